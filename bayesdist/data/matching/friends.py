@@ -91,12 +91,11 @@ def friends_of_friends(places: Float, exposure: Int, length: float, *, each: Eac
 def cells(places: Float, exposure: Int, length: float, detections: int) -> Iterator[Cell]:
     """Cells of the sky with about so many detections, and with any."""
     square = _squares(places, length)
-    extent = square.max(axis=1) + 1
+    extent = square.max(axis=1) + 1.0
     side = int(np.sqrt(detections / len(places) * extent[0] * extent[1])) + 1
     side, margin = max(side, MIN_SIDE * FINE), MARGIN * FINE
-    column, line = square // side
-    n_lines = int(line.max()) + 3  # none in the first and the last
-    cell = (column + 1) * n_lines + line + 1
+    n_lines = int(square[1].max()) // side + 3  # none in the first and the last
+    cell = (square[0] // side + np.int64(1)) * n_lines + square[1] // side + 1
     order = np.argsort(cell, kind="stable")
     cell, square = cell[order], square[:, order]
     for number in np.unique(cell):
@@ -118,8 +117,12 @@ def cells(places: Float, exposure: Int, length: float, detections: int) -> Itera
 
 def _squares(places: Float, length: float) -> Int:
     """Squares (2, N) from the lowest, of a grid that is the same for all cells."""
-    square = np.floor(places.T / (length / FINE)).astype(np.int64, order="C")
-    return square - square.min(axis=1, keepdims=True)
+    lowest, highest = (np.floor(end / (length / FINE)) for end in (places.min(0), places.max(0)))
+    narrow = (highest - lowest).max() < np.iinfo(np.int32).max
+    square = np.empty((2, len(places)), np.int32 if narrow else np.int64)
+    for axis in range(2):
+        square[axis] = np.floor(places[:, axis] / (length / FINE)) - lowest[axis]
+    return square
 
 
 def _within(square: Int, low: Int, high: Int) -> Bool:
@@ -132,7 +135,7 @@ def grouped(cell: Cell) -> Grouped:
     """Groups of a cell."""
     places, rows = cell.places, cell.rows
     column, line = _squares(places, cell.length)
-    key = column * (line.max() + 1) + line
+    key = column * (line.max() + np.int64(1)) + line
     _, some, of_square = np.unique(key, return_index=True, return_inverse=True)
     pairs = cKDTree(places[some]).query_pairs(cell.length, output_type="ndarray")
     links = coo_array((np.ones(len(pairs), bool), tuple(pairs.T)), shape=(len(some),) * 2)
