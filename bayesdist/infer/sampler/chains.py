@@ -351,7 +351,7 @@ def _verdict(
             n_outside=quality.n_outside,
         )
 
-    if len(worst) < len(target.names) and worst:
+    if 0 < len(worst) < len(target.names):
         found = of(worst, draws[..., [target.names.index(name) for name in worst]])
         if not found.converged:
             return found

@@ -121,11 +121,12 @@ def self_calibrate(
     pixel = model.pixel_size(theta)
     before: Friends | None = None
     mode: SelfCalibrationMode | None = None
+    each = partial(each_of, compute)
     for turn in range(max_iterations):
         flat = detections if plane is None else plane.onto_it(model, detections, theta)
-        places = places_of(model, flat, theta, dilation)
-        each = partial(each_of, compute)
-        friends = friends_of_friends(places, flat.exposure, radius * pixel, each=each)
+        friends = friends_of_friends(
+            places_of(model, flat, theta, dilation), flat.exposure, radius * pixel, each=each
+        )
         found = replace(flat, star=friends.star)
         problem = prepare(
             model,
