@@ -46,7 +46,7 @@ def unsynced(full) -> Iterator[None]:
     """Files need not reach the disk, for which a run waits a hundred times; unless run in full."""
     with pytest.MonkeyPatch.context() as patch:
         if not full:
-            patch.setattr("bayesdist.files.os.fsync", lambda number: None)
+            patch.setattr("bayesdist.files.atomic.os.fsync", lambda number: None)
         yield
 
 

@@ -40,13 +40,13 @@ def quick() -> Iterator[None]:
     """Context in which figures of runs are not made, and what else takes long is left out.
 
     Posteriors leave out what those of large runs do, the likelihood of each star at each draw: a
-    fifth of a small run, and tests/infer/test_files looks at it.  Structure that a fit leaves out
-    is integrated over a coarse grid of its sizes: a tenth, and tests/diagnose looks at it.
+    fifth of a small run, and tests/infer/posterior/test_files looks at it.  Structure that a fit
+    leaves out is integrated over a coarse grid of its sizes: a tenth, and tests/diagnose looks at it.
     """
     structure = "bayesdist.diagnose.correlated.structure"
     with (
         sketched(made=False),
-        patch("bayesdist.infer.files.LARGEST", 0),
+        patch("bayesdist.infer.posterior.files.LARGEST", 0),
         patch(f"{structure}.LENGTHS", np.geomspace(0.02, 0.6, 3)),
         patch(f"{structure}.HALVINGS", 2),
     ):

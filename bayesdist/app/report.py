@@ -20,13 +20,13 @@ from bayesdist.assess import VectorMap, distortion_vectors
 from bayesdist.assess.coefficients import coefficient_table
 from bayesdist.assess.evaluation import Evaluation
 from bayesdist.assess.solution import chip_places
-from bayesdist.checks import Check
 from bayesdist.diagnose.diagnostics import Diagnostics
+from bayesdist.files.tables import read_ecsv
 from bayesdist.infer import Posterior
 from bayesdist.model import Chip
 from bayesdist.model.grid import outline_pixels
-from bayesdist.reading.tables import read_ecsv
 from bayesdist.report.context import ChipResults, Product, ReportInput, SelfcalResults
+from bayesdist.utils.checks import Check
 
 log = logging.getLogger("bayesdist")
 

@@ -25,9 +25,9 @@ from bayesdist.app.tables.diagnostics_files import load_diagnostics
 from bayesdist.app.tables.evaluation_files import load_evaluation
 from bayesdist.assess.evaluation import Evaluation, EvaluationSettings
 from bayesdist.assess.model import ErrorModel
-from bayesdist.checks import Check, in_order
 from bayesdist.diagnose.diagnostics import Diagnostics
 from bayesdist.infer import LinearFit, Posterior, load_posterior
+from bayesdist.utils.checks import Check, in_order
 
 T = TypeVar("T")
 

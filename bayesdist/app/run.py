@@ -37,7 +37,7 @@ from bayesdist.app.store.rundir import RunDirectory
 from bayesdist.assess.evaluation import Evaluation
 from bayesdist.errors import InputError, NotConvergedError
 from bayesdist.infer import Posterior
-from bayesdist.infer.checks import convergence_check
+from bayesdist.infer.posterior.checks import convergence_check
 
 __all__ = ["continue_stage", "make_stages", "run"]
 

@@ -28,16 +28,16 @@ from bayesdist.app.store.rundir import part_files
 from bayesdist.app.store.summary import Sampler
 from bayesdist.app.tables.diagnostics_files import write_diagnostics
 from bayesdist.app.tables.evaluation_files import write_evaluation
-from bayesdist.checks import warnings_of
 from bayesdist.data import Matches
 from bayesdist.data.storage.write import write_columns
 from bayesdist.diagnose.residuals.epoch_shift import epoch_shift
 from bayesdist.diagnose.residuals.quoted import majority_sentence
-from bayesdist.files import made_folder, remove_leftovers
+from bayesdist.files.atomic import made_folder, remove_leftovers
 from bayesdist.infer import LinearFit, Posterior, save_posterior
 from bayesdist.infer.posterior.memberships import memberships_of
-from bayesdist.infer.skew import skew_of
+from bayesdist.infer.solution.skew import skew_of
 from bayesdist.infer.stars.stars import in_table_order, prepare
+from bayesdist.utils.checks import warnings_of
 
 log = logging.getLogger("bayesdist")
 

@@ -1,6 +1,6 @@
 """Names of the package, each with the module where it is at home; loaded when first used."""
 
-from .area import (
+from .maps.area import (
     AreaMap as AreaMap,
     area_map as area_map,
 )
@@ -19,7 +19,7 @@ from .evaluation import (
     EvaluationSettings as EvaluationSettings,
     evaluate as evaluate,
 )
-from .maps import (
+from .maps.uncertainty import (
     UncertaintyMap as UncertaintyMap,
     uncertainty_map as uncertainty_map,
 )

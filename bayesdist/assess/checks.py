@@ -6,10 +6,10 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from bayesdist.arrays import Float
-from bayesdist.checks import EITHER, LARGER, Check
-from bayesdist.limits import MATCH_RADIUS
 from bayesdist.model.timedep import TimeDependence
+from bayesdist.utils.arrays import Float
+from bayesdist.utils.checks import EITHER, LARGER, Check
+from bayesdist.utils.limits import MATCH_RADIUS
 
 GROUP = "Assumptions"
 

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from astropy.table import MaskedColumn, Table
 
-from bayesdist.arrays import Float
 from bayesdist.model import AXES
+from bayesdist.utils.arrays import Float
 
 if TYPE_CHECKING:
     from bayesdist.infer import LinearFit, Posterior

@@ -11,11 +11,11 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import ArrayLike
 
-from bayesdist.arrays import Bool, Float, Int
 from bayesdist.assess.solution import place_of
 from bayesdist.errors import InputError
 from bayesdist.model import DistortionModel
 from bayesdist.model.grid import grid_pixels, mesh
+from bayesdist.utils.arrays import Bool, Float, Int
 
 MIN_POSITIONS = 4  # of a region
 Region: TypeAlias = "str | tuple[tuple[float, float], ...]"

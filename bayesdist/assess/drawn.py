@@ -17,7 +17,6 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from bayesdist.arrays import Float
 from bayesdist.assess.domain import EvaluationDomain, WorstPosition
 from bayesdist.assess.statistics import extent, of_sizes, sizes
 from bayesdist.assess.terms.forms import (
@@ -30,7 +29,8 @@ from bayesdist.assess.terms.forms import (
     NoiseField,
 )
 from bayesdist.infer.equations.scaled import one_thread
-from bayesdist.infer.solution import Solution
+from bayesdist.infer.solution.solution import Solution
+from bayesdist.utils.arrays import Float
 
 ROWS = 16  # draws whose noise comes from one generator: so that blocks do not change it
 BLOCK = 200_000  # positions times draws whose errors a thread holds at once

@@ -7,13 +7,12 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from bayesdist.arrays import Float
-from bayesdist.assess.area import AreaMap, area_map
 from bayesdist.assess.budget.budget import ErrorBudget, budget_of
 from bayesdist.assess.budget.surface import BudgetSurface, budget_surface
 from bayesdist.assess.domain import EvaluationDomain
 from bayesdist.assess.drawn import DrawnErrors
-from bayesdist.assess.maps import RELATIVE, UncertaintyMap, uncertainty_map, with_local
+from bayesdist.assess.maps.area import AreaMap, area_map
+from bayesdist.assess.maps.uncertainty import RELATIVE, UncertaintyMap, uncertainty_map, with_local
 from bayesdist.assess.model import ErrorModel
 from bayesdist.assess.requirements.margins import Margin, judge
 from bayesdist.assess.requirements.requirement import Requirement
@@ -23,7 +22,6 @@ from bayesdist.assess.terms.correlated import StructureErrors
 from bayesdist.assess.terms.forms import Known
 from bayesdist.assess.terms.given import Centroids, centroids_of
 from bayesdist.assess.units import pixel_scale_of
-from bayesdist.checks import Check, in_order, worst
 from bayesdist.diagnose.diagnostics import Diagnostics
 from bayesdist.errors import InputError, required
 from bayesdist.infer import LinearFit, Posterior, Solution
@@ -32,7 +30,9 @@ from bayesdist.infer.selfcal import gauge_free
 from bayesdist.infer.selfcal.sky_moves import gauge_free_matrix
 from bayesdist.model import Chip
 from bayesdist.model.grid import DEFAULT_GRID
-from bayesdist.streams import restarted
+from bayesdist.utils.arrays import Float
+from bayesdist.utils.checks import Check, in_order, worst
+from bayesdist.utils.streams import restarted
 
 VALIDITY_DRAWS = 1000  # for each of its epochs
 VALIDITY_EPOCHS = 40  # of a curve

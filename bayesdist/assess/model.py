@@ -11,7 +11,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.linalg import solve_triangular
 
-from bayesdist.arrays import Float
 from bayesdist.assess.budget.budget import ErrorBudget, budget_of
 from bayesdist.assess.domain import EvaluationDomain
 from bayesdist.assess.drawn import DrawnErrors, generators
@@ -28,10 +27,11 @@ from bayesdist.errors import InputError, required
 from bayesdist.infer import LinearFit, Posterior
 from bayesdist.infer.catalogue.star_errors import StarCovariance
 from bayesdist.infer.equations.scaled import recolouring, scaled_cholesky
-from bayesdist.infer.solution import Solution
-from bayesdist.memory import require_memory
+from bayesdist.infer.solution.solution import Solution
 from bayesdist.model import LookupTable
 from bayesdist.model.grid import DEFAULT_GRID
+from bayesdist.utils.arrays import Float
+from bayesdist.utils.memory import require_memory
 
 
 @dataclass(frozen=True, eq=False)

@@ -12,10 +12,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from bayesdist.arrays import Float
 from bayesdist.errors import InputError
-from bayesdist.infer.solution import Solution
+from bayesdist.infer.solution.solution import Solution
 from bayesdist.model import Chip, DistortionModel, Groups, PolynomialBasis
+from bayesdist.utils.arrays import Float
 
 
 @dataclass(frozen=True, eq=False)

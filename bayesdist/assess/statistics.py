@@ -6,8 +6,8 @@ import functools
 
 import numpy as np
 
-from bayesdist.arrays import Float
 from bayesdist.errors import require_known
+from bayesdist.utils.arrays import Float
 
 _PERCENTILES = {"p50": 50.0, "p68": 68.0, "p90": 90.0, "p95": 95.0, "p99": 99.0}
 _DIRECTIONS = 64  # over half a turn

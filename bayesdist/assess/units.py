@@ -6,8 +6,8 @@ import math
 
 from bayesdist.data.tables.units import UNITS
 from bayesdist.errors import InputError, require_known
-from bayesdist.infer.solution import Solution
-from bayesdist.limits import PIXEL_SIZE
+from bayesdist.infer.solution.solution import Solution
+from bayesdist.utils.limits import PIXEL_SIZE
 
 _MAS = {"mas": 1.0, "arcsec": 1e3, "deg": 3.6e6}
 

@@ -6,12 +6,12 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from bayesdist.arrays import Float
 from bayesdist.assess.comparison.frame import turn_matrix
 from bayesdist.assess.solution import Place, Solution, place_of
 from bayesdist.errors import InputError, require_known
 from bayesdist.model.basis import point_blocks
 from bayesdist.model.grid import DEFAULT_GRID, grid_pixels, mesh, position_of_largest
+from bayesdist.utils.arrays import Float
 
 PARTS = ("no_constant", "non_linear")
 

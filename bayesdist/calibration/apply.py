@@ -18,11 +18,11 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import ArrayLike
 
-from bayesdist.arrays import Bool, Float, Int
 from bayesdist.calibration.chip_map import ChipMap, chip_of
 from bayesdist.calibration.inverse import detector_grid
 from bayesdist.calibration.subarray import FULL, Subarray
 from bayesdist.errors import InputError
+from bayesdist.utils.arrays import Bool, Float, Int
 
 # Points along each edge of a chip, whose image bulges.
 _EDGE = 257

@@ -14,11 +14,11 @@ import numpy as np
 from numpy.polynomial import legendre
 from numpy.typing import ArrayLike
 
-from bayesdist.arrays import Float
 from bayesdist.calibration.chip_map import ChipMap
 from bayesdist.calibration.subarray import FULL, Subarray
 from bayesdist.errors import InputError
 from bayesdist.model import PolynomialBasis
+from bayesdist.utils.arrays import Float
 
 _MAGNITUDES = 2.5 / np.log(10.0)
 

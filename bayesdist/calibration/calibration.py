@@ -14,15 +14,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from bayesdist.arrays import Float
 from bayesdist.calibration.chip_map import ChipMap, chip_of, sampling_of
 from bayesdist.calibration.further import FurtherError
 from bayesdist.calibration.inverse import ExplicitInverse
 from bayesdist.calibration.plane import Plane
 from bayesdist.errors import InputError
-from bayesdist.infer.solution import Solution
-from bayesdist.infer.transforms import without_frames
+from bayesdist.infer.solution.solution import Solution
+from bayesdist.infer.solution.transforms import without_frames
 from bayesdist.model import Chip, DistortionModel, LookupTable, TimeDependence, corrected
+from bayesdist.utils.arrays import Float
 
 ORIGINS = ("stated", "reference", "chip")
 FOLLOWING_ORDER = 9  # of the polynomial that stands for look-up tables where two are compared

@@ -13,11 +13,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import ArrayLike
 
-from bayesdist.arrays import Float
 from bayesdist.errors import InputError
-from bayesdist.infer.solution import Solution
+from bayesdist.infer.solution.solution import Solution
 from bayesdist.model import Chip, LookupTable, PolynomialBasis
 from bayesdist.model.basis import point_blocks
+from bayesdist.utils.arrays import Float
 
 # Newton's method has converged when a step is this short in pixels, which rounding allows.
 STEP, MAX_STEPS = 1e-9, 30

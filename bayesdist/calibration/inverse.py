@@ -15,11 +15,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from bayesdist.arrays import Float
 from bayesdist.calibration.chip_map import ChipMap
 from bayesdist.errors import InputError
 from bayesdist.model import PolynomialBasis
 from bayesdist.model.basis import MAX_ORDER, polynomial_values
+from bayesdist.utils.arrays import Float
 
 Terms = Mapping[tuple[int, int], float]
 Forward = Callable[[Float, Float], tuple[Float, Float]]

@@ -14,15 +14,15 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from bayesdist.arrays import Complex, Float
 from bayesdist.calibration.calibration import Calibration
 from bayesdist.calibration.further import scaled
 from bayesdist.calibration.plane import ARCSEC, Agreement, Orientation, Plane
 from bayesdist.errors import DegenerateError, InputError
-from bayesdist.infer.solution import DerivedSolution, Solution
+from bayesdist.infer.solution.solution import DerivedSolution, Solution
 from bayesdist.model import DistortionModel, PolynomialBasis
 from bayesdist.model.grid import DEFAULT_GRID, grid_pixels, mesh
 from bayesdist.model.similarity import turned, turned_model
+from bayesdist.utils.arrays import Complex, Float
 
 
 def lay_on(

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from bayesdist.arrays import Float
-from bayesdist.infer.solution import Solution
+from bayesdist.infer.solution.solution import Solution
+from bayesdist.utils.arrays import Float
 
 ARCSEC = {"arcsec": 1.0, "mas": 1e-3, "deg": 3600.0}
 

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from bayesdist.arrays import Float
 from bayesdist.calibration.calibration import Calibration
 from bayesdist.calibration.chip_map import ChipMap
 from bayesdist.errors import FormatError, InputError
+from bayesdist.utils.arrays import Float
 
 MOST_PIXELS = 1e6  # columns or rows of a chip
 FAR = 1e7  # pixels from the chip to its reference pixel

@@ -17,7 +17,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from bayesdist.arrays import Float, Int
 from bayesdist.calibration.calibration import Calibration
 from bayesdist.calibration.chip_map import sampling_of
 from bayesdist.calibration.plane import ARCSEC
@@ -25,6 +24,7 @@ from bayesdist.errors import InputError
 from bayesdist.infer.equations.priors import GaussianPriors, JointPrior
 from bayesdist.model import DistortionModel
 from bayesdist.model.frames import LINEAR_MATRICES, frame_names
+from bayesdist.utils.arrays import Float, Int
 
 FEWEST_DRAWS = 4.0  # effective draws for each parameter, whose covariance is inverted
 SINGULAR = 1e-12  # of the largest eigenvalue in units of the standard deviations

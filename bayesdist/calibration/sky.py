@@ -15,13 +15,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from bayesdist.arrays import Float
 from bayesdist.calibration.chip_map import ChipMap, Monomials
 from bayesdist.calibration.inverse import detector_grid
 from bayesdist.data.sky.tangent import ARCSEC, plane_axes, sky_of_plane, tangent_plane
 from bayesdist.errors import InputError
 from bayesdist.model import PolynomialBasis
 from bayesdist.model.basis import MAX_ORDER
+from bayesdist.utils.arrays import Float
 
 LEFT = 1e-5  # of a pixel: a thousandth of the best centroids' errors
 _NODES = 33

@@ -16,12 +16,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from bayesdist.arrays import Float, Int
 from bayesdist.calibration.calibration import Calibration
 from bayesdist.calibration.chip_map import ChipMap
 from bayesdist.calibration.plane import ARCSEC
 from bayesdist.data.sky.tangent import sky_of_plane, tangent_jacobian
 from bayesdist.errors import InputError
+from bayesdist.utils.arrays import Float, Int
 
 
 @dataclass(frozen=True, eq=False)

@@ -17,8 +17,8 @@ import numpy as np
 from astropy.io import fits
 from numpy.typing import ArrayLike
 
-from bayesdist.arrays import Float
 from bayesdist.errors import FormatError, InputError
+from bayesdist.utils.arrays import Float
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,6 @@ import numpy as np
 from astropy.table import Table
 from numpy.typing import NDArray
 
-from bayesdist.arrays import Float, Int
 from bayesdist.data.reading.columns import is_on_sky, plane_unit, position_unit
 from bayesdist.data.reading.table import with_sky_columns
 from bayesdist.data.sky.earth import parallax_factors
@@ -29,7 +28,8 @@ from bayesdist.data.tables.column import Quantities, SourceColumn
 from bayesdist.data.tables.names import ALIASES, find_columns
 from bayesdist.data.tables.units import check_unit
 from bayesdist.errors import InputError
-from bayesdist.reading.tables import read_table
+from bayesdist.files.tables import read_table
+from bayesdist.utils.arrays import Float, Int
 
 _PAIRS = (("sigma_u", "sigma_v"), ("pm_u", "pm_v"), ("sigma_pm_u", "sigma_pm_v"))
 _PARALLAX = ("parallax", "sigma_parallax")

@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesdist.arrays import Float, Int
 from bayesdist.data.tables.checks import COMPLETED, check_columns, columns_of
 from bayesdist.errors import InputError
+from bayesdist.utils.arrays import Float, Int
 
 NO_STAR = -1
 

@@ -12,13 +12,13 @@ from typing import Any
 import numpy as np
 from astropy.table import Column, MaskedColumn, Table
 
-from bayesdist.arrays import Float
 from bayesdist.data.sky.earth import velocity_aberration
 from bayesdist.data.tables.column import SourceColumn
 from bayesdist.data.tables.names import find_columns
 from bayesdist.errors import InputError
-from bayesdist.files import atomic_path
-from bayesdist.reading.tables import read_table
+from bayesdist.files.atomic import atomic_path
+from bayesdist.files.tables import read_table
+from bayesdist.utils.arrays import Float
 
 _NUMBERS = ("exptime", "vafactor", "pa_v3", "ra", "dec")
 _SLOWEST = 2e-4  # |VAFACTOR - 1| of anything in orbit about the Earth stays below 1.4e-4

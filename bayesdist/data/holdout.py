@@ -13,10 +13,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesdist.arrays import Bool
 from bayesdist.data.matches import Matches
 from bayesdist.errors import InputError
-from bayesdist.streams import mixed
+from bayesdist.utils.arrays import Bool
+from bayesdist.utils.streams import mixed
 
 Bits = NDArray[np.uint64]
 

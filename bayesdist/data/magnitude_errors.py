@@ -10,8 +10,8 @@ from numpy.typing import ArrayLike
 from scipy.interpolate import PchipInterpolator
 from scipy.optimize import isotonic_regression
 
-from bayesdist.arrays import Float, Int
 from bayesdist.errors import InputError
+from bayesdist.utils.arrays import Float, Int
 
 _MIN_STARS_IN_BIN = 40
 _MAX_BINS = 25

@@ -11,13 +11,13 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from bayesdist.arrays import Float
 from bayesdist.data.batches import batch_edges, every_kth
 from bayesdist.data.columns.checked import SIGMAS, MatchColumns, refuse_repeated
 from bayesdist.data.columns.joining import joined_arguments, joined_columns
 from bayesdist.data.columns.labels import Labels, merged_counts
 from bayesdist.data.magnitude_errors import AddedErrors, MagnitudeErrors, no_magnitudes
 from bayesdist.errors import InputError
+from bayesdist.utils.arrays import Float
 
 Errors = MagnitudeErrors | AddedErrors | float | tuple[ArrayLike, ArrayLike]
 

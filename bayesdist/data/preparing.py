@@ -7,13 +7,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from bayesdist.arrays import Float
 from bayesdist.data.catalog import ReferenceCatalog
 from bayesdist.data.exposures import ExposureLog
 from bayesdist.data.magnitude_errors import MAD_TO_SIGMA, MagnitudeErrors
 from bayesdist.data.matches import Matches
 from bayesdist.data.tables.checks import columns_of
 from bayesdist.errors import InputError, required
+from bayesdist.utils.arrays import Float
 
 _STARS_IN_BIN = 200  # stars of a bin in magnitude
 _MAX_BINS = 40

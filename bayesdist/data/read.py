@@ -30,8 +30,8 @@ from bayesdist.data.tables.checks import absent
 from bayesdist.data.tables.column import SourceColumn
 from bayesdist.data.tables.names import ALIASES, find_columns
 from bayesdist.errors import InputError
-from bayesdist.reading.regular import read_lines
-from bayesdist.reading.tables import read_table
+from bayesdist.files.regular import read_lines
+from bayesdist.files.tables import read_table
 
 PathLike = str | os.PathLike[str]
 IN_MEMORY = "table"  # name of a table that is no file, in errors

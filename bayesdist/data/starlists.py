@@ -10,7 +10,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 from astropy.table import Table
 
-from bayesdist.arrays import Bool, Float
 from bayesdist.data.detections import Detections
 from bayesdist.data.formats.files import exposure_names, input_files, kind_of
 from bayesdist.data.formats.hst1pass import read_hst1pass
@@ -18,7 +17,8 @@ from bayesdist.data.tables.checks import COMPLETED, counted
 from bayesdist.data.tables.column import SourceColumn
 from bayesdist.data.tables.names import ALIASES, BASIC, find_columns, origin_of
 from bayesdist.errors import FormatError, InputError
-from bayesdist.reading.tables import TABLE_SUFFIXES, read_table
+from bayesdist.files.tables import TABLE_SUFFIXES, read_table
+from bayesdist.utils.arrays import Bool, Float
 
 log = logging.getLogger("bayesdist")
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 
-from bayesdist.checks import LARGER, Check
 from bayesdist.diagnose.correlated import Discrepancy
 from bayesdist.diagnose.correlated.deviations import CURVATURE
 from bayesdist.diagnose.holdout.validation import HoldoutValidation
@@ -12,15 +11,16 @@ from bayesdist.diagnose.residuals.coverage import Coverage
 from bayesdist.diagnose.residuals.misfit import Misfit, worst_misfit
 from bayesdist.diagnose.residuals.sample import ExposureScatter
 from bayesdist.diagnose.score.result import ScoreTest
-from bayesdist.limits import (
+from bayesdist.utils.checks import LARGER, Check
+from bayesdist.utils.limits import (
     EXPOSURE_CHI2,
     HELD_OUT_DOUBTFUL,
     STRUCTURE,
     STRUCTURE_IN_BUDGET,
     STRUCTURE_SEEN,
 )
-from bayesdist.limits import SCORE_TESTS as SCORE_LIMIT
-from bayesdist.numbers import count, number, percent, probability, size_of
+from bayesdist.utils.limits import SCORE_TESTS as SCORE_LIMIT
+from bayesdist.utils.numbers import count, number, percent, probability, size_of
 
 FIT, HELD_OUT, SCORE_TESTS = "Fit", "Held-out truth", "Score tests"
 

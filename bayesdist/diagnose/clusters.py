@@ -11,7 +11,7 @@ import math
 import numpy as np
 from scipy.sparse import csr_matrix
 
-from bayesdist.arrays import Float, Int
+from bayesdist.utils.arrays import Float, Int
 
 
 def sums_over(cluster: Int, values: Float, n: int = 0) -> Float:

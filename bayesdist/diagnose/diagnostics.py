@@ -9,8 +9,6 @@ from typing import Literal
 
 import numpy as np
 
-from bayesdist.arrays import Float, Int
-from bayesdist.checks import EITHER, Check
 from bayesdist.data import MagnitudeErrors, Matches
 from bayesdist.diagnose.checks import (
     coverage_checks,
@@ -55,7 +53,9 @@ from bayesdist.infer.equations.scaled import one_thread
 from bayesdist.infer.exposures.chip_offsets import Settling
 from bayesdist.infer.selfcal import SelfCalibrationMode
 from bayesdist.infer.stars.likelihood import Likelihood
-from bayesdist.streams import restarted
+from bayesdist.utils.arrays import Float, Int
+from bayesdist.utils.checks import EITHER, Check
+from bayesdist.utils.streams import restarted
 
 Bins = tuple[int, int]
 

@@ -12,13 +12,13 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.sparse import csr_array
 
-from bayesdist.arrays import Float, Int
 from bayesdist.calibration.calibration import Calibration
 from bayesdist.data import Matches
 from bayesdist.diagnose.residuals.binned import BinnedResiduals, binned_residuals
-from bayesdist.infer.solution import Solution
-from bayesdist.infer.transforms import without_frames
+from bayesdist.infer.solution.solution import Solution
+from bayesdist.infer.solution.transforms import without_frames
 from bayesdist.model import LookupTable, corrected
+from bayesdist.utils.arrays import Float, Int
 
 MIN_OVERLAP = 0.5  # of the stars of the exposure that has fewer: what "overlap well" means
 MIN_SHARED_STARS = 100  # shared stars below which there is no map to be drawn

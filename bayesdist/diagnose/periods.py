@@ -12,12 +12,10 @@ from functools import partial
 
 import numpy as np
 
-from bayesdist.arrays import Float, Int
 from bayesdist.data import Matches
 from bayesdist.diagnose.residuals.binned import BAND_AXES, BinnedSums, BinValues, band_bins
 from bayesdist.diagnose.residuals.misfit import STARS_PER_BIN
 from bayesdist.diagnose.residuals.tables import StatisticsTable, period_table
-from bayesdist.distributions import chi2_isf, chi2_sf, f_sf
 from bayesdist.errors import DegenerateError
 from bayesdist.infer import LinearFit
 from bayesdist.infer.compare.period_dates import sum_by_period
@@ -29,8 +27,10 @@ from bayesdist.infer.compare.periods import (
 )
 from bayesdist.infer.compare.positions import PositionChange
 from bayesdist.infer.stars.stars import prepare
-from bayesdist.limits import DIFFERENCE
-from bayesdist.numbers import p_words
+from bayesdist.utils.arrays import Float, Int
+from bayesdist.utils.distributions import chi2_isf, chi2_sf, f_sf
+from bayesdist.utils.limits import DIFFERENCE
+from bayesdist.utils.numbers import p_words
 
 MAX_BINS = 45  # along each side, as in Appendix C
 COMBINED = "combined"

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike
 
-from bayesdist.arrays import Float
-from bayesdist.distributions import beta_ppf, beta_sf, chi2_isf
+from bayesdist.utils.arrays import Float
+from bayesdist.utils.distributions import beta_ppf, beta_sf, chi2_isf
 
 MIN_P = 1e-300  # tails underflow: no probability is zero
 

@@ -20,13 +20,13 @@ from .exposures.hierarchy import (
     fit_hierarchical as fit_hierarchical,
     held_in_reference as held_in_reference,
 )
-from .files import (
+from .posterior.files import (
     load_fit as load_fit,
     load_posterior as load_posterior,
     save_fit as save_fit,
     save_posterior as save_posterior,
 )
-from .linear import (
+from .solution.linear import (
     LinearFit as LinearFit,
     Rejection as Rejection,
     build_model as build_model,
@@ -49,7 +49,7 @@ from .posterior.memberships import (
     memberships as memberships,
 )
 from .sampler.sample import sample as sample
-from .solution import (
+from .solution.solution import (
     ReferenceGauge as ReferenceGauge,
     Solution as Solution,
     TransformedSolution as TransformedSolution,
@@ -60,7 +60,7 @@ from .stars.shards import (
     Compute as Compute,
     Shards as Shards,
 )
-from .transforms import (
+from .solution.transforms import (
     LinearTerms as LinearTerms,
     linear_terms as linear_terms,
     lines as lines,

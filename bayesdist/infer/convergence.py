@@ -13,9 +13,9 @@ from typing import Any
 import numpy as np
 from scipy.special import logsumexp
 
-from bayesdist.arrays import Float
-from bayesdist.limits import DRAWS_PER_WALKER
-from bayesdist.numbers import count
+from bayesdist.utils.arrays import Float
+from bayesdist.utils.limits import DRAWS_PER_WALKER
+from bayesdist.utils.numbers import count
 
 AXES = {"chain_axis": 0, "draw_axis": 1}
 TAIL = (0.05, 0.95)  # quantiles whose effective sample sizes are those of the tails

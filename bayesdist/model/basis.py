@@ -17,8 +17,8 @@ import numpy as np
 from numpy.polynomial import legendre
 from numpy.typing import ArrayLike
 
-from bayesdist.arrays import Float
 from bayesdist.errors import InputError
+from bayesdist.utils.arrays import Float
 
 MAX_ORDER = 12
 # Points whose basis values are held at once: 91 terms (order 12) of them are 24 MB.

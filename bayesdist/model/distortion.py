@@ -21,10 +21,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from bayesdist.arrays import Float, Int
 from bayesdist.errors import InputError
 from bayesdist.model.effective import EffectiveCoefficients
 from bayesdist.model.grouping import Groups, group_by
+from bayesdist.utils.arrays import Float, Int
 
 NO_EXPOSURE = -1  # code of the polynomial itself where it is no exposure's
 

@@ -12,7 +12,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from bayesdist.arrays import Float, Int
 from bayesdist.model.frames import (
     CHIP_DEVIATIONS,
     RIGID,
@@ -25,6 +24,7 @@ from bayesdist.model.frames import (
 from bayesdist.model.grouping import Groups
 from bayesdist.model.layout import ParameterLayout
 from bayesdist.model.timedep import TimeDependence
+from bayesdist.utils.arrays import Float, Int
 
 
 @dataclass(frozen=True)

@@ -22,7 +22,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike
 
-from bayesdist.arrays import Float
+from bayesdist.utils.arrays import Float
 
 _NAMES: dict[str, tuple[str, ...]] = {
     "none": (),

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from bayesdist.arrays import Float, Int
 from bayesdist.errors import InputError
-from bayesdist.memory import require_memory
+from bayesdist.utils.arrays import Float, Int
+from bayesdist.utils.memory import require_memory
 
 DEFAULT_GRID = (33, 17)
 BYTES_OF_POINT = 500  # at least: its position, the polynomial there, and some draws

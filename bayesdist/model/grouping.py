@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from bayesdist.arrays import Float, Int
+from bayesdist.utils.arrays import Float, Int
 
 
 @dataclass(frozen=True, eq=False)

@@ -10,11 +10,11 @@ from itertools import product
 import numpy as np
 from numpy.polynomial.legendre import leggauss
 
-from bayesdist.arrays import Float, Int
 from bayesdist.errors import InputError
 from bayesdist.model.basis import PolynomialBasis
 from bayesdist.model.frames import CHIP_DEVIATIONS, FRAME_KINDS, RIGID, frame_names
 from bayesdist.model.timedep import AXES, TimeDependence
+from bayesdist.utils.arrays import Float, Int
 
 GAUGES = ("first", "held")
 

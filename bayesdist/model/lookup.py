@@ -17,9 +17,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from bayesdist.arrays import Bool, Float, Int
 from bayesdist.errors import InputError
 from bayesdist.model.basis import as_pair
+from bayesdist.utils.arrays import Bool, Float, Int
 
 
 @dataclass(frozen=True, eq=False)

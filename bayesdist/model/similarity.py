@@ -14,9 +14,9 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import ArrayLike
 
-from bayesdist.arrays import Float
 from bayesdist.model.distortion import DistortionModel
 from bayesdist.model.timedep import TimeDependence
+from bayesdist.utils.arrays import Float
 
 
 def turned_model(model: DistortionModel) -> DistortionModel:

@@ -13,8 +13,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from bayesdist.arrays import Float
 from bayesdist.errors import InputError
+from bayesdist.utils.arrays import Float
 
 AXES = ("u", "v")
 

@@ -14,12 +14,12 @@ from pathlib import Path
 import numpy as np
 from astropy.io import fits
 
-from bayesdist.arrays import Float
 from bayesdist.assess import AreaMap, UncertaintyMap
-from bayesdist.assess.maps import RELATIVE
+from bayesdist.assess.maps.uncertainty import RELATIVE
 from bayesdist.calibration.area import PixelAreaMap
 from bayesdist.errors import InputError
-from bayesdist.files import atomic_path
+from bayesdist.files.atomic import atomic_path
+from bayesdist.utils.arrays import Float
 
 PREFIX = {"least squares": "LSQ", "posterior": "MIX", RELATIVE: "REL"}
 

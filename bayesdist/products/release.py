@@ -16,7 +16,7 @@ from bayesdist.calibration.calibration import Calibration
 from bayesdist.calibration.orientation import oriented
 from bayesdist.calibration.plane import Orientation
 from bayesdist.errors import InputError
-from bayesdist.files import made_folder, path_within
+from bayesdist.files.atomic import made_folder, path_within
 from bayesdist.model.lookup import LookupTable
 from bayesdist.products.formats.idctab.build import idctab_from_solution
 from bayesdist.products.formats.idctab.drift import Loss, storable

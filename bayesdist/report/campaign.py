@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from bayesdist.arrays import Bool, Float, Int
 from bayesdist.model import Chip, LookupTable
+from bayesdist.utils.arrays import Bool, Float, Int
 
 if TYPE_CHECKING:
     from astropy.table import Table

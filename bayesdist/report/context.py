@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
-from bayesdist.arrays import Float, Int
-from bayesdist.checks import Check, warnings_of
-from bayesdist.numbers import MISSING, count, with_mas
 from bayesdist.report.figures.mosaic import Mosaic
+from bayesdist.utils.arrays import Float, Int
+from bayesdist.utils.checks import Check, warnings_of
+from bayesdist.utils.numbers import MISSING, count, with_mas
 
 if TYPE_CHECKING:
     from astropy.table import Table

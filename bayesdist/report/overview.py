@@ -8,11 +8,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from bayesdist.checks import LEVELS
-from bayesdist.files import atomic_path
-from bayesdist.numbers import MISSING, count, number
+from bayesdist.files.atomic import atomic_path
 from bayesdist.report.page import template
 from bayesdist.report.texttable import Level
+from bayesdist.utils.checks import LEVELS
+from bayesdist.utils.numbers import MISSING, count, number
 
 
 @dataclass(frozen=True)

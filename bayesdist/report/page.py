@@ -13,12 +13,12 @@ from typing import Any
 import jinja2
 from markupsafe import Markup
 
-from bayesdist.numbers import MISSING
 from bayesdist.report.contents import explanation_of, section_of
 from bayesdist.report.drawing import Drawing
 from bayesdist.report.figures.style import HALF_WIDTH
 from bayesdist.report.registry import Registry
 from bayesdist.report.texttable import Level, TextTable
+from bayesdist.utils.numbers import MISSING
 
 REPORT = "bayesdist.report"  # whose templates all pages share
 _AS_BROWSERS_SAY = {"svg": "svg+xml", "png": "png"}

@@ -10,7 +10,7 @@ from typing import Any
 
 from markupsafe import Markup
 
-from bayesdist.files import atomic_path
+from bayesdist.files.atomic import atomic_path
 from bayesdist.report.context import ReportInput
 from bayesdist.report.drawing import Drawing, draw_all
 from bayesdist.report.page import Part, parts_of, template

@@ -8,8 +8,8 @@ from itertools import groupby
 from pathlib import PurePath
 from typing import Any
 
-from bayesdist.checks import Check
-from bayesdist.numbers import MISSING, number
+from bayesdist.utils.checks import Check
+from bayesdist.utils.numbers import MISSING, number
 
 _FEW_ROWS, _FEW_LETTERS = 16, 100  # of a table that leaves room next to it
 MAX_ROWS = 60  # of frames and exposures; hundreds of them belong in the files

@@ -6,9 +6,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from bayesdist.arrays import Bool, Float, Int
 from bayesdist.model import Chip, DistortionModel
 from bayesdist.model.grid import mesh
+from bayesdist.utils.arrays import Bool, Float, Int
 
 MOST_STEPS = 30
 CLOSE = 1e-9  # pixels

@@ -9,12 +9,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import ArrayLike
 
-from bayesdist.arrays import Bool, Float, Int
 from bayesdist.data.batches import even_edges
 from bayesdist.data.matches import Matches
 from bayesdist.data.storage.write import write_partitioned
 from bayesdist.errors import InputError
 from bayesdist.model import DistortionModel
+from bayesdist.utils.arrays import Bool, Float, Int
 
 _AT_ONCE, _STEP = 65_536, 8192
 CHUNK = 1_000_000  # matches in memory at a time

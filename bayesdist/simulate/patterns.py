@@ -10,9 +10,9 @@ from math import lcm
 import numpy as np
 from scipy.spatial.distance import pdist
 
-from bayesdist.arrays import Float
 from bayesdist.model import Chip, DistortionModel
 from bayesdist.model.grid import mesh
+from bayesdist.utils.arrays import Float
 
 GAP = 50.0  # pixels between chips without a given position
 ONE_LINE = 0.02  # of the spread along the offsets, below which that across them counts as none

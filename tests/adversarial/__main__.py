@@ -9,7 +9,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from bayesdist.files import atomic_path
+from bayesdist.files.atomic import atomic_path
 
 from . import KINDS
 from .goals import table_of

@@ -16,10 +16,10 @@ from bayesdist.app.store.rundir import RunDirectory
 from bayesdist.assess import LocalErrors
 from bayesdist.assess.domain import EvaluationDomain
 from bayesdist.assess.terms.local import INTERPOLATION as BETWEEN
-from bayesdist.infer.transforms import reference_gauge, without_frames
+from bayesdist.infer.solution.transforms import reference_gauge, without_frames
 from bayesdist.model import DistortionModel
 from bayesdist.model.grid import grid_pixels, mesh
-from bayesdist.streams import restarted
+from bayesdist.utils.streams import restarted
 from tests.app.support import after_stages
 
 from .campaign_truth import ARCSEC, BRIGHT, EPOCH0, FAINT, NEW, TERMS, CampaignTruth

@@ -23,7 +23,7 @@ from bayesdist.assess import Margin, Requirement
 from bayesdist.assess.statistics import field_statistic
 from bayesdist.diagnose.significance import clopper_pearson
 from bayesdist.model.grid import grid_pixels, mesh
-from bayesdist.streams import restarted
+from bayesdist.utils.streams import restarted
 from tests.app.support import after_stages
 
 from . import campaign_measure

@@ -9,7 +9,7 @@ import numpy as np
 from astropy.io import fits
 from astropy.table import Table
 
-from bayesdist.reading.tables import read_table
+from bayesdist.files.tables import read_table
 from tests.app.support import cli, edit, good, one_sentence, refused, snapshot, summary_of
 
 CONFIG = "campaign_f606w.toml"

@@ -118,7 +118,7 @@ def test_no_stage_takes_all_rows_into_memory(job, tmp_path, on_disk, monkeypatch
     )
     for name in ("kinds.fit_data", "kinds.matches.stars", "report"):
         monkeypatch.setattr(f"bayesdist.app.{name}.SAMPLE", 900, raising=False)
-    monkeypatch.setattr("bayesdist.infer.linear.MEDIAN_STARS", 900)
+    monkeypatch.setattr("bayesdist.infer.solution.linear.MEDIAN_STARS", 900)
     good("init", tmp_path / "c.toml", "--matches", job.parent / "stars")
     good("check", job)
     run = tmp_path / "run"

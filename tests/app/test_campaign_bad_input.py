@@ -17,9 +17,9 @@ from bayesdist.app.results import results_of
 from bayesdist.app.store.rundir import RunDirectory
 from bayesdist.data import Matches
 from bayesdist.errors import DegenerateError
+from bayesdist.files.tables import read_table
 from bayesdist.infer import fit_linear, load_fit
 from bayesdist.model import Chip, DistortionModel
-from bayesdist.reading.tables import read_table
 from tests.app.damaged import CONFIG, ONE, Campaign, masked, scattered, setting
 from tests.app.support import cli, good, one_sentence, refused, summary_of
 from tests.reduced import case_in_full, only_in_full

@@ -14,7 +14,7 @@ from astropy.table import Table
 from bayesdist.app.results import Results
 from bayesdist.assess.terms.correlated import DEVIATIONS, STRUCTURE, STRUCTURE_IN_FIT
 from bayesdist.diagnose.correlated.information import Information, cell_sums
-from bayesdist.infer.solution import likelihood_of
+from bayesdist.infer.solution.solution import likelihood_of
 from tests.adversarial import KINDS
 from tests.adversarial.campaign_measure import actual_error, assessed, stated_sigma
 from tests.adversarial.campaign_truth import CampaignTruth

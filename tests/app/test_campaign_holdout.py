@@ -20,8 +20,8 @@ from bayesdist.app.pipeline import diagnose
 from bayesdist.app.results import results_of
 from bayesdist.app.store.rundir import RunDirectory
 from bayesdist.data import read_matches
+from bayesdist.files.tables import read_table
 from bayesdist.infer import load_fit
-from bayesdist.reading.tables import read_table
 from tests.app.support import carried_out, cli, good, one_sentence, refused, summary_of
 from tests.reduced import only_in_full
 

@@ -21,7 +21,7 @@ from scipy import stats
 
 from bayesdist.data import read_matches
 from bayesdist.infer import load_fit
-from bayesdist.infer.transforms import without_frames
+from bayesdist.infer.solution.transforms import without_frames
 from tests.app.support import (
     carried_out,
     cli,

@@ -18,7 +18,7 @@ from bayesdist.calibration.calibration import calibration_of
 from bayesdist.calibration.prior import prior_of_calibration
 from bayesdist.errors import InputError
 from bayesdist.infer import save_fit
-from bayesdist.infer.linear import NO_REJECTION
+from bayesdist.infer.solution.linear import NO_REJECTION
 from tests.reduced import case_in_full
 
 from .support import as_table, good, refused

@@ -31,8 +31,8 @@ from bayesdist.app.store.summary import Summary, schema_text
 from bayesdist.assess.terms.correlated import STRUCTURE, STRUCTURE_IN_FIT
 from bayesdist.data import read_matches
 from bayesdist.errors import InputError
+from bayesdist.files.documents import read_json
 from bayesdist.infer import load_fit, load_posterior, memberships, residuals
-from bayesdist.reading.documents import read_json
 from tests.app.support import (
     SIZE,
     begin_stagewise,

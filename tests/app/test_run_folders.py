@@ -12,7 +12,7 @@ import pytest
 from bayesdist.app.store.record import FileMark, Record
 from bayesdist.app.store.rundir import RunDirectory
 from bayesdist.errors import InputError
-from bayesdist.files import path_within
+from bayesdist.files.atomic import path_within
 from tests.app.support import cli, good, refused, write_config
 from tests.reduced import case_in_full
 

@@ -14,8 +14,8 @@ from scipy.stats import norm
 from bayesdist.app.saving import write_star_files
 from bayesdist.app.store.rundir import RunDirectory, part_files
 from bayesdist.data import batches, read_matches
+from bayesdist.files.parquet import parquet_units
 from bayesdist.infer import load_fit, load_posterior
-from bayesdist.reading.parquet import parquet_units
 from tests.app.support import begin_stagewise, good, snapshot, summary_of, write_job
 
 

@@ -10,8 +10,8 @@ from bayesdist.diagnose.residuals.binned import binned_sums
 from bayesdist.diagnose.residuals.coverage import coverage_of
 from bayesdist.diagnose.residuals.misfit import partitions_for
 from bayesdist.infer.stars.survey import _hull
-from bayesdist.limits import UNCOVERED_BY_CHANCE
 from bayesdist.model import Chip
+from bayesdist.utils.limits import UNCOVERED_BY_CHANCE
 
 SIZE = (1016.0, 508.0)
 CHIP = Chip(3, "A", SIZE, (508.5, 254.5))

@@ -17,7 +17,7 @@ from bayesdist.assess.terms.parameters import (
     ScaleError,
 )
 from bayesdist.assess.terms.solution import SolutionErrors
-from bayesdist.infer.transforms import reference_gauge, without_frames
+from bayesdist.infer.solution.transforms import reference_gauge, without_frames
 from tests.budgets import detector_budget
 from tests.infer.small_campaign import campaign_model, campaign_truth
 

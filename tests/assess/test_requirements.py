@@ -6,11 +6,11 @@ import pytest
 from scipy import stats
 
 from bayesdist.assess import STATISTICS, Requirement, UserTerm, check_requirements, drawn
-from bayesdist.checks import EITHER, LARGER, Check
 from bayesdist.diagnose.significance import clopper_pearson
 from bayesdist.errors import InputError
-from bayesdist.infer.checks import scatter_too_small
+from bayesdist.infer.posterior.checks import scatter_too_small
 from bayesdist.model import Chip, DistortionModel
+from bayesdist.utils.checks import EITHER, LARGER, Check
 from tests.reduced import case_in_full
 
 RADIAL = [s for s in STATISTICS if s[:2] not in ("u_", "v_")]

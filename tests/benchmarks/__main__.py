@@ -16,7 +16,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from bayesdist.files import atomic_path
+from bayesdist.files.atomic import atomic_path
 from tests.benchmarks import (
     budget,
     commands,

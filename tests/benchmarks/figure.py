@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from bayesdist.files import atomic_path
+from bayesdist.files.atomic import atomic_path
 from bayesdist.report.figures.style import INK, PALETTE, WIDTH, figure_style, new_figure
 
 __all__ = ["draw_scaling"]

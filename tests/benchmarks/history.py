@@ -10,7 +10,7 @@ import json
 from pathlib import Path
 from typing import Any
 
-from bayesdist.files import atomic_path
+from bayesdist.files.atomic import atomic_path
 from bayesdist.report.figures.style import PALETTE, WIDTH, figure_style, new_figure
 from tests.benchmarks.scamp import summarised
 

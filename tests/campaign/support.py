@@ -23,7 +23,7 @@ from bayesdist.infer.catalogue.star_errors import StarErrors, star_covariance
 from bayesdist.infer.exposures.hierarchy import HierarchicalFit
 from bayesdist.infer.nodes import Matern, NodeGrid, TableFit
 from bayesdist.infer.series import Series
-from bayesdist.infer.solution import TransformedSolution
+from bayesdist.infer.solution.solution import TransformedSolution
 from bayesdist.missions.acs.simulate import AcsCampaign, acs_model, read_acs
 from bayesdist.missions.acs.simulate.pointings import OWN
 from bayesdist.model import LookupTable

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from bayesdist.infer.transforms import reference_gauge, without_frames
+from bayesdist.infer.solution.transforms import reference_gauge, without_frames
 from tests.adversarial.campaign_kinds import chip_by_chip, drift
 from tests.adversarial.campaign_measure import assessed
 from tests.adversarial.campaign_truth import EPOCH0, TWO, Recipe, made

@@ -8,7 +8,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from bayesdist.files import atomic_path
+from bayesdist.files.atomic import atomic_path
 from bayesdist.report.figures.style import figure_style
 
 from .campaigns import KINDS

@@ -14,8 +14,8 @@ from bayesdist.data import ReadOptions, matches_from_table, open_matches, read_m
 from bayesdist.data.reading.columns import numbered
 from bayesdist.data.tables.names import ALIASES
 from bayesdist.errors import InputError
-from bayesdist.reading.tables import read_table
-from bayesdist.reading.text_tables import is_text_table
+from bayesdist.files.tables import read_table
+from bayesdist.files.text_tables import is_text_table
 
 
 def stars(n=6, **more):

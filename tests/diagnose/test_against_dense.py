@@ -14,7 +14,7 @@ from bayesdist.diagnose.score.regressors import functions_for
 from bayesdist.diagnose.score.result import Family
 from bayesdist.diagnose.score.sample import scored_sample
 from bayesdist.infer import GaussianPriors, Rejection, fit_linear
-from bayesdist.infer.solution import likelihood_of
+from bayesdist.infer.solution.solution import likelihood_of
 from bayesdist.infer.stars.stars import in_table_order, prepare
 from bayesdist.model import DistortionModel
 

@@ -28,9 +28,9 @@ from bayesdist.diagnose.significance import holm
 from bayesdist.infer import GaussianPriors, OutlierMixture, fit_linear, load
 from bayesdist.infer.density.grid import build_proposal
 from bayesdist.infer.density.target import Target
-from bayesdist.limits import HELD_OUT_DOUBTFUL
 from bayesdist.model import Chip, DistortionModel
 from bayesdist.simulate import simulate_matches
+from bayesdist.utils.limits import HELD_OUT_DOUBTFUL
 from tests.reduced import case_in_full, only_in_full
 
 SIZE = (1000.0, 800.0)

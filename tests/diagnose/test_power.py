@@ -7,7 +7,7 @@ import pytest
 from scipy import stats
 
 from bayesdist.diagnose import score_tests
-from bayesdist.limits import SCORE_TESTS
+from bayesdist.utils.limits import SCORE_TESTS
 
 from .. import seeds
 from ..infer.patterned import moved

@@ -16,7 +16,7 @@ from bayesdist.diagnose.score.questions import order_family
 from bayesdist.diagnose.score.result import Family, Outcome, corrected, noncentrality
 from bayesdist.diagnose.score.sample import SAMPLE, scored_sample
 from bayesdist.errors import InputError
-from bayesdist.infer.transforms import without_frames
+from bayesdist.infer.solution.transforms import without_frames
 
 from ..infer.patterned import moved
 from .support import TIME, Scene, by_name, polynomial

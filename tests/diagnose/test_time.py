@@ -9,8 +9,8 @@ import pytest
 from scipy import stats
 
 from bayesdist.diagnose.score.gap import visit_codes
-from bayesdist.limits import SCORE_TESTS
 from bayesdist.model import TimeDependence
+from bayesdist.utils.limits import SCORE_TESTS
 from tests.reduced import case_in_full
 
 from .. import seeds

@@ -11,8 +11,8 @@ from bayesdist.data.matches import Matches
 from bayesdist.infer import LinearFit
 from bayesdist.infer.catalogue.star_errors import StarCovariance, StarErrors, star_covariance
 from bayesdist.infer.equations.scaled import recolouring
-from bayesdist.infer.solution import Solution
-from bayesdist.infer.transforms import lines, without_frames
+from bayesdist.infer.solution.solution import Solution
+from bayesdist.infer.solution.transforms import lines, without_frames
 from bayesdist.model import Chip, DistortionModel, TimeDependence
 from bayesdist.model.frames import CHIP_DEVIATIONS
 from bayesdist.simulate import simulate_matches

@@ -8,7 +8,7 @@ import pytest
 import bayesdist as bd
 from bayesdist.calibration.calibration import calibration_of
 from bayesdist.errors import InputError
-from bayesdist.infer.linear import NO_REJECTION
+from bayesdist.infer.solution.linear import NO_REJECTION
 from bayesdist.products.formats.common.document import BuildOptions
 from bayesdist.products.registry import build, product_settings, read_calibration
 

@@ -11,7 +11,7 @@ from numpy.testing import assert_allclose
 from bayesdist.calibration.calibration import calibration_of
 from bayesdist.calibration.orientation import oriented
 from bayesdist.errors import InputError
-from bayesdist.infer.transforms import lines, reference_gauge, segment
+from bayesdist.infer.solution.transforms import lines, reference_gauge, segment
 from bayesdist.missions.acs.simulate import acs_solution
 from bayesdist.model import DistortionModel, TimeDependence
 from bayesdist.products import IdcTab, idctab_from_solution, read_idctab

@@ -14,7 +14,7 @@ from numpy.testing import assert_allclose
 from bayesdist.calibration.calibration import GaussianSolution, calibration_of
 from bayesdist.calibration.plane import Orientation
 from bayesdist.errors import InputError
-from bayesdist.infer.transforms import reference_gauge
+from bayesdist.infer.solution.transforms import reference_gauge
 from bayesdist.missions.acs.simulate import acs_solution
 from bayesdist.missions.acs.simulate.tables import detector_tables, filter_tables
 from bayesdist.model.lookup import LookupTable, corrected

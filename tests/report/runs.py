@@ -22,19 +22,19 @@ from bayesdist.assess import (
     uncertainty_map,
 )
 from bayesdist.assess.solution import chip_places
-from bayesdist.checks import Check
 from bayesdist.data.magnitude_errors import estimate
 from bayesdist.data.matches import Matches
 from bayesdist.diagnose.residuals.sample import star_sample
 from bayesdist.diagnose.residuals.star_sums import flagged_by_exposure, star_sums
-from bayesdist.infer.checks import fit_checks, sampling_checks
 from bayesdist.infer.convergence import Convergence, Limits
-from bayesdist.infer.linear import LinearFit, fit_linear, residuals
 from bayesdist.infer.posterior import Posterior, SamplerInfo
+from bayesdist.infer.posterior.checks import fit_checks, sampling_checks
+from bayesdist.infer.solution.linear import LinearFit, fit_linear, residuals
 from bayesdist.infer.stars.loading import load
 from bayesdist.infer.stars.mixture import OutlierMixture
 from bayesdist.model import Chip, DistortionModel, TimeDependence
 from bayesdist.report.context import ChipResults, Product, ReportInput
+from bayesdist.utils.checks import Check
 from tests.budgets import detector_budget
 
 SIZE = (1016.0, 1016.0)

@@ -9,11 +9,11 @@ import pytest
 
 from bayesdist.assess.checks import catalogue_checks
 from bayesdist.assess.requirements.validity import ValidityPeriod
-from bayesdist.checks import GROUPS, LARGER, Check
 from bayesdist.report.contents import EXPLAINED, section_of
 from bayesdist.report.context import Product
 from bayesdist.report.sections.run.provenance import product_table
 from bayesdist.report.sections.run.status import status_checks, status_table, verdict
+from bayesdist.utils.checks import GROUPS, LARGER, Check
 
 YEARS = np.linspace(2010.3, 2020.3, 41)
 

@@ -11,18 +11,18 @@ import numpy as np
 import pytest
 from lxml import html as lxml_html
 
-from bayesdist.checks import Check
 from bayesdist.diagnose import ScoreTest
 from bayesdist.diagnose.checks import structure_checks
 from bayesdist.diagnose.residuals.misfit import Misfit
 from bayesdist.errors import InputError
-from bayesdist.infer.checks import sampling_checks
+from bayesdist.infer.posterior.checks import sampling_checks
 from bayesdist.report.context import Product
 from bayesdist.report.run_report import render_report, write_report
 from bayesdist.report.sections import REPORT
 from bayesdist.report.sections.run.coefficients import coefficient_tables
 from bayesdist.report.sections.run.fit import fit_tables
 from bayesdist.report.sections.run.status import status_checks, verdict
+from bayesdist.utils.checks import Check
 
 from .runs import coefficient_table, report_input
 

@@ -9,8 +9,8 @@ from dataclasses import replace
 import pytest
 from lxml import html as lxml_html
 
-from bayesdist.checks import Check
 from bayesdist.report.run_report import render_markdown, render_report, write_report
+from bayesdist.utils.checks import Check
 
 
 @pytest.fixture(scope="module")

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from bayesdist.numbers import (
+from bayesdist.utils.numbers import (
     MISSING,
     count,
     counted,

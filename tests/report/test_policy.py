@@ -19,10 +19,10 @@ from lxml import html as lxml_html
 from bayesdist.assess import Requirement, UserTerm
 from bayesdist.assess.budget.surface import budget_surface
 from bayesdist.assess.model import error_model
-from bayesdist.checks import Check
 from bayesdist.report.context import Product
 from bayesdist.report.overview import OverviewRow, write_overview
 from bayesdist.report.run_report import render_markdown, render_report, write_report
+from bayesdist.utils.checks import Check
 from tests.budgets import detector_budget
 
 from .runs import report_input

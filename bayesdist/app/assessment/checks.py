@@ -12,11 +12,11 @@ from bayesdist.app.kinds.kind import kind_of
 from bayesdist.app.kinds.matches.added_errors import knows_circle
 from bayesdist.assess.checks import catalogue_checks, matching_checks, time_checks
 from bayesdist.assess.units import pixel_doubt
-from bayesdist.checks import LARGER, Check
 from bayesdist.diagnose.diagnostics import Diagnostics
 from bayesdist.infer import Posterior
-from bayesdist.infer.checks import fit_checks, sampling_checks
-from bayesdist.limits import CHI2_TOO_LARGE
+from bayesdist.infer.posterior.checks import fit_checks, sampling_checks
+from bayesdist.utils.checks import LARGER, Check
+from bayesdist.utils.limits import CHI2_TOO_LARGE
 
 
 def run_checks(

@@ -19,7 +19,7 @@ from bayesdist.assess.terms.local import LocalErrors, interpolation_term
 from bayesdist.assess.terms.parameters import ExposureVariation
 from bayesdist.diagnose.diagnostics import Diagnostics
 from bayesdist.infer import Posterior
-from bayesdist.infer.solution import Solution
+from bayesdist.infer.solution.solution import Solution
 from bayesdist.model import LookupTable
 
 

@@ -10,7 +10,7 @@ import click
 import bayesdist.version
 from bayesdist.app.commands.options import command
 from bayesdist.errors import InputError
-from bayesdist.reading.regular import read_text
+from bayesdist.files.regular import read_text
 
 _PACKAGE = Path(bayesdist.version.__file__).parent
 _FOLDERS = (_PACKAGE / "docs", _PACKAGE.parent / "docs")  # as installed, and in the source

@@ -9,7 +9,7 @@ import numpy as np
 
 from bayesdist.app.commands.options import command, force, seed
 from bayesdist.errors import InputError
-from bayesdist.files import atomic_path
+from bayesdist.files.atomic import atomic_path
 
 
 @command()

@@ -20,8 +20,8 @@ from bayesdist.app.config.section import Section
 from bayesdist.app.config.selfcal import SelfcalConfig
 from bayesdist.assess import Requirement
 from bayesdist.errors import ConfigError, InputError
-from bayesdist.reading.documents import toml_of
-from bayesdist.reading.regular import MOST_TEXT, read_text
+from bayesdist.files.documents import toml_of
+from bayesdist.files.regular import MOST_TEXT, read_text
 
 # by the section that says of which kind a configuration is
 KINDS: dict[str, type[RunConfig]] = {

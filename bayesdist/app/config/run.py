@@ -39,7 +39,7 @@ from bayesdist.assess.terms.given import said_by_user
 from bayesdist.assess.terms.parameters import one_size_term
 from bayesdist.errors import InputError
 from bayesdist.infer import Compute, OutlierMixture
-from bayesdist.infer.solution import Solution
+from bayesdist.infer.solution.solution import Solution
 from bayesdist.model import Chip, TimeDependence
 
 FREE = "free"  # rates that no other run says anything of

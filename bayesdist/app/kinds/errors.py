@@ -6,11 +6,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from bayesdist.arrays import Float
 from bayesdist.data.magnitude_errors import AddedErrors, MagnitudeErrors
 from bayesdist.data.matches import Matches
 from bayesdist.infer import Posterior
 from bayesdist.infer.exposures.chip_offsets import Settling
+from bayesdist.utils.arrays import Float
 
 
 @dataclass(frozen=True, eq=False)

@@ -10,7 +10,6 @@ import numpy as np
 from bayesdist.app.kinds.errors import QUOTED, ErrorLaw
 from bayesdist.app.kinds.fitted import Fitted
 from bayesdist.app.kinds.matched import Matched
-from bayesdist.arrays import Float
 from bayesdist.data.matches import Matches
 from bayesdist.diagnose.residuals.quoted import error_scale_sentence
 from bayesdist.diagnose.residuals.sample import SAMPLE
@@ -18,6 +17,7 @@ from bayesdist.infer import LinearFit, Shards, load
 from bayesdist.infer.exposures.frame_choice import FrameChoice, frames_that_help
 from bayesdist.infer.stars.shards import Compute
 from bayesdist.model import DistortionModel
+from bayesdist.utils.arrays import Float
 
 
 class StarReader:

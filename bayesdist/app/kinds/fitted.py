@@ -13,11 +13,12 @@ from numpy.typing import NDArray
 
 from bayesdist.app.kinds.errors import ErrorLaw, ExposureScatter
 from bayesdist.app.store.output import write_table
-from bayesdist.arrays import Bool, Float
 from bayesdist.data import ReferenceCatalog
 from bayesdist.data.matches import Matches
 from bayesdist.diagnose.tables.between_nodes import BetweenNodes
 from bayesdist.errors import InputError
+from bayesdist.files.faults import restoring
+from bayesdist.files.records import record_from_arrays, record_to_arrays
 from bayesdist.infer import GaussianPriors, LinearFit, Posterior, load_fit, load_posterior, save_fit
 from bayesdist.infer.catalogue.added_errors import GroupedErrors
 from bayesdist.infer.nodes import corrected_matches, inside_chips, on_the_chips
@@ -25,8 +26,7 @@ from bayesdist.infer.sampler.checkpoints import read_arrays, write_arrays
 from bayesdist.infer.selfcal import Gauge, SelfCalibrationMode
 from bayesdist.infer.series import Series
 from bayesdist.model import LookupTable
-from bayesdist.reading.faults import restoring
-from bayesdist.records import record_from_arrays, record_to_arrays
+from bayesdist.utils.arrays import Bool, Float
 
 SOLUTION, GAUGE = "solution.h5", "gauge.ecsv"
 

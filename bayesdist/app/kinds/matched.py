@@ -14,7 +14,6 @@ from bayesdist.app.config import Config
 from bayesdist.app.config.fit import HoldoutBlock
 from bayesdist.app.kinds.errors import ExposureScatter
 from bayesdist.app.store.output import write_table
-from bayesdist.arrays import Float
 from bayesdist.assess.terms.parameters import ScaleError
 from bayesdist.data import ReferenceCatalog
 from bayesdist.data.holdout import HoldoutSpec, exposures_drawn, split_matches
@@ -23,9 +22,10 @@ from bayesdist.diagnose.overlap import OverlapTest
 from bayesdist.errors import InputError
 from bayesdist.infer import Posterior
 from bayesdist.infer.catalogue.star_errors import StarErrors
-from bayesdist.infer.solution import Solution
-from bayesdist.limits import HELD_OUT
+from bayesdist.infer.solution.solution import Solution
 from bayesdist.model import LookupTable
+from bayesdist.utils.arrays import Float
+from bayesdist.utils.limits import HELD_OUT
 
 MATCHING = "matching.ecsv"
 

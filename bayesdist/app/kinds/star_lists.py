@@ -10,7 +10,6 @@ from pathlib import Path
 import numpy as np
 
 from bayesdist.app.config.campaign import StarListsBlock
-from bayesdist.arrays import Bool, Float, Int
 from bayesdist.calibration.calibration import Calibration
 from bayesdist.data import Detections, StarCuts, read_star_lists
 from bayesdist.errors import InputError
@@ -18,6 +17,7 @@ from bayesdist.infer.selfcal.start import Start
 from bayesdist.model import Chip
 from bayesdist.products import IdcTab, read_idctab
 from bayesdist.products.formats.idctab.calibration import idctab_calibration
+from bayesdist.utils.arrays import Bool, Float, Int
 
 OFF_CHIP = 0.02  # of a list's detections beyond the edge of a chip: more are no stray ones
 EDGE = 1.0  # pixels: half of one to the edge, and half of one for lists that count from 0

@@ -24,10 +24,10 @@ from bayesdist.assess.evaluation import Evaluation
 from bayesdist.assess.terms.forms import PRODUCT
 from bayesdist.diagnose.diagnostics import Diagnostics
 from bayesdist.diagnose.residuals.sample import star_sample
-from bayesdist.files import atomic_path, path_within
+from bayesdist.files.atomic import atomic_path, path_within
 from bayesdist.infer import Posterior
-from bayesdist.limits import FILE_ERROR
 from bayesdist.products.registry import format_of, lint
+from bayesdist.utils.limits import FILE_ERROR
 
 log = logging.getLogger("bayesdist")
 

@@ -25,8 +25,8 @@ from bayesdist.calibration.orientation import lay_on
 from bayesdist.calibration.plane import Plane
 from bayesdist.diagnose.diagnostics import Diagnostics
 from bayesdist.infer import Posterior
-from bayesdist.infer.solution import Solution
-from bayesdist.infer.transforms import reference_gauge, without_frames
+from bayesdist.infer.solution.solution import Solution
+from bayesdist.infer.solution.transforms import reference_gauge, without_frames
 from bayesdist.model import LookupTable
 from bayesdist.products import Period, read_calibration, write_release
 from bayesdist.products.formats.common.document import BuildOptions, Built

@@ -20,7 +20,6 @@ import numpy as np
 from bayesdist.app.config import Config
 from bayesdist.app.config.products import ReleaseBlock
 from bayesdist.app.products.made_files import ProductInput, made_files, write_files
-from bayesdist.arrays import Float
 from bayesdist.assess.solution import place_of
 from bayesdist.assess.terms.forms import MEASURED, PRODUCT, Known, Row
 from bayesdist.calibration.calibration import Calibration
@@ -31,6 +30,7 @@ from bayesdist.model.grid import grid_pixels, mesh
 from bayesdist.products import read_d2im, read_lookup_file
 from bayesdist.products.formats.common.read_back import Positions, ReadBack, by_calibrations
 from bayesdist.products.registry import read_back, read_calibration
+from bayesdist.utils.arrays import Float
 
 log = logging.getLogger("bayesdist")
 

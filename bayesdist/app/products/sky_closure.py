@@ -12,8 +12,8 @@ from bayesdist.app.products.made_files import ProductInput
 from bayesdist.calibration.plane import ARCSEC
 from bayesdist.data.sky.tangent import sky_of_plane
 from bayesdist.diagnose.residuals.sample import StarSample
-from bayesdist.limits import SKY_CLOSURE
 from bayesdist.products.formats.sip.positions import sky_of_header
+from bayesdist.utils.limits import SKY_CLOSURE
 
 log = logging.getLogger("bayesdist")
 

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from bayesdist.errors import InputError
-from bayesdist.files import made_folder
+from bayesdist.files.atomic import made_folder
 
 # some systems know no such locks
 fcntl: Any = import_module("fcntl") if find_spec("fcntl") else None

@@ -11,7 +11,7 @@ from typing import Any
 from bayesdist.app.config import Config
 from bayesdist.app.store import Adjustable, Made, Stage, as_json, differences
 from bayesdist.data import input_files
-from bayesdist.files import sha256_of
+from bayesdist.files.atomic import sha256_of
 from bayesdist.version import __version__
 
 

@@ -14,7 +14,7 @@ from astropy.table import Table
 
 from bayesdist.app.store import versions, write_json
 from bayesdist.errors import InputError
-from bayesdist.files import atomic_path
+from bayesdist.files.atomic import atomic_path
 from bayesdist.infer import Posterior
 
 

@@ -17,8 +17,8 @@ from pydantic_core import to_json
 from bayesdist.app.store.keys import as_json, digest_of, digest_of_plain
 from bayesdist.app.store.summary import Sections
 from bayesdist.errors import InputError
-from bayesdist.files import atomic_path, sha256_of
-from bayesdist.reading.documents import model_of, read_json
+from bayesdist.files.atomic import atomic_path, sha256_of
+from bayesdist.files.documents import model_of, read_json
 from bayesdist.version import __version__
 
 SCHEMA = 2

@@ -11,7 +11,7 @@ from bayesdist.app.store.keys import shown
 from bayesdist.app.store.lock import LOCK
 from bayesdist.app.store.made_from import changes, input_name, is_adjustable, with_seed
 from bayesdist.errors import InputError
-from bayesdist.files import is_leftover
+from bayesdist.files.atomic import is_leftover
 
 
 def refuse_inside_input(folder: Path, config: Config, base: Path) -> None:

@@ -33,7 +33,7 @@ from bayesdist.app.store.refusals import (
 from bayesdist.app.store.summary import head_of
 from bayesdist.assess import Requirement
 from bayesdist.errors import ConfigError, InputError
-from bayesdist.files import atomic_path, made_folder, remove_leftovers
+from bayesdist.files.atomic import atomic_path, made_folder, remove_leftovers
 
 T = TypeVar("T")
 

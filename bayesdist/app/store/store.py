@@ -22,8 +22,8 @@ from bayesdist.app.store.record import (
     json_text,
     write_text,
 )
-from bayesdist.files import is_leftover, path_within, remove_leftovers, watched_writes
-from bayesdist.reading.regular import read_bytes
+from bayesdist.files.atomic import is_leftover, path_within, remove_leftovers, watched_writes
+from bayesdist.files.regular import read_bytes
 
 T = TypeVar("T")
 

@@ -16,10 +16,10 @@ from bayesdist.diagnose.diagnostics import Diagnostics
 from bayesdist.diagnose.residuals.misfit import Misfit
 from bayesdist.diagnose.score.result import ScoreTest
 from bayesdist.errors import InputError, required
+from bayesdist.files.faults import restoring
+from bayesdist.files.records import record_from_arrays, record_to_arrays
 from bayesdist.infer import LinearFit, Posterior
 from bayesdist.infer.sampler.checkpoints import read_arrays, write_arrays
-from bayesdist.reading.faults import restoring
-from bayesdist.records import record_from_arrays, record_to_arrays
 
 CORRELATED = "discrepancy.h5"
 OTHERS = "diagnostics.h5"

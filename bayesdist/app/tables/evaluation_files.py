@@ -21,12 +21,12 @@ from bayesdist.assess.budget.budget import ErrorBudget
 from bayesdist.assess.coefficients import coefficient_table
 from bayesdist.assess.evaluation import Evaluation
 from bayesdist.assess.requirements.validity import ValidityPeriod
-from bayesdist.checks import warnings_of
+from bayesdist.files.faults import restoring
+from bayesdist.files.records import record_from_arrays, record_to_arrays
 from bayesdist.infer import LinearFit, Posterior
 from bayesdist.infer.sampler.checkpoints import read_arrays, write_arrays
 from bayesdist.products.maps_file import write_maps
-from bayesdist.reading.faults import restoring
-from bayesdist.records import record_from_arrays, record_to_arrays
+from bayesdist.utils.checks import warnings_of
 
 FILE = "evaluation.h5"
 COLUMNS = ("epoch", "probability", "low", "high", "value")

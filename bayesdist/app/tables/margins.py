@@ -12,8 +12,8 @@ from bayesdist.app.screen import number, table_text
 from bayesdist.app.store.rundir import RunDirectory
 from bayesdist.app.store.summary import MarginRow, WorstPosition
 from bayesdist.assess import Margin, Requirement
-from bayesdist.assess.maps import per_axis
-from bayesdist.numbers import rounded
+from bayesdist.assess.maps.uncertainty import per_axis
+from bayesdist.utils.numbers import rounded
 
 # of what a requirement is, beside chip and epoch
 SCOPE = ("region", "epochs", "relative", "separation", "magnitude")

@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from bayesdist.arrays import Float, Int
 from bayesdist.assess.domain import EvaluationDomain
 from bayesdist.assess.drawn import DrawnErrors
 from bayesdist.assess.terms.forms import PRODUCT
+from bayesdist.utils.arrays import Float, Int
 
 TOTAL = "total"
 TOGETHER = "all terms but products, combined by draws"

@@ -14,7 +14,6 @@ from itertools import pairwise
 
 import numpy as np
 
-from bayesdist.arrays import Float
 from bayesdist.assess.domain import EvaluationDomain
 from bayesdist.assess.drawn import DrawnErrors
 from bayesdist.assess.terms.forms import (
@@ -29,6 +28,7 @@ from bayesdist.assess.terms.given import Centroids
 from bayesdist.data.magnitude_errors import MagnitudeErrors
 from bayesdist.errors import InputError
 from bayesdist.model import DistortionModel
+from bayesdist.utils.arrays import Float
 
 JOINT = "model"  # all errors of parameters together
 CONSTANT = 1e-9  # moments that change less, relative to the largest, do not depend on time

@@ -13,7 +13,6 @@ from dataclasses import dataclass
 import numpy as np
 from astropy.table import Table
 
-from bayesdist.arrays import Float
 from bayesdist.assess.comparison.frame import (
     CommonFrame,
     Similarity,
@@ -22,14 +21,15 @@ from bayesdist.assess.comparison.frame import (
     with_errors,
 )
 from bayesdist.assess.comparison.gap import GapDifference
-from bayesdist.assess.maps import sigmas_of
+from bayesdist.assess.maps.uncertainty import sigmas_of
 from bayesdist.calibration.chip_map import ChipMap, position_moments
 from bayesdist.errors import required
 from bayesdist.infer.equations.scaled import FieldTest, chi_square, known_terms
-from bayesdist.limits import DIFFERENCE
 from bayesdist.model import AXES
 from bayesdist.model.basis import point_blocks
 from bayesdist.model.grid import DEFAULT_GRID, grid_pixels, mesh, position_of_largest
+from bayesdist.utils.arrays import Float
+from bayesdist.utils.limits import DIFFERENCE
 
 __all__ = [
     "Comparison",

@@ -16,13 +16,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from bayesdist.arrays import Complex, Float
 from bayesdist.assess.units import convert
 from bayesdist.calibration.chip_map import ChipMap
 from bayesdist.calibration.orientation import as_real, similarity_fields, turn_between
 from bayesdist.errors import InputError
 from bayesdist.infer.compare.frame_fields import term_squares
 from bayesdist.model import PolynomialBasis
+from bayesdist.utils.arrays import Complex, Float
 
 NEAR = 0.1  # radians, or of the scale: axes that lie alike
 

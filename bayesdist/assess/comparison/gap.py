@@ -16,7 +16,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from bayesdist.arrays import Float
 from bayesdist.assess.comparison.frame import (
     draws_of_sum,
     least_squares,
@@ -29,6 +28,7 @@ from bayesdist.calibration.chip_map import ChipMap
 from bayesdist.calibration.orientation import as_real, similarity_fields, turn_between
 from bayesdist.infer.equations.scaled import FieldTest, chi_square
 from bayesdist.model import PolynomialBasis
+from bayesdist.utils.arrays import Float
 
 
 @dataclass(frozen=True, eq=False)

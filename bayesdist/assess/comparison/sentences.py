@@ -6,9 +6,9 @@ import numpy as np
 
 from bayesdist.assess.comparison.compare import Comparison, comparison_table
 from bayesdist.assess.comparison.gap import GapDifference
-from bayesdist.distributions import norm_sf
-from bayesdist.limits import DIFFERENCE
-from bayesdist.numbers import p_words
+from bayesdist.utils.distributions import norm_sf
+from bayesdist.utils.limits import DIFFERENCE
+from bayesdist.utils.numbers import p_words
 
 IDENTICAL = 1e-9  # pixels
 

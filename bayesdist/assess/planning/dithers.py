@@ -13,8 +13,7 @@ import numpy as np
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from bayesdist.arrays import Float, Int
-from bayesdist.assess.maps import UncertaintyMap, uncertainty_map
+from bayesdist.assess.maps.uncertainty import UncertaintyMap, uncertainty_map
 from bayesdist.data.detections import Detections
 from bayesdist.errors import InputError
 from bayesdist.infer.compare.frame_fields import mean_squares
@@ -31,6 +30,7 @@ from bayesdist.model import Chip, DistortionModel
 from bayesdist.model.grid import outline_pixels
 from bayesdist.simulate.dithers import dithered_model, sky_seen, stars_on_detector
 from bayesdist.simulate.patterns import DitherPattern
+from bayesdist.utils.arrays import Float, Int
 
 KINDS = ("gauge-free", "shape", "absolute")
 LEAST_SHARED = 3  # stars that two exposures share at least, if they overlap at all

@@ -7,9 +7,9 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cache
 
-from bayesdist.arrays import Float
 from bayesdist.infer.compare.planning import with_information
-from bayesdist.infer.solution import Solution
+from bayesdist.infer.solution.solution import Solution
+from bayesdist.utils.arrays import Float
 
 MOST = 4096  # exposures beyond which more are no plan
 

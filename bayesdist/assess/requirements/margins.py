@@ -8,7 +8,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from bayesdist.arrays import Float
 from bayesdist.assess.domain import EvaluationDomain, WorstPosition
 from bayesdist.assess.drawn import DrawnErrors
 from bayesdist.assess.model import error_model
@@ -18,12 +17,13 @@ from bayesdist.assess.requirements.verdict import counting_error, verdict_of
 from bayesdist.assess.solution import place_of
 from bayesdist.assess.terms.forms import ErrorTerm
 from bayesdist.assess.units import convert, pixel_scale_of
-from bayesdist.checks import Check, doubts_of
 from bayesdist.errors import InputError
-from bayesdist.infer.checks import convergence_check
-from bayesdist.infer.solution import Solution
+from bayesdist.infer.posterior.checks import convergence_check
+from bayesdist.infer.solution.solution import Solution
 from bayesdist.model import Chip, DistortionModel
 from bayesdist.model.grid import DEFAULT_GRID
+from bayesdist.utils.arrays import Float
+from bayesdist.utils.checks import Check, doubts_of
 
 EPOCHS = 9  # of a range that are judged, its ends and what lies evenly between
 

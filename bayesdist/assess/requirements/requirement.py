@@ -16,8 +16,8 @@ from bayesdist.assess.statistics import STATISTICS
 from bayesdist.assess.units import UNITS
 from bayesdist.diagnose.residuals.coverage import Coverage
 from bayesdist.errors import InputError, require_known
-from bayesdist.limits import BEYOND_STARS
 from bayesdist.model.grid import grid_pixels, mesh
+from bayesdist.utils.limits import BEYOND_STARS
 
 
 @dataclass(frozen=True)

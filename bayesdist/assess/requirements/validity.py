@@ -7,13 +7,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import ArrayLike
 
-from bayesdist.arrays import Float
 from bayesdist.assess.drawn import DrawnErrors
 from bayesdist.assess.requirements.margins import domains_of
 from bayesdist.assess.requirements.requirement import Requirement
 from bayesdist.assess.units import convert
 from bayesdist.diagnose.significance import clopper_pearson
 from bayesdist.model.grid import DEFAULT_GRID
+from bayesdist.utils.arrays import Float
 
 BAND = 0.95
 

@@ -6,16 +6,16 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from bayesdist.arrays import Float
 from bayesdist.assess.checks import visits_of
-from bayesdist.checks import LARGER, Check, doubts_of
 from bayesdist.diagnose.correlated import Discrepancy
 from bayesdist.diagnose.diagnostics import Diagnostics
 from bayesdist.diagnose.significance import clopper_pearson
-from bayesdist.distributions import beta_std
-from bayesdist.limits import CONFIDENCE
 from bayesdist.model import DistortionModel
-from bayesdist.numbers import count
+from bayesdist.utils.arrays import Float
+from bayesdist.utils.checks import LARGER, Check, doubts_of
+from bayesdist.utils.distributions import beta_std
+from bayesdist.utils.limits import CONFIDENCE
+from bayesdist.utils.numbers import count
 
 
 def counting_error(fraction: float, n: float) -> float:

@@ -8,7 +8,6 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesdist.arrays import Float, Int
 from bayesdist.assess.domain import EvaluationDomain
 from bayesdist.assess.terms.forms import (
     LOCAL,
@@ -23,6 +22,7 @@ from bayesdist.assess.terms.forms import (
 from bayesdist.diagnose.correlated import Discrepancy
 from bayesdist.diagnose.correlated.deviations import LinearDeviations
 from bayesdist.errors import required
+from bayesdist.utils.arrays import Float, Int
 
 STRUCTURE = "unmodelled structure"
 STRUCTURE_IN_FIT = "unmodelled structure in coefficients"

@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from bayesdist.arrays import Float
 from bayesdist.assess.domain import EvaluationDomain
 from bayesdist.assess.terms.forms import (
     GIVEN,
@@ -26,6 +25,7 @@ from bayesdist.data.magnitude_errors import MagnitudeErrors
 from bayesdist.errors import InputError, require_known
 from bayesdist.model import DistortionModel, PolynomialBasis
 from bayesdist.model.grid import DEFAULT_GRID, grid_pixels, mesh
+from bayesdist.utils.arrays import Float
 
 if TYPE_CHECKING:
     from bayesdist.diagnose.diagnostics import Diagnostics

@@ -7,15 +7,15 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from bayesdist.arrays import Float
 from bayesdist.assess.domain import EvaluationDomain
 from bayesdist.assess.solution import place_of
 from bayesdist.assess.terms.forms import LOCAL, MEASURED, Independent, Row
 from bayesdist.diagnose.tables.between_nodes import BetweenNodes, MeanSquare
 from bayesdist.errors import InputError
-from bayesdist.infer.solution import Solution
+from bayesdist.infer.solution.solution import Solution
 from bayesdist.model import DistortionModel, LookupTable
 from bayesdist.model.grid import grid_pixels, mesh
+from bayesdist.utils.arrays import Float
 
 INTERPOLATION = "look-up tables, between nodes"
 SOURCE = f"{MEASURED}: neighbours in different exposures"

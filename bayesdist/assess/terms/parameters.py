@@ -8,7 +8,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from bayesdist.arrays import Float
 from bayesdist.assess.solution import place_of
 from bayesdist.assess.terms.forms import (
     GIVEN,
@@ -21,9 +20,10 @@ from bayesdist.assess.terms.forms import (
 )
 from bayesdist.errors import InputError, require_known
 from bayesdist.infer.catalogue.star_errors import StarCovariance
-from bayesdist.infer.solution import Solution
+from bayesdist.infer.solution.solution import Solution
 from bayesdist.mission import load_object, missions
 from bayesdist.model import DistortionModel
+from bayesdist.utils.arrays import Float
 
 CATALOGUE = "reference catalogue (shared stars)"
 MOTIONS = "proper motions (shared stars)"

@@ -8,7 +8,6 @@ from functools import partial
 
 import numpy as np
 
-from bayesdist.arrays import Float, Int
 from bayesdist.assess.domain import EvaluationDomain
 from bayesdist.assess.solution import place_of
 from bayesdist.assess.terms.forms import (
@@ -20,7 +19,8 @@ from bayesdist.assess.terms.forms import (
     polynomial_errors,
 )
 from bayesdist.assess.terms.parameters import CatalogueErrors
-from bayesdist.infer.solution import Solution
+from bayesdist.infer.solution.solution import Solution
+from bayesdist.utils.arrays import Float, Int
 
 COEFFICIENTS = "coefficients"
 TIME_DEPENDENCE = "time dependence"

@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesdist.arrays import Float, Int
 from bayesdist.data.columns.labels import LABELS_OF_CODES, Labels, merged_counts
 from bayesdist.data.tables.checks import (
     COMPLETED,
@@ -23,6 +22,7 @@ from bayesdist.data.tables.checks import (
 from bayesdist.data.tables.repeated import first_duplicate
 from bayesdist.data.tables.units import check_unit, conversion, unit_of, without_unit
 from bayesdist.errors import InputError
+from bayesdist.utils.arrays import Float, Int
 
 POSITIONS = ("x", "y", "u", "v")
 SIGMAS = ("sigma_u", "sigma_v")

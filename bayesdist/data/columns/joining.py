@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesdist.arrays import Float, Int
 from bayesdist.data.columns.checked import OPTIONAL, POSITIONS, SIGMAS, MatchColumns
 from bayesdist.data.columns.labels import LABELS_OF_CODES, merged_counts
 from bayesdist.errors import InputError
+from bayesdist.utils.arrays import Float, Int
 
 
 def joined_arguments(tables: Sequence[MatchColumns]) -> dict[str, Any]:

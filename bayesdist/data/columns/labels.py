@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from bayesdist.arrays import Int
 from bayesdist.errors import InputError
+from bayesdist.utils.arrays import Int
 
 LABELS_OF_CODES = {
     "exposure": "exposure_names",

@@ -12,10 +12,10 @@ from astropy.table import Table
 
 from bayesdist.data.formats.hst1pass import is_hst1pass, is_matchup
 from bayesdist.errors import FormatError, InputError
+from bayesdist.files.regular import read_lines
+from bayesdist.files.tables import TABLE_SUFFIXES, is_binary, is_fits, read_table
+from bayesdist.files.text_tables import is_text_table
 from bayesdist.mission import load_object, missions
-from bayesdist.reading.regular import read_lines
-from bayesdist.reading.tables import TABLE_SUFFIXES, is_binary, is_fits, read_table
-from bayesdist.reading.text_tables import is_text_table
 
 PathLike = str | os.PathLike[str]
 

@@ -14,12 +14,12 @@ from pathlib import Path
 
 import numpy as np
 
-from bayesdist.arrays import Float, Int
 from bayesdist.data.catalog import ReferenceCatalog
 from bayesdist.data.detections import Detections
 from bayesdist.data.matches import Matches
 from bayesdist.errors import FormatError
-from bayesdist.reading.regular import read_lines
+from bayesdist.files.regular import read_lines
+from bayesdist.utils.arrays import Float, Int
 
 _COLUMN = re.compile(r"#\s*\((\d+)\)\s+(\S+)\s+--\s")
 _KEYWORD = re.compile(r"#\s*(\w+)\s*:\s*(.*?)\s*$")

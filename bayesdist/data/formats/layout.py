@@ -16,7 +16,7 @@ from bayesdist.data.tables.column import Columns
 from bayesdist.data.tables.names import origin_of
 from bayesdist.data.tables.parquet import describe_part
 from bayesdist.errors import InputError
-from bayesdist.reading.tables import read_table
+from bayesdist.files.tables import read_table
 
 PathLike = str | os.PathLike[str]
 

@@ -20,7 +20,6 @@ import numpy as np
 from astropy.table import Table
 from numpy.typing import ArrayLike, NDArray
 
-from bayesdist.arrays import Bool, Float, Int
 from bayesdist.data.catalog import ReferenceCatalog
 from bayesdist.data.columns.labels import merged_counts
 from bayesdist.data.detections import Detections
@@ -40,6 +39,7 @@ from bayesdist.data.matching.similarity import PatternIndex, mismatch_reason, pa
 from bayesdist.data.starlists import StarCuts
 from bayesdist.data.tables.column import encoded
 from bayesdist.errors import InputError, required
+from bayesdist.utils.arrays import Bool, Float, Int
 
 Start = Callable[[Float, Float, Int, float], ArrayLike]
 

@@ -8,7 +8,6 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import cKDTree
 
-from bayesdist.arrays import Bool, Float, Int
 from bayesdist.data.catalog import ReferenceCatalog
 from bayesdist.data.detections import Detections
 from bayesdist.data.exposures import Exposure
@@ -38,6 +37,7 @@ from bayesdist.data.matching.similarity import (
     grown_map,
 )
 from bayesdist.errors import InputError
+from bayesdist.utils.arrays import Bool, Float, Int
 
 _ASTRAY_FRACTION = 0.2  # of the matched fraction of the best chip: a chip below lies elsewhere
 _MIN_DETECTIONS_ON_CHIP = 20  # detections of a chip for that comparison

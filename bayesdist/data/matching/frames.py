@@ -13,7 +13,6 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import cKDTree
 
-from bayesdist.arrays import Float, Int
 from bayesdist.data.matching.linear_map import LinearMap
 from bayesdist.data.matching.similarity import (
     PatternIndex,
@@ -22,6 +21,7 @@ from bayesdist.data.matching.similarity import (
     pattern_index,
 )
 from bayesdist.errors import InputError
+from bayesdist.utils.arrays import Float, Int
 
 BRIGHT_STARS = 3000  # stars of an exposure that are used
 WIDE = 0.3  # of the spacing: stars farther from those of others are new

@@ -15,8 +15,8 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-from bayesdist.arrays import Bool, Float, Int
 from bayesdist.data.detections import NO_STAR
+from bayesdist.utils.arrays import Bool, Float, Int
 
 FINE = 16  # grid squares in a linking length: detections in one are friends without a comparison
 MAX_EXTENT = 3.0  # linking lengths that a group may span: a longer one is a chain of stars

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.polynomial.legendre import legvander
 from scipy.spatial import cKDTree
 
-from bayesdist.arrays import Bool, Float, Int
+from bayesdist.utils.arrays import Bool, Float, Int
 
 Solution = TypeVar("Solution")
 MAX_SAMPLE = 20_000  # detections that the iterations use

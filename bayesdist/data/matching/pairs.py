@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial import ConvexHull, QhullError, cKDTree
 
-from bayesdist.arrays import Bool, Float, Int
 from bayesdist.data.matching.linear_map import MAX_SAMPLE
+from bayesdist.utils.arrays import Bool, Float, Int
 
 _MAX_PROBES = 20_000  # displaced detections that sample chance matches
 _DIRECTIONS = np.exp(2j * np.pi * np.arange(8) / 8)

@@ -7,13 +7,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from bayesdist.arrays import Float
 from bayesdist.data.catalog import ReferenceCatalog
 from bayesdist.data.detections import Detections
 from bayesdist.data.exposures import ExposureLog
 from bayesdist.data.magnitude_errors import MAD_TO_SIGMA
 from bayesdist.data.matching.similarity import MIRRORED
 from bayesdist.errors import InputError
+from bayesdist.utils.arrays import Float
 
 _MAX_FRACTION_LEFT_OUT = 0.2  # of the exposures: beyond, the campaign itself is wrong
 _MAX_FAILURES_AT_FIRST = 2  # exposures that fail before any has matched

@@ -12,7 +12,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from bayesdist.arrays import Float
+from bayesdist.utils.arrays import Float
 
 _MIN_PAIRS_IN_RING = 100
 _MAX_RINGS = 8

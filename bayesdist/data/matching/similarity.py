@@ -16,11 +16,11 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.spatial import cKDTree
 
-from bayesdist.arrays import Complex, Float
 from bayesdist.data.matching.linear_map import LinearMap, iterated_map
 from bayesdist.data.matching.pairs import chance_rate, hull_of, mean_spacing
 from bayesdist.data.matching.triangles import Candidate, Level, candidates
 from bayesdist.errors import InputError
+from bayesdist.utils.arrays import Complex, Float
 
 _MIN_STARS_TRIED = 60  # stars of the shallowest try
 _STARS_OF_FIRST_LEVEL = 400  # each further one has three times as many

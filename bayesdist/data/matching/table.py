@@ -7,7 +7,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from bayesdist.arrays import Int
 from bayesdist.data.catalog import ReferenceCatalog
 from bayesdist.data.matches import Matches
 from bayesdist.data.matching.linear_map import MIN_PAIRS, LinearMap, iterated_map
@@ -19,6 +18,7 @@ from bayesdist.data.matching.similarity import (
     pattern_index,
 )
 from bayesdist.errors import InputError
+from bayesdist.utils.arrays import Int
 
 _NARROW = 0.25  # mean distances between reference stars: reach of its last pairs
 _FALSE_RATE = 0.02  # chance matches of a detection that the default radius allows

@@ -10,8 +10,8 @@ from itertools import combinations
 import numpy as np
 from scipy.spatial import cKDTree
 
-from bayesdist.arrays import Bool, Complex, Float, Int
 from bayesdist.data.matching.linear_map import robust_fit
+from bayesdist.utils.arrays import Bool, Complex, Float, Int
 
 _MIN_SIDE_RATIO = 0.15  # shortest to longest side: below, a small error turns the shape around
 _MAX_SIDE_RATIO = 0.985  # sides nearer to each other than this may change places

@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 
-from bayesdist.arrays import Float, Int
 from bayesdist.data.reading.options import ReadOptions
 from bayesdist.data.sky.positions import SKY_QUANTITIES, reference_sky
 from bayesdist.data.sky.tangent import onto_plane
@@ -18,6 +17,7 @@ from bayesdist.data.tables.column import EncodedColumn, Quantities, SourceColumn
 from bayesdist.data.tables.names import ALIASES, PAIRS, find_columns, origin_of
 from bayesdist.data.tables.units import check_unit
 from bayesdist.errors import InputError
+from bayesdist.utils.arrays import Float, Int
 
 
 def position_unit(pair: tuple[SourceColumn, SourceColumn], unit: str | None) -> str:

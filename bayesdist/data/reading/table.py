@@ -10,7 +10,6 @@ import numpy as np
 from astropy.table import Column, Table
 from astropy.time import Time
 
-from bayesdist.arrays import Float
 from bayesdist.data.matches import Matches
 from bayesdist.data.reading.columns import columns_read, is_on_sky, match_columns
 from bayesdist.data.reading.options import ReadOptions
@@ -19,6 +18,7 @@ from bayesdist.data.tables.checks import absent, row_number, without_missing
 from bayesdist.data.tables.column import Quantities
 from bayesdist.data.tables.names import ALIASES, PAIRS, find_columns
 from bayesdist.errors import InputError
+from bayesdist.utils.arrays import Float
 
 _MOTION = "mas / yr"
 _SPARED = frozenset((*SPARED, "colour", "flux"))  # optional: a star may lack them

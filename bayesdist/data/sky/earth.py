@@ -14,8 +14,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike
 
-from bayesdist.arrays import Float
 from bayesdist.errors import InputError
+from bayesdist.utils.arrays import Float
 
 if TYPE_CHECKING:
     from astropy.time import Time

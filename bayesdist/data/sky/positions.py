@@ -11,11 +11,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesdist.arrays import Float
 from bayesdist.data.sky.earth import parallax_factors
 from bayesdist.data.sky.tangent import mean_direction
 from bayesdist.data.tables.column import Quantities, SourceColumn
 from bayesdist.errors import InputError
+from bayesdist.utils.arrays import Float
 
 MOTIONS = ("pm_ra", "pm_dec", "sigma_pm_ra", "sigma_pm_dec")
 # that a star may lack: it then has none that counts

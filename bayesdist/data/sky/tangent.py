@@ -14,9 +14,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from bayesdist.arrays import Float
 from bayesdist.data.tables.checks import Place, row_number
 from bayesdist.errors import InputError
+from bayesdist.utils.arrays import Float
 
 ARCSEC = np.degrees(1.0) * 3600.0  # seconds of arc in a radian
 

@@ -9,13 +9,13 @@ from typing import TYPE_CHECKING, Any
 
 from numpy.typing import NDArray
 
-from bayesdist.arrays import Int
 from bayesdist.data.batches import BATCH
 from bayesdist.data.columns.labels import DEFAULT_LABELS, LABELS_OF_CODES
 from bayesdist.data.matches import Matches
 from bayesdist.data.tables.checks import columns_of
 from bayesdist.errors import InputError
-from bayesdist.files import atomic_path, made_folder
+from bayesdist.files.atomic import atomic_path, made_folder
+from bayesdist.utils.arrays import Int
 
 if TYPE_CHECKING:
     import pyarrow

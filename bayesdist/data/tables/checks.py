@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesdist.arrays import Bool
 from bayesdist.errors import InputError
+from bayesdist.utils.arrays import Bool
 
 NOT_FINITE = ("refuse", "reject")
 # of a value, and of an error: the square of one over that of the other is still a number

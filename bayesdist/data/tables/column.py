@@ -13,11 +13,11 @@ from astropy.table import Column
 from astropy.time import Time
 from numpy.typing import NDArray
 
-from bayesdist.arrays import Float, Int
 from bayesdist.data.tables.checks import Place, absent, row_number
 from bayesdist.data.tables.names import known_unit
 from bayesdist.data.tables.units import conversion, unit_of
 from bayesdist.errors import InputError
+from bayesdist.utils.arrays import Float, Int
 
 log = logging.getLogger("bayesdist")
 

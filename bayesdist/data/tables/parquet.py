@@ -15,12 +15,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from bayesdist.arrays import Int
 from bayesdist.data.tables.checks import Place
 from bayesdist.data.tables.column import EncodedColumn
 from bayesdist.errors import InputError
-from bayesdist.reading.faults import naming_faults
-from bayesdist.reading.parquet import open_parquet, parquet_column, parquet_units
+from bayesdist.files.faults import naming_faults
+from bayesdist.files.parquet import open_parquet, parquet_column, parquet_units
+from bayesdist.utils.arrays import Int
 
 if TYPE_CHECKING:
     import pyarrow

@@ -15,8 +15,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesdist.arrays import Int
 from bayesdist.errors import InputError
+from bayesdist.utils.arrays import Int
 
 UInt = NDArray[np.uint64]
 Keys = Sequence[NDArray[Any]]

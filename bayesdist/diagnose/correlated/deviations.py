@@ -16,11 +16,11 @@ import numpy as np
 import scipy.linalg
 from numpy.typing import NDArray
 
-from bayesdist.arrays import Float, Int
 from bayesdist.diagnose.correlated.information import GroupCells, Information
 from bayesdist.diagnose.correlated.priors import DiscrepancyPriors, log_half_cauchy, log_widths
 from bayesdist.model import DistortionModel, Groups
 from bayesdist.model.frames import LINEAR_MATRICES
+from bayesdist.utils.arrays import Float, Int
 
 # deviations of an exposure that scatter together, and the frames that fit them already
 KINDS = {

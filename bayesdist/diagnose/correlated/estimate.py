@@ -9,7 +9,6 @@ from operator import add
 
 import numpy as np
 
-from bayesdist.arrays import Float
 from bayesdist.data.matches import Matches
 from bayesdist.diagnose.correlated.deviations import MAX_EXPOSURES, linear_deviations
 from bayesdist.diagnose.correlated.functions import StructureFunctions
@@ -28,13 +27,14 @@ from bayesdist.diagnose.correlated.structure import chip_structure
 from bayesdist.infer.equations.priors import GaussianPriors
 from bayesdist.infer.equations.scaled import one_thread
 from bayesdist.infer.exposures.chip_offsets import Settling
-from bayesdist.infer.solution import Solution, likelihood_of
+from bayesdist.infer.solution.solution import Solution, likelihood_of
 from bayesdist.infer.stars.likelihood import Likelihood
 from bayesdist.infer.stars.loading import opened
 from bayesdist.infer.stars.shards import Shards
 from bayesdist.infer.stars.stars import prepare
 from bayesdist.model import DistortionModel
 from bayesdist.model.grid import cell_index
+from bayesdist.utils.arrays import Float
 
 DRAWS = 2000
 

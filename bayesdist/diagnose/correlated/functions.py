@@ -14,8 +14,8 @@ from functools import cached_property
 import numpy as np
 from numpy.polynomial import legendre
 
-from bayesdist.arrays import Float, Int
 from bayesdist.model.basis import polynomial_terms
+from bayesdist.utils.arrays import Float, Int
 
 ORDERS = 3  # Legendre orders above the model's
 FALL = 0.5  # rms of an order relative to the one below it

@@ -13,7 +13,6 @@ from functools import cached_property
 
 import numpy as np
 
-from bayesdist.arrays import Float, Int
 from bayesdist.infer.equations.normal import NormalEquations
 from bayesdist.infer.equations.priors import GaussianPriors
 from bayesdist.infer.equations.scaled import scaled_inverse
@@ -22,6 +21,7 @@ from bayesdist.infer.stars.stars import Stars
 from bayesdist.infer.stars.sums import Sums
 from bayesdist.model import DistortionModel, Groups
 from bayesdist.model.grid import cell_index
+from bayesdist.utils.arrays import Float, Int
 
 # A star that alone determines a parameter has no residual: its squared score is uninformative.
 MIN_FREE = 0.1

@@ -19,11 +19,11 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import cKDTree
 
-from bayesdist.arrays import Float, Int
 from bayesdist.data.matches import Matches
 from bayesdist.infer.stars.likelihood import Likelihood
 from bayesdist.infer.stars.stars import prepare
 from bayesdist.model import DistortionModel
+from bayesdist.utils.arrays import Float, Int
 
 # of separations, in pixels; the last bin is of pairs farther apart
 EDGES = np.array([0.0, 6.0, 12.0, 24.0, 48.0, 96.0])

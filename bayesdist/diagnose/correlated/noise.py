@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from bayesdist.arrays import Float, Int
 from bayesdist.diagnose.clusters import sums_over
 from bayesdist.diagnose.correlated.information import Information
 from bayesdist.infer.equations.scaled import scaled_inverse
 from bayesdist.model.grid import cell_index
+from bayesdist.utils.arrays import Float, Int
 
 STARS_PER_BLOCK = 60
 MAX_BLOCKS = 8  # along each side of a chip

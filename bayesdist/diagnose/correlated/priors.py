@@ -13,8 +13,8 @@ from dataclasses import dataclass, fields
 
 import numpy as np
 
-from bayesdist.arrays import Float
 from bayesdist.errors import InputError
+from bayesdist.utils.arrays import Float
 
 TERM_STEPS = 24  # of the amplitude of the higher orders
 

@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesdist.arrays import Float
 from bayesdist.diagnose.correlated.deviations import KINDS, LinearDeviations
 from bayesdist.diagnose.correlated.functions import StructureFunctions
 from bayesdist.model import Chip, DistortionModel
+from bayesdist.utils.arrays import Float
 
 POINTS = 12  # on each axis of a chip, over which sizes are averaged
 

@@ -6,13 +6,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from bayesdist.arrays import Float, Int
 from bayesdist.data.matches import Matches
 from bayesdist.diagnose.correlated.priors import log_half_cauchy
 from bayesdist.infer.catalogue.star_sums import StarSums, influence_by_group
 from bayesdist.infer.stars.likelihood import Likelihood
 from bayesdist.infer.stars.stars import Stars, prepare
 from bayesdist.model import DistortionModel
+from bayesdist.utils.arrays import Float, Int
 
 STEPS = 60
 RANGE = 300.0

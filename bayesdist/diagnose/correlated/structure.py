@@ -20,10 +20,10 @@ from itertools import pairwise
 
 import numpy as np
 
-from bayesdist.arrays import Float
 from bayesdist.diagnose.correlated.functions import FINE, StructureFunctions
 from bayesdist.diagnose.correlated.neighbours import SharedVariance
 from bayesdist.diagnose.correlated.priors import AmplitudeGrid, log_half_cauchy, log_widths
+from bayesdist.utils.arrays import Float
 
 # of the field, in longer half sides; all equally probable beforehand
 LENGTHS = np.geomspace(0.02, 0.6, 7)

@@ -14,9 +14,9 @@ from typing import Any
 
 import numpy as np
 
-from bayesdist.arrays import Float, Int
 from bayesdist.data.matches import Matches
 from bayesdist.model import Chip, DistortionModel
+from bayesdist.utils.arrays import Float, Int
 
 ALL = "all"
 STARS_PER_BIN = 60

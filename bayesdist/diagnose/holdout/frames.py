@@ -14,7 +14,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from bayesdist.arrays import Float, Int
 from bayesdist.data.matches import Matches
 from bayesdist.diagnose.holdout.predictive import (
     Prediction,
@@ -27,6 +26,7 @@ from bayesdist.diagnose.holdout.predictive import (
 from bayesdist.infer.equations.scaled import determined
 from bayesdist.model import DistortionModel
 from bayesdist.model.frames import RIGID, frame_names, nearest_frame
+from bayesdist.utils.arrays import Float, Int
 
 SOFT, EXACT = 10, 6  # steps with weights that reach far, and with those of the mixture
 REACH = 4.0  # chi-square at which the former are one half

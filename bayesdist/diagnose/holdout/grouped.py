@@ -13,11 +13,11 @@ from dataclasses import dataclass, field
 import numpy as np
 from scipy.sparse import csr_matrix
 
-from bayesdist.arrays import Float, Int
 from bayesdist.diagnose.holdout.frames import Frame
 from bayesdist.diagnose.holdout.predictive import SCALES, Predictive
 from bayesdist.diagnose.holdout.rows import HeldRows
-from bayesdist.distributions import gamma_cdf, gamma_sf, norm_sf
+from bayesdist.utils.arrays import Float, Int
+from bayesdist.utils.distributions import gamma_cdf, gamma_sf, norm_sf
 
 KNOTS, POINTS, LAST = 48, 2000, 60.0
 MIN_SKEW = 1e-4

@@ -15,12 +15,12 @@ from dataclasses import dataclass, field
 import numpy as np
 from scipy.special import ndtr, ndtri
 
-from bayesdist.arrays import Float, Int
 from bayesdist.data.matches import Matches
 from bayesdist.infer.catalogue.star_errors import StarInfluence
 from bayesdist.infer.posterior import Posterior
 from bayesdist.infer.stars.stars import errors_of
 from bayesdist.model import DistortionModel, Groups, LookupTable
+from bayesdist.utils.arrays import Float, Int
 
 NEVER = 1e-300
 AT_ONCE = 2**14  # stars

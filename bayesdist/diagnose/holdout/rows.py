@@ -15,7 +15,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from bayesdist.arrays import Float, Int
 from bayesdist.data.matches import Matches
 from bayesdist.diagnose.holdout.frames import Frame, framed
 from bayesdist.diagnose.holdout.predictive import (
@@ -23,6 +22,7 @@ from bayesdist.diagnose.holdout.predictive import (
     noise_of,
     predictions,
 )
+from bayesdist.utils.arrays import Float, Int
 
 
 @dataclass(frozen=True, eq=False)

@@ -19,11 +19,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesdist.arrays import Float, Int
 from bayesdist.data import Matches
 from bayesdist.diagnose.clusters import joint_clusters, products_over, squares_over, sums_over
 from bayesdist.diagnose.holdout.predictive import Predictive
 from bayesdist.diagnose.holdout.rows import HeldRows
+from bayesdist.utils.arrays import Float, Int
 
 
 class SharedErrors:

@@ -10,7 +10,6 @@ from scipy.linalg import block_diag
 from scipy.sparse import csr_matrix
 from scipy.special import erf
 
-from bayesdist.arrays import Float
 from bayesdist.data.matches import Matches
 from bayesdist.diagnose.holdout.bins import ALL, Partition
 from bayesdist.diagnose.holdout.frames import Frame
@@ -29,6 +28,7 @@ from bayesdist.diagnose.holdout.predictive import (
 )
 from bayesdist.diagnose.holdout.rows import HeldRows, predicted_rows
 from bayesdist.diagnose.holdout.shared import SharedErrors
+from bayesdist.utils.arrays import Float
 
 PIT_BINS = 20
 TAILS = (3.0, 4.0, 5.0)  # sigma

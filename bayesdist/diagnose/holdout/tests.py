@@ -13,15 +13,15 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import betainc, erf
 
-from bayesdist.arrays import Float
 from bayesdist.diagnose.holdout.bins import ALL, Partition
 from bayesdist.diagnose.holdout.frames import Frame
 from bayesdist.diagnose.holdout.grouped import ScaleSums
 from bayesdist.diagnose.holdout.predictive import Predictive
 from bayesdist.diagnose.holdout.sums import LEVELS, PIT_BINS, STEP, TAILS, BinSums, HeldSums
 from bayesdist.diagnose.significance import clopper_pearson, hotelling_p
-from bayesdist.distributions import chi2_sf, norm_sf
-from bayesdist.limits import HELD_OUT_DISTRIBUTION, HELD_OUT_RATIO, HELD_OUT_TAILS
+from bayesdist.utils.arrays import Float
+from bayesdist.utils.distributions import chi2_sf, norm_sf
+from bayesdist.utils.limits import HELD_OUT_DISTRIBUTION, HELD_OUT_RATIO, HELD_OUT_TAILS
 
 AXIS = "axis"  # a part: the stars along one axis
 

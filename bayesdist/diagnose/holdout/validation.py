@@ -7,7 +7,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from bayesdist.arrays import Float
 from bayesdist.data.matches import Matches
 from bayesdist.diagnose.holdout.bins import Bin, partitions_of
 from bayesdist.diagnose.holdout.frames import frames_for
@@ -22,8 +21,9 @@ from bayesdist.diagnose.holdout.tests import (
 )
 from bayesdist.diagnose.significance import holm
 from bayesdist.errors import InputError
-from bayesdist.limits import HELD_OUT, HELD_OUT_DOUBTFUL, HELD_OUT_UNUSUAL
-from bayesdist.numbers import p_words
+from bayesdist.utils.arrays import Float
+from bayesdist.utils.limits import HELD_OUT, HELD_OUT_DOUBTFUL, HELD_OUT_UNUSUAL
+from bayesdist.utils.numbers import p_words
 
 SAMPLE = 200_000  # stars that say where bins end
 ORDER = ("offset", "deviation", "spread", "tails", "distribution")  # of what tells most

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from bayesdist.arrays import Bool, Float, Int
 from bayesdist.errors import InputError, require_known
+from bayesdist.utils.arrays import Bool, Float, Int
 
 BAND_AXES = ("X", "Y", "radial")
 

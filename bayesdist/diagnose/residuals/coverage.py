@@ -11,11 +11,11 @@ import numpy as np
 from scipy.optimize import linprog
 from scipy.spatial import ConvexHull, QhullError
 
-from bayesdist.arrays import Float
 from bayesdist.diagnose.residuals.binned import BinnedSums
-from bayesdist.limits import UNCOVERED, UNCOVERED_BY_CHANCE
 from bayesdist.model import Chip
 from bayesdist.model.grid import mesh
+from bayesdist.utils.arrays import Float
+from bayesdist.utils.limits import UNCOVERED, UNCOVERED_BY_CHANCE
 
 SPARSE = 0.02  # of the density where stars usually are: strays, not coverage
 _FINE = (65, 65)

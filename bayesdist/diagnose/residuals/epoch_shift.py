@@ -18,13 +18,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from bayesdist.arrays import Float, Int
 from bayesdist.data.magnitude_errors import MAD_TO_SIGMA
 from bayesdist.data.matches import Matches
 from bayesdist.diagnose.clusters import squares_over
 from bayesdist.diagnose.score.sample import ScoredSample, scored_sample
-from bayesdist.infer.solution import Solution
-from bayesdist.limits import EPOCH_SHIFT
+from bayesdist.infer.solution.solution import Solution
+from bayesdist.utils.arrays import Float, Int
+from bayesdist.utils.limits import EPOCH_SHIFT
 
 SAMPLE = 20_000  # detections that are looked at
 MIN_STARS = 30  # stars with motions

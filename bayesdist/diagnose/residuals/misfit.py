@@ -12,13 +12,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.polynomial import legendre
 
-from bayesdist.arrays import Float
 from bayesdist.diagnose.residuals.binned import BinnedResiduals, BinnedSums
-from bayesdist.distributions import chi2_sf
-from bayesdist.limits import STRUCTURE, STRUCTURE_SEEN
 from bayesdist.model import Chip
 from bayesdist.model.basis import polynomial_terms
-from bayesdist.numbers import p_words, size_of
+from bayesdist.utils.arrays import Float
+from bayesdist.utils.distributions import chi2_sf
+from bayesdist.utils.limits import STRUCTURE, STRUCTURE_SEEN
+from bayesdist.utils.numbers import p_words, size_of
 
 STARS_PER_BIN = 25
 MAX_BINS = 32  # along each side

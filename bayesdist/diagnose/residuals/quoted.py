@@ -9,11 +9,11 @@ from __future__ import annotations
 import numpy as np
 
 from bayesdist.data.matches import Matches
-from bayesdist.distributions import chi2_ppf
-from bayesdist.infer.linear import LinearFit
 from bayesdist.infer.posterior import Posterior
+from bayesdist.infer.solution.linear import LinearFit
 from bayesdist.infer.stars.stars import prepare
-from bayesdist.limits import FALSE_MAJORITY, QUOTED_ERRORS, WIDENED_ERRORS
+from bayesdist.utils.distributions import chi2_ppf
+from bayesdist.utils.limits import FALSE_MAJORITY, QUOTED_ERRORS, WIDENED_ERRORS
 
 LOW_QUANTILE = 0.1  # of the matches
 

@@ -17,9 +17,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from bayesdist.arrays import Float
 from bayesdist.diagnose.residuals.binned import BinValues
 from bayesdist.errors import DegenerateError, InputError
+from bayesdist.utils.arrays import Float
 
 STATISTICS = ("mean", "sigma", "min", "max", "median", "p01", "p99")
 DRAWS = 300  # of bins with fresh noise: errors to 4 %

@@ -6,15 +6,15 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from bayesdist.arrays import Bool, Float, Int
 from bayesdist.data.magnitude_errors import MagnitudeErrors, estimate
 from bayesdist.data.matches import Matches
-from bayesdist.infer.linear import LinearFit
 from bayesdist.infer.posterior import Posterior
 from bayesdist.infer.posterior.memberships import memberships_of
+from bayesdist.infer.solution.linear import LinearFit
 from bayesdist.infer.stars.likelihood import Likelihood
 from bayesdist.infer.stars.stars import in_table_order, prepare
-from bayesdist.limits import EXPOSURE_CHI2
+from bayesdist.utils.arrays import Bool, Float, Int
+from bayesdist.utils.limits import EXPOSURE_CHI2
 
 SAMPLE = 200_000  # stars that show what all of them look like
 MIN_STARS = 50  # stars whose scatter says anything by magnitude

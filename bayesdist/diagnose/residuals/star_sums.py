@@ -11,7 +11,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from bayesdist.arrays import Bool, Float, Int
 from bayesdist.diagnose.residuals.binned import BinnedSums, binned_sums
 from bayesdist.infer.kernel import Constants
 from bayesdist.infer.posterior import Posterior
@@ -20,6 +19,7 @@ from bayesdist.infer.stars.likelihood import Likelihood, star_averages
 from bayesdist.infer.stars.shards import Shards
 from bayesdist.infer.stars.stars import Stars
 from bayesdist.infer.stars.sums import Sums
+from bayesdist.utils.arrays import Bool, Float, Int
 
 Bins = tuple[int, int]
 

@@ -16,7 +16,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.linalg import cho_solve
 
-from bayesdist.arrays import Float, Int
 from bayesdist.diagnose.clusters import add_over, sums_over
 from bayesdist.diagnose.score.projection import (
     Projection,
@@ -27,8 +26,9 @@ from bayesdist.diagnose.score.projection import (
 from bayesdist.diagnose.score.result import Family, Outcome, outcome
 from bayesdist.diagnose.score.sample import Block
 from bayesdist.diagnose.significance import chi_square_of, hotelling_p
-from bayesdist.distributions import chi2_sf
 from bayesdist.model.frames import LINEAR_MATRICES, frame_names
+from bayesdist.utils.arrays import Float, Int
+from bayesdist.utils.distributions import chi2_sf
 
 EXPOSURES = Family(
     "exposures",

@@ -22,13 +22,13 @@ from functools import partial
 
 import numpy as np
 
-from bayesdist.arrays import Float, Int
 from bayesdist.diagnose.clusters import squares_over
 from bayesdist.diagnose.score.projection import Projection
 from bayesdist.diagnose.score.result import Family, Outcome, outcome, smallest_pattern
 from bayesdist.diagnose.score.sample import Block
-from bayesdist.distributions import f_sf
 from bayesdist.model.frames import DEVIATIONS, LINEAR_MATRICES, RIGID, frame_names
+from bayesdist.utils.arrays import Float, Int
+from bayesdist.utils.distributions import f_sf
 
 GAP = Family("gap", "", "", "no drift of the gap between the chips is left in the residuals")
 MIN_FREE = 3  # visits beyond those that the line takes

@@ -18,11 +18,11 @@ from functools import partial
 
 import numpy as np
 
-from bayesdist.arrays import Float, Int
 from bayesdist.diagnose.clusters import sums_over
 from bayesdist.diagnose.score.result import Family, Outcome, noncentrality, outcome
 from bayesdist.diagnose.score.sample import ScoredSample
-from bayesdist.distributions import t_sf
+from bayesdist.utils.arrays import Float, Int
+from bayesdist.utils.distributions import t_sf
 
 MOTIONS = Family(
     "motions",

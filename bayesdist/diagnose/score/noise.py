@@ -13,13 +13,13 @@ from functools import partial
 
 import numpy as np
 
-from bayesdist.arrays import Float, Int
 from bayesdist.diagnose.clusters import squares_over
 from bayesdist.diagnose.score.result import Family, Outcome, outcome, smallest_pattern
 from bayesdist.diagnose.score.sample import ScoredSample
 from bayesdist.diagnose.significance import hotelling_p
-from bayesdist.distributions import chi2_sf
 from bayesdist.model.grid import cell_index
+from bayesdist.utils.arrays import Float, Int
+from bayesdist.utils.distributions import chi2_sf
 
 BY_POSITION = Family(
     "noise by position",

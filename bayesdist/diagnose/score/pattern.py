@@ -7,10 +7,10 @@ from dataclasses import replace
 import numpy as np
 from scipy.special import i0e, i1e
 
-from bayesdist.arrays import Bool, Float, Int
 from bayesdist.diagnose.score.result import Family, Outcome, outcome
 from bayesdist.diagnose.score.sample import ScoredSample
 from bayesdist.model.grid import cell_index
+from bayesdist.utils.arrays import Bool, Float, Int
 
 REPEATING = Family(
     "repeating pattern",

@@ -15,10 +15,10 @@ from functools import cached_property
 import numpy as np
 from scipy.linalg import cho_solve
 
-from bayesdist.arrays import Bool, Float, Int
 from bayesdist.diagnose.score.regressors import Functions
 from bayesdist.diagnose.score.sample import Block, ScoredSample
 from bayesdist.infer.equations.priors import GaussianPriors
+from bayesdist.utils.arrays import Bool, Float, Int
 
 RIDGE = 1e-12  # of a scaled information matrix: what the sample does not determine stays finite
 LARGEST_LEVERAGE = 0.95  # of one detection; it has next to no residual of its own there

@@ -12,11 +12,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from bayesdist.arrays import Float
 from bayesdist.diagnose.score.result import Family
 from bayesdist.diagnose.score.sample import ScoredSample
 from bayesdist.model.basis import MAX_ORDER, polynomial_terms
 from bayesdist.model.timedep import TimeDependence
+from bayesdist.utils.arrays import Float
 
 Terms = tuple[tuple[int, int], ...]
 

@@ -19,7 +19,6 @@ from itertools import pairwise
 import numpy as np
 from scipy.linalg import block_diag
 
-from bayesdist.arrays import Float, Int
 from bayesdist.diagnose.clusters import add_over
 from bayesdist.diagnose.score.projection import (
     LARGEST_LEVERAGE,
@@ -32,7 +31,8 @@ from bayesdist.diagnose.score.regressors import Regressors, one_of_each
 from bayesdist.diagnose.score.result import Family, Outcome, outcome
 from bayesdist.diagnose.score.sample import Block
 from bayesdist.diagnose.significance import chi_square_of
-from bayesdist.distributions import chi2_sf, f_sf
+from bayesdist.utils.arrays import Float, Int
+from bayesdist.utils.distributions import chi2_sf, f_sf
 
 MAX_TAKEN = 0.5  # of the noise, by fit and step: what is left then says nothing of it
 # power of what is left of a star's noise: 1/2 is exact where quoted errors are right (HC2), and 1,

@@ -10,11 +10,11 @@ import numpy as np
 from numpy.polynomial import legendre
 from scipy.linalg import block_diag
 
-from bayesdist.arrays import Bool, Float, Int
 from bayesdist.diagnose.score.questions import Products, Question, questions
 from bayesdist.diagnose.score.result import Family, Outcome
 from bayesdist.diagnose.score.sample import ScoredSample
 from bayesdist.model.basis import polynomial_terms
+from bayesdist.utils.arrays import Bool, Float, Int
 
 CONSTANT = 1e-9  # scatter of values, in magnitudes or of the time from -1 to 1
 SAYS_NOTHING = 0.2  # probability by chance above which an adjusted test has seen nothing

@@ -11,9 +11,9 @@ import numpy as np
 from scipy import special
 
 from bayesdist.diagnose.significance import holm
-from bayesdist.distributions import chi2_isf, f_isf
-from bayesdist.limits import SCORE_TESTS
-from bayesdist.numbers import p_words
+from bayesdist.utils.distributions import chi2_isf, f_isf
+from bayesdist.utils.limits import SCORE_TESTS
+from bayesdist.utils.numbers import p_words
 
 HeldBy = Literal["", "noise", "structure", "exposures", "curvature"]
 

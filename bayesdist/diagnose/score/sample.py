@@ -7,11 +7,11 @@ from functools import cached_property
 
 import numpy as np
 
-from bayesdist.arrays import Bool, Float, Int
 from bayesdist.data.matches import Matches
-from bayesdist.infer.solution import Solution, likelihood_of
+from bayesdist.infer.solution.solution import Solution, likelihood_of
 from bayesdist.infer.stars.stars import Stars, prepare
 from bayesdist.model import DistortionModel
+from bayesdist.utils.arrays import Bool, Float, Int
 
 SAMPLE = 200_000  # detections that are looked at
 LARGEST_BLOCK = 4096  # detections, whose functions stay in the cache

@@ -17,7 +17,7 @@ from bayesdist.diagnose.score.result import ScoreTest, corrected
 from bayesdist.diagnose.score.sample import scored_sample
 from bayesdist.diagnose.score.truncation import truncation_test
 from bayesdist.infer.equations.priors import GaussianPriors
-from bayesdist.infer.solution import Solution
+from bayesdist.infer.solution.solution import Solution
 
 
 def score_tests(

@@ -15,10 +15,10 @@ from functools import partial
 import numpy as np
 from scipy import optimize, special
 
-from bayesdist.arrays import Float, Int
 from bayesdist.diagnose.score.result import Family, Outcome
 from bayesdist.diagnose.score.sample import ScoredSample
 from bayesdist.diagnose.significance import chi_square_of
+from bayesdist.utils.arrays import Float, Int
 
 TRUNCATION = Family(
     "truncation", "match again with a wider radius", "", "the residuals do not end abruptly"

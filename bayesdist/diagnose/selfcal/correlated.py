@@ -14,7 +14,6 @@ from functools import partial
 
 import numpy as np
 
-from bayesdist.arrays import Float
 from bayesdist.diagnose.correlated.deviations import deviation_columns, deviation_draws
 from bayesdist.diagnose.correlated.functions import FINE, MIN_SIDE, StructureFunctions
 from bayesdist.diagnose.correlated.noise import not_narrower
@@ -37,6 +36,7 @@ from bayesdist.diagnose.selfcal.scores import DetectionScores, score_excess, sco
 from bayesdist.infer.equations.scaled import one_thread
 from bayesdist.infer.selfcal.mode import SelfCalibrationMode
 from bayesdist.infer.selfcal.problem import Problem
+from bayesdist.utils.arrays import Float
 
 DRAWS = 2000
 MAX_DETECTIONS = 60_000  # from which structure is estimated, at most

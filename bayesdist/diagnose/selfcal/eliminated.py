@@ -20,7 +20,6 @@ from functools import cached_property
 import numpy as np
 from scipy.sparse import csr_array
 
-from bayesdist.arrays import Float, Int
 from bayesdist.diagnose.clusters import sums_over
 from bayesdist.diagnose.correlated.deviations import DeviationColumns
 from bayesdist.diagnose.correlated.functions import StructureFunctions
@@ -28,6 +27,7 @@ from bayesdist.diagnose.selfcal.scores import DetectionScores, places_by_star
 from bayesdist.infer.selfcal.elimination import PlaceDerivatives
 from bayesdist.infer.selfcal.mode import SelfCalibrationMode
 from bayesdist.infer.selfcal.problem import Problem
+from bayesdist.utils.arrays import Float, Int
 
 DETECTIONS = 8192  # in memory at a time
 UNKNOWN = 1e-10  # relative curvature below which a combination of numbers is undetermined

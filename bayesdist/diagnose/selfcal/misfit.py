@@ -19,14 +19,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.sparse import csr_array
 
-from bayesdist.arrays import Float, Int
 from bayesdist.diagnose.residuals.misfit import Misfit, bin_means, partitions_for, worst_misfit
 from bayesdist.diagnose.selfcal.scores import StarBlock, star_blocks
-from bayesdist.distributions import f_sf
 from bayesdist.infer.selfcal import SelfCalibrationMode
 from bayesdist.infer.selfcal.problem import Problem
 from bayesdist.model.basis import polynomial_terms
 from bayesdist.model.grid import cell_index
+from bayesdist.utils.arrays import Float, Int
+from bayesdist.utils.distributions import f_sf
 
 MAX_SIDE = 16  # cells along each side of a chip
 MAX_CELLS = 512  # of all chips: the matrix of all shifts is decomposed

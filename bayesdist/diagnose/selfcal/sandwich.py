@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from bayesdist.arrays import Float
 from bayesdist.diagnose.selfcal.eliminated import Columns, Piece, absorbed_by_stars, pieces
 from bayesdist.diagnose.selfcal.scores import DetectionScores
 from bayesdist.infer.selfcal.mode import SelfCalibrationMode
+from bayesdist.utils.arrays import Float
 
 # A star that alone determines a parameter has no residual: its squared score is uninformative.
 MIN_FREE = 0.1

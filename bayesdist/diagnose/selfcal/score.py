@@ -13,7 +13,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from bayesdist.arrays import Bool, Float, Int
 from bayesdist.diagnose.correlated.deviations import deviation_columns
 from bayesdist.diagnose.score.exposures import EXPOSURES
 from bayesdist.diagnose.score.motions import MOTIONS, SHORTEST, StarResiduals, motion_outcome
@@ -46,6 +45,7 @@ from bayesdist.diagnose.significance import hotelling_p
 from bayesdist.infer.selfcal.elimination import memberships
 from bayesdist.infer.selfcal.mode import SelfCalibrationMode
 from bayesdist.infer.selfcal.problem import Problem
+from bayesdist.utils.arrays import Bool, Float, Int
 
 MAX_DETECTIONS = 60_000  # that are looked at
 STARS_PER_DIRECTION = 2  # below, a covariance of the scores says nothing

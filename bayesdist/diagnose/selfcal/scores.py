@@ -7,7 +7,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from bayesdist.arrays import Bool, Float, Int
 from bayesdist.diagnose.clusters import sums_over
 from bayesdist.diagnose.correlated.noise import MAX_BLOCKS, STARS_PER_BLOCK, block_ratios
 from bayesdist.infer.selfcal.calibrate import MOST_TAKEN
@@ -15,6 +14,7 @@ from bayesdist.infer.selfcal.elimination import STARS, memberships
 from bayesdist.infer.selfcal.mode import SelfCalibrationMode
 from bayesdist.infer.selfcal.problem import Problem
 from bayesdist.model.grid import cell_index
+from bayesdist.utils.arrays import Bool, Float, Int
 
 LOOSE = 1e-9  # relative curvature below which a combination of a star's parameters is undetermined
 

@@ -21,10 +21,10 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import log_ndtr
 
-from bayesdist.arrays import Bool, Float, Int
 from bayesdist.diagnose.clusters import squares_over, sums_over
 from bayesdist.errors import DegenerateError
 from bayesdist.model import Chip
+from bayesdist.utils.arrays import Bool, Float, Int
 
 FINE, COARSE = 8, 4  # cells along a side of the squares between nodes
 AREA_RATIO = (FINE / COARSE) ** 2  # areas of the cells

@@ -8,7 +8,6 @@ from functools import partial
 
 import numpy as np
 
-from bayesdist.arrays import Float
 from bayesdist.data import Matches
 from bayesdist.diagnose.tables.between_nodes import BetweenNodes, between_nodes
 from bayesdist.errors import DegenerateError
@@ -22,6 +21,7 @@ from bayesdist.infer.nodes import (
     pixel_shifts,
 )
 from bayesdist.model import Chip, LookupTable
+from bayesdist.utils.arrays import Float
 
 FAR = 6.0  # standard deviations
 

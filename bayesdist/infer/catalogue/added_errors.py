@@ -29,7 +29,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from bayesdist.arrays import Bool, Float, Int
 from bayesdist.data.magnitude_errors import AddedErrors
 from bayesdist.data.matches import Matches
 from bayesdist.errors import InputError
@@ -41,9 +40,10 @@ from bayesdist.infer.catalogue.by_magnitude import (
     variances_of,
 )
 from bayesdist.infer.equations.priors import GaussianPriors
-from bayesdist.infer.linear import LinearFit
+from bayesdist.infer.solution.linear import LinearFit
 from bayesdist.infer.stars.likelihood import good_probability, log_densities
 from bayesdist.model import DistortionModel
+from bayesdist.utils.arrays import Bool, Float, Int
 
 ONE, AXIS = "one", "axis"
 STARS = 50_000  # from which the errors are estimated: they are then known to half a percent

@@ -12,17 +12,23 @@ from __future__ import annotations
 
 import numpy as np
 
-from bayesdist.arrays import Float
 from bayesdist.data.magnitude_errors import MagnitudeErrors, estimate
 from bayesdist.data.matches import Matches
 from bayesdist.errors import InputError
 from bayesdist.infer.catalogue.magnitude_law import MagnitudeLaw
 from bayesdist.infer.equations.priors import GaussianPriors
-from bayesdist.infer.linear import DEFAULT_REJECTION, NO_REJECTION, LinearFit, Rejection, fit_linear
+from bayesdist.infer.solution.linear import (
+    DEFAULT_REJECTION,
+    NO_REJECTION,
+    LinearFit,
+    Rejection,
+    fit_linear,
+)
 from bayesdist.infer.stars.likelihood import good_probability
 from bayesdist.infer.stars.shards import Compute
 from bayesdist.infer.stars.stars import groups_of, in_table_order, prepare
 from bayesdist.model import DistortionModel
+from bayesdist.utils.arrays import Float
 
 STARS = 200_000  # from which the law is estimated: it is then known to a part in a thousand
 PER_EXPOSURE = 100  # mean number of stars of each exposure among these, at least

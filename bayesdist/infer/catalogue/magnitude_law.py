@@ -12,8 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.optimize import minimize_scalar
 
-from bayesdist.arrays import Float, Int
 from bayesdist.data.magnitude_errors import MagnitudeErrors
+from bayesdist.utils.arrays import Float, Int
 
 CELLS = 1000  # cells of magnitude, within which the law hardly changes
 LOG_VARIANCE = 1.36  # variance of ln(scatter) times n, for the median absolute deviation

@@ -21,14 +21,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from bayesdist.arrays import Float, Int
 from bayesdist.data.matches import Matches
 from bayesdist.errors import InputError
 from bayesdist.infer.catalogue.star_sums import StarSums, influence_by_group
 from bayesdist.infer.equations.scaled import one_thread
-from bayesdist.infer.linear import LinearFit
-from bayesdist.infer.solution import Solution
+from bayesdist.infer.solution.linear import LinearFit
+from bayesdist.infer.solution.solution import Solution
 from bayesdist.infer.stars.stars import prepare
+from bayesdist.utils.arrays import Float, Int
 
 
 @dataclass(frozen=True, eq=False)

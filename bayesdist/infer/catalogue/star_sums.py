@@ -15,9 +15,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from bayesdist.arrays import Float, Int
 from bayesdist.infer.stars.stars import Stars
 from bayesdist.model import DistortionModel, Groups
+from bayesdist.utils.arrays import Float, Int
 
 SCRATCH = 64_000_000  # bytes of the stars' sums in memory at a time
 

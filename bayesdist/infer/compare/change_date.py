@@ -16,9 +16,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.linalg import null_space
 
-from bayesdist.arrays import Float, Int
 from bayesdist.data.matches import Matches
-from bayesdist.distributions import chi2_sf
 from bayesdist.infer.compare.frame_fields import mean_squares, without
 from bayesdist.infer.compare.monitoring import Change, NewFit
 from bayesdist.infer.equations.normal import NormalEquations, mixture
@@ -27,6 +25,8 @@ from bayesdist.infer.kernel import Constants
 from bayesdist.infer.stars.stars import prepare
 from bayesdist.model import DistortionModel
 from bayesdist.model.frames import nearest_frame
+from bayesdist.utils.arrays import Float, Int
+from bayesdist.utils.distributions import chi2_sf
 
 MOST_PERIODS = 24
 CREDIBLE = 0.95

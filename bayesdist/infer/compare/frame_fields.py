@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from bayesdist.arrays import Float
 from bayesdist.model import DistortionModel, PolynomialBasis
 from bayesdist.model.frames import frame_matrix, frame_names, nearest_frame
+from bayesdist.utils.arrays import Float
 
 
 def term_squares(basis: PolynomialBasis) -> Float:

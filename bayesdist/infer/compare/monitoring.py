@@ -15,7 +15,6 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from bayesdist.arrays import Float
 from bayesdist.data.matches import Matches
 from bayesdist.errors import InputError
 from bayesdist.infer.catalogue.star_errors import StarErrors, star_covariance, star_influence
@@ -25,14 +24,15 @@ from bayesdist.infer.density.target import Target
 from bayesdist.infer.equations.priors import GaussianPriors
 from bayesdist.infer.equations.scaled import FieldTest, chi_square
 from bayesdist.infer.exposures.hierarchy import held_in_reference
-from bayesdist.infer.linear import DEFAULT_REJECTION, LinearFit, Rejection, fit_linear
-from bayesdist.infer.solution import Solution, TransformedSolution
+from bayesdist.infer.solution.linear import DEFAULT_REJECTION, LinearFit, Rejection, fit_linear
+from bayesdist.infer.solution.solution import Solution, TransformedSolution
+from bayesdist.infer.solution.transforms import without_frames
 from bayesdist.infer.stars.likelihood import MixtureAt
 from bayesdist.infer.stars.loading import load
 from bayesdist.infer.stars.mixture import OutlierMixture
 from bayesdist.infer.stars.shards import Compute
-from bayesdist.infer.transforms import without_frames
 from bayesdist.model import DistortionModel
+from bayesdist.utils.arrays import Float
 
 __all__ = ["Change", "NewFit", "change_of", "fit_new", "new_model", "with_star_errors_of"]
 

@@ -13,7 +13,6 @@ from dataclasses import replace
 
 import numpy as np
 
-from bayesdist.arrays import Float
 from bayesdist.data.matches import Matches
 from bayesdist.errors import DegenerateError, InputError
 from bayesdist.infer.compare.order_result import HeldOutOrders, OrderSelection, OrderSurfaces
@@ -25,13 +24,14 @@ from bayesdist.infer.compare.order_sums import (
     held_out_gain,
     truncated,
 )
-from bayesdist.infer.linear import DEFAULT_REJECTION, LinearFit, Rejection, fit_linear
-from bayesdist.infer.solution import Solution
+from bayesdist.infer.solution.linear import DEFAULT_REJECTION, LinearFit, Rejection, fit_linear
+from bayesdist.infer.solution.solution import Solution
+from bayesdist.infer.solution.transforms import without_frames
 from bayesdist.infer.stars.loading import opened
 from bayesdist.infer.stars.shards import Shards
-from bayesdist.infer.transforms import without_frames
 from bayesdist.model import DistortionModel
 from bayesdist.model.basis import MAX_ORDER
+from bayesdist.utils.arrays import Float
 
 DEFAULT_ORDERS = tuple(range(3, 10))
 

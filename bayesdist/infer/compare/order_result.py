@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from bayesdist.arrays import Float, Int
-from bayesdist.distributions import chi2_sf, f_sf, norm_sf
-from bayesdist.numbers import p_words
+from bayesdist.utils.arrays import Float, Int
+from bayesdist.utils.distributions import chi2_sf, f_sf, norm_sf
+from bayesdist.utils.numbers import p_words
 
 CLEAR = 3.0  # standard errors from which on a higher order counts as better
 CLEAR_P = float(norm_sf(CLEAR))

@@ -14,13 +14,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesdist.arrays import Float, Int
 from bayesdist.infer import kernel
 from bayesdist.infer.stars.likelihood import Clip
 from bayesdist.infer.stars.stars import Stars
 from bayesdist.infer.stars.sums import Sums
 from bayesdist.model.grid import cell_index
-from bayesdist.streams import mixed
+from bayesdist.utils.arrays import Float, Int
+from bayesdist.utils.streams import mixed
 
 
 @dataclass(frozen=True, eq=False)

@@ -19,8 +19,6 @@ from functools import cached_property
 import numpy as np
 from scipy.linalg import block_diag
 
-from bayesdist.arrays import Float
-from bayesdist.distributions import norm_sf
 from bayesdist.errors import DegenerateError, InputError
 from bayesdist.infer.compare.positions import (
     DifferenceField,
@@ -31,10 +29,12 @@ from bayesdist.infer.compare.positions import (
 from bayesdist.infer.equations.normal import NormalEquations, least_squares
 from bayesdist.infer.equations.rank import require_full_rank
 from bayesdist.infer.equations.scaled import FieldTest, chi_square, scaled_inverse
-from bayesdist.infer.linear import LinearFit
+from bayesdist.infer.solution.linear import LinearFit
 from bayesdist.infer.stars.stars import Stars
 from bayesdist.infer.stars.sums import Sums
 from bayesdist.model import Chip, DistortionModel
+from bayesdist.utils.arrays import Float
+from bayesdist.utils.distributions import norm_sf
 
 __all__ = [
     "CoefficientChange",

@@ -7,12 +7,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from bayesdist.arrays import Float
 from bayesdist.data.matches import Matches
 from bayesdist.errors import InputError
 from bayesdist.infer.equations.scaled import recolouring, scaled_cholesky, scaled_inverse
-from bayesdist.infer.solution import Solution
+from bayesdist.infer.solution.solution import Solution
 from bayesdist.model import DistortionModel
+from bayesdist.utils.arrays import Float
 
 
 @dataclass(frozen=True, eq=False)

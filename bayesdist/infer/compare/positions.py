@@ -6,11 +6,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from bayesdist.arrays import Float
-from bayesdist.distributions import chi2_sf
 from bayesdist.infer.equations.scaled import chi_square, scaled_cholesky
 from bayesdist.model import Chip, DistortionModel
 from bayesdist.model.grid import grid_pixels, mesh
+from bayesdist.utils.arrays import Float
+from bayesdist.utils.distributions import chi2_sf
 
 
 @dataclass(frozen=True, eq=False)

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from bayesdist.arrays import Bool, Float
+from bayesdist.utils.arrays import Bool, Float
 
 
 def to_cube_root(names: tuple[str, ...], h: Float) -> Float:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 
-from bayesdist.arrays import Float
 from bayesdist.errors import DegenerateError
 from bayesdist.infer.density.coordinates import Split
 from bayesdist.infer.density.importance import quality_of
@@ -17,8 +16,9 @@ from bayesdist.infer.density.laplace import (
 )
 from bayesdist.infer.density.proposal import GridProposal
 from bayesdist.infer.density.target import Target
-from bayesdist.infer.linear import LinearFit
+from bayesdist.infer.solution.linear import LinearFit
 from bayesdist.infer.stars.mixture import TAILS
+from bayesdist.utils.arrays import Float
 
 Line = dict[float, Conditional]  # nodes by their value on one axis
 

@@ -13,8 +13,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from bayesdist.arrays import Float
 from bayesdist.infer.convergence import importance_efficiency, pareto_k
+from bayesdist.utils.arrays import Float
 
 CLOSE = 0.02  # distance from the posterior (total variation) at which warm-up ends
 MOST_WARMUP = 10_000

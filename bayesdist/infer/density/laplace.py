@@ -10,12 +10,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from bayesdist.arrays import Float
 from bayesdist.errors import DegenerateError
 from bayesdist.infer.density.coordinates import Split, from_cube_root
 from bayesdist.infer.density.target import Target
 from bayesdist.infer.equations.arrow import Arrow, ArrowFactor
-from bayesdist.infer.linear import LinearFit
+from bayesdist.infer.solution.linear import LinearFit
+from bayesdist.utils.arrays import Float
 
 MAX_STEPS = 60
 UNSEEN = 1e-8  # decrement that rounding of the log density may hide: the step is taken unseen

@@ -8,9 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.interpolate import CubicHermiteSpline, CubicSpline, PchipInterpolator
 
-from bayesdist.arrays import Bool, Float
 from bayesdist.infer.density.piecewise import PiecewiseExponential
 from bayesdist.infer.stars.mixture import TAILS
+from bayesdist.utils.arrays import Bool, Float
 
 MESH = {1: 4001, 2: 401}  # points of each axis, by the number of axes
 

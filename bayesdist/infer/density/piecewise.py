@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from bayesdist.arrays import Float
+from bayesdist.utils.arrays import Float
 
 
 class PiecewiseExponential:

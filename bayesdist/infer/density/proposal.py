@@ -19,11 +19,11 @@ from typing import Protocol
 
 import numpy as np
 
-from bayesdist.arrays import Float, Int
 from bayesdist.infer.density.coordinates import Split
 from bayesdist.infer.density.laplace import Node
 from bayesdist.infer.density.marginal import Marginal, cardinal
 from bayesdist.infer.equations.arrow import Arrow
+from bayesdist.utils.arrays import Float, Int
 
 Random = np.random.Generator | np.random.RandomState
 

@@ -8,7 +8,6 @@ from typing import Protocol
 
 import numpy as np
 
-from bayesdist.arrays import Float
 from bayesdist.infer import kernel
 from bayesdist.infer.equations.arrow import Arrow
 from bayesdist.infer.equations.normal import mixture
@@ -18,6 +17,7 @@ from bayesdist.infer.stars.mixture import HYPER_NAMES, Hyper, OutlierMixture
 from bayesdist.infer.stars.shards import Shards
 from bayesdist.infer.stars.stars import Stars
 from bayesdist.model import DistortionModel
+from bayesdist.utils.arrays import Float
 
 SCRATCH = 32_000_000  # bytes of effective coefficients in memory at a time
 

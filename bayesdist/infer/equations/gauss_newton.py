@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 
-from bayesdist.arrays import Float
 from bayesdist.errors import DegenerateError
 from bayesdist.infer.equations.normal import NormalEquations
 from bayesdist.infer.equations.priors import GaussianPriors
 from bayesdist.infer.equations.rank import require_full_rank
 from bayesdist.model import DistortionModel
 from bayesdist.model.frames import nearest_frame
+from bayesdist.utils.arrays import Float
 
 RELINEARISED = 1e-7  # pixels: where the Gauss-Newton iteration over the frames stops
 STALLED = 1e-4  # formal errors: steps below this that do not shrink are rounding

@@ -12,7 +12,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from bayesdist.arrays import Float
 from bayesdist.infer import kernel
 from bayesdist.infer.equations.arrow import Arrow
 from bayesdist.infer.kernel import Constants
@@ -20,6 +19,7 @@ from bayesdist.infer.stars.likelihood import Clip
 from bayesdist.infer.stars.stars import Stars
 from bayesdist.infer.stars.sums import Sums
 from bayesdist.model import DistortionModel, Groups
+from bayesdist.utils.arrays import Float
 
 
 @dataclass(frozen=True, eq=False)

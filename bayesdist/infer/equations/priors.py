@@ -8,10 +8,10 @@ from difflib import get_close_matches
 
 import numpy as np
 
-from bayesdist.arrays import Float
 from bayesdist.errors import InputError
 from bayesdist.infer.equations.arrow import Arrow
 from bayesdist.model import DistortionModel
+from bayesdist.utils.arrays import Float
 
 
 @dataclass(frozen=True, eq=False)

@@ -15,8 +15,8 @@ import numpy as np
 import scipy.linalg
 from threadpoolctl import threadpool_limits
 
-from bayesdist.arrays import Bool, Float
-from bayesdist.distributions import chi2_sf
+from bayesdist.utils.arrays import Bool, Float
+from bayesdist.utils.distributions import chi2_sf
 
 RANK = 1e-9  # eigenvalues of a correlation matrix below it are rounding
 

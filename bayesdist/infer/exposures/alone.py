@@ -12,14 +12,19 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from bayesdist.arrays import Float
 from bayesdist.data.matches import Matches
 from bayesdist.errors import DegenerateError, InputError
 from bayesdist.infer.equations.scaled import one_thread
-from bayesdist.infer.linear import DEFAULT_REJECTION, Rejection, fit_linear
-from bayesdist.infer.solution import TransformedSolution
-from bayesdist.infer.transforms import LinearTerms, bare_model, linear_terms, reference_gauge
+from bayesdist.infer.solution.linear import DEFAULT_REJECTION, Rejection, fit_linear
+from bayesdist.infer.solution.solution import TransformedSolution
+from bayesdist.infer.solution.transforms import (
+    LinearTerms,
+    bare_model,
+    linear_terms,
+    reference_gauge,
+)
 from bayesdist.model import DistortionModel
+from bayesdist.utils.arrays import Float
 
 
 @dataclass(frozen=True, eq=False)

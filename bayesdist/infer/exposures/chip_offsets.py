@@ -19,8 +19,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from bayesdist.arrays import Bool, Float, Int
 from bayesdist.model import DistortionModel, Groups
+from bayesdist.utils.arrays import Bool, Float, Int
 
 AXES = ("u", "v")
 

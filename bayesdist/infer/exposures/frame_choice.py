@@ -8,7 +8,7 @@ import numpy as np
 
 from bayesdist.data.matches import Matches
 from bayesdist.errors import InputError
-from bayesdist.infer.linear import Rejection, fit_linear, residuals
+from bayesdist.infer.solution.linear import Rejection, fit_linear, residuals
 from bayesdist.model import DistortionModel
 from bayesdist.model.frames import FRAME_KINDS
 

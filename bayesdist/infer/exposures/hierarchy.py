@@ -25,22 +25,22 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import ArrayLike
 
-from bayesdist.arrays import Bool, Float, Int
 from bayesdist.data.matches import Matches
-from bayesdist.distributions import f_sf
 from bayesdist.errors import DegenerateError, InputError
 from bayesdist.infer.equations.normal import least_squares
 from bayesdist.infer.equations.priors import GaussianPriors
 from bayesdist.infer.equations.scaled import one_thread
 from bayesdist.infer.exposures.chip_offsets import Settling
 from bayesdist.infer.exposures.scatter import Scatter
-from bayesdist.infer.linear import DEFAULT_REJECTION, LinearFit, Rejection, fit_linear
-from bayesdist.infer.solution import Solution
+from bayesdist.infer.solution.linear import DEFAULT_REJECTION, LinearFit, Rejection, fit_linear
+from bayesdist.infer.solution.solution import Solution
+from bayesdist.infer.solution.transforms import bare_model, reference_gauge
 from bayesdist.infer.stars.likelihood import ClippedGaussian
 from bayesdist.infer.stars.loading import opened
 from bayesdist.infer.stars.shards import Shards
-from bayesdist.infer.transforms import bare_model, reference_gauge
 from bayesdist.model import DistortionModel
+from bayesdist.utils.arrays import Bool, Float, Int
+from bayesdist.utils.distributions import f_sf
 
 SCALE = 1e-4  # of the prior on tau: variation of the scale by velocity aberration in a year
 # A focal plane that breathes moves its chips too: then the gap's deviations repeat those of scale

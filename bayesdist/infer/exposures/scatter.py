@@ -24,9 +24,9 @@ import numpy as np
 from scipy.optimize import minimize
 from scipy.special import logsumexp
 
-from bayesdist.arrays import Bool, Float, Int
 from bayesdist.infer.density.piecewise import PiecewiseExponential
 from bayesdist.infer.equations.arrow import Arrow, ArrowFactor
+from bayesdist.utils.arrays import Bool, Float, Int
 
 DEGREES = 4.0  # of freedom of the prior on tau, a half-Student-t
 MESH = np.concatenate([np.arange(-10.0, -3.0), np.arange(-3.0, 4.25, 0.5), [5.0, 7.0]])  # sigmas

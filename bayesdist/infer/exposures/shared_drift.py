@@ -11,13 +11,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from bayesdist.arrays import Float
 from bayesdist.errors import DegenerateError, InputError
 from bayesdist.infer.equations.scaled import scaled_inverse, unit_diagonal
-from bayesdist.infer.solution import DerivedSolution, Solution
-from bayesdist.infer.transforms import reference_gauge, without_frames
+from bayesdist.infer.solution.solution import DerivedSolution, Solution
+from bayesdist.infer.solution.transforms import reference_gauge, without_frames
 from bayesdist.model import DistortionModel
 from bayesdist.model.similarity import turned, turned_model
+from bayesdist.utils.arrays import Float
 
 
 @dataclass(frozen=True, eq=False)

@@ -15,8 +15,8 @@ from typing import Any
 import numba as nb
 import numpy as np
 
-from bayesdist.arrays import Int
 from bayesdist.infer.kernel.lanes import FAST
+from bayesdist.utils.arrays import Int
 
 # how a pass is compiled: without a check for division by zero, which would exclude vectors
 PASS: dict[str, Any] = {"cache": True, "nogil": True, "fastmath": FAST, "error_model": "numpy"}

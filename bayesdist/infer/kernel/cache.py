@@ -16,7 +16,7 @@ from pathlib import Path
 
 from numba import config
 
-from bayesdist.reading.regular import read_bytes
+from bayesdist.files.regular import read_bytes
 
 log = logging.getLogger("bayesdist")
 

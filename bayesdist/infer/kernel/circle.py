@@ -23,9 +23,9 @@ import math
 import numba as nb
 import numpy as np
 
-from bayesdist.arrays import Float, Int
 from bayesdist.infer.kernel.lanes import FAST
 from bayesdist.infer.kernel.numeric import exp_negative
+from bayesdist.utils.arrays import Float, Int
 
 SURE = 8.6**2  # squared errors from the edge within which the probability is 1 to the last digit
 # smallest resolved squared error over radius; steeper edges are blurred to it, which concerns stars

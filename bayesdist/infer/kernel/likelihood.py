@@ -7,7 +7,6 @@ import math
 import numba as nb
 import numpy as np
 
-from bayesdist.arrays import Float, Int
 from bayesdist.infer.kernel.blocks import PASS, lay_out, scratch, share_out, threads_for
 from bayesdist.infer.kernel.lanes import (
     WIDTH,
@@ -23,6 +22,7 @@ from bayesdist.infer.kernel.lanes import (
 from bayesdist.infer.kernel.mixture import Constants, log_of_product, packed
 from bayesdist.infer.kernel.numeric import exp_negative, inverse_root
 from bayesdist.infer.kernel.polynomial import evaluate
+from bayesdist.utils.arrays import Float, Int
 
 SCRATCH = 16_000_000  # bytes of partial sums in memory at a time
 

@@ -12,10 +12,10 @@ from typing import NamedTuple
 import numba as nb
 import numpy as np
 
-from bayesdist.arrays import Float
 from bayesdist.infer.kernel.blocks import BLOCK
 from bayesdist.infer.kernel.lanes import WIDTH, choose, load, product, spread, total
 from bayesdist.infer.kernel.numeric import bits_of, from_bits
+from bayesdist.utils.arrays import Float
 
 NO_OUTLIERS, GAUSSIAN, UNIFORM = 0, 1, 2
 NEVER = 1e300  # chi-square of an outlier where there are none

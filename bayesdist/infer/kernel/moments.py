@@ -15,7 +15,6 @@ import numba as nb
 import numpy as np
 from numpy.polynomial import legendre as series
 
-from bayesdist.arrays import Float, Int
 from bayesdist.infer.kernel.blocks import BLOCK, PASS, lay_out, scratch, share_out, threads_for
 from bayesdist.infer.kernel.lanes import (
     AT_MOST,
@@ -34,6 +33,7 @@ from bayesdist.infer.kernel.lanes import (
 from bayesdist.infer.kernel.mixture import Constants, log_of_product, packed
 from bayesdist.infer.kernel.numeric import exp_negative, inverse_root
 from bayesdist.infer.kernel.polynomial import evaluate, legendre
+from bayesdist.utils.arrays import Float, Int
 
 PIECE = 4096
 EVALUATIONS = 10  # cost of the sums of one star, in likelihood evaluations

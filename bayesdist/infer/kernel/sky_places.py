@@ -9,9 +9,9 @@ from __future__ import annotations
 import numba as nb
 import numpy as np
 
-from bayesdist.arrays import Float, Int
 from bayesdist.infer.kernel.blocks import PASS, share_out
 from bayesdist.infer.kernel.lanes import FAST
+from bayesdist.utils.arrays import Float, Int
 
 
 @nb.njit(cache=True, forceinline=True, fastmath=FAST)

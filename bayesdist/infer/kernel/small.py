@@ -11,11 +11,11 @@ import math
 import numba as nb
 import numpy as np
 
-from bayesdist.arrays import Float
 from bayesdist.infer.kernel.blocks import PASS
 from bayesdist.infer.kernel.lanes import FAST
 from bayesdist.infer.kernel.numeric import exp_negative
 from bayesdist.infer.kernel.star_modes import cholesky
+from bayesdist.utils.arrays import Float
 
 SUMS = PASS | {"fastmath": FAST | {"reassoc"}}
 

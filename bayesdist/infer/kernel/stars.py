@@ -7,11 +7,11 @@ import math
 import numba as nb
 import numpy as np
 
-from bayesdist.arrays import Float, Int
 from bayesdist.infer.kernel.blocks import PASS, lay_out, scratch, share_out, threads_for
 from bayesdist.infer.kernel.mixture import Constants, packed
 from bayesdist.infer.kernel.numeric import exp_negative
 from bayesdist.infer.kernel.polynomial import evaluate
+from bayesdist.utils.arrays import Float, Int
 
 
 @nb.njit(**PASS)

@@ -14,7 +14,6 @@ import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesdist.arrays import Float, Int
 from bayesdist.infer.kernel.blocks import PASS, share_out
 from bayesdist.infer.kernel.lanes import FAST
 from bayesdist.infer.kernel.sky_places import legendre
@@ -35,6 +34,7 @@ from bayesdist.infer.kernel.star_modes import (
     summed_over_members,
     to_mode,
 )
+from bayesdist.utils.arrays import Float, Int
 
 Flags = NDArray[np.int8]
 

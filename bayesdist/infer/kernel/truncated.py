@@ -18,7 +18,6 @@ from typing import Any
 import numba as nb
 import numpy as np
 
-from bayesdist.arrays import Float, Int
 from bayesdist.infer.kernel.blocks import BLOCK, PASS, lay_out, scratch, share_out, threads_for
 from bayesdist.infer.kernel.circle import MOST, NODES, log_circle, slopes
 from bayesdist.infer.kernel.lanes import FAST
@@ -36,6 +35,7 @@ from bayesdist.infer.kernel.moments import (
 )
 from bayesdist.infer.kernel.numeric import exp_negative
 from bayesdist.infer.kernel.polynomial import evaluate, legendre
+from bayesdist.utils.arrays import Float, Int
 
 SCRATCH = 16_000_000  # bytes of partial sums in memory at a time
 INTEGRAL = 30  # cost of a star, in likelihood evaluations without a circle

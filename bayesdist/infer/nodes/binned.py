@@ -16,12 +16,12 @@ import scipy.sparse
 from numpy.typing import ArrayLike
 from scipy import ndimage
 
-from bayesdist.arrays import Bool, Float, Int
 from bayesdist.errors import DegenerateError, InputError
 from bayesdist.infer.nodes.field import checked_stars
 from bayesdist.infer.nodes.grid import STEP, NodeGrid
 from bayesdist.model import Chip
 from bayesdist.model.lookup import LookupTable
+from bayesdist.utils.arrays import Bool, Float, Int
 
 PASSES = 20  # of the clipping, at most
 OWN_SCATTER = 5  # stars from which on a bin's error is from its own scatter

@@ -8,7 +8,6 @@ from functools import partial
 import numpy as np
 from numpy.typing import ArrayLike
 
-from bayesdist.arrays import Float
 from bayesdist.errors import InputError
 from bayesdist.infer.equations.scaled import one_thread
 from bayesdist.infer.kernel.blocks import at_once
@@ -23,6 +22,7 @@ from bayesdist.infer.nodes.mixture import jitter_variance
 from bayesdist.infer.nodes.posterior import TablePosterior, axis_posterior
 from bayesdist.infer.nodes.sums import BLOCK, NodeSums, node_sums
 from bayesdist.model import Chip
+from bayesdist.utils.arrays import Float
 
 STEADY = 1e-5  # change of the stars' typical variance that is small against any error of the jitter
 MAX_ITERATIONS = 6

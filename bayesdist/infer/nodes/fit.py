@@ -16,11 +16,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from bayesdist.arrays import Bool, Float
 from bayesdist.data.matches import Matches
 from bayesdist.errors import InputError
 from bayesdist.infer.equations.scaled import one_thread
-from bayesdist.infer.linear import LinearFit, fit_linear
 from bayesdist.infer.nodes.binned import binned_table
 from bayesdist.infer.nodes.field import field_table
 from bayesdist.infer.nodes.grid import STEP
@@ -29,8 +27,10 @@ from bayesdist.infer.nodes.mixture import ResidualMixture, fit_mixture
 from bayesdist.infer.nodes.pixels import corrected_matches, on_the_chips, pixel_shifts
 from bayesdist.infer.nodes.posterior import TablePosterior
 from bayesdist.infer.nodes.table_fit import Iteration, TableFit, table_of
+from bayesdist.infer.solution.linear import LinearFit, fit_linear
 from bayesdist.model import DistortionModel
 from bayesdist.model.lookup import LookupTable
+from bayesdist.utils.arrays import Bool, Float
 
 LIKELY = 0.5  # stars that are less likely true matches are left out
 SEARCHED = 2  # iterations that optimise hyperparameters, which are fixed in later ones

@@ -14,10 +14,10 @@ import numpy as np
 import scipy.linalg
 import scipy.sparse
 
-from bayesdist.arrays import Float, Int
 from bayesdist.errors import InputError
 from bayesdist.model import Chip, PolynomialBasis
 from bayesdist.model.lookup import LookupTable
+from bayesdist.utils.arrays import Float, Int
 
 STEP = (64.0, 64.0)  # pixels: the grid of D2IMFILE and NPOLFILE
 

@@ -16,9 +16,9 @@ import numpy as np
 import scipy.linalg
 from scipy.optimize import minimize
 
-from bayesdist.arrays import Float, Int
 from bayesdist.infer.nodes.grid import NodeGrid
 from bayesdist.infer.nodes.sums import NodeSums
+from bayesdist.utils.arrays import Float, Int
 
 SMOOTHNESS = (0.5, 1.5, 2.5)
 

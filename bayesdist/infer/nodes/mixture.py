@@ -11,9 +11,9 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.optimize import brentq
 
-from bayesdist.arrays import Float
 from bayesdist.infer.stars.likelihood import good_probability
 from bayesdist.infer.stars.mixture import OUTLIER_MODE, OUTLIER_SHAPE, OutlierMixture
+from bayesdist.utils.arrays import Float
 
 SAMPLE = 200_000  # stars from which the mixture's three numbers are estimated
 STEPS = 200

@@ -7,13 +7,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from bayesdist.arrays import Bool, Float
 from bayesdist.data.matches import Matches
 from bayesdist.errors import DegenerateError
-from bayesdist.infer.solution import Solution
+from bayesdist.infer.solution.solution import Solution
 from bayesdist.infer.stars.stars import errors_of, groups_of
 from bayesdist.model import DistortionModel
 from bayesdist.model.lookup import LookupTable, corrected
+from bayesdist.utils.arrays import Bool, Float
 
 FOLDED = 1e-6  # area of a pixel's image over the square of its sides
 

@@ -8,11 +8,11 @@ import numpy as np
 import scipy.linalg
 from numpy.typing import ArrayLike
 
-from bayesdist.arrays import Float
 from bayesdist.infer.nodes.grid import NodeGrid
 from bayesdist.infer.nodes.hyperparameters import FittedField, Matern, cholesky
 from bayesdist.infer.nodes.sums import NodeSums
 from bayesdist.model.lookup import LookupTable
+from bayesdist.utils.arrays import Float
 
 BLOCK = 2048  # pixels whose rows over all nodes are in memory at once
 COLUMNS = 512  # of a symmetric product, of which no more than one triangle is made

@@ -14,10 +14,10 @@ import numpy as np
 import scipy.linalg
 import scipy.sparse
 
-from bayesdist.arrays import Float
 from bayesdist.errors import DegenerateError
 from bayesdist.infer.nodes.grid import NodeGrid
 from bayesdist.infer.stars.sums import Sums
+from bayesdist.utils.arrays import Float
 
 BLOCK = 65_536  # stars at once: their polynomials take 11 MB at order 5
 

@@ -8,14 +8,14 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from bayesdist.arrays import Float
 from bayesdist.data.matches import Matches
 from bayesdist.errors import InputError
-from bayesdist.infer.linear import LinearFit
 from bayesdist.infer.nodes.mixture import ResidualMixture
 from bayesdist.infer.nodes.pixels import corrected_matches, on_the_chips
 from bayesdist.infer.nodes.posterior import TablePosterior
+from bayesdist.infer.solution.linear import LinearFit
 from bayesdist.model.lookup import LookupTable, corrected
+from bayesdist.utils.arrays import Float
 
 BLOCK = 1024  # positions whose rows over all nodes are in memory at once
 

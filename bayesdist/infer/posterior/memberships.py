@@ -6,7 +6,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from bayesdist.arrays import Float, Int
 from bayesdist.data.matches import Matches
 from bayesdist.infer.kernel import Constants
 from bayesdist.infer.posterior.posterior import Posterior
@@ -14,6 +13,7 @@ from bayesdist.infer.stars.likelihood import star_averages, star_log_likelihoods
 from bayesdist.infer.stars.mixture import Hyper
 from bayesdist.infer.stars.shards import Shards
 from bayesdist.infer.stars.stars import Stars, in_table_order, prepare
+from bayesdist.utils.arrays import Float, Int
 
 MOST_DRAWS, LEAST_DRAWS = 64, 8
 AT_A_TIME = 1_000_000  # log-likelihoods of a star that are in memory beside the result

@@ -7,12 +7,12 @@ from functools import cached_property
 
 import numpy as np
 
-from bayesdist.arrays import Float
 from bayesdist.infer.convergence import Convergence
-from bayesdist.infer.solution import Solution
+from bayesdist.infer.solution.solution import Solution
 from bayesdist.infer.stars.likelihood import MixtureAt
 from bayesdist.infer.stars.mixture import Hyper, OutlierMixture
 from bayesdist.model import DistortionModel
+from bayesdist.utils.arrays import Float
 
 
 @dataclass(frozen=True)

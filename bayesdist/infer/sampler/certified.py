@@ -12,7 +12,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from bayesdist.arrays import Float
 from bayesdist.errors import InputError
 from bayesdist.infer.convergence import diagnose
 from bayesdist.infer.density.laplace import Node
@@ -24,6 +23,7 @@ from bayesdist.infer.sampler.move_schedule import Plan, expected_passes
 from bayesdist.infer.sampler.proposal_batch import ProposalBatch, pilot_batch
 from bayesdist.infer.sampler.surrogate import Surrogate, certify, draw_surrogate
 from bayesdist.infer.sampler.whitening import Whitening
+from bayesdist.utils.arrays import Float
 
 SECOND_STAGES = ("auto", "always", "never")
 PILOTS = 400  # passes that the certificate costs

@@ -16,7 +16,6 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from bayesdist.arrays import Float
 from bayesdist.errors import DegenerateError, InputError
 from bayesdist.infer.convergence import (
     Convergence,
@@ -50,7 +49,8 @@ from bayesdist.infer.sampler.move_schedule import (
 )
 from bayesdist.infer.sampler.proposal_batch import ProposalBatch, pilot_batch
 from bayesdist.infer.sampler.whitening import Whitening
-from bayesdist.limits import PARETO_K
+from bayesdist.utils.arrays import Float
+from bayesdist.utils.limits import PARETO_K
 
 if TYPE_CHECKING:
     from bayesdist.infer.sampler.ensembles import Ensembles

@@ -15,11 +15,11 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesdist.arrays import Float
 from bayesdist.errors import InputError
-from bayesdist.files import atomic_path
-from bayesdist.reading.faults import restoring
-from bayesdist.reading.hdf5 import hdf5_arrays
+from bayesdist.files.atomic import atomic_path
+from bayesdist.files.faults import restoring
+from bayesdist.files.hdf5 import hdf5_arrays
+from bayesdist.utils.arrays import Float
 
 BLOCK_ARRAYS = ("coords", "log_prob", "accepted", "log_weights")
 END_ARRAYS = ("log_q", "random_keys", "random_state")

@@ -24,7 +24,6 @@ import emcee
 import numpy as np
 from emcee.moves import DEMove, MHMove
 
-from bayesdist.arrays import Bool, Float, Int
 from bayesdist.errors import InputError
 from bayesdist.infer.density.proposal import Proposal
 from bayesdist.infer.density.target import Density
@@ -32,6 +31,7 @@ from bayesdist.infer.sampler.checkpoints import Block, Walkers, block_path
 from bayesdist.infer.sampler.move_schedule import Plan, StepRange
 from bayesdist.infer.sampler.proposal_batch import ProposalBatch, draw_batch
 from bayesdist.infer.sampler.whitening import Whitening
+from bayesdist.utils.arrays import Bool, Float, Int
 
 START_BATCHES = 20  # further batches of proposals that are searched for starts of walkers
 

@@ -11,9 +11,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from bayesdist.distributions import chi2_isf
 from bayesdist.infer.convergence import Convergence, Limits
-from bayesdist.limits import DRAWS_PER_WALKER, PARETO_K
+from bayesdist.utils.distributions import chi2_isf
+from bayesdist.utils.limits import DRAWS_PER_WALKER, PARETO_K
 
 FIRST_CHECK = 50  # steps after which state-dependent moves are first judged
 PILOT = 512  # smallest number of proposals that judge the proposal

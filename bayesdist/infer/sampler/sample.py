@@ -18,17 +18,17 @@ from bayesdist.infer.density.proposal import GridProposal
 from bayesdist.infer.density.target import Target
 from bayesdist.infer.equations.priors import GaussianPriors
 from bayesdist.infer.equations.scaled import one_thread
-from bayesdist.infer.linear import LinearFit
 from bayesdist.infer.posterior import Posterior
 from bayesdist.infer.posterior.memberships import count_outliers
 from bayesdist.infer.sampler.certified import run_certified
 from bayesdist.infer.sampler.chains import Settings, ensemble_seeds, run_chains
 from bayesdist.infer.sampler.checkpoints import read_arrays, write_arrays
+from bayesdist.infer.solution.linear import LinearFit
 from bayesdist.infer.stars.loading import opened
 from bayesdist.infer.stars.mixture import OutlierMixture
 from bayesdist.infer.stars.shards import Compute, Shards
 from bayesdist.infer.stars.stars import Stars
-from bayesdist.memory import require_memory
+from bayesdist.utils.memory import require_memory
 
 STEPS_KEPT = 100  # at least, of each walker
 METHODS = ("exact", "certified")

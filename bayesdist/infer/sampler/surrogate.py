@@ -36,13 +36,13 @@ from math import factorial
 import numpy as np
 from numpy.polynomial import hermite_e
 
-from bayesdist.arrays import Float
 from bayesdist.errors import InputError, NotConvergedError
 from bayesdist.infer.convergence import importance_efficiency, pareto_k
 from bayesdist.infer.density.proposal import Random
 from bayesdist.infer.posterior import Certificate
 from bayesdist.infer.sampler.move_schedule import EFFICIENT
-from bayesdist.limits import PARETO_K
+from bayesdist.utils.arrays import Float
+from bayesdist.utils.limits import PARETO_K
 
 DEGREE = 3  # of the polynomial in the hyperparameters
 LEAST_TRAINING = 20

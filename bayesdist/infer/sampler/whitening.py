@@ -6,10 +6,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from bayesdist.arrays import Float
 from bayesdist.infer.density.proposal import Proposal
 from bayesdist.infer.density.target import Density
 from bayesdist.infer.equations.arrow import ArrowFactor
+from bayesdist.utils.arrays import Float
 
 
 @dataclass(frozen=True, eq=False)

@@ -8,7 +8,6 @@ from functools import partial
 
 import numpy as np
 
-from bayesdist.arrays import Float, Int
 from bayesdist.data.detections import Detections
 from bayesdist.data.matching.friends import Friends, friends_of_friends
 from bayesdist.errors import NotSettledError
@@ -21,6 +20,7 @@ from bayesdist.infer.selfcal.problem import Problem, StarPriors, prepare
 from bayesdist.infer.selfcal.tangent import TangentPlane, places_of
 from bayesdist.infer.stars.shards import Compute
 from bayesdist.model import DistortionModel
+from bayesdist.utils.arrays import Float, Int
 
 MAX_ITERATIONS = 12
 SHRINK = 0.5  # smallest factor on the linking length from one iteration to the next

@@ -6,11 +6,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from bayesdist.arrays import Float, Int
 from bayesdist.infer.selfcal.elimination import Mixture, eliminated_rows, memberships
 from bayesdist.infer.selfcal.mode import SelfCalibrationMode
 from bayesdist.infer.selfcal.pieces import StarPiece, in_pieces
 from bayesdist.infer.stars.shards import Compute
+from bayesdist.utils.arrays import Float, Int
 
 
 @dataclass(frozen=True, eq=False)

@@ -17,12 +17,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesdist.arrays import Float, Int
 from bayesdist.infer import kernel
 from bayesdist.infer.kernel.blocks import threads_for
 from bayesdist.infer.kernel.moments import product_table
 from bayesdist.infer.selfcal.problem import Problem
 from bayesdist.infer.stars.sums import Sums
+from bayesdist.utils.arrays import Float, Int
 
 STARS = 4096  # eliminated at a time
 SURE, NEVER = 0.99, 1e-6  # memberships beyond which no other choice is considered

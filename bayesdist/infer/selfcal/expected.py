@@ -10,15 +10,15 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from bayesdist.arrays import Float
 from bayesdist.data.detections import Detections
 from bayesdist.infer.equations.priors import Prior
 from bayesdist.infer.selfcal.elimination import Mixture, expand
 from bayesdist.infer.selfcal.gauge import Gauge, find_gauge
 from bayesdist.infer.selfcal.problem import Problem, prepare
 from bayesdist.infer.selfcal.sky_moves import gauge_free_matrix
-from bayesdist.infer.solution import Solution
+from bayesdist.infer.solution.solution import Solution
 from bayesdist.model import DistortionModel
+from bayesdist.utils.arrays import Float
 
 BOUNDED = 1e-3  # fraction of a free direction that the others may leave unexplained
 NONE_FALSE = Mixture(jitter=0.0, fraction=1e-300)

@@ -13,7 +13,6 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.linalg import qr
 
-from bayesdist.arrays import Float, Int
 from bayesdist.infer.equations.priors import Prior
 from bayesdist.infer.selfcal.problem import Problem
 from bayesdist.infer.selfcal.sky_moves import (
@@ -27,6 +26,7 @@ from bayesdist.infer.selfcal.sky_moves import (
     rates,
 )
 from bayesdist.model import DistortionModel
+from bayesdist.utils.arrays import Float, Int
 
 NULL = 1e-10  # of the largest eigenvalue: no information
 ROUNDING = 1e-13  # of the largest eigenvalue: less is only rounding

@@ -15,16 +15,16 @@ from functools import cached_property
 
 import numpy as np
 
-from bayesdist.arrays import Float, Int
 from bayesdist.errors import DegenerateError, NotSettledError
 from bayesdist.infer.equations.priors import Prior
-from bayesdist.infer.linear import LinearFit
 from bayesdist.infer.selfcal import pieces as of
 from bayesdist.infer.selfcal.elimination import Expansion, Mixture
 from bayesdist.infer.selfcal.gauge import Decision, Gauge, find_gauge
 from bayesdist.infer.selfcal.problem import Problem
+from bayesdist.infer.solution.linear import LinearFit
 from bayesdist.infer.stars.likelihood import Clip
 from bayesdist.infer.stars.shards import Compute, MappedPieces
+from bayesdist.utils.arrays import Float, Int
 
 PriorAt = Callable[[Float], Prior]  # linearised at parameters (D,)
 

@@ -14,7 +14,6 @@ from typing import Any, Self
 
 import numpy as np
 
-from bayesdist.arrays import Float
 from bayesdist.infer.selfcal.elimination import (
     Expansion,
     Mixture,
@@ -24,6 +23,7 @@ from bayesdist.infer.selfcal.elimination import (
 )
 from bayesdist.infer.selfcal.problem import Problem, StarPriors
 from bayesdist.infer.stars.shards import Compute, MappedPieces, Task
+from bayesdist.utils.arrays import Float
 
 PIECE = 2**17  # detections: some tenths of a second for the draws that are evaluated together
 

@@ -16,7 +16,6 @@ from pathlib import Path
 
 import numpy as np
 
-from bayesdist.arrays import Float
 from bayesdist.errors import DegenerateError
 from bayesdist.infer.convergence import Limits
 from bayesdist.infer.density.coordinates import Split
@@ -33,6 +32,7 @@ from bayesdist.infer.selfcal.pieces import in_pieces, log_density, slope, to_sam
 from bayesdist.infer.selfcal.problem import Problem
 from bayesdist.infer.stars.mixture import Hyper, OutlierMixture
 from bayesdist.infer.stars.shards import Compute, Pieces
+from bayesdist.utils.arrays import Float
 
 DROP = 18.0  # distance (in log density) below the top to which the nodes extend
 N_NODES = 13  # 9 lose 0.2 % of the draws where the jitter has no lower end, 25 gain nothing

@@ -13,13 +13,13 @@ from typing import Any
 import numpy as np
 from scipy.spatial import cKDTree
 
-from bayesdist.arrays import Float, Int
 from bayesdist.data.catalog import ReferenceCatalog
 from bayesdist.data.matching.linear_map import MIN_PAIRS, LinearMap, iterated_map
 from bayesdist.errors import InputError
 from bayesdist.infer.equations.priors import Prior
 from bayesdist.infer.selfcal.problem import Problem, StarPriors
 from bayesdist.model import DistortionModel
+from bayesdist.utils.arrays import Float, Int
 
 MIN_REFERENCE_STARS = 2  # reference stars that fix position, rotation and scale
 MAX_DISTANCE = 5.0  # times the median from the map: not the reference star, but a neighbour

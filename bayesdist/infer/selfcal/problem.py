@@ -8,13 +8,13 @@ from functools import cached_property
 import numpy as np
 from scipy import ndimage
 
-from bayesdist.arrays import Bool, Float, Int
 from bayesdist.data.detections import Detections
 from bayesdist.errors import InputError
 from bayesdist.infer import kernel
 from bayesdist.infer.kernel.blocks import threads_for
 from bayesdist.model import DistortionModel
 from bayesdist.model.grouping import Groups
+from bayesdist.utils.arrays import Bool, Float, Int
 
 MIN_DETECTIONS = 2  # of a star that gives information about the distortion
 MOTIONS = {"none": 2, "proper_motion": 4, "parallax": 5}

@@ -6,9 +6,9 @@ from itertools import combinations
 
 import numpy as np
 
-from bayesdist.arrays import Float
-from bayesdist.infer.solution import Solution
+from bayesdist.infer.solution.solution import Solution
 from bayesdist.model import DistortionModel
+from bayesdist.utils.arrays import Float
 
 # of the linear maps of the sky
 GENERATORS = {

@@ -9,10 +9,10 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from bayesdist.arrays import Float, Int
 from bayesdist.data.matching.frames import MutualFrames
 from bayesdist.data.matching.linear_map import LinearMap
 from bayesdist.model import Chip, DistortionModel, PolynomialBasis
+from bayesdist.utils.arrays import Float, Int
 
 Start = Callable[[Float, Float, int], Float]
 

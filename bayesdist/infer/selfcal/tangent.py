@@ -13,10 +13,10 @@ from typing import Any
 
 import numpy as np
 
-from bayesdist.arrays import Float
 from bayesdist.data.detections import Detections
 from bayesdist.data.sky.tangent import ARCSEC
 from bayesdist.model import DistortionModel
+from bayesdist.utils.arrays import Float
 
 STEPS = 3  # of Newton's method, each of which leaves a hundredth or less
 

@@ -13,9 +13,9 @@ from collections.abc import Callable
 
 import numpy as np
 
-from bayesdist.arrays import Bool, Float, Int
 from bayesdist.infer.series.design import Design
 from bayesdist.infer.series.trend import MIN_EXPOSURES_FOUND
+from bayesdist.utils.arrays import Bool, Float, Int
 
 # log marginal likelihood (C, M) of dates (C, M, B), up to a constant for each chain
 Likelihood = Callable[[Float], Float]

@@ -6,7 +6,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from bayesdist.arrays import Float
 from bayesdist.infer.convergence import Convergence, Limits, diagnose
 from bayesdist.infer.kernel import precisions
 from bayesdist.infer.series.breaks import BreakMoves
@@ -14,6 +13,7 @@ from bayesdist.infer.series.gibbs import draw_trend, sweep
 from bayesdist.infer.series.problem import Problem, State, break_likelihood
 from bayesdist.infer.series.scatter import FRACTION_PRIOR, KAPPA_RATE, MAX_FRACTION
 from bayesdist.infer.series.series import MAD_TO_SIGMA
+from bayesdist.utils.arrays import Float
 
 ENSEMBLES = 4  # the chains are judged in as many groups
 N_SCANS = 10  # sweeps of the warm-up in which breaks are drawn among all gaps

@@ -18,8 +18,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 from astropy.table import Table
 
-from bayesdist.arrays import Float, Int
-from bayesdist.distributions import t_ppf
 from bayesdist.errors import InputError
 from bayesdist.infer.kernel import precisions
 from bayesdist.infer.series.breaks import BreakMoves
@@ -30,6 +28,8 @@ from bayesdist.infer.series.posterior import Change, SeriesPosterior
 from bayesdist.infer.series.problem import WIDE, Problem, normal_equations
 from bayesdist.infer.series.series import Series
 from bayesdist.infer.series.trend import KINDS, TrendModel
+from bayesdist.utils.arrays import Float, Int
+from bayesdist.utils.distributions import t_ppf
 
 MIN_DIFFERENCE = 4.0
 CONFIDENCE = 0.95

@@ -16,10 +16,10 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import ArrayLike
 
-from bayesdist.arrays import Float, Int
 from bayesdist.errors import DegenerateError
 from bayesdist.infer.series.series import Series
 from bayesdist.infer.series.trend import MIN_EXPOSURES_FOUND, TrendModel
+from bayesdist.utils.arrays import Float, Int
 
 
 @dataclass(frozen=True, eq=False)

@@ -28,7 +28,6 @@ from dataclasses import replace
 import numpy as np
 from scipy.special import betainc, betaincinv, gammainc, gammaincinv
 
-from bayesdist.arrays import Float
 from bayesdist.infer.kernel import densities, draw_deviations, gaussians, precisions, shear
 from bayesdist.infer.series.breaks import BreakMoves
 from bayesdist.infer.series.problem import Problem, State, break_likelihood, trend_equations
@@ -42,6 +41,7 @@ from bayesdist.infer.series.scatter import (
     draw_scatter,
     scale_prior,
 )
+from bayesdist.utils.arrays import Float
 
 DRIFT_NU, DRIFT_SCALE = 2.0, 1.0
 N_DRIFT_MOVES = 2  # amplitudes that a sweep moves with all else of the trend integrated out

@@ -12,13 +12,13 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import ndtr
 
-from bayesdist.arrays import Float, Int
 from bayesdist.infer.convergence import smoothed_weights
 from bayesdist.infer.equations.scaled import one_thread
 from bayesdist.infer.kernel import densities
 from bayesdist.infer.series.posterior import SeriesPosterior
 from bayesdist.infer.series.problem import State
-from bayesdist.limits import PARETO_K
+from bayesdist.utils.arrays import Float, Int
+from bayesdist.utils.limits import PARETO_K
 
 CHAINS, WARMUP, SWEEPS = 6, 30, 60
 CHAINS_AT_ONCE = 192

@@ -8,7 +8,6 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import ArrayLike
 
-from bayesdist.arrays import Float
 from bayesdist.errors import InputError
 from bayesdist.infer.convergence import Convergence
 from bayesdist.infer.equations.scaled import chi_square
@@ -17,6 +16,7 @@ from bayesdist.infer.series.design import Design
 from bayesdist.infer.series.problem import State
 from bayesdist.infer.series.series import Series
 from bayesdist.infer.series.trend import TrendModel
+from bayesdist.utils.arrays import Float
 
 
 @dataclass(frozen=True, eq=False)

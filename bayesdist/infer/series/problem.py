@@ -7,11 +7,11 @@ from functools import cached_property
 
 import numpy as np
 
-from bayesdist.arrays import Bool, Float, Int
 from bayesdist.infer.kernel import gaussians
 from bayesdist.infer.series.breaks import Likelihood
 from bayesdist.infer.series.design import Design
 from bayesdist.infer.series.series import Series
+from bayesdist.utils.arrays import Bool, Float, Int
 
 WIDE = 100.0  # prior standard deviation of the trend's parameters
 CANDIDATES_AT_ONCE = 8

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from bayesdist.arrays import Float
+from bayesdist.utils.arrays import Float
 
 NU = 2.0
 PRIOR_SCALE = 1.0

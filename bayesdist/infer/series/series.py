@@ -9,8 +9,8 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import ArrayLike
 
-from bayesdist.arrays import Float, Int
 from bayesdist.errors import DegenerateError, InputError
+from bayesdist.utils.arrays import Float, Int
 
 MAD_TO_SIGMA = 1.4826
 

@@ -6,11 +6,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from bayesdist.arrays import Float
 from bayesdist.infer.series.compare import Comparison, compare
 from bayesdist.infer.series.posterior import SeriesPosterior
 from bayesdist.infer.series.series import Series
 from bayesdist.infer.series.trend import TrendModel
+from bayesdist.utils.arrays import Float
 
 MIN_SIGNIFICANCE = 3.0  # sigma from which a coefficient's own slope or step is named
 CLAIMS = {

@@ -7,12 +7,12 @@ from typing import Protocol
 
 import numpy as np
 
-from bayesdist.arrays import Bool, Float
 from bayesdist.data.matches import Matches
 from bayesdist.infer import kernel
 from bayesdist.infer.kernel import GAUSSIAN, Constants
 from bayesdist.infer.stars.stars import Stars, in_table_order, prepare
 from bayesdist.model import DistortionModel
+from bayesdist.utils.arrays import Bool, Float
 
 
 class Likelihood(Protocol):

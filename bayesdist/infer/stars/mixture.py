@@ -30,10 +30,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.special import expit, gammaln, log_expit, logit
 
-from bayesdist.arrays import Float
 from bayesdist.errors import InputError, required
 from bayesdist.infer import kernel
 from bayesdist.infer.kernel import Constants
+from bayesdist.utils.arrays import Float
 
 HYPER_NAMES = {"j": "log j", "f": "logit f", "s_out": "log s_out"}
 KINDS = {"none": kernel.NO_OUTLIERS, "gaussian": kernel.GAUSSIAN, "uniform": kernel.UNIFORM}

@@ -9,12 +9,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesdist.arrays import Float, Int
 from bayesdist.data.matches import Matches
 from bayesdist.errors import InputError
 from bayesdist.infer import kernel
 from bayesdist.infer.kernel import Constants
 from bayesdist.model import DistortionModel, Groups
+from bayesdist.utils.arrays import Float, Int
 
 NOBODY = np.zeros(0, np.int64)
 

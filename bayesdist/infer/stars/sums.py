@@ -9,8 +9,8 @@ from typing import Any, ClassVar, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesdist.arrays import Int
 from bayesdist.model import Groups, merge_groups
+from bayesdist.utils.arrays import Int
 
 Rows = tuple[Int, ...]
 

@@ -8,11 +8,11 @@ from itertools import chain
 import numpy as np
 from scipy.spatial import ConvexHull, QhullError
 
-from bayesdist.arrays import Float, Int
 from bayesdist.data.matches import Matches
 from bayesdist.errors import InputError
 from bayesdist.infer.stars.stars import Stars
 from bayesdist.model import Groups, merge_groups
+from bayesdist.utils.arrays import Float, Int
 
 # relative distance by which a star at the edge of its circle may seem to lie outside
 ROUNDING = 1e-6

@@ -11,12 +11,12 @@ import numpy as np
 
 from bayesdist.app.screen import progress_bar, table_text
 from bayesdist.app.store.record import write_text
-from bayesdist.arrays import Float
 from bayesdist.errors import InputError
-from bayesdist.infer.solution import Solution
+from bayesdist.infer.solution.solution import Solution
 from bayesdist.missions.acs.simulate import AcsCampaign, acs_solution, simulate_acs, write_acs
 from bayesdist.model import DistortionModel
 from bayesdist.products import IdcTab, idctab_from_solution, write_idctab
+from bayesdist.utils.arrays import Float
 
 START = "start_idc.fits"
 REFERENCE = "F606W"  # the filter of the detector's tables and of the drift

@@ -19,7 +19,7 @@ from bayesdist.app.store.rundir import RunDirectory
 from bayesdist.app.tables.margins import results_text
 from bayesdist.data import Matches
 from bayesdist.errors import InputError
-from bayesdist.files import made_folder
+from bayesdist.files.atomic import made_folder
 from bayesdist.infer import LinearFit, Posterior
 from bayesdist.missions.wise.simulate import simulate_wise
 from bayesdist.simulate import Truth

@@ -16,7 +16,6 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from bayesdist.arrays import Float, Int
 from bayesdist.calibration.calibration import Calibration, calibration_of_maps
 from bayesdist.calibration.chip_map import ChipMap, fitted_map
 from bayesdist.errors import FormatError, InputError
@@ -30,6 +29,7 @@ from bayesdist.products.formats.common.document import (
     MissingSizeError,
     finding_lines,
 )
+from bayesdist.utils.arrays import Float, Int
 
 if TYPE_CHECKING:
     from astropy.table import Table  # slow to import, and needed for few files
@@ -97,7 +97,7 @@ def _parse(content: Content) -> GbdesParameters | None:
     # of thousands of columns the names stand anywhere in the end of a Parquet file
     if content.path is None or not all(name.encode() in content.raw for name in _COLUMNS):
         return None
-    from bayesdist.reading.tables import read_table  # slow to import
+    from bayesdist.files.tables import read_table  # slow to import
 
     table = read_table(content.path)
     if not set(_COLUMNS) <= set(table.colnames):

@@ -10,11 +10,11 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 
-from bayesdist.arrays import Bool, Float
-from bayesdist.distributions import f_isf
-from bayesdist.numbers import size_of
 from bayesdist.report.figures.panels import Panels
 from bayesdist.report.figures.style import CYCLE, INK, PALE, PALETTE, figure_style, nice_below
+from bayesdist.utils.arrays import Bool, Float
+from bayesdist.utils.distributions import f_isf
+from bayesdist.utils.numbers import size_of
 
 if TYPE_CHECKING:
     from bayesdist.assess import UncertaintyMap, VectorMap

@@ -9,9 +9,6 @@ import numpy as np
 from matplotlib.colors import LinearSegmentedColormap
 from matplotlib.figure import Figure
 
-from bayesdist.arrays import Float
-from bayesdist.distributions import chi2_ppf, chi2_sf, norm_isf
-from bayesdist.numbers import size_of
 from bayesdist.report.figures.arrows import Arrows, vector_map
 from bayesdist.report.figures.mosaic import Mosaic
 from bayesdist.report.figures.panels import ChipPanels
@@ -23,6 +20,9 @@ from bayesdist.report.figures.style import (
     new_figure,
     nice_below,
 )
+from bayesdist.utils.arrays import Float
+from bayesdist.utils.distributions import chi2_ppf, chi2_sf, norm_isf
+from bayesdist.utils.numbers import size_of
 
 if TYPE_CHECKING:
     from bayesdist.assess.comparison.compare import Comparison

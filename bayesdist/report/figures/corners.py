@@ -11,9 +11,9 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 
-from bayesdist.arrays import Float
-from bayesdist.numbers import display_scale
 from bayesdist.report.figures.style import PALETTE, WIDTH, figure_style, new_figure
+from bayesdist.utils.arrays import Float
+from bayesdist.utils.numbers import display_scale
 
 _LEVELS = tuple(1.0 - np.exp(-0.5 * np.array([1.0, 2.0]) ** 2))  # content of 1 and 2 sigma in 2-D
 

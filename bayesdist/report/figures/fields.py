@@ -15,9 +15,9 @@ from matplotlib.ticker import MaxNLocator
 from numpy.typing import ArrayLike
 from scipy.interpolate import RectBivariateSpline
 
-from bayesdist.arrays import Float
 from bayesdist.report.figures.panels import Panels
 from bayesdist.report.figures.style import COLORBAR, INK, SEQUENTIAL, figure_style
+from bayesdist.utils.arrays import Float
 
 EMPTY = "#D9DEE3"  # of a cell without a value
 FAR = 15.0  # factor between values, from which on even steps would show the largest alone

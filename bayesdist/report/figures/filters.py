@@ -7,7 +7,6 @@ from dataclasses import dataclass
 
 from matplotlib.figure import Figure
 
-from bayesdist.arrays import Float
 from bayesdist.report.figures.style import (
     CYCLE,
     INK,
@@ -17,6 +16,7 @@ from bayesdist.report.figures.style import (
     legend_above,
     new_figure,
 )
+from bayesdist.utils.arrays import Float
 
 MARKERS = "os^Dvp"
 

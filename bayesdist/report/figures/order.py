@@ -9,8 +9,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
-from bayesdist.numbers import display_scale
 from bayesdist.report.figures.style import PALETTE, WIDTH, figure_style, new_figure
+from bayesdist.utils.numbers import display_scale
 
 if TYPE_CHECKING:
     from bayesdist.infer.compare.order_result import OrderSelection

@@ -10,7 +10,6 @@ from matplotlib.axes import Axes
 from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
 
-from bayesdist.arrays import Float
 from bayesdist.model.grid import mesh, outline_pixels
 from bayesdist.report.figures.style import (
     COLORBAR,
@@ -21,6 +20,7 @@ from bayesdist.report.figures.style import (
     figure_style,
     new_figure,
 )
+from bayesdist.utils.arrays import Float
 
 if TYPE_CHECKING:
     from matplotlib.collections import QuadMesh

@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 from matplotlib.text import Text
 from matplotlib.transforms import Bbox
 
-from bayesdist.arrays import Bool, Float
+from bayesdist.utils.arrays import Bool, Float
 
 
 class _AllTicks:

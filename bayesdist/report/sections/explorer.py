@@ -9,14 +9,14 @@ import numpy as np
 from matplotlib.colors import to_hex
 from scipy.interpolate import PchipInterpolator
 
-from bayesdist.arrays import Float
 from bayesdist.assess.budget.surface import JOINT, BudgetSurface, GridRow
 from bayesdist.assess.terms.forms import MEASURED, Row
 from bayesdist.assess.terms.given import CENTROID
-from bayesdist.numbers import ladder
 from bayesdist.report.contents import REPORT
 from bayesdist.report.context import ReportInput, needed
 from bayesdist.report.figures.style import CYCLE, SEQUENTIAL
+from bayesdist.utils.arrays import Float
+from bayesdist.utils.numbers import ladder
 
 MOMENT_DIGITS = 7  # quadratic forms of them cancel in part
 MAP_DIGITS = 5

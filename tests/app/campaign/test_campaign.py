@@ -10,7 +10,7 @@ from bayesdist.app.kinds.fitted import read_tables
 from bayesdist.data import read_exposures, read_matches
 from bayesdist.infer import load_posterior
 from bayesdist.infer.nodes import NodeGrid
-from bayesdist.infer.transforms import reference_gauge, segment, without_frames
+from bayesdist.infer.solution.transforms import reference_gauge, segment, without_frames
 from bayesdist.missions.acs.simulate import read_acs
 from bayesdist.model import corrected
 from bayesdist.products import read_d2im, read_idctab

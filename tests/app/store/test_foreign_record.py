@@ -15,7 +15,7 @@ from bayesdist.app.store.keys import digest_of
 from bayesdist.app.store.record import SCHEMA
 from bayesdist.app.store.summary import Summary
 from bayesdist.errors import InputError
-from bayesdist.reading.documents import model_of
+from bayesdist.files.documents import model_of
 
 WHOLE: dict[str, Any] = {
     "schema": SCHEMA,

@@ -12,9 +12,9 @@ from typing import Any
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from bayesdist import files
 from bayesdist.app.store import Adjustable, ArtefactStore, Record, Stage
-from bayesdist.files import atomic_path
+from bayesdist.files import atomic as files
+from bayesdist.files.atomic import atomic_path
 from tests.reduced import FULL
 
 STAGES = ("first", "second", "third")

@@ -9,7 +9,7 @@ from bayesdist.diagnose.correlated.functions import StructureFunctions
 from bayesdist.diagnose.correlated.information import Information, cell_sums
 from bayesdist.diagnose.correlated.structure import chip_structure
 from bayesdist.infer import GaussianPriors
-from bayesdist.infer.solution import likelihood_of
+from bayesdist.infer.solution.solution import likelihood_of
 from bayesdist.infer.stars.stars import prepare
 from tests.diagnose.correlated.skies import SIGMA, matched
 

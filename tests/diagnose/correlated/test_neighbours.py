@@ -10,7 +10,7 @@ import pytest
 from bayesdist.diagnose.correlated import estimate_discrepancy
 from bayesdist.diagnose.correlated.neighbours import EDGES, shared_variances
 from bayesdist.infer import fit_linear
-from bayesdist.infer.solution import likelihood_of
+from bayesdist.infer.solution.solution import likelihood_of
 from bayesdist.model import Chip, DistortionModel
 from bayesdist.simulate import simulate_matches
 

@@ -15,8 +15,8 @@ from bayesdist.infer import GaussianPriors, Rejection, fit_linear
 from bayesdist.infer.catalogue import star_sums as module
 from bayesdist.infer.catalogue.star_errors import StarErrors, star_covariance
 from bayesdist.infer.exposures.hierarchy import fit_hierarchical
-from bayesdist.infer.solution import Solution
-from bayesdist.infer.transforms import linear_terms, reference_gauge
+from bayesdist.infer.solution.solution import Solution
+from bayesdist.infer.solution.transforms import linear_terms, reference_gauge
 from bayesdist.model import DistortionModel
 from tests.reduced import only_in_full
 

@@ -8,7 +8,7 @@ import pytest
 from bayesdist.errors import InputError
 from bayesdist.infer import fit_linear
 from bayesdist.infer.compare.order import in_one_frame
-from bayesdist.infer.transforms import without_frames
+from bayesdist.infer.solution.transforms import without_frames
 from bayesdist.model import DistortionModel, TimeDependence
 from bayesdist.simulate import simulate_matches
 

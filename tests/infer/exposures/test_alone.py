@@ -11,7 +11,7 @@ from scipy import stats
 from bayesdist.errors import DegenerateError, InputError
 from bayesdist.infer import fit_linear
 from bayesdist.infer.exposures.alone import fit_exposures
-from bayesdist.infer.transforms import LINEAR_TERMS, linear_terms, reference_gauge
+from bayesdist.infer.solution.transforms import LINEAR_TERMS, linear_terms, reference_gauge
 
 from ..small_campaign import campaign, seen_by
 

@@ -9,16 +9,16 @@ import pytest
 from scipy import stats
 
 from bayesdist.errors import DegenerateError, InputError
+from bayesdist.files.records import record_from_arrays, record_to_arrays
 from bayesdist.infer import GaussianPriors, OutlierMixture, Rejection, fit_linear, sample
 from bayesdist.infer.equations.arrow import Arrow
 from bayesdist.infer.exposures import scatter as scatter_module
 from bayesdist.infer.exposures.alone import fit_exposures
 from bayesdist.infer.exposures.hierarchy import fit_hierarchical, held_in_reference
 from bayesdist.infer.exposures.scatter import Scatter
-from bayesdist.infer.transforms import lines, reference_gauge
+from bayesdist.infer.solution.transforms import lines, reference_gauge
 from bayesdist.model import FRAME_KINDS
 from bayesdist.model.frames import CHIP_DEVIATIONS
-from bayesdist.records import record_from_arrays, record_to_arrays
 from tests.reduced import case_in_full, only_in_full
 
 from ..small_campaign import LINEAR, campaign, campaign_model, seen_by, true_lines

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from bayesdist.errors import DegenerateError, InputError
-from bayesdist.infer.linear import LinearFit
 from bayesdist.infer.nodes import pixel_shifts
+from bayesdist.infer.solution.linear import LinearFit
 from bayesdist.model import TimeDependence
 from bayesdist.model.frames import nearest_frame
 from tests.infer.support import TWO_CHIPS, columns_of, numerical_gradient, simulated, table

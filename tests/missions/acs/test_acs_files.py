@@ -13,8 +13,8 @@ from bayesdist.data import read_catalog
 from bayesdist.data.exposures import read_exposures
 from bayesdist.data.starlists import StarCuts, read_star_lists
 from bayesdist.errors import InputError
+from bayesdist.files.tables import read_table
 from bayesdist.missions.acs.simulate import read_acs, simulate_acs, write_acs
-from bayesdist.reading.tables import read_table
 
 
 @pytest.fixture(scope="module")

@@ -20,7 +20,6 @@ from bayesdist.app.commands.on_files.position_table import (
     write_positions,
 )
 from bayesdist.app.screen import number
-from bayesdist.arrays import Bool, Float, Int
 from bayesdist.calibration.apply import (
     Application,
     OutputFrame,
@@ -31,6 +30,7 @@ from bayesdist.calibration.apply import (
 from bayesdist.calibration.calibration import Calibration
 from bayesdist.calibration.inverse import fitted_inverse
 from bayesdist.errors import InputError
+from bayesdist.utils.arrays import Bool, Float, Int
 
 METHODS = ("newton", "polynomial", "table")
 

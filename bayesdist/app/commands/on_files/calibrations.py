@@ -16,11 +16,11 @@ from bayesdist.calibration.calibration import Calibration, calibration_of
 from bayesdist.calibration.plane import ARCSEC, Plane
 from bayesdist.calibration.subarray import Subarray, subarray_at_corner, subarrays_of_image
 from bayesdist.errors import InputError
+from bayesdist.files.documents import read_json_as
 from bayesdist.infer import LinearFit, load_fit, load_posterior
-from bayesdist.infer.solution import Solution
+from bayesdist.infer.solution.solution import Solution
 from bayesdist.products.formats.common.content import read_hdus
 from bayesdist.products.registry import read_calibration
-from bayesdist.reading.documents import read_json_as
 
 _SUMMARY = TypeAdapter(Summary)
 

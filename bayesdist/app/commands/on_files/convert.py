@@ -18,13 +18,13 @@ from bayesdist.app.commands.on_files.calibrations import (
 )
 from bayesdist.app.screen import number as digits
 from bayesdist.app.store.output import refuse_existing
-from bayesdist.arrays import Float
 from bayesdist.calibration.calibration import Calibration, calibration_of_maps
 from bayesdist.calibration.inverse import detector_grid
 from bayesdist.calibration.plane import ARCSEC
 from bayesdist.data.sky.tangent import sky_of_plane
 from bayesdist.errors import InputError, required
-from bayesdist.files import atomic_path
+from bayesdist.files.atomic import atomic_path
+from bayesdist.files.documents import toml_of
 from bayesdist.products.formats.common.document import (
     PARAMETERS,
     BuildOptions,
@@ -34,7 +34,7 @@ from bayesdist.products.formats.common.document import (
     FormatSettings,
 )
 from bayesdist.products.registry import build, format_of, open_document, product_settings
-from bayesdist.reading.documents import toml_of
+from bayesdist.utils.arrays import Float
 
 _GRID = 65  # points of each axis over which the loss is measured
 _ROUNDING = 1e-6  # pixels: what is less is called none

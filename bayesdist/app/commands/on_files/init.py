@@ -20,7 +20,7 @@ from bayesdist.data import FORMATS, Matches
 from bayesdist.data.formats.files import mission_formats
 from bayesdist.data.formats.layout import TableLayout, table_layout
 from bayesdist.errors import InputError
-from bayesdist.files import atomic_path
+from bayesdist.files.atomic import atomic_path
 
 log = logging.getLogger("bayesdist")
 

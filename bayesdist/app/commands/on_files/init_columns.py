@@ -8,10 +8,10 @@ import numpy as np
 from numpy.polynomial import legendre
 
 from bayesdist.app.commands.on_files.init_detector import quoted
-from bayesdist.arrays import Float
 from bayesdist.data import Matches
 from bayesdist.data.formats.layout import TableLayout
 from bayesdist.model.basis import polynomial_terms
+from bayesdist.utils.arrays import Float
 
 # names under which SExtractor writes what the image's own WCS makes of the pixels
 _BY_THE_IMAGE = ("alpha_j2000", "alphawin_j2000", "alphapsf_j2000", "sky_centroid.ra")

@@ -6,8 +6,8 @@ from collections.abc import Iterable, Mapping
 
 import numpy as np
 
-from bayesdist.arrays import Float, Int
 from bayesdist.errors import InputError
+from bayesdist.utils.arrays import Float, Int
 
 _DETECTOR = """\
 [detector]

@@ -15,7 +15,7 @@ def inspect(path: str | Path) -> str:
     """Text on an IDCTAB, a D2IMFILE or NPOLFILE, a WCS in FITS, a posterior, or that of a run."""
     path = Path(path)
     if path.is_dir() or path.suffix == ".nc":
-        from bayesdist.infer.files import load_posterior
+        from bayesdist.infer.posterior.files import load_posterior
 
         return _posterior_text(load_posterior(path))
     from bayesdist.products.registry import describe  # each reading loads what it needs alone

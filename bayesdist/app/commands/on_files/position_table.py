@@ -13,12 +13,12 @@ from numpy.typing import NDArray
 from bayesdist.app.commands.on_files.calibrations import notes_of
 from bayesdist.app.screen import number
 from bayesdist.app.store.output import refuse_existing
-from bayesdist.arrays import Float, Int
 from bayesdist.calibration.apply import Positions
 from bayesdist.calibration.calibration import Calibration
 from bayesdist.errors import InputError
-from bayesdist.files import atomic_path
-from bayesdist.reading.tables import read_table
+from bayesdist.files.atomic import atomic_path
+from bayesdist.files.tables import read_table
+from bayesdist.utils.arrays import Float, Int
 
 log = logging.getLogger("bayesdist")
 

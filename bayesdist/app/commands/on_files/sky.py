@@ -22,13 +22,13 @@ from bayesdist.app.commands.on_files.position_table import (
     refuse_columns,
     write_positions,
 )
-from bayesdist.arrays import Float
 from bayesdist.calibration.apply import on_chip
 from bayesdist.calibration.calibration import Calibration, calibration_of
 from bayesdist.calibration.sky_positions import sky_positions
 from bayesdist.errors import InputError
-from bayesdist.files import atomic_path
-from bayesdist.infer.solution import Solution
+from bayesdist.files.atomic import atomic_path
+from bayesdist.infer.solution.solution import Solution
+from bayesdist.utils.arrays import Float
 
 if TYPE_CHECKING:
     import pandas

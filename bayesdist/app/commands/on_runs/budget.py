@@ -12,7 +12,7 @@ from bayesdist.app.results import open_results
 from bayesdist.app.screen import number, table_text
 from bayesdist.app.store.rundir import RunDirectory
 from bayesdist.assess.budget.budget import TOTAL, ErrorBudget, place_budget
-from bayesdist.assess.maps import circular_error, per_axis
+from bayesdist.assess.maps.uncertainty import circular_error, per_axis
 from bayesdist.assess.terms.forms import PRODUCT
 
 

@@ -16,10 +16,10 @@ from bayesdist.app.rehearsal import rehearse
 from bayesdist.app.results import Results, open_results
 from bayesdist.app.screen import number
 from bayesdist.app.store.rundir import RunDirectory
-from bayesdist.checks import warnings_of
 from bayesdist.infer import Limits
 from bayesdist.infer.sampler.certified import PILOTS, has_second_stage
 from bayesdist.infer.sampler.move_schedule import expected_passes
+from bayesdist.utils.checks import warnings_of
 
 # measured on two cores of a server at orders 4 and 5; other machines differ by factors
 STAR_S = 3e-9  # of the likelihood, for each star and pass

@@ -13,13 +13,13 @@ import numpy as np
 from astropy.table import Table
 
 from bayesdist.app.kinds.fitted import Fitted, required
-from bayesdist.arrays import Float
 from bayesdist.errors import InputError
 from bayesdist.infer.series import FilterDependence, Series, TrendModel, filter_dependence
-from bayesdist.infer.solution import Solution
-from bayesdist.infer.transforms import linear_terms, lines, reference_gauge, without_frames
-from bayesdist.limits import DIFFERENCE
+from bayesdist.infer.solution.solution import Solution
+from bayesdist.infer.solution.transforms import linear_terms, lines, reference_gauge, without_frames
 from bayesdist.model import TimeDependence
+from bayesdist.utils.arrays import Float
+from bayesdist.utils.limits import DIFFERENCE
 
 Measured = tuple[float, float]  # value and standard deviation
 

@@ -13,7 +13,7 @@ from bayesdist.assess.drawn import DrawnErrors
 from bayesdist.assess.evaluation import drawn_errors, judged, validity_of
 from bayesdist.assess.requirements.margins import judge
 from bayesdist.assess.requirements.validity import ValidityPeriod
-from bayesdist.infer.solution import Solution
+from bayesdist.infer.solution.solution import Solution
 
 
 def errors_of(results: Results) -> DrawnErrors:

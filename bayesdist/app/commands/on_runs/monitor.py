@@ -25,12 +25,12 @@ from bayesdist.data import Matches, input_files
 from bayesdist.diagnose.diagnostics import misfits_of, residual_sums
 from bayesdist.diagnose.residuals.misfit import worst_misfit
 from bayesdist.errors import InputError
-from bayesdist.files import sha256_of
+from bayesdist.files.atomic import sha256_of
 from bayesdist.infer import Posterior
 from bayesdist.infer.compare.change_date import PeriodScore, period_scores, scan_dates
 from bayesdist.infer.compare.monitoring import NewFit, change_of, fit_new
-from bayesdist.infer.linear import Rejection
 from bayesdist.infer.posterior.memberships import count_outliers
+from bayesdist.infer.solution.linear import Rejection
 from bayesdist.report.drawing import save_figures
 from bayesdist.report.figures.comparison import change_over_time, difference_vectors
 

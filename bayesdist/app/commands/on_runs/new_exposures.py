@@ -15,7 +15,7 @@ from bayesdist.data import Matches, read_matches
 from bayesdist.errors import InputError
 from bayesdist.infer.catalogue.star_errors import StarErrors
 from bayesdist.infer.compare.monitoring import NewFit, fit_new, with_star_errors_of
-from bayesdist.infer.linear import Rejection
+from bayesdist.infer.solution.linear import Rejection
 
 
 def fit_new_exposures(release: Results, new: Path) -> tuple[Matches, NewFit, tuple[str, ...]]:

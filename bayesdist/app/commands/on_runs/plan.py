@@ -11,12 +11,12 @@ from bayesdist.app.commands.on_runs.judging import probability_met
 from bayesdist.app.results import Results, open_results
 from bayesdist.app.store.rundir import RunDirectory
 from bayesdist.app.tables.margins import judged_requirements
-from bayesdist.arrays import Float
 from bayesdist.assess.planning.exposures import Schedule, exposures_needed
 from bayesdist.assess.requirements.requirement import Requirement
 from bayesdist.errors import InputError
 from bayesdist.infer.compare.planning import ExposureContent, exposure_content, exposure_information
-from bayesdist.infer.solution import Solution
+from bayesdist.infer.solution.solution import Solution
+from bayesdist.utils.arrays import Float
 
 DRAWS = 1000
 LATER = 4  # dates that stand for exposures spread evenly

@@ -25,7 +25,7 @@ from bayesdist.app.store.output import record_folder, write_table
 from bayesdist.app.store.rundir import RunDirectory
 from bayesdist.errors import InputError
 from bayesdist.infer.exposures.shared_drift import with_drift_of
-from bayesdist.infer.solution import Solution
+from bayesdist.infer.solution.solution import Solution
 from bayesdist.model import LookupTable
 
 PRINTED = ("filter", "chip", "term", "at_edge", "sigma_at_edge")

@@ -22,7 +22,6 @@ from bayesdist.app.config.section import (
     same_names,
 )
 from bayesdist.app.config.selfcal import Frames, MinDetections, scale_faults
-from bayesdist.arrays import Float
 from bayesdist.assess.planning.dithers import Camera, PlannedStars, PriorInformation
 from bayesdist.model import Chip
 from bayesdist.simulate.dithers import dither_pattern
@@ -32,6 +31,7 @@ from bayesdist.simulate.patterns import (
     grid_offsets,
     rolls_in_turn,
 )
+from bayesdist.utils.arrays import Float
 
 Pair = tuple[PositiveFloat, PositiveFloat]
 MOST_EXPOSURES = 10_000  # of one pattern

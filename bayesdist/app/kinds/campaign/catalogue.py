@@ -11,10 +11,10 @@ from bayesdist.app.kinds.matched import columns_by_code
 from bayesdist.data import ExposureLog, ReferenceCatalog, catalog_from_table
 from bayesdist.data.sky.tangent import mean_direction, tangent_plane
 from bayesdist.errors import InputError
+from bayesdist.files.tables import read_table
 from bayesdist.infer.catalogue.star_errors import StarErrors
 from bayesdist.products import IdcTab
 from bayesdist.products.formats.idctab.hst import parity_of
-from bayesdist.reading.tables import read_table
 
 
 def read_campaign_catalog(

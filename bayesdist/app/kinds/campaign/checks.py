@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from bayesdist.checks import LARGER, Check, level_of
-from bayesdist.limits import COMPLETENESS, FALSE_MATCHES
-from bayesdist.numbers import count, percent
+from bayesdist.utils.checks import LARGER, Check, level_of
+from bayesdist.utils.limits import COMPLETENESS, FALSE_MATCHES
+from bayesdist.utils.numbers import count, percent
 
 GROUP = "Campaign"
 

@@ -25,12 +25,12 @@ from bayesdist.infer.exposures.hierarchy import (
     held_in_reference,
     trend_p_values,
 )
-from bayesdist.infer.linear import Rejection
 from bayesdist.infer.nodes import corrected_matches, on_the_chips
 from bayesdist.infer.series import Series
-from bayesdist.limits import TREND
+from bayesdist.infer.solution.linear import Rejection
 from bayesdist.model import Chip, DistortionModel
 from bayesdist.model.frames import RIGID
+from bayesdist.utils.limits import TREND
 
 SERIES = ("A_2", "A_3", "B_1", "B_2", "B_3")
 

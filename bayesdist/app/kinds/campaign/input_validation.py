@@ -12,12 +12,12 @@ from bayesdist.app.config.products import ReleaseBlock
 from bayesdist.app.kinds.campaign.inputs import Inputs
 from bayesdist.app.kinds.campaign.reference import rehearse_references
 from bayesdist.app.kinds.star_lists import refuse_other_chips
-from bayesdist.arrays import Float, Int
 from bayesdist.data.holdout import refuse_strangers
 from bayesdist.data.matching.reports import check_campaign
 from bayesdist.errors import ConfigError, DegenerateError, InputError
 from bayesdist.model import TimeDependence
 from bayesdist.products import read_idctab
+from bayesdist.utils.arrays import Float, Int
 
 MIN_EXPOSURES = 3  # exposures: two of them differ, but do not scatter
 ONE_DAY = 1.0 / 365.25  # years: epochs within say nothing of a rate

@@ -11,8 +11,8 @@ from dataclasses import replace
 
 from bayesdist.app.store.keys import attributes
 from bayesdist.infer import GaussianPriors
-from bayesdist.infer.solution import Solution, TransformedSolution
-from bayesdist.infer.transforms import lines, reference_gauge, without_frames
+from bayesdist.infer.solution.solution import Solution, TransformedSolution
+from bayesdist.infer.solution.transforms import lines, reference_gauge, without_frames
 from bayesdist.model import DistortionModel, TimeDependence
 
 CONSTANTS = (("u", 0, 0), ("v", 0, 0))

@@ -22,7 +22,7 @@ from bayesdist.data.matches import Matches
 from bayesdist.diagnose.overlap import OverlapTest, overlap_test
 from bayesdist.infer import Posterior
 from bayesdist.infer.catalogue.star_errors import StarErrors
-from bayesdist.infer.solution import Solution
+from bayesdist.infer.solution.solution import Solution
 from bayesdist.model import DistortionModel, LookupTable
 
 GAUGE_EXPOSURES = 1  # the first ones, which cannot be held out: they define the gauge

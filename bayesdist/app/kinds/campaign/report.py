@@ -14,13 +14,13 @@ from bayesdist.app.store.rundir import RunDirectory
 from bayesdist.data.preparing import motion_error_line
 from bayesdist.diagnose.overlap import OverlapTest
 from bayesdist.diagnose.residuals.binned import binned_residuals
+from bayesdist.files.tables import read_ecsv
 from bayesdist.infer import GaussianPriors, LinearFit, Posterior, fit_linear
 from bayesdist.infer.equations.scaled import one_thread
-from bayesdist.infer.linear import Rejection
 from bayesdist.infer.nodes import corrected_matches, inside_chips, pixel_shifts
+from bayesdist.infer.solution.linear import Rejection
 from bayesdist.model import DistortionModel
 from bayesdist.model.grid import outline_pixels
-from bayesdist.reading.tables import read_ecsv
 from bayesdist.report.campaign import (
     CampaignResults,
     CatalogStars,

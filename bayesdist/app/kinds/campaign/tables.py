@@ -13,7 +13,6 @@ from bayesdist.app.kinds.campaign.inputs import Inputs
 from bayesdist.app.kinds.campaign.matched import CampaignMatched
 from bayesdist.app.kinds.campaign.reference import held_tables
 from bayesdist.app.kinds.fitted import StoredLookupTables
-from bayesdist.arrays import Float
 from bayesdist.data.magnitude_errors import MagnitudeErrors
 from bayesdist.data.matches import Matches
 from bayesdist.diagnose.tables.between_nodes import BetweenNodes
@@ -30,6 +29,7 @@ from bayesdist.infer.nodes import (
 )
 from bayesdist.model import DistortionModel, LookupTable, corrected
 from bayesdist.model.grid import grid_pixels, mesh
+from bayesdist.utils.arrays import Float
 
 MIN_SCATTER_RATIO = 2.0  # ratio of scatters beyond which centroids are not what most of it is
 MIN_EXPLAINED = 0.5  # fraction of the variance of the scatters that the dates must explain

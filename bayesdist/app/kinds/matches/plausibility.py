@@ -7,10 +7,10 @@ from collections.abc import Iterator
 import numpy as np
 
 from bayesdist.app.config import Config
-from bayesdist.arrays import Float
 from bayesdist.data import Matches
 from bayesdist.errors import InputError
 from bayesdist.model import DistortionModel, TimeDependence
+from bayesdist.utils.arrays import Float
 
 OFF = 1e3  # factor on the scale by which u and v cannot be those of the detector
 ODD = 3.0  # factor that is worth a warning

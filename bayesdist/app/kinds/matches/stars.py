@@ -40,7 +40,7 @@ from bayesdist.infer import (
     sample,
 )
 from bayesdist.infer.exposures.frame_choice import frames_that_help
-from bayesdist.infer.linear import Rejection
+from bayesdist.infer.solution.linear import Rejection
 from bayesdist.model import DistortionModel
 from bayesdist.products.registry import read_calibration
 

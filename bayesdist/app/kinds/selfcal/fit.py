@@ -23,7 +23,6 @@ from bayesdist.app.kinds.fitted import (
 )
 from bayesdist.app.kinds.selfcal.gauge import fixed_by, gauge_summary, gauge_table, gauge_words
 from bayesdist.app.kinds.selfcal.matched import SelfcalMatched, magnitude_errors_of, matches_of
-from bayesdist.arrays import Float
 from bayesdist.infer import Compute, GaussianPriors, Posterior
 from bayesdist.infer.sampler.checkpoints import read_arrays
 from bayesdist.infer.selfcal import SelfCalibrationMode, sample_selfcal
@@ -32,6 +31,7 @@ from bayesdist.infer.selfcal.gauge import Decision
 from bayesdist.infer.selfcal.mode import gauge_of, mode_at, solve_in_gauge
 from bayesdist.infer.selfcal.pieces import one_cluster
 from bayesdist.model import DistortionModel
+from bayesdist.utils.arrays import Float
 
 ARRAYS = ("theta", "stars", "mixture", "held", "n_free", "reference")
 RELINEARISED = 3  # times a problem is linearised anew about a solution that is read

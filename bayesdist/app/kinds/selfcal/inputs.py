@@ -14,7 +14,6 @@ from bayesdist.app.config import SelfcalConfig
 from bayesdist.app.kinds.selfcal.known import Commanded, GaugeConstraints, read_commanded
 from bayesdist.app.kinds.selfcal.start import started
 from bayesdist.app.kinds.star_lists import lists_of, refuse_other_chips
-from bayesdist.arrays import Float
 from bayesdist.calibration.plane import ARCSEC
 from bayesdist.data import ReferenceCatalog, read_catalog, read_exposures
 from bayesdist.data.detections import Detections, detections_of
@@ -25,6 +24,7 @@ from bayesdist.infer.selfcal import ReferenceStars
 from bayesdist.infer.selfcal.problem import Problem, prepare
 from bayesdist.infer.selfcal.tangent import TangentPlane
 from bayesdist.model import DistortionModel
+from bayesdist.utils.arrays import Float
 
 log = logging.getLogger("bayesdist")
 

@@ -9,18 +9,18 @@ from pathlib import Path
 import numpy as np
 
 from bayesdist.app.config import SelfcalConfig
-from bayesdist.arrays import Float, Int
 from bayesdist.data.tables.column import SourceColumn
 from bayesdist.data.tables.names import find_columns
 from bayesdist.data.tables.units import conversion
-from bayesdist.distributions import chi2_sf
 from bayesdist.errors import InputError
+from bayesdist.files.tables import read_table
 from bayesdist.infer.equations.priors import GaussianPriors, Prior
 from bayesdist.infer.selfcal.prior import frame_prior, pointing_prior, tie
 from bayesdist.infer.selfcal.sky_moves import functionals
-from bayesdist.limits import GAUGE_CONTRADICTION
 from bayesdist.model import DistortionModel
-from bayesdist.reading.tables import read_table
+from bayesdist.utils.arrays import Float, Int
+from bayesdist.utils.distributions import chi2_sf
+from bayesdist.utils.limits import GAUGE_CONTRADICTION
 
 _COLUMNS = {
     "exposure": ("exposure", "name", "rootname"),

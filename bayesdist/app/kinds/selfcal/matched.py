@@ -17,18 +17,18 @@ from astropy.table import Table
 
 from bayesdist.app.kinds.matched import Matched
 from bayesdist.app.kinds.selfcal.inputs import Inputs
-from bayesdist.arrays import Float
 from bayesdist.data import MagnitudeErrors
 from bayesdist.data.detections import Detections
 from bayesdist.data.matches import Matches
+from bayesdist.files.documents import json_of
+from bayesdist.files.faults import restoring
 from bayesdist.infer.sampler.checkpoints import read_arrays, write_arrays
 from bayesdist.infer.selfcal import SelfCalibrationMode
 from bayesdist.infer.selfcal.calibrate import scatter_by_magnitude
 from bayesdist.infer.selfcal.elimination import Mixture, memberships
 from bayesdist.infer.selfcal.problem import Problem
 from bayesdist.model import DistortionModel
-from bayesdist.reading.documents import json_of
-from bayesdist.reading.faults import restoring
+from bayesdist.utils.arrays import Float
 
 
 def matches_of(

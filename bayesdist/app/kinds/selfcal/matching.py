@@ -13,7 +13,6 @@ from bayesdist.app.kinds.selfcal.gauge import CONVENTION, fixed_by
 from bayesdist.app.kinds.selfcal.inputs import Inputs
 from bayesdist.app.kinds.selfcal.matched import SelfcalMatched, selfcal_matched
 from bayesdist.app.screen import number
-from bayesdist.arrays import Bool, Float, Int
 from bayesdist.data.detections import NO_STAR
 from bayesdist.data.matching.pairs import hull_of, inside_hull
 from bayesdist.errors import DegenerateError, InputError, NotSettledError
@@ -24,6 +23,7 @@ from bayesdist.infer.selfcal.gauge import NamedDirection
 from bayesdist.infer.selfcal.pieces import one_cluster
 from bayesdist.infer.selfcal.tangent import places_of
 from bayesdist.model import DistortionModel
+from bayesdist.utils.arrays import Bool, Float, Int
 
 log = logging.getLogger("bayesdist")
 

@@ -13,12 +13,12 @@ from astropy.units import Unit
 
 from bayesdist.app.kinds.fitted import SelfCalibrated
 from bayesdist.app.store.output import write_table
-from bayesdist.arrays import Float
 from bayesdist.data import ReferenceCatalog
 from bayesdist.data.storage.write import write_columns
 from bayesdist.diagnose.correlated import Discrepancy
 from bayesdist.infer import Compute
 from bayesdist.infer.selfcal import SelfCalibrationMode, StarCatalogue, star_catalogue
+from bayesdist.utils.arrays import Float
 
 NAMES = ("u", "v", "pm_u", "pm_v", "parallax")
 FEW, DOUBTFUL, REFERENCE = 1, 2, 4

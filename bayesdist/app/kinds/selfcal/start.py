@@ -10,7 +10,6 @@ from bayesdist.app.config import SelfcalConfig
 from bayesdist.app.config.section import one_chip
 from bayesdist.app.kinds.selfcal.known import Commanded
 from bayesdist.app.kinds.star_lists import positions_by_chip, start_of
-from bayesdist.arrays import Float, Int
 from bayesdist.data import ReferenceCatalog
 from bayesdist.data.detections import Detections
 from bayesdist.data.matching.frames import mutual_frames
@@ -26,6 +25,7 @@ from bayesdist.infer.selfcal.start import (
     undistorted,
 )
 from bayesdist.model import Chip, DistortionModel
+from bayesdist.utils.arrays import Float, Int
 
 
 def started(

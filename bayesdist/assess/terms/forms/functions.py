@@ -9,10 +9,10 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesdist.arrays import Float
 from bayesdist.assess.domain import EvaluationDomain
 from bayesdist.assess.terms.forms.rows import DrawnField, Image, Row, Scale
 from bayesdist.model.grid import DEFAULT_GRID, grid_pixels, mesh
+from bayesdist.utils.arrays import Float
 
 MANY = 64  # functions from which on their values are kept, not their coefficients alone
 

@@ -7,9 +7,9 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from bayesdist.arrays import Float
 from bayesdist.assess.domain import EvaluationDomain
 from bayesdist.assess.terms.forms.rows import ErrorField, Image, Row
+from bayesdist.utils.arrays import Float
 
 
 @dataclass(frozen=True, eq=False)

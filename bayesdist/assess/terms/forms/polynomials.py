@@ -7,13 +7,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from bayesdist.arrays import Float, Int
 from bayesdist.assess.domain import EvaluationDomain
 from bayesdist.assess.solution import place_of
 from bayesdist.assess.terms.forms.rows import DrawnField, Image, Row, Scale
 from bayesdist.calibration.chip_map import position_moments
 from bayesdist.infer.compare.frame_fields import mean_squares
 from bayesdist.model import DistortionModel
+from bayesdist.utils.arrays import Float, Int
 
 
 def polynomial_errors(

@@ -14,8 +14,8 @@ from typing import ClassVar, Protocol
 
 import numpy as np
 
-from bayesdist.arrays import Float, Int
 from bayesdist.assess.domain import EvaluationDomain
+from bayesdist.utils.arrays import Float, Int
 
 Scale = Mapping[str, float]
 

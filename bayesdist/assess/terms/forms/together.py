@@ -7,11 +7,11 @@ from functools import cached_property, reduce
 
 import numpy as np
 
-from bayesdist.arrays import Float
 from bayesdist.assess.domain import EvaluationDomain
 from bayesdist.assess.terms.forms.functions import Functions
 from bayesdist.assess.terms.forms.polynomials import Polynomials
 from bayesdist.assess.terms.forms.rows import DrawnField, Image, Scale
+from bayesdist.utils.arrays import Float
 
 
 @dataclass(frozen=True, eq=False)

@@ -12,15 +12,15 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from bayesdist.arrays import Float
 from bayesdist.missions.acs.handbook.numbers import detector_numbers
 from bayesdist.missions.acs.handbook.whole_detector import WholeDetector
 from bayesdist.model.grid import mesh
-from bayesdist.numbers import size_of
 from bayesdist.report.figures.arrows import Arrows, magnification_of, vector_map
 from bayesdist.report.figures.fields import Grid, contour_levels, scalar_map
 from bayesdist.report.figures.panels import OneArray
 from bayesdist.report.figures.style import PALETTE, nice_below
+from bayesdist.utils.arrays import Float
+from bayesdist.utils.numbers import size_of
 
 if TYPE_CHECKING:
     from bayesdist.diagnose.residuals.binned import BinnedResiduals

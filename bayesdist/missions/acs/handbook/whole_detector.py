@@ -15,11 +15,11 @@ import numpy as np
 from numpy.polynomial import legendre
 from numpy.typing import ArrayLike
 
-from bayesdist.arrays import Float
 from bayesdist.calibration.area import pixel_areas
 from bayesdist.calibration.chip_map import ChipMap
 from bayesdist.errors import InputError
 from bayesdist.model.grid import mesh
+from bayesdist.utils.arrays import Float
 
 
 @dataclass(frozen=True, eq=False)

@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesdist.arrays import Bool, Float
 from bayesdist.data.detections import Detections
 from bayesdist.missions.acs.simulate.stars import FAINT, centroid_error
 from bayesdist.missions.acs.simulate.truth import AcsTruth, DetectionTruth
 from bayesdist.model import Chip
+from bayesdist.utils.arrays import Bool, Float
 
 BORDER = 5.0  # pixels: too close to an edge for a fit
 LIMIT, SOFT = -7.5, 0.3  # magnitude at which half of the stars are found, and width of the decline

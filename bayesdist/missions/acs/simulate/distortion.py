@@ -13,9 +13,9 @@ from types import MappingProxyType
 
 import numpy as np
 
-from bayesdist.arrays import Float
 from bayesdist.errors import InputError
 from bayesdist.model import Chip, DistortionModel, TimeDependence
+from bayesdist.utils.arrays import Float
 
 SM4 = 2009.4  # Servicing Mission 4, May 2009
 EPOCH0 = (2004.5, 2012.5)  # RDATE of Tables 1-3

@@ -13,7 +13,7 @@ from bayesdist.data.starlists import read_star_lists
 from bayesdist.data.storage.write import write_columns
 from bayesdist.data.tables.checks import columns_of
 from bayesdist.errors import InputError
-from bayesdist.files import atomic_path, made_folder
+from bayesdist.files.atomic import atomic_path, made_folder
 from bayesdist.missions.acs.simulate.truth import AcsCampaign
 from bayesdist.missions.acs.simulate.truth_files import read_truth, write_truth
 

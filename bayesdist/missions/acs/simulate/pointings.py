@@ -15,11 +15,11 @@ import numpy as np
 from astropy.coordinates import get_body_barycentric
 from astropy.time import Time
 
-from bayesdist.arrays import Bool, Float
 from bayesdist.data.exposures import Exposure, ExposureLog
 from bayesdist.data.sky.earth import velocity_aberration
 from bayesdist.missions.acs.simulate.distortion import SM4
 from bayesdist.missions.acs.simulate.stars import CENTRE
+from bayesdist.utils.arrays import Bool, Float
 
 # Of the catalogue's pixel (5000, 5000): 00h 22m 35.0s, -72d 04' 00"
 RA, DEC = 5.645833333333333, -72.06666666666666

@@ -11,8 +11,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import cKDTree
 
-from bayesdist.arrays import Float
 from bayesdist.data import ReferenceCatalog
+from bayesdist.utils.arrays import Float
 
 HALF_SIZE = 4500.0  # pixels from the centre to each side
 CENTRE = (5000.0, 5000.0)

@@ -12,11 +12,11 @@ import numpy as np
 from scipy.linalg import cholesky
 from scipy.sparse import csr_array
 
-from bayesdist.arrays import Float
 from bayesdist.missions.acs.simulate.distortion import CHIPS, EPOCH0, HALF, acs_solution
 from bayesdist.model import PolynomialBasis
 from bayesdist.model.grid import mesh
 from bayesdist.model.lookup import LookupTable
+from bayesdist.utils.arrays import Float
 
 STEP = 64.0
 SHAPE = (32, 64)  # nodes along y and x

@@ -8,7 +8,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from bayesdist.arrays import Bool, Float, Int
 from bayesdist.calibration.chip_map import ChipMap
 from bayesdist.data import ReferenceCatalog
 from bayesdist.data.detections import Detections
@@ -17,6 +16,7 @@ from bayesdist.missions.acs.simulate.pointings import AcsFrames
 from bayesdist.missions.acs.simulate.stars import TrueStars
 from bayesdist.model import DistortionModel
 from bayesdist.model.lookup import LookupTable
+from bayesdist.utils.arrays import Bool, Float, Int
 
 LINEAR_TERMS = ("A_1", "A_2", "A_3", "B_1", "B_2", "B_3")
 MARGIN = 0.15  # beyond the edges of a chip, in halves of it: range of the inverse

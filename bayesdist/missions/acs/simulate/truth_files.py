@@ -11,15 +11,15 @@ from astropy.table import Table
 from bayesdist.data.exposures import ExposureLog
 from bayesdist.data.storage.write import write_columns
 from bayesdist.data.tables.checks import columns_of
-from bayesdist.files import atomic_path
+from bayesdist.files.atomic import atomic_path
+from bayesdist.files.faults import naming_faults
+from bayesdist.files.tables import read_table
 from bayesdist.missions.acs.simulate.pointings import AcsFrames
 from bayesdist.missions.acs.simulate.stars import TrueStars
 from bayesdist.missions.acs.simulate.truth import LINEAR_TERMS, AcsTruth, DetectionTruth
 from bayesdist.model import DistortionModel
 from bayesdist.model.grid import mesh
 from bayesdist.model.lookup import LookupTable
-from bayesdist.reading.faults import naming_faults
-from bayesdist.reading.tables import read_table
 
 STAR_UNITS = {"u": "pix", "v": "pix", "pm_u": "pix / yr", "pm_v": "pix / yr"}
 MATRIX = ("uu", "uv", "vu", "vv")

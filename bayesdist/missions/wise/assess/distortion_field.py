@@ -12,12 +12,12 @@ import numpy as np
 from numpy.polynomial import legendre
 from numpy.typing import ArrayLike
 
-from bayesdist.arrays import Float
 from bayesdist.assess.solution import place_of
 from bayesdist.assess.vectors import VectorMap, distortion_vectors
-from bayesdist.infer.solution import Solution
+from bayesdist.infer.solution.solution import Solution
 from bayesdist.model import PolynomialBasis
 from bayesdist.model.grid import grid_pixels
+from bayesdist.utils.arrays import Float
 
 
 @dataclass(frozen=True, eq=False)

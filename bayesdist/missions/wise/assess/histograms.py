@@ -11,12 +11,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from bayesdist.arrays import Float, Int
 from bayesdist.diagnose.residuals.binned import BinnedSums, band_bins
 from bayesdist.infer.stars.likelihood import Clip
 from bayesdist.infer.stars.stars import Stars
 from bayesdist.infer.stars.sums import Sums
 from bayesdist.missions.wise.assess.distortion_field import DistortionField
+from bayesdist.utils.arrays import Float, Int
 
 CALIBRATED = "calibrated"
 HISTOGRAM_BINS = 401  # an odd number: one of them lies about zero

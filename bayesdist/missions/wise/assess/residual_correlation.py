@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import fft
 
-from bayesdist.arrays import Float, Int
 from bayesdist.diagnose.residuals.binned import BinnedResiduals
 from bayesdist.missions.wise.assess.residual_field import ResidualField, residual_field
+from bayesdist.utils.arrays import Float, Int
 
 DRAWS = 500  # noise fields that give mean and sigma, and half a thousand more for the ranks
 _AT_ONCE = 50

@@ -8,10 +8,10 @@ from functools import cached_property
 import numpy as np
 from numpy.polynomial import legendre
 
-from bayesdist.arrays import Bool, Float
 from bayesdist.diagnose.residuals.binned import BinnedResiduals
 from bayesdist.errors import DegenerateError, InputError
 from bayesdist.model.basis import polynomial_terms
+from bayesdist.utils.arrays import Bool, Float
 
 _FEWEST_STARS = 5
 

@@ -12,17 +12,17 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from bayesdist.arrays import Float
 from bayesdist.diagnose.residuals.binned import BinnedResiduals
-from bayesdist.distributions import f_sf
 from bayesdist.errors import DegenerateError, InputError
-from bayesdist.limits import STRUCTURE
 from bayesdist.missions.wise.assess.residual_field import (
     ResidualField,
     polynomials,
     residual_field,
 )
 from bayesdist.model.basis import polynomial_terms
+from bayesdist.utils.arrays import Float
+from bayesdist.utils.distributions import f_sf
+from bayesdist.utils.limits import STRUCTURE
 
 Base = tuple[Float, Float]
 

@@ -9,14 +9,14 @@ import numpy as np
 from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 
-from bayesdist.arrays import Float
 from bayesdist.missions.wise.bands.context import BANDS, BandsInput
-from bayesdist.numbers import number, size_of
 from bayesdist.report.figures.arrows import Arrows, cross_map, magnification_of, spacing, vector_map
 from bayesdist.report.figures.fields import Grid, scalar_map
 from bayesdist.report.figures.panels import ArrayPanels
 from bayesdist.report.figures.style import nice_below
 from bayesdist.report.registry import Plot
+from bayesdist.utils.arrays import Float
+from bayesdist.utils.numbers import number, size_of
 
 if TYPE_CHECKING:
     from bayesdist.assess import UncertaintyMap, VectorMap

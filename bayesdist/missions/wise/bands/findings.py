@@ -9,9 +9,9 @@ import numpy as np
 from bayesdist.missions.wise.assess.account import LONGEST_DIFFERENCES
 from bayesdist.missions.wise.bands.context import BANDS, BandResult, BandsInput, Printed
 from bayesdist.missions.wise.bands.curves import CASES, below_draws, chance_of
-from bayesdist.numbers import MISSING, count, number, percent, probability, size_of
 from bayesdist.report.sections.run.status import Verdict
 from bayesdist.report.texttable import TextTable, listing
+from bayesdist.utils.numbers import MISSING, count, number, percent, probability, size_of
 
 SAME_VECTOR = 0.005  # of the printed maximum
 

@@ -10,8 +10,8 @@ from bayesdist.diagnose.residuals.rows import STATISTICS
 from bayesdist.missions.wise.assess.account import RowAccount
 from bayesdist.missions.wise.assess.published import HEADS, PrintedRow
 from bayesdist.missions.wise.bands.context import BANDS, BandsInput
-from bayesdist.numbers import MISSING, number, rounded
 from bayesdist.report.texttable import TextTable
+from bayesdist.utils.numbers import MISSING, number, rounded
 
 TITLES = {
     "5-1": "Residuals of the fit in bins",

@@ -10,13 +10,13 @@ from astropy.table import Table
 
 from bayesdist.app.screen import table_text
 from bayesdist.app.store.output import record_folder, write_table
-from bayesdist.arrays import Float
 from bayesdist.data.detections import Detections
 from bayesdist.data.tables.checks import row_number
 from bayesdist.data.tables.column import SourceColumn
 from bayesdist.data.tables.names import find_columns
 from bayesdist.data.tables.repeated import first_duplicate
 from bayesdist.errors import InputError
+from bayesdist.files.tables import read_table
 from bayesdist.missions.wise.bands.optical import optical_models
 from bayesdist.missions.wise.bring_up.iterate import BringUp, bring_up
 from bayesdist.missions.wise.pairs.files import RVB_ALIASES, band_name
@@ -24,7 +24,7 @@ from bayesdist.missions.wise.pairs.radial_limit import RadialLimit
 from bayesdist.missions.wise.pairs.rvb_pairs import RvbPairs, write_rvb
 from bayesdist.missions.wise.published import WISE_ARRAYS
 from bayesdist.model import Chip, DistortionModel
-from bayesdist.reading.tables import read_table
+from bayesdist.utils.arrays import Float
 
 _COLUMNS = {
     "x": ("x",),

@@ -12,14 +12,14 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from bayesdist.arrays import Bool, Float, Int
 from bayesdist.data.detections import Detections
 from bayesdist.data.matches import Matches
 from bayesdist.errors import InputError
-from bayesdist.infer.linear import DEFAULT_REJECTION, LinearFit, Rejection, fit_linear
+from bayesdist.infer.solution.linear import DEFAULT_REJECTION, LinearFit, Rejection, fit_linear
 from bayesdist.missions.wise.bring_up.pairs import Field
 from bayesdist.missions.wise.pairs.radial_limit import RadialLimit
 from bayesdist.model import Chip, DistortionModel
+from bayesdist.utils.arrays import Bool, Float, Int
 
 __all__ = ["BringUp", "bring_up"]
 

@@ -7,7 +7,6 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.stats import poisson
 
-from bayesdist.arrays import Bool, Float, Int
 from bayesdist.data.detections import Detections
 from bayesdist.data.matches import Matches
 from bayesdist.data.matching.pairs import mutual_pairs
@@ -15,6 +14,7 @@ from bayesdist.errors import InputError
 from bayesdist.missions.wise.pairs.radial_limit import RadialLimit
 from bayesdist.model import DistortionModel
 from bayesdist.model.grid import mesh
+from bayesdist.utils.arrays import Bool, Float, Int
 
 RARE = 1e-3
 DISPLACED = 10.0  # in units of the radius in the corners

@@ -9,7 +9,6 @@ from dataclasses import dataclass, field
 import numpy as np
 from astropy.table import Table
 
-from bayesdist.arrays import Float, Int
 from bayesdist.data.batches import BATCH
 from bayesdist.data.formats.files import input_files
 from bayesdist.data.tables.checks import Place, row_number
@@ -17,8 +16,9 @@ from bayesdist.data.tables.column import Columns, SourceColumn
 from bayesdist.data.tables.names import BASIC, find_columns
 from bayesdist.data.tables.parquet import ParquetPart, describe_part
 from bayesdist.errors import InputError
+from bayesdist.files.tables import read_table
 from bayesdist.missions.wise.published import WISE_BANDS
-from bayesdist.reading.tables import read_table
+from bayesdist.utils.arrays import Float, Int
 
 PathLike = str | os.PathLike[str]
 

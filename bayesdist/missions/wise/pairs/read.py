@@ -14,7 +14,6 @@ from typing import Any
 import numpy as np
 from astropy.table import Column
 
-from bayesdist.arrays import Bool
 from bayesdist.data.matches import Matches
 from bayesdist.data.reading.columns import match_columns
 from bayesdist.data.reading.options import ReadOptions, check_sigma, refuse_missing_errors
@@ -31,6 +30,7 @@ from bayesdist.missions.wise.pairs.files import (
 )
 from bayesdist.missions.wise.pairs.rvb_pairs import RvbPairs, colour_of
 from bayesdist.missions.wise.published import WISE_ARRAYS, WISE_BANDS
+from bayesdist.utils.arrays import Bool
 
 __all__ = ["chosen_band", "read_rvb", "rvb_bands", "stream_rvb"]
 

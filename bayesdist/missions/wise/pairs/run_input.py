@@ -17,7 +17,7 @@ from bayesdist.data.tables.checks import Place
 from bayesdist.data.tables.names import ALIASES
 from bayesdist.data.tables.parquet import ParquetPart
 from bayesdist.errors import InputError
-from bayesdist.files import made_folder
+from bayesdist.files.atomic import made_folder
 from bayesdist.missions.wise.pairs.files import (
     MAGNITUDES,
     ArrayCheck,

@@ -17,12 +17,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from bayesdist.arrays import Bool, Float, Int
 from bayesdist.data.matches import Matches
 from bayesdist.data.storage.write import Part, write_parts
 from bayesdist.data.tables.checks import columns_of
 from bayesdist.errors import InputError
-from bayesdist.files import made_folder
+from bayesdist.files.atomic import made_folder
+from bayesdist.utils.arrays import Bool, Float, Int
 
 NO_COLOUR = "no colour"
 COLOUR = "colour"

@@ -11,7 +11,6 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from bayesdist.arrays import Bool, Float, Int
 from bayesdist.data.columns.labels import merged_counts
 from bayesdist.data.matches import Matches
 from bayesdist.data.tables.checks import counted
@@ -24,6 +23,7 @@ from bayesdist.missions.wise.pairs.rvb_pairs import (
     colours_of,
 )
 from bayesdist.missions.wise.pairs.section import RvbBlock
+from bayesdist.utils.arrays import Bool, Float, Int
 
 OFFSET = "offset beyond the radial limit"
 CHI2 = "chi-square beyond the radial limit"

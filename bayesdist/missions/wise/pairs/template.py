@@ -8,6 +8,7 @@ from bayesdist.app.commands.on_files.init_columns import column_lines
 from bayesdist.data import input_files
 from bayesdist.data.tables.parquet import describe_part
 from bayesdist.errors import InputError
+from bayesdist.files.tables import read_table
 from bayesdist.missions.wise.pairs.files import (
     IPAC,
     MAGNITUDES,
@@ -16,7 +17,6 @@ from bayesdist.missions.wise.pairs.files import (
 )
 from bayesdist.missions.wise.pairs.read import rvb_bands, stream_rvb
 from bayesdist.missions.wise.published import WISE_ARRAYS
-from bayesdist.reading.tables import read_table
 
 SIGMA = 0.1  # pixels, for pairs that say nothing about their errors
 

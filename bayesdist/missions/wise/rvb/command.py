@@ -16,13 +16,13 @@ from bayesdist.data import Matches
 from bayesdist.data.tables.column import SourceColumn
 from bayesdist.data.tables.names import find_columns
 from bayesdist.errors import InputError
+from bayesdist.files.tables import read_table
 from bayesdist.missions.wise.pairs.files import RVB_ALIASES, open_rvb_files
 from bayesdist.missions.wise.pairs.read import chosen_band, stream_rvb
 from bayesdist.missions.wise.pairs.rvb_pairs import RvbPairs, write_rvb
 from bayesdist.missions.wise.published import WISE_ARRAYS
 from bayesdist.missions.wise.rvb.linear import fit_transform, linear_moments
 from bayesdist.missions.wise.rvb.transform import PARAMETERS, RvbTransform, rereference, transformed
-from bayesdist.reading.tables import read_table
 
 SOLUTION_ALIASES: dict[str, tuple[str, ...]] = {
     "frame": RVB_ALIASES["exposure"],

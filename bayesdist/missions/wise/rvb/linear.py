@@ -9,11 +9,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from bayesdist.arrays import Float
 from bayesdist.data.matches import Matches
 from bayesdist.errors import DegenerateError, InputError
 from bayesdist.infer.stars.sums import Sums
 from bayesdist.missions.wise.rvb.transform import PARAMETERS, RvbTransform
+from bayesdist.utils.arrays import Float
 
 FREE = 5  # parameters that are fitted, the first of `PARAMETERS`
 

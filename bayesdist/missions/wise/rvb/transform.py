@@ -13,9 +13,9 @@ from dataclasses import astuple, dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from bayesdist.arrays import Float, Int
 from bayesdist.data.matches import Matches
 from bayesdist.errors import InputError
+from bayesdist.utils.arrays import Float, Int
 
 PARAMETERS = ("shift_u", "shift_v", "rotation", "scale_u", "scale_v", "skew")
 

@@ -6,11 +6,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from bayesdist.arrays import Float, Int
 from bayesdist.data.detections import Detections
 from bayesdist.errors import InputError
 from bayesdist.missions.wise.simulate import wise_solution
 from bayesdist.model import DistortionModel
+from bayesdist.utils.arrays import Float, Int
 
 __all__ = ["simulate_unpaired"]
 

@@ -14,7 +14,7 @@ from astropy.table import Table
 
 from bayesdist.data.storage.write import write_columns
 from bayesdist.errors import InputError
-from bayesdist.files import atomic_path, made_folder
+from bayesdist.files.atomic import atomic_path, made_folder
 from bayesdist.missions.wise.simulate.pattern import PartitionPattern
 from bayesdist.missions.wise.simulate.sets import PairChunk, WiseSet
 

@@ -10,13 +10,13 @@ from pathlib import Path
 
 import numpy as np
 
-from bayesdist.arrays import Float
 from bayesdist.errors import InputError
 from bayesdist.missions.wise.published import WISE_ARRAYS
 from bayesdist.missions.wise.simulate import wise_solution
 from bayesdist.model import DistortionModel
 from bayesdist.products import SipHeader, write_sip
 from bayesdist.products.formats.common.cards import text_card
+from bayesdist.utils.arrays import Float
 
 __all__ = ["DELIVERED_TURN", "optical_model", "write_optical_model"]
 

@@ -11,9 +11,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.polynomial import legendre
 
-from bayesdist.arrays import Float
 from bayesdist.model import PolynomialBasis
 from bayesdist.model.grid import mesh
+from bayesdist.utils.arrays import Float
 
 BLOCKS = {"W1": 5, "W2": 5, "W3": 2}  # on each axis
 

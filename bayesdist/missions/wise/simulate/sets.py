@@ -8,7 +8,6 @@ from functools import cached_property
 import numpy as np
 from numpy.polynomial import legendre
 
-from bayesdist.arrays import Bool, Float, Int
 from bayesdist.data.batches import even_edges
 from bayesdist.errors import InputError
 from bayesdist.missions.wise.published import (
@@ -23,6 +22,7 @@ from bayesdist.missions.wise.simulate.solution import wise_solution
 from bayesdist.missions.wise.simulate.stars import POPULATIONS
 from bayesdist.missions.wise.simulate.survey import FalseMatches, Survey, false_matches, survey
 from bayesdist.model import DistortionModel
+from bayesdist.utils.arrays import Bool, Float, Int
 
 CHUNK = 2**19  # pairs of a chunk at most
 _STEP = 8192  # positions at a time: they stay in the cache

@@ -7,12 +7,12 @@ from functools import partial
 
 import numpy as np
 
-from bayesdist.arrays import Float
 from bayesdist.data.matches import Matches
 from bayesdist.errors import InputError
 from bayesdist.missions.wise.published import SAMPLE_SIZES, WISE_ARRAYS, WISE_COEFFICIENTS
 from bayesdist.model import Chip, DistortionModel
 from bayesdist.simulate.matches import Truth, simulate_matches, simulate_partitioned
+from bayesdist.utils.arrays import Float
 
 FAINT, BRIGHT = 14.5, 7.0
 

@@ -11,8 +11,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from bayesdist.arrays import Bool, Float
 from bayesdist.missions.wise.published import WISE_ARRAYS
+from bayesdist.utils.arrays import Bool, Float
 
 COUNTS = 0.3  # slope of the logarithm of star counts by magnitude
 REFERENCE_ARCSEC = 0.08  # 2MASS positions on each axis

@@ -11,8 +11,8 @@ import numpy as np
 from numpy.polynomial import legendre
 from scipy.optimize import brentq
 
-from bayesdist.arrays import Float, Int
 from bayesdist.errors import InputError
+from bayesdist.utils.arrays import Float, Int
 
 FRAMES = 5000  # framesets; one serves all bands
 CADENCE_S = 11.0

@@ -11,7 +11,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from bayesdist.arrays import Float
 from bayesdist.calibration.calibration import Calibration, calibration_of_maps
 from bayesdist.calibration.chip_map import fitted_map
 from bayesdist.calibration.plane import ARCSEC, Plane
@@ -21,6 +20,7 @@ from bayesdist.products.formats.ast.mapping import Step, parse_dump, steps_of
 from bayesdist.products.formats.common.content import Content
 from bayesdist.products.formats.common.document import Choice, required_size
 from bayesdist.products.formats.common.parameters import with_parameters
+from bayesdist.utils.arrays import Float
 
 _REMARK = re.compile(r"#\s*bayesdist\s+(\w+)\s+(.*?)\s*$", re.MULTILINE)
 _BEGIN = re.compile(r"(#.*\n|\s*\n)*\s*Begin\s+\w+")

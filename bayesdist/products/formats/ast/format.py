@@ -8,7 +8,6 @@ from math import comb
 import numpy as np
 from pydantic import PositiveFloat, PositiveInt
 
-from bayesdist.arrays import Float
 from bayesdist.calibration.calibration import Calibration
 from bayesdist.calibration.plane import arcsec_per
 from bayesdist.errors import InputError
@@ -25,6 +24,7 @@ from bayesdist.products.formats.common.document import (
     finding_lines,
 )
 from bayesdist.products.formats.common.parameters import parameters_content
+from bayesdist.utils.arrays import Float
 
 
 class Settings(FormatSettings):

@@ -13,9 +13,9 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from bayesdist.arrays import Float
 from bayesdist.errors import FormatError, InputError
 from bayesdist.model.basis import MAX_ORDER
+from bayesdist.utils.arrays import Float
 
 _BEGIN = re.compile(r"\s*Begin\s+(\w+)\s*(#.*)?$")
 _END = re.compile(r"\s*End\s+(\w+)\s*(#.*)?$")

@@ -9,10 +9,10 @@ from textwrap import wrap
 
 from astropy.io import fits
 
-from bayesdist.arrays import Float
 from bayesdist.errors import FormatError
-from bayesdist.infer.solution import Solution
+from bayesdist.infer.solution.solution import Solution
 from bayesdist.model import LookupTable
+from bayesdist.utils.arrays import Float
 
 _UNPRINTABLE = re.compile(r"[^ -~]")  # a header has printable ASCII alone
 # Without one of these nothing ties pixels to a world.

@@ -24,10 +24,10 @@ from math import comb
 import numpy as np
 from numpy.typing import ArrayLike
 
-from bayesdist.arrays import Float
 from bayesdist.errors import DegenerateError
 from bayesdist.model import polynomial_terms
 from bayesdist.model.basis import polynomial_values
+from bayesdist.utils.arrays import Float
 
 Coefficients = Mapping[tuple[int, int], float]
 

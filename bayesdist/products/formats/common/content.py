@@ -24,14 +24,14 @@ import numpy as np
 from astropy.io import fits
 from numpy.typing import NDArray
 
-from bayesdist.arrays import Float
 from bayesdist.errors import BayesdistError, FormatError
-from bayesdist.files import atomic_path
+from bayesdist.files.atomic import atomic_path
+from bayesdist.files.faults import reason_of
+from bayesdist.files.fits import HDU_STARTS, RECORD, data_size, open_fits, padded
+from bayesdist.files.regular import read_bytes
+from bayesdist.files.unpacked import unpacked
 from bayesdist.products.formats.common.cards import card_images, header_of
-from bayesdist.reading.faults import reason_of
-from bayesdist.reading.fits import HDU_STARTS, RECORD, data_size, open_fits, padded
-from bayesdist.reading.regular import read_bytes
-from bayesdist.reading.unpacked import unpacked
+from bayesdist.utils.arrays import Float
 
 _CARD = re.compile(r"[A-Z0-9_-]{1,8} *=|(COMMENT|HISTORY| {8})")
 

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from bayesdist.arrays import Float
 from bayesdist.calibration.calibration import Calibration
 from bayesdist.model import TimeDependence
+from bayesdist.utils.arrays import Float
 
 Positions = Callable[[Float, Float, int, float | None], Float]
 

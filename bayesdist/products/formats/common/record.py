@@ -13,15 +13,15 @@ from typing import Any
 import numpy as np
 from pydantic import BaseModel, Field, TypeAdapter
 
-from bayesdist.arrays import Float
 from bayesdist.calibration.calibration import Calibration, GaussianSolution
 from bayesdist.calibration.further import further_from
 from bayesdist.calibration.inverse import detector_grid
 from bayesdist.calibration.orientation import in_arcsec
 from bayesdist.calibration.plane import Plane, arcsec_per
 from bayesdist.errors import BayesdistError, FormatError, InputError
+from bayesdist.files.documents import model_of
 from bayesdist.model import Chip, DistortionModel, LookupTable
-from bayesdist.reading.documents import model_of
+from bayesdist.utils.arrays import Float
 from bayesdist.version import __version__
 
 VERSION = 1

@@ -16,7 +16,6 @@ from functools import cached_property
 import numpy as np
 from astropy.io import fits
 
-from bayesdist.arrays import Float
 from bayesdist.calibration.calibration import Calibration, calibration_of_maps
 from bayesdist.calibration.chip_map import ChipMap, fitted_map
 from bayesdist.calibration.plane import ARCSEC, Plane
@@ -32,6 +31,7 @@ from bayesdist.products.formats.common.parameters import (
 )
 from bayesdist.products.formats.lookup.plane import Plane as TablePlane
 from bayesdist.products.formats.sip.read import cd_matrix, image_size
+from bayesdist.utils.arrays import Float
 
 TABLES, ERRORS = "WCSDVARR", "WCSDVERR"
 _DEGREES = {"deg": 1.0, "arcsec": 1 / 3600, "mas": 1 / 3.6e6, "rad": 180 / np.pi, "": 1.0}

@@ -6,7 +6,6 @@ import numpy as np
 from astropy.io import fits
 from pydantic import PositiveFloat
 
-from bayesdist.arrays import Float
 from bayesdist.calibration.calibration import Calibration
 from bayesdist.calibration.chip_map import ChipMap
 from bayesdist.calibration.inverse import detector_grid
@@ -36,6 +35,7 @@ from bayesdist.products.formats.cpdis.file import (
 )
 from bayesdist.products.formats.cpdis.lint import lint_cpdis
 from bayesdist.products.formats.sip.format import describe_wcs
+from bayesdist.utils.arrays import Float
 
 _CLOSE = 1e-4  # pixels: error between nodes that is aimed at where no step is asked for
 _STEPS = (64.0, 32.0, 16.0, 8.0, 4.0)  # pixels

@@ -10,7 +10,7 @@ from astropy.io import fits
 from bayesdist.calibration.calibration import Calibration, as_calibration
 from bayesdist.calibration.plane import ARCSEC
 from bayesdist.errors import InputError
-from bayesdist.infer.solution import Solution
+from bayesdist.infer.solution.solution import Solution
 from bayesdist.products.formats.common.cards import (
     append_cards,
     convergence_cards,

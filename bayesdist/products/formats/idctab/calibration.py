@@ -15,7 +15,6 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesdist.arrays import Float
 from bayesdist.calibration.calibration import Calibration, GaussianSolution, calibration_of_maps
 from bayesdist.calibration.chip_map import ChipMap, fitted_map
 from bayesdist.calibration.inverse import ExplicitInverse
@@ -26,6 +25,7 @@ from bayesdist.products.formats.idctab.drift import RATES
 from bayesdist.products.formats.idctab.hst import parity_of
 from bayesdist.products.formats.idctab.plausible import refuse_implausible
 from bayesdist.products.formats.idctab.table import FILTER_COLUMNS, IdcTab
+from bayesdist.utils.arrays import Float
 
 Filters = Sequence[str] | None
 

@@ -16,13 +16,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from bayesdist.arrays import Float
 from bayesdist.calibration.calibration import Calibration
 from bayesdist.calibration.plane import ARCSEC
 from bayesdist.errors import InputError
-from bayesdist.infer.solution import Solution, TransformedSolution
-from bayesdist.infer.transforms import segment as segment_of
+from bayesdist.infer.solution.solution import Solution, TransformedSolution
+from bayesdist.infer.solution.transforms import segment as segment_of
 from bayesdist.model import TimeDependence
+from bayesdist.utils.arrays import Float
 
 Term = tuple[str, int, int]
 

@@ -21,7 +21,6 @@ from typing import Any
 import numpy as np
 from astropy.io import fits
 
-from bayesdist.arrays import Float
 from bayesdist.calibration.calibration import Calibration
 from bayesdist.calibration.plane import Orientation
 from bayesdist.products.formats.common.cards import (
@@ -31,6 +30,7 @@ from bayesdist.products.formats.common.cards import (
     wrapped_cards,
 )
 from bayesdist.products.formats.idctab.numbers import ChipInverse, ChipNumbers
+from bayesdist.utils.arrays import Float
 
 
 @dataclass(frozen=True, eq=False)

@@ -13,7 +13,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from bayesdist.arrays import Float
 from bayesdist.calibration.calibration import Calibration
 from bayesdist.calibration.chip_map import ChipMap
 from bayesdist.calibration.inverse import fitted_inverse
@@ -25,6 +24,7 @@ from bayesdist.products.formats.common.coefficients import (
     require_regular,
 )
 from bayesdist.products.formats.idctab.drift import RATES
+from bayesdist.utils.arrays import Float
 
 INVERSE_NODES = 33  # points of each axis of the fit
 

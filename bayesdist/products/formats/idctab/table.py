@@ -28,7 +28,6 @@ import numpy as np
 from astropy.io import fits
 from numpy.typing import ArrayLike, NDArray
 
-from bayesdist.arrays import Float, Int
 from bayesdist.errors import FormatError, InputError
 from bayesdist.model import polynomial_terms
 from bayesdist.products.formats.common.cards import named_in
@@ -36,6 +35,7 @@ from bayesdist.products.formats.common.coefficients import evaluate, idctab_colu
 from bayesdist.products.formats.common.content import Hdu, read_hdus, write_hdus
 from bayesdist.products.formats.idctab.drift import drift, scheme_of
 from bayesdist.products.formats.idctab.hst import serves
+from bayesdist.utils.arrays import Float, Int
 
 Filter = str | Sequence[str] | None  # one name, or those of both wheels
 

@@ -17,7 +17,6 @@ from dataclasses import dataclass, field
 import numpy as np
 from astropy.io import fits
 
-from bayesdist.arrays import Float
 from bayesdist.errors import InputError
 from bayesdist.model.lookup import LookupTable
 from bayesdist.products.formats.common.cards import (
@@ -29,6 +28,7 @@ from bayesdist.products.formats.common.cards import (
 )
 from bayesdist.products.formats.common.content import hdus_of
 from bayesdist.products.formats.lookup.file import AXES, LookupFile
+from bayesdist.utils.arrays import Float
 
 # A maximum below this fraction of the largest absolute value may turn negative on the way.
 _CLEARLY = 0.01

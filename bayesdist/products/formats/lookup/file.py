@@ -22,12 +22,12 @@ from functools import cached_property
 import numpy as np
 from astropy.io import fits
 
-from bayesdist.arrays import Float
 from bayesdist.errors import FormatError, InputError
 from bayesdist.model.lookup import LookupTable
 from bayesdist.products.formats.common.cards import named_in
 from bayesdist.products.formats.common.content import Hdu, read_hdus, write_hdus
 from bayesdist.products.formats.lookup.plane import Plane
+from bayesdist.utils.arrays import Float
 
 AXES = ("DX", "DY")
 _SIGMA = "SIGMA_"

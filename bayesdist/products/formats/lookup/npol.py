@@ -16,7 +16,6 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from bayesdist.arrays import Float
 from bayesdist.errors import DegenerateError, FormatError, InputError
 from bayesdist.model.lookup import LookupTable
 from bayesdist.products.formats.common.cards import number_card
@@ -34,6 +33,7 @@ from bayesdist.products.formats.lookup.file import (
     read_lookup_file,
     write_lookup_file,
 )
+from bayesdist.utils.arrays import Float
 
 
 def write_npol(

@@ -8,9 +8,9 @@ from functools import cached_property
 import numpy as np
 from astropy.io import fits
 
-from bayesdist.arrays import Float
 from bayesdist.errors import FormatError
 from bayesdist.products.formats.common.content import Hdu
+from bayesdist.utils.arrays import Float
 
 
 @dataclass(frozen=True, eq=False)

@@ -10,7 +10,6 @@ from typing import Annotated, Any
 import numpy as np
 from pydantic import Field
 
-from bayesdist.arrays import Float
 from bayesdist.calibration.calibration import Calibration
 from bayesdist.calibration.chip_map import ChipMap, Monomials
 from bayesdist.calibration.inverse import fit_inverse
@@ -48,6 +47,7 @@ from bayesdist.products.formats.siaf.table import (
     side_name,
     table_of,
 )
+from bayesdist.utils.arrays import Float
 
 WHERE = "products.siaf"
 

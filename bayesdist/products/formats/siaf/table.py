@@ -18,19 +18,19 @@ from typing import Any
 
 import numpy as np
 
-from bayesdist.arrays import Float
 from bayesdist.calibration.calibration import Calibration, calibration_of_maps
 from bayesdist.calibration.chip_map import fitted_map
 from bayesdist.calibration.inverse import ExplicitInverse, detector_grid
 from bayesdist.calibration.plane import Plane
 from bayesdist.errors import FormatError, InputError, required
+from bayesdist.files.documents import json_of
+from bayesdist.files.faults import reason_of
 from bayesdist.products.formats.common.coefficients import Coefficients, evaluate
 from bayesdist.products.formats.common.content import Content, read_content
 from bayesdist.products.formats.common.document import Choice, MissingSizeError
 from bayesdist.products.formats.common.read_back import ReadBack
 from bayesdist.products.formats.common.record import calibration_from
-from bayesdist.reading.documents import json_of
-from bayesdist.reading.faults import reason_of
+from bayesdist.utils.arrays import Float
 
 NAMES = ("Sci2IdlX", "Sci2IdlY", "Idl2SciX", "Idl2SciY")
 COLUMNS = ("AperName", "siaf_index", "exponent_x", "exponent_y", *NAMES)

@@ -7,14 +7,13 @@ from dataclasses import replace
 
 import numpy as np
 
-from bayesdist.arrays import Float
 from bayesdist.calibration.calibration import Calibration, as_calibration
 from bayesdist.calibration.chip_map import Monomials
 from bayesdist.calibration.inverse import fit_inverse
 from bayesdist.calibration.plane import ARCSEC, arcsec_per
 from bayesdist.calibration.sky import reprojected
 from bayesdist.errors import InputError
-from bayesdist.infer.solution import Solution
+from bayesdist.infer.solution.solution import Solution
 from bayesdist.model import DistortionModel
 from bayesdist.products.formats.common.cards import (
     convergence_cards,
@@ -29,6 +28,7 @@ from bayesdist.products.formats.common.coefficients import (
 )
 from bayesdist.products.formats.sip.families import offset_ranges
 from bayesdist.products.formats.sip.header import LINEAR_AXES, SIP_ORDERS, SipHeader, worst_closure
+from bayesdist.utils.arrays import Float
 
 # How far from the identity the linear part may be when it is to be a correction of pixels.
 _NEAR_IDENTITY = 0.5

@@ -6,7 +6,6 @@ from dataclasses import replace
 
 import numpy as np
 
-from bayesdist.arrays import Float
 from bayesdist.calibration.calibration import Calibration, calibration_of_maps
 from bayesdist.calibration.chip_map import fitted_map
 from bayesdist.calibration.inverse import detector_grid
@@ -20,6 +19,7 @@ from bayesdist.products.formats.common.parameters import (
     refuse_other,
 )
 from bayesdist.products.formats.sip.header import SIP_ORDERS, SipHeader
+from bayesdist.utils.arrays import Float
 
 
 def sip_calibration(

@@ -15,10 +15,10 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import ArrayLike
 
-from bayesdist.arrays import Float
 from bayesdist.calibration.inverse import detector_grid
 from bayesdist.errors import InputError
 from bayesdist.products.formats.common.coefficients import evaluate
+from bayesdist.utils.arrays import Float
 
 Terms = Mapping[tuple[int, int], float]
 

@@ -10,7 +10,6 @@ import numpy as np
 from numpy.polynomial import legendre
 from numpy.typing import ArrayLike
 
-from bayesdist.arrays import Bool, Float
 from bayesdist.errors import InputError
 from bayesdist.model.basis import polynomial_terms
 from bayesdist.products.formats.common.coefficients import evaluate, sip_keyword
@@ -25,6 +24,7 @@ from bayesdist.products.formats.sip.families import (
     with_coefficient,
 )
 from bayesdist.products.formats.sip.header import SipHeader
+from bayesdist.utils.arrays import Bool, Float
 
 # Odds of a further, independent fault, for values that a suspect leaves unexplained.
 _SECOND_FAULT = 1e-2

@@ -8,7 +8,6 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from astropy.io import fits
 
-from bayesdist.arrays import Float
 from bayesdist.calibration.calibration import Calibration
 from bayesdist.calibration.plane import ARCSEC, arcsec_per
 from bayesdist.data.sky.tangent import tangent_plane
@@ -18,6 +17,7 @@ from bayesdist.products.formats.common.read_back import ReadBack
 from bayesdist.products.formats.sip.header import SipHeader
 from bayesdist.products.formats.sip.read import sip_of
 from bayesdist.products.formats.sip.write import sip_header
+from bayesdist.utils.arrays import Float
 
 
 def sip_positions(

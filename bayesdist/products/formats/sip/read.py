@@ -7,12 +7,12 @@ import os
 import numpy as np
 from astropy.io import fits
 
-from bayesdist.arrays import Float
 from bayesdist.errors import FormatError, InputError
 from bayesdist.products.formats.common.cards import card_images
 from bayesdist.products.formats.common.coefficients import sip_powers
 from bayesdist.products.formats.common.content import Content, read_content, readable
 from bayesdist.products.formats.sip.header import SipHeader
+from bayesdist.utils.arrays import Float
 
 CD_KEYWORDS = ("CD1_1", "CD1_2", "CD2_1", "CD2_2")
 # Keywords in place of a CD matrix in other headers.

@@ -17,12 +17,12 @@ from dataclasses import replace
 
 import numpy as np
 
-from bayesdist.arrays import Float
 from bayesdist.errors import InputError
 from bayesdist.model.basis import polynomial_terms
 from bayesdist.products.formats.common.cards import header_of, keyword_of
 from bayesdist.products.formats.common.coefficients import substitution
 from bayesdist.products.formats.sip.header import SipHeader
+from bayesdist.utils.arrays import Float
 
 Terms = Mapping[tuple[int, int], float]
 

@@ -12,6 +12,7 @@ from astropy import log
 from astropy.io import fits
 from astropy.wcs import WCS, FITSFixedWarning
 
+from bayesdist.files.fits import RECORD
 from bayesdist.products.formats.common.cards import holds_wcs
 from bayesdist.products.formats.common.content import Content, Hdu
 from bayesdist.products.formats.common.document import Finding, finding_lines
@@ -24,7 +25,6 @@ from bayesdist.products.formats.sip.wcs_sky import (
     first_line,
     pv_keywords,
 )
-from bayesdist.reading.fits import RECORD
 
 _WCS = re.compile(
     r"(CTYPE|CRVAL|CRPIX|CDELT|CUNIT|CROTA|LTV)\d+[A-Z]?$|(CD|PC|PV|PS|LTM)\d+_\d+[A-Z]?$|"

@@ -7,7 +7,7 @@ import os
 import numpy as np
 from astropy.io import fits
 
-from bayesdist.files import atomic_path
+from bayesdist.files.atomic import atomic_path
 from bayesdist.products.formats.common.cards import (
     header_of,
     keyword_of,

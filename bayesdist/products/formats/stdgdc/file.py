@@ -26,7 +26,6 @@ from functools import cached_property
 import numpy as np
 from astropy.io import fits
 
-from bayesdist.arrays import Float
 from bayesdist.calibration.calibration import Calibration, calibration_of_maps
 from bayesdist.calibration.chip_map import ChipMap, fitted_map
 from bayesdist.calibration.inverse import detector_grid
@@ -41,6 +40,7 @@ from bayesdist.products.formats.common.parameters import (
     stored_calibration,
     stored_in,
 )
+from bayesdist.utils.arrays import Float
 
 _S = ("BDS1_1", "BDS1_2", "BDS2_1", "BDS2_2")
 

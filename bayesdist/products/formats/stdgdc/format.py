@@ -8,7 +8,6 @@ import numpy as np
 from astropy.io import fits
 from numpy.typing import NDArray
 
-from bayesdist.arrays import Float
 from bayesdist.calibration.area import pixel_areas
 from bayesdist.calibration.calibration import Calibration
 from bayesdist.calibration.chip_map import ChipMap
@@ -40,6 +39,7 @@ from bayesdist.products.formats.stdgdc.file import (
     stdgdc_of,
 )
 from bayesdist.products.formats.stdgdc.lint import lint_stdgdc
+from bayesdist.utils.arrays import Float
 
 _BETWEEN = 997  # points along each axis at most, between pixels, at which the tables are checked
 _LARGEST = 2**26  # pixels: beyond it a detector is a misprint

@@ -6,7 +6,6 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from bayesdist.arrays import Float
 from bayesdist.calibration.inverse import detector_grid
 from bayesdist.errors import FormatError
 from bayesdist.model import LookupTable
@@ -17,6 +16,7 @@ from bayesdist.products.formats.stdgdc.file import (
     StdGdc,
     stdgdc_calibration,
 )
+from bayesdist.utils.arrays import Float
 
 _CLOSE = 0.3  # pixels: an inverse that closes worse is counted from another pixel
 _TOO_FAR = 0.5  # of the detector: no camera moves pixels so far

@@ -17,7 +17,6 @@ import numpy as np
 from astropy.io import fits
 from numpy.typing import ArrayLike
 
-from bayesdist.arrays import Float
 from bayesdist.calibration.calibration import Calibration, calibration_of_maps
 from bayesdist.calibration.chip_map import ChipMap, fitted_map
 from bayesdist.calibration.inverse import detector_grid
@@ -28,6 +27,7 @@ from bayesdist.products.formats.common.content import Content, readable
 from bayesdist.products.formats.common.document import Choice, required_size
 from bayesdist.products.formats.common.parameters import with_parameters
 from bayesdist.products.formats.sip.read import cd_matrix, image_size
+from bayesdist.utils.arrays import Float
 
 Powers = tuple[int, int]
 

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from bayesdist.errors import InputError
-from bayesdist.files import atomic_path
+from bayesdist.files.atomic import atomic_path
 from bayesdist.model.basis import polynomial_terms
 from bayesdist.products.formats.common.coefficients import largest_magnitude, sip_keyword
 from bayesdist.products.formats.sip.families import EDGE, families, offset_ranges

@@ -6,13 +6,13 @@ from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from typing import Any
 
-from bayesdist.numbers import MISSING, count, display_scale, interval, number, rounded
 from bayesdist.report.campaign import CampaignResults
 from bayesdist.report.contents import REPORT
 from bayesdist.report.context import ReportInput, needed
 from bayesdist.report.sections.campaign.published import Published, PublishedLine, published_terms
 from bayesdist.report.sections.campaign.terms import name_of_scatter, name_of_term
 from bayesdist.report.texttable import TextTable, listing
+from bayesdist.utils.numbers import MISSING, count, display_scale, interval, number, rounded
 
 Row = tuple[str, ...]
 

@@ -9,9 +9,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.colors import Normalize
 
-from bayesdist.arrays import Float
 from bayesdist.model import LookupTable
-from bayesdist.numbers import count, display_scale, number, size_of
 from bayesdist.report.campaign import CampaignResults, ChipResiduals
 from bayesdist.report.contents import REPORT
 from bayesdist.report.context import ReportInput, needed
@@ -22,6 +20,8 @@ from bayesdist.report.figures.style import OUTLINE, PALETTE, WIDTH, new_figure, 
 from bayesdist.report.registry import Plot
 from bayesdist.report.sections.run.residuals import residual_panels
 from bayesdist.report.texttable import TextTable, listing, tabulated
+from bayesdist.utils.arrays import Float
+from bayesdist.utils.numbers import count, display_scale, number, size_of
 
 if TYPE_CHECKING:
     from bayesdist.diagnose.residuals.binned import BinnedResiduals

@@ -9,8 +9,6 @@ from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 from matplotlib.ticker import ScalarFormatter
 
-from bayesdist.arrays import Float
-from bayesdist.numbers import count, number, percent, size_of
 from bayesdist.report.contents import REPORT
 from bayesdist.report.context import ReportInput, needed
 from bayesdist.report.figures.style import (
@@ -24,6 +22,8 @@ from bayesdist.report.figures.style import (
 )
 from bayesdist.report.registry import Plot
 from bayesdist.report.texttable import TextTable, listing
+from bayesdist.utils.arrays import Float
+from bayesdist.utils.numbers import count, number, percent, size_of
 
 if TYPE_CHECKING:
     from bayesdist.report.campaign import CatalogStars

@@ -7,7 +7,6 @@ from dataclasses import replace
 import numpy as np
 
 from bayesdist.diagnose.overlap import OverlapTest
-from bayesdist.numbers import count, number, size_of
 from bayesdist.report.contents import REPORT
 from bayesdist.report.context import ReportInput, needed
 from bayesdist.report.figures.arrows import Arrows, magnification_of, vector_map
@@ -15,6 +14,7 @@ from bayesdist.report.figures.panels import Panels
 from bayesdist.report.figures.style import WIDTH, new_figure, nice_below
 from bayesdist.report.registry import Plot
 from bayesdist.report.texttable import TextTable, tabulated
+from bayesdist.utils.numbers import count, number, size_of
 
 MIN_STARS_PER_CELL = 5  # for a cell that is drawn and counted
 

@@ -9,13 +9,13 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 
-from bayesdist.assess.maps import per_axis
-from bayesdist.numbers import MISSING, count, display_scale, number, percent, with_mas
+from bayesdist.assess.maps.uncertainty import per_axis
 from bayesdist.report.contents import REPORT
 from bayesdist.report.context import ReportInput, SelfcalResults, needed
 from bayesdist.report.figures.style import CYCLE, INK, PALE, WIDTH, new_figure
 from bayesdist.report.registry import Plot
 from bayesdist.report.texttable import MAX_ROWS, TextTable, further, listing, tabulated
+from bayesdist.utils.numbers import MISSING, count, display_scale, number, percent, with_mas
 
 if TYPE_CHECKING:
     from astropy.table import Table

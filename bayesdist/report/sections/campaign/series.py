@@ -10,8 +10,6 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.ticker import MaxNLocator
 
-from bayesdist.arrays import Float
-from bayesdist.numbers import count, display_scale, number, size_of
 from bayesdist.report.campaign import CampaignResults
 from bayesdist.report.contents import REPORT
 from bayesdist.report.context import ReportInput, needed
@@ -24,6 +22,8 @@ from bayesdist.report.sections.campaign.terms import (
     name_of_term,
     terms_of,
 )
+from bayesdist.utils.arrays import Float
+from bayesdist.utils.numbers import count, display_scale, number, size_of
 
 if TYPE_CHECKING:
     from bayesdist.report.campaign import LinearSeries

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from bayesdist.arrays import Bool, Float
+from bayesdist.utils.arrays import Bool, Float
 
 if TYPE_CHECKING:
     from bayesdist.report.campaign import LinearSeries

@@ -11,17 +11,8 @@ from matplotlib.axes import Axes
 from matplotlib.colors import BoundaryNorm, ListedColormap
 from matplotlib.patches import Patch
 
-from bayesdist.assess.maps import circular_error, per_axis
+from bayesdist.assess.maps.uncertainty import circular_error, per_axis
 from bayesdist.assess.terms.forms import PRODUCT
-from bayesdist.numbers import (
-    MISSING,
-    Scale,
-    display_scale,
-    length_scale,
-    number,
-    percent,
-    with_mas,
-)
 from bayesdist.report.contents import REPORT
 from bayesdist.report.context import ReportInput, needed
 from bayesdist.report.figures.fields import Grid, scalar_map
@@ -37,6 +28,15 @@ from bayesdist.report.figures.style import (
 from bayesdist.report.registry import Plot
 from bayesdist.report.sections.gauge import gauge_of_new_exposure
 from bayesdist.report.texttable import TextTable
+from bayesdist.utils.numbers import (
+    MISSING,
+    Scale,
+    display_scale,
+    length_scale,
+    number,
+    percent,
+    with_mas,
+)
 
 AS_ABOVE = "as above"  # of the rows of single chips
 _LETTERS = 31  # of a label beside another one, over a narrow figure

@@ -7,11 +7,11 @@ from typing import Any
 
 import numpy as np
 
-from bayesdist.numbers import MISSING, interval, number, rounded
 from bayesdist.report.contents import REPORT
 from bayesdist.report.context import ReportInput
 from bayesdist.report.sections.gauge import gauge_mark, gauge_note
 from bayesdist.report.texttable import MAX_ROWS, TextTable, further, tabulated
+from bayesdist.utils.numbers import MISSING, interval, number, rounded
 
 _ON_SCREEN = ("68 %", "95 %", "R-hat", "ESS")
 _WIDER = 1.05  # than the sampled one: an error that rounding or few draws do not explain

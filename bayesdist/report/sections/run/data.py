@@ -8,8 +8,6 @@ import numpy as np
 from matplotlib.colors import LogNorm, Normalize
 from matplotlib.figure import Figure
 
-from bayesdist.arrays import Bool, Float
-from bayesdist.numbers import MISSING, count, display_scale, number
 from bayesdist.report.contents import REPORT
 from bayesdist.report.context import ReportInput, needed
 from bayesdist.report.figures.fields import Grid, scalar_map
@@ -24,6 +22,8 @@ from bayesdist.report.texttable import (
     short_paths,
     tabulated,
 )
+from bayesdist.utils.arrays import Bool, Float
+from bayesdist.utils.numbers import MISSING, count, display_scale, number
 
 if TYPE_CHECKING:
     from bayesdist.data import MagnitudeErrors

@@ -4,15 +4,15 @@ from __future__ import annotations
 
 import numpy as np
 
-from bayesdist.arrays import Bool
 from bayesdist.diagnose.residuals.rows import residual_statistics
 from bayesdist.diagnose.score.result import POWER
-from bayesdist.infer.skew import skew_of
-from bayesdist.limits import SCORE_TESTS
-from bayesdist.numbers import MISSING, count, display_scale, number, rounded, with_mas
+from bayesdist.infer.solution.skew import skew_of
 from bayesdist.report.contents import REPORT
 from bayesdist.report.context import ReportInput
 from bayesdist.report.texttable import TextTable, listing, tabulated
+from bayesdist.utils.arrays import Bool
+from bayesdist.utils.limits import SCORE_TESTS
+from bayesdist.utils.numbers import MISSING, count, display_scale, number, rounded, with_mas
 
 
 @REPORT.table("fit")

@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 from matplotlib.figure import Figure
 
-from bayesdist.numbers import display_scale, number, size_of, with_mas
 from bayesdist.report.contents import REPORT
 from bayesdist.report.context import ReportInput
 from bayesdist.report.figures.arrows import (
@@ -25,6 +24,7 @@ from bayesdist.report.figures.style import nice_below
 from bayesdist.report.registry import Plot
 from bayesdist.report.sections.gauge import gauge_mark, gauge_of_maps
 from bayesdist.report.texttable import TextTable, tabulated
+from bayesdist.utils.numbers import display_scale, number, size_of, with_mas
 
 if TYPE_CHECKING:
     from bayesdist.assess import VectorMap

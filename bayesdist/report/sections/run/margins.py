@@ -8,8 +8,6 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
 
-from bayesdist.arrays import Float
-from bayesdist.numbers import count, counted, display_scale, interval, number, percent, rounded
 from bayesdist.report.contents import REPORT
 from bayesdist.report.context import ReportInput
 from bayesdist.report.figures.style import (
@@ -23,6 +21,16 @@ from bayesdist.report.figures.style import (
 from bayesdist.report.registry import Plot
 from bayesdist.report.sections.gauge import gauge_of_new_exposure
 from bayesdist.report.texttable import TextTable, tabulated
+from bayesdist.utils.arrays import Float
+from bayesdist.utils.numbers import (
+    count,
+    counted,
+    display_scale,
+    interval,
+    number,
+    percent,
+    rounded,
+)
 
 if TYPE_CHECKING:
     from bayesdist.assess import Margin

@@ -7,19 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from bayesdist.arrays import Float, Int
 from bayesdist.infer.catalogue.added_errors import DECISIVE
-from bayesdist.numbers import (
-    MISSING,
-    Scale,
-    broken_name,
-    count,
-    display_scale,
-    interval,
-    number,
-    percent,
-    rounded,
-)
 from bayesdist.report.contents import REPORT
 from bayesdist.report.context import ReportInput, needed
 from bayesdist.report.figures.corners import Column, corner_figure
@@ -34,6 +22,18 @@ from bayesdist.report.figures.style import (
 )
 from bayesdist.report.registry import Plot
 from bayesdist.report.texttable import TextTable, tabulated
+from bayesdist.utils.arrays import Float, Int
+from bayesdist.utils.numbers import (
+    MISSING,
+    Scale,
+    broken_name,
+    count,
+    display_scale,
+    interval,
+    number,
+    percent,
+    rounded,
+)
 
 if TYPE_CHECKING:
     from bayesdist.infer import Posterior

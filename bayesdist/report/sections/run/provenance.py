@@ -7,10 +7,10 @@ from typing import Any
 
 import numpy as np
 
-from bayesdist.numbers import MISSING, count, number, percent
 from bayesdist.report.contents import REPORT
 from bayesdist.report.context import ReportInput
 from bayesdist.report.texttable import Level, TextTable, check_cells, listing, moment, short_paths
+from bayesdist.utils.numbers import MISSING, count, number, percent
 
 _DETAILS = ("stages", "timings", "versions")  # the margin of each page names our version
 _PRINTED = {"inputs": 4}  # rows on paper

@@ -12,9 +12,7 @@ from matplotlib.figure import Figure
 from numpy.typing import ArrayLike
 from scipy.special import ndtr
 
-from bayesdist.arrays import Float
 from bayesdist.errors import required
-from bayesdist.numbers import display_scale
 from bayesdist.report.contents import REPORT
 from bayesdist.report.context import ReportInput
 from bayesdist.report.figures.arrows import (
@@ -28,6 +26,8 @@ from bayesdist.report.figures.mosaic import Mosaic
 from bayesdist.report.figures.panels import ChipPanels, Panels
 from bayesdist.report.figures.style import PALETTE, WIDTH, legend_above, new_figure, nice_below
 from bayesdist.report.registry import Plot
+from bayesdist.utils.arrays import Float
+from bayesdist.utils.numbers import display_scale
 
 if TYPE_CHECKING:
     from bayesdist.diagnose.residuals.binned import BinnedResiduals

@@ -9,9 +9,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from bayesdist.assess.maps import per_axis
-from bayesdist.checks import GROUPS, LEVELS, Check, doubts_of, warnings_of, worst
-from bayesdist.numbers import counted, rounded, with_mas
+from bayesdist.assess.maps.uncertainty import per_axis
 from bayesdist.report.contents import REPORT
 from bayesdist.report.context import ReportInput, needed
 from bayesdist.report.sections.run.margins import VERDICT_LEVELS
@@ -21,6 +19,8 @@ from bayesdist.report.sections.run.validity import (
     validity_clause,
 )
 from bayesdist.report.texttable import TextTable, check_cells
+from bayesdist.utils.checks import GROUPS, LEVELS, Check, doubts_of, warnings_of, worst
+from bayesdist.utils.numbers import counted, rounded, with_mas
 
 if TYPE_CHECKING:
     from bayesdist.assess import Margin
@@ -42,7 +42,7 @@ class Verdict:
 def status_checks(r: ReportInput) -> dict[str, tuple[Check, ...]]:
     """Criteria by subject; empty groups are left out.
 
-    They stand in the order of `bayesdist.checks.GROUPS`.
+    They stand in the order of `bayesdist.utils.checks.GROUPS`.
     """
     groups = {
         **{name: tuple(c for c in r.checks if c.group == name) for name in GROUPS},

@@ -10,8 +10,6 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
-from bayesdist.arrays import Bool, Float, Int
-from bayesdist.numbers import count, display_scale, number
 from bayesdist.report.contents import REPORT
 from bayesdist.report.context import ReportInput, needed
 from bayesdist.report.figures.style import (
@@ -25,6 +23,8 @@ from bayesdist.report.figures.style import (
     new_figure,
 )
 from bayesdist.report.registry import Plot
+from bayesdist.utils.arrays import Bool, Float, Int
+from bayesdist.utils.numbers import count, display_scale, number
 
 _POINTS = 1200  # single stars in a panel: more hide each other
 _MIN_STARS = 25  # in a bin on average

@@ -6,8 +6,8 @@ import math
 from datetime import UTC, datetime
 
 from bayesdist.assess.requirements.validity import ValidityPeriod
-from bayesdist.checks import Check
 from bayesdist.report.context import ReportInput
+from bayesdist.utils.checks import Check
 
 
 def validity_checks(r: ReportInput) -> tuple[Check, ...]:

@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 from astropy.modeling import Model
 
-from bayesdist.arrays import Float
 from bayesdist.calibration.calibration import Calibration
 from bayesdist.calibration.inverse import detector_grid, fitted_inverse
 from bayesdist.calibration.plane import Plane
@@ -24,6 +23,7 @@ from bayesdist.products.formats.common.asdf.tree import Detector, PlacedSettings
 from bayesdist.products.formats.common.coefficients import require_regular
 from bayesdist.products.formats.common.document import BuildOptions
 from bayesdist.products.formats.common.record import at_date, record_of
+from bayesdist.utils.arrays import Float
 
 
 @dataclass(frozen=True, eq=False)

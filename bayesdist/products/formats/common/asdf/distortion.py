@@ -10,7 +10,6 @@ import numpy as np
 from astropy.modeling import Model
 from numpy.typing import ArrayLike
 
-from bayesdist.arrays import Float
 from bayesdist.calibration.calibration import Calibration, calibration_of_maps
 from bayesdist.calibration.chip_map import fitted_map
 from bayesdist.calibration.inverse import detector_grid
@@ -22,6 +21,7 @@ from bayesdist.products.formats.common.asdf.tree import Detector
 from bayesdist.products.formats.common.document import Choice, MissingSizeError
 from bayesdist.products.formats.common.read_back import ReadBack, of_chips
 from bayesdist.products.formats.common.record import calibration_from
+from bayesdist.utils.arrays import Float
 
 ARCSEC = {"arcsec": 1.0, "deg": 3600.0, "mas": 1e-3, "rad": 180 / np.pi * 3600, "arcmin": 60.0}
 AGREEMENT = 1e-6  # pixels: as far as record and transform of one file may differ

@@ -7,7 +7,6 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 from astropy.modeling import Model, models
 
-from bayesdist.arrays import Float
 from bayesdist.errors import BayesdistError
 from bayesdist.products.formats.common.asdf.distortion import (
     AGREEMENT,
@@ -19,6 +18,7 @@ from bayesdist.products.formats.common.asdf.distortion import (
 from bayesdist.products.formats.common.asdf.transforms import exchanged, leaves, order_of, tables_of
 from bayesdist.products.formats.common.document import Finding, finding_lines, repeated_values
 from bayesdist.products.formats.common.record import error_lines
+from bayesdist.utils.arrays import Float
 
 PIXEL, SKY = ("pix", "pixel"), ("arcsec",)
 # Closure that a good inverse reaches, and one that only a wrong coefficient leaves; pixels.

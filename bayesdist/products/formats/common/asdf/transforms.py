@@ -14,11 +14,11 @@ import numpy as np
 from astropy.modeling import CompoundModel, Model, models
 from numpy.typing import ArrayLike
 
-from bayesdist.arrays import Float
 from bayesdist.calibration.chip_map import Monomials
 from bayesdist.calibration.inverse import ExplicitInverse
 from bayesdist.model import LookupTable
 from bayesdist.products.formats.common.coefficients import Coefficients
+from bayesdist.utils.arrays import Float
 
 # Fixed-point steps that invert tables: each leaves the table's largest slope times what was left.
 _LEFT, _MOST_STEPS = 1e-10, 12

@@ -11,9 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
+from bayesdist.files.asdf import asdf_tree, asdf_with_transforms
 from bayesdist.products.formats.common.content import Content
 from bayesdist.products.formats.common.document import FormatSettings
-from bayesdist.reading.asdf import asdf_tree, asdf_with_transforms
 
 DESCRIPTION = "Geometric distortion with its uncertainty, by bayesdist"
 

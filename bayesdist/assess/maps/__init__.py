@@ -1,0 +1,1 @@
+"""Maps over the detector: uncertainty of positions, area of pixels."""

@@ -1,0 +1,108 @@
+"""Area that a pixel covers in (u, v), relative to that at the reference pixel."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from bayesdist.calibration.area import determinant
+from bayesdist.calibration.calibration import calibration_of
+from bayesdist.errors import InputError, required
+from bayesdist.infer.solution.solution import Solution
+from bayesdist.model.basis import point_blocks
+from bayesdist.model.grid import DEFAULT_GRID, grid_pixels, mesh
+from bayesdist.utils.arrays import Float
+
+
+@dataclass(frozen=True, eq=False)
+class AreaMap:
+    """Relative pixel area over the detector.
+
+    Parameters
+    ----------
+    x : ndarray, shape (nx,)
+    y : ndarray, shape (ny,)
+        FITS 1-based pixels.
+    area : ndarray, shape (ny, nx)
+        ``|det d(u, v) / d(x, y)|`` over its value at the reference pixel.
+    sigma : ndarray, shape (ny, nx)
+        Standard deviation of `area`; 0 at the reference pixel by definition.
+    reference_area : float
+        Area of the reference pixel, in `unit` squared.
+    unit : str
+        Unit of u and v.
+    chip : int
+    epoch : float or None
+    """
+
+    x: Float
+    y: Float
+    area: Float
+    sigma: Float
+    reference_area: float
+    unit: str
+    chip: int
+    epoch: float | None
+
+
+def area_map(
+    solution: Solution,
+    *,
+    grid: tuple[int, int] = DEFAULT_GRID,
+    epoch: float | None = None,
+    chip: int | None = None,
+) -> AreaMap:
+    """Relative pixel area, with its uncertainty by the delta method.
+
+    The map to multiply flat-fielded photometry with, as in Figure 4.5 of section 4.1 of the ACS
+    handbook.  The frame of an exposure is linear and cancels, so it is the same for all exposures.
+
+    Parameters
+    ----------
+    solution : LinearFit or Posterior
+    grid : tuple of int
+        Points on x and y.
+    epoch : float, optional
+        Decimal years; needed by a model with time dependence.
+    chip : int, optional
+        Chip number; the first chip by default.
+
+    Returns
+    -------
+    AreaMap
+
+    Raises
+    ------
+    InputError
+        When the mapping is singular at the reference pixel, for an unknown chip, a missing epoch,
+        or a bad grid.
+    """
+    one = calibration_of(solution).chip(chip, epoch, origin="stated")
+    basis, covariance = one.basis, required(one.cov, "the solution has no covariance")
+    det_ref, d_ref = determinant(basis, one.coefficients, *np.array(basis.reference_pixel)[:, None])
+    if det_ref[0] == 0.0:
+        raise InputError(
+            "the pixel area is zero at the reference pixel",
+            where=f"chip {one.chip}",
+            do="check the linear terms of the solution and model.reference_pixel",
+        )
+    x, y = grid_pixels(basis.size, grid)
+    X, Y = mesh(x, y)
+    area, sigma = np.empty(X.size), np.empty(X.size)
+    for rows in point_blocks(X.size):
+        det, d = determinant(basis, one.coefficients, X[rows], Y[rows])
+        ratio = det / det_ref
+        slope = d / det_ref - (ratio / det_ref)[:, None] * d_ref
+        area[rows] = np.abs(ratio)
+        sigma[rows] = np.sqrt(np.maximum(np.einsum("nk,nk->n", slope @ covariance, slope), 0.0))
+    return AreaMap(
+        x=x,
+        y=y,
+        area=area.reshape(y.size, x.size),
+        sigma=sigma.reshape(y.size, x.size),
+        reference_area=abs(float(det_ref[0])),
+        unit=one.unit,
+        chip=one.chip or 1,
+        epoch=one.epoch,
+    )

@@ -1,0 +1,238 @@
+"""Maps of the uncertainty of a solution's positions, and circles that hold a given probability."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cache
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy.interpolate import CubicSpline
+from scipy.optimize import brentq
+
+from bayesdist.assess.solution import place_of
+from bayesdist.calibration.chip_map import position_moments
+from bayesdist.infer.solution.solution import Solution
+from bayesdist.model.grid import DEFAULT_GRID, grid_pixels, mesh, position_of_largest
+from bayesdist.utils.arrays import Float
+
+RELATIVE = "relative positions"
+NODES = 33  # ratios of the axes between which radii are interpolated: to 1e-4
+ANGLES = 256
+
+
+@dataclass(frozen=True, eq=False)
+class UncertaintyMap:
+    """Standard deviation of the model's position over the detector.
+
+    Parameters
+    ----------
+    x : ndarray, shape (nx,)
+    y : ndarray, shape (ny,)
+        FITS 1-based pixels.
+    sigma_u, sigma_v : ndarray, shape (ny, nx)
+        In `unit`.
+    correlation : ndarray, shape (ny, nx)
+        Between u and v; 0 where one of them is known exactly.
+    unit : str
+    chip : int
+    epoch : float or None
+        Decimal years.
+    kind : str
+        'least squares', 'posterior', or `RELATIVE`: the posterior without what the gauge decides.
+
+    Examples
+    --------
+    >>> rng = np.random.default_rng(1)
+    >>> matches, truth = bd.simulate_wise(500, rng=rng)
+    >>> model = bd.build_model(matches, order=2, size=(1016, 1016))
+    >>> fit = bd.fit_linear(matches, model)
+    >>> found = bd.uncertainty_map(fit, grid=(5, 3))
+    >>> bool(found.radius_max >= found.sigma_u.max())
+    True
+    """
+
+    x: Float
+    y: Float
+    sigma_u: Float
+    sigma_v: Float
+    correlation: Float
+    unit: str
+    chip: int
+    epoch: float | None
+    kind: str
+
+    @property
+    def radius(self) -> Float:
+        """hypot(sigma_u, sigma_v), (ny, nx): half the diagonal of the +-1 sigma error box."""
+        return np.hypot(self.sigma_u, self.sigma_v)
+
+    @property
+    def per_axis(self) -> Float:
+        """Rms of sigma_u and sigma_v, (ny, nx): 1 sigma of one axis."""
+        return per_axis(self.sigma_u, self.sigma_v)
+
+    def circular_error(self, probability: float) -> Float:
+        """Radius (ny, nx) of the circle that holds the true position with a probability.
+
+        Parameters
+        ----------
+        probability : float
+            Between 0 and 1.
+        """
+        return circular_error(self.sigma_u, self.sigma_v, self.correlation, probability)
+
+    @property
+    def radius_max(self) -> float:
+        """Largest radius: the "max radius" of WSDC D-T033, section 6."""
+        return float(self.radius.max())
+
+    @property
+    def position_of_max(self) -> tuple[float, float]:
+        """Pixel (x, y) of the largest radius."""
+        return position_of_largest(self.radius, self.x, self.y)
+
+    @property
+    def sigma_u_max(self) -> float:
+        """Largest sigma_u."""
+        return float(self.sigma_u.max())
+
+    @property
+    def sigma_v_max(self) -> float:
+        """Largest sigma_v."""
+        return float(self.sigma_v.max())
+
+
+def sigmas_of(uu: Float, vv: Float, uv: Float) -> tuple[Float, Float, Float]:
+    """Standard deviations (N,) of u and v, and their correlation; 0 where one is known exactly."""
+    sigma_u, sigma_v = np.sqrt(uu), np.sqrt(vv)
+    product = sigma_u * sigma_v
+    correlation = np.divide(uv, product, out=np.zeros_like(uv), where=product > 0)
+    return sigma_u, sigma_v, np.clip(correlation, -1.0, 1.0)
+
+
+def with_local(found: UncertaintyMap, sigma: Float | None) -> UncertaintyMap:
+    """A map with what the model leaves out at each position; itself where that is not known.
+
+    `sigma`: (ny nx, 2), of u and v at the points of the map.
+    """
+    if sigma is None:
+        return found
+    u, v = sigma.T.reshape(2, *found.sigma_u.shape)
+    sigma_u, sigma_v = np.hypot(found.sigma_u, u), np.hypot(found.sigma_v, v)
+    return replace(
+        found,
+        sigma_u=sigma_u,
+        sigma_v=sigma_v,
+        correlation=found.correlation * found.sigma_u * found.sigma_v / (sigma_u * sigma_v),
+    )
+
+
+def uncertainty_map(
+    solution: Solution,
+    *,
+    grid: tuple[int, int] = DEFAULT_GRID,
+    epoch: float | None = None,
+    chip: int | None = None,
+    exposure: int | str | None = None,
+) -> UncertaintyMap:
+    """Uncertainty of the predicted position, J cov J^T, over a grid.
+
+    Parameters
+    ----------
+    solution : LinearFit or Posterior
+    grid : tuple of int
+        Points on x and y.
+    epoch : float, optional
+        Decimal years; needed by a model with time dependence.
+    chip : int, optional
+        Chip number; the first chip by default.
+    exposure : int or str, optional
+        Code or name of the exposure in whose frame the position is predicted; the gauge by default.
+
+    Returns
+    -------
+    UncertaintyMap
+
+    Raises
+    ------
+    InputError
+        For an unknown chip or exposure, a missing epoch, or a bad grid.
+
+    Examples
+    --------
+    >>> rng = np.random.default_rng(1)
+    >>> matches, truth = bd.simulate_wise(500, rng=rng)
+    >>> model = bd.build_model(matches, order=2, size=(1016, 1016))
+    >>> fit = bd.fit_linear(matches, model)
+    >>> found = bd.uncertainty_map(fit, grid=(5, 3))
+    >>> found.sigma_u.shape
+    (3, 5)
+    """
+    place = place_of(solution.model, epoch=epoch, exposure=exposure, chip=chip)
+    x, y = grid_pixels(place.chip.size, grid)
+    uu, vv, uv = position_moments(place.covariance(solution), place.basis, *mesh(x, y))
+    shape = (y.size, x.size)
+    sigma_u, sigma_v, correlation = (one.reshape(shape) for one in sigmas_of(uu, vv, uv))
+    return UncertaintyMap(
+        x=x,
+        y=y,
+        sigma_u=sigma_u,
+        sigma_v=sigma_v,
+        correlation=correlation,
+        unit=solution.model.unit,
+        chip=place.chip.number,
+        epoch=place.epoch,
+        kind=solution.kind,
+    )
+
+
+def per_axis(sigma_u: ArrayLike, sigma_v: ArrayLike) -> Float:
+    """Rms of the standard deviations of both axes: 1 sigma of one axis, whatever its direction.
+
+    `sigma_u`, `sigma_v`: in one unit, which is that of the result.
+    """
+    return np.asarray(np.hypot(sigma_u, sigma_v) / np.sqrt(2.0))
+
+
+def circular_error(
+    sigma_u: ArrayLike, sigma_v: ArrayLike, correlation: ArrayLike, probability: float
+) -> Float:
+    """Radius of the circle about the true position that holds a probability: CE68, CE95.
+
+    Parameters
+    ----------
+    sigma_u, sigma_v : array_like
+        Standard deviations, in one unit, which is that of the result.
+    correlation : array_like
+        Between u and v.
+    probability : float
+        Between 0 and 1.
+
+    Examples
+    --------
+    >>> float(circular_error(1.0, 1.0, 0.0, 0.68).round(3))
+    1.51
+    """
+    u, v = np.square(sigma_u), np.square(sigma_v)
+    middle, half = (u + v) / 2, (u - v) / 2
+    spread = np.hypot(half, np.multiply(correlation, np.sqrt(u * v)))
+    major, minor = np.sqrt(middle + spread), np.sqrt(np.maximum(middle - spread, 0.0))
+    ratio = np.divide(minor, major, out=np.ones_like(major), where=major > 0)
+    return np.asarray(major * _radii(probability)(ratio))
+
+
+@cache
+def _radii(probability: float) -> CubicSpline:
+    """Radius over the major axis, as a function of minor over major axis."""
+    ratios = np.linspace(0.0, 1.0, NODES)
+    angle = (np.arange(ANGLES) + 0.5) * np.pi / (2 * ANGLES)
+
+    def outside(radius: float, ratio: float) -> float:
+        square = np.cos(angle) ** 2 + (ratio * np.sin(angle)) ** 2
+        return float(np.exp(-0.5 * radius**2 / square).mean())
+
+    return CubicSpline(
+        ratios,
+        [brentq(lambda r, k=k: outside(r, k) - (1 - probability), 1e-3, 10.0) for k in ratios],
+    )

@@ -1,0 +1,88 @@
+"""JSON and TOML: trees of a plausible depth, with numbers that are numbers."""
+
+from __future__ import annotations
+
+import json
+import re
+import tomllib
+from pathlib import Path
+from typing import Any, TypeVar
+
+from pydantic import TypeAdapter, ValidationError
+
+from bayesdist.errors import FormatError
+from bayesdist.files.regular import MOST_TEXT, read_text
+
+T = TypeVar("T")
+
+DEEPEST = 64  # brackets within each other; our own files have fewer than ten
+
+
+def json_of(text: str, where: str, *, do: str = "restore it, or write it again") -> Any:
+    """Tree of a JSON text."""
+    try:
+        return _not_too_deep(json.loads(text), where, do)
+    except (ValueError, RecursionError) as error:
+        raise FormatError(
+            f"is not JSON that can be read ({_reason(error)})", where=where, do=do
+        ) from error
+
+
+def toml_of(text: str, where: str) -> dict[str, Any]:
+    """Tree of a TOML text."""
+    do = "correct it there"
+    try:
+        return _not_too_deep(tomllib.loads(text), where, do)
+    except (ValueError, RecursionError) as error:
+        raise FormatError(f"is not valid TOML ({_reason(error)})", where=where, do=do) from error
+
+
+def read_json(path: Path, *, do: str = "restore it, or write it again") -> Any:
+    """Tree of a JSON file; errors as of `read_text` and `json_of`."""
+    return json_of(read_text(path, most=MOST_TEXT), str(path), do=do)
+
+
+def read_json_as(kind: TypeAdapter[T], path: Path, *, do: str) -> T:
+    """Content of a JSON file as a type; errors as of `read_json` and `model_of`."""
+    return model_of(kind, read_json(path, do=do), str(path), do=do)
+
+
+def model_of(kind: TypeAdapter[T], tree: Any, where: str, *, do: str) -> T:
+    """A tree as a type.
+
+    FormatError with the key that does not fit.
+    """
+    try:
+        return kind.validate_python(tree)
+    except ValidationError as error:
+        first = error.errors()[0]
+        key = ".".join(str(part) for part in first["loc"])
+        reason = re.sub(r" or instance of \w+", "", first["msg"]).rstrip(".")
+        raise FormatError(
+            f"is not as bayesdist wrote it ({f'{key}: ' if key else ''}{reason})",
+            where=where,
+            do=do,
+        ) from error
+
+
+def _not_too_deep(tree: Any, where: str, do: str) -> Any:
+    """The tree, unless its brackets are nested too deep for whoever goes through it."""
+    level, depth = [tree], 1
+    while level := [one for one in level if isinstance(one, dict | list)]:
+        if depth > DEEPEST:
+            raise FormatError(
+                f"has more than {DEEPEST} brackets within each other", where=where, do=do
+            )
+        level = [
+            inner for one in level for inner in (one.values() if isinstance(one, dict) else one)
+        ]
+        depth += 1
+    return tree
+
+
+def _reason(error: Exception) -> str:
+    if isinstance(error, RecursionError):
+        return "brackets are nested too deep"
+    if "integer string conversion" in str(error):
+        return "a whole number has thousands of digits"
+    return str(error)

@@ -1,0 +1,219 @@
+"""Table files to an astropy Table; anything wrong with one becomes one clear error."""
+
+from __future__ import annotations
+
+import csv
+import io
+import re
+import warnings
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from functools import partial
+from itertools import takewhile
+from pathlib import Path
+
+import numpy as np
+from astropy.io import fits
+from astropy.table import Table, vstack
+from astropy.utils.xml.iterparser import get_xml_iterator
+
+from bayesdist.errors import FormatError, InputError
+from bayesdist.files.faults import naming_faults
+from bayesdist.files.fits import FITS_START, open_fits
+from bayesdist.files.parquet import parquet_table
+from bayesdist.files.regular import head_of, read_bytes, read_lines
+from bayesdist.files.text_tables import is_text_table, parse_text_table, refuse_cut_end
+from bayesdist.files.unpacked import unpacked
+
+_COMMAS = re.compile(r"# delimiter: ['\"]?,")
+
+
+@contextmanager
+def _reading(path: Path) -> Iterator[None]:
+    """Context of `naming_faults` in which the warnings of readers are silenced.
+
+    Python keeps its rules for warnings once for all threads, so that several threads at a time must
+    do without.
+    """
+    with naming_faults(path), warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # units are checked later, column by column
+        warnings.filterwarnings("error", message=".*truncated.*")
+        yield
+
+
+def _whole_lines(path: Path, mark: str) -> list[str]:
+    """Lines without their ends: as a list, for astropy takes a lone line for the name of a file.
+
+    FormatError where the last one is cut.
+    """
+    lines = read_lines(path)
+    if lines and lines[0].startswith("# %ECSV"):
+        head = takewhile(lambda line: line.startswith("#"), lines)
+        mark = "," if any(_COMMAS.match(line) for line in head) else " "
+    bare = [line.rstrip("\r\n") for line in lines]
+    _refuse_short_rows(bare, mark, path)
+    refuse_cut_end(lines, mark, where=str(path))
+    return bare
+
+
+def read_ecsv(path: Path) -> Table:
+    """Table of an ECSV file; errors as of `read_table`."""
+    with _reading(path):
+        return Table.read(_whole_lines(path, " "), format="ascii.ecsv")
+
+
+def _read_text(path: Path) -> Table:
+    return parse_text_table(read_lines(path), where=str(path))
+
+
+def _read_separated(path: Path, *, mark: str, format: str) -> Table:
+    return Table.read(_whole_lines(path, mark), format=format, comment="#", guess=False)
+
+
+def _refuse_short_rows(lines: list[str], mark: str, path: Path) -> None:
+    """Refuse rows with fewer cells than there are names: astropy fills them up in silence."""
+    width, row = 0, 0
+    for cells in csv.reader((line for line in lines if line[:1] != "#"), delimiter=mark):
+        if not cells or cells == [""]:
+            continue
+        if width and len(cells) < width:
+            raise FormatError(
+                f"has {len(cells)} of {width} cells",
+                where=f"{path}, row {row}",
+                do="the table may be truncated: fetch or write it again",
+            )
+        width, row = width or len(cells), row + 1
+
+
+def _read_votable(path: Path) -> Table:
+    raw = unpacked(read_bytes(path), str(path))
+    for announced in re.findall(rb"nrows\s*=\s*[\"'](\d+)", raw):
+        # room is made for so many rows before any is read; a row has a tag or a byte at least
+        if len(announced) > 12 or int(announced) > len(raw):
+            raise FormatError(
+                f"announces {announced[:20].decode()} rows in {len(raw)} bytes",
+                where=str(path),
+                do="fetch or write it again",
+            )
+    table = Table.read(io.BytesIO(raw), format="votable")
+    if any(np.ma.is_masked(table[name]) for name in table.colnames):
+        _refuse_unreadable_cells(raw, path)
+    return table
+
+
+# cells that state that there is no number; whatever is no number either, astropy takes for such
+_NO_NUMBER = {"", "null"}
+
+
+def _refuse_unreadable_cells(raw: bytes, path: Path) -> None:
+    """Refuse cells of a VOTable's columns of numbers that are neither numbers nor missing."""
+    fields, row, column = list[tuple[str, str]](), 0, 0
+    with get_xml_iterator(io.BytesIO(raw)) as steps:
+        for begins, tag, content, _ in steps:
+            if begins and tag == "FIELD":
+                single = "arraysize" not in content
+                kind = content.get("datatype", "") if single else ""
+                fields.append((content.get("name", ""), kind))
+            elif begins and tag == "TABLE":
+                fields, row = [], 0
+            elif begins and tag == "TR":
+                row, column = row + 1, 0
+            elif not begins and tag == "TD" and column < len(fields):
+                name, kind = fields[column]
+                column += 1
+                if kind in ("float", "double") and not _says_number(content):
+                    raise FormatError(
+                        f"{content.strip()[:40]!r} is no number",
+                        where=f"{path}, row {row}, column {name!r}",
+                        do="correct the cell or leave it empty",
+                    )
+
+
+def _says_number(cell: str) -> bool:
+    try:
+        float(cell)
+    except ValueError:
+        return cell.strip().lower() in _NO_NUMBER
+    return True
+
+
+def _read_fits(path: Path) -> Table:
+    with open_fits(unpacked(read_bytes(path), str(path)), str(path)) as hdus:
+        tables = [hdu for hdu in hdus if isinstance(hdu, fits.BinTableHDU | fits.TableHDU)]
+        objects = [hdu for hdu in tables if hdu.name == "LDAC_OBJECTS"]
+        if objects:
+            return _ldac(hdus, objects)
+        if tables:
+            # NaN stays NaN: to call it a missing value would name the wrong fault
+            return Table.read(tables[0], format="fits", mask_invalid=False)
+    raise FormatError("holds no table extension", where=str(path), do="give a FITS table")
+
+
+def _ldac(hdus: fits.HDUList, objects: list[fits.BinTableHDU]) -> Table:
+    """Objects of a FITS_LDAC catalogue, with the date of the image; several are chips."""
+    tables = [Table.read(hdu, format="fits", mask_invalid=False) for hdu in objects]
+    heads = [hdu for hdu in hdus if hdu.name == "LDAC_IMHEAD"]
+    text = ""
+    if heads and heads[0].data is not None:
+        text = "".join(str(card) for card in np.ravel(heads[0].data.field(0)))
+    image = fits.Header.fromstring(text if len(text) % 80 == 0 else "")
+    for number, table in enumerate(tables, 1):
+        if len(tables) > 1 and "EXT_NUMBER" not in table.colnames:
+            table["EXT_NUMBER"] = number
+        table.meta = {}  # settings of SExtractor
+    out = vstack(tables, metadata_conflicts="silent") if len(tables) > 1 else tables[0]
+    for key in ("MJD-OBS", "DATE-OBS"):
+        if key in image:
+            out.meta[key] = image[key]
+    return out
+
+
+TABLE_SUFFIXES: dict[str, Callable[[Path], Table]] = {
+    ".ecsv": read_ecsv,
+    ".csv": partial(_read_separated, mark=",", format="ascii.csv"),
+    ".tsv": partial(_read_separated, mark="\t", format="ascii.tab"),
+    ".fits": _read_fits,
+    ".fit": _read_fits,
+    ".ldac": _read_fits,
+    ".parquet": parquet_table,
+    ".vot": _read_votable,
+    ".xml": _read_votable,
+    ".tbl": _read_text,
+    ".ipac": _read_text,
+}
+
+
+def is_binary(path: Path) -> bool:
+    """True where a file is no text; a file that cannot be read is left to its reader."""
+    head = head_of(path)
+    return b"\0" in head or head.startswith(FITS_START)
+
+
+def is_fits(path: Path) -> bool:
+    """True where a file begins as FITS does."""
+    return head_of(path).startswith(FITS_START)
+
+
+def read_table(path: Path) -> Table:
+    """Table of a file, by its extension; one that is missing, damaged or unknown is refused.
+
+    Known are .ecsv, .csv, .tsv, .fits (first table extension, of FITS_LDAC the objects; also
+    .fits.gz), .parquet, .vot or .xml (VOTable), .tbl and .ipac; other names by content: FITS, and
+    text as `parse_text_table` knows it.
+    """
+    name = path.name.lower().removesuffix(".gz")
+    reader = next((r for end, r in TABLE_SUFFIXES.items() if name.endswith(end)), None)
+    if reader is None and is_fits(path):
+        reader = _read_fits
+    if reader is None and not is_binary(path) and is_text_table(read_lines(path)):
+        reader = _read_text
+    if reader is None:
+        raise InputError(
+            f"extension {path.suffix!r} is not one of a table",
+            where=str(path),
+            do=f"give a file that ends in {', '.join(TABLE_SUFFIXES)}, or set the format",
+        )
+    if path.is_file() and not path.stat().st_size:
+        raise FormatError("is empty", where=str(path), do="fetch or write it again")
+    with _reading(path):
+        return reader(path)

@@ -1,0 +1,163 @@
+"""Checks of a fit and of a posterior: convergence, chi-square, what was left out."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from bayesdist.infer.convergence import Convergence
+from bayesdist.infer.posterior import Posterior
+from bayesdist.infer.solution.linear import LinearFit
+from bayesdist.utils.checks import EITHER, Check, level_of
+from bayesdist.utils.distributions import chi2_cdf
+from bayesdist.utils.limits import (
+    CHI2_TOO_LARGE,
+    CHI2_TOO_SMALL,
+    CHI2_TOO_SMALL_CHANCE,
+    CONDITION,
+    IMPORTANCE_EFFICIENCY,
+    LEFT_OUT,
+    MEAN_ERROR,
+    PARETO_K,
+)
+from bayesdist.utils.numbers import count, number, percent
+
+FIT, SAMPLING = "Fit", "Sampling"
+
+
+def scatter_too_small(total: float, dof: float) -> bool:
+    """True if residuals with this chi-square scatter less than their quoted errors."""
+    by_chance = float(chi2_cdf(total, max(dof, 1)))
+    return total < CHI2_TOO_SMALL.value * dof and by_chance < CHI2_TOO_SMALL_CHANCE.value
+
+
+def fit_checks(
+    fit: LinearFit,
+    *,
+    in_circle: bool = False,
+    things: str = "stars",
+    chooser: str = "least-squares fit",
+) -> tuple[Check, ...]:
+    """Checks of chi-square, of the rows left out and of the condition of a fit.
+
+    `in_circle` if the likelihood accounts for the circles that stars were matched in; `things` are
+    what is fitted, one row each, and `chooser` leaves out rows that are far off.
+    """
+    ratio = fit.chi2 / fit.dof if fit.dof > 0 else float("nan")
+    left_out = fit.n_rejected / fit.n_rows
+    small = scatter_too_small(fit.chi2, fit.dof)
+    sentence = _of_chi2(fit, small, in_circle)
+    return (
+        Check(
+            FIT,
+            "Chi-square per degree of freedom, quoted errors",
+            number(ratio),
+            f"{CHI2_TOO_SMALL.value:g} to {CHI2_TOO_LARGE.value:g}",
+            level_of(not small and CHI2_TOO_LARGE.met_by(ratio), "warn"),
+            sentence,
+            EITHER if small and not in_circle else "",
+        ),
+        Check(
+            FIT,
+            f"{things.capitalize()} left out by the {chooser}",
+            percent(left_out),
+            f"at most {percent(LEFT_OUT.value, 2)}",
+            level_of(LEFT_OUT.met_by(left_out), "warn"),
+        ),
+        Check(
+            FIT,
+            "Condition number of the scaled normal matrix",
+            number(fit.condition, 2),
+            f"at most {number(CONDITION.value, 1)}",
+            level_of(CONDITION.met_by(fit.condition), "warn"),
+        ),
+    )
+
+
+def _of_chi2(fit: LinearFit, small: bool, in_circle: bool) -> str:
+    """Sentence on a chi-square that is not about one; empty where it is."""
+    ratio = fit.chi2 / max(fit.dof, 1)
+    if small and in_circle:
+        return (
+            f"chi-square per degree of freedom of least squares is {ratio:.2g}: the match circle "
+            "cuts the residuals, and draws this fit to the nominal solution; the posterior "
+            "accounts for the circle"
+        )
+    if small:
+        return (
+            f"chi-square per degree of freedom is {ratio:.2g}: the match radius has cut the "
+            "residuals, or the quoted errors are too large, and with them all uncertainties"
+        )
+    if ratio > CHI2_TOO_LARGE.value:
+        return (
+            f"chi-square per degree of freedom is {ratio:.3g} with the quoted errors: they are too "
+            "small, which the jitter takes up, or the model does not fit"
+        )
+    return ""
+
+
+def convergence_check(c: Convergence) -> Check:
+    """Check that the draws can be relied on at all."""
+    sentence = ""
+    if not c.converged:
+        why = "; ".join(c.reasons)
+        sentence = "the posterior is not converged" + (f": {why}" if why else "")
+    good = "yes" if c.converged else "NO"
+    return Check(
+        SAMPLING, "Converged", good, "yes", level_of(c.converged), sentence, sentence and EITHER
+    )
+
+
+def sampling_checks(posterior: Posterior | None) -> tuple[Check, ...]:
+    """Checks of the draws; that there are none, for a fit alone."""
+    if posterior is None:
+        return (Check(SAMPLING, "Posterior", "not sampled", "sampled and converged", "warn"),)
+    c = posterior.convergence
+    D = len(posterior.mean)
+    sd = np.sqrt(np.diag(posterior.cov))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        mcse = float(np.nanmax(np.where(sd > 0, c.mcse_mean[:D] / sd, 0.0), initial=0.0))
+    label = posterior.approximation
+    method = [Check(SAMPLING, "Method", level="warn", sentence=label)] if label else []
+    # what only advises does not fail by itself: the limits of R-hat and ESS decide
+    return (
+        *method,
+        convergence_check(c),
+        Check(
+            SAMPLING,
+            f"Largest R-hat, {posterior.sampler.ensembles} independent ensembles",
+            f"{c.rhat_max:.4f}" if np.isfinite(c.rhat_max) else "∞",
+            f"at most {c.limits.rhat:g}",
+            level_of(c.rhat_max <= c.limits.rhat),
+        ),
+        *(
+            Check(
+                SAMPLING,
+                f"Smallest {part} effective sample size",
+                count(np.floor(ess)),
+                f"at least {count(c.limits.ess)}",
+                level_of(ess >= c.limits.ess),
+            )
+            for part, ess in (("bulk", c.ess_bulk_min), ("tail", c.ess_tail_min))
+        ),
+        Check(
+            SAMPLING,
+            "Largest Monte-Carlo error of a mean, in posterior sd",
+            number(mcse, 2),
+            MEAN_ERROR.words,
+            level_of(MEAN_ERROR.met_by(mcse), "warn"),
+        ),
+        Check(
+            SAMPLING,
+            "Pareto k of the proposal",
+            number(c.pareto_k, 2),
+            PARETO_K.words,
+            level_of(PARETO_K.met_by(c.pareto_k), "warn"),
+        ),
+        Check(
+            SAMPLING,
+            "Importance efficiency of the proposal",
+            percent(c.importance_efficiency, 2),
+            f"at least {percent(IMPORTANCE_EFFICIENCY.value, 2)}",
+            level_of(IMPORTANCE_EFFICIENCY.met_by(c.importance_efficiency), "warn"),
+        ),
+    )

@@ -1,0 +1,362 @@
+"""Solutions as netCDF files, written whole or not at all, and read with one clear error.
+
+fit.nc holds a linear fit, posterior.nc a posterior, as a tree that ArviZ and xarray open: groups
+posterior, sample_stats, diagnostics; for tables in memory also observed_data, constant_data and,
+where that is not too large, log_likelihood. Values for each star of larger data are in separate
+files, in the parts of `stars/`.
+"""
+
+from __future__ import annotations
+
+import io
+import json
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+import h5netcdf
+import h5py
+import numpy as np
+from numpy.typing import NDArray
+
+from bayesdist.data.matches import Matches
+from bayesdist.errors import FormatError
+from bayesdist.files.atomic import atomic_path
+from bayesdist.files.documents import json_of
+from bayesdist.files.faults import restoring
+from bayesdist.files.hdf5 import netcdf_groups
+from bayesdist.infer.convergence import DIAGNOSTICS, Convergence, Limits
+from bayesdist.infer.posterior import Certificate, Posterior, SamplerInfo
+from bayesdist.infer.posterior.memberships import memberships, star_log_likelihood
+from bayesdist.infer.solution.linear import LinearFit
+from bayesdist.infer.stars.likelihood import Clip
+from bayesdist.infer.stars.mixture import OutlierMixture
+from bayesdist.model import DistortionModel
+
+SCHEMA = 2
+POSTERIOR_NUMBERS = ("n_stars", "n_flagged", "n_false", "reference_sigma")
+MOST_STARS = 1_000_000  # with more stars their data are not repeated in the file
+LARGEST = 16_000_000  # bytes of log-likelihood that are stored star by star and draw by draw
+LEAST_RHAT = 0.5  # chains of four draws have 0.87 at least
+FIT_NUMBERS = ("n_rows", "n_used", "rms_u", "rms_v", "rms_rejected", "chi2", "dof", "condition")
+
+
+def save_posterior(
+    posterior: Posterior,
+    matches: Matches | None,
+    path: str | Path,
+    *,
+    provenance: Mapping[str, object] | None = None,
+) -> None:
+    """Write a posterior to a netCDF file.
+
+    Parameters
+    ----------
+    posterior : Posterior
+    matches : Matches or None
+        The data it was made from; None, or more than a million stars, leaves them out.
+    path : path
+        Replaced atomically.
+    provenance : mapping, optional
+        JSON-able facts about the run, stored as an attribute.
+
+    Raises
+    ------
+    InputError
+        When the system refuses to write.
+
+    Examples
+    --------
+    >>> rng = np.random.default_rng(1)
+    >>> matches, truth = bd.simulate_wise(500, rng=rng)
+    >>> model = bd.build_model(matches, order=2, size=(1016, 1016))
+    >>> fit = bd.fit_linear(matches, model)
+    >>> posterior = bd.sample(fit, matches, seed=1, target_ess=100)
+    >>> bd.save_posterior(posterior, matches, "posterior.nc")
+    >>> np.array_equal(bd.load_posterior("posterior.nc").theta, posterior.theta)
+    True
+    """
+    c = posterior.convergence
+    names, units = posterior.model.names, posterior.model.units
+    groups = {
+        "": _Group(
+            attrs={
+                "schema": SCHEMA,
+                "creator": "bayesdist",
+                "model": json.dumps(posterior.model.to_dict()),
+                "mixture": json.dumps(asdict(posterior.mixture)),
+                "provenance": json.dumps(dict(provenance or {}), default=str),
+                "certificate": json.dumps(posterior.certificate and asdict(posterior.certificate)),
+                "n_parameters": len(names),
+                "own_places": int(posterior.own_places),
+                **{name: getattr(posterior, name) for name in POSTERIOR_NUMBERS},
+            }
+        ),
+        "posterior": _Group(
+            {
+                "theta": (("chain", "draw", "parameter"), posterior.theta),
+                **{k: (("chain", "draw"), v) for k, v in posterior.hyper.items()},
+                "parameter": (("parameter",), names),
+            },
+            coordinates={"unit": ("parameter", units)},
+        ),
+        "sample_stats": _Group(
+            {"lp": (("chain", "draw"), posterior.log_prob)},
+            attrs=asdict(posterior.sampler) | {"exact": int(posterior.sampler.exact)},
+        ),
+        "diagnostics": _Group(
+            {
+                **{name: (("sampled",), getattr(c, name)) for name in DIAGNOSTICS},
+                "sampled": (("sampled",), c.names),
+            },
+            attrs={
+                "pareto_k": c.pareto_k,
+                "importance_efficiency": c.importance_efficiency,
+                "converged": int(c.converged),
+                "reasons": json.dumps(c.reasons),
+                "limit_ess": c.limits.ess,
+                "limit_rhat": c.limits.rhat,
+            },
+        ),
+    }
+    if matches is not None and len(matches) <= MOST_STARS:
+        groups["observed_data"] = _Group({"u": (("star",), matches.u), "v": (("star",), matches.v)})
+        groups["constant_data"] = _constants(posterior, matches)
+        # of one draw only where the stars' positions are unknowns too
+        few = posterior.log_prob.size * len(matches) * 8 <= LARGEST
+        if few and not posterior.own_places:
+            values = star_log_likelihood(posterior, matches)
+            groups["log_likelihood"] = _Group({"uv": (("chain", "draw", "star"), values)})
+    _write(groups, path)
+
+
+def _constants(posterior: Posterior, matches: Matches) -> _Group:
+    """Columns of the matches that the posterior was made from."""
+    columns = {
+        "x": matches.x,
+        "y": matches.y,
+        "sigma_u": matches.sigma_u,
+        "sigma_v": matches.sigma_v,
+        "exposure": np.asarray(matches.exposure),
+        "chip": matches.chip_number,
+        "outlier_probability": memberships(posterior, matches).outlier_probability,
+        "row": matches.row,
+    }
+    for name in ("epoch", "mag", "colour"):
+        if getattr(matches, name) is not None:
+            columns[name] = getattr(matches, name)
+    return _Group(
+        {name: (("star",), values) for name, values in columns.items()},
+        attrs={"unit": matches.unit, "exposure_names": json.dumps(matches.exposure_names)},
+    )
+
+
+def load_posterior(path: str | Path) -> Posterior:
+    """Posterior from a file.
+
+    Parameters
+    ----------
+    path : path
+        A posterior.nc, or a run directory that holds one.
+
+    Returns
+    -------
+    Posterior
+
+    Raises
+    ------
+    FormatError
+        When the file is missing or is not such a file.
+
+    Examples
+    --------
+    >>> rng = np.random.default_rng(1)
+    >>> matches, truth = bd.simulate_wise(500, rng=rng)
+    >>> model = bd.build_model(matches, order=2, size=(1016, 1016))
+    >>> fit = bd.fit_linear(matches, model)
+    >>> posterior = bd.sample(fit, matches, seed=1, target_ess=100)
+    >>> bd.save_posterior(posterior, None, "posterior.nc")
+    >>> bd.load_posterior("posterior.nc").model == posterior.model
+    True
+    """
+    path = Path(path)
+    if path.is_dir():
+        path = path / "posterior.nc"
+    with _reading(path, "a posterior", "sample"):
+        groups = netcdf_groups(path)
+        attrs, draws = groups[""].attrs, groups["posterior"].arrays
+        checks, limits = groups["diagnostics"].arrays, groups["diagnostics"].attrs
+        stats = groups["sample_stats"]
+        if attrs.get("creator") != "bayesdist":
+            raise KeyError("creator")
+        mixture = _tree(attrs["mixture"])
+        mixture["fraction_prior"] = tuple(mixture["fraction_prior"])
+        info: dict[str, Any] = {str(k): _plain(v) for k, v in stats.attrs.items()}
+        info["exact"] = bool(info["exact"])
+        model = DistortionModel.from_dict(_tree(attrs["model"]))
+        theta, log_prob = draws["theta"], stats.arrays["lp"]
+        hyper = {str(name): draws[name] for name in ("j", "f", "s_out") if name in draws}
+        shape = (*theta.shape[:2], len(model.names))
+        _refuse_other_shape(theta, shape)
+        for one in (log_prob, *hyper.values()):
+            _refuse_other_shape(one, shape[:2])
+        for check in DIAGNOSTICS:  # NaN where a parameter does not move
+            _refuse_other_shape(np.nan_to_num(checks[check]), checks["sampled"].shape)
+        if (checks["rhat"] < LEAST_RHAT).any():  # False for NaN
+            raise FormatError(f"R-hat is below {LEAST_RHAT}, which no draws have")
+        return Posterior(
+            model=model,
+            mixture=OutlierMixture(**mixture),
+            theta=theta,
+            hyper=hyper,
+            log_prob=log_prob,
+            n_stars=int(attrs["n_stars"]),
+            n_flagged=int(attrs["n_flagged"]),
+            n_false=float(attrs["n_false"]),
+            reference_sigma=float(attrs["reference_sigma"]),
+            convergence=Convergence(
+                names=tuple(str(n) for n in checks["sampled"]),
+                **{name: checks[name] for name in DIAGNOSTICS},
+                pareto_k=float(limits["pareto_k"]),
+                importance_efficiency=float(limits["importance_efficiency"]),
+                converged=bool(limits["converged"]),
+                reasons=tuple(_tree(limits["reasons"])),
+                limits=Limits(float(limits["limit_ess"]), float(limits["limit_rhat"])),
+            ),
+            sampler=SamplerInfo(**info),
+            certificate=_certificate(_tree(attrs["certificate"])),
+            own_places=bool(attrs.get("own_places", False)),
+        )
+
+
+def _certificate(fields: dict[str, Any] | None) -> Certificate | None:
+    return None if fields is None else Certificate(**fields | {"reasons": tuple(fields["reasons"])})
+
+
+def _refuse_other_shape(values: NDArray[Any], shape: tuple[int, ...]) -> None:
+    """Refuse (ValueError) an array of another shape, or with values that are no finite numbers."""
+    if values.shape != shape:
+        raise ValueError(f"an array has the shape {values.shape} in place of {shape}")
+    if values.dtype.kind not in "fiu" or not np.isfinite(values).all():
+        raise ValueError("an array has values that are not finite")
+
+
+def _tree(text: object) -> Any:
+    """Tree of an attribute that holds JSON."""
+    if not isinstance(text, str):
+        raise TypeError("an attribute is no text")
+    return json_of(text, "")
+
+
+def _plain(value: object) -> object:
+    return value.item() if isinstance(value, np.generic) else value
+
+
+def save_fit(fit: LinearFit, path: str | Path) -> None:
+    """Write a linear fit to a netCDF file, which is replaced atomically."""
+    names = fit.model.names
+    data = _Group(
+        {
+            "mean": (("parameter",), fit.mean),
+            "cov": (("parameter", "parameter_2"), fit.cov),
+            "clip": (("parameter",), fit.clip.theta),
+            "parameter": (("parameter",), names),
+            "parameter_2": (("parameter_2",), names),
+        },
+        attrs={
+            "creator": "bayesdist",
+            "model": json.dumps(fit.model.to_dict()),
+            "rejected": json.dumps(fit.rejected),
+            "clip_chi2_limit": fit.clip.chi2_limit,
+            "clip_abs_limit": fit.clip.abs_limit,
+            **{name: getattr(fit, name) for name in FIT_NUMBERS},
+        },
+    )
+    _write({"": data}, path)
+
+
+def load_fit(path: str | Path) -> LinearFit:
+    """Linear fit from a file.
+
+    Raises
+    ------
+    FormatError
+        When the file is missing or is not such a file.
+    """
+    path = Path(path)
+    with _reading(path, "a fit", "fit"):
+        top = netcdf_groups(path)[""]
+        data, attrs = top.arrays, top.attrs
+        model = DistortionModel.from_dict(_tree(attrs["model"]))
+        n = len(model.names)
+        for name, shape in (("mean", (n,)), ("cov", (n, n)), ("clip", (n,))):
+            _refuse_other_shape(data[name], shape)
+        return LinearFit(
+            model=model,
+            mean=data["mean"],
+            cov=data["cov"],
+            clip=Clip(
+                data["clip"],
+                float(attrs["clip_chi2_limit"]),
+                float(attrs["clip_abs_limit"]),
+            ),
+            rejected=_tree(attrs["rejected"]),
+            **{name: attrs[name].item() for name in FIT_NUMBERS},
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class _Group:
+    """A group of a netCDF file: variables with the names of their dimensions, and attributes.
+
+    `coordinates` belong to the variables that have their dimension, and are none themselves.
+    """
+
+    variables: Mapping[str, tuple[tuple[str, ...], Any]] = field(default_factory=dict)
+    attrs: Mapping[str, Any] = field(default_factory=dict)
+    coordinates: Mapping[str, tuple[str, Any]] = field(default_factory=dict)
+
+
+def _write(groups: Mapping[str, _Group], path: str | Path) -> None:
+    """Write the groups of a file, '' at its top, replaced atomically.
+
+    The file is built in memory: on a full disk HDF5 itself would crash when it is closed.
+    """
+    buffer = io.BytesIO()
+    with h5netcdf.File(buffer, "w") as file:
+        for name, group in groups.items():
+            _fill(file.create_group(name) if name else file, group)
+    with atomic_path(path) as temporary:
+        temporary.write_bytes(buffer.getvalue())
+
+
+def _fill(target: h5netcdf.Group, group: _Group) -> None:
+    """Write one group of a file."""
+    target.attrs.update(group.attrs)
+    coordinates = {name: ((along,), values) for name, (along, values) in group.coordinates.items()}
+    for name, (along, content) in {**group.variables, **coordinates}.items():
+        values = np.asarray(content)
+        if values.dtype.kind == "U":
+            values = values.astype(h5py.string_dtype())
+        for one, size in zip(along, values.shape, strict=True):
+            target.dimensions.setdefault(one, size)
+        variable = target.create_variable(name, along, values.dtype, values)
+        of = [one for one, (where, _) in group.coordinates.items() if where in along]
+        if of and name not in (*of, *along):
+            variable.attrs["coordinates"] = " ".join(of)
+
+
+@contextmanager
+def _reading(path: Path, what: str, stage: str) -> Iterator[None]:
+    """Turn any exception while a file is read into one FormatError.
+
+    `what` names the expected content ('a posterior', 'a fit'), `stage` the stage that makes it.
+    """
+    if not path.exists():
+        raise FormatError(
+            "there is no such file", where=str(path), do=f"run 'bayesdist stage {stage} RUN' first"
+        )
+    with restoring(path, what, do=f"make it again with 'bayesdist stage {stage} RUN'"):
+        yield

@@ -1,0 +1,1 @@
+"""Solutions: parameters with their covariance; the linear fit, and transformed ones."""

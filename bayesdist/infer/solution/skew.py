@@ -1,0 +1,80 @@
+"""Skew of the gnDSTR model, the angle between the detector's axes on the sky, as a constraint.
+
+WSDC D-T033, section 1: a polynomial for each axis "plus a skew factor applied to Y", constrained to
+zero. With all linear terms in both polynomials the skew is no additional parameter: a solution (u,
+v) = S(skew) w, whose w has perpendicular axes at the reference pixel, is again a polynomial of the
+same order. The skew is a function of four linear coefficients.
+
+For e_x, e_y, the images of one pixel along x and along y at the reference pixel::
+
+    sin(skew) = - e_x . e_y / (|e_x| |e_y|)         the angle from e_x to e_y is 90 degrees + skew
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from bayesdist.infer.solution.solution import Solution
+from bayesdist.model import DistortionModel
+from bayesdist.utils.arrays import Float
+
+__all__ = ["Skew", "skew_of"]
+
+
+@dataclass(frozen=True)
+class Skew:
+    """Deviation of the angle between the axes from 90 degrees.
+
+    Parameters
+    ----------
+    value, sigma : float
+        Radians.
+    """
+
+    value: float
+    sigma: float
+
+    @property
+    def significance(self) -> float:
+        """The value in units of its error; infinite where the axes are known exactly."""
+        return self.value / self.sigma if self.sigma > 0 else float("inf")
+
+
+def skew_of(solution: Solution, *, chip: int | None = None) -> Skew:
+    """Skew in a solution's linear terms, with its error.
+
+    Parameters
+    ----------
+    solution : Solution
+        The error of a fit with extra weight in the corners is that of its sandwich covariance.
+    chip : int, optional
+        Chip number; the first chip by default.
+
+    Returns
+    -------
+    Skew
+        At the reference pixel; drift and exposure frames are left out.
+    """
+    value, gradient = _skew(solution.model, solution.mean, chip)
+    # rounding may leave the variance of what was imposed below zero
+    return Skew(value, float(np.sqrt(max(float(gradient @ solution.cov @ gradient), 0.0))))
+
+
+def _skew(model: DistortionModel, theta: Float, chip: int | None) -> tuple[float, Float]:
+    """Skew in radians, and its derivative (D,) with respect to theta."""
+    basis = model.basis(chip)
+    slices = [model.coefficient_slice(chip, axis) for axis in (0, 1)]
+    rows = basis.monomial_matrix[[basis.terms.index((1, 0)), basis.terms.index((0, 1))]]
+    # columns of J: images of the two axes
+    J = np.stack([rows @ theta[part] for part in slices])
+    (a, b), (c, d) = J
+    n_x, n_y = np.hypot(a, c), np.hypot(b, d)
+    cosine = (a * b + c * d) / (n_x * n_y)
+    by_x = (J[:, 1] / n_y - cosine * J[:, 0] / n_x) / n_x
+    by_y = (J[:, 0] / n_x - cosine * J[:, 1] / n_y) / n_y
+    gradient = np.zeros_like(theta)
+    for axis, part in enumerate(slices):
+        gradient[part] = -(by_x[axis] * rows[0] + by_y[axis] * rows[1])
+    return float(-np.arcsin(cosine)), gradient / np.sqrt(1 - cosine**2)

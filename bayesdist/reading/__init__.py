@@ -1,6 +1,0 @@
-"""The door: the one room in which files are opened, decoded and checked before they are used.
-
-What is read is a regular file of a plausible size, whose content is no larger than its size allows;
-whatever libraries say of a damaged one is one `InputError`.  Rooms above get arrays, tables, HDUs
-and trees, and open no file themselves.
-"""

@@ -1,0 +1,67 @@
+"""Tables that end too early are refused, or said to; what is whole is read."""
+
+from __future__ import annotations
+
+import logging
+
+import numpy as np
+import pytest
+from astropy.table import Table
+
+from bayesdist.errors import FormatError
+from bayesdist.files.tables import read_table
+
+KINDS = {
+    "a.ecsv": {"format": "ascii.ecsv"},
+    "b.ecsv": {"format": "ascii.ecsv", "delimiter": ","},
+    "c.csv": {"format": "ascii.csv"},
+    "d.tsv": {"format": "ascii.tab"},
+    "e.txt": {"format": "ascii.basic"},
+}
+
+
+@pytest.fixture(params=KINDS)
+def written(request, rng, tmp_path):
+    """A table whose last column has four decimals, and its bytes without the last line end."""
+    table = Table({name: rng.normal(size=30) for name in "xyv"})
+    table["u"] = np.round(10 + rng.integers(100, 999, 30) / 1000 + 1e-4, 4)
+    path = tmp_path / request.param
+    table.write(path, **KINDS[request.param])
+    assert len(read_table(path)) == 30
+    return path, path.read_bytes().rstrip(b"\r\n")
+
+
+@pytest.mark.parametrize("lost", [1, 2, 5])
+def test_a_last_number_without_its_last_letters(written, lost):
+    path, raw = written
+    path.write_bytes(raw[:-lost])
+    with pytest.raises(FormatError, match="ends within its last number"):
+        read_table(path)
+
+
+def test_a_last_row_without_its_last_cell(written):
+    path, raw = written
+    path.write_bytes(raw[:-8])
+    with pytest.raises(FormatError, match="truncated"):
+        read_table(path)
+
+
+def test_a_whole_row_without_an_end_of_line(written, caplog):
+    path, raw = written
+    path.write_bytes(raw)
+    with caplog.at_level(logging.WARNING, "bayesdist"):
+        assert len(read_table(path)) == 30
+    assert f"{path}: its last line has no end" in caplog.text
+
+
+def test_numbers_in_full_precision_are_warned_of_or_refused_when_little_is_left(tmp_path, caplog):
+    path = tmp_path / "a.csv"
+    values = np.random.default_rng(1).normal(size=20)
+    text = "x,u\n" + "\n".join(f"{k},{v!r}" for k, v in enumerate(values.tolist()))
+    path.write_text(text[:-2])
+    with caplog.at_level(logging.WARNING, "bayesdist"):
+        assert abs(read_table(path)["u"][-1] - values[-1]) < 1e-12
+    assert "no end" in caplog.text
+    path.write_text(text[: text.rindex(",") + 5])
+    with pytest.raises(FormatError, match="ends within its last number"):
+        read_table(path)

@@ -1,0 +1,60 @@
+"""Records as arrays: what is read back is equal to the last bit."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import pytest
+
+from bayesdist.assess import Requirement
+from bayesdist.files.records import record_from_arrays, record_to_arrays
+from bayesdist.model import Chip, DistortionModel
+
+MODEL = DistortionModel(2, (Chip(1, "A", (100.0, 80.0), (50.5, 40.5)),))
+
+
+def back(value: Any) -> Any:
+    return record_from_arrays(record_to_arrays(value))
+
+
+def test_numbers_texts_and_containers_stay_what_they_are():
+    value = {"a": (1, 2.5, None, True), ("u", 3): [float("inf"), "text"], "b": np.float64(0.1)}
+    found = back(value)
+    assert found == value
+    assert isinstance(found["a"], tuple) and isinstance(found[("u", 3)], list)
+
+
+def test_arrays_are_equal_to_the_last_bit_and_are_written_once():
+    values = np.random.default_rng(1).normal(size=(3, 4)).astype(np.float32)
+    arrays = record_to_arrays((values, values))
+    assert len(arrays) == 2  # and the tree
+    first, second = record_from_arrays(arrays)
+    np.testing.assert_array_equal(first, values)
+    assert first.dtype == np.float32 and second is first
+    np.testing.assert_array_equal(back(np.array(["ab", "c"])), ["ab", "c"])
+
+
+def test_dataclasses_and_models_are_made_again():
+    asked = Requirement("r", "rms", 1.0, region=[(0, 0), (9, 0), (9, 9)], chip=1)
+    assert back(asked) == asked
+    one, other = back((MODEL, DistortionModel.from_dict(MODEL.to_dict())))
+    assert one.to_dict() == MODEL.to_dict() and one is other
+
+
+def test_what_cannot_be_written_is_refused():
+    with pytest.raises(TypeError, match="cannot be written"):
+        record_to_arrays({"f": len})
+
+
+@dataclass(frozen=True)
+class Foreign:
+    """A class that is not of the package."""
+
+    a: int
+
+
+def test_classes_of_others_are_not_made_from_files():
+    with pytest.raises(TypeError, match="no class of this package"):
+        back(Foreign(1))
