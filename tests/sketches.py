@@ -41,7 +41,7 @@ def quick() -> Iterator[None]:
 
     Posteriors leave out what those of large runs do, the likelihood of each star at each draw: a
     fifth of a small run, and tests/infer/posterior/test_files looks at it.  Structure that a fit
-    leaves out is integrated over a coarse grid of its sizes: a tenth, and tests/diagnose looks at it.
+    leaves out is integrated over a coarse grid of its sizes: a tenth, which tests/diagnose tests.
     """
     structure = "bayesdist.diagnose.correlated.structure"
     with (
