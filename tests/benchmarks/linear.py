@@ -34,7 +34,7 @@ class Sizes:
     astropy_s: float
 
 
-FULL = Sizes(orders=(4, 5), stars=(10_000, 100_000), astropy_s=60)
+FULL = Sizes(orders=(4,), stars=(10_000, 100_000), astropy_s=60)
 QUICK = Sizes(orders=(2,), stars=(500,), astropy_s=60)
 
 

@@ -24,7 +24,7 @@ class Size:
     de: float
     nuts: float
     ours: float
-    bases: tuple[str, ...] = nuts.BASES  # of NUTS
+    bases: tuple[str, ...] = ("whitened",)  # of NUTS
     nuts_warmup: int = 400
     nuts_draws: int = 1000
 
@@ -43,9 +43,9 @@ class Sizes:
 FULL = Sizes(
     order=5,
     each=(
-        Size(5_000, stock_plain=10, stock_chain=100, de=25, nuts=20, ours=6),
-        Size(50_000, stock_plain=10, stock_chain=0, de=25, nuts=110, ours=6, bases=("whitened",)),
-        Size(1_000_000, stock_plain=8, stock_chain=0, de=12, nuts=0, ours=15, bases=()),
+        Size(5_000, stock_plain=6, stock_chain=80, de=20, nuts=20, ours=6),
+        Size(50_000, stock_plain=6, stock_chain=0, de=15, nuts=50, ours=6),
+        Size(1_000_000, stock_plain=8, stock_chain=0, de=10, nuts=0, ours=15, bases=()),
     ),
     rows=5_000,
     thin=10,
@@ -64,6 +64,7 @@ QUICK = Sizes(
             ours=1,
             nuts_warmup=300,
             nuts_draws=500,
+            bases=nuts.BASES,
         ),
     ),
     rows=700,

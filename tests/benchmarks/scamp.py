@@ -21,7 +21,7 @@ __all__ = ["FULL", "QUICK", "run", "summarised"]
 
 Float = NDArray[np.float64]
 
-FULL = Sizes((4096.0, 2048.0), 4, 82.0, 15, 3000, (1, 2), (0.0, 0.05))
+FULL = Sizes((4096.0, 2048.0), 4, 82.0, 15, 3000, (1,), (0.0, 0.05))
 QUICK = Sizes((1024.0, 1024.0), 2, 3.0, 6, 900, (1,), (0.05,))
 ABSENT = "scamp is not installed (Debian package scamp)"
 SOLUTIONS: dict[str, tuple[Callable[..., dict[str, Any]], tuple[str, ...]]] = {
