@@ -273,6 +273,7 @@ def test_one_roll_angle_shows_in_the_matches_whatever_the_log_says(campaign):
 # -- the field ------------------------------------------------------------------------------------
 
 
+@only_in_full("tests/data names one, and test_campaign_on_sky refuses one in a run")
 def test_a_catalogue_of_the_wrong_field(campaign):
     def change(table: Table) -> None:
         rng = np.random.default_rng(2)
@@ -308,6 +309,7 @@ def test_a_catalogue_in_a_unit_that_it_says(campaign, undamaged):
     assert campaign.catalog(change).matched()["n_pairs"] == n_pairs
 
 
+@only_in_full("test_campaign_on_sky has a mirrored catalogue")
 def test_a_mirrored_catalogue(campaign):
     def change(table: Table) -> None:
         for name in ("u", "pm_u"):

@@ -110,7 +110,7 @@ def test_intervals_cover_as_they_say(full):
     held = model_of(4)
     x, y = rng.uniform(1, 1000, 50), rng.uniform(1, 800, 50)
     pulls, wider, changed = [], [], []
-    for _ in range(150 if full else 60):
+    for _ in range(150 if full else 30):
         theta = truth_of(model, rng)
         turn, shift = np.exp(1j * rng.uniform(0, 2 * np.pi)), complex(*rng.normal(size=2))
         first = stars_of(model, theta, 200, rng)

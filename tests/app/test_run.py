@@ -14,7 +14,6 @@ import warnings
 from html.parser import HTMLParser
 from pathlib import Path
 
-import arviz
 import numpy as np
 import pytest
 import xarray as xr
@@ -236,6 +235,8 @@ def test_the_posterior_finds_the_truth(finished, posterior, matches):
 
 
 def test_the_posterior_opens_in_arviz_and_xarray(finished, posterior):
+    import arviz
+
     data = arviz.from_netcdf(finished.path / "posterior.nc")
     groups = ("posterior", "sample_stats", "observed_data", "constant_data")
     assert set(groups) <= set(data.groups())

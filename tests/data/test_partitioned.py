@@ -20,7 +20,7 @@ from bayesdist.data.magnitude_errors import AddedErrors
 from bayesdist.data.storage.write import write_partitioned
 from bayesdist.data.tables import repeated as duplicates_module
 from bayesdist.errors import FormatError, InputError
-from tests.reduced import only_in_full
+from tests.reduced import FULL, only_in_full
 
 ARRAYS = ("x", "y", "u", "v", "sigma_u", "sigma_v", "epoch", "mag", "colour")
 CODES = ("exposure", "chip", "filter", "row", "source")
@@ -304,7 +304,7 @@ def test_epochs_in_all_their_forms(rng, tmp_path, monkeypatch):
 
 
 @settings(
-    max_examples=15,
+    max_examples=30 if FULL else 8,
     deadline=None,
     suppress_health_check=[HealthCheck.function_scoped_fixture],
 )

@@ -46,11 +46,11 @@ def test_noise_is_no_structure():
 @pytest.mark.parametrize(
     "order", [case_in_full(k, instead="the highest is run") for k in (1, 4)] + [7]
 )
-def test_what_a_polynomial_leaves_of_noise_is_no_structure(order):
-    """200 data sets, fitted by numpy: p-values are those of chance, in no partition too small."""
-    rng = np.random.default_rng(order)
+def test_what_a_polynomial_leaves_of_noise_is_no_structure(order, full):
+    """Data sets fitted by numpy: p-values are those of chance, in no partition too small."""
+    rng, n = np.random.default_rng(order), 200 if full else 80
     p = []
-    for _ in range(200):
+    for _ in range(n):
         x, y, r = _stars(3000, rng)
         X, Y = (x - 500.5) / 500, (y - 400.5) / 400
         i, j = np.array([(i, j) for i in range(order + 1) for j in range(order + 1 - i)]).T
@@ -60,8 +60,8 @@ def test_what_a_polynomial_leaves_of_noise_is_no_structure(order):
     p = np.array(p)
     for level in (0.01, 0.1, 0.3):
         # three tests share the probability: Bonferroni leaves them a little too careful
-        assert (p < level).sum() <= binom.ppf(0.999, 200, level)
-    assert (p < 0.3).sum() >= binom.ppf(0.001, 200, 0.2)
+        assert (p < level).sum() <= binom.ppf(0.999, n, level)
+    assert (p < 0.3).sum() >= binom.ppf(0.001, n, 0.2)
 
 
 def test_structure_beside_noisy_cells_has_its_size():

@@ -256,7 +256,7 @@ SMALLEST = {
 def test_smallest_is_found_nine_times_in_ten(case, full):
     if not full and case not in ("order", "order of few"):
         pytest.skip("two of them are run: set BAYESDIST_FULL=1")
-    runs = 400 if full else 24
+    runs = 400 if full else 16
     found = sum(seeds.over(_is_found, [(case, k) for k in range(runs)], lot=20) if full
                 else [_is_found(case, k) for k in range(runs)])  # fmt: skip
     # the noise that it is computed from is itself an estimate: two per cent either way

@@ -83,7 +83,7 @@ class Input:
 
 def inputs(folder: Path, *, begun: bool = True) -> list[Input]:
     """All inputs, written into a new folder; runs that have `begun` take seconds to make."""
-    with sketched():
+    with sketched(made=False):
         run = _run(folder / "finished")
         found = [
             *_stars(folder / "stars", run),

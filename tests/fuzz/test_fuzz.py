@@ -20,7 +20,7 @@ from tests.fuzz.mutation import MUTATIONS
 from tests.fuzz.sandbox import Answer, answers
 from tests.fuzz.verdicts import accepted, not_accepted
 
-FEW, MANY = 100, 20_000
+FEW, MANY = 50, 20_000
 
 
 @pytest.fixture(scope="module")

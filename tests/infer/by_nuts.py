@@ -4,8 +4,15 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable, Mapping
+from importlib.util import find_spec
 
 import numpy as np
+import pytest
+
+# looked for, not imported: all tests are collected by each process
+needs_numpyro = pytest.mark.skipif(
+    find_spec("numpyro") is None, reason="NumPyro (extra 'test') is not installed"
+)
 
 
 def nuts_draws(

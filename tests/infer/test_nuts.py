@@ -10,11 +10,10 @@ from bayesdist.data import match_table, read_matches, read_matchup
 from bayesdist.infer import OutlierMixture, build_model, fit_by_magnitude, fit_linear, sample
 from bayesdist.model import Chip, DistortionModel
 from bayesdist.simulate import simulate_matches
-from tests.infer.by_nuts import nuts_draws, spread_draws, stein_pulls
+from tests.infer.by_nuts import needs_numpyro, nuts_draws, spread_draws, stein_pulls
 from tests.reduced import case_in_full
 
-pytestmark = pytest.mark.slow
-numpyro = pytest.importorskip("numpyro", reason="NumPyro (extra 'test') is not installed")
+pytestmark = [pytest.mark.slow, needs_numpyro]
 
 
 def _density(matches, fit):
@@ -25,6 +24,7 @@ def _density(matches, fit):
     """
     import jax
     import jax.numpy as jnp
+    import numpyro
     import numpyro.distributions as dist
 
     jax.config.update("jax_enable_x64", True)
@@ -98,6 +98,7 @@ def _hst1pass(data_dir):
 
 def test_draws_of_another_density_are_seen(rng):
     """Means off by a tenth of a standard deviation, or widths by a tenth."""
+    import numpyro
 
     def density():
         numpyro.sample("x", numpyro.distributions.Normal(np.zeros(3), 1.0).to_event(1))

@@ -68,7 +68,8 @@ def original_exposure(
         for axis, name in ((1, "RA---TAN"), (2, "DEC--TAN")):
             header[f"CTYPE{axis}"] = name
         header["EXTVER"] = version
-        hdus.append(fits.ImageHDU(np.zeros((2048, 4096), np.float32), header=header, name="SCI"))
+        # nobody looks at the values
+        hdus.append(fits.ImageHDU(np.zeros((2048, 4096), np.uint8), header=header, name="SCI"))
         hdus[-1].header["EXTVER"] = version
     return fits.HDUList(hdus)
 

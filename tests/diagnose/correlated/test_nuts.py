@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-import arviz
 import numpy as np
 import pytest
 from numpy.polynomial.legendre import legvander2d
@@ -14,11 +13,10 @@ from bayesdist.diagnose.correlated import DiscrepancyPriors
 from bayesdist.diagnose.correlated.deviations import DeviationColumns, deviation_draws
 from bayesdist.diagnose.correlated.functions import StructureFunctions
 from bayesdist.diagnose.correlated.structure import LENGTHS, chip_structure
-from tests.infer.by_nuts import nuts_draws
+from tests.infer.by_nuts import needs_numpyro, nuts_draws
 from tests.reduced import only_in_full
 
-pytestmark = pytest.mark.slow
-numpyro = pytest.importorskip("numpyro", reason="NumPyro (extra 'test') is not installed")
+pytestmark = [pytest.mark.slow, needs_numpyro]
 
 ORDER, SIGMA = 2, 0.02
 POWERS = [(i, j) for i in range(ORDER + 1) for j in range(ORDER + 1 - i)]
@@ -36,6 +34,8 @@ def nuts(density: Callable[[], None], start: dict[str, object], seed: int):
 
 
 def _effective(chains: np.ndarray) -> np.ndarray:
+    import arviz
+
     return np.array([float(arviz.ess(chains[..., k])) for k in range(chains.shape[-1])])
 
 
@@ -72,6 +72,7 @@ def test_structure(found, capsys):
     """Polynomial, higher orders and sines of both axes; three amplitudes; length and likeness."""
     import jax
     import jax.numpy as jnp
+    import numpyro
     import numpyro.distributions as dist
 
     jax.config.update("jax_enable_x64", True)
@@ -219,6 +220,7 @@ def test_deviations_of_exposures(deviations, capsys):
     """The same density without any conjugacy."""
     import jax
     import jax.numpy as jnp
+    import numpyro
     import numpyro.distributions as dist
 
     jax.config.update("jax_enable_x64", True)

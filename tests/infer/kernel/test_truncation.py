@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
@@ -45,7 +46,9 @@ HYPER = {
 }
 
 
-NODES = leggauss(2000)
+@cache
+def nodes():
+    return leggauss(2000)
 
 
 def circle_terms(du, dv, A, B, radius):
@@ -59,7 +62,7 @@ def circle_terms(du, dv, A, B, radius):
 
 def log_z(du, dv, A, B, radius):
     """Logarithm of the probability of the circle, by the integral over one axis of two erf."""
-    t, w = NODES
+    t, w = nodes()
     x, h = radius * np.sin(t * np.pi / 2), radius * np.cos(t * np.pi / 2)
     a, b = np.sqrt(A), np.sqrt(B)
     near, far = (abs(dv) - h) / b, (abs(dv) + h) / b

@@ -7,13 +7,12 @@ import pytest
 from numpy.polynomial.legendre import leggauss, legvander2d
 
 from bayesdist.infer import OutlierMixture, fit_linear, sample
-from tests.infer.by_nuts import nuts_draws, spread_draws, stein_pulls
+from tests.infer.by_nuts import needs_numpyro, nuts_draws, spread_draws, stein_pulls
 from tests.reduced import only_in_full
 
 from ..selected import SIDE, selected
 
-pytestmark = pytest.mark.slow
-numpyro = pytest.importorskip("numpyro", reason="NumPyro (extra 'test') is not installed")
+pytestmark = [pytest.mark.slow, needs_numpyro]
 
 NODES = 24  # of the integral over one axis, within 1e-8 for circles of three sigma
 
@@ -22,6 +21,7 @@ def _density(matches, fit, start, radius: float):
     """Density of z, log j, logit f and log s, of Gaussian outliers; theta is start + L z."""
     import jax
     import jax.numpy as jnp
+    import numpyro
     import numpyro.distributions as dist
     from jax.scipy.special import erf
 

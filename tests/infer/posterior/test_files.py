@@ -6,7 +6,6 @@ import json
 import resource
 from dataclasses import replace
 
-import arviz as az
 import h5py
 import numpy as np
 import pytest
@@ -64,6 +63,13 @@ def written(request, campaign, tmp_path_factory):
     return posterior, matches, path
 
 
+@pytest.fixture(scope="module")
+def az():
+    import arviz
+
+    return arviz
+
+
 # what is asked of a damaged file is asked of that of one mixture
 OF_ONE = pytest.mark.parametrize(
     "written",
@@ -100,7 +106,7 @@ def test_posterior_round_trip(written):
     np.testing.assert_array_equal(load_posterior(path.parent).theta, posterior.theta)
 
 
-def test_arviz_opens_it(written):
+def test_arviz_opens_it(written, az):
     posterior, matches, path = written
     data = az.from_netcdf(path)
     assert {"posterior", "sample_stats", "observed_data", "constant_data", "log_likelihood"} <= set(
@@ -138,7 +144,7 @@ def test_xarray_opens_it(written):
         assert list(tree["posterior"]["unit"].values) == list(posterior.model.units)
 
 
-def test_log_likelihood_of_the_stars_adds_up(written):
+def test_log_likelihood_of_the_stars_adds_up(written, az):
     """The sum over stars plus the log prior is the log density that the sampler saw."""
     posterior, _, path = written
     total = az.from_netcdf(path).log_likelihood["uv"].sum("star").values
@@ -150,7 +156,7 @@ def test_log_likelihood_of_the_stars_adds_up(written):
     np.testing.assert_allclose(difference, 0, atol=1e-6)
 
 
-def test_what_is_said_of_each_star_is_the_mean_over_some_draws(written):
+def test_what_is_said_of_each_star_is_the_mean_over_some_draws(written, az):
     """Where draws times stars are too many for the file, this is what takes their place."""
     posterior, matches, path = written
     found = memberships(posterior, matches)
@@ -163,7 +169,9 @@ def test_what_is_said_of_each_star_is_the_mean_over_some_draws(written):
 
 
 @OF_ONE
-def test_large_runs_leave_out_star_times_draw_and_then_the_stars(written, monkeypatch, tmp_path):
+def test_large_runs_leave_out_star_times_draw_and_then_the_stars(
+    written, az, monkeypatch, tmp_path
+):
     posterior, matches, _ = written
     monkeypatch.setattr(files, "LARGEST", posterior.log_prob.size * len(matches) * 8 - 1)
     save_posterior(posterior, matches, tmp_path / "big.nc")

@@ -9,12 +9,11 @@ from numpy.polynomial.legendre import legder, legval, legvander
 from bayesdist.infer.equations.priors import Prior
 from bayesdist.infer.selfcal import sample_selfcal
 from bayesdist.infer.selfcal.mode import solve
-from tests.infer.by_nuts import nuts_draws, spread_draws, stein_pulls
+from tests.infer.by_nuts import needs_numpyro, nuts_draws, spread_draws, stein_pulls
 from tests.infer.selfcal.fields import SIZE, field, problem_of
 from tests.reduced import only_in_full
 
-pytestmark = pytest.mark.slow
-numpyro = pytest.importorskip("numpyro", reason="NumPyro (extra 'test') is not installed")
+pytestmark = [pytest.mark.slow, needs_numpyro]
 
 
 def _basis(x, y, terms):
@@ -62,6 +61,7 @@ def _density(simulated, problem, solution):
     """Free parameters, log j and logit f; the stars are parameters too."""
     import jax
     import jax.numpy as jnp
+    import numpyro
     import numpyro.distributions as dist
 
     seen, sigma = _seen(simulated, problem.rows), simulated.detections.sigma[problem.rows]
