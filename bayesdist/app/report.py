@@ -59,12 +59,12 @@ def _is_command_line() -> bool:
 
 def report_input(results: Results) -> ReportInput:
     """All that the report shows, from the artefacts of a run."""
-    run, config, data, fitted = results.run, results.config, results.data, results.fitted
+    run, config, fitted = results.run, results.config, results.fitted
     fit, posterior, solution = results.fit, results.posterior, results.solution
     found, evaluation, epoch = results.diagnostics, results.evaluation, results.epoch
     campaign, selfcal = None, None
     if fitted.scatter is not None:
-        campaign = campaign_results(run, results.inputs, data, posterior, found.overlap)
+        campaign = campaign_results(run, results.inputs, results.data, posterior, found.overlap)
     if fitted.solved is not None:
         selfcal = selfcal_results(run, fitted, posterior, epoch)
     facts, folder = run.facts, run.path.resolve().name
