@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 
 from bayesdist.app.config import Config
-from bayesdist.app.kinds.campaign.report import campaign_results
 from bayesdist.app.kinds.fitted import Fitted, required
 from bayesdist.app.results import Results
 from bayesdist.app.store import as_json
@@ -64,6 +63,8 @@ def report_input(results: Results) -> ReportInput:
     found, evaluation, epoch = results.diagnostics, results.evaluation, results.epoch
     campaign, selfcal = None, None
     if fitted.scatter is not None:
+        from bayesdist.app.kinds.campaign.report import campaign_results
+
         campaign = campaign_results(run, results.inputs, results.data, posterior, found.overlap)
     if fitted.solved is not None:
         selfcal = selfcal_results(run, fitted, posterior, epoch)
