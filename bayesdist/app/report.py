@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 
 from bayesdist.app.config import Config
-from bayesdist.app.kinds.campaign.report import campaign_results
 from bayesdist.app.kinds.fitted import Fitted, required
 from bayesdist.app.results import Results
 from bayesdist.app.store import as_json
@@ -59,12 +58,14 @@ def _is_command_line() -> bool:
 
 def report_input(results: Results) -> ReportInput:
     """All that the report shows, from the artefacts of a run."""
-    run, config, data, fitted = results.run, results.config, results.data, results.fitted
+    run, config, fitted = results.run, results.config, results.fitted
     fit, posterior, solution = results.fit, results.posterior, results.solution
     found, evaluation, epoch = results.diagnostics, results.evaluation, results.epoch
     campaign, selfcal = None, None
     if fitted.scatter is not None:
-        campaign = campaign_results(run, results.inputs, data, posterior, found.overlap)
+        from bayesdist.app.kinds.campaign.report import campaign_results
+
+        campaign = campaign_results(run, results.inputs, results.data, posterior, found.overlap)
     if fitted.solved is not None:
         selfcal = selfcal_results(run, fitted, posterior, epoch)
     facts, folder = run.facts, run.path.resolve().name

@@ -11,15 +11,12 @@ from typing import Any
 from bayesdist.app.assessment.checks import frames_doubt, in_circle
 from bayesdist.app.assessment.holdout import holdout_summary, holdout_table
 from bayesdist.app.assessment.periods import periods_summary, periods_table
-from bayesdist.app.assessment.series import write_series_tables
 from bayesdist.app.assessment.settings import idle_dates
 from bayesdist.app.config import Config
-from bayesdist.app.kinds.campaign.linear_terms import line_sections
 from bayesdist.app.kinds.fit_data import FitData
 from bayesdist.app.kinds.fitted import Fitted
 from bayesdist.app.kinds.matches.added_errors import added_errors_rows, grouping_sentence
 from bayesdist.app.kinds.matches.plausibility import doubts_on_stars
-from bayesdist.app.kinds.selfcal.stars import write_stars
 from bayesdist.app.rehearsal import rehearse_solution
 from bayesdist.app.results import Results
 from bayesdist.app.store.keys import attributes
@@ -118,6 +115,8 @@ def save_diagnosed(results: Results) -> None:
     """Write what residuals say, held-out stars, periods and exposures among them."""
     run, found = results.run, results.diagnostics
     if results.fitted.alone is not None:
+        from bayesdist.app.assessment.series import write_series_tables
+
         write_series_tables(run, results.fitted, results.config)
     write_diagnostics(run, results.fit, results.posterior, found)
     if found.holdout is not None:
@@ -133,6 +132,8 @@ def save_diagnosed(results: Results) -> None:
             log.info("diagnose: %s", text)
     solved = results.fitted.solved
     if solved is not None:
+        from bayesdist.app.kinds.selfcal.stars import write_stars
+
         notes = provenance_notes(results.posterior, solved.gauge_words)
         stars = write_stars(run.path, solved, found.correlated, notes, results.config.resources())
         run.summarise(selfcal=run.summary.get("selfcal", {}) | {"stars": stars})
@@ -148,6 +149,8 @@ def save_evaluation(results: Results) -> None:
     gauge, solution = results.fitted.gauge_words, results.solution
     write_evaluation(run, results.fit, results.posterior, solution, gauge, found)
     if results.fitted.scatter is not None:
+        from bayesdist.app.kinds.campaign.linear_terms import line_sections
+
         run.summarise(**line_sections(solution, config.chips()[0].number))
     for one in found.validity:
         log.info("evaluate: %s", one.sentence)

@@ -33,7 +33,7 @@ from bayesdist.infer.solution.solution import Solution
 from bayesdist.utils.arrays import Float
 
 ROWS = 16  # draws whose noise comes from one generator: so that blocks do not change it
-BLOCK = 200_000  # positions times draws whose errors a thread holds at once
+BLOCK = 60_000  # positions times draws whose errors a thread holds at once: in its cache
 MOST_PAIRS = 5000  # pairs of positions that stand for all: percentiles over them to about 1 %
 
 
@@ -268,5 +268,7 @@ def _normal(seed: int, rows: slice, n_positions: int) -> Float:
     """Standard normal numbers (rows, N, 2), those of a draw the same in any block."""
     shape = ROWS, n_positions, 2
     starts = range(rows.start, rows.stop, ROWS)
-    out = [np.random.default_rng((seed, k)).standard_normal(shape) for k in starts]
-    return np.concatenate(out)[: rows.stop - rows.start]
+    out = np.empty((len(starts), *shape))
+    for block, k in zip(out, starts, strict=True):
+        np.random.default_rng((seed, k)).standard_normal(out=block)
+    return out.reshape(-1, n_positions, 2)[: rows.stop - rows.start]

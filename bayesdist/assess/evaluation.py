@@ -26,8 +26,6 @@ from bayesdist.diagnose.diagnostics import Diagnostics
 from bayesdist.errors import InputError, required
 from bayesdist.infer import LinearFit, Posterior, Solution
 from bayesdist.infer.equations.scaled import one_thread
-from bayesdist.infer.selfcal import gauge_free
-from bayesdist.infer.selfcal.sky_moves import gauge_free_matrix
 from bayesdist.model import Chip
 from bayesdist.model.grid import DEFAULT_GRID
 from bayesdist.utils.arrays import Float
@@ -370,6 +368,8 @@ def _relative(
     settings: EvaluationSettings,
 ) -> UncertaintyMap:
     """Uncertainty of relative positions on a chip, with what the model leaves out."""
+    from bayesdist.infer.selfcal.sky_moves import gauge_free, gauge_free_matrix
+
     local, correlated = None, diagnostics.correlated
     if correlated is not None and correlated.structure:
         S = gauge_free_matrix(solution.model, np.asarray(solution.mean, float), null)

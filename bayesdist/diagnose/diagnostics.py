@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
@@ -43,19 +43,17 @@ from bayesdist.diagnose.residuals.sample import (
 from bayesdist.diagnose.residuals.star_sums import StarSums, flagged_by_exposure, star_sums
 from bayesdist.diagnose.score.result import ScoreTest
 from bayesdist.diagnose.score.tests import score_tests
-from bayesdist.diagnose.selfcal.correlated import selfcal_discrepancy
-from bayesdist.diagnose.selfcal.misfit import dithered_misfit
-from bayesdist.diagnose.selfcal.score import selfcal_score_tests
-from bayesdist.diagnose.selfcal.scores import taken_by_stars
 from bayesdist.infer import GaussianPriors, LinearFit, Posterior, Shards
 from bayesdist.infer.catalogue.star_errors import StarCovariance, StarErrors, star_covariance
 from bayesdist.infer.equations.scaled import one_thread
 from bayesdist.infer.exposures.chip_offsets import Settling
-from bayesdist.infer.selfcal import SelfCalibrationMode
 from bayesdist.infer.stars.likelihood import Likelihood
 from bayesdist.utils.arrays import Float, Int
 from bayesdist.utils.checks import EITHER, Check
 from bayesdist.utils.streams import restarted
+
+if TYPE_CHECKING:
+    from bayesdist.infer.selfcal import SelfCalibrationMode
 
 Bins = tuple[int, int]
 
@@ -153,16 +151,19 @@ def diagnose_fit(
     partitions, sums = residual_sums(fit, shards, None if posterior is None else shown)
     several = len(model.chips) > 1
     sample = star_sample(table, len(stars), fit, posterior)
-    if eliminated is not None:
+    if eliminated is None:
+        misfits = misfits_of(fit, partitions, sums)
+    else:
+        from bayesdist.diagnose.selfcal.misfit import dithered_misfit
+
+        misfits = (dithered_misfit(eliminated),)
         sample = replace(sample, taken=_taken(eliminated, sample.table.row))
     if centroid == "residuals":
         centroid = centroid_scatter(sample, n_params=model.n_params)
     return Diagnostics(
         sums=sums,
         partitions=partitions,
-        misfits=misfits_of(fit, partitions, sums)
-        if eliminated is None
-        else (dithered_misfit(eliminated),),
+        misfits=misfits,
         coverage=tuple(
             coverage_of(
                 sums.binned[chip.number, bins["cells"]],
@@ -219,6 +220,8 @@ def misfits_of(
 
 def _taken(eliminated: SelfCalibrationMode, rows: Int) -> Float:
     """Fraction (N,) of the variance that places of stars take out of detections."""
+    from bayesdist.diagnose.selfcal.scores import taken_by_stars
+
     own = eliminated.problem.rows
     taken = np.zeros(max(int(own.max(initial=-1)), int(rows.max(initial=-1))) + 1)
     taken[own] = taken_by_stars(eliminated)
@@ -262,6 +265,9 @@ def diagnose(
     in_memory = stars if stars.in_memory else None
     shared = None
     if eliminated is not None:
+        from bayesdist.diagnose.selfcal.correlated import selfcal_discrepancy
+        from bayesdist.diagnose.selfcal.score import selfcal_score_tests
+
         estimated = selfcal_discrepancy(eliminated, rng=restarted(rng), priors=discrepancy)
         tests = selfcal_score_tests(
             eliminated, mag=stars.mag, colour=stars.colour, epoch=stars.epoch

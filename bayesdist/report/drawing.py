@@ -17,7 +17,6 @@ from pickle import PickleError
 from typing import Any, Literal
 
 import numpy as np
-from matplotlib import rc_context
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
@@ -72,6 +71,7 @@ def render(plot: Plot, kind: Kind = "png", *, pdf: bool = False) -> Drawing:
     )
 
 
+@figure_style()
 def draw_all(
     registry: Registry, results: Any, *, pdf: bool = False, processes: int = 1
 ) -> dict[str, Drawing]:
@@ -142,6 +142,9 @@ def _laid_out(figure: Figure) -> Bbox:
         for spine in ax.spines.values():
             if type(spine) is Spine:  # it lies on the frame, and would measure all ticks again
                 spine.set_in_layout(False)
+        for axis in (ax.xaxis, ax.yaxis):
+            if not axis.label.get_text():  # it would be placed all the same
+                axis.label.set_visible(False)
     figure.set_dpi(DPI)
     renderer = FigureCanvasAgg(figure).get_renderer()
     engine = figure.get_layout_engine()
@@ -149,9 +152,7 @@ def _laid_out(figure: Figure) -> Bbox:
         with _measured_once(figure):
             engine.execute(figure)
     box = figure.get_tightbbox(renderer)
-    # an engine, even 'none', would have each file drawn twice
-    with rc_context({"figure.autolayout": False, "figure.constrained_layout.use": False}):
-        figure.set_layout_engine(None)
+    figure.set_layout_engine(None)  # an engine, even 'none', would have each file drawn twice
     return Bbox(box.padded(MARGIN / DPI).get_points())
 
 
@@ -214,10 +215,8 @@ def _pdf(figure: Figure, box: Bbox) -> bytes:
 
 
 def _svg(figure: Figure, box: Bbox) -> bytes:
-    """Figure with letters as outlines: a page on paper has them whatever fonts there are."""
     buffer = io.BytesIO()
-    with rc_context({"svg.fonttype": "path", "svg.hashsalt": "bayesdist"}):
-        figure.savefig(buffer, format="svg", dpi=DPI, bbox_inches=box, metadata={"Date": None})
+    figure.savefig(buffer, format="svg", dpi=DPI, bbox_inches=box, metadata={"Date": None})
     return buffer.getvalue()
 
 

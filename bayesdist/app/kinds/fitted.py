@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 from astropy.table import Table
@@ -23,10 +23,12 @@ from bayesdist.infer import GaussianPriors, LinearFit, Posterior, load_fit, load
 from bayesdist.infer.catalogue.added_errors import GroupedErrors
 from bayesdist.infer.nodes import corrected_matches, inside_chips, on_the_chips
 from bayesdist.infer.sampler.checkpoints import read_arrays, write_arrays
-from bayesdist.infer.selfcal import Gauge, SelfCalibrationMode
-from bayesdist.infer.series import Series
 from bayesdist.model import LookupTable
 from bayesdist.utils.arrays import Bool, Float
+
+if TYPE_CHECKING:
+    from bayesdist.infer.selfcal import Gauge, SelfCalibrationMode
+    from bayesdist.infer.series import Series
 
 SOLUTION, GAUGE = "solution.h5", "gauge.ecsv"
 

@@ -4,15 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import Any
 
 from bayesdist.app.config import Config
-from bayesdist.app.kinds.campaign.fit import fit_campaign
-from bayesdist.app.kinds.campaign.input_validation import refuse_campaign
-from bayesdist.app.kinds.campaign.inputs import read_campaign
-from bayesdist.app.kinds.campaign.matched import load_matched_campaign
-from bayesdist.app.kinds.campaign.matching import campaign_lines, match_lists
 from bayesdist.app.kinds.fit_data import StarReader
 from bayesdist.app.kinds.fitted import Fitted, load_fitted
 from bayesdist.app.kinds.matched import Matched
@@ -22,10 +18,6 @@ from bayesdist.app.kinds.matches.stars import (
     read_stars,
     sample_stars,
 )
-from bayesdist.app.kinds.selfcal.fit import fit_selfcal, load_selfcal, sample_detections
-from bayesdist.app.kinds.selfcal.inputs import read_selfcal, refuse_selfcal
-from bayesdist.app.kinds.selfcal.matched import load_matched_selfcal
-from bayesdist.app.kinds.selfcal.matching import match_dithers, selfcal_lines
 from bayesdist.infer import Posterior
 
 
@@ -62,31 +54,49 @@ class Kind:
 
 MATCHES = Kind(read=read_stars, match=match_stars, fit=fit_stars, begins_with="fit")
 
-CAMPAIGN = Kind(
-    read=read_campaign,
-    match=lambda inputs, _: match_lists(inputs),
-    fit=lambda matched, *_: fit_campaign(matched),
-    load_matched=load_matched_campaign,
-    refuse=refuse_campaign,
-    lines=campaign_lines,
-)
 
-SELFCAL = Kind(
-    read=read_selfcal,
-    match=lambda inputs, _: match_dithers(inputs),
-    fit=lambda matched, *_: fit_selfcal(matched),
-    sample=sample_detections,
-    load_matched=load_matched_selfcal,
-    load_fitted=load_selfcal,
-    refuse=refuse_selfcal,
-    lines=selfcal_lines,
-    rows="detections",
-    chooser="limits of residuals",
-)
+@cache
+def _campaign() -> Kind:
+    """A campaign; like self-calibrations it is imported where there is one."""
+    from bayesdist.app.kinds.campaign.fit import fit_campaign
+    from bayesdist.app.kinds.campaign.input_validation import refuse_campaign
+    from bayesdist.app.kinds.campaign.inputs import read_campaign
+    from bayesdist.app.kinds.campaign.matched import load_matched_campaign
+    from bayesdist.app.kinds.campaign.matching import campaign_lines, match_lists
+
+    return Kind(
+        read=read_campaign,
+        match=lambda inputs, _: match_lists(inputs),
+        fit=lambda matched, *_: fit_campaign(matched),
+        load_matched=load_matched_campaign,
+        refuse=refuse_campaign,
+        lines=campaign_lines,
+    )
+
+
+@cache
+def _selfcal() -> Kind:
+    from bayesdist.app.kinds.selfcal.fit import fit_selfcal, load_selfcal, sample_detections
+    from bayesdist.app.kinds.selfcal.inputs import read_selfcal, refuse_selfcal
+    from bayesdist.app.kinds.selfcal.matched import load_matched_selfcal
+    from bayesdist.app.kinds.selfcal.matching import match_dithers, selfcal_lines
+
+    return Kind(
+        read=read_selfcal,
+        match=lambda inputs, _: match_dithers(inputs),
+        fit=lambda matched, *_: fit_selfcal(matched),
+        sample=sample_detections,
+        load_matched=load_matched_selfcal,
+        load_fitted=load_selfcal,
+        refuse=refuse_selfcal,
+        lines=selfcal_lines,
+        rows="detections",
+        chooser="limits of residuals",
+    )
 
 
 def kind_of(config: Config) -> Kind:
     """The kind of run that a configuration is of."""
     if config.campaign is not None:
-        return CAMPAIGN
-    return SELFCAL if config.selfcal is not None else MATCHES
+        return _campaign()
+    return _selfcal() if config.selfcal is not None else MATCHES

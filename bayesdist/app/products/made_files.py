@@ -10,14 +10,13 @@ from typing import Any
 from bayesdist.app.assessment.settings import assessment_epoch
 from bayesdist.app.config import Config
 from bayesdist.app.config.products import ReleaseBlock
-from bayesdist.app.kinds.campaign.aberration import ABERRATION
 from bayesdist.app.kinds.fit_data import FitData
 from bayesdist.app.kinds.fitted import Fitted
 from bayesdist.assess.budget.budget import TOTAL
 from bayesdist.assess.model import with_diagnosed_errors
 from bayesdist.assess.terms.correlated import DEVIATIONS, STRUCTURE_IN_FIT
 from bayesdist.assess.terms.forms import PRODUCT
-from bayesdist.assess.terms.parameters import CATALOGUE, MOTIONS
+from bayesdist.assess.terms.parameters import ABERRATION, CATALOGUE, MOTIONS
 from bayesdist.assess.terms.solution import COEFFICIENTS, EXPOSURE_FRAME, TIME_DEPENDENCE
 from bayesdist.calibration.calibration import Calibration, calibration_of
 from bayesdist.calibration.further import FurtherError

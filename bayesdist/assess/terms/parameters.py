@@ -28,6 +28,7 @@ from bayesdist.utils.arrays import Float
 CATALOGUE = "reference catalogue (shared stars)"
 MOTIONS = "proper motions (shared stars)"
 EXPOSURE_SCATTER = "exposure-to-exposure variation"
+ABERRATION = "velocity aberration"
 
 
 @dataclass(frozen=True, eq=False)

@@ -14,6 +14,7 @@ from typing import Any
 
 import numba as nb
 import numpy as np
+from numba.extending import overload
 
 from bayesdist.infer.kernel.lanes import FAST
 from bayesdist.utils.arrays import Int
@@ -38,12 +39,17 @@ def pieces_of(starts: Int, size: int) -> Int:
     return np.column_stack([group, begin, end]).astype(np.int64)
 
 
-@nb.njit(cache=True)
 def scratch(n):
     """Empty rows (n, BLOCK) that begin where a vector does not cross lines of the cache."""
     room = np.empty(n * BLOCK + 8)
     first = -(room.ctypes.data // 8) % 8
     return room[first : first + n * BLOCK].reshape(n, BLOCK)
+
+
+@overload(scratch)
+def _scratch(n):
+    """`scratch` for any n: as a function of numba it is compiled for each that a call writes."""
+    return scratch
 
 
 @nb.njit(cache=True)

@@ -55,7 +55,6 @@ def _memberships(first, end, blocks, columns, coef, order, rows, unit2, out):
         g, a, e = blocks[b]
         n = e - a
         lay_out(columns, a, e, stars)
-        out[:, :, a:e] = 0.0
         for d in range(len(rows)):
             mean = out[d // each]
             evaluate(coef[d, g], order, stars[0], stars[1], n, model)
@@ -88,7 +87,7 @@ def memberships(
     They are averaged over `each` draws at a time.  `coef` (D, G, 2, K) and the constants are those
     of D draws; other arguments as in `residuals`.
     """
-    out = np.empty((len(coef) // each, 3, len(columns[0])))
+    out = np.zeros((len(coef) // each, 3, len(columns[0])))
     with threads_for(4 * out.shape[2] * len(coef)):
         share_out(
             _memberships,

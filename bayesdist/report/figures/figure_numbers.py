@@ -19,7 +19,6 @@ from matplotlib.quiver import Quiver
 
 HEADS = ("panel", "mark", "label", "x", "y", "value", "value_2")
 MOST_ROWS = 20_000  # beyond them a figure is a picture of a table of its own
-Row = tuple[Any, ...]
 
 
 def numbers_of(figure: Figure) -> str:
@@ -43,7 +42,7 @@ def _lines(panels: Sequence[Axes]) -> Iterator[str]:
     for k, ax in enumerate(panels, start=1):
         for mark, label, rows in _marks(ax):
             head = f"{k},{mark},{_quoted(label)}"
-            for row in rows:
+            for row in rows.tolist() if isinstance(rows, np.ndarray) else rows:
                 yield head + (",%.6g" * len(row) % tuple(row)) + "\n"
 
 
@@ -75,7 +74,7 @@ def _of_collection(one: Any) -> tuple[str, Iterable[Sequence[float]]]:
             return "contour", ()
         lines = zip(one.levels, one.get_paths(), strict=True)
         return "contour", (
-            (*xy, level) for level, path in lines for xy in np.asarray(path.vertices)
+            (*xy, level) for level, path in lines for xy in np.asarray(path.vertices).tolist()
         )
     if isinstance(one, LineCollection):
         paths = [np.asarray(path.vertices, float) for path in one.get_paths()]
@@ -90,7 +89,7 @@ def _of_collection(one: Any) -> tuple[str, Iterable[Sequence[float]]]:
     return "other", ()
 
 
-def _cells(image: AxesImage) -> Iterator[Row]:
+def _cells(image: AxesImage) -> Iterator[Sequence[float]]:
     values: Any = np.ma.filled(np.ma.asarray(image.get_array(), float), np.nan)
     if values.ndim != 2:
         return
@@ -100,9 +99,8 @@ def _cells(image: AxesImage) -> Iterator[Row]:
     y = bottom + (np.arange(ny) + 0.5) * (top - bottom) / ny
     if image.origin == "upper":
         y = y[::-1]
-    for j, row in enumerate(values):
-        for i, value in enumerate(row):
-            yield x[i], y[j], value
+    across, up = np.meshgrid(x, y)
+    yield from np.column_stack([across.ravel(), up.ravel(), values.ravel()]).tolist()
 
 
 def _quoted(text: str) -> str:

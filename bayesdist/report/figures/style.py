@@ -75,8 +75,12 @@ _RC: Any = {
     "image.cmap": SEQUENTIAL,
     "figure.facecolor": "white",
     "savefig.facecolor": "white",
+    "figure.autolayout": False,  # panels are laid out once, see `bayesdist.report.drawing`
+    "figure.constrained_layout.use": False,
     "figure.constrained_layout.h_pad": 0.06,
     "figure.constrained_layout.w_pad": 0.06,
+    "svg.fonttype": "path",  # a page on paper has its letters whatever fonts there are
+    "svg.hashsalt": "bayesdist",
 }
 
 

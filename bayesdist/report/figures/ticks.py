@@ -84,6 +84,7 @@ class _OneTickAxis:
 
     _one_by_one = False
     _placed: tuple[Any, ...] = ()
+    _measured: tuple[Any, ...] = ()
 
     def reset_ticks(self: Any) -> None:
         """Drop the ticks: those that are needed are made when they are drawn."""
@@ -137,10 +138,22 @@ class _OneTickAxis:
             boxes: tuple[list[Bbox], list[Bbox]]
             boxes = super()._get_ticklabel_bboxes(ticks, renderer)  # type: ignore[misc]
             return boxes
-        return (
-            [box for tick in ticks for box in tick.boxes(tick.label1, renderer)],
-            [box for tick in ticks for box in tick.boxes(tick.label2, renderer)],
-        )
+        shown = [(t, t.label1.get_visible(), t.label2.get_visible()) for t in ticks]
+        state = self._placed[0], shown, self.axes.bbox.bounds, self.axes.figure.dpi
+        if not self._measured or self._measured[0] != state:  # each is asked for twice in a row
+            first = [box for tick in ticks for box in tick.boxes(tick.label1, renderer)]
+            second = [box for tick in ticks for box in tick.boxes(tick.label2, renderer)]
+            self._measured = state, first, second
+        return self._measured[1], self._measured[2]
+
+    def _update_label_position(self: Any, renderer: Any) -> None:
+        if self.label.get_visible():
+            super()._update_label_position(renderer)  # type: ignore[misc]
+
+    def set_tick_params(self: Any, *which: Any, **look: Any) -> None:
+        """Set the look of ticks and their labels."""
+        self._measured = ()
+        super().set_tick_params(*which, **look)  # type: ignore[misc]
 
     @contextmanager
     def _separate(self) -> Iterator[None]:

@@ -15,10 +15,9 @@ import numpy as np
 
 from bayesdist.app.kinds.campaign.inputs import Inputs
 from bayesdist.app.kinds.errors import ExposureScatter
-from bayesdist.assess.terms.parameters import EXPOSURE_SCATTER, ScaleError
+from bayesdist.assess.terms.parameters import ABERRATION, EXPOSURE_SCATTER, ScaleError
 from bayesdist.infer.solution.solution import Solution
 
-ABERRATION = "velocity aberration"
 # Cox & Gilliland (2002, HST Calibration Workshop): the scale varies by up to 5e-5 over an orbit
 SWING = 5e-5
 PERIOD = 5760.0  # s, of 96 minutes

@@ -94,9 +94,9 @@ class FunctionField(DrawnField):
 
     def errors(self, draws: slice, scale: Scale) -> Float:
         """Errors (d, N, 2) of some draws."""
-        number, parts = np.arange(draws.start, draws.stop), []
+        parts = []
         for values, phi in self._parts:
-            some = values[number % len(values)]
+            some = _of_draws(values, draws)
             parts.append(some if phi is None else np.swapaxes(some @ phi.T, 1, 2))
         out = parts[0] if len(parts) == 1 else np.concatenate(parts, axis=1)
         size = scale.get(self.of.row.name, 1.0)
@@ -146,3 +146,12 @@ class FunctionField(DrawnField):
         by_draw = np.sqrt(np.mean(np.square(values, dtype=float), axis=(1, 2)))
         mean = float(by_draw.mean())
         return float(by_draw.std()) / mean if mean > 0 else 0.0
+
+
+def _of_draws(values: NDArray[np.floating], draws: slice) -> NDArray[np.floating]:
+    """Rows (d, ...) of some draws: row k mod n' is that of draw k.  They are copied if need be."""
+    if draws.stop <= len(values):
+        return values[draws]
+    if len(values) == 1:
+        return np.broadcast_to(values, (draws.stop - draws.start, *values.shape[1:]))
+    return values[np.arange(draws.start, draws.stop) % len(values)]

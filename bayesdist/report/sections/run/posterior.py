@@ -38,7 +38,7 @@ from bayesdist.utils.numbers import (
 if TYPE_CHECKING:
     from bayesdist.infer import Posterior
 
-_MIXTURE_LABELS = {"f": "f", "j": "j", "s_out": r"$s_\mathrm{out}$"}
+_MIXTURE_LABELS = {"f": "f", "j": "j", "s_out": "sₒᵤₜ"}
 _MAX_POINTS = 20_000  # draws that enter a corner plot
 N_SLOWEST = 4  # parameters whose ranks are shown
 _NAMED = 25  # coefficients that have room for their names
