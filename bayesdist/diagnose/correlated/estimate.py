@@ -24,6 +24,7 @@ from bayesdist.diagnose.correlated.priors import DiscrepancyPriors
 from bayesdist.diagnose.correlated.result import ChipStructure, Discrepancy
 from bayesdist.diagnose.correlated.shared_stars import shared_stars
 from bayesdist.diagnose.correlated.structure import chip_structure
+from bayesdist.diagnose.efficient import EfficientScore
 from bayesdist.infer.equations.priors import GaussianPriors
 from bayesdist.infer.equations.scaled import one_thread
 from bayesdist.infer.exposures.chip_offsets import Settling
@@ -159,19 +160,20 @@ def _structures(
     """Structure of chips (by code), its effect on the parameters, and its sizes for summaries."""
     model, sums = working.model, working.sums
     stars = sums.position[:, :, 0].sum(axis=1)
-    shift = information.covariance @ information.score
     theta, out, rows = np.zeros((n, model.n_params)), {}, []
     for code in chips:
         chip = model.chips[code]
         functions = StructureFunctions.for_stars(model.order, chip.size, int(stars[code]))
         chip_waves = ChipStructure(functions, functions.finer_waves(rng), np.empty(0))
         S, crossed, taken, score = _along_axes(information, working, chip_waves, code)
-        left = [S[a] - crossed[a].T @ (information.covariance @ crossed[a]) for a in (0, 1)]
-        pull = [score[a] - crossed[a].T @ shift for a in (0, 1)]
+        left = [
+            EfficientScore.of(information.covariance, information.score, *sums)
+            for sums in zip(crossed, S, score, strict=True)
+        ]
         posterior = chip_structure(
             functions,
-            left,
-            pull,
+            [one.information for one in left],
+            [one.score for one in left],
             noise=_star_error(information, code),
             higher_order=priors.higher_order * pixel,
             structure=priors.structure * pixel,

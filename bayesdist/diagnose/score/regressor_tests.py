@@ -20,13 +20,8 @@ import numpy as np
 from scipy.linalg import block_diag
 
 from bayesdist.diagnose.clusters import add_over
-from bayesdist.diagnose.score.projection import (
-    LARGEST_LEVERAGE,
-    Projection,
-    beside_others,
-    independent_directions,
-    squares_of,
-)
+from bayesdist.diagnose.efficient import beside_others, independent_directions, squares_of
+from bayesdist.diagnose.score.projection import LARGEST_LEVERAGE, Projection
 from bayesdist.diagnose.score.regressors import Regressors, one_of_each
 from bayesdist.diagnose.score.result import Family, Outcome, outcome
 from bayesdist.diagnose.score.sample import Block
@@ -137,16 +132,15 @@ class _Directions:
     ) -> _Directions:
         """Directions of regressors on some chips, of these columns."""
         own, directions = several.own(n_chips), several.directions(n_chips)
-        S = projection.efficient_information(columns)
+        S = projection.regressors.information[np.ix_(columns, columns)]
+        cross = projection.cross[:, columns[own]].T @ projection.following
+        whole = directions.T @ projection.beside_exposures(S[np.ix_(own, own)], cross) @ directions
         A = beside_others(S, own, directions)
         S = A.T @ S @ A
-        # beside the exposures' parameters alone
-        inside = projection.n_global + columns[own]
-        whole = directions.T @ projection.information[np.ix_(inside, inside)] @ directions
         N = independent_directions(whole, S, several.least)
         # eigenvectors: their information is diagonal
         basis = A @ (N / np.sqrt(np.einsum("nq,nm,mq->q", N, S, N, optimize=True)))
-        return cls(several, columns, basis, basis.T @ projection.efficient_score[columns])
+        return cls(several, columns, basis, basis.T @ projection.regressors.score[columns])
 
 
 def _star_sums(

@@ -23,7 +23,9 @@ from scipy.sparse import csr_array
 from bayesdist.diagnose.clusters import sums_over
 from bayesdist.diagnose.correlated.deviations import DeviationColumns
 from bayesdist.diagnose.correlated.functions import StructureFunctions
+from bayesdist.diagnose.efficient import EfficientScore
 from bayesdist.diagnose.selfcal.scores import DetectionScores, places_by_star
+from bayesdist.infer.equations.scaled import determined
 from bayesdist.infer.selfcal.elimination import PlaceDerivatives
 from bayesdist.infer.selfcal.mode import SelfCalibrationMode
 from bayesdist.infer.selfcal.problem import Problem
@@ -198,32 +200,18 @@ class Absorbed:
     right: Float  # A^-1/2 b (S q,)
 
 
-@dataclass(frozen=True, eq=False)
-class Remainder:
-    """Information (n, n) and score (n,) of further columns, free parameters eliminated too."""
-
-    information: Float
-    score: Float
-    gain: Float  # response (D, n) of the parameters to the columns; zero for fixed ones
-
-
-def without_parameters(solution: SelfCalibrationMode, N: Float, score: Float) -> Remainder:
+def without_parameters(solution: SelfCalibrationMode, N: Float, score: Float) -> EfficientScore:
     """Columns other than the parameters, these eliminated as free in the solution, with its priors.
 
     N and `score` are those of `eliminated`.
     """
-    D, free, known = len(solution.theta), solution.free, solution.prior
-    A = N[np.ix_(free, free)] + known.precision[np.ix_(free, free)]
-    pull = (score[:D] + known.pull(solution.theta))[free]
-    scale = np.sqrt(np.maximum(np.diag(A), 1e-300))
-    values, vectors = np.linalg.eigh(A / np.outer(scale, scale))
-    good = values > UNKNOWN
-    root = vectors[:, good] / np.sqrt(values[good]) / scale[:, None]
-    through = root.T @ N[free, D:]
-    S = N[D:, D:] - through.T @ through
-    gain = np.zeros((D, len(N) - D))
-    gain[free] = root @ through
-    return Remainder((S + S.T) / 2, score[D:] - through.T @ (root.T @ pull), gain)
+    D, prior = len(solution.theta), solution.prior
+    free = np.ix_(solution.free, solution.free)
+    root = determined(N[free] + prior.precision[free])
+    covariance = np.zeros((D, D))
+    covariance[free] = root @ root.T
+    nuisance = score[:D] + prior.pull(solution.theta)
+    return EfficientScore.of(covariance, nuisance, N[:D, D:], N[D:, D:], score[D:])
 
 
 def absorbed_by_stars(

@@ -14,14 +14,15 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from bayesdist.diagnose.correlated.deviations import deviation_columns
-from bayesdist.diagnose.score.exposures import EXPOSURES
-from bayesdist.diagnose.score.motions import MOTIONS, SHORTEST, StarResiduals, motion_outcome
-from bayesdist.diagnose.score.noise import noise_tests
-from bayesdist.diagnose.score.projection import (
+from bayesdist.diagnose.efficient import (
+    EfficientScore,
     beside_others,
     independent_directions,
     squares_of,
 )
+from bayesdist.diagnose.score.exposures import EXPOSURES
+from bayesdist.diagnose.score.motions import MOTIONS, SHORTEST, StarResiduals, motion_outcome
+from bayesdist.diagnose.score.noise import noise_tests
 from bayesdist.diagnose.score.regressors import (
     Functions,
     Regressors,
@@ -93,9 +94,7 @@ class _Sums:
     """Information and score of the further columns of a problem."""
 
     known: Float  # (n, n) information if stars and parameters were known
-    # information, score (n, n) or (n,): with both eliminated
-    information: Float
-    score: Float
+    left: EfficientScore
     covariance: Float  # (n, n) of the score, by the scores of single stars
     square: Float  # (n, n) mean products of displacements over the detections
     n_stars: int
@@ -170,8 +169,7 @@ def _summed(
     further = np.ix_(columns.order[D:], columns.order[D:])
     return _Sums(
         known[further],
-        left.information,
-        left.score,
+        left,
         covariance,
         square[further] / len(p),
         p.n_stars,
@@ -187,7 +185,7 @@ def _regressor_tests(
     for one in functions.regressors:
         which = columns.along_axes(one.every)
         own, directions = one.own(n_chips), one.directions(n_chips)
-        left = beside_others(sums.information[np.ix_(which, which)], own, directions)
+        left = beside_others(sums.left.information[np.ix_(which, which)], own, directions)
         whole = np.zeros_like(left)
         whole[own] = directions
         found = _tested(sums, one.family, which, whole, left, max(MIN_INFORMATION, one.least))
@@ -209,12 +207,14 @@ def _tested(
     anything is projected out and must keep `least` of their information.
     """
     at = np.ix_(which, which)
-    known, information = whole.T @ sums.known[at] @ whole, left.T @ sums.information[at] @ left
+    known = whole.T @ sums.known[at] @ whole
+    information = left.T @ sums.left.information[at] @ left
     N = left @ independent_directions(known, information, least)
     q, n = N.shape[1], sums.n_stars
     if q == 0 or n < STARS_PER_DIRECTION * q + 2:
         return None
-    U, S, V = N.T @ sums.score[which], N.T @ sums.information[at] @ N, N.T @ sums.covariance[at] @ N
+    U, S = N.T @ sums.left.score[which], N.T @ sums.left.information[at] @ N
+    V = N.T @ sums.covariance[at] @ N
     T = float(U @ np.linalg.solve(V, U))
     square, noise = squares_of(U, S, V, N.T @ sums.square[at] @ N)
     return outcome(
