@@ -64,6 +64,12 @@ class LinearDeviations:
     kinds: tuple[str, ...] = ()
     size: float = 1.0  # half the longer side of a chip, in the unit of u, v: that of a shift of 1
 
+    @property
+    def facts(self) -> dict[str, object]:
+        """Number of exposures and median scatters, for summaries."""
+        scatter = {name: float(np.median(values)) for name, values in self.scatter.items()}
+        return {"exposures": self.n_exposures, "scatter": scatter}
+
     def polynomials(self, epoch: float | None, chip: int) -> Float:
         """Coefficients (n, 2, K) on a chip of the curvature alone, at an epoch."""
         out = np.zeros((len(self.curvature), 2, self.model.n_terms))

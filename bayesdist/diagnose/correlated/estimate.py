@@ -23,7 +23,7 @@ from bayesdist.diagnose.correlated.noise import not_narrower, score_excess
 from bayesdist.diagnose.correlated.priors import DiscrepancyPriors
 from bayesdist.diagnose.correlated.result import ChipStructure, Discrepancy
 from bayesdist.diagnose.correlated.shared_stars import shared_stars
-from bayesdist.diagnose.correlated.structure import chip_structure
+from bayesdist.diagnose.correlated.structure import structure_posterior
 from bayesdist.diagnose.efficient import EfficientScore
 from bayesdist.infer.equations.priors import GaussianPriors
 from bayesdist.infer.equations.scaled import one_thread
@@ -124,8 +124,7 @@ def estimate_discrepancy(
             linear = replace(linear, theta=settling.mean(linear.theta))
     facts |= {"unit": model.unit, "noise_ratio": ratio}
     if linear is not None:
-        facts["exposures"] = linear.n_exposures
-        facts["scatter"] = {k: float(np.median(v)) for k, v in linear.scatter.items()}
+        facts |= linear.facts
     return Discrepancy(model, mean, formal, noise, found, theta, linear, facts)
 
 
@@ -170,8 +169,8 @@ def _structures(
             EfficientScore.of(information.covariance, information.score, *sums)
             for sums in zip(crossed, S, score, strict=True)
         ]
-        posterior = chip_structure(
-            functions,
+        posterior = structure_posterior(
+            [[functions]] * 2,
             [one.information for one in left],
             [one.score for one in left],
             noise=_star_error(information, code),
@@ -179,7 +178,7 @@ def _structures(
             structure=priors.structure * pixel,
             pairs=neighbours.get(code, (None, None)),
         )
-        found = replace(chip_waves, coefficients=posterior.draws(n, rng))
+        found = replace(chip_waves, coefficients=np.stack(posterior.draws(n, rng), axis=1))
         for a in (0, 1):
             # the fit absorbs structure into polynomials; the truth lies on the other side
             theta -= found.coefficients[:, a] @ (working.covariance @ taken[a]).T
