@@ -24,7 +24,7 @@ from bayesdist.diagnose.clusters import sums_over
 from bayesdist.diagnose.correlated.deviations import DeviationColumns
 from bayesdist.diagnose.correlated.functions import StructureFunctions
 from bayesdist.diagnose.efficient import EfficientScore
-from bayesdist.diagnose.selfcal.scores import DetectionScores, places_by_star
+from bayesdist.diagnose.selfcal.scores import DetectionScores, inverse_roots, places_by_star
 from bayesdist.infer.equations.scaled import determined
 from bayesdist.infer.selfcal.elimination import PlaceDerivatives
 from bayesdist.infer.selfcal.mode import SelfCalibrationMode
@@ -32,7 +32,6 @@ from bayesdist.infer.selfcal.problem import Problem
 from bayesdist.utils.arrays import Float, Int
 
 DETECTIONS = 8192  # in memory at a time
-UNKNOWN = 1e-10  # relative curvature below which a combination of numbers is undetermined
 
 
 @dataclass(frozen=True, eq=False)
@@ -233,7 +232,7 @@ def absorbed_by_stars(
             summed = piece.of_stars(turned[:, :, axis, None])[:, here] @ values
             T[:, columns.dense(code, axis)] = summed
     T[:, columns.sparse] = (piece.of_stars(S_H) @ piece.sparse).toarray()
-    roots = _inverse_roots(own)
+    roots = inverse_roots(own)
     rows = np.reshape(roots @ T.reshape(S, q, -1), (S * q, -1))
     return Absorbed(rows, np.ravel(np.einsum("skq,sq->sk", roots, b)))
 
@@ -324,12 +323,3 @@ def _pulled(columns: Columns, piece: Piece, gradient: Float) -> Float:
             out[columns.dense(code, axis)] = values.T @ turned[here, axis]
     out[columns.sparse] = piece.sparse.T @ gradient.ravel()
     return out
-
-
-def _inverse_roots(matrices: Float) -> Float:
-    """R with R^T R the inverse of each matrix (S, q, q), without undetermined directions."""
-    scale = np.sqrt(np.maximum(np.einsum("sqq->sq", matrices), 1e-300))
-    values, vectors = np.linalg.eigh(matrices / (scale[:, :, None] * scale[:, None, :]))
-    good = values > UNKNOWN
-    roots = np.where(good, np.where(good, values, 1.0) ** -0.5, 0.0)
-    return np.asarray(roots[:, :, None] * np.swapaxes(vectors, 1, 2) / scale[:, None, :])
