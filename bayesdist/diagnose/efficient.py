@@ -47,7 +47,52 @@ class EfficientScore:
         return cls(gain, (left + left.T) / 2, score - gain.T @ nuisance_score)
 
 
-def beside_others(information: Float, own: Bool, directions: Float) -> Float:
+@dataclass(frozen=True, eq=False)
+class Directions:
+    """Combinations of columns that the parameters have left, in units of their information."""
+
+    columns: Int  # (m,)
+    basis: Float  # (m, q) with unit information, all parameters projected out
+    score: Float  # (q,) also the step by which the fit would move
+
+    @classmethod
+    def of(
+        cls,
+        left: EfficientScore,
+        columns: Int,
+        own: Bool,
+        combinations: Float,
+        known: Float,
+        least: float,
+    ) -> Directions:
+        """Directions of the `own` ones of some columns (m,), without what the others say of them.
+
+        `combinations` (k, n) are those of the own ones that are asked for, `known` (k, k) their
+        information before anything is projected out, of which a direction must keep `least`.
+        """
+        S = left.information[np.ix_(columns, columns)]
+        A = _beside_others(S, own, combinations)
+        S = A.T @ S @ A
+        N = independent_directions(combinations.T @ known @ combinations, S, least)
+        # eigenvectors: their information is diagonal
+        basis = A @ (N / np.sqrt(np.einsum("nq,nm,mq->q", N, S, N, optimize=True)))
+        return cls(columns, basis, basis.T @ left.score[columns])
+
+    @property
+    def q(self) -> int:
+        """Number of directions."""
+        return self.basis.shape[1]
+
+    def squares(self, covariance: Float, square: Float) -> tuple[float, float]:
+        """Mean squares of the pattern that the score stands for, and of what noise makes of it.
+
+        `covariance` (q, q) is that of the score, `square` (m, m) the mean products of the columns.
+        """
+        of_basis = self.basis.T @ square @ self.basis
+        return squares_of(self.score, np.eye(self.q), covariance, of_basis)
+
+
+def _beside_others(information: Float, own: Bool, directions: Float) -> Float:
     """Directions (n, q) of the `own` regressors (n,), without what the others say of them.
 
     `information` (n, n) is that of all, the parameters projected out; `directions` are combinations

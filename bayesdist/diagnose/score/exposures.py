@@ -224,7 +224,7 @@ def _of_exposure(
     covariance = of_own + of_others
     share = float(np.trace(of_own) / np.trace(covariance))
     n_others = max(int(sample.used.sum()) - n_own, 1)
-    own = projection.beside_exposures(left.information, by_global)
+    own = projection.with_global(left.information, by_global)
     return whole, _Deviations(
         left.score,
         left.information,

@@ -61,14 +61,19 @@ class Projection:
         local = -np.linalg.solve(self.parameters[G:, G:], self.parameters[G:, :G])
         return np.concatenate([np.eye(G), local])
 
-    def beside_exposures(self, information: Float, cross: Float) -> Float:
-        """Information (n, n) of columns with the exposures' parameters alone projected out.
+    def with_global(self, information: Float, cross: Float) -> Float:
+        """Information (n, n) of columns when the exposures' parameters alone are projected out.
 
         From that with all of them projected out, and `cross` (n, G) with the global parameters that
         the others follow.
         """
         G = self.n_global
         return np.asarray(information + cross @ self.covariance[:G, :G] @ cross.T)
+
+    def beside_exposures(self, which: Int) -> Float:
+        """Information (n, n) of regressors, the exposures' parameters alone projected out."""
+        left = self.regressors.information[np.ix_(which, which)]
+        return self.with_global(left, self.cross[:, which].T @ self.following)
 
     def star_scores(self, F: Float, block: Block, coefficients: Float) -> Float:
         """Scores (n, q) of detections, by coefficients (2, L, q) of functions F (L, n)."""

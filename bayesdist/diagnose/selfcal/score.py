@@ -14,12 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from bayesdist.diagnose.correlated.deviations import deviation_columns
-from bayesdist.diagnose.efficient import (
-    EfficientScore,
-    beside_others,
-    independent_directions,
-    squares_of,
-)
+from bayesdist.diagnose.efficient import Directions, EfficientScore
 from bayesdist.diagnose.score.exposures import EXPOSURES
 from bayesdist.diagnose.score.motions import MOTIONS, SHORTEST, StarResiduals, motion_outcome
 from bayesdist.diagnose.score.noise import noise_tests
@@ -127,8 +122,8 @@ def selfcal_score_tests(
     sums = _summed(solution, columns, rows, solution.stars[some])
     found = one_of_each(_regressor_tests(sums, columns, functions))
     chosen = columns.of_exposures
-    each = np.eye(len(chosen))
-    deviating = _tested(sums, EXPOSURES_OF_SELFCAL, chosen, each, each)
+    every = np.ones(len(chosen), bool)
+    deviating = _tested(sums, EXPOSURES_OF_SELFCAL, chosen, every, np.eye(len(chosen)))
     moving = None
     if epoch is not None and whole.n_star == 2 and np.ptp(epoch) > SHORTEST:
         scores = scores_of_detections(solution)
@@ -183,12 +178,9 @@ def _regressor_tests(
     """Tests of all regressors that there are stars enough for."""
     n_chips = len(columns.problem.model.chips)
     for one in functions.regressors:
-        which = columns.along_axes(one.every)
-        own, directions = one.own(n_chips), one.directions(n_chips)
-        left = beside_others(sums.left.information[np.ix_(which, which)], own, directions)
-        whole = np.zeros_like(left)
-        whole[own] = directions
-        found = _tested(sums, one.family, which, whole, left, max(MIN_INFORMATION, one.least))
+        which, own = columns.along_axes(one.every), one.own(n_chips)
+        least = max(MIN_INFORMATION, one.least)
+        found = _tested(sums, one.family, which, own, one.directions(n_chips), least)
         if found is not None:
             yield one, found
 
@@ -197,26 +189,20 @@ def _tested(
     sums: _Sums,
     family: Family,
     which: Int,
-    whole: Float,
-    left: Float,
+    own: Bool,
+    combinations: Float,
     least: float = MIN_INFORMATION,
 ) -> Outcome | None:
-    """Outcome of one test; None where the data cannot be asked.
-
-    It is that of the directions `left` (n, m) of some columns, which are `whole` (n, m) before
-    anything is projected out and must keep `least` of their information.
-    """
-    at = np.ix_(which, which)
-    known = whole.T @ sums.known[at] @ whole
-    information = left.T @ sums.left.information[at] @ left
-    N = left @ independent_directions(known, information, least)
-    q, n = N.shape[1], sums.n_stars
+    """Outcome of one test of some columns, as of `Directions`; None where they cannot be asked."""
+    known = sums.known[np.ix_(which[own], which[own])]
+    one, n = Directions.of(sums.left, which, own, combinations, known, least), sums.n_stars
+    q = one.q
     if q == 0 or n < STARS_PER_DIRECTION * q + 2:
         return None
-    U, S = N.T @ sums.left.score[which], N.T @ sums.left.information[at] @ N
-    V = N.T @ sums.covariance[at] @ N
-    T = float(U @ np.linalg.solve(V, U))
-    square, noise = squares_of(U, S, V, N.T @ sums.square[at] @ N)
+    at = np.ix_(which, which)
+    V = one.basis.T @ sums.covariance[at] @ one.basis
+    T = float(one.score @ np.linalg.solve(V, one.score))
+    square, noise = one.squares(V, sums.square[at])
     return outcome(
         family,
         T,
