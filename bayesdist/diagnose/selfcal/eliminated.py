@@ -123,7 +123,7 @@ def even_stars(problem: Problem, most: int) -> Int:
 
 @dataclass(frozen=True, eq=False)
 class Piece:
-    """Some stars with their n detections."""
+    """Some stars with their n detections, displaced along the axes of the polynomials."""
 
     stars: slice  # in the problem
     rows: slice  # of the detections, in the problem
@@ -132,7 +132,13 @@ class Piece:
     frame: Float  # matrix (n, 2, 2) from the axes of the polynomials to those of the sky
     # for each chip, the detections on it, and the values of its columns
     dense: tuple[tuple[Int, Float], ...]
-    sparse: csr_array  # displacements along u and v, in turn (2 n, n_sparse)
+    sparse: csr_array  # displacements along both axes, in turn (2 n, n_sparse)
+
+    def scores(self, every: DetectionScores) -> DetectionScores:
+        """Scores of these detections along the axes of the polynomials."""
+        some = every.at(self.rows)
+        gradient = np.einsum("nab,na->nb", self.frame, some.gradient)
+        return DetectionScores(gradient, self.frame.mT @ some.curvature @ self.frame)
 
     def __len__(self) -> int:
         return len(self.star)
@@ -166,27 +172,25 @@ def pieces(columns: Columns) -> Iterator[Piece]:
             more = columns.values(code, rows.start + here)
             dense.append((here, np.concatenate([phi[here], more], axis=1)))
         entries = []
+        back = np.linalg.inv(structure.linear)
         for g in np.unique(group):
             here = np.flatnonzero(group == g)
             # parameters of exposures and drifts
             used = np.flatnonzero(structure.columns[g] >= 0)
-            values = np.einsum("mak,nk->nam", structure.extra[g][used], phi[here])
+            values = np.einsum("mak,nk->nam", back[g] @ structure.extra[g][used], phi[here])
             moved = [(structure.columns[g][used] - p.model.n_polynomial, values)]
             if columns.deviations is not None:
                 place = int(p.groups.chip[g]), float(p.groups.epoch[g])
                 which, values = columns.deviations.at(int(g), *place, phi[here], columns.centre)
-                moved.append((n_sparse_params + which, structure.linear[g] @ values))
+                moved.append((n_sparse_params + which, values))
             row = 2 * here[:, None, None] + np.arange(2)[:, None]
             for at, values in moved:
                 parts = (values, row, at)
                 entries.append([np.broadcast_to(part, values.shape).ravel() for part in parts])
         data, row, at = (np.concatenate(part) for part in zip(*entries, strict=True))
         sparse = csr_array((data, (row, at)), shape=(2 * n, columns.n_sparse))
-        star, by_star, frame = (
-            p.star[rows] - first,
-            places_by_star(p, rows),
-            structure.linear[group],
-        )
+        star, by_star = p.star[rows] - first, back[group] @ places_by_star(p, rows)
+        frame = structure.linear[group]
         yield Piece(slice(first, last), rows, star, by_star, frame, tuple(dense), sparse)
         first = last
 
@@ -226,10 +230,9 @@ def absorbed_by_stars(
     gradient = np.einsum("naq,na->nq", piece.by_star, scores.gradient)
     b = sums_over(piece.star, gradient, S) - pull
     T = np.zeros((S * q, columns.sparse.stop))
-    turned = S_H @ piece.frame
     for code, (here, values) in enumerate(piece.dense):
         for axis in (0, 1):
-            summed = piece.of_stars(turned[:, :, axis, None])[:, here] @ values
+            summed = piece.of_stars(S_H[:, :, axis, None])[:, here] @ values
             T[:, columns.dense(code, axis)] = summed
     T[:, columns.sparse] = (piece.of_stars(S_H) @ piece.sparse).toarray()
     roots = inverse_roots(own)
@@ -264,13 +267,13 @@ def eliminated(
     )
     other = np.zeros((len(inside), n))
     for piece in pieces(columns):
-        here = scores.at(piece.rows)
+        here = piece.scores(scores)
         sums = absorbed_by_stars(columns, piece, here, stars)
         add_products(total, columns, columns, piece, here.curvature)
         total -= sums.rows.T @ sums.rows
         score += _pulled(columns, piece, here.gradient) - sums.rows.T @ sums.right
         if working is not None:
-            here = working.at(piece.rows)
+            here = piece.scores(working)
             sums = absorbed_by_stars(columns, piece, here, stars)
             add_products(other, narrow, columns, piece, here.curvature)
             other -= sums.rows[:, inside].T @ sums.rows
@@ -282,8 +285,6 @@ def eliminated(
 
 def add_products(N: Float, left: Columns, right: Columns, piece: Piece, H: Float) -> None:
     """Add Z^T H Z of a piece to N, by internal columns; `left` may lack the dense functions."""
-    H_M = H @ piece.frame
-    weight = np.swapaxes(piece.frame, 1, 2) @ H_M
     n, others = len(piece), left.n_sparse
     across = np.arange(2 * n).reshape(n, 2)
     for code, (here, values) in enumerate(piece.dense):
@@ -292,7 +293,7 @@ def add_products(N: Float, left: Columns, right: Columns, piece: Piece, H: Float
             # of dense columns along the axis a with the sparse ones
             turn = csr_array(
                 (
-                    H_M[here, :, a].ravel(),
+                    H[here, :, a].ravel(),
                     (np.repeat(np.arange(len(here)), 2), across[here].ravel()),
                 ),
                 shape=(len(here), 2 * n),
@@ -303,7 +304,7 @@ def add_products(N: Float, left: Columns, right: Columns, piece: Piece, H: Float
             for b in (0, 1):
                 if left is right and b < a:
                     continue
-                product = some.T @ (weight[here, a, b, None] * values)
+                product = some.T @ (H[here, a, b, None] * values)
                 N[left.dense(code, a), right.dense(code, b)] += product
                 if left is right and b > a:
                     N[left.dense(code, b), right.dense(code, a)] += product.T
@@ -317,9 +318,8 @@ def add_products(N: Float, left: Columns, right: Columns, piece: Piece, H: Float
 def _pulled(columns: Columns, piece: Piece, gradient: Float) -> Float:
     """Sums (n,) of Z^T g over a piece, by internal columns."""
     out = np.zeros(columns.sparse.stop)
-    turned = np.einsum("nab,na->nb", piece.frame, gradient)
     for code, (here, values) in enumerate(piece.dense):
         for axis in (0, 1):
-            out[columns.dense(code, axis)] = values.T @ turned[here, axis]
+            out[columns.dense(code, axis)] = values.T @ gradient[here, axis]
     out[columns.sparse] = piece.sparse.T @ gradient.ravel()
     return out

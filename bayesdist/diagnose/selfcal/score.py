@@ -143,14 +143,13 @@ def _summed(
     n, D = columns.sparse.stop, columns.n_params
     known, taken, square = (np.zeros((n, n)) for _ in range(3))
     score, psi = np.zeros(n), []
-    unit = np.broadcast_to(np.eye(2), (len(p), 2, 2))
     for piece in pieces(columns):
-        here = scores.at(piece.rows)
+        here = piece.scores(scores)
         sums = absorbed_by_stars(columns, piece, here, stars)
         taken += sums.rows.T @ sums.rows
         score -= sums.rows.T @ sums.right
         add_products(known, columns, columns, piece, here.curvature)
-        add_products(square, columns, columns, piece, unit[piece.rows])
+        add_products(square, columns, columns, piece, piece.frame.mT @ piece.frame)
         psi.append(star_scores(columns, piece, here.gradient))
     inside = np.ix_(columns.order, columns.order)
     own = np.concatenate(psi)
