@@ -166,8 +166,8 @@ def _structures(
         chip_waves = ChipStructure(functions, functions.finer_waves(rng), np.empty(0))
         S, crossed, taken, score = _along_axes(information, working, chip_waves, code)
         left = [
-            EfficientScore.of(information.covariance, information.score, *sums)
-            for sums in zip(crossed, S, score, strict=True)
+            EfficientScore.of(information.covariance, information.score, *axis)
+            for axis in zip(crossed, S, score, strict=True)
         ]
         posterior = structure_posterior(
             [[functions]] * 2,

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from bayesdist.diagnose.correlated.deviations import deviation_columns, deviation_draws
+from bayesdist.diagnose.correlated.deviations import deviation_draws
 from bayesdist.diagnose.correlated.functions import MIN_SIDE, StructureFunctions
 from bayesdist.diagnose.correlated.noise import not_narrower
 from bayesdist.diagnose.correlated.priors import DiscrepancyPriors
@@ -17,20 +17,18 @@ from bayesdist.diagnose.correlated.result import ChipStructure, Discrepancy
 from bayesdist.diagnose.correlated.structure import structure_posterior
 from bayesdist.diagnose.selfcal.eliminated import (
     Columns,
+    EvenStars,
     eliminated,
-    even_stars,
     without_parameters,
 )
 from bayesdist.diagnose.selfcal.sandwich import sandwich
-from bayesdist.diagnose.selfcal.scores import DetectionScores, score_excess, scores_of_detections
+from bayesdist.diagnose.selfcal.scores import score_excess, scores_of_detections
 from bayesdist.infer.equations.scaled import one_thread
 from bayesdist.infer.selfcal.mode import SelfCalibrationMode
 from bayesdist.infer.selfcal.problem import Problem
 from bayesdist.utils.arrays import Float
 
 DRAWS = 2000
-MAX_DETECTIONS = 60_000  # from which structure is estimated, at most
-MAX_EXPOSURES = 150  # whose single deviations are estimated
 MAX_SINES = 700  # of all axes and chips: their information is decomposed
 # of the field, in longer half sides; all equally probable beforehand
 LENGTHS = np.geomspace(0.08, 0.6, 5)
@@ -51,27 +49,17 @@ def selfcal_discrepancy(
     working = scores_of_detections(solution)
     flat = working.flattened(score_excess(solution, working))
     cov = solution.cov
-    noise, ratio = _noise(solution, working)
+    noise, ratio = not_narrower(sandwich(solution, working), cov)
 
-    some = even_stars(solution.problem, MAX_DETECTIONS)
-    problem, stars = solution.problem.of_stars(some), solution.stars[some]
-    chosen = np.isin(solution.problem.star, some)
-    flat, working = flat.at(chosen), working.at(chosen)
-    functions = _functions(problem)
-    counts = np.bincount(problem.groups.index, minlength=len(problem.groups))
-    deviations = deviation_columns(
-        model,
-        solution.theta,
-        problem.groups,
-        counts.astype(float),
-        most=MAX_EXPOSURES,
-    )
-    columns = Columns(problem, solution.theta, functions, deviations)
-    N, score, taken = eliminated(columns, flat, stars, working=working)
+    some = EvenStars.of(solution)
+    flat, working = flat.at(some.rows), working.at(some.rows)
+    functions, deviations = _functions(some.problem), some.deviations
+    columns = Columns(some.problem, solution.theta, functions, deviations)
+    N, score, taken = eliminated(columns, flat, some.stars, working=working)
     left = without_parameters(solution, N, score)
     S, score = left.information, left.score
     # effect of a unit of each function on the fit of all detections
-    D, all_of_them = model.n_params, len(solution.problem) / len(problem)
+    D, all_of_them = model.n_params, len(solution.problem) / len(some.problem)
     taken = cov @ taken[:, D:] * all_of_them
 
     m = 2 * sum(f.n_known for f in functions.values())
@@ -86,15 +74,6 @@ def selfcal_discrepancy(
     if model.frames != "affine" and not (linear and linear.scatter):
         facts["exposures_measured"] = False
     return Discrepancy(model, solution.theta, cov, noise, found, theta, linear, facts)
-
-
-def _noise(solution: SelfCalibrationMode, scores: DetectionScores) -> tuple[Float, float]:
-    """Covariance (D, D) by the stars' scatter, and its ratio to the formal one."""
-    inner = np.ix_(solution.free, solution.free)
-    narrow, ratio = not_narrower(sandwich(solution, scores)[inner], solution.cov[inner])
-    out = np.zeros((len(solution.theta),) * 2)
-    out[inner] = narrow
-    return out, ratio
 
 
 def _functions(problem: Problem) -> dict[int, StructureFunctions]:

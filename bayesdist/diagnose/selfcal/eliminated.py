@@ -21,7 +21,7 @@ import numpy as np
 from scipy.sparse import csr_array
 
 from bayesdist.diagnose.clusters import sums_over
-from bayesdist.diagnose.correlated.deviations import DeviationColumns
+from bayesdist.diagnose.correlated.deviations import DeviationColumns, deviation_columns
 from bayesdist.diagnose.correlated.functions import StructureFunctions
 from bayesdist.diagnose.efficient import EfficientScore
 from bayesdist.diagnose.selfcal.scores import DetectionScores, inverse_roots, places_by_star
@@ -29,9 +29,11 @@ from bayesdist.infer.equations.scaled import determined
 from bayesdist.infer.selfcal.elimination import PlaceDerivatives
 from bayesdist.infer.selfcal.mode import SelfCalibrationMode
 from bayesdist.infer.selfcal.problem import Problem
-from bayesdist.utils.arrays import Float, Int
+from bayesdist.utils.arrays import Bool, Float, Int
 
 DETECTIONS = 8192  # in memory at a time
+MAX_DETECTIONS = 60_000  # that are looked at
+MAX_EXPOSURES = 150  # whose single deviations are looked at
 
 
 @dataclass(frozen=True, eq=False)
@@ -113,12 +115,27 @@ class Columns:
         return np.mean(out, axis=0)
 
 
-def even_stars(problem: Problem, most: int) -> Int:
-    """Stars to be used: all, or every k-th, so that there are no more detections than `most`.
+@dataclass(frozen=True, eq=False)
+class EvenStars:
+    """Some stars of a solution, or all; a part of them is less informative, and unbiased."""
 
-    A part of the stars is less informative than all of them, and unbiased.
-    """
-    return np.arange(0, problem.n_stars, int(np.ceil(len(problem) / most)))
+    rows: Bool  # (N,) of their detections, among those of all stars
+    problem: Problem
+    stars: Float  # (S, q)
+    deviations: DeviationColumns | None  # of their exposures
+
+    @classmethod
+    def of(cls, solution: SelfCalibrationMode) -> EvenStars:
+        """All stars, or every k-th, so that there are no more detections than `MAX_DETECTIONS`."""
+        whole = solution.problem
+        some = np.arange(0, whole.n_stars, int(np.ceil(len(whole) / MAX_DETECTIONS)))
+        problem = whole.of_stars(some)
+        groups = problem.groups
+        counts = np.bincount(groups.index, minlength=len(groups)).astype(float)
+        deviations = deviation_columns(
+            whole.model, solution.theta, groups, counts, most=MAX_EXPOSURES
+        )
+        return cls(np.isin(whole.star, some), problem, solution.stars[some], deviations)
 
 
 @dataclass(frozen=True, eq=False)
