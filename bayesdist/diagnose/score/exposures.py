@@ -177,13 +177,9 @@ def _fields(block: Block, names: list[str], origin: tuple[float, float]) -> Floa
 def _of_exposure(
     projection: Projection, blocks: list[Block], names: list[str], meat: _Meat | None
 ) -> tuple[Float, _Deviations]:
-    """Information before anything is projected out, and one exposure's deviations.
-
-    Without the scores of the global parameters, the part of other exposures in the covariance is
-    taken to be as wrong as errors are on average.
-    """
+    """Information before anything is projected out, and one exposure's deviations."""
     sample, model = projection.sample, projection.sample.model
-    n, D, G = len(names), model.n_params, projection.n_global
+    n, D = len(names), model.n_params
     whole, cross, score = np.zeros((n, n)), np.zeros((D, n)), np.zeros(n)
     square = np.zeros((n, n))
     area = model.basis().mean_squares
@@ -200,8 +196,38 @@ def _of_exposure(
         projection.covariance, projection.score, cross[rows], whole, score, rows
     )
     by_global = cross[rows].T @ projection.following[rows]
+    of_own, of_others = _covariances(projection, blocks, fields, left, meat)
+    covariance = of_own + of_others
+    share = float(np.trace(of_own) / np.trace(covariance))
+    n_own = sum(int(sample.used[block.rows].sum()) for block in blocks)
+    n_others = max(int(sample.used.sum()) - n_own, 1)
+    return whole, _Deviations(
+        left.score,
+        left.information,
+        projection.with_global(left.information, by_global),
+        by_global,
+        (covariance + covariance.T) / 2,
+        square,
+        1.0 / (share**2 / n_own + (1.0 - share) ** 2 / n_others),
+    )
+
+
+def _covariances(
+    projection: Projection,
+    blocks: list[Block],
+    fields: list[Float],
+    left: EfficientScore,
+    meat: _Meat | None,
+) -> tuple[Float, Float]:
+    """Covariance (n, n) of an exposure's scores: of its own stars, and of all else.
+
+    Without the scores of the global parameters, the part of other exposures is taken to be as wrong
+    as errors are on average.
+    """
+    sample = projection.sample
     # the global parameters, which other exposures see as well, with those of exposures following
-    nuisance = left.gain[:G]
+    nuisance = left.gain[: projection.n_global]
+    shared = projection.following @ nuisance
     others, psi = left.information.copy(), []
     for block, Z in zip(blocks, fields, strict=True):
         F = projection.functions.polynomials(block.rows)
@@ -209,28 +235,14 @@ def _of_exposure(
         if meat is None:
             others -= contracted(direct, weighted(F, sample.curvature[:, block.rows], direct))
         else:
-            direct += block.moved(projection.following) @ nuisance
+            direct += block.moved(shared)
         psi.append(projection.star_scores(F, block, direct))
-    own_scores = np.concatenate(psi)
-    n_own = sum(int(sample.used[block.rows].sum()) for block in blocks)
+    own = np.concatenate(psi)
     if meat is None:
-        of_own, of_others = own_scores.T @ own_scores, projection.score_ratio * others
-    else:
-        star = np.concatenate([sample.star[block.rows] for block in blocks])
-        of_own, of_others = meat.covariance(nuisance, star, own_scores)
-        P = projection.precision[np.ix_(rows, rows)]
-        before, after = projection.following[rows] @ nuisance, left.gain[rows]
-        of_others += after.T @ P @ after - before.T @ P @ before
-    covariance = of_own + of_others
-    share = float(np.trace(of_own) / np.trace(covariance))
-    n_others = max(int(sample.used.sum()) - n_own, 1)
-    own = projection.with_global(left.information, by_global)
-    return whole, _Deviations(
-        left.score,
-        left.information,
-        own,
-        by_global,
-        (covariance + covariance.T) / 2,
-        square,
-        1.0 / (share**2 / n_own + (1.0 - share) ** 2 / n_others),
-    )
+        return own.T @ own, projection.score_ratio * others
+    star = np.concatenate([sample.star[block.rows] for block in blocks])
+    of_own, of_others = meat.covariance(nuisance, star, own)
+    rows = np.unique(np.concatenate([block.columns for block in blocks]))
+    P = projection.precision[np.ix_(rows, rows)]
+    before, after = shared[rows], left.gain[rows]
+    return of_own, of_others + after.T @ P @ after - before.T @ P @ before
