@@ -18,7 +18,6 @@ from bayesdist.diagnose.checks import (
     structure_checks,
 )
 from bayesdist.diagnose.correlated import Discrepancy, DiscrepancyPriors, estimate_discrepancy
-from bayesdist.diagnose.correlated.result import as_stored
 from bayesdist.diagnose.holdout.validation import HoldoutValidation
 from bayesdist.diagnose.overlap import OverlapTest
 from bayesdist.diagnose.periods import PeriodSettings, TimeVariation, time_variation
@@ -291,7 +290,7 @@ def diagnose(
         found,
         flagged=flagged_by_exposure(shards, posterior) if len(fit.model.exposures) > 1 else None,
         score_tests=tests,
-        correlated=as_stored(estimated),
+        correlated=estimated.stored,
         catalogue=shared,
         periods=None
         if periods is None

@@ -323,7 +323,7 @@ def _of_run(run: Path, folder: Path) -> Iterator[Input]:
         "release": ["release", "@/run", "-o", "@/released"],
     }
     names = ("run.json", "summary.json", "config.toml", "posterior.nc", "fit.nc", "diagnostics.h5",
-             "evaluation.h5", "discrepancy.h5", "budget.ecsv", "margins.ecsv", "coefficients.ecsv",
+             "evaluation.h5", "budget.ecsv", "margins.ecsv", "coefficients.ecsv",
              "maps.fits", "sip.hdr", "chain-1-*.h5")  # fmt: skip
     for name in names:
         for path in sorted((here / "run").glob(name))[:1]:

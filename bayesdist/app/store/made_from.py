@@ -59,7 +59,7 @@ STAGES = {
     "match": Stage(),
     "fit": Stage(revision=2),
     "sample": Stage(revision=2, checkpoints=("chain-*.h5",)),
-    "diagnose": Stage(revision=3),
+    "diagnose": Stage(revision=4),
     "evaluate": Stage(revision=3),
     "export": Stage(),
     "report": Stage(),

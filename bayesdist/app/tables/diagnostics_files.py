@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import hashlib
 import logging
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from typing import Any
 
 import numpy as np
 
 from bayesdist.app.store.keys import attributes
 from bayesdist.app.store.rundir import RunDirectory
-from bayesdist.diagnose.correlated.result import discrepancy_from_arrays, discrepancy_to_arrays
 from bayesdist.diagnose.diagnostics import Diagnostics
 from bayesdist.diagnose.residuals.misfit import Misfit
 from bayesdist.diagnose.score.result import ScoreTest
@@ -21,8 +20,7 @@ from bayesdist.files.records import record_from_arrays, record_to_arrays
 from bayesdist.infer import LinearFit, Posterior
 from bayesdist.infer.sampler.checkpoints import read_arrays, write_arrays
 
-CORRELATED = "discrepancy.h5"
-OTHERS = "diagnostics.h5"
+FILE = "diagnostics.h5"
 
 log = logging.getLogger("bayesdist")
 
@@ -39,14 +37,11 @@ def write_diagnostics(
     run: RunDirectory, fit: LinearFit, posterior: Posterior, found: Diagnostics
 ) -> None:
     """Write diagnostics of a fit and a posterior, and their sections of summary.json."""
-    fingerprint = fingerprint_of(fit, posterior)
     correlated = required(found.correlated, "correlated errors are diagnosed of a posterior only")
-    arrays, facts = discrepancy_to_arrays(correlated)
-    write_arrays(run / CORRELATED, fingerprint, arrays)
-    others = replace(found, correlated=None)
-    write_arrays(run / OTHERS, fingerprint, record_to_arrays(others))
+    write_arrays(run / FILE, fingerprint_of(fit, posterior), record_to_arrays(found))
+    facts = correlated.facts
     run.summarise(
-        discrepancy=facts,
+        discrepancy=dict(facts),
         score_tests=[_row(test) for test in found.score_tests],
         misfit=_misfit_summary(found),
     )
@@ -63,21 +58,16 @@ def write_diagnostics(
 
 def load_diagnostics(run: RunDirectory, fit: LinearFit, posterior: Posterior) -> Diagnostics | None:
     """Diagnostics of a fit and a posterior; None where there are none of just these."""
-    facts = run.summary.get("discrepancy")
-    fingerprint = fingerprint_of(fit, posterior)
-    if not facts or not (run / OTHERS).exists():
+    if not (run / FILE).exists():
         return None
     try:
-        found = read_arrays(run / OTHERS, fingerprint, do="")
-        arrays = read_arrays(run / CORRELATED, fingerprint, do="")
+        arrays = read_arrays(run / FILE, fingerprint_of(fit, posterior), do="")
     except InputError:
         return None
     again = f"run 'bayesdist stage diagnose {run.path}' again"
-    with restoring(run / OTHERS, "diagnostics", do=again):
-        others = record_from_arrays(found, Diagnostics)
-    with restoring(run / CORRELATED, "correlated errors", do=again):
-        correlated = discrepancy_from_arrays(posterior.model, arrays)
-        return replace(others, correlated=replace(correlated, facts=facts))
+    with restoring(run / FILE, "diagnostics", do=again):
+        found: Diagnostics = record_from_arrays(arrays, Diagnostics)
+        return found
 
 
 def _row(test: ScoreTest) -> dict[str, Any]:

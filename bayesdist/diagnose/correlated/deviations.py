@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from bayesdist.diagnose.correlated.information import GroupCells, Information
 from bayesdist.diagnose.correlated.priors import DiscrepancyPriors, log_half_cauchy, log_widths
+from bayesdist.diagnose.efficient import EfficientScore
 from bayesdist.model import DistortionModel, Groups
 from bayesdist.model.frames import LINEAR_MATRICES
 from bayesdist.utils.arrays import Float, Int
@@ -62,6 +63,12 @@ class LinearDeviations:
     # deviations of each exposure: of 'shift', 'rotation', 'scale' and 'shear'
     kinds: tuple[str, ...] = ()
     size: float = 1.0  # half the longer side of a chip, in the unit of u, v: that of a shift of 1
+
+    @property
+    def facts(self) -> dict[str, object]:
+        """Number of exposures and median scatters, for summaries."""
+        scatter = {name: float(np.median(values)) for name, values in self.scatter.items()}
+        return {"exposures": self.n_exposures, "scatter": scatter}
 
     def polynomials(self, epoch: float | None, chip: int) -> Float:
         """Coefficients (n, 2, K) on a chip of the curvature alone, at an epoch."""
@@ -216,10 +223,9 @@ def linear_deviations(
             if which == 0:
                 S += np.einsum("caq,car->qr", moved, pulled, optimize=True)
                 score += np.einsum("caq,ca->q", moved, cells.score, optimize=True)
-    through = information.covariance @ crossed[0]
-    S = S - crossed[0].T @ through
-    score = score - through.T @ information.score
-    return deviation_draws(columns, S, score, working.covariance @ crossed[1], priors, n, rng)
+    left = EfficientScore.of(information.covariance, information.score, crossed[0], S, score)
+    taken = working.covariance @ crossed[1]
+    return deviation_draws(columns, left.information, left.score, taken, priors, n, rng)
 
 
 def deviation_draws(
@@ -237,7 +243,6 @@ def deviation_draws(
     absorbs eliminated; `taken` (D, q) is the effect of a unit of each on the fit.
     """
     total, scatter = len(columns), columns.scatter
-    S = (S + S.T) / 2
     medians = {
         "shift": priors.exposure,
         "rotation": priors.exposure,

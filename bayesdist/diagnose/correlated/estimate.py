@@ -23,7 +23,8 @@ from bayesdist.diagnose.correlated.noise import not_narrower, score_excess
 from bayesdist.diagnose.correlated.priors import DiscrepancyPriors
 from bayesdist.diagnose.correlated.result import ChipStructure, Discrepancy
 from bayesdist.diagnose.correlated.shared_stars import shared_stars
-from bayesdist.diagnose.correlated.structure import chip_structure
+from bayesdist.diagnose.correlated.structure import structure_posterior
+from bayesdist.diagnose.efficient import EfficientScore
 from bayesdist.infer.equations.priors import GaussianPriors
 from bayesdist.infer.equations.scaled import one_thread
 from bayesdist.infer.exposures.chip_offsets import Settling
@@ -123,8 +124,7 @@ def estimate_discrepancy(
             linear = replace(linear, theta=settling.mean(linear.theta))
     facts |= {"unit": model.unit, "noise_ratio": ratio}
     if linear is not None:
-        facts["exposures"] = linear.n_exposures
-        facts["scatter"] = {k: float(np.median(v)) for k, v in linear.scatter.items()}
+        facts |= linear.facts
     return Discrepancy(model, mean, formal, noise, found, theta, linear, facts)
 
 
@@ -159,25 +159,26 @@ def _structures(
     """Structure of chips (by code), its effect on the parameters, and its sizes for summaries."""
     model, sums = working.model, working.sums
     stars = sums.position[:, :, 0].sum(axis=1)
-    shift = information.covariance @ information.score
     theta, out, rows = np.zeros((n, model.n_params)), {}, []
     for code in chips:
         chip = model.chips[code]
         functions = StructureFunctions.for_stars(model.order, chip.size, int(stars[code]))
         chip_waves = ChipStructure(functions, functions.finer_waves(rng), np.empty(0))
         S, crossed, taken, score = _along_axes(information, working, chip_waves, code)
-        left = [S[a] - crossed[a].T @ (information.covariance @ crossed[a]) for a in (0, 1)]
-        pull = [score[a] - crossed[a].T @ shift for a in (0, 1)]
-        posterior = chip_structure(
-            functions,
-            left,
-            pull,
+        left = [
+            EfficientScore.of(information.covariance, information.score, *axis)
+            for axis in zip(crossed, S, score, strict=True)
+        ]
+        posterior = structure_posterior(
+            [[functions]] * 2,
+            [one.information for one in left],
+            [one.score for one in left],
             noise=_star_error(information, code),
             higher_order=priors.higher_order * pixel,
             structure=priors.structure * pixel,
             pairs=neighbours.get(code, (None, None)),
         )
-        found = replace(chip_waves, coefficients=posterior.draws(n, rng))
+        found = replace(chip_waves, coefficients=np.stack(posterior.draws(n, rng), axis=1))
         for a in (0, 1):
             # the fit absorbs structure into polynomials; the truth lies on the other side
             theta -= found.coefficients[:, a] @ (working.covariance @ taken[a]).T

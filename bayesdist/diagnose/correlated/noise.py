@@ -66,10 +66,13 @@ def block_ratios(block: Int, values: Float, n: int) -> Float:
 def not_narrower(noise: Float, formal: Float) -> tuple[Float, float]:
     """Covariance by the stars' scatter, on the whole not below the formal one, and their ratio.
 
+    Both are (D, D), and zero for parameters that are fixed.
     Quoted errors that are too large are the user's statement: residuals cannot distinguish them
     from matches that were cut.
     """
     # a small part of the formal one, so that no direction is without variance
     noise = 0.99 * noise + 0.01 * formal
-    ratio = float(np.sum(scaled_inverse(formal) * noise)) / len(formal)
+    free = np.flatnonzero(np.diag(formal) > 0)
+    inner = np.ix_(free, free)
+    ratio = float(np.sum(scaled_inverse(formal[inner]) * noise[inner])) / len(free)
     return noise * max(1.0, 1 / ratio), ratio

@@ -1,4 +1,4 @@
-"""Posterior of the structure outside a polynomial on a chip, amplitudes marginalised.
+"""Posterior of the structure outside a polynomial, amplitudes marginalised.
 
 With the part that the fit absorbs eliminated, the data determine the coefficients z of the
 structure's functions through a score s and an information S, so that for amplitudes eta
@@ -112,40 +112,49 @@ class SizedField:
 
 @dataclass(frozen=True, eq=False)
 class _Point:
-    """A correlation length, and an amplitude of the field on each axis."""
+    """A correlation length, and an amplitude of the field in each part."""
 
     length: float
-    amplitudes: tuple[float, float]
-    axes: tuple[SizedField, SizedField]
+    amplitudes: tuple[float, ...]
+    parts: tuple[SizedField, ...]
 
 
 @dataclass(frozen=True, eq=False)
 class Structure:
-    """Posterior of the structure on a chip."""
+    """Posterior of the structure."""
 
-    functions: StructureFunctions
+    # functions of each part: of one axis of a chip, or of all axes of all chips that are coupled
+    functions: tuple[tuple[StructureFunctions, ...], ...]
     terms_amplitude: Float  # grid (TERM_STEPS,) of amplitudes of the higher orders
     points: tuple[_Point, ...]  # lengths and amplitudes of the field
     weight: Float  # posterior probability (points, TERM_STEPS) of each combination
 
-    def draws(self, n: int, rng: np.random.Generator) -> Float:
-        """Coefficients (n, 2, n_known + 2 FINE) of terms, sines and finer waves on both axes."""
-        functions, decline = self.functions, self.functions.decline()
+    def draws(self, n: int, rng: np.random.Generator) -> list[Float]:
+        """Coefficients (n, n_known + 2 FINE) of terms, sines and finer waves of each function."""
         counts = rng.multinomial(n, self.weight.ravel()).reshape(self.weight.shape)
         out = []
         for point, by_terms in zip(self.points, counts, strict=True):
-            m = int(by_terms.sum())
-            if not m:
-                continue
-            amplitude = np.repeat(self.terms_amplitude, by_terms)
-            fine = np.sqrt(functions.finer(point.length))
-            both = []
-            for size, axis in zip(point.amplitudes, point.axes, strict=True):
-                terms, sines = axis.draws(amplitude, rng)
-                waves = size * fine * rng.standard_normal((m, 2 * FINE))
-                both.append(np.concatenate([terms * decline, sines, waves], axis=1))
-            out.append(np.stack(both, axis=1))
-        return rng.permutation(np.concatenate(out))
+            if by_terms.any():
+                amplitude = np.repeat(self.terms_amplitude, by_terms)
+                out.append(self._draws_at(point, amplitude, rng))
+        order = rng.permutation(n)
+        return [np.concatenate(rows)[order] for rows in zip(*out, strict=True)]
+
+    def _draws_at(self, point: _Point, amplitude: Float, rng: np.random.Generator) -> list[Float]:
+        """Draws at one point, given amplitudes (m,) of the terms."""
+        out = []
+        for some, size, part in zip(self.functions, point.amplitudes, point.parts, strict=True):
+            terms, sines = part.draws(amplitude, rng)
+            fine = np.sqrt([one.finer(point.length) for one in some])
+            waves = rng.standard_normal((len(amplitude), len(some), 2 * FINE))
+            waves *= size * fine[:, None]
+            first, start = 0, 0
+            for k, one in enumerate(some):
+                own = terms[:, first : first + one.n_terms] * one.decline()
+                along = sines[:, start : start + one.n_sines]
+                out.append(np.concatenate([own, along, waves[:, k]], axis=1))
+                first, start = first + one.n_terms, start + one.n_sines
+        return out
 
     @property
     def length(self) -> float:
@@ -155,8 +164,8 @@ class Structure:
         return float(by_point @ [p.length for p in self.points] / by_point.sum())
 
 
-def chip_structure(
-    functions: StructureFunctions,
+def structure_posterior(
+    functions: Sequence[Sequence[StructureFunctions]],
     information: Sequence[Float],
     score: Sequence[Float],
     *,
@@ -164,29 +173,33 @@ def chip_structure(
     higher_order: float,
     structure: float,
     pairs: Sequence[SharedVariance | None] = (None, None),
+    lengths: Float = LENGTHS,
 ) -> Structure:
-    """Posterior of the coefficients of structure functions on the two axes of a chip.
+    """Posterior of the coefficients of structure functions, of one part or two.
 
-    Length and amplitudes are those of both axes: what bends light or silicon bends it along both,
-    and few data determine little of each.  But the field may differ, as a pattern of columns does.
+    The parts of matched stars are the two axes of a chip.  Length and amplitudes are those of both:
+    what bends light or silicon bends it along both, and few data determine little of each.  But the
+    field may differ, as a pattern of columns does.  Stars that are solved for couple all axes of
+    all chips, which are one part then.
 
-    For each axis `information` (n_known, n_known) is that of the coefficients, and `score`
-    (n_known,) the gradient of the log-likelihood where they are zero, both with the part that the
-    fit absorbs eliminated; `pairs` is the evidence of neighbouring stars.  `noise` is the typical
-    error of one star, a few times which limits the amplitudes; `higher_order` and `structure` are
-    prior medians of the amplitudes, in the unit of the positions.
+    For the `functions` of each part `information` (m, m) is that of their coefficients, and `score`
+    (m,) the gradient of the log-likelihood where they are zero, both with the part that the fit
+    absorbs eliminated; `pairs` is the evidence of neighbouring stars.  `noise` is the typical error
+    of one star, a few times which limits the amplitudes; `higher_order` and `structure` are prior
+    medians of the amplitudes, in the unit of the positions; `lengths` are those of the field.
     """
-    T = functions.n_terms
-    best_known = max((np.diag(S)[:T] for S in information), key=np.median)
+    known = [_terms_first(*one) for one in zip(functions, information, score, strict=True)]
     amplitudes = AmplitudeGrid.of(
-        best_known, noise=noise, higher_order=higher_order, structure=structure
+        max((np.diag(S)[: sum(f.n_terms for f in some)] for some, S, _ in known), key=np.median),
+        noise=noise,
+        higher_order=higher_order,
+        structure=structure,
     )
     by_length = list[tuple[float, list[_Sized], Float]]()
-    for length in LENGTHS:
-        fields = [
-            Field.of([functions], length, S, s) for S, s in zip(information, score, strict=True)
-        ]
-        shared = [None if p is None else p.of_field(length) for p in pairs]
+    for length in lengths:
+        fields = [Field.of(some, length, S, s) for some, S, s in known]
+        near = pairs[: len(known)]
+        shared = [None if p is None else p.of_field(length) for p in near]
         sized = _refined(
             partial(_Sized.of, fields, shared, amplitudes.terms), amplitudes, structure
         )
@@ -194,20 +207,36 @@ def chip_structure(
     largest = max(density.max() for _, _, density in by_length)
     points, log_weight = list[_Point](), list[Float]()
     for length, sized, density in by_length:
-        for i, j in np.argwhere(density.max(axis=2) > largest - NEGLIGIBLE):
-            u, v = sized[i], sized[j]
-            points.append(_Point(length, (u.amplitude, v.amplitude), (u.axes[0], v.axes[1])))
-            log_weight.append(density[i, j] - largest)
+        for at in np.argwhere(density.max(axis=-1) > largest - NEGLIGIBLE):
+            chosen = [sized[k] for k in at]
+            sizes = tuple(one.amplitude for one in chosen)
+            parts = tuple(one.parts[k] for k, one in enumerate(chosen))
+            points.append(_Point(length, sizes, parts))
+            log_weight.append(density[tuple(at)] - largest)
     weight = np.exp(log_weight)
-    return Structure(functions, amplitudes.terms, tuple(points), weight / weight.sum())
+    return Structure(
+        tuple(tuple(some) for some in functions),
+        amplitudes.terms,
+        tuple(points),
+        weight / weight.sum(),
+    )
+
+
+def _terms_first(
+    functions: Sequence[StructureFunctions], S: Float, s: Float
+) -> tuple[Sequence[StructureFunctions], Float, Float]:
+    """Functions with the information and score of all terms, then of all sines."""
+    is_sine = np.concatenate([np.arange(one.n_known) >= one.n_terms for one in functions])
+    order = np.argsort(is_sine, kind="stable")
+    return functions, S[np.ix_(order, order)], s[order]
 
 
 @dataclass(frozen=True, eq=False)
 class _Sized:
-    """One amplitude of the field, and the evidence (2, TERM_STEPS) of each axis for it."""
+    """One amplitude of the field, and the evidence (parts, TERM_STEPS) of each part for it."""
 
     amplitude: float
-    axes: tuple[SizedField, SizedField]
+    parts: tuple[SizedField, ...]
     evidence: Float
 
     @classmethod
@@ -218,16 +247,16 @@ class _Sized:
         of_terms: Float,
         log_amplitude: float,
     ) -> _Sized:
-        """By the fields on both axes, the evidence of neighbours, and amplitudes of the terms."""
+        """By the fields of all parts, the evidence of neighbours, and amplitudes of the terms."""
         amplitude = float(np.exp(log_amplitude))
-        u, v = (field.at(amplitude) for field in fields)
+        parts = tuple(field.at(amplitude) for field in fields)
         near = [0.0 if known is None else known(amplitude) for known in shared]
-        evidence = [one.log_evidence(of_terms) + k for one, k in zip((u, v), near, strict=True)]
-        return cls(amplitude, (u, v), np.stack(evidence))
+        evidence = [one.log_evidence(of_terms) + k for one, k in zip(parts, near, strict=True)]
+        return cls(amplitude, parts, np.stack(evidence))
 
     @property
     def views(self) -> Float:
-        """Evidence (3, TERM_STEPS) of both axes together, and of each."""
+        """Evidence (1 + parts, TERM_STEPS) of all parts together, and of each."""
         return np.stack([self.evidence.sum(axis=0), *self.evidence])
 
 
@@ -242,10 +271,11 @@ def _refined(
         tops = np.array([(prior + one.views).max(axis=1) for one in sized])
         tops += log_half_cauchy(np.exp(grid), median)[:, None]
         best = tops.max(axis=0)  # of this length: a peak may lie between two points
-        # axis by axis only where they may differ
-        views = (0, 1, 2) if best[1] + best[2] > best[0] + prior.max() + CHANGE else (0,)
+        # part by part only where they may differ
+        several = len(best) - 1
+        apart = best[1:].sum() > best[0] + (several - 1) * prior.max() + CHANGE
         middles = set[float]()
-        for k in views:
+        for k in range(1 + several if apart else 1):
             middles.update(_middles(grid, tops[:, k].tolist(), float(best[k])))
         if not middles:
             break
@@ -257,10 +287,17 @@ def _refined(
 
 
 def _density(sized: Sequence[_Sized], median: float) -> Float:
-    """Log density (n, n, TERM_STEPS) of amplitudes of the field on u and on v, and of the terms."""
+    """Log density of amplitudes of the field in each part, and of the terms.
+
+    (n, TERM_STEPS) for one part, (n, n, TERM_STEPS) for two.
+    """
     amplitude = np.array([one.amplitude for one in sized])
-    u, v = (np.stack([one.evidence[axis] for one in sized]) for axis in (0, 1))
-    width, both = log_widths(amplitude), np.add.outer(amplitude**2, amplitude**2) / 2
+    width = log_widths(amplitude)
+    evidence = np.stack([one.evidence for one in sized], axis=1)
+    if len(evidence) == 1:
+        return np.asarray((log_half_cauchy(amplitude, median) + width)[:, None] + evidence[0])
+    u, v = evidence
+    both = np.add.outer(amplitude**2, amplitude**2) / 2
     apart = np.abs(np.subtract.outer(np.log(amplitude), np.log(amplitude)))
     differ = np.log(UNLIKE / 2) - apart + width
     np.fill_diagonal(differ, np.log(1 - UNLIKE))

@@ -14,15 +14,10 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.linalg import cho_solve
 
 from bayesdist.diagnose.clusters import add_over, sums_over
-from bayesdist.diagnose.score.projection import (
-    Projection,
-    independent_directions,
-    squares_of,
-    weighted,
-)
+from bayesdist.diagnose.efficient import EfficientScore, independent_directions, squares_of
+from bayesdist.diagnose.score.projection import Projection, contracted, weighted
 from bayesdist.diagnose.score.result import Family, Outcome, outcome
 from bayesdist.diagnose.score.sample import Block
 from bayesdist.diagnose.significance import chi_square_of, hotelling_p
@@ -89,13 +84,10 @@ class _Meat:
         by_star = np.zeros((int(sample.star.max()) + 1, G))
         for block in sample.blocks:
             F = projection.functions.polynomials(block.rows)
-            psi = projection.star_scores(F, block, projection.through(block, np.eye(G)))
+            psi = projection.star_scores(F, block, block.moved(projection.following))
             add_over(by_star, sample.star[block.rows], psi)
-        total = by_star.T @ by_star + projection.precision
-        for one in projection.exposures.values():
-            gain = one.gain[:, :G]
-            total += gain.T @ (one.precision[:, None] * gain)
-        return cls(by_star, total)
+        following = projection.following
+        return cls(by_star, by_star.T @ by_star + following.T @ projection.precision @ following)
 
     def covariance(self, nuisance: Float, star: Int, own: Float) -> tuple[Float, Float]:
         """Covariance (n, n) of an exposure's scores: of its own stars, and of all others.
@@ -125,18 +117,15 @@ def exposure_test(projection: Projection) -> Outcome | None:
     found = list(_deviations(projection, names))
     if len(found) < 2:
         return None
-    T, n = 0.0, 0
+    T, n = sum(one.statistic for one in found), sum(len(one.score) for one in found)
     squares = [squares_of(one.score, one.own, one.covariance, one.square) for one in found]
-    shared, apart = np.zeros((projection.n_global, projection.n_global)), 0.0
+    apart = 0.0
     for one in found:
-        T += one.statistic
-        n += len(one.score)
-        shared += one.cross.T @ np.linalg.solve(one.information, one.cross)
-        alone = np.linalg.solve(
-            one.information, one.cross @ cho_solve(projection.root, one.cross.T)
-        )
+        alone = np.linalg.solve(one.information, one.own - one.information)
         apart += float(np.trace(alone @ alone))
-    together = cho_solve(projection.root, shared)
+    G = projection.n_global
+    shared = sum(one.cross.T @ np.linalg.solve(one.information, one.cross) for one in found)
+    together = projection.covariance[:G, :G] @ shared
     # mean n, variance 2 n (1 + ...), as a multiple of a chi-square
     stretch = 1.0 + (float((together * together.T).sum()) - apart) / n
     dof = n / stretch
@@ -188,74 +177,72 @@ def _fields(block: Block, names: list[str], origin: tuple[float, float]) -> Floa
 def _of_exposure(
     projection: Projection, blocks: list[Block], names: list[str], meat: _Meat | None
 ) -> tuple[Float, _Deviations]:
-    """Information before anything is projected out, and one exposure's deviations.
-
-    Without the scores of the global parameters, the part of other exposures in the covariance is
-    taken to be as wrong as errors are on average.
-    """
-    sample, model, G = projection.sample, projection.sample.model, projection.n_global
-    n = len(names)
-    local = projection.exposures.get(blocks[0].frame_exposure)
-    whole, cross, score = np.zeros((n, n)), np.zeros((n, G)), np.zeros(n)
+    """Information before anything is projected out, and one exposure's deviations."""
+    sample, model = projection.sample, projection.sample.model
+    n, D = len(names), model.n_params
+    whole, cross, score = np.zeros((n, n)), np.zeros((D, n)), np.zeros(n)
     square = np.zeros((n, n))
-    to_local = np.zeros((0 if local is None else len(local.index), n))
     area = model.basis().mean_squares
     fields = [_fields(block, names, model.origin) for block in blocks]
-    parts = [block.parts(G) for block in blocks]
-    for block, Z, (by_global, by_local) in zip(blocks, fields, parts, strict=True):
+    for block, Z in zip(blocks, fields, strict=True):
         F = projection.functions.polynomials(block.rows)
         WZ = weighted(F, sample.curvature[:, block.rows], Z)
-        whole += np.einsum("akm,akn->mn", Z, WZ)
-        columns = block.columns[: by_global.shape[2]]
-        cross[:, columns] += np.einsum("akn,akm->nm", WZ, by_global)
-        score += np.einsum("akn,ak->n", Z, sample.score[:, block.rows] @ F.T)
-        square += np.einsum("akm,k,akn->mn", Z, area, Z) / len(blocks)
-        if local is not None:
-            at = np.searchsorted(local.index, block.columns[by_global.shape[2] :])
-            to_local[at] += np.einsum("akl,akn->ln", by_local, WZ)
-    own, own_gain = whole, np.zeros((0, n))
-    if local is not None:
-        own_gain = local.inverse @ to_local
-        own = whole - to_local.T @ own_gain
-        cross = cross - to_local.T @ local.gain[:, :G]
-        score = score - own_gain.T @ local.score
-    nuisance = cho_solve(projection.root, cross.T)
-    information = own - cross @ nuisance
-    others, psi = information.copy(), []
-    for block, Z, (_, by_local) in zip(blocks, fields, parts, strict=True):
-        F = projection.functions.polynomials(block.rows)
-        through = projection.through(block, nuisance)
-        direct = Z - through
-        if local is not None:
-            at = np.searchsorted(local.index, block.columns[block.columns >= G])
-            direct -= by_local @ own_gain[at]
-        if meat is None:
-            pulled = weighted(F, sample.curvature[:, block.rows], direct)
-            others -= np.einsum("akm,akn->mn", direct, pulled)
-        else:
-            direct += through
-        psi.append(projection.star_scores(F, block, direct))
-    own_scores = np.concatenate(psi)
-    n_own = sum(int(sample.used[block.rows].sum()) for block in blocks)
-    if meat is None:
-        of_own, of_others = own_scores.T @ own_scores, projection.score_ratio * others
-    else:
-        star = np.concatenate([sample.star[block.rows] for block in blocks])
-        of_own, of_others = meat.covariance(nuisance, star, own_scores)
-        if local is not None:
-            before = local.gain[:, :G] @ nuisance
-            after = own_gain - before
-            P = local.precision[:, None]
-            of_others += after.T @ (P * after) - before.T @ (P * before)
+        whole += contracted(Z, WZ)
+        cross[block.columns] += contracted(block.derivative, WZ)
+        score += contracted(Z, (sample.score[:, block.rows] @ F.T)[..., None])[:, 0]
+        square += contracted(Z, area[:, None] * Z) / len(blocks)
+    rows = np.unique(np.concatenate([block.columns for block in blocks]))
+    left = EfficientScore.of(
+        projection.covariance, projection.score, cross[rows], whole, score, rows
+    )
+    by_global = cross[rows].T @ projection.following[rows]
+    of_own, of_others = _covariances(projection, blocks, fields, left, meat)
     covariance = of_own + of_others
     share = float(np.trace(of_own) / np.trace(covariance))
+    n_own = sum(int(sample.used[block.rows].sum()) for block in blocks)
     n_others = max(int(sample.used.sum()) - n_own, 1)
     return whole, _Deviations(
-        score - nuisance.T @ projection.score[:G],
-        (information + information.T) / 2,
-        (own + own.T) / 2,
-        cross,
+        left.score,
+        left.information,
+        projection.with_global(left.information, by_global),
+        by_global,
         (covariance + covariance.T) / 2,
         square,
         1.0 / (share**2 / n_own + (1.0 - share) ** 2 / n_others),
     )
+
+
+def _covariances(
+    projection: Projection,
+    blocks: list[Block],
+    fields: list[Float],
+    left: EfficientScore,
+    meat: _Meat | None,
+) -> tuple[Float, Float]:
+    """Covariance (n, n) of an exposure's scores: of its own stars, and of all else.
+
+    Without the scores of the global parameters, the part of other exposures is taken to be as wrong
+    as errors are on average.
+    """
+    sample = projection.sample
+    # the global parameters, which other exposures see as well, with those of exposures following
+    nuisance = left.gain[: projection.n_global]
+    shared = projection.following @ nuisance
+    others, psi = left.information.copy(), []
+    for block, Z in zip(blocks, fields, strict=True):
+        F = projection.functions.polynomials(block.rows)
+        direct = Z - block.moved(left.gain)
+        if meat is None:
+            others -= contracted(direct, weighted(F, sample.curvature[:, block.rows], direct))
+        else:
+            direct += block.moved(shared)
+        psi.append(projection.star_scores(F, block, direct))
+    own = np.concatenate(psi)
+    if meat is None:
+        return own.T @ own, projection.score_ratio * others
+    star = np.concatenate([sample.star[block.rows] for block in blocks])
+    of_own, of_others = meat.covariance(nuisance, star, own)
+    rows = np.unique(np.concatenate([block.columns for block in blocks]))
+    P = projection.precision[np.ix_(rows, rows)]
+    before, after = shared[rows], left.gain[rows]
+    return of_own, of_others + after.T @ P @ after - before.T @ P @ before

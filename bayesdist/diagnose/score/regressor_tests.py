@@ -20,13 +20,8 @@ import numpy as np
 from scipy.linalg import block_diag
 
 from bayesdist.diagnose.clusters import add_over
-from bayesdist.diagnose.score.projection import (
-    LARGEST_LEVERAGE,
-    Projection,
-    beside_others,
-    independent_directions,
-    squares_of,
-)
+from bayesdist.diagnose.efficient import Directions
+from bayesdist.diagnose.score.projection import LARGEST_LEVERAGE, Projection
 from bayesdist.diagnose.score.regressors import Regressors, one_of_each
 from bayesdist.diagnose.score.result import Family, Outcome, outcome
 from bayesdist.diagnose.score.sample import Block
@@ -95,14 +90,23 @@ def _outcome(projection: Projection, family: Family, parts: Sequence[_Part]) -> 
 
 def _parts_of(projection: Projection, chips: list[int]) -> Iterator[tuple[Regressors, _Part]]:
     """Tests of all regressors on some chips."""
-    tried = []
+    asked, tried = [], []
     for several in projection.functions.regressors:
         columns = np.concatenate([projection.columns(several.every, chip) for chip in chips])
-        one = _Directions.of(projection, several, columns, len(chips))
+        own = several.own(len(chips))
+        one = Directions.of(
+            projection.regressors,
+            columns,
+            own,
+            several.directions(len(chips)),
+            projection.beside_exposures(columns[own]),
+            several.least,
+        )
         if one.q:
+            asked.append(several)
             tried.append(one)
     sums = _star_sums(projection, chips, tried)
-    for one, (V, spreads, taken) in zip(tried, sums, strict=True):
+    for several, one, (V, spreads, taken) in zip(asked, tried, sums, strict=True):
         # as Wishart matrices that scatter as much
         quoted, found = one.q * (one.q + 1) / spreads - one.q + 1
         if taken > MAX_TAKEN or quoted < MIN_DOF:
@@ -111,46 +115,13 @@ def _parts_of(projection: Projection, chips: list[int]) -> Iterator[tuple[Regres
         dof = dof_residual + one.q - 1
         T = dof_residual / dof * float(one.score @ np.linalg.solve(V, one.score))
         p = float(f_sf(T / one.q, one.q, dof_residual))
-        square = np.repeat(projection.functions.mean_square[one.regressors.every], 2)
-        Q = (one.basis.T * np.tile(square, len(chips)) / len(chips)) @ one.basis
-        squares = squares_of(one.score, np.eye(one.q), V, Q)
-        yield one.regressors, _Part(T, p, one.q, dof_residual, *squares)
-
-
-@dataclass(frozen=True, eq=False)
-class _Directions:
-    """Regressors of one family that the parameters have left, in units of their information."""
-
-    regressors: Regressors
-    columns: Int  # (n,)
-    basis: Float  # (n, q) with unit information, all parameters projected out
-    score: Float  # (q,) also the step by which the fit would move
-
-    @property
-    def q(self) -> int:
-        """Number of directions."""
-        return self.basis.shape[1]
-
-    @classmethod
-    def of(
-        cls, projection: Projection, several: Regressors, columns: Int, n_chips: int
-    ) -> _Directions:
-        """Directions of regressors on some chips, of these columns."""
-        own, directions = several.own(n_chips), several.directions(n_chips)
-        S = projection.efficient_information(columns)
-        A = beside_others(S, own, directions)
-        S = A.T @ S @ A
-        # beside the exposures' parameters alone
-        inside = projection.n_global + columns[own]
-        whole = directions.T @ projection.information[np.ix_(inside, inside)] @ directions
-        N = independent_directions(whole, S, several.least)
-        # eigenvectors: their information is diagonal
-        basis = A @ (N / np.sqrt(np.einsum("nq,nm,mq->q", N, S, N, optimize=True)))
-        return cls(several, columns, basis, basis.T @ projection.efficient_score[columns])
+        square = np.repeat(projection.functions.mean_square[several.every], 2)
+        squares = one.squares(V, np.diag(np.tile(square, len(chips)) / len(chips)))
+        yield several, _Part(T, p, one.q, dof_residual, *squares)
 
 
 def _star_sums(
-    projection: Projection, chips: list[int], tried: Sequence[_Directions]
+    projection: Projection, chips: list[int], tried: Sequence[Directions]
 ) -> list[tuple[Float, Float, float]]:
     """Covariance of the scores of each family, from those of single stars.
 
@@ -230,7 +201,7 @@ class _Together:
     starts: Int  # (families,) where the directions of each family begin
 
     @classmethod
-    def of(cls, tried: Sequence[_Directions]) -> _Together:
+    def of(cls, tried: Sequence[Directions]) -> _Together:
         """Directions of these families."""
         return cls(
             np.concatenate([one.columns for one in tried]),

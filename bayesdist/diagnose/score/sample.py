@@ -27,13 +27,12 @@ class Block:
     frame_exposure: int  # code of the exposure whose frame they have
     frame: Float  # (2, 2) linear part of that frame
     effective: Float  # (2, K)
-    columns: Int  # (m,) parameters that the polynomial depends on, the global ones first
+    columns: Int  # (m,) parameters that the polynomial depends on
     derivative: Float  # (2, K, m) of the effective coefficients by them
 
-    def parts(self, n_global: int) -> tuple[Float, Float]:
-        """Derivatives (2, K, m) by global parameters, and by those of the exposure."""
-        n = int((self.columns < n_global).sum())
-        return self.derivative[..., :n], self.derivative[..., n:]
+    def moved(self, by: Float) -> Float:
+        """Change (2, K, n) of the polynomial by changes (D, n) of the parameters."""
+        return np.asarray(self.derivative @ by[self.columns])
 
 
 @dataclass(frozen=True, eq=False)

@@ -21,16 +21,19 @@ import numpy as np
 from scipy.sparse import csr_array
 
 from bayesdist.diagnose.clusters import sums_over
-from bayesdist.diagnose.correlated.deviations import DeviationColumns
+from bayesdist.diagnose.correlated.deviations import DeviationColumns, deviation_columns
 from bayesdist.diagnose.correlated.functions import StructureFunctions
-from bayesdist.diagnose.selfcal.scores import DetectionScores, places_by_star
+from bayesdist.diagnose.efficient import EfficientScore
+from bayesdist.diagnose.selfcal.scores import DetectionScores, inverse_roots, places_by_star
+from bayesdist.infer.equations.scaled import determined
 from bayesdist.infer.selfcal.elimination import PlaceDerivatives
 from bayesdist.infer.selfcal.mode import SelfCalibrationMode
 from bayesdist.infer.selfcal.problem import Problem
-from bayesdist.utils.arrays import Float, Int
+from bayesdist.utils.arrays import Bool, Float, Int
 
 DETECTIONS = 8192  # in memory at a time
-UNKNOWN = 1e-10  # relative curvature below which a combination of numbers is undetermined
+MAX_DETECTIONS = 60_000  # that are looked at
+MAX_EXPOSURES = 150  # whose single deviations are looked at
 
 
 @dataclass(frozen=True, eq=False)
@@ -112,17 +115,32 @@ class Columns:
         return np.mean(out, axis=0)
 
 
-def even_stars(problem: Problem, most: int) -> Int:
-    """Stars to be used: all, or every k-th, so that there are no more detections than `most`.
+@dataclass(frozen=True, eq=False)
+class EvenStars:
+    """Some stars of a solution, or all; a part of them is less informative, and unbiased."""
 
-    A part of the stars is less informative than all of them, and unbiased.
-    """
-    return np.arange(0, problem.n_stars, int(np.ceil(len(problem) / most)))
+    rows: Bool  # (N,) of their detections, among those of all stars
+    problem: Problem
+    stars: Float  # (S, q)
+    deviations: DeviationColumns | None  # of their exposures
+
+    @classmethod
+    def of(cls, solution: SelfCalibrationMode) -> EvenStars:
+        """All stars, or every k-th, so that there are no more detections than `MAX_DETECTIONS`."""
+        whole = solution.problem
+        some = np.arange(0, whole.n_stars, int(np.ceil(len(whole) / MAX_DETECTIONS)))
+        problem = whole.of_stars(some)
+        groups = problem.groups
+        counts = np.bincount(groups.index, minlength=len(groups)).astype(float)
+        deviations = deviation_columns(
+            whole.model, solution.theta, groups, counts, most=MAX_EXPOSURES
+        )
+        return cls(np.isin(whole.star, some), problem, solution.stars[some], deviations)
 
 
 @dataclass(frozen=True, eq=False)
 class Piece:
-    """Some stars with their n detections."""
+    """Some stars with their n detections, displaced along the axes of the polynomials."""
 
     stars: slice  # in the problem
     rows: slice  # of the detections, in the problem
@@ -131,7 +149,13 @@ class Piece:
     frame: Float  # matrix (n, 2, 2) from the axes of the polynomials to those of the sky
     # for each chip, the detections on it, and the values of its columns
     dense: tuple[tuple[Int, Float], ...]
-    sparse: csr_array  # displacements along u and v, in turn (2 n, n_sparse)
+    sparse: csr_array  # displacements along both axes, in turn (2 n, n_sparse)
+
+    def scores(self, every: DetectionScores) -> DetectionScores:
+        """Scores of these detections along the axes of the polynomials."""
+        some = every.at(self.rows)
+        gradient = np.einsum("nab,na->nb", self.frame, some.gradient)
+        return DetectionScores(gradient, self.frame.mT @ some.curvature @ self.frame)
 
     def __len__(self) -> int:
         return len(self.star)
@@ -165,27 +189,25 @@ def pieces(columns: Columns) -> Iterator[Piece]:
             more = columns.values(code, rows.start + here)
             dense.append((here, np.concatenate([phi[here], more], axis=1)))
         entries = []
+        back = np.linalg.inv(structure.linear)
         for g in np.unique(group):
             here = np.flatnonzero(group == g)
             # parameters of exposures and drifts
             used = np.flatnonzero(structure.columns[g] >= 0)
-            values = np.einsum("mak,nk->nam", structure.extra[g][used], phi[here])
+            values = np.einsum("mak,nk->nam", back[g] @ structure.extra[g][used], phi[here])
             moved = [(structure.columns[g][used] - p.model.n_polynomial, values)]
             if columns.deviations is not None:
                 place = int(p.groups.chip[g]), float(p.groups.epoch[g])
                 which, values = columns.deviations.at(int(g), *place, phi[here], columns.centre)
-                moved.append((n_sparse_params + which, structure.linear[g] @ values))
+                moved.append((n_sparse_params + which, values))
             row = 2 * here[:, None, None] + np.arange(2)[:, None]
             for at, values in moved:
                 parts = (values, row, at)
                 entries.append([np.broadcast_to(part, values.shape).ravel() for part in parts])
         data, row, at = (np.concatenate(part) for part in zip(*entries, strict=True))
         sparse = csr_array((data, (row, at)), shape=(2 * n, columns.n_sparse))
-        star, by_star, frame = (
-            p.star[rows] - first,
-            places_by_star(p, rows),
-            structure.linear[group],
-        )
+        star, by_star = p.star[rows] - first, back[group] @ places_by_star(p, rows)
+        frame = structure.linear[group]
         yield Piece(slice(first, last), rows, star, by_star, frame, tuple(dense), sparse)
         first = last
 
@@ -198,32 +220,18 @@ class Absorbed:
     right: Float  # A^-1/2 b (S q,)
 
 
-@dataclass(frozen=True, eq=False)
-class Remainder:
-    """Information (n, n) and score (n,) of further columns, free parameters eliminated too."""
-
-    information: Float
-    score: Float
-    gain: Float  # response (D, n) of the parameters to the columns; zero for fixed ones
-
-
-def without_parameters(solution: SelfCalibrationMode, N: Float, score: Float) -> Remainder:
+def without_parameters(solution: SelfCalibrationMode, N: Float, score: Float) -> EfficientScore:
     """Columns other than the parameters, these eliminated as free in the solution, with its priors.
 
     N and `score` are those of `eliminated`.
     """
-    D, free, known = len(solution.theta), solution.free, solution.prior
-    A = N[np.ix_(free, free)] + known.precision[np.ix_(free, free)]
-    pull = (score[:D] + known.pull(solution.theta))[free]
-    scale = np.sqrt(np.maximum(np.diag(A), 1e-300))
-    values, vectors = np.linalg.eigh(A / np.outer(scale, scale))
-    good = values > UNKNOWN
-    root = vectors[:, good] / np.sqrt(values[good]) / scale[:, None]
-    through = root.T @ N[free, D:]
-    S = N[D:, D:] - through.T @ through
-    gain = np.zeros((D, len(N) - D))
-    gain[free] = root @ through
-    return Remainder((S + S.T) / 2, score[D:] - through.T @ (root.T @ pull), gain)
+    D, prior = len(solution.theta), solution.prior
+    free = np.ix_(solution.free, solution.free)
+    root = determined(N[free] + prior.precision[free])
+    covariance = np.zeros((D, D))
+    covariance[free] = root @ root.T
+    nuisance = score[:D] + prior.pull(solution.theta)
+    return EfficientScore.of(covariance, nuisance, N[:D, D:], N[D:, D:], score[D:])
 
 
 def absorbed_by_stars(
@@ -239,13 +247,12 @@ def absorbed_by_stars(
     gradient = np.einsum("naq,na->nq", piece.by_star, scores.gradient)
     b = sums_over(piece.star, gradient, S) - pull
     T = np.zeros((S * q, columns.sparse.stop))
-    turned = S_H @ piece.frame
     for code, (here, values) in enumerate(piece.dense):
         for axis in (0, 1):
-            summed = piece.of_stars(turned[:, :, axis, None])[:, here] @ values
+            summed = piece.of_stars(S_H[:, :, axis, None])[:, here] @ values
             T[:, columns.dense(code, axis)] = summed
     T[:, columns.sparse] = (piece.of_stars(S_H) @ piece.sparse).toarray()
-    roots = _inverse_roots(own)
+    roots = inverse_roots(own)
     rows = np.reshape(roots @ T.reshape(S, q, -1), (S * q, -1))
     return Absorbed(rows, np.ravel(np.einsum("skq,sq->sk", roots, b)))
 
@@ -277,13 +284,13 @@ def eliminated(
     )
     other = np.zeros((len(inside), n))
     for piece in pieces(columns):
-        here = scores.at(piece.rows)
+        here = piece.scores(scores)
         sums = absorbed_by_stars(columns, piece, here, stars)
         add_products(total, columns, columns, piece, here.curvature)
         total -= sums.rows.T @ sums.rows
         score += _pulled(columns, piece, here.gradient) - sums.rows.T @ sums.right
         if working is not None:
-            here = working.at(piece.rows)
+            here = piece.scores(working)
             sums = absorbed_by_stars(columns, piece, here, stars)
             add_products(other, narrow, columns, piece, here.curvature)
             other -= sums.rows[:, inside].T @ sums.rows
@@ -295,8 +302,6 @@ def eliminated(
 
 def add_products(N: Float, left: Columns, right: Columns, piece: Piece, H: Float) -> None:
     """Add Z^T H Z of a piece to N, by internal columns; `left` may lack the dense functions."""
-    H_M = H @ piece.frame
-    weight = np.swapaxes(piece.frame, 1, 2) @ H_M
     n, others = len(piece), left.n_sparse
     across = np.arange(2 * n).reshape(n, 2)
     for code, (here, values) in enumerate(piece.dense):
@@ -305,7 +310,7 @@ def add_products(N: Float, left: Columns, right: Columns, piece: Piece, H: Float
             # of dense columns along the axis a with the sparse ones
             turn = csr_array(
                 (
-                    H_M[here, :, a].ravel(),
+                    H[here, :, a].ravel(),
                     (np.repeat(np.arange(len(here)), 2), across[here].ravel()),
                 ),
                 shape=(len(here), 2 * n),
@@ -316,7 +321,7 @@ def add_products(N: Float, left: Columns, right: Columns, piece: Piece, H: Float
             for b in (0, 1):
                 if left is right and b < a:
                     continue
-                product = some.T @ (weight[here, a, b, None] * values)
+                product = some.T @ (H[here, a, b, None] * values)
                 N[left.dense(code, a), right.dense(code, b)] += product
                 if left is right and b > a:
                     N[left.dense(code, b), right.dense(code, a)] += product.T
@@ -330,18 +335,8 @@ def add_products(N: Float, left: Columns, right: Columns, piece: Piece, H: Float
 def _pulled(columns: Columns, piece: Piece, gradient: Float) -> Float:
     """Sums (n,) of Z^T g over a piece, by internal columns."""
     out = np.zeros(columns.sparse.stop)
-    turned = np.einsum("nab,na->nb", piece.frame, gradient)
     for code, (here, values) in enumerate(piece.dense):
         for axis in (0, 1):
-            out[columns.dense(code, axis)] = values.T @ turned[here, axis]
+            out[columns.dense(code, axis)] = values.T @ gradient[here, axis]
     out[columns.sparse] = piece.sparse.T @ gradient.ravel()
     return out
-
-
-def _inverse_roots(matrices: Float) -> Float:
-    """R with R^T R the inverse of each matrix (S, q, q), without undetermined directions."""
-    scale = np.sqrt(np.maximum(np.einsum("sqq->sq", matrices), 1e-300))
-    values, vectors = np.linalg.eigh(matrices / (scale[:, :, None] * scale[:, None, :]))
-    good = values > UNKNOWN
-    roots = np.where(good, np.where(good, values, 1.0) ** -0.5, 0.0)
-    return np.asarray(roots[:, :, None] * np.swapaxes(vectors, 1, 2) / scale[:, None, :])

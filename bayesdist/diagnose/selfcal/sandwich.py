@@ -29,7 +29,7 @@ def sandwich(solution: SelfCalibrationMode, scores: DetectionScores) -> Float:
     inside[columns.order] = root
     meat = np.array(solution.prior.precision)
     for piece in pieces(columns):
-        here = scores.at(piece.rows)
+        here = piece.scores(scores)
         sums = absorbed_by_stars(columns, piece, here, solution.stars)
         S, q = piece.stars.stop - piece.stars.start, p.n_star
         moved = _displacements(columns, piece, inside)
@@ -52,11 +52,10 @@ def star_scores(columns: Columns, piece: Piece, gradient: Float) -> Float:
     """
     S = piece.stars.stop - piece.stars.start
     out = np.zeros((S, columns.sparse.stop))
-    turned = np.einsum("nab,na->nb", piece.frame, gradient)
     # one value for each star
     for code, (here, values) in enumerate(piece.dense):
         for axis in (0, 1):
-            summed = piece.of_stars(turned[:, None, axis, None])[:, here] @ values
+            summed = piece.of_stars(gradient[:, None, axis, None])[:, here] @ values
             out[:, columns.dense(code, axis)] = summed
     out[:, columns.sparse] = (piece.of_stars(gradient[:, None, :]) @ piece.sparse).toarray()
     return out[:, columns.order]
@@ -68,6 +67,5 @@ def _displacements(columns: Columns, piece: Piece, root: Float) -> Float:
     for code, (here, values) in enumerate(piece.dense):
         for axis in (0, 1):
             out[here, axis] = values @ root[columns.dense(code, axis)]
-    out = piece.frame @ out
     out += (piece.sparse @ root[columns.sparse]).reshape(out.shape)
     return np.asarray(out)

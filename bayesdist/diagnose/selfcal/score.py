@@ -13,15 +13,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from bayesdist.diagnose.correlated.deviations import deviation_columns
+from bayesdist.diagnose.efficient import Directions, EfficientScore
 from bayesdist.diagnose.score.exposures import EXPOSURES
 from bayesdist.diagnose.score.motions import MOTIONS, SHORTEST, StarResiduals, motion_outcome
 from bayesdist.diagnose.score.noise import noise_tests
-from bayesdist.diagnose.score.projection import (
-    beside_others,
-    independent_directions,
-    squares_of,
-)
 from bayesdist.diagnose.score.regressors import (
     Functions,
     Regressors,
@@ -30,24 +25,22 @@ from bayesdist.diagnose.score.regressors import (
 )
 from bayesdist.diagnose.score.result import Family, Outcome, ScoreTest, corrected, outcome
 from bayesdist.diagnose.score.sample import ScoredSample
-from bayesdist.diagnose.selfcal.correlated import MAX_EXPOSURES
 from bayesdist.diagnose.selfcal.eliminated import (
     Columns,
+    EvenStars,
     absorbed_by_stars,
     add_products,
-    even_stars,
     pieces,
     without_parameters,
 )
 from bayesdist.diagnose.selfcal.sandwich import star_scores
-from bayesdist.diagnose.selfcal.scores import scores_of_detections, taken_by_stars
+from bayesdist.diagnose.selfcal.scores import DetectionScores, scores_of_detections, taken_by_stars
 from bayesdist.diagnose.significance import hotelling_p
 from bayesdist.infer.selfcal.elimination import memberships
 from bayesdist.infer.selfcal.mode import SelfCalibrationMode
 from bayesdist.infer.selfcal.problem import Problem
 from bayesdist.utils.arrays import Bool, Float, Int
 
-MAX_DETECTIONS = 60_000  # that are looked at
 STARS_PER_DIRECTION = 2  # below, a covariance of the scores says nothing
 MIN_INFORMATION = 0.02  # of a direction, relative to that with known stars
 UNDITHERED = 1e-3  # of half a side: offsets that say nothing
@@ -93,9 +86,7 @@ class _Sums:
     """Information and score of the further columns of a problem."""
 
     known: Float  # (n, n) information if stars and parameters were known
-    # information, score (n, n) or (n,): with both eliminated
-    information: Float
-    score: Float
+    left: EfficientScore
     covariance: Float  # (n, n) of the score, by the scores of single stars
     square: Float  # (n, n) mean products of displacements over the detections
     n_stars: int
@@ -114,49 +105,42 @@ def selfcal_score_tests(
     A test is left out where the data cannot be asked.  `mag`, `colour` and `epoch` (N,) are those
     of each detection of its problem, the last in decimal years.
     """
-    whole = solution.problem
-    some = even_stars(whole, MAX_DETECTIONS)
-    rows = np.isin(whole.star, some)
-    problem, model = whole.of_stars(some), whole.model
-    counts = np.bincount(problem.groups.index, minlength=len(problem.groups)).astype(float)
-    deviations = deviation_columns(
-        model, solution.theta, problem.groups, counts, most=MAX_EXPOSURES
-    )
-    sample = _sample(solution, some, rows, mag=mag, colour=colour, epoch=epoch)
+    whole, some, scores = solution.problem, EvenStars.of(solution), scores_of_detections(solution)
+    chosen = scores.at(some.rows)
+    sample = _sample(solution, some, chosen, mag=mag, colour=colour, epoch=epoch)
     functions = functions_for(sample)
-    columns = _AddedColumns(problem, solution.theta, deviations=deviations, added=functions)
-    sums = _summed(solution, columns, rows, solution.stars[some])
+    columns = _AddedColumns(
+        some.problem, solution.theta, deviations=some.deviations, added=functions
+    )
+    sums = _summed(solution, columns, chosen, some.stars)
     found = one_of_each(_regressor_tests(sums, columns, functions))
-    chosen = columns.of_exposures
-    each = np.eye(len(chosen))
-    deviating = _tested(sums, EXPOSURES_OF_SELFCAL, chosen, each, each)
+    which = columns.of_exposures
+    every = np.ones(len(which), bool)
+    deviating = _tested(sums, EXPOSURES_OF_SELFCAL, which, every, np.eye(len(which)))
     moving = None
     if epoch is not None and whole.n_star == 2 and np.ptp(epoch) > SHORTEST:
-        scores = scores_of_detections(solution)
         stars = StarResiduals(
             whole.star, epoch, scores.gradient, scores.curvature, whole.priors.precision
         )
-        moving = motion_outcome(stars, model.unit, MOTIONS_OF_SELFCAL)
+        moving = motion_outcome(stars, whole.model.unit, MOTIONS_OF_SELFCAL)
     found += [one for one in (deviating, moving) if one is not None]
     return corrected([*found, *noise_tests(sample)])
 
 
 def _summed(
-    solution: SelfCalibrationMode, columns: _AddedColumns, rows: Bool, stars: Float
+    solution: SelfCalibrationMode, columns: _AddedColumns, scores: DetectionScores, stars: Float
 ) -> _Sums:
-    """Sums over some of the detections of a solution."""
-    p, scores = columns.problem, scores_of_detections(solution).at(rows)
-    n, D = columns.sparse.stop, columns.n_params
+    """Sums over the detections of some stars of a solution."""
+    p, n, D = columns.problem, columns.sparse.stop, columns.n_params
     known, taken, square = (np.zeros((n, n)) for _ in range(3))
     score, psi = np.zeros(n), []
-    unit = np.broadcast_to(np.eye(2), (len(p), 2, 2))
     for piece in pieces(columns):
-        here = scores.at(piece.rows)
+        here = piece.scores(scores)
         sums = absorbed_by_stars(columns, piece, here, stars)
         taken += sums.rows.T @ sums.rows
         score -= sums.rows.T @ sums.right
         add_products(known, columns, columns, piece, here.curvature)
-        add_products(square, columns, columns, piece, unit[piece.rows])
+        add_products(square, columns, columns, piece, piece.frame.mT @ piece.frame)
         psi.append(star_scores(columns, piece, here.gradient))
     inside = np.ix_(columns.order, columns.order)
     own = np.concatenate(psi)
@@ -170,8 +154,7 @@ def _summed(
     further = np.ix_(columns.order[D:], columns.order[D:])
     return _Sums(
         known[further],
-        left.information,
-        left.score,
+        left,
         covariance,
         square[further] / len(p),
         p.n_stars,
@@ -185,12 +168,9 @@ def _regressor_tests(
     """Tests of all regressors that there are stars enough for."""
     n_chips = len(columns.problem.model.chips)
     for one in functions.regressors:
-        which = columns.along_axes(one.every)
-        own, directions = one.own(n_chips), one.directions(n_chips)
-        left = beside_others(sums.information[np.ix_(which, which)], own, directions)
-        whole = np.zeros_like(left)
-        whole[own] = directions
-        found = _tested(sums, one.family, which, whole, left, max(MIN_INFORMATION, one.least))
+        which, own = columns.along_axes(one.every), one.own(n_chips)
+        least = max(MIN_INFORMATION, one.least)
+        found = _tested(sums, one.family, which, own, one.directions(n_chips), least)
         if found is not None:
             yield one, found
 
@@ -199,24 +179,20 @@ def _tested(
     sums: _Sums,
     family: Family,
     which: Int,
-    whole: Float,
-    left: Float,
+    own: Bool,
+    combinations: Float,
     least: float = MIN_INFORMATION,
 ) -> Outcome | None:
-    """Outcome of one test; None where the data cannot be asked.
-
-    It is that of the directions `left` (n, m) of some columns, which are `whole` (n, m) before
-    anything is projected out and must keep `least` of their information.
-    """
-    at = np.ix_(which, which)
-    known, information = whole.T @ sums.known[at] @ whole, left.T @ sums.information[at] @ left
-    N = left @ independent_directions(known, information, least)
-    q, n = N.shape[1], sums.n_stars
+    """Outcome of one test of some columns, as of `Directions`; None where they cannot be asked."""
+    known = sums.known[np.ix_(which[own], which[own])]
+    one, n = Directions.of(sums.left, which, own, combinations, known, least), sums.n_stars
+    q = one.q
     if q == 0 or n < STARS_PER_DIRECTION * q + 2:
         return None
-    U, S, V = N.T @ sums.score[which], N.T @ sums.information[at] @ N, N.T @ sums.covariance[at] @ N
-    T = float(U @ np.linalg.solve(V, U))
-    square, noise = squares_of(U, S, V, N.T @ sums.square[at] @ N)
+    at = np.ix_(which, which)
+    V = one.basis.T @ sums.covariance[at] @ one.basis
+    T = float(one.score @ np.linalg.solve(V, one.score))
+    square, noise = one.squares(V, sums.square[at])
     return outcome(
         family,
         T,
@@ -231,8 +207,8 @@ def _tested(
 
 def _sample(
     solution: SelfCalibrationMode,
-    some: Int,
-    rows: Bool,
+    some: EvenStars,
+    scores: DetectionScores,
     **known: Float | None,
 ) -> ScoredSample:
     """Sample of detections along the axes of the detector, in the unit of u and v.
@@ -240,13 +216,12 @@ def _sample(
     Rolls turn the axes of the sky from exposure to exposure, and errors are those of pixels.
     """
     whole, theta, model = solution.problem, solution.theta, solution.problem.model
-    p, pixel = whole.of_stars(some), model.pixel_size(theta)
+    p, rows, pixel = some.problem, some.rows, model.pixel_size(theta)
     group = p.groups.index
-    scores = scores_of_detections(solution).at(rows)
     J = p.jacobians(theta, slice(0, len(p)))
     g = np.einsum("nab,na->nb", J, scores.gradient) / pixel
     H = np.swapaxes(J, 1, 2) @ scores.curvature @ J / pixel**2
-    r = (p.places(theta) - p.star_places(solution.stars[some]))[..., None]
+    r = (p.places(theta) - p.star_places(some.stars))[..., None]
     residual = np.linalg.solve(J, r)[:, :, 0] * pixel
     variance = (p.var + solution.mixture.jitter**2) * pixel**2
     taken = taken_by_stars(solution)[rows]

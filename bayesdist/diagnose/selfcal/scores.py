@@ -16,7 +16,9 @@ from bayesdist.infer.selfcal.problem import Problem
 from bayesdist.model.grid import cell_index
 from bayesdist.utils.arrays import Bool, Float, Int
 
-LOOSE = 1e-9  # relative curvature below which a combination of a star's parameters is undetermined
+UNKNOWN = (
+    1e-10  # relative curvature below which a combination of a star's parameters is undetermined
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,8 +93,8 @@ class StarBlock:
     member: Float  # probability (n,) to belong to the star
     weight: Float  # inverse variance (n,) of each axis, times that probability
     residual: Float  # detection minus star (n, 2)
-    # L^-1 B (n, q, 2): B is the curvature of the log density by the star's parameters and the
-    # detection's pixels, L L^T that by the star's parameters alone
+    # R B (n, q, 2): B is the curvature of the log density by the star's parameters and the
+    # detection's pixels, R^T R the inverse of that by the star's parameters alone
     ties: Float
 
 
@@ -110,7 +112,7 @@ def star_blocks(solution: SelfCalibrationMode) -> Iterator[StarBlock]:
         by_star = np.swapaxes(to_pixels @ places_by_star(p, rows), 1, 2)
         curvature = w[:, None, None] * by_star @ np.swapaxes(by_star, 1, 2)
         own = p.priors.precision[first:last] + sums_over(star, curvature, last - first)
-        roots = _inverse_roots(own)
+        roots = inverse_roots(own)
         residual = np.einsum("nij,nj->ni", to_pixels, residuals[rows])
         ties = w[:, None, None] * (roots[star] @ by_star)
         yield StarBlock(rows, star, members[rows], w, residual, ties)
@@ -125,12 +127,13 @@ def taken_by_stars(solution: SelfCalibrationMode) -> Float:
     return np.minimum(out, MOST_TAKEN)
 
 
-def _inverse_roots(matrices: Float) -> Float:
-    """L^-1 of A = L L^T, (S, q, q); undetermined directions get some curvature."""
-    scale = np.sqrt(np.einsum("sqq->sq", matrices))
-    scaled = matrices / (scale[:, :, None] * scale[:, None, :])
-    scaled += LOOSE * np.eye(matrices.shape[1])
-    return np.asarray(np.linalg.inv(np.linalg.cholesky(scaled)) / scale[:, None, :])
+def inverse_roots(matrices: Float) -> Float:
+    """R with R^T R the inverse of each matrix (S, q, q), without undetermined directions."""
+    scale = np.sqrt(np.maximum(np.einsum("sqq->sq", matrices), 1e-300))
+    values, vectors = np.linalg.eigh(matrices / (scale[:, :, None] * scale[:, None, :]))
+    good = values > UNKNOWN
+    roots = np.where(good, np.where(good, values, 1.0) ** -0.5, 0.0)
+    return np.asarray(roots[:, :, None] * np.swapaxes(vectors, 1, 2) / scale[:, None, :])
 
 
 def places_by_star(problem: Problem, rows: slice) -> Float:

@@ -7,7 +7,7 @@ import pytest
 
 from bayesdist.diagnose.correlated.functions import StructureFunctions
 from bayesdist.diagnose.correlated.information import Information, cell_sums
-from bayesdist.diagnose.correlated.structure import chip_structure
+from bayesdist.diagnose.correlated.structure import structure_posterior
 from bayesdist.infer import GaussianPriors
 from bayesdist.infer.solution.solution import likelihood_of
 from bayesdist.infer.stars.stars import prepare
@@ -90,11 +90,13 @@ def test_conditional_means_are_those_of_dense_algebra():
     roots = rng.normal(0, 30, (2, m, m + 5))
     S = [root @ root.T for root in roots]
     s = [rng.normal(0, 40, m) @ np.linalg.cholesky(one).T * 0.02 for one in S]
-    posterior = chip_structure(functions, S, s, noise=0.02, higher_order=1e-3, structure=1e-3)
+    posterior = structure_posterior(
+        [[functions]] * 2, S, s, noise=0.02, higher_order=1e-3, structure=1e-3
+    )
     point = posterior.points[len(posterior.points) // 2]
     amplitude = 3e-3
     T, decline = functions.n_terms, functions.decline()
-    for a, axis in enumerate(point.axes):
+    for a, part in enumerate(point.parts):
         variance = np.concatenate(
             [
                 (amplitude * decline) ** 2,
@@ -103,7 +105,7 @@ def test_conditional_means_are_those_of_dense_algebra():
         )
         precision = S[a] + np.diag(1 / variance)
         mean, cov = np.linalg.solve(precision, s[a]), np.linalg.inv(precision)
-        terms, sines = axis.draws(np.full(40_000, amplitude), rng)
+        terms, sines = part.draws(np.full(40_000, amplitude), rng)
         drawn = np.concatenate([terms * decline, sines], axis=1)
         pull = (drawn.mean(axis=0) - mean) / np.sqrt(np.diag(cov) / len(drawn))
         assert np.abs(pull).max() < 5.0
@@ -123,8 +125,13 @@ def test_draws_do_not_follow_rounding():
         noise = np.random.default_rng(2).normal(0, rounding, (m, m))
         root = np.sqrt(np.diag(S))
         moved = S + np.outer(root, root) * (noise + noise.T)
-        found = chip_structure(
-            functions, [moved] * 2, [score] * 2, noise=0.02, higher_order=1e-3, structure=1e-3
+        found = structure_posterior(
+            [[functions]] * 2,
+            [moved] * 2,
+            [score] * 2,
+            noise=0.02,
+            higher_order=1e-3,
+            structure=1e-3,
         )
-        drawn.append(found.draws(200, np.random.default_rng(3)))
+        drawn.append(np.stack(found.draws(200, np.random.default_rng(3)), axis=1))
     np.testing.assert_allclose(drawn[1], drawn[0], rtol=0, atol=1e-9 * np.abs(drawn[0]).max())

@@ -12,7 +12,7 @@ from scipy.stats import kurtosis
 from bayesdist.diagnose.correlated import DiscrepancyPriors
 from bayesdist.diagnose.correlated.deviations import DeviationColumns, deviation_draws
 from bayesdist.diagnose.correlated.functions import StructureFunctions
-from bayesdist.diagnose.correlated.structure import LENGTHS, chip_structure
+from bayesdist.diagnose.correlated.structure import LENGTHS, structure_posterior
 from tests.infer.by_nuts import needs_numpyro, nuts_draws
 from tests.reduced import only_in_full
 
@@ -92,8 +92,8 @@ def test_structure(found, capsys):
     S = [left.T @ left / SIGMA**2] * 2
     score = [left.T @ data[:, a] / SIGMA**2 for a in (0, 1)]
     medians = {"higher_order": 2e-3, "structure": 2e-3}
-    posterior = chip_structure(functions, S, score, noise=SIGMA, **medians)
-    drawn = posterior.draws(40_000, rng)[..., :m]
+    posterior = structure_posterior([[functions]] * 2, S, score, noise=SIGMA, **medians)
+    drawn = np.stack(posterior.draws(40_000, rng), axis=1)[..., :m]
     places = np.array([[-0.9, 0.9, 0.0, 0.5], [-0.9, -0.9, 0.1, 0.8]])
     at, low_at = functions.evaluate(*places), polynomials(*places)
     root = np.linalg.cholesky(np.linalg.inv(P.T @ P)) * SIGMA
