@@ -13,7 +13,7 @@ from bayesdist.data.matching.friends import Friends, friends_of_friends
 from bayesdist.errors import NotSettledError
 from bayesdist.infer.equations.priors import Prior
 from bayesdist.infer.selfcal.elimination import Mixture, memberships
-from bayesdist.infer.selfcal.gauge import Gauge
+from bayesdist.infer.selfcal.gauge import Decision, Gauge
 from bayesdist.infer.selfcal.mode import PriorAt, SelfCalibrationMode, gauge_of, solve_in_gauge
 from bayesdist.infer.selfcal.pieces import each_of
 from bayesdist.infer.selfcal.problem import Problem, StarPriors, prepare
@@ -47,6 +47,25 @@ class SelfCalibration:
     # with star codes and errors, on one tangent plane where that is requested
     detections: Detections
     iterations: int
+
+
+@dataclass(frozen=True, eq=False)
+class _Iteration:
+    """What the next iteration takes from one: no detections."""
+
+    friends: Friends
+    n_detections: int  # of stars
+    mixture: Mixture
+    decision: Decision | None
+
+    def is_near(self, problem: Problem) -> bool:
+        """True where errors and free directions are those of the next problem at first.
+
+        Nearly the same detections: new ones may lie far from their positions by the solution.
+        Stars with motions start at rest, and then the first errors have to be large.
+        """
+        same = abs(len(problem) / self.n_detections - 1.0) < ALIKE
+        return same and problem.n_star == 2
 
 
 def self_calibrate(
@@ -119,8 +138,7 @@ def self_calibrate(
         detections = replace(detections, sigma=np.full(len(detections), GUESS))
     radius = max(start_radius or match_radius, match_radius)
     pixel = model.pixel_size(theta)
-    before: Friends | None = None
-    mode: SelfCalibrationMode | None = None
+    before: _Iteration | None = None
     each = partial(each_of, compute)
     for turn in range(max_iterations):
         flat = detections if plane is None else plane.onto_it(model, detections, theta)
@@ -140,7 +158,7 @@ def self_calibrate(
         )
         if references is not None:
             problem = replace(problem, priors=references(problem, theta))
-        near = mode if mode is not None and _still(problem, mode) else None
+        near = before if before is not None and before.is_near(problem) else None
         mode = solve_in_gauge(
             problem,
             theta,
@@ -160,7 +178,7 @@ def self_calibrate(
             sigma = _errors_of(detections, mode)
             detections = replace(detections, sigma=sigma)
         few = max(MAX_CHANGED * len(detections), MIN_CHANGED)
-        if last and before is not None and _changed(before, friends) <= few:
+        if last and before is not None and _changed(before.friends, friends) <= few:
             if measured:  # with the errors of this iteration
                 problem = replace(mode.problem, var=sigma[mode.problem.rows] ** 2)
                 mode = solve_in_gauge(
@@ -176,9 +194,9 @@ def self_calibrate(
             gauge = gauge_of(mode.problem, mode.theta, prior_at(mode.theta), mode)
             found = replace(found, sigma=detections.sigma)
             return SelfCalibration(mode, gauge, friends, found, turn + 1)
-        before = friends
-        scatter = mode.error
+        before, scatter = _Iteration(friends, len(problem), mode.mixture, mode.decision), mode.error
         radius = max(match_radius, min(radius, max(SHRINK * radius, REACH * scatter)))
+        del flat, found, problem, mode  # else these are held while the next ones are made
     if last:
         raise NotSettledError(
             f"stars and solution still change after {max_iterations} iterations",
@@ -191,16 +209,6 @@ def self_calibrate(
         where="self-calibration",
         do="give a higher order, a better start, or a larger match radius",
     )
-
-
-def _still(problem: Problem, mode: SelfCalibrationMode) -> bool:
-    """True where errors and free directions of the last iteration are those of this one at first.
-
-    Nearly the same detections: new ones may lie far from their positions by the solution.  Stars
-    with motions start at rest, and then the first errors have to be large.
-    """
-    same = abs(len(problem) / len(mode.problem) - 1.0) < ALIKE
-    return same and problem.n_star == 2
 
 
 def _errors_of(detections: Detections, mode: SelfCalibrationMode) -> Float:
