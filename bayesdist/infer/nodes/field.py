@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from functools import partial
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -16,16 +15,16 @@ from bayesdist.infer.nodes.hyperparameters import (
     SMOOTHNESS,
     Evidence,
     fitted_field,
-    refined_field,
 )
 from bayesdist.infer.nodes.mixture import jitter_variance
-from bayesdist.infer.nodes.posterior import TablePosterior, axis_posterior
+from bayesdist.infer.nodes.posterior import AxisField, TablePosterior
 from bayesdist.infer.nodes.sums import BLOCK, NodeSums, node_sums
 from bayesdist.model import Chip
 from bayesdist.utils.arrays import Float
 
 STEADY = 1e-5  # change of the stars' typical variance that is small against any error of the jitter
 MAX_ITERATIONS = 6
+SEARCHES = ("chip", "tiles", "none")
 
 
 # a factorisation of this size is no faster on two threads: the two axes have one each
@@ -43,8 +42,7 @@ def field_table(
     step: tuple[float, float] = STEP,
     smoothness: Sequence[float] = SMOOTHNESS,
     earlier: TablePosterior | None = None,
-    hold: bool = False,
-    thorough: bool = True,
+    search: str = "chip",
 ) -> TablePosterior:
     """Posterior of a table from the residuals of one chip.
 
@@ -76,12 +74,11 @@ def field_table(
     smoothness : sequence of float
         Matern smoothness to choose from.
     earlier : TablePosterior, optional
-        Table of nearly the same stars from an earlier iteration, at which the search starts.
-    hold : bool
-        True to take the hyperparameters of the earlier table unchanged.
-    thorough : bool
-        False to take those that are most probable for independent tiles of the chip: near those of
-        the whole chip, and found in a fifth of the time.
+        Table of nearly the same stars from an earlier iteration, from which this one starts.
+    search : str
+        Of the hyperparameters.  'chip': all that are likely on independent tiles are tried on the
+        whole chip; 'tiles': those of the tiles are taken, which are near; 'none': the earlier
+        table's are held.
 
     Returns
     -------
@@ -90,8 +87,8 @@ def field_table(
     Raises
     ------
     InputError
-        For arrays of other shapes, values that are not finite, an unknown smoothness, or `hold`
-        without an earlier table.
+        For arrays of other shapes, values that are not finite, an unknown smoothness or search, or
+        no search and no earlier table.
     DegenerateError
         When the stars do not determine the polynomial.
     """
@@ -101,10 +98,12 @@ def field_table(
             f"there is no field of smoothness {bad}" if bad else "no smoothness is given",
             do=f"choose among {', '.join(map(str, SMOOTHNESS))}",
         )
-    if hold and earlier is None:
+    if search not in SEARCHES:
+        raise InputError(f"there is no search {search!r}", do=f"choose among {', '.join(SEARCHES)}")
+    if search == "none" and earlier is None:
         raise InputError("there are no hyperparameters to hold", do="give the earlier table")
     px, py, r, var, w = checked_stars(x, y, shift, variance, weight, chip)
-    grid = NodeGrid(chip, order, step)
+    grid = NodeGrid(chip, order, step) if earlier is None else earlier.grid
 
     def sums_at(j2: float) -> tuple[NodeSums, NodeSums]:
         return node_sums(grid, px, py, r, w[:, None] / (var + j2))
@@ -114,35 +113,40 @@ def field_table(
     ) -> tuple[float, float]:
         return jitter_variance(_residual(grid, px, py, r, sums, nodes), var, w, n)
 
-    typical = float(np.median(var))
+    def searched(sums: NodeSums, before: AxisField | None) -> AxisField:
+        if search == "none" and before is not None:
+            return before.following(sums)
+        evidence = Evidence(grid, sums)
+        return AxisField.of(evidence, fitted_field(evidence, smoothness, thorough=search == "chip"))
+
     if earlier is None:
         # a first value without any smoothing: there are no hyperparameters yet
-        rough = [Evidence(grid, s) for s in sums_at(0.0)]
-        n = sum(at_once(_n_rough, rough))
-        j2, _ = jitter_at([e.sums for e in rough], [e.rough for e in rough], n)
-        sums = sums_at(j2)
-        fields = at_once(
-            lambda s: fitted_field(Evidence(grid, s), smoothness, thorough=thorough), sums
-        )
+        sums = sums_at(0.0)
+        nodes = at_once(lambda s: Evidence(grid, s).rough, sums)
+        n = float(sum(np.count_nonzero(s.nodes.diagonal()) for s in sums))
+        before: Sequence[AxisField | None] = (None, None)
     else:
-        j2, fields = earlier.jitter**2, [axis.field for axis in earlier.axes]
+        sums, before = sums_at(earlier.jitter**2), earlier.axes
+        nodes = [axis.mean for axis in earlier.axes]
+        n = sum(axis.n_effective for axis in earlier.axes)
+    if search == "none" and earlier is not None:
+        j2 = earlier.jitter**2
+    else:
+        j2, _ = jitter_at(sums, nodes, n)
         sums = sums_at(j2)
-        if not hold:
-            fields = at_once(lambda s, f: refined_field(Evidence(grid, s), f), sums, fields)
+    axes = at_once(searched, sums, before)
+    typical = float(np.median(var))
     for _ in range(MAX_ITERATIONS):
-        axes = at_once(partial(axis_posterior, grid), sums, fields)
         n = sum(axis.n_effective for axis in axes)
         new, error = jitter_at(sums, [axis.mean for axis in axes], n)
         if abs(new - j2) < 0.3 * error + STEADY * (typical + j2):
             break
         j2, sums = new, sums_at(new)
-    mean = np.stack([axis.mean for axis in axes])
-    sigma = np.stack([axis.sigma for axis in axes])
-    table = grid.table(mean, sigma, filter=filter)
+        axes = at_once(AxisField.at_same_prior, axes, sums)
     # standard error of j where j is large; where it is zero, its possible size
     jitter = float(np.sqrt(j2))
     spread = float(np.sqrt(j2 + error)) - jitter
-    return TablePosterior(table, grid, (axes[0], axes[1]), jitter, spread, float(w.sum()))
+    return TablePosterior(grid, (axes[0], axes[1]), filter, jitter, spread, float(w.sum()))
 
 
 def checked_stars(
@@ -211,9 +215,3 @@ def _residual(
         fitted += grid.basis.evaluate(x[rows], y[rows]) @ polynomial
         out[rows] = shift[rows] - fitted
     return out
-
-
-def _n_rough(evidence: Evidence) -> float:
-    """Number of parameters of a fit without smoothing."""
-    sums = evidence.sums
-    return len(sums.polynomial) + float((sums.information * evidence.noise).sum())

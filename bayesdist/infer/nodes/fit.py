@@ -26,14 +26,15 @@ from bayesdist.infer.nodes.hyperparameters import SMOOTHNESS
 from bayesdist.infer.nodes.mixture import ResidualMixture, fit_mixture
 from bayesdist.infer.nodes.pixels import corrected_matches, on_the_chips, pixel_shifts
 from bayesdist.infer.nodes.posterior import TablePosterior
-from bayesdist.infer.nodes.table_fit import Iteration, TableFit, table_of
+from bayesdist.infer.nodes.table_fit import Iteration, TableFit, shifts_of
 from bayesdist.infer.solution.linear import LinearFit, fit_linear
 from bayesdist.model import DistortionModel
 from bayesdist.model.lookup import LookupTable
 from bayesdist.utils.arrays import Bool, Float
 
 LIKELY = 0.5  # stars that are less likely true matches are left out
-SEARCHED = 2  # iterations that optimise hyperparameters, which are fixed in later ones
+# of the hyperparameters, as of `field_table`, in the first iterations; in later ones they are held
+SEARCHES = ("tiles", "chip")
 
 
 # all large matrices are factored here, one at a time: see `field_table`
@@ -49,7 +50,7 @@ def fit_with_tables(
     tolerance: float = 2e-4,
     step: tuple[float, float] = STEP,
     smoothness: Sequence[float] = SMOOTHNESS,
-    thorough: bool = True,
+    start: TableFit | None = None,
     report: Callable[[Iteration], None] | None = None,
 ) -> TableFit:
     """Fit the polynomial and the look-up tables of one filter in turn.
@@ -76,8 +77,8 @@ def fit_with_tables(
         Pixels between nodes.
     smoothness : sequence of float
         Matern smoothness to choose from, for 'field'.
-    thorough : bool
-        As of `field_table`.
+    start : TableFit, optional
+        Fit of the same matches, perhaps with other errors, whose iterations go on.
     report : callable, optional
         Called with each iteration.
 
@@ -107,21 +108,31 @@ def fit_with_tables(
     matches, model = _with_own_exposures(matches, model)
     chips = [c for k, c in enumerate(matches.chip_numbers) if (matches.chip == k).any()]
     numbers = matches.chip_number
-    lower = corrected_matches([table_of(one) for one in beneath], matches)
+    lower = corrected_matches([shifts_of(one) for one in beneath], matches)
     x, y = lower.x, lower.y
-    tables: dict[int, LookupTable] = {}
-    posteriors: dict[int, TablePosterior] = {}
     progress: list[Iteration] = []
+    fitted: dict[int, LookupTable | TablePosterior] = {}
+    own = np.zeros((len(x), 2))
+    if start is not None:
+        progress += start.progress
+        fitted |= zip(chips, start.fitted, strict=True)
+        for c, table in fitted.items():
+            rows = numbers == c
+            own[rows] = shifts_of(table).evaluate(x[rows], y[rows])
+    searched = dict(fitted)  # those whose hyperparameters are held
 
     def solved(moved: Matches, mixture: ResidualMixture, pixel: float) -> LinearFit:
         """Polynomial fit for fixed tables; `pixel` is the size of one in u, v."""
         jitter = np.full(len(x), mixture.jitter)
-        for number, posterior in posteriors.items():
-            jitter[numbers == number] = posterior.jitter
+        for chip, table in fitted.items():
+            if isinstance(table, TablePosterior):
+                jitter[numbers == chip] = table.jitter
         moved = _with_memberships(moved, mixture, jitter * pixel)
         return fit_linear(on_the_chips(moved, model), model)
 
-    def new_table(chip: int, rows: Bool, shift: Float, variance: Float) -> LookupTable:
+    def new_table(
+        chip: int, rows: Bool, shift: Float, variance: Float, search: str
+    ) -> LookupTable | TablePosterior:
         where = model.chips[model.chip_code(chip)]
         if method == "binned":
             return binned_table(
@@ -133,7 +144,8 @@ def fit_with_tables(
                 filter=filter,
                 step=step,
             )
-        posteriors[chip] = field_table(
+        earlier = searched.get(chip)
+        return field_table(
             x[rows],
             y[rows],
             shift[rows],
@@ -144,41 +156,39 @@ def fit_with_tables(
             filter=filter,
             step=step,
             smoothness=smoothness,
-            earlier=posteriors.get(chip),
-            hold=number > SEARCHED,
-            thorough=thorough,
+            earlier=earlier if isinstance(earlier, TablePosterior) else None,
+            search=search,
         )
-        return posteriors[chip].table
 
-    moved, own = lower, np.zeros((len(x), 2))
+    def corrected_by_all() -> Matches:
+        return matches.with_columns(x=x + own[:, 0], y=y + own[:, 1])
+
+    moved = corrected_by_all()
     solution = fit_linear(on_the_chips(moved, model), model)
-    for number in range(1, max_iterations + 1):
+    for number in range(len(progress) + 1, len(progress) + 1 + max_iterations):
+        search = SEARCHES[number - 1] if number <= len(SEARCHES) else "none"
         pixel = model.pixel_size(solution.mean)
         shifts = pixel_shifts(solution, moved)
         mixture = fit_mixture(shifts.shift, shifts.variance)
         weight = np.where(mixture.probability >= LIKELY, mixture.probability, 0.0)
         rms = float(np.sqrt((weight[:, None] * shifts.shift**2).sum() / (2 * weight.sum())))
         total = shifts.shift + own
-        change = []
+        change = 0.0
         for c in chips:
             rows = numbers == c
-            new = new_table(c, rows, total, shifts.variance)
-            old = tables[c].values if c in tables else np.zeros_like(new.values)
-            change.append((new.values - old).ravel())
-            tables[c] = new
+            before = shifts_of(fitted[c]).values if c in fitted else 0.0
+            fitted[c] = new_table(c, rows, total, shifts.variance, search)
+            new = shifts_of(fitted[c])
+            change = max(change, float(np.abs(new.values - before).max()))
+            if search != "none":
+                searched[c] = fitted[c]
             own[rows] = new.evaluate(x[rows], y[rows])
-        difference = np.concatenate(change)
         progress.append(
-            Iteration(
-                number=number,
-                moved=float(np.abs(difference).max()),
-                rms=rms,
-                false_fraction=mixture.fraction,
-            )
+            Iteration(number=number, moved=change, rms=rms, false_fraction=mixture.fraction)
         )
         if report is not None:
             report(progress[-1])
-        moved = matches.with_columns(x=x + own[:, 0], y=y + own[:, 1])
+        moved = corrected_by_all()
         solution = solved(moved, mixture, pixel)
         if progress[-1].moved < tolerance:
             break
@@ -186,7 +196,7 @@ def fit_with_tables(
         filter=filter,
         solution=solution,
         beneath=tuple(beneath),
-        fitted=tuple(posteriors.get(c, tables[c]) for c in chips),
+        fitted=tuple(fitted[c] for c in chips),
         mixture=mixture,
         progress=tuple(progress),
         converged=progress[-1].moved < tolerance,
@@ -208,7 +218,7 @@ def _check(
             f"{max_iterations} iterations to a tolerance of {tolerance} pixels",
             do="give one iteration or more and a positive tolerance",
         )
-    for table in map(table_of, beneath):
+    for table in map(shifts_of, beneath):
         if table.filter:
             raise InputError(
                 f"the look-up table {table.label} is not the detector's",

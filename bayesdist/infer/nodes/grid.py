@@ -11,7 +11,6 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-import scipy.linalg
 import scipy.sparse
 
 from bayesdist.errors import InputError
@@ -110,8 +109,8 @@ class NodeGrid:
         MQ = matrix @ Q
         Z = MQ - 0.5 * Q @ (Q.T @ MQ)
         left, right = np.concatenate([Z, Q], axis=1), np.concatenate([Q, Z], axis=1)
-        # the transpose of a C array has the order of BLAS, and the matrix is symmetric
-        return scipy.linalg.blas.dgemm(-1.0, left, right, 1.0, matrix.T, trans_b=1, overwrite_c=1).T
+        matrix -= left @ right.T
+        return matrix
 
     @cached_property
     def lag(self) -> Int:
@@ -126,3 +125,9 @@ class NodeGrid:
         """Distances (n_nodes,) in pixels between the first node and each."""
         x, y = self.positions
         return np.hypot(x - x[0], y - y[0])
+
+    @cached_property
+    def polynomials_by_lag(self) -> Float:
+        """Projection on the polynomials, summed over the pairs of nodes of each lag (n_nodes,)."""
+        Q = self.polynomials
+        return np.bincount(self.lag.ravel(), (Q @ Q.T).ravel(), self.n_nodes).astype(float)

@@ -10,12 +10,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 
 import numpy as np
 import scipy.linalg
-from scipy.optimize import minimize
 
+from bayesdist.infer.kernel.lapack import cholesky, inverse_of
 from bayesdist.infer.nodes.grid import NodeGrid
 from bayesdist.infer.nodes.sums import NodeSums
 from bayesdist.utils.arrays import Float, Int
@@ -31,7 +31,7 @@ EMPTY = 1e-8
 TILE = 16  # nodes: the search starts on independent tiles of the chip
 LOG_LENGTH = (np.log(2.0), 1.0)  # prior of log(length / step): mean, standard deviation
 SETTLED = 0.02  # gain in log density at which the search stops
-UNKNOWN = np.diag([0.04, 0.04])  # of log amplitude and log length, before the first differences
+STEPS = 30  # far more than it takes
 RULED_OUT = 10.0  # a smoothness so much worse on the tiles is not tried again
 
 
@@ -43,17 +43,22 @@ class Matern:
     length: float  # correlation length, pixels
     smoothness: float  # 1/2, 3/2 or 5/2: a rough field, one with a slope, one with a curvature
 
-    def correlation(self, distance: Float) -> Float:
-        """Correlation of two points at a distance in pixels."""
+    def by_lag(self, distance: Float) -> tuple[Float, Float]:
+        """Covariance of nodes (n,) pixels apart, and its derivative by the logarithm of the length.
+
+        The first distance is zero.
+        """
         t = np.sqrt(2 * self.smoothness) * np.asarray(distance, float) / self.length
+        scale = self.amplitude**2 * np.exp(-t)
         shape = {0.5: 1.0, 1.5: 1.0 + t, 2.5: 1.0 + t + t**2 / 3}[self.smoothness]
-        return shape * np.exp(-t)
+        slope = {0.5: t, 1.5: t**2, 2.5: t**2 * (1.0 + t) / 3}[self.smoothness]
+        covariance = scale * shape
+        covariance[0] += self.amplitude**2 * NUGGET
+        return covariance, scale * slope
 
     def covariance(self, grid: NodeGrid) -> Float:
         """Covariance (n_nodes, n_nodes) of free node values."""
-        by_lag = self.amplitude**2 * self.correlation(grid.lags)
-        by_lag[0] += self.amplitude**2 * NUGGET
-        return by_lag[grid.lag]
+        return self.by_lag(grid.lags)[0][grid.lag]
 
     def restricted(self, grid: NodeGrid) -> Float:
         """Covariance (n_nodes, n_nodes) of node values without their polynomial part."""
@@ -62,11 +67,24 @@ class Matern:
 
 @dataclass(frozen=True, eq=False)
 class FittedField:
-    """Hyperparameters of one axis at their most probable values."""
+    """Log density of one axis at some hyperparameters, and the field that goes with them."""
 
     prior: Matern
-    covariance: Float  # of log amplitude and log length (2, 2), from the curvature there
-    log_evidence: float  # log marginal likelihood there, up to a constant
+    log_evidence: float  # log density of amplitude and length, up to a constant
+    slope: Float  # of it by log amplitude and log length (2,)
+    curvature: Float  # minus its second derivatives, nearly (2, 2)
+    mean: Float  # most probable node values (n,); of tiles, one after the other
+    n_effective: float  # number of nodes that the stars determine
+
+    @property
+    def covariance(self) -> Float:
+        """Covariance (2, 2) of log amplitude and log length."""
+        return np.asarray(np.linalg.inv(self.curvature))
+
+    @property
+    def point(self) -> Float:
+        """Log amplitude and log length (2,)."""
+        return np.asarray(np.log([self.prior.amplitude, self.prior.length]))
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,28 +95,35 @@ class Evidence:
     sums: NodeSums
 
     @cached_property
+    def _typical(self) -> float:
+        """Median information about a node that has stars."""
+        information = self.sums.nodes.diagonal()
+        return float(np.median(information[information > 0]))
+
+    @cached_property
     def noise(self) -> Float:
-        """Covariance B (n, n) of the rough node values."""
+        """Covariance B (n, n) of the rough node values: its lower triangle, and zeros."""
         Q, A = self.grid.polynomials, self.sums.information
-        scale = np.median(np.diag(A)[np.diag(A) > 0])
         A = self.grid.without_their_polynomials(A)
-        A += scale * (Q @ Q.T)
-        A[np.diag_indices_from(A)] += EMPTY * scale
-        inverse, _ = scipy.linalg.lapack.dpotri(cholesky(A), lower=1, overwrite_c=1)
-        return np.tril(inverse) + np.tril(inverse, -1).T
+        A += self._typical * (Q @ Q.T)
+        A[np.diag_indices_from(A)] += EMPTY * self._typical
+        return inverse_of(cholesky(A))
 
     @cached_property
     def rough(self) -> Float:
         """Rough node values (n,), without any smoothing."""
-        return self.noise @ self.grid.without_polynomials(self.sums.marginal_right)
+        return _product(self.noise, self.grid.without_polynomials(self.sums.marginal_right))
 
-    def log_likelihood(self, prior: Matern) -> float:
-        """Log marginal likelihood, up to a constant that does not depend on the prior."""
-        V = prior.restricted(self.grid)
-        V += self.noise
-        L = cholesky(V)
-        z = scipy.linalg.solve_triangular(L, self.rough, lower=True, check_finite=False)
-        return float(-0.5 * z @ z - np.log(np.diag(L)).sum())
+    def at(self, prior: Matern) -> FittedField:
+        """Log density of hyperparameters, and the field with them."""
+        grid = self.grid
+        out = _Parts(prior, grid)
+        V = grid.without_their_polynomials(out.by_lag[grid.lag])
+        bent = partial(_bent, grid, out.slope_by_lag[grid.lag])
+        out.add(V, bent, self.noise, self.rough, grid.lag)
+        # the field has no polynomials, of which the inverse of V has as much as that of B
+        out.weights -= (1.0 + EMPTY) * self._typical * grid.polynomials_by_lag
+        return out.field(_log_prior(grid, prior))
 
     @cached_property
     def _tiles(self) -> Int:
@@ -110,36 +135,21 @@ class Evidence:
         return np.array([nodes[j : j + my, i : i + mx].ravel() for j, i in corners])
 
     @cached_property
-    def _tile_parts(self) -> tuple[Int, Float, Float]:
-        """Lags of a tile (m, m), and B (T, m, m) and rough values (T, m) of all tiles."""
+    def _tile_parts(self) -> tuple[Int, list[Float], Float]:
+        """Lags of a tile (m, m), and B (m, m) and rough values (T, m) of all tiles."""
         tiles = self._tiles
         lag = self.grid.lag[np.ix_(tiles[0], tiles[0])]
-        noise = self.noise[tiles[:, :, None], tiles[:, None, :]]
+        noise = [np.asfortranarray(self.noise[np.ix_(tile, tile)]) for tile in tiles]
         return lag, noise, self.rough[tiles]
 
-    def tiled_log_likelihood(self, prior: Matern) -> float:
-        """Log marginal likelihood of independent tiles: a good start at a hundredth of the cost."""
+    def at_tiles(self, prior: Matern) -> FittedField:
+        """As `at`, of independent tiles: a good start at a hundredth of the cost."""
         lag, noise, rough = self._tile_parts
-        by_lag = prior.amplitude**2 * prior.correlation(self.grid.lags)
-        by_lag[0] += prior.amplitude**2 * NUGGET
-        out = 0.0
+        out = _Parts(prior, self.grid)
+        bent = partial(np.matmul, out.slope_by_lag[lag])
         for B, b in zip(noise, rough, strict=True):
-            L = cholesky(by_lag[lag] + B)
-            z = scipy.linalg.solve_triangular(L, b, lower=True, check_finite=False)
-            out -= 0.5 * z @ z + np.log(np.diag(L)).sum()
-        return float(out)
-
-    def log_prior(self, prior: Matern) -> float:
-        """Log prior density of log amplitude and log length, up to a constant.
-
-        The density of the amplitude itself rises in proportion to it: this keeps the most probable
-        value from zero, where it would claim certainty (Chung et al. 2013, Psychometrika 78, 685).
-        The length is about a few steps: it matters only where there is hardly any pattern.
-        """
-        mean, sd = LOG_LENGTH
-        step = float(np.sqrt(np.prod(self.grid.step)))
-        off = (np.log(prior.length / step) - mean) / sd
-        return 2 * float(np.log(prior.amplitude)) - 0.5 * float(off**2)
+            out.add(out.by_lag[lag], bent, B, b, lag)
+        return out.field(_log_prior(self.grid, prior))
 
     @cached_property
     def start(self) -> tuple[float, float]:
@@ -151,110 +161,143 @@ class Evidence:
         return float(np.log(amplitude)), float(np.log(2 * np.sqrt(np.prod(self.grid.step))))
 
 
+class _Parts:
+    """Sums over the parts of a chip that are taken to be independent.
+
+    With V = C + B and a = V^-1 b the slopes are (a^T V_k a - tr V^-1 V_k) / 2, and the curvature
+    is the average information a^T V_k V^-1 V_l a / 2 (Gilmour, Thompson and Cullis 1995).  As
+    C depends on the lag of two nodes alone, the trace is a sum over lags.
+    """
+
+    def __init__(self, prior: Matern, grid: NodeGrid) -> None:
+        self.prior = prior
+        self.by_lag, self.slope_by_lag = prior.by_lag(grid.lags)
+        self.value = 0.0
+        self.slope, self.curvature = np.zeros(2), np.zeros((2, 2))
+        self.weights = np.zeros(grid.n_nodes)  # sums of V^-1 over pairs of nodes of one lag
+        self.means: list[Float] = []
+
+    def add(
+        self, V: Float, bent: Callable[[Float], Float], noise: Float, rough: Float, lag: Int
+    ) -> None:
+        """Add a part of covariance V, which is overwritten; `bent` is V_2 times a vector."""
+        V += noise.T
+        L = cholesky(V)
+        z = scipy.linalg.solve_triangular(L, rough, lower=True, check_finite=False)
+        a = scipy.linalg.solve_triangular(L, z, lower=True, trans=1, check_finite=False)
+        self.value -= float(0.5 * z @ z + np.log(np.diag(L)).sum())
+        inverse = inverse_of(L)
+        self.weights += 2 * np.bincount(lag.ravel(), inverse.T.ravel(), len(self.weights))
+        self.weights[0] -= np.trace(inverse)
+        mean = rough - _product(noise, a)
+        moved = np.array([2 * mean, bent(a)])
+        self.slope += 0.5 * moved @ a
+        self.curvature += 0.5 * moved @ np.array([_product(inverse, one) for one in moved]).T
+        self.means.append(mean)
+
+    def field(self, log_prior: tuple[float, Float, Float]) -> FittedField:
+        """Log density, with that of the prior and its slope and curvature."""
+        value, slope, curvature = log_prior
+        informed = float(self.by_lag @ self.weights)
+        own = self.slope - 0.5 * np.array([2 * informed, self.slope_by_lag @ self.weights])
+        # of a likelihood in the square of the amplitude, expressed by its logarithm
+        curvature[0, 0] += max(0.0, -2 * own[0])
+        return FittedField(
+            self.prior,
+            self.value + value,
+            own + slope,
+            self.curvature + curvature,
+            np.concatenate(self.means),
+            informed,
+        )
+
+
+def _bent(grid: NodeGrid, matrix: Float, vector: Float) -> Float:
+    return grid.without_polynomials(matrix @ vector)
+
+
+def _product(lower: Float, vector: Float) -> Float:
+    """Product of a symmetric matrix, of which the lower triangle is given, with a vector."""
+    out: Float = scipy.linalg.blas.dsymv(1.0, lower, vector, lower=1)
+    return out
+
+
+def _log_prior(grid: NodeGrid, prior: Matern) -> tuple[float, Float, Float]:
+    """Log prior density of log amplitude and log length, up to a constant; slope and curvature.
+
+    The density of the amplitude itself rises in proportion to it: this keeps the most probable
+    value from zero, where it would claim certainty (Chung et al. 2013, Psychometrika 78, 685).
+    The length is about a few steps: it matters only where there is hardly any pattern.
+    """
+    mean, sd = LOG_LENGTH
+    step = float(np.sqrt(np.prod(grid.step)))
+    off = (np.log(prior.length / step) - mean) / sd
+    value = 2 * float(np.log(prior.amplitude)) - 0.5 * float(off**2)
+    return value, np.array([2.0, -off / sd]), np.diag([0.0, sd**-2])
+
+
 def fitted_field(evidence: Evidence, smoothness: Sequence[float], *, thorough: bool) -> FittedField:
     """Most probable amplitude, length and smoothness of the given ones.
 
-    If `thorough` the whole chip is used after the tiles.
+    They are searched on tiles, and if `thorough` on the whole chip from there.
     """
-
-    def density(nu: float, whole: bool) -> Callable[[Float], float]:
-        likelihood = evidence.log_likelihood if whole else evidence.tiled_log_likelihood
-
-        def of(point: Float) -> float:
-            prior = _prior(point, nu)
-            return likelihood(prior) + evidence.log_prior(prior)
-
-        return of
-
-    found: dict[float, tuple[Float, Float, float]] = {}
-    for nu in smoothness:
-        tiled = density(nu, False)
-        rough = minimize(
-            lambda p, f=tiled: -f(p),
-            evidence.start,
-            method="Nelder-Mead",
-            bounds=_bounds(evidence),
-            options={"xatol": 0.1, "fatol": 0.5, "maxfev": 100},
-        )
-        found[nu] = _summit(tiled, rough.x)
-    best = max(top for _, _, top in found.values())
+    found = {nu: _summit(evidence, evidence.at_tiles, evidence.start, nu) for nu in smoothness}
+    best = max(one.log_evidence for one in found.values())
+    likely = {nu: one for nu, one in found.items() if one.log_evidence > best - RULED_OUT}
     if thorough:
-        for nu in smoothness:
-            if found[nu][2] > best - RULED_OUT:
-                found[nu] = _summit(density(nu, True), found[nu][0], covariance=found[nu][1])
-            else:
-                found[nu] = (*found[nu][:2], -np.inf)
-    chosen = max(found, key=lambda nu: found[nu][2])
-    point, covariance, top = found[chosen]
-    return FittedField(_prior(point, chosen), covariance, top)
+        whole = [_summit(evidence, evidence.at, one.point, nu) for nu, one in likely.items()]
+        return max(whole, key=lambda one: one.log_evidence)
+    return evidence.at(max(likely.values(), key=lambda one: one.log_evidence).prior)
 
 
-def refined_field(evidence: Evidence, earlier: FittedField) -> FittedField:
-    """Most probable amplitude and length, starting from those of nearly the same data."""
-    nu = earlier.prior.smoothness
-
-    def density(point: Float) -> float:
-        prior = _prior(point, nu)
-        return evidence.log_likelihood(prior) + evidence.log_prior(prior)
-
-    start = np.log([earlier.prior.amplitude, earlier.prior.length])
-    point, covariance, top = _summit(density, start, covariance=earlier.covariance)
-    return FittedField(_prior(point, nu), covariance, top)
-
-
-def _prior(point: Float, nu: float) -> Matern:
-    return Matern(float(np.exp(point[0])), float(np.exp(point[1])), nu)
-
-
-def _bounds(evidence: Evidence) -> list[tuple[float, float]]:
+def _bounds(evidence: Evidence) -> tuple[Float, Float]:
     """Bounds of log amplitude and log length: far beyond the range that a grid can show."""
     amplitude, _ = evidence.start
     step = np.log(np.sqrt(np.prod(evidence.grid.step)))
     extent = np.log(max(evidence.grid.chip.size))
-    return [(amplitude - 5.0, amplitude + 5.0), (step - 2.0, extent + 1.0)]
+    return np.array([amplitude - 5.0, step - 2.0]), np.array([amplitude + 5.0, extent + 1.0])
 
 
 def _summit(
-    density: Callable[[Float], float], start: Float, *, covariance: Float = UNKNOWN
-) -> tuple[Float, Float, float]:
-    """Maximum of a smooth function of two variables, the covariance there, and its value.
+    evidence: Evidence,
+    density: Callable[[Matern], FittedField],
+    start: Sequence[float] | Float,
+    nu: float,
+) -> FittedField:
+    """Most probable amplitude and length for one smoothness, by Newton's method.
 
-    Newton's method on differences of half a standard error: a few steps from a good start, and the
-    curvature is obtained too.  It ends where the parabola has foretold the value at its own top.
+    The curvature is corrected along the last step, by what the slope has changed there.
     """
-    x = np.asarray(start, float)
-    h, f = _widths(covariance), density(x)
-    for _ in range(8):
-        ends = np.array([[density(x + s * h[k] * np.eye(2)[k]) for s in (1, -1)] for k in (0, 1)])
-        corner = density(x + h)
-        slope = (ends[:, 0] - ends[:, 1]) / (2 * h)
-        curvature = np.diag((ends[:, 0] - 2 * f + ends[:, 1]) / h**2)
-        cross = corner - ends[0, 0] - ends[1, 0] + f
-        curvature[0, 1] = curvature[1, 0] = cross / (h[0] * h[1])
-        values, vectors = np.linalg.eigh(-curvature)
-        # uphill even where the curvature has the wrong sign
-        values = np.maximum(np.abs(values), 1e-3 * np.abs(values).max() + 1e-6)
-        covariance = (vectors / values) @ vectors.T
-        step = covariance @ slope
-        gain = 0.5 * float(slope @ step)
-        shorter = min(1.0, 1.0 / float(np.abs(step).max() + 1e-300))
-        x, foretold = x + step * shorter, f + gain * shorter * (2 - shorter)
-        if gain < SETTLED:
-            return x, covariance, foretold
-        h, f = _widths(covariance), density(x)
-        if shorter == 1.0 and abs(f - foretold) < SETTLED:
+
+    def at(point: Float) -> FittedField:
+        return density(Matern(float(np.exp(point[0])), float(np.exp(point[1])), nu))
+
+    low, high = _bounds(evidence)
+    here, longest = at(np.clip(start, low, high)), 1.0
+    curvature = here.curvature
+    for _ in range(STEPS):
+        step = np.asarray(np.linalg.solve(curvature, here.slope), float)
+        step *= min(1.0, longest / float(np.abs(step).max() + 1e-300))
+        step = np.clip(here.point + step, low, high) - here.point
+        if here.slope @ step - 0.5 * step @ curvature @ step < SETTLED:
             break
-    return x, covariance, f
+        there = at(here.point + step)
+        change = here.slope - there.slope
+        if there.log_evidence > here.log_evidence:
+            here, longest = there, 1.0
+        else:
+            longest = 0.5 * float(np.abs(step).max())
+        curvature = _corrected(here.curvature, step, change)
+    return here
 
 
-def _widths(covariance: Float) -> Float:
-    return np.clip(0.5 * np.sqrt(np.diag(covariance)), 0.01, 0.3)
-
-
-def cholesky(matrix: Float) -> Float:
-    """Lower factor of a symmetric matrix, which is overwritten."""
-    # the transpose of a C array has the order of LAPACK, and the matrix is symmetric
-    L, failed = scipy.linalg.lapack.dpotrf(matrix.T, lower=1, clean=1, overwrite_a=1)
-    if failed:
-        raise np.linalg.LinAlgError("the matrix is not positive definite")
-    return L
+def _corrected(curvature: Float, step: Float, change: Float) -> Float:
+    """Curvature (2, 2) with the measured change of the slope along a step, if concave (BFGS)."""
+    if change @ step <= 0:
+        return curvature
+    along = curvature @ step
+    return (
+        curvature
+        - np.outer(along, along) / (step @ along)
+        + np.outer(change, change) / (change @ step)
+    )

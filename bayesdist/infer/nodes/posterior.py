@@ -2,30 +2,83 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
-import scipy.linalg
 from numpy.typing import ArrayLike
+from scipy.sparse.linalg import LinearOperator, cg
 
+from bayesdist.infer.kernel.blocks import at_once
+from bayesdist.infer.kernel.lapack import cholesky, divided
 from bayesdist.infer.nodes.grid import NodeGrid
-from bayesdist.infer.nodes.hyperparameters import FittedField, Matern, cholesky
+from bayesdist.infer.nodes.hyperparameters import Evidence, FittedField, Matern
 from bayesdist.infer.nodes.sums import NodeSums
 from bayesdist.model.lookup import LookupTable
 from bayesdist.utils.arrays import Float
 
 BLOCK = 2048  # pixels whose rows over all nodes are in memory at once
 COLUMNS = 512  # of a symmetric product, of which no more than one triangle is made
+SOLVED = 1e-10  # relative error of nodes that follow a change of the stars' weights
 
 
 @dataclass(frozen=True, eq=False)
 class AxisField:
     """Posterior of the node values of one axis: Gaussian, the polynomial being integrated out."""
 
-    mean: Float  # (n,) pixels
-    root: Float  # R (n, n) with R R^T the covariance
-    field: FittedField  # hyperparameters
+    grid: NodeGrid
     sums: NodeSums  # normal equations of the stars
+    field: FittedField  # hyperparameters
+    mean: Float  # (n,) pixels
+    n_effective: float  # number of parameters, nodes and polynomial, that the stars determine
+
+    @classmethod
+    def of(cls, evidence: Evidence, field: FittedField) -> AxisField:
+        """Posterior at the hyperparameters of a field of the same stars."""
+        sums = evidence.sums
+        n = len(sums.polynomial) + field.n_effective
+        return cls(evidence.grid, sums, field, field.mean, n)
+
+    def at_same_prior(self, sums: NodeSums) -> AxisField:
+        """Posterior from other sums, at these hyperparameters."""
+        evidence = Evidence(self.grid, sums)
+        return AxisField.of(evidence, evidence.at(self.field.prior))
+
+    def following(self, sums: NodeSums) -> AxisField:
+        """Posterior from sums of nearly the same stars, at these hyperparameters.
+
+        With d = R z the precision of z is 1 + R^T dA R, dA being the change of the information:
+        near 1, so that a few products with R are enough.
+        """
+        R = self.root
+
+        def precision(z: Float) -> Float:
+            d = R @ z
+            return z + R.T @ (sums.informed(d) - self.sums.informed(d))
+
+        right = R.T @ sums.marginal_right
+        z, _ = cg(LinearOperator(R.shape, precision, dtype=float), right, right, rtol=SOLVED)
+        return replace(self, sums=sums, mean=R @ z)
+
+    @cached_property
+    def root(self) -> Float:
+        """R (n, n) with R R^T the covariance.
+
+        With d = L z, z ~ N(0, 1) and L the polynomial-free part of the Cholesky factor of the
+        prior, the precision of z is 1 + L^T A L: never singular, whatever bins are empty.
+        """
+        L = self.grid.without_polynomials(cholesky(self.field.prior.covariance(self.grid)))
+        informed = self.sums.informed(L)
+        M = np.zeros(L.shape)
+        for start in range(0, len(L), COLUMNS):
+            M[start : start + COLUMNS, start:] = (
+                L[:, start : start + COLUMNS].T @ informed[:, start:]
+            )
+        M[np.diag_indices_from(M)] += 1.0
+        # R^T = K^-1 L^T with K K^T = M
+        root = divided(cholesky(M), np.asfortranarray(L.T)).T
+        # the prior's factor has rounding errors of 1e-16 of its size in the polynomial space
+        return self.grid.without_polynomials(root)
 
     @property
     def sigma(self) -> Float:
@@ -36,12 +89,6 @@ class AxisField:
     def cov(self) -> Float:
         """Covariance (n, n), square pixels."""
         return self.root @ self.root.T
-
-    @property
-    def n_effective(self) -> float:
-        """Number of parameters, nodes and polynomial, that the stars determine."""
-        nodes = float((self.sums.informed(self.root) * self.root).sum())
-        return len(self.sums.polynomial) + nodes
 
     def gain(self, rows: Float) -> Float:
         """Part of an error beneath this table that it absorbs: rows (N, n) times S A, (N, n)."""
@@ -56,11 +103,11 @@ class TablePosterior:
 
     Parameters
     ----------
-    table : LookupTable
-        Posterior means, with the standard error of each node.
     grid : NodeGrid
     axes : tuple of AxisField
         Of the x and of the y plane.
+    filter : str
+        The table's filter; '' for the detector's own.
     jitter : float
         Error of the stars beyond the quoted ones, pixels.
     jitter_sigma : float
@@ -69,12 +116,23 @@ class TablePosterior:
         Number of stars, each counted by its weight.
     """
 
-    table: LookupTable
     grid: NodeGrid
     axes: tuple[AxisField, AxisField]
+    filter: str
     jitter: float
     jitter_sigma: float
     n_stars: float
+
+    @property
+    def means(self) -> LookupTable:
+        """Table of the posterior means, without their errors, which take time."""
+        return self.grid.table(np.stack([axis.mean for axis in self.axes]), filter=self.filter)
+
+    @cached_property
+    def table(self) -> LookupTable:
+        """Table of the posterior means, with the standard error of each node."""
+        sigma = np.stack(at_once(lambda axis: axis.sigma, self.axes))
+        return replace(self.means, sigma=sigma.reshape(2, *self.grid.shape))
 
     @property
     def priors(self) -> tuple[Matern, Matern]:
@@ -131,22 +189,3 @@ class TablePosterior:
         if refitted:
             out -= self.grid.basis.evaluate(x, y) @ self.axes[axis].sums.absorbed
         return out
-
-
-def axis_posterior(grid: NodeGrid, sums: NodeSums, field: FittedField) -> AxisField:
-    """Posterior of the node values of one axis at given hyperparameters.
-
-    With d = L z, z ~ N(0, 1) and L the polynomial-free part of the Cholesky factor of the prior,
-    the precision of z is 1 + L^T A L: never singular, whatever bins are empty.
-    """
-    L = grid.without_polynomials(cholesky(field.prior.covariance(grid)))
-    informed = sums.informed(L)
-    M = np.zeros_like(L)
-    for start in range(0, len(L), COLUMNS):
-        M[start : start + COLUMNS, start:] = L[:, start : start + COLUMNS].T @ informed[:, start:]
-    M[np.diag_indices_from(M)] += 1.0
-    # R^T = K^-1 L^T with K K^T = M
-    root = scipy.linalg.blas.dtrsm(1.0, cholesky(M), L.T, lower=1, overwrite_b=1).T
-    # the prior's factor has rounding errors of 1e-16 of its size in the polynomial space
-    root = grid.without_polynomials(root)
-    return AxisField(root @ (root.T @ sums.marginal_right), root, field, sums)

@@ -32,9 +32,9 @@ class Iteration:
     false_fraction: float  # of the matches
 
 
-def table_of(table: LookupTable | TablePosterior) -> LookupTable:
-    """The table, of a posterior its means."""
-    return table.table if isinstance(table, TablePosterior) else table
+def shifts_of(table: LookupTable | TablePosterior) -> LookupTable:
+    """The table, of a posterior its means without their errors."""
+    return table.means if isinstance(table, TablePosterior) else table
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,7 +70,8 @@ class TableFit:
     @property
     def tables(self) -> tuple[LookupTable, ...]:
         """All tables, the detector's first."""
-        return tuple(table_of(one) for one in (*self.beneath, *self.fitted))
+        every = (*self.beneath, *self.fitted)
+        return tuple(one.table if isinstance(one, TablePosterior) else one for one in every)
 
     @property
     def posteriors(self) -> tuple[TablePosterior, ...]:
@@ -90,7 +91,8 @@ class TableFit:
         Matches
             The few that are moved off their chip are left out, and counted in `rejected`.
         """
-        return on_the_chips(corrected_matches(self.tables, matches), self.solution.model)
+        tables = [shifts_of(one) for one in (*self.beneath, *self.fitted)]
+        return on_the_chips(corrected_matches(tables, matches), self.solution.model)
 
     def shift_variance(self, x: ArrayLike, y: ArrayLike, *, chip: int) -> Float:
         """Variance of the tables' shift, less what the polynomial follows.
@@ -129,19 +131,19 @@ class TableFit:
                 "binned tables know no covariance of their nodes", do="choose method 'field'"
             )
         for posterior in self.posteriors:
-            if posterior.table.chip == chip:
+            if posterior.grid.chip.number == chip:
                 return posterior
         raise InputError(
             f"there is no table for chip {chip}",
-            do=f"there are those for {', '.join(str(p.table.chip) for p in self.posteriors)}",
+            do=f"there are those for {', '.join(str(p.grid.chip.number) for p in self.posteriors)}",
         )
 
     def _variance(self, own: TablePosterior, x: Float, y: Float, chip: int) -> Float:
         """Variance (N, 2) of the tables' shift where the polynomial follows, square pixels."""
-        lower = next((one for one in self.beneath if table_of(one).chip == chip), None)
+        lower = next((one for one in self.beneath if shifts_of(one).chip == chip), None)
         if lower is None:
             return own.position_sigma(x, y, refitted=True) ** 2
-        px, py = corrected([table_of(lower)], x, y, chip=chip)
+        px, py = corrected([shifts_of(lower)], x, y, chip=chip)
         if not isinstance(lower, TablePosterior):
             own_variance = own.position_sigma(px, py, refitted=True) ** 2
             return own_variance + held_sigma([lower], x, y, chip=chip) ** 2

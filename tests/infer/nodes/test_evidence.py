@@ -14,6 +14,7 @@ from tests.infer.nodes.support import (
     STEP,
     bilinear,
     grid,
+    joint_solution,
     matern_covariance,
     node_pixels,
     pattern,
@@ -54,6 +55,11 @@ def reml(x, y, r, variance, prior: Matern) -> float:
     )
 
 
+def log_prior(prior: Matern) -> float:
+    """Gamma-like in the amplitude, normal in the logarithm of the length about two steps."""
+    return 2 * np.log(prior.amplitude) - 0.5 * np.log(prior.length / (2 * STEP[0])) ** 2
+
+
 @pytest.mark.parametrize("nu", SMOOTHNESS)
 def test_covariance_is_the_general_formula(nu):
     prior = Matern(0.1, 80.0, nu)
@@ -71,9 +77,34 @@ def test_log_likelihood_is_that_of_the_stars(rng, hole):
     x, y, r, variance = data
     priors = [Matern(0.08, 70, 1.5), Matern(0.05, 70, 1.5), Matern(0.1, 40, 0.5), PATTERN]
     priors.append(Matern(0.03, 150, 2.5))
-    want = np.array([reml(x, y, r[:, 0], variance, p) for p in priors])
-    got = np.array([evidence.log_likelihood(p) for p in priors])
+    want = np.array([reml(x, y, r[:, 0], variance, p) + log_prior(p) for p in priors])
+    got = np.array([evidence.at(p).log_evidence for p in priors])
     np.testing.assert_allclose(np.diff(got), np.diff(want), atol=2e-3, rtol=1e-6)
+
+
+@pytest.mark.parametrize("nu", SMOOTHNESS)
+@pytest.mark.parametrize("part", ["at", "at_tiles"])
+def test_slopes_are_those_of_the_density(rng, nu, part):
+    """By differences."""
+    density = getattr(evidence_of(*stars(rng, 5000, hole=True)), part)
+    point, h = np.log([0.06, 60.0]), 1e-4
+    here = density(Matern(*np.exp(point), nu))
+    ends = [[density(Matern(*np.exp(point + s * e), nu)) for s in (h, -h)] for e in np.eye(2)]
+    slope = [(up.log_evidence - down.log_evidence) / (2 * h) for up, down in ends]
+    np.testing.assert_allclose(here.slope, slope, rtol=1e-5, atol=1e-4)
+
+
+def test_the_field_is_that_of_the_stars(rng):
+    """Node values and their number, against the posterior by a solve over the nodes."""
+    x, y, r, variance = stars(rng, 3000)
+    found = evidence_of(x, y, r, variance).at(PATTERN)
+    joint = joint_solution(x, y, r, np.stack([variance] * 2, axis=1), [PATTERN] * 2)
+    mean, cov = joint.nodes
+    np.testing.assert_allclose(found.mean, mean[:, 0], atol=2e-7)
+    W = bilinear(x, y) / np.sqrt(variance)[:, None]
+    phi = legendre_design(3, x, y, size=SIZE) / np.sqrt(variance)[:, None]
+    W -= phi @ np.linalg.lstsq(phi, W, rcond=None)[0]
+    np.testing.assert_allclose(found.n_effective, np.trace(W.T @ W @ cov[0]), rtol=1e-5)
 
 
 def test_hyperparameters_come_back(rng):
@@ -115,8 +146,7 @@ def test_search_ends_at_the_top(rng):
     found = fitted_field(evidence, (1.5,), thorough=True)
 
     def density(point) -> float:
-        prior = Matern(*np.exp(point), 1.5)
-        return evidence.log_likelihood(prior) + evidence.log_prior(prior)
+        return evidence.at(Matern(*np.exp(point), 1.5)).log_evidence
 
     top = np.log([found.prior.amplitude, found.prior.length])
     root = np.linalg.cholesky(found.covariance)

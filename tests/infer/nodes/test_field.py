@@ -99,7 +99,7 @@ def test_what_it_takes_up_of_an_error_beneath(small, rng):
     """A table beneath that is wrong by e changes this one's mean by minus S A e: measured."""
     x, y, r, variance, got = small
     wrong = 0.05 * pattern(rng)
-    moved = table_of(x, y, r - bilinear(x, y) @ wrong, variance, earlier=got, hold=True)
+    moved = table_of(x, y, r - bilinear(x, y) @ wrong, variance, earlier=got, search="none")
     px, py = places(rng, 50)
     for a, axis in enumerate(got.axes):
         rows = got.rows(px, py, a)
@@ -158,7 +158,7 @@ def test_a_table_by_tiles_is_nearly_that_of_the_whole_chip(rng):
     d = pattern(rng, Matern(0.05, 120.0, 1.5))
     x, y = places(rng, 20_000)
     r, variance = measured(rng, x, y, d)
-    whole, tiles = (table_of(x, y, r, variance, thorough=k) for k in (True, False))
+    whole, tiles = (table_of(x, y, r, variance, search=k) for k in ("chip", "tiles"))
     off = (tiles.table.values - whole.table.values) / whole.table.sigma
     assert 0 < np.abs(off).max() < 0.5 and off.std() < 0.1
 
@@ -249,7 +249,7 @@ def test_an_earlier_table_is_where_the_search_begins(small, rng):
         now, before = (np.log([p.field.prior.amplitude, p.field.prior.length]) for p in (a, b))
         assert (np.abs(now - before) < 0.3 * np.sqrt(np.diag(b.field.covariance))).all()
         assert a.field.prior != c.field.prior
-    held = table_of(x, y, r, variance, earlier=other, hold=True)
+    held = table_of(x, y, r, variance, earlier=other, search="none")
     assert held.priors == other.priors
     assert abs(held.jitter - got.jitter) < got.jitter_sigma
 
@@ -260,7 +260,7 @@ def test_wrong_input_is_named(rng):
     with pytest.raises(InputError, match=r"no field of smoothness \[1.0\]"):
         table_of(x, y, r, variance, smoothness=(1.0,))
     with pytest.raises(InputError, match="no hyperparameters to hold"):
-        table_of(x, y, r, variance, hold=True)
+        table_of(x, y, r, variance, search="none")
     with pytest.raises(InputError, match="no smoothness"):
         table_of(x, y, r, variance, smoothness=())
     with pytest.raises(InputError, match=r"'variance' has shape \(500,\)"):

@@ -92,7 +92,7 @@ def fit_tables(matched: CampaignMatched) -> tuple[StoredLookupTables, TableFit |
         between = measured_between(pairs, fit, held, filter=filter, fitted=False)
         of_nodes = _on_the_grid(held, fit, "", grid, partial(_held_variance, held))
         return _stored(held, of_nodes, between), None
-    pairs = _with_errors(matched, held)
+    pairs, rough = _with_errors(matched, held)
     found = fit_with_tables(
         pairs,
         model,
@@ -101,6 +101,7 @@ def fit_tables(matched: CampaignMatched) -> tuple[StoredLookupTables, TableFit |
         method=block.method,
         step=block.step,
         max_iterations=block.max_iterations,
+        start=rough,
         report=_log_iteration,
     )
     known = bool(found.posteriors)
@@ -127,8 +128,10 @@ def scatter_by_magnitude(
     return fit, scattered, errors
 
 
-def _with_errors(matched: CampaignMatched, held: tuple[LookupTable, ...]) -> Matches:
-    """Pairs with errors by magnitude, free of the pattern that the tables are to describe.
+def _with_errors(
+    matched: CampaignMatched, held: tuple[LookupTable, ...]
+) -> tuple[Matches, TableFit]:
+    """Pairs with errors by magnitude, free of the pattern that tables are to describe; rough ones.
 
     The scatter of the residuals before any table is twice that of the stars: with errors from
     there the tables would be smoothed too much, and their own errors twice too large.  How smooth
@@ -145,10 +148,10 @@ def _with_errors(matched: CampaignMatched, held: tuple[LookupTable, ...]) -> Mat
         method=block.method,
         step=block.step,
         max_iterations=ROUGH_ITERATIONS,
-        thorough=False,
+        report=_log_iteration,
     )
     _, _, errors = scatter_by_magnitude(rough.corrected(pairs), model, inputs)
-    return pairs.with_errors(errors)
+    return pairs.with_errors(errors), rough
 
 
 def _stored(

@@ -1,0 +1,56 @@
+"""Factors of large symmetric matrices, in place, while other threads work.
+
+The routines are those of SciPy's LAPACK and BLAS.  SciPy's own wrappers hold Python's lock while
+they run: two threads would take turns.  Calls by ctypes release it.
+"""
+
+from __future__ import annotations
+
+import ctypes
+from typing import Any
+
+import numpy as np
+from numba.extending import get_cython_function_address
+
+from bayesdist.utils.arrays import Float
+
+
+def _routine(module: str, name: str, n_arguments: int) -> Any:
+    address = get_cython_function_address(f"scipy.linalg.{module}", name)
+    return ctypes.CFUNCTYPE(None, *[ctypes.c_void_p] * n_arguments)(address)
+
+
+_POTRF, _POTRI = (_routine("cython_lapack", name, 5) for name in ("dpotrf", "dpotri"))
+_TRSM = _routine("cython_blas", "dtrsm", 11)
+
+
+def cholesky(matrix: Float) -> Float:
+    """Lower factor (n, n) of a symmetric matrix, which is overwritten: a C array of float64."""
+    n, info = ctypes.c_int(len(matrix)), ctypes.c_int()
+    # the transpose of a C array has the order of LAPACK, and the matrix is symmetric
+    _POTRF(b"L", _at(n), matrix.ctypes.data, _at(n), _at(info))
+    if info.value:
+        raise np.linalg.LinAlgError("the matrix is not positive definite")
+    for k, row in enumerate(matrix):
+        row[:k] = 0.0
+    return matrix.T
+
+
+def inverse_of(factor: Float) -> Float:
+    """Lower triangle (n, n), and zeros, of (L L^T)^-1; L, from `cholesky`, is overwritten."""
+    n, info = ctypes.c_int(len(factor)), ctypes.c_int()
+    _POTRI(b"L", _at(n), factor.ctypes.data, _at(n), _at(info))
+    return factor
+
+
+def divided(factor: Float, values: Float) -> Float:
+    """L^-1 times values (n, n), which are overwritten; both in the order of Fortran."""
+    n, one = ctypes.c_int(len(factor)), ctypes.c_double(1.0)
+    sides = (b"L", b"L", b"N", b"N")
+    at = (factor.ctypes.data, _at(n), values.ctypes.data, _at(n))
+    _TRSM(*sides, _at(n), _at(n), _at(one), *at)
+    return values
+
+
+def _at(value: Any) -> Any:
+    return ctypes.addressof(value)
