@@ -53,18 +53,24 @@ def _scratch(n):
 
 
 @nb.njit(cache=True)
+def _copy(column, row):
+    n = len(column)
+    for s in range(n):
+        row[s] = column[s]
+    for s in range(n, BLOCK):
+        row[s] = 1.0
+
+
+@nb.njit(cache=True)
 def lay_out(columns, first, end, rows):
     """Copy X, Y, u, v, var_u, var_v of some stars to rows of `scratch`, and ones behind them."""
     X, Y, u, v, var_u, var_v = columns[:6]
-    for s in range(BLOCK):
-        i = first + s
-        inside = i < end
-        rows[0, s] = X[i] if inside else 1.0
-        rows[1, s] = Y[i] if inside else 1.0
-        rows[2, s] = u[i] if inside else 1.0
-        rows[3, s] = v[i] if inside else 1.0
-        rows[4, s] = var_u[i] if inside else 1.0
-        rows[5, s] = var_v[i] if inside else 1.0
+    _copy(X[first:end], rows[0])
+    _copy(Y[first:end], rows[1])
+    _copy(u[first:end], rows[2])
+    _copy(v[first:end], rows[3])
+    _copy(var_u[first:end], rows[4])
+    _copy(var_v[first:end], rows[5])
 
 
 def share_out(loop: Callable[..., None], n: int, *arguments: Any) -> None:

@@ -78,6 +78,13 @@ def product_table(order: int) -> Float:
     return one[np.ix_(i, i, mi)] * one[np.ix_(j, j, mj)]
 
 
+def _matrices(moments: Float, order: int) -> Float:
+    """Sums of w phi phi^T (G, c, K, K) from the moments (G, c, M) of the weights."""
+    table = product_table(order)
+    matrices = moments @ table.reshape(-1, table.shape[-1]).T
+    return np.asarray(matrices.reshape(*moments.shape[:2], *table.shape[:2]))
+
+
 # Sums of three rows with as many Legendre functions as the registers hold: one function a number.
 _ONE, _TWO, _THREE, _FOUR, _FIVE, _SIX = (tile(n, BLOCK) for n in range(1, 7))
 
@@ -160,7 +167,6 @@ def _least_squares(start, stop, pieces, columns, coef, order, rules, sums, scala
             e = min(a + BLOCK, end)
             n = e - a
             lay_out(columns, a, e, stars)
-            legendre(stars[0], stars[1], n, 2 * order, P, Q)
             evaluate(coef[g, :2], order, stars[0], stars[1], n, about)
             evaluate(coef[g, 2:], order, stars[0], stars[1], n, test)
             for s in range(0, n, WIDTH):
@@ -185,6 +191,7 @@ def _least_squares(start, stop, pieces, columns, coef, order, rules, sums, scala
                 left_out += (there - used) * (ru * ru + rv * rv)
                 weighted_chi2 += wu * ru * ru + wv * rv * rv
                 u_sum, v_sum = u_sum + used * ru, v_sum + used * rv
+            legendre(stars[0], stars[1], n, 2 * order, P, Q)
             add_columns(weighted, n, P, Q, lanes)
         write_columns(lanes, sums[b])
         scalars[b, 0] = total(used_sum)
@@ -216,7 +223,6 @@ def _mixture(start, stop, pieces, columns, coef, order, row, unit2, em, sums, sc
             e = min(a + BLOCK, end)
             n = e - a
             lay_out(columns, a, e, stars)
-            legendre(stars[0], stars[1], n, 2 * order, P, Q)
             evaluate(coef[g], order, stars[0], stars[1], n, model)
             density[:] = 1.0
             for s in range(0, n, WIDTH):
@@ -268,6 +274,7 @@ def _mixture(start, stop, pieces, columns, coef, order, row, unit2, em, sums, sc
                 js, pp, fs = js - pq * D_j * D_s, pp + pq, fs + pq * D_s
                 ss += 2.0 * p * r2 * w - pq * D_s * D_s
             logs += log_of_product(density) - n * log_unit
+            legendre(stars[0], stars[1], n, 2 * order, P, Q)
             add_columns(weighted, n, P, Q, lanes)
         write_columns(lanes, sums[b])
         scalars[b, 0] = logs - total(low)
@@ -291,7 +298,7 @@ def empty_sums(n_pieces: int, order: int, columns: int, scalars: int) -> tuple[F
 
 def _by_group(sums: Float, pieces: Int) -> Float:
     """Moments (G, columns, M) of each group from those of its consecutive pieces."""
-    first = np.flatnonzero(np.diff(pieces[:, 0], prepend=-1))
+    _, first = np.unique(pieces[:, 0], return_index=True)
     return np.asarray(np.add.reduceat(sums, first, axis=0))
 
 
@@ -336,7 +343,7 @@ def least_squares_moments(
         )
     total = _by_group(sums, pieces)
     weight = np.zeros((len(about), 3, K, K))
-    weight[:, 0::2] = np.einsum("gcm,klm->gckl", total[:, :2], product_table(order), optimize=True)
+    weight[:, 0::2] = _matrices(total[:, :2], order)
     right = total[:, 3:5, :K].copy()
     return Moments(weight, right, np.zeros((len(about), N_HYPER, 2, K)), scalars.sum(axis=0))
 
@@ -382,7 +389,7 @@ def mixture_moments(
 def mixture_sums(total: Float, scalars: Float, order: int, em: bool) -> Moments:
     """Moments of a mixture from sums (G, COLUMNS, M) over the stars of each group."""
     K = (order + 1) * (order + 2) // 2
-    weight = np.einsum("gcm,klm->gckl", total[:, :3], product_table(order), optimize=True)
+    weight = _matrices(total[:, :3], order)
     cross = total[:, 5:11, :K].reshape(len(total), N_HYPER, 2, K).copy()
     if em:
         cross[:] = 0.0
