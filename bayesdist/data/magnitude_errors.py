@@ -7,8 +7,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.interpolate import PchipInterpolator
-from scipy.optimize import isotonic_regression
 
 from bayesdist.errors import InputError
 from bayesdist.utils.arrays import Float, Int
@@ -62,6 +60,8 @@ class MagnitudeErrors:
         inside = np.clip(np.asarray(mag, float), self.mag[0], self.mag[-1])
         if len(self.mag) == 1:
             return np.full(inside.shape, self.sigma_u[0]), np.full(inside.shape, self.sigma_v[0])
+        from scipy.interpolate import PchipInterpolator  # a fifth of a second
+
         u, v = (
             np.exp(PchipInterpolator(self.mag, np.log(sigma))(inside))
             for sigma in (self.sigma_u, self.sigma_v)
@@ -193,6 +193,8 @@ def _with_lost_freedom(scatter: Float, n: Int, n_params: int) -> Float:
 
 def _smoothed(log_sigma: Float, n: Int) -> Float:
     """Isotonic regression, or falling then rising where chi-square is clearly better."""
+    from scipy.optimize import isotonic_regression
+
     weights = n / _LOG_VARIANCE
 
     def chi2(curve: Float) -> float:

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import astropy.units as apu
 import numpy as np
 
 from bayesdist.errors import InputError
+
+if TYPE_CHECKING:
+    import astropy.units as apu
 
 UNITS = ("pix", "arcsec", "mas", "deg")
 
@@ -35,6 +37,8 @@ def check_unit(unit: str, *, where: str = "unit") -> str:
 
 def length_advice(unit: str) -> str:
     """Advice on positions in a length, as millimetres of a focal plane; empty for other units."""
+    import astropy.units as apu  # a tenth of a second, as wherever it is used here
+
     parsed = apu.Unit(unit.strip(), parse_strict="silent")
     if parsed.physical_type != "length":
         return ""
@@ -52,6 +56,8 @@ def unit_of(column: Any, *, where: str) -> apu.UnitBase | None:
     text = _SPELLINGS.get(str(unit).strip().lower(), str(unit).strip())
     if not text:
         return None
+    import astropy.units as apu
+
     parsed = apu.Unit(text, parse_strict="silent")
     if isinstance(parsed, apu.UnrecognizedUnit):
         raise InputError(
@@ -62,6 +68,8 @@ def unit_of(column: Any, *, where: str) -> apu.UnitBase | None:
 
 def conversion(unit: apu.UnitBase | str, to: str, *, where: str) -> float:
     """Factor from values of `unit` to those of `to`; units of different quantities are refused."""
+    import astropy.units as apu
+
     try:
         return float(apu.Unit(unit).to(apu.Unit(to)))
     except apu.UnitConversionError:
