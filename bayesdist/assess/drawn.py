@@ -34,6 +34,7 @@ from bayesdist.utils.arrays import Float
 
 ROWS = 16  # draws whose noise comes from one generator: so that blocks do not change it
 BLOCK = 60_000  # positions times draws whose errors a thread holds at once: in its cache
+EPOCHS = 8  # whose polynomials are in memory at once
 MOST_PAIRS = 5000  # pairs of positions that stand for all: percentiles over them to about 1 %
 
 
@@ -129,10 +130,9 @@ class DrawnErrors:
         positions that near, a magnitude where no errors by magnitude are known, and a missing
         epoch.
         """
-        (found,) = self.over_epochs(domain, (domain.epoch,), names, scale=scale, n_draws=n_draws)
+        (found,) = self._together(domain, (domain.epoch,), names, scale, n_draws)
         return found
 
-    @one_thread  # of each thread that it starts
     def over_epochs(
         self,
         domain: EvaluationDomain,
@@ -147,6 +147,22 @@ class DrawnErrors:
         `epochs`: decimal years. `names`, `scale`, `n_draws`: as `statistics`. Returns (n_draws,),
         one for each epoch.
         """
+        found: list[dict[str, Float]] = []
+        for k in range(0, len(epochs), EPOCHS):
+            some = replace(self, _cache={})  # errors at so many epochs are not kept
+            found += some._together(domain, epochs[k : k + EPOCHS], names, scale, n_draws)
+        return tuple(found)
+
+    @one_thread  # of each thread that it starts
+    def _together(
+        self,
+        domain: EvaluationDomain,
+        epochs: Sequence[float | None],
+        names: Sequence[str],
+        scale: Mapping[str, float] | None,
+        n_draws: int | None,
+    ) -> tuple[dict[str, Float], ...]:
+        """Statistics at a few epochs, for all of which the noise is drawn once."""
         pairs = domain.pairs()
         if pairs is not None and pairs.shape[1] > MOST_PAIRS:
             rng = np.random.default_rng(self.seed)
