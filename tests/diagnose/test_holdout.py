@@ -34,7 +34,7 @@ from bayesdist.utils.limits import HELD_OUT_DOUBTFUL
 from tests.reduced import case_in_full, only_in_full
 
 SIZE = (1000.0, 800.0)
-RUNS = 200 if os.environ.get("BAYESDIST_FULL") else 20
+RUNS = 200 if os.environ.get("BAYESDIST_FULL") else 12
 F, SIGMA, FAR = 0.05, 0.02, 0.4
 
 

@@ -57,7 +57,7 @@ def monitored(release, matches, mixture=EXACT, **options):
     ],
 )
 def test_without_a_change_p_is_uniform(frames, time, dof, full) -> None:
-    n = 200 if full else 15
+    n = 200 if full else 10
     values, scatters, since = [], [], []
     for seed in range(n):
         _, change, date = monitored(*pair(seed, frames=frames, time=time))

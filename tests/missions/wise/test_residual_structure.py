@@ -118,12 +118,12 @@ def test_a_wave_is_seen_as_far_as_it_keeps_its_phase():
     assert 0.28 * length < c.reach < 0.42 * length
 
 
-# reduced, each number of blocks with tilts or without
+# reduced, each number of blocks once, with tilts or without
 @pytest.mark.parametrize(
     ("n", "k", "tilts"),
     [
         (n, k, tilts)
-        if tilts == bool(number % 2)
+        if tilts == bool(number % 2) and (n, k) != (45, 5)
         else case_in_full(n, k, tilts, instead="other numbers of blocks are run like this")
         for number, (n, k) in enumerate([(31, 5), (45, 5), (45, 9), (31, 2), (24, 3)])
         for tilts in (False, True)
