@@ -19,7 +19,7 @@ from bayesdist.version import __version__
 _LONGEST = 1000  # letters of a sentence
 # objects between collections of garbage: imports make half a million that stay, and looking at
 # them again and again takes a tenth of a small run
-SELDOM = 100_000, 50, 100
+SELDOM = 50_000, 20, 100
 # a command has threads of its own on all cores: those of linear algebra would only wait beside them
 ALGEBRA = "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "BLIS_NUM_THREADS"
 COMMANDS = "bayesdist.app.commands"
