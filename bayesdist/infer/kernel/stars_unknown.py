@@ -82,7 +82,7 @@ def weighted_stars(
 @nb.njit(**PASS)
 def _log_marginals(
     start, stop, first, last, starts, group, X, Y, offset, W, var, time, factor, centre, precision,
-    stars, middles, share, state, coef, order, rows, least, sums,
+    stars, middles, response, state, coef, order, rows, least, sums,
 ):  # fmt: skip
     q, K, n_draws = stars.shape[1], coef.shape[2], len(rows)
     step = -(-(last - first) // PIECES)
@@ -104,8 +104,11 @@ def _log_marginals(
                 legendre(X[i], Y[i], order, px, py, phi)
                 for axis in range(2):
                     _add_products(coef[group[i], axis], phi, offset[i, axis], at[axis, i - a])
+                u, v = at[0, i - a], at[1, i - a]
+                for axis in range(2):
+                    by_u, by_v = response[i, axis, 0], response[i, axis, 1]
                     for d in range(n_draws):
-                        mean[axis, d] += share[i] * at[axis, i - a, d]
+                        mean[axis, d] += by_u * u[d] + by_v * v[d]
             for d in range(n_draws):
                 for i in range(e - a):
                     own[PLACE_U, i], own[PLACE_V, i] = at[0, i, d], at[1, i, d]
@@ -128,7 +131,8 @@ def _log_marginals(
 
 def log_marginals(
     first: int, last: int, detections: tuple[Any, ...], stars: Float,
-    middles: Float, share: Float, state: Flags, coef: Float, order: int, rows: Float, least: float,
+    middles: Float, response: Float, state: Flags, coef: Float, order: int, rows: Float,
+    least: float,
 ) -> Float:  # fmt: skip
     """Log densities (PIECES, D) of stars first..last, their parameters integrated out (Laplace).
 
@@ -136,15 +140,15 @@ def log_marginals(
     Summed over all choices of members where some are doubtful: state (N,), as of
     `summed_over_members`.
 
-    middles (S, 2), share (N,): a star moves with the weighted mean of its detections, and lies at
-    `stars` where that mean is `middles`.
+    middles (S, 2), response (N, 2, 2): a star moves as its detections do, each times its response,
+    and lies at `stars` where the sum of these is `middles`.
     coef (G, 2, K, D): of the Legendre products, draws last: one detection takes them together.
     rows (D, 3): squared jitter, log of the core's fraction, log density of outliers.
     least: root of the least curvature that a star's position may have.
     """
     sums = np.zeros((PIECES, len(rows)))
     share_out(
-        _log_marginals, PIECES, first, last, *detections, stars, middles, share, state, coef,
+        _log_marginals, PIECES, first, last, *detections, stars, middles, response, state, coef,
         order, rows, least, sums,
     )  # fmt: skip
     return sums
