@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bayesdist.infer.kernel.blocks import PASS, share_out
-from bayesdist.infer.kernel.lanes import FAST
+from bayesdist.infer.kernel.lanes import FAST, WIDTH, load, put
 from bayesdist.infer.kernel.sky_places import legendre
 from bayesdist.infer.kernel.star_modes import (
     DOUBTFUL,
@@ -95,16 +95,15 @@ def _log_marginals(
             own = own_rows(W, var, a, e)
             when = time[a:e] if q >= 4 else time
             where = factor[a:e] if q == 5 else factor
-            at = np.empty((2, e - a, n_draws))
+            at = np.empty((2, e - a, coef.shape[3]))
             several = False
             for i in range(a, e):
                 several |= state[i] == DOUBTFUL
             mean[:] = 0.0
             for i in range(a, e):
                 legendre(X[i], Y[i], order, px, py, phi)
-                for axis in range(2):
-                    _add_products(coef[group[i], axis], phi, offset[i, axis], at[axis, i - a])
                 u, v = at[0, i - a], at[1, i - a]
+                _place(coef[group[i]], phi, offset[i], u, v)
                 for axis in range(2):
                     by_u, by_v = response[i, axis, 0], response[i, axis, 1]
                     for d in range(n_draws):
@@ -147,24 +146,27 @@ def log_marginals(
     least: root of the least curvature that a star's position may have.
     """
     sums = np.zeros((PIECES, len(rows)))
+    in_vectors = np.zeros((*coef.shape[:-1], -(-len(rows) // WIDTH) * WIDTH))
+    in_vectors[..., : len(rows)] = coef
     share_out(
-        _log_marginals, PIECES, first, last, *detections, stars, middles, response, state, coef,
-        order, rows, least, sums,
+        _log_marginals, PIECES, first, last, *detections, stars, middles, response, state,
+        in_vectors, order, rows, least, sums,
     )  # fmt: skip
     return sums
 
 
 @nb.njit(cache=True, forceinline=True, fastmath=FAST)
-def _add_products(coef, phi, start, out):
-    """start + sum of phi_k coef_k, for all draws (D,) at a time."""
-    for d in range(len(out)):
-        out[d] = start + phi[0] * coef[0, d]
-    for k in range(1, len(phi) - 1, 2):  # two at a time: half as often to memory and back
-        for d in range(len(out)):
-            out[d] += phi[k] * coef[k, d] + phi[k + 1] * coef[k + 1, d]
-    if len(phi) % 2 == 0:
-        for d in range(len(out)):
-            out[d] += phi[-1] * coef[-1, d]
+def _place(coef, phi, offset, u, v):
+    """Write offset + sum of phi_k coef_k, for all draws, to u and v: coefficients (2, K, D)."""
+    of_u, of_v = coef[0], coef[1]
+    for d in range(0, len(u), WIDTH):
+        at_u = load(of_u[0], d) * phi[0] + offset[0]
+        at_v = load(of_v[0], d) * phi[0] + offset[1]
+        for k in range(1, len(phi)):
+            at_u = at_u + load(of_u[k], d) * phi[k]
+            at_v = at_v + load(of_v[k], d) * phi[k]
+        put(u, d, at_u)
+        put(v, d, at_v)
 
 
 @nb.njit(cache=True, forceinline=True, fastmath=FAST | {"reassoc"})

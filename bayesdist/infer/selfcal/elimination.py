@@ -272,7 +272,7 @@ def log_marginal(problem: Problem, theta: Float, mixtures: Float, modes: StarMod
     step = max(8, SCRATCH // (16 * p.model.n_terms * len(p.groups)) // 8 * 8)
     for a in range(0, len(theta), step):
         some = slice(a, a + step)
-        coefficients = np.ascontiguousarray(np.moveaxis(p.effective(theta[some]), 0, -1))
+        coefficients = np.moveaxis(p.effective(theta[some]), 0, -1)
         with threads_for(MODE * len(p) * len(theta[some])):
             sums = kernel.log_marginals(
                 0,
