@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bayesdist.infer.kernel.blocks import PASS, share_out
-from bayesdist.infer.kernel.lanes import FAST
+from bayesdist.infer.kernel.lanes import FAST, WIDTH, load, put
 from bayesdist.infer.kernel.sky_places import legendre
 from bayesdist.infer.kernel.star_modes import (
     DOUBTFUL,
@@ -82,7 +82,7 @@ def weighted_stars(
 @nb.njit(**PASS)
 def _log_marginals(
     start, stop, first, last, starts, group, X, Y, offset, W, var, time, factor, centre, precision,
-    stars, middles, share, state, coef, order, rows, least, sums,
+    stars, middles, response, state, coef, order, rows, least, sums,
 ):  # fmt: skip
     q, K, n_draws = stars.shape[1], coef.shape[2], len(rows)
     step = -(-(last - first) // PIECES)
@@ -95,17 +95,19 @@ def _log_marginals(
             own = own_rows(W, var, a, e)
             when = time[a:e] if q >= 4 else time
             where = factor[a:e] if q == 5 else factor
-            at = np.empty((2, e - a, n_draws))
+            at = np.empty((2, e - a, coef.shape[3]))
             several = False
             for i in range(a, e):
                 several |= state[i] == DOUBTFUL
             mean[:] = 0.0
             for i in range(a, e):
                 legendre(X[i], Y[i], order, px, py, phi)
+                u, v = at[0, i - a], at[1, i - a]
+                _place(coef[group[i]], phi, offset[i], u, v)
                 for axis in range(2):
-                    _add_products(coef[group[i], axis], phi, offset[i, axis], at[axis, i - a])
+                    by_u, by_v = response[i, axis, 0], response[i, axis, 1]
                     for d in range(n_draws):
-                        mean[axis, d] += share[i] * at[axis, i - a, d]
+                        mean[axis, d] += by_u * u[d] + by_v * v[d]
             for d in range(n_draws):
                 for i in range(e - a):
                     own[PLACE_U, i], own[PLACE_V, i] = at[0, i, d], at[1, i, d]
@@ -128,7 +130,8 @@ def _log_marginals(
 
 def log_marginals(
     first: int, last: int, detections: tuple[Any, ...], stars: Float,
-    middles: Float, share: Float, state: Flags, coef: Float, order: int, rows: Float, least: float,
+    middles: Float, response: Float, state: Flags, coef: Float, order: int, rows: Float,
+    least: float,
 ) -> Float:  # fmt: skip
     """Log densities (PIECES, D) of stars first..last, their parameters integrated out (Laplace).
 
@@ -136,31 +139,34 @@ def log_marginals(
     Summed over all choices of members where some are doubtful: state (N,), as of
     `summed_over_members`.
 
-    middles (S, 2), share (N,): a star moves with the weighted mean of its detections, and lies at
-    `stars` where that mean is `middles`.
+    middles (S, 2), response (N, 2, 2): a star moves as its detections do, each times its response,
+    and lies at `stars` where the sum of these is `middles`.
     coef (G, 2, K, D): of the Legendre products, draws last: one detection takes them together.
     rows (D, 3): squared jitter, log of the core's fraction, log density of outliers.
     least: root of the least curvature that a star's position may have.
     """
     sums = np.zeros((PIECES, len(rows)))
+    in_vectors = np.zeros((*coef.shape[:-1], -(-len(rows) // WIDTH) * WIDTH))
+    in_vectors[..., : len(rows)] = coef
     share_out(
-        _log_marginals, PIECES, first, last, *detections, stars, middles, share, state, coef,
-        order, rows, least, sums,
+        _log_marginals, PIECES, first, last, *detections, stars, middles, response, state,
+        in_vectors, order, rows, least, sums,
     )  # fmt: skip
     return sums
 
 
 @nb.njit(cache=True, forceinline=True, fastmath=FAST)
-def _add_products(coef, phi, start, out):
-    """start + sum of phi_k coef_k, for all draws (D,) at a time."""
-    for d in range(len(out)):
-        out[d] = start + phi[0] * coef[0, d]
-    for k in range(1, len(phi) - 1, 2):  # two at a time: half as often to memory and back
-        for d in range(len(out)):
-            out[d] += phi[k] * coef[k, d] + phi[k + 1] * coef[k + 1, d]
-    if len(phi) % 2 == 0:
-        for d in range(len(out)):
-            out[d] += phi[-1] * coef[-1, d]
+def _place(coef, phi, offset, u, v):
+    """Write offset + sum of phi_k coef_k, for all draws, to u and v: coefficients (2, K, D)."""
+    of_u, of_v = coef[0], coef[1]
+    for d in range(0, len(u), WIDTH):
+        at_u = load(of_u[0], d) * phi[0] + offset[0]
+        at_v = load(of_v[0], d) * phi[0] + offset[1]
+        for k in range(1, len(phi)):
+            at_u = at_u + load(of_u[k], d) * phi[k]
+            at_v = at_v + load(of_v[k], d) * phi[k]
+        put(u, d, at_u)
+        put(v, d, at_v)
 
 
 @nb.njit(cache=True, forceinline=True, fastmath=FAST | {"reassoc"})

@@ -187,8 +187,8 @@ class StarModes:
     """Modes of the stars at a solution, and their response to their detections from there."""
 
     stars: Float
-    weight: Float  # (N,) of each detection in the position of its star; they add to 1
-    middles: Float  # weighted mean positions (S, 2) of the detections at the solution
+    response: Float  # (N, 2, 2) of a star's position to its detections'; they add to 1
+    middles: Float  # mean positions (S, 2) of the detections at the solution, by these
     state: NDArray[np.int8]  # of each detection (N,): `kernel.MEMBER`, `DOUBTFUL` or `FALSE`
 
     @classmethod
@@ -196,23 +196,45 @@ class StarModes:
         """Modes of a problem at theta (D,), where `stars` are the modes."""
         p, z = problem, problem.places(theta)
         member = memberships(problem, theta, mixture, stars)
-        weight = member / (p.var + mixture.jitter**2) * (p.W[:, 0] + p.W[:, 2])
-        total = np.bincount(p.star, weight)
-        lost = total[p.star] <= 0  # a star without members stays in the middle
-        weight = np.where(lost, 1.0 / p.counts[p.star], weight / np.where(lost, 1.0, total[p.star]))
-        return cls(stars, weight, _means(p, weight, z), _states(p, member))
+        s2 = p.var + mixture.jitter**2
+        response = _response(p, _curvatures(p, z - p.star_places(stars), member, s2))
+        return cls(stars, response, _means(p, response, z), _states(p, member))
 
     def moved(self, problem: Problem, theta: Float) -> Float:
         """Stars (S, q), moved as their detections are by theta (D,): start of a search there."""
         out = self.stars.copy()
-        out[:, :2] += _means(problem, self.weight, problem.places(theta)) - self.middles
+        out[:, :2] += _means(problem, self.response, problem.places(theta)) - self.middles
         return out
 
 
-def _means(problem: Problem, weight: Float, places: Float) -> Float:
-    """Weighted mean positions (S, 2) of the detections of each star."""
-    means = [np.bincount(problem.star, weight * places[:, axis]) for axis in (0, 1)]
-    return np.stack(means, axis=1)
+def _curvatures(problem: Problem, residual: Float, member: Float, s2: Float) -> Float:
+    """Curvature uu, uv, vv (3, N) of each detection by the position of its star."""
+    (u, v), (uu, uv, vv) = residual.T, problem.W.T
+    along = np.sqrt(member * (1.0 - member)) / s2
+    gu, gv = along * (uu * u + uv * v), along * (uv * u + vv * v)
+    core = member / s2
+    return np.stack([core * uu - gu * gu, core * uv - gu * gv, core * vv - gv * gv])
+
+
+def _response(problem: Problem, curvature: Float) -> Float:
+    """Response (N, 2, 2) of a star to each of its detections: to their mean if it has no mode."""
+    star, counts = problem.star, problem.counts
+    uu, uv, vv = (np.bincount(star, one, minlength=len(counts)) for one in curvature)
+    det = uu * vv - uv * uv
+    lost = ~((det > 0) & (uu > 0))
+    uu, uv, vv = (np.where(lost, 0.0, one / np.where(lost, 1.0, det))[star] for one in (uu, uv, vv))
+    a, b, c = curvature
+    rows = [[vv * a - uv * b, vv * b - uv * c], [uu * b - uv * a, uu * c - uv * b]]
+    out = np.stack([np.stack(row, axis=1) for row in rows], axis=1)
+    out[lost[star]] = np.eye(2)
+    out[lost[star]] /= counts[star[lost[star]]][:, None, None]
+    return out
+
+
+def _means(problem: Problem, response: Float, places: Float) -> Float:
+    """Mean positions (S, 2) of the detections of each star, by their response (N, 2, 2)."""
+    moves = np.einsum("nab,nb->na", response, places)
+    return np.stack([np.bincount(problem.star, moves[:, axis]) for axis in (0, 1)], axis=1)
 
 
 def _states(problem: Problem, member: Float) -> NDArray[np.int8]:
@@ -250,7 +272,7 @@ def log_marginal(problem: Problem, theta: Float, mixtures: Float, modes: StarMod
     step = max(8, SCRATCH // (16 * p.model.n_terms * len(p.groups)) // 8 * 8)
     for a in range(0, len(theta), step):
         some = slice(a, a + step)
-        coefficients = np.ascontiguousarray(np.moveaxis(p.effective(theta[some]), 0, -1))
+        coefficients = np.moveaxis(p.effective(theta[some]), 0, -1)
         with threads_for(MODE * len(p) * len(theta[some])):
             sums = kernel.log_marginals(
                 0,
@@ -258,7 +280,7 @@ def log_marginal(problem: Problem, theta: Float, mixtures: Float, modes: StarMod
                 p.columns,
                 modes.stars,
                 modes.middles,
-                modes.weight,
+                modes.response,
                 modes.state,
                 coefficients,
                 p.model.order,

@@ -97,7 +97,7 @@ class ModePiece(StarPiece):
     def __sizeof__(self) -> int:
         """As `StarPiece`."""
         m = self.modes
-        return super().__sizeof__() + sum(c.nbytes for c in (m.weight, m.middles, m.state))
+        return super().__sizeof__() + sum(c.nbytes for c in (m.response, m.middles, m.state))
 
 
 def to_sample(piece: StarPiece, theta: Float, mixture: Mixture) -> ModePiece:
