@@ -13,7 +13,7 @@ import numba as nb
 from numba import types
 from numba.extending import intrinsic
 
-from bayesdist.infer.kernel.lanes import Lanes, larger
+from bayesdist.infer.kernel.lanes import HAS_512, Lanes, larger, near_inverse_root
 
 
 def _same_bits(element: Any) -> Any:
@@ -67,15 +67,31 @@ def exp_negative(x):
 
 
 @nb.njit(cache=True, forceinline=True, fastmath={"contract"})
+def _nearer(x, r):
+    """1 / sqrt(x) from r, whose relative error is raised to the fourth power."""
+    e = 1.0 - (x * r) * r
+    return r + r * (e * (0.5 + e * (0.375 + e * 0.3125)))
+
+
+if HAS_512:
+
+    @nb.njit(cache=True, forceinline=True)
+    def _near(x):
+        return near_inverse_root(x)
+
+else:
+
+    @nb.njit(cache=True, forceinline=True)
+    def _near(x):
+        # halving and negating the exponent is right to 3.5 %
+        return _nearer(x, from_bits(0x5FE6EB50C7B537A9 - (bits_of(x) >> 1)))
+
+
+@nb.njit(cache=True, forceinline=True)
 def inverse_root(x):
-    """1 / sqrt(x) for positive x in the normal range, within two units of the last digit.
+    """1 / sqrt(x) of lanes, positive in the normal range, within two units of the last digit.
 
     Division and root share one unit of the processor, which would be busy for longer than all the
     other arithmetic of a star.
     """
-    # halving and negating the exponent is right to 3.5 %, and each step raises that to the fourth
-    r = from_bits(0x5FE6EB50C7B537A9 - (bits_of(x) >> 1))
-    for _ in range(2):
-        e = 1.0 - (x * r) * r
-        r += r * (e * (0.5 + e * (0.375 + e * 0.3125)))
-    return r
+    return _nearer(x, _near(x))
