@@ -261,7 +261,8 @@ def test_smallest_is_found_nine_times_in_ten(case, full):
                 else [_is_found(case, k) for k in range(runs)])  # fmt: skip
     # the noise that it is computed from is itself an estimate: two per cent either way
     assert stats.binom.cdf(found, runs, 0.88) > 1e-3, found / runs
-    assert stats.binom.sf(found - 1, runs, 0.95) > 1e-3, found / runs
+    if full:  # all of a few may be found
+        assert stats.binom.sf(found - 1, runs, 0.95) > 1e-3, found / runs
 
 
 def _is_found(case: str, seed: int) -> bool:
@@ -275,7 +276,8 @@ def test_smallest_of_the_noise_is_found_nine_times_in_ten(full):
     found = sum(seeds.over(noise_is_found, [(k,) for k in range(runs)], lot=20) if full
                 else [noise_is_found(k) for k in range(runs)])  # fmt: skip
     assert stats.binom.cdf(found, runs, 0.88) > 1e-3, found / runs
-    assert stats.binom.sf(found - 1, runs, 0.96) > 1e-3, found / runs
+    if full:  # all of a few may be found
+        assert stats.binom.sf(found - 1, runs, 0.96) > 1e-3, found / runs
 
 
 def noise_is_found(seed: int) -> bool:

@@ -58,7 +58,7 @@ def base_of(facts: Mapping[str, Any], run: Path) -> Path:
 STAGES = {
     "match": Stage(),
     "fit": Stage(revision=3),
-    "sample": Stage(revision=2, checkpoints=("chain-*.h5",)),
+    "sample": Stage(revision=3, checkpoints=("chain-*.h5",)),
     "diagnose": Stage(revision=4),
     "evaluate": Stage(revision=3),
     "export": Stage(),

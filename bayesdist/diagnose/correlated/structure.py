@@ -173,7 +173,7 @@ def structure_posterior(
     higher_order: float,
     structure: float,
     pairs: Sequence[SharedVariance | None] = (None, None),
-    lengths: Float = LENGTHS,
+    lengths: Float | None = None,
 ) -> Structure:
     """Posterior of the coefficients of structure functions, of one part or two.
 
@@ -186,7 +186,8 @@ def structure_posterior(
     (m,) the gradient of the log-likelihood where they are zero, both with the part that the fit
     absorbs eliminated; `pairs` is the evidence of neighbouring stars.  `noise` is the typical error
     of one star, a few times which limits the amplitudes; `higher_order` and `structure` are prior
-    medians of the amplitudes, in the unit of the positions; `lengths` are those of the field.
+    medians of the amplitudes, in the unit of the positions; `lengths` of the field are `LENGTHS` by
+    default.
     """
     known = [_terms_first(*one) for one in zip(functions, information, score, strict=True)]
     amplitudes = AmplitudeGrid.of(
@@ -196,7 +197,7 @@ def structure_posterior(
         structure=structure,
     )
     by_length = list[tuple[float, list[_Sized], Float]]()
-    for length in lengths:
+    for length in LENGTHS if lengths is None else lengths:
         fields = [Field.of(some, length, S, s) for some, S, s in known]
         near = pairs[: len(known)]
         shared = [None if p is None else p.of_field(length) for p in near]

@@ -24,7 +24,12 @@ from bayesdist.diagnose.clusters import sums_over
 from bayesdist.diagnose.correlated.deviations import DeviationColumns, deviation_columns
 from bayesdist.diagnose.correlated.functions import StructureFunctions
 from bayesdist.diagnose.efficient import EfficientScore
-from bayesdist.diagnose.selfcal.scores import DetectionScores, inverse_roots, places_by_star
+from bayesdist.diagnose.selfcal.scores import (
+    UNKNOWN,
+    DetectionScores,
+    inverse_roots,
+    places_by_star,
+)
 from bayesdist.infer.equations.scaled import determined
 from bayesdist.infer.selfcal.elimination import PlaceDerivatives
 from bayesdist.infer.selfcal.mode import SelfCalibrationMode
@@ -227,7 +232,7 @@ def without_parameters(solution: SelfCalibrationMode, N: Float, score: Float) ->
     """
     D, prior = len(solution.theta), solution.prior
     free = np.ix_(solution.free, solution.free)
-    root = determined(N[free] + prior.precision[free])
+    root = determined(N[free] + prior.precision[free], UNKNOWN)
     covariance = np.zeros((D, D))
     covariance[free] = root @ root.T
     nuisance = score[:D] + prior.pull(solution.theta)

@@ -16,9 +16,8 @@ from bayesdist.infer.selfcal.problem import Problem
 from bayesdist.model.grid import cell_index
 from bayesdist.utils.arrays import Bool, Float, Int
 
-UNKNOWN = (
-    1e-10  # relative curvature below which a combination of a star's parameters is undetermined
-)
+# relative curvature below which a combination of parameters, or of a star's, is undetermined
+UNKNOWN = 1e-10
 
 
 @dataclass(frozen=True, eq=False)

@@ -123,14 +123,14 @@ def known_terms(cov: Float) -> Bool:
     return np.asarray(variance > 1e-20 * variance.max(initial=0.0))
 
 
-def determined(matrix: Float) -> Float:
+def determined(matrix: Float, rank: float = RANK) -> Float:
     """Root R (n, rank) of the inverse, R R^T, of a positive semidefinite matrix where it has one.
 
-    Eigenvalues at the level of rounding count as zero.
+    Eigenvalues below `rank` times the largest, at the level of rounding by default, count as zero.
     """
     diagonal = np.diag(matrix)
     known = diagonal > 0
     unit = np.where(known, 1.0 / np.sqrt(np.where(known, diagonal, 1.0)), 0.0)
     values, vectors = np.linalg.eigh(unit[:, None] * matrix * unit)
-    good = values > RANK * values.max(initial=1e-300)
+    good = values > rank * values.max(initial=1e-300)
     return np.asarray(unit[:, None] * vectors[:, good] / np.sqrt(values[good]))

@@ -48,7 +48,7 @@ def scratch(n):
 
 @overload(scratch)
 def _scratch(n):
-    """`scratch` for any n: as a function of numba it is compiled for each that a call writes."""
+    """`scratch` for any n; numba would compile it anew for each literal number of rows."""
     return scratch
 
 

@@ -13,9 +13,10 @@ import operator
 from collections.abc import Callable, Sequence
 from typing import Any
 
-from llvmlite import binding, ir
+from llvmlite import ir
 from numba import config, types
 from numba.core import cgutils, typing
+from numba.core.codegen import get_host_cpu_features
 from numba.core.typing.templates import AbstractTemplate, infer_global
 from numba.extending import intrinsic, lower_builtin, models, register_model
 
@@ -23,8 +24,7 @@ from numba.extending import intrinsic, lower_builtin, models, register_model
 FAST = {"contract", "nsz", "arcp"}
 FLAGS = tuple(sorted(FAST))
 
-_HOST = binding.get_host_cpu_features().flatten()
-_FEATURES = _HOST if config.CPU_FEATURES is None else config.CPU_FEATURES
+_FEATURES = get_host_cpu_features() if config.CPU_FEATURES is None else config.CPU_FEATURES
 HAS_512 = "+avx512f" in _FEATURES.split(",") and config.CPU_NAME is None
 WIDTH = 8 if HAS_512 else 4
 WIDE = 4 * WIDTH

@@ -26,7 +26,7 @@ _TRSM = _routine("cython_blas", "dtrsm", 11)
 
 def cholesky(matrix: Float) -> Float:
     """Lower factor (n, n) of a symmetric matrix, which is overwritten: a C array of float64."""
-    n, info = ctypes.c_int(len(matrix)), ctypes.c_int()
+    n, info = _order(matrix, matrix.flags.c_contiguous), ctypes.c_int()
     # the transpose of a C array has the order of LAPACK, and the matrix is symmetric
     _POTRF(b"L", _at(n), matrix.ctypes.data, _at(n), _at(info))
     if info.value:
@@ -38,18 +38,30 @@ def cholesky(matrix: Float) -> Float:
 
 def inverse_of(factor: Float) -> Float:
     """Lower triangle (n, n), and zeros, of (L L^T)^-1; L, from `cholesky`, is overwritten."""
-    n, info = ctypes.c_int(len(factor)), ctypes.c_int()
+    n, info = _order(factor, factor.flags.f_contiguous), ctypes.c_int()
     _POTRI(b"L", _at(n), factor.ctypes.data, _at(n), _at(info))
+    if info.value:
+        raise np.linalg.LinAlgError("the factor is singular")
     return factor
 
 
 def divided(factor: Float, values: Float) -> Float:
     """L^-1 times values (n, n), which are overwritten; both in the order of Fortran."""
-    n, one = ctypes.c_int(len(factor)), ctypes.c_double(1.0)
+    n, one = _order(factor, factor.flags.f_contiguous), ctypes.c_double(1.0)
+    if _order(values, values.flags.f_contiguous).value != n.value:
+        raise ValueError("the values have another shape than the factor")
     sides = (b"L", b"L", b"N", b"N")
     at = (factor.ctypes.data, _at(n), values.ctypes.data, _at(n))
     _TRSM(*sides, _at(n), _at(n), _at(one), *at)
     return values
+
+
+def _order(matrix: Float, contiguous: bool) -> ctypes.c_int:
+    """Order of a square matrix; ValueError where LAPACK would write elsewhere than into it."""
+    n = len(matrix)
+    if matrix.shape != (n, n) or matrix.dtype != np.float64 or not contiguous:
+        raise ValueError("a square matrix of float64 is expected, contiguous in the order stated")
+    return ctypes.c_int(n)
 
 
 def _at(value: Any) -> Any:

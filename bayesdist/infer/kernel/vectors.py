@@ -6,15 +6,16 @@ slows the processor down.  The passes are nothing but vectors, and a third faste
 
 from __future__ import annotations
 
-from llvmlite import binding
 from numba import config
+from numba.core.codegen import get_host_cpu_features
 
 
 def use_whole_vectors() -> None:
-    """Compile for the whole width, unless NUMBA_CPU_FEATURES or NUMBA_CPU_NAME say otherwise.
+    """Compile for the whole width, unless numba's variables for the processor say otherwise.
 
     Without effect in a process in which numba has already compiled something else.
     """
-    features = binding.get_host_cpu_features()
-    if features.get("avx512f") and config.CPU_FEATURES is None and config.CPU_NAME is None:
-        config.CPU_FEATURES = f"{features.flatten()},-prefer-256-bit"
+    features = get_host_cpu_features()
+    wide = "+avx512f" in features.split(",")
+    if wide and config.CPU_FEATURES is None and config.CPU_NAME is None:
+        config.CPU_FEATURES = f"{features},-prefer-256-bit"

@@ -74,7 +74,8 @@ def field_table(
     smoothness : sequence of float
         Matern smoothness to choose from.
     earlier : TablePosterior, optional
-        Table of nearly the same stars from an earlier iteration, from which this one starts.
+        Table of nearly the same stars on the same grid from an earlier iteration: it gives the
+        first jitter, and the hyperparameters where they are not searched.
     search : str
         Of the hyperparameters.  'chip': all that are likely on independent tiles are tried on the
         whole chip; 'tiles': those of the tiles are taken, which are near; 'none': the earlier
@@ -87,8 +88,8 @@ def field_table(
     Raises
     ------
     InputError
-        For arrays of other shapes, values that are not finite, an unknown smoothness or search, or
-        no search and no earlier table.
+        For arrays of other shapes, values that are not finite, an unknown smoothness or search, no
+        search and no earlier table, or an earlier table on another grid.
     DegenerateError
         When the stars do not determine the polynomial.
     """
@@ -103,7 +104,14 @@ def field_table(
     if search == "none" and earlier is None:
         raise InputError("there are no hyperparameters to hold", do="give the earlier table")
     px, py, r, var, w = checked_stars(x, y, shift, variance, weight, chip)
-    grid = NodeGrid(chip, order, step) if earlier is None else earlier.grid
+    grid = NodeGrid(chip, order, step)
+    if earlier is not None:
+        if earlier.grid != grid:
+            raise InputError(
+                f"the earlier table of chip {earlier.grid.chip.number} has another grid",
+                do="give one of the same chip, order and step",
+            )
+        grid = earlier.grid  # with what is known of it
 
     def sums_at(j2: float) -> tuple[NodeSums, NodeSums]:
         return node_sums(grid, px, py, r, w[:, None] / (var + j2))

@@ -78,7 +78,8 @@ def fit_with_tables(
     smoothness : sequence of float
         Matern smoothness to choose from, for 'field'.
     start : TableFit, optional
-        Fit of the same matches, perhaps with other errors, whose iterations go on.
+        Fit of the same matches, perhaps with other errors, whose iterations are continued: from the
+        third on the hyperparameters are held.
     report : callable, optional
         Called with each iteration.
 
@@ -91,8 +92,8 @@ def fit_with_tables(
     ------
     InputError
         For an unknown method, no iterations, a tolerance that is not positive, matches of several
-        filters, matches without the exposure that holds the gauge, or a table of a filter among
-        the detector's.
+        filters, matches without the exposure that holds the gauge, a table of a filter among the
+        detector's, or a start of other chips or by another method.
     DegenerateError
         When the matches do not determine the model.
 
@@ -114,6 +115,7 @@ def fit_with_tables(
     fitted: dict[int, LookupTable | TablePosterior] = {}
     own = np.zeros((len(x), 2))
     if start is not None:
+        _check_start(start, chips, method)
         progress += start.progress
         fitted |= zip(chips, start.fitted, strict=True)
         for c, table in fitted.items():
@@ -230,6 +232,18 @@ def _check(
         raise InputError(
             f"the matches are of filters {', '.join(map(repr, present))}",
             do="give those of one: matches.select(matches.filter == k)",
+        )
+
+
+def _check_start(start: TableFit, chips: Sequence[int], method: str) -> None:
+    """Refuse a start whose tables are of other chips, or were made by another method."""
+    known = [shifts_of(table).chip for table in start.fitted]
+    fields = all(isinstance(table, TablePosterior) for table in start.fitted)
+    if known != list(chips) or fields != (method == "field"):
+        raise InputError(
+            f"the start has tables of chips {known}, {'fields' if fields else 'bins'}",
+            where="start",
+            do=f"give a fit of chips {list(chips)} by the method {method!r}",
         )
 
 

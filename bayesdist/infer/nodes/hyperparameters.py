@@ -26,7 +26,7 @@ SMOOTHNESS = (0.5, 1.5, 2.5)
 # has a covariance that no computer can factor. 1e-9 is 3e-5 of the amplitude.
 NUGGET = 1e-9
 # A bin without stars is given one observation of zero, 1e4 times worse than the typical bin's: it
-# does not constrain a pattern of any size and keeps B finite. (The posterior needs no such help.)
+# does not constrain a pattern of any size and keeps B finite.
 EMPTY = 1e-8
 TILE = 16  # nodes: the search starts on independent tiles of the chip
 LOG_LENGTH = (np.log(2.0), 1.0)  # prior of log(length / step): mean, standard deviation
@@ -77,11 +77,6 @@ class FittedField:
     n_effective: float  # number of nodes that the stars determine
 
     @property
-    def covariance(self) -> Float:
-        """Covariance (2, 2) of log amplitude and log length."""
-        return np.asarray(np.linalg.inv(self.curvature))
-
-    @property
     def point(self) -> Float:
         """Log amplitude and log length (2,)."""
         return np.asarray(np.log([self.prior.amplitude, self.prior.length]))
@@ -118,8 +113,8 @@ class Evidence:
         """Log density of hyperparameters, and the field with them."""
         grid = self.grid
         out = _Parts(prior, grid)
-        V = grid.without_their_polynomials(out.by_lag[grid.lag])
-        bent = partial(_bent, grid, out.slope_by_lag[grid.lag])
+        V = np.ascontiguousarray(prior.restricted(grid))
+        bent = partial(_bent, grid, out.slope_by_lag)
         out.add(V, bent, self.noise, self.rough, grid.lag)
         # the field has no polynomials, of which the inverse of V has as much as that of B
         out.weights -= (1.0 + EMPTY) * self._typical * grid.polynomials_by_lag
@@ -148,7 +143,7 @@ class Evidence:
         out = _Parts(prior, self.grid)
         bent = partial(np.matmul, out.slope_by_lag[lag])
         for B, b in zip(noise, rough, strict=True):
-            out.add(out.by_lag[lag], bent, B, b, lag)
+            out.add(np.ascontiguousarray(out.by_lag[lag]), bent, B, b, lag)
         return out.field(_log_prior(self.grid, prior))
 
     @cached_property
@@ -212,8 +207,9 @@ class _Parts:
         )
 
 
-def _bent(grid: NodeGrid, matrix: Float, vector: Float) -> Float:
-    return grid.without_polynomials(matrix @ vector)
+def _bent(grid: NodeGrid, by_lag: Float, vector: Float) -> Float:
+    """Product of a field's covariance (n, n), of which that by lag is given, with a vector."""
+    return grid.without_polynomials(by_lag[grid.lag] @ vector)
 
 
 def _product(lower: Float, vector: Float) -> Float:

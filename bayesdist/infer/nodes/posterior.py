@@ -57,8 +57,8 @@ class AxisField:
             return z + R.T @ (sums.informed(d) - self.sums.informed(d))
 
         right = R.T @ sums.marginal_right
-        z, _ = cg(LinearOperator(R.shape, precision, dtype=float), right, right, rtol=SOLVED)
-        return replace(self, sums=sums, mean=R @ z)
+        z, unsolved = cg(LinearOperator(R.shape, precision, dtype=float), right, right, rtol=SOLVED)
+        return self.at_same_prior(sums) if unsolved else replace(self, sums=sums, mean=R @ z)
 
     @cached_property
     def root(self) -> Float:

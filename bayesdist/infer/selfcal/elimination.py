@@ -27,6 +27,7 @@ from bayesdist.utils.arrays import Float, Int
 STARS = 4096  # eliminated at a time
 SURE, NEVER = 0.99, 1e-6  # memberships beyond which no other choice is considered
 MODE = 10  # evaluations of a polynomial that last as long as the search for a star's mode
+NO_MODE = 1e-6  # relative determinant of a curvature that says nothing of where the mode is
 SCRATCH = 2_000_000  # bytes of coefficients of draws at a time: the cache of a core
 
 
@@ -187,7 +188,7 @@ class StarModes:
     """Modes of the stars at a solution, and their response to their detections from there."""
 
     stars: Float
-    response: Float  # (N, 2, 2) of a star's position to its detections'; they add to 1
+    response: Float  # (N, 2, 2) of a star's position to its detections'
     middles: Float  # mean positions (S, 2) of the detections at the solution, by these
     state: NDArray[np.int8]  # of each detection (N,): `kernel.MEMBER`, `DOUBTFUL` or `FALSE`
 
@@ -218,10 +219,13 @@ def _curvatures(problem: Problem, residual: Float, member: Float, s2: Float) -> 
 
 def _response(problem: Problem, curvature: Float) -> Float:
     """Response (N, 2, 2) of a star to each of its detections: to their mean if it has no mode."""
-    star, counts = problem.star, problem.counts
-    uu, uv, vv = (np.bincount(star, one, minlength=len(counts)) for one in curvature)
+    star, counts, known = problem.star, problem.counts, problem.priors.precision
+    uu, uv, vv = (
+        np.bincount(star, one, minlength=len(counts)) + known[:, a, b]
+        for one, (a, b) in zip(curvature, ((0, 0), (0, 1), (1, 1)), strict=True)
+    )
     det = uu * vv - uv * uv
-    lost = ~((det > 0) & (uu > 0))
+    lost = ~((det > NO_MODE * uu * vv) & (uu > 0))
     uu, uv, vv = (np.where(lost, 0.0, one / np.where(lost, 1.0, det))[star] for one in (uu, uv, vv))
     a, b, c = curvature
     rows = [[vv * a - uv * b, vv * b - uv * c], [uu * b - uv * a, uu * c - uv * b]]

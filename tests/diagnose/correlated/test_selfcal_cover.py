@@ -100,7 +100,7 @@ def pulls(seed: int, rms: float) -> np.ndarray:
     ],
 )
 def test_errors_cover(rms, full, capsys):
-    z = np.abs([pulls(seed, rms) for seed in range(40 if full else 4)])
+    z = np.abs([pulls(seed, rms) for seed in range(40 if full else 6)])
     within = [np.mean(z < k) for k in (1.0, 1.96)]
     with capsys.disabled():
         print(f"\n{rms} px: {within[0]:.3f} within one error, {within[1]:.3f} within 1.96")
@@ -118,7 +118,7 @@ def p_values(seed: int) -> dict[str, float]:
 
 
 def test_p_values_are_those_of_chance(full):
-    found = [p_values(seed) for seed in range(60 if full else 4)]
+    found = [p_values(seed) for seed in range(60 if full else 6)]
     for name in found[0]:
         p = np.array([one[name] for one in found])
         least = 1e-4 if full else 1e-3

@@ -131,7 +131,7 @@ def scatter_by_magnitude(
 def _with_errors(
     matched: CampaignMatched, held: tuple[LookupTable, ...]
 ) -> tuple[Matches, TableFit]:
-    """Pairs with errors by magnitude, free of the pattern that tables are to describe; rough ones.
+    """Pairs with errors by magnitude, free of the pattern of tables; and those rough tables.
 
     The scatter of the residuals before any table is twice that of the stars: with errors from
     there the tables would be smoothed too much, and their own errors twice too large.  How smooth
@@ -167,7 +167,10 @@ def _stored(
 
 def _log_iteration(one: Iteration) -> None:
     log.info(
-        "fit: tables, round %d: moved %.2g px, residuals %.4f px", one.number, one.moved, one.rms
+        "fit: tables, iteration %d: moved %.2g px, residuals %.4f px",
+        one.number,
+        one.moved,
+        one.rms,
     )
 
 
@@ -217,7 +220,7 @@ def _warnings(config: Config, stored: StoredLookupTables, fit: TableFit | None) 
     if not fit.converged:
         yield (
             f"the look-up tables still moved by {fit.progress[-1].moved:.2g} pixels in the last "
-            f"of {len(fit.progress)} rounds"
+            f"of {len(fit.progress)} iterations"
         )
 
 
