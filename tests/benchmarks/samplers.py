@@ -44,7 +44,7 @@ FULL = Sizes(
     order=5,
     each=(
         Size(5_000, stock_plain=6, stock_chain=80, de=20, nuts=20, ours=6),
-        Size(50_000, stock_plain=6, stock_chain=0, de=15, nuts=50, ours=6),
+        Size(50_000, stock_plain=6, stock_chain=0, de=15, nuts=110, ours=6),
         Size(1_000_000, stock_plain=8, stock_chain=0, de=10, nuts=0, ours=15, bases=()),
     ),
     rows=5_000,
