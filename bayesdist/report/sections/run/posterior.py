@@ -38,7 +38,7 @@ from bayesdist.utils.numbers import (
 if TYPE_CHECKING:
     from bayesdist.infer import Posterior
 
-_MIXTURE_LABELS = {"f": "f", "j": "j", "s_out": "sₒᵤₜ"}
+_MIXTURE = ("f", "j", "s_out")
 _MAX_POINTS = 20_000  # draws that enter a corner plot
 N_SLOWEST = 4  # parameters whose ranks are shown
 _NAMED = 25  # coefficients that have room for their names
@@ -199,8 +199,8 @@ def _mixture_draws(posterior: Posterior) -> list[tuple[str, str, Float]]:
     unit = posterior.model.unit
     hyper = {key: np.asarray(draws, float) for key, draws in posterior.hyper.items()}
     return [
-        (label, "%", 100.0 * hyper[key]) if key == "f" else (label, unit, hyper[key])
-        for key, label in _MIXTURE_LABELS.items()
+        (key, "%", 100.0 * hyper[key]) if key == "f" else (key, unit, hyper[key])
+        for key in _MIXTURE
         if key in hyper
     ]
 
