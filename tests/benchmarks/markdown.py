@@ -393,7 +393,7 @@ def _processes(part: dict[str, Any]) -> list[str]:
         "## Self-calibration on several processes",
         "",
         f"{first['n_stars']:,} detections in {first['exposures']} exposures of two chips, order "
-        f"{part['order']}, {first['n_params']} parameters, in pieces of {part['piece']:,} "
+        f"{part['order']}, {first['n_params']} parameters, in chunks of {part['piece']:,} "
         "detections on workers of this machine: grouped into stars once, solved once, and sampled "
         "to ESS 400. Seconds by the clock, of the processor in the program that starts the run "
         "(with the scheduler), and of the processor on all workers together; peak memory of both, "
