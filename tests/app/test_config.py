@@ -207,6 +207,8 @@ def test_a_key_like_no_other_lists_the_known_ones():
         ("compute", {"engine": "dsak"}, ["compute.engine", "'threads' or 'dask'"]),
         ("compute", {"scheduler": "tcp://a:1"}, ["compute.scheduler", "'threads'", "'dask'"]),
         ("compute", {"workers": 2}, ["compute.workers", "set the engine to 'dask'"]),
+        ("compute", {"scratch": "/scratch"}, ["compute.scratch", "set the engine to 'dask'"]),
+        ("compute", {"engine": "dask", "scratch": "here"}, ["compute.scratch", "absolute path"]),
         ("compute", {"engine": "dask", "workers": 0}, ["compute.workers", "greater than 0"]),
         (
             "compute",

@@ -6,6 +6,7 @@ What a kind does not have is a constant of its class, so that nobody has to ask 
 from __future__ import annotations
 
 from collections.abc import Iterator
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 
 from pydantic import Field, PositiveFloat, PositiveInt
@@ -139,10 +140,11 @@ class ComputeBlock(Section):
     scheduler: str | None = None
     workers: PositiveInt | None = None
     memory_mb: PositiveFloat = 1000.0
+    scratch: str | None = None
 
     def faults(self) -> Iterator[str]:
         """Settings of a cluster where there is none, or another's."""
-        for key in ("scheduler", "workers"):
+        for key in ("scheduler", "workers", "scratch"):
             if self.engine != "dask" and getattr(self, key) is not None:
                 yield (
                     f"compute.{key} is given, but compute.engine is {self.engine!r}; set the "
@@ -152,6 +154,11 @@ class ComputeBlock(Section):
             yield (
                 "compute.workers is given, but the cluster of compute.scheduler has its own; "
                 "leave one of the two out"
+            )
+        if self.scratch is not None and not Path(self.scratch).is_absolute():
+            yield (
+                f"compute.scratch is {self.scratch!r}, which is another folder for each program; "
+                "give its absolute path, the same for this program and all workers"
             )
 
     def resources(self) -> Compute:

@@ -18,11 +18,11 @@ from bayesdist.data.matches import Matches
 from bayesdist.diagnose.tables.between_nodes import BetweenNodes
 from bayesdist.errors import InputError
 from bayesdist.files.faults import restoring
+from bayesdist.files.hdf5 import read_arrays, write_arrays
 from bayesdist.files.records import record_from_arrays, record_to_arrays
 from bayesdist.infer import GaussianPriors, LinearFit, Posterior, load_fit, load_posterior, save_fit
 from bayesdist.infer.catalogue.added_errors import GroupedErrors
 from bayesdist.infer.nodes import corrected_matches, inside_chips, on_the_chips
-from bayesdist.infer.sampler.checkpoints import read_arrays, write_arrays
 from bayesdist.model import LookupTable
 from bayesdist.utils.arrays import Bool, Float
 

@@ -16,9 +16,9 @@ from bayesdist.diagnose.residuals.misfit import Misfit
 from bayesdist.diagnose.score.result import ScoreTest
 from bayesdist.errors import InputError, required
 from bayesdist.files.faults import restoring
+from bayesdist.files.hdf5 import read_arrays, write_arrays
 from bayesdist.files.records import record_from_arrays, record_to_arrays
 from bayesdist.infer import LinearFit, Posterior
-from bayesdist.infer.sampler.checkpoints import read_arrays, write_arrays
 
 FILE = "diagnostics.h5"
 

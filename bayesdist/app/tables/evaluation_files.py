@@ -22,9 +22,9 @@ from bayesdist.assess.coefficients import coefficient_table
 from bayesdist.assess.evaluation import Evaluation
 from bayesdist.assess.requirements.validity import ValidityPeriod
 from bayesdist.files.faults import restoring
+from bayesdist.files.hdf5 import read_arrays, write_arrays
 from bayesdist.files.records import record_from_arrays, record_to_arrays
 from bayesdist.infer import LinearFit, Posterior
-from bayesdist.infer.sampler.checkpoints import read_arrays, write_arrays
 from bayesdist.products.maps_file import write_maps
 from bayesdist.utils.checks import warnings_of
 

@@ -17,6 +17,7 @@ import asyncio
 import copy
 import logging
 import pickle
+import tempfile
 import threading
 import weakref
 from collections.abc import Iterable, Iterator, Sequence
@@ -24,11 +25,14 @@ from concurrent.futures import CancelledError
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
+from pathlib import Path
 from time import monotonic
 from typing import Any, Self
 
 from bayesdist.data.matches import Matches
 from bayesdist.errors import InputError
+from bayesdist.files.hdf5 import read_arrays, write_arrays
+from bayesdist.files.records import record_from_arrays, record_to_arrays
 from bayesdist.infer import kernel
 from bayesdist.infer.stars.shards import (
     BRANCHES,
@@ -76,30 +80,33 @@ class ClusterPieces(MappedPieces):
     With a `scheduler` in `compute`, the cluster is that one; the version of bayesdist must be the
     same on its workers.  Otherwise `workers` processes are started here and ended by `close`, or
     when this object or the program goes; a script that does so needs the usual
-    ``if __name__ == "__main__":``.
+    ``if __name__ == "__main__":``.  With a `scratch` in `compute` the sources, which are records
+    then, are files below it until `close`; else the scheduler stores them.
 
     InputError when the cluster cannot be reached or started, has no workers, or has workers with
-    another version of bayesdist.
+    another version of bayesdist; when the scratch folder cannot be written to, or be read there.
     """
 
     def __init__(self, make: Task, sources: Iterable[Any], compute: Compute) -> None:
         self._pieces: list[Future] = []
         self._loading: set[str] = set()  # workers that sources are tied to
+        folder = None if compute.scratch is None else _folder_in(compute.scratch)
         self._client, cluster = _connected(compute)
         self._where = self._client.scheduler.address
         self._lease = _Lease()
-        self._end = weakref.finalize(self._lease, _end, self._client, cluster)
+        self._end = weakref.finalize(self._lease, _end, self._client, cluster, folder)
         try:
             places = _places(self._client)
             self._loading = set(places)
             _require_version(self._client)
-            # the scheduler stores the sources, so that a lost piece can be made again
+            # sources stay in files or in the scheduler, so that a lost piece can be made again
             with _large_graphs():
                 for k, source in enumerate(sources):
                     self._pieces.append(
                         self._client.submit(
+                            _made_from,
                             make,
-                            source,
+                            source if folder is None else _Written.as_number(k, source, folder),
                             workers=[places[k % len(places)]],
                             allow_other_workers=True,
                             pure=False,
@@ -254,6 +261,8 @@ class ClusterShards(ClusterPieces, Shards):
     def __init__(self, model: DistortionModel, matches: Matches, compute: Compute) -> None:
         Shards.__init__(self, model)
         make = partial(shard_of, model, n_total=len(matches))
+        if not matches.in_memory:
+            compute = replace(compute, scratch=None)
         ClusterPieces.__init__(self, make, matches.readers(), compute)
         try:
             self.survey = super().sum(_survey)
@@ -282,6 +291,30 @@ class _Work:
 
     task: Task
     args: tuple[Any, ...]
+
+
+@dataclass(frozen=True)
+class _Written:
+    """A record in a file that workers read."""
+
+    path: Path
+
+    @classmethod
+    def as_number(cls, k: int, record: Any, folder: tempfile.TemporaryDirectory[str]) -> _Written:
+        """The record of a number, written to a folder."""
+        path = Path(folder.name) / f"{k:06d}.h5"
+        write_arrays(path, "", record_to_arrays(record))
+        return cls(path)
+
+    def read(self) -> Any:
+        """The record; InputError where the file is not seen."""
+        do = "name a folder in compute.scratch that all workers see under the same path"
+        return record_from_arrays(read_arrays(self.path, "", do=do))
+
+
+def _made_from(make: Task, source: Any) -> Any:
+    """On a worker: the piece of a source, which may be in a file."""
+    return make(source.read() if isinstance(source, _Written) else source)
 
 
 def _made(_: Any) -> None:
@@ -408,13 +441,29 @@ def _large_graphs() -> Any:
     return dask.config.set({"distributed.admin.large-graph-warning-threshold": "1 PB"})
 
 
-def _end(client: Any, cluster: LocalCluster | None) -> None:
-    """Close the client and its own cluster."""
+def _folder_in(scratch: str) -> tempfile.TemporaryDirectory[str]:
+    """New folder in the scratch folder."""
+    try:
+        return tempfile.TemporaryDirectory(prefix="bayesdist-", dir=scratch)
+    except OSError as error:
+        raise InputError(
+            f"no folder can be made in {scratch} ({error.strerror})",
+            where="compute.scratch",
+            do="name a folder that can be written to, and that all workers see",
+        ) from error
+
+
+def _end(
+    client: Any, cluster: LocalCluster | None, folder: tempfile.TemporaryDirectory[str] | None
+) -> None:
+    """Close the client and its own cluster, and remove the sources' folder."""
 
     def close() -> None:
         client.close()
         if cluster is not None:
             cluster.close()
+        if folder is not None:
+            folder.cleanup()
 
     # garbage may be collected in the thread that closing has to wait for
     if client.loop.asyncio_loop is _running_loop():

@@ -42,6 +42,9 @@ class Compute:
         Address of a Dask scheduler; without one a cluster of this machine's processes is started.
     workers : int, optional
         Processes of that cluster; as many as there are cores by default.
+    scratch : str, optional
+        Folder that all workers of a cluster see under this path: what is in memory goes to them by
+        files in it, which the workers read.  By default it is sent, and the scheduler holds it.
 
     Examples
     --------
@@ -54,6 +57,7 @@ class Compute:
     memory_mb: float = 1000.0
     scheduler: str | None = None
     workers: int | None = None
+    scratch: str | None = None
 
     def __post_init__(self) -> None:
         if not 0 <= self.memory_mb < float("inf"):

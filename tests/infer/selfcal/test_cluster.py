@@ -10,7 +10,7 @@ import os
 import shutil
 import signal
 import sys
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 
 import numpy as np
@@ -18,6 +18,7 @@ import pytest
 
 from bayesdist.data.matching import friends
 from bayesdist.data.matching.friends import friends_of_friends, grouped
+from bayesdist.errors import InputError
 from bayesdist.infer import Compute
 from bayesdist.infer.equations.priors import Prior
 from bayesdist.infer.selfcal import pieces, sample_selfcal, self_calibrate, star_catalogue
@@ -240,8 +241,11 @@ def test_solution_and_stars_are_those_of_one_process(start, solution, compute):
         assert_close(one, other, root[:, :, None] * root[:, None])
 
 
-def test_stars_are_those_of_one_process(compute):
+@pytest.mark.parametrize("by_files", [False, True])
+def test_stars_are_those_of_one_process(compute, by_files, tmp_path):
     """Detections are grouped, solved and grouped again on the workers."""
+    if by_files:
+        compute = replace(compute, scratch=str(tmp_path))
     simulated = fields.field(4, 6, 200, disturbed=0.03)
     given = simulated.model, simulated.unlabelled, simulated.theta
     more = {"match_radius": 1.0, "start_radius": 4.0, "min_detections": 3}
@@ -250,6 +254,36 @@ def test_stars_are_those_of_one_process(compute):
     assert there.friends.n_ambiguous == here.friends.n_ambiguous
     assert there.iterations == here.iterations > 1
     assert_same_mode(there.mode, here.mode)
+    assert not list(tmp_path.iterdir())
+
+
+def test_workers_read_pieces_from_files_again_where_one_is_lost(solution, compute, tmp_path):
+    """The scheduler has their paths alone; they are removed at the end."""
+    folder, mark = tmp_path / "scratch", tmp_path / "mark"
+    folder.mkdir()
+    compute = replace(compute, scratch=str(folder))
+    with in_pieces(solution.problem, solution.stars, compute) as there:
+        files = list(folder.glob("bayesdist-*/*.h5"))
+        pieces = list(there.each(content))
+        assert len(files) == len(pieces) > 4
+        assert sum(f.stat().st_size for f in files) > 80 * len(solution.problem)
+        there.sum(die_once, mark, solution.problem.X[0])
+        assert mark.exists()
+        assert np.array_equal(np.concatenate(there.sum(content)), solution.problem.var)
+    assert not list(folder.iterdir())
+
+
+def test_scratch_folder_that_workers_do_not_see(solution, compute, tmp_path, monkeypatch):
+    monkeypatch.setattr(cluster_module, "write_arrays", lambda *_: None)
+    given = solution.problem, solution.stars
+    unseen, missing = (replace(compute, scratch=str(p)) for p in (tmp_path, tmp_path / "nowhere"))
+    message = r"000000\.h5.*compute.scratch that all workers see"
+    with pytest.raises(InputError, match=message), in_pieces(*given, unseen):
+        pass
+    assert not list(tmp_path.iterdir())
+    message = r"compute\.scratch: .*nowhere.*name a folder"
+    with pytest.raises(InputError, match=message), in_pieces(*given, missing):
+        pass
 
 
 @pytest.mark.slow

@@ -16,7 +16,7 @@ import sys
 import threading
 import time
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import dask
 import numpy as np
@@ -183,6 +183,17 @@ def test_table_in_memory(problem, compute, by_threads):
     assert_same_draws(sample(fit, matches, seed=5, compute=compute), by_threads[1])
 
 
+def test_table_in_memory_by_files(problem, compute, by_threads, tmp_path):
+    model, matches = problem
+    shards = load(model, matches, replace(compute, scratch=str(tmp_path)))
+    try:
+        assert len(list(tmp_path.rglob("*.h5"))) == len(matches.readers())
+        assert_same_fit(fit_linear(shards, model), by_threads[0])
+    finally:
+        shards.close()
+    assert not list(tmp_path.iterdir())
+
+
 def test_table_on_disk_by_a_relative_path(problem, compute, tmp_path, monkeypatch):
     """The workers stand in another folder than we do."""
     model, matches = problem
@@ -190,9 +201,11 @@ def test_table_on_disk_by_a_relative_path(problem, compute, tmp_path, monkeypatc
     monkeypatch.chdir(tmp_path)
     opened = open_matches("stars.parquet")
     assert len(opened.readers()) == 5
-    shards = load(model, opened, compute)
+    (tmp_path / "scratch").mkdir()
+    shards = load(model, opened, replace(compute, scratch=str(tmp_path / "scratch")))
     try:
         assert len(shards) == N
+        assert not list(tmp_path.rglob("*.h5"))  # they are files already
         assert np.concatenate(shards.sum(first_shard)).tobytes() == matches.u.tobytes()
         # threads over the same pieces
         fit = fit_linear(opened, model)
