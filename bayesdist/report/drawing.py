@@ -118,11 +118,14 @@ def _drawing(item: Item, results: Any, pdf: bool) -> Drawing:
 
 
 def _marks(figure: Figure) -> int:
-    """Number of single marks in the collections of a figure: points, arrows, segments, cells."""
+    """Number of marks a figure has as vectors: points, arrows, segments, cells."""
     found = 0
     for ax in figure.axes:
         for one in ax.collections:
             found += max(len(one.get_paths()), len(np.asarray(one.get_offsets())))
+        for line in ax.lines:
+            if str(line.get_marker()) != "None" and not line.get_rasterized():
+                found += len(np.atleast_1d(line.get_xdata()))
     return found
 
 

@@ -4,6 +4,7 @@ import base64
 import io
 import re
 from concurrent.futures.process import BrokenProcessPool
+from functools import partial
 from types import SimpleNamespace
 from xml.etree import ElementTree
 
@@ -220,17 +221,30 @@ def cloud(_, n: int) -> Plot:
     return Plot(figure, "", "", "")
 
 
+def marked(_, n: int, **style) -> Plot:
+    """Points by `plot`, as one line of markers."""
+    figure = new_figure(3.0, 2.0)
+    figure.subplots().plot(*np.random.default_rng(5).normal(size=(2, n)), **style)
+    return Plot(figure, "", "", "")
+
+
 def test_dense_figures_are_pixels_on_the_screen_and_vectors_on_paper():
     many = drawing.MOST_VECTORS + 1
     items = (
         Item("few", "", cloud, (9,)),
         Item("many", "", cloud, (many,)),
+        Item("marked", "", partial(marked, marker=".", ls=""), (many,)),
+        Item("line", "", marked, (many,)),
+        Item("drawn", "", partial(marked, marker=".", ls="", rasterized=True), (many,)),
         Item("paper", "", cloud, (many,), printed=True),
     )
     drawn = drawing.draw_all(SimpleNamespace(items=lambda *_: items), None)
     assert {name: one.kind for name, one in drawn.items()} == {
         "few": "svg",
         "many": "png",
+        "marked": "png",
+        "line": "svg",
+        "drawn": "svg",
         "paper": "svg",
     }
 
