@@ -278,8 +278,8 @@ def write_star_files(matches: Matches, fit: LinearFit, posterior: Posterior, fol
     remove_leftovers(folder)
     for path in part_files(folder):
         path.unlink()
-    for k, batch in enumerate(matches.batches()):
-        _write_part(batch, fit, posterior, folder / f"part-{k:05d}.parquet")
+    for k, reader in enumerate(matches.readers()):  # a batch is let go before the next one is read
+        _write_part(reader.load(), fit, posterior, folder / f"part-{k:05d}.parquet")
 
 
 def _write_part(table: Matches, fit: LinearFit, posterior: Posterior, path: Path) -> None:

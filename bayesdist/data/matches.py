@@ -320,9 +320,8 @@ class Matches(MatchColumns):
             rows = slice(-start % k, None, k)
             start += len(reader)
             if len(range(len(reader))[rows]):
-                # copies: a view would hold the whole batch in memory
-                columns = reader.load()._columns
-                parts.append({name: values[rows].copy() for name, values in columns.items()})
+                # copies: views, and the batch by a name, would hold it while the next one is read
+                parts.append({n: a[rows].copy() for n, a in reader.load()._columns.items()})
         return Matches.of_distinct_rows(**joined_columns(parts), **self.labels.arguments())
 
     def select(self, which: ArrayLike, *, reason: str | None = None) -> Matches:

@@ -325,7 +325,7 @@ def test_any_sizes_of_row_groups_pieces_and_batches(tmp_path_factory, groups, pi
         writer.close()
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("bayesdist.data.tables.parquet._BATCH", batch)
-        patch.setattr("bayesdist.data.storage.stored._BLOCK", piece + 3)
+        patch.setattr("bayesdist.data.storage.stored.BLOCK", piece + 3)
         assert_same(folder, monkeypatch=patch, piece=piece, unit="pix")
 
 
@@ -635,7 +635,7 @@ from bayesdist.data.tables import repeated
 def peak():
     return int(next(s for s in open("/proc/self/status") if s.startswith("VmHWM")).split()[1])
 
-batches.BATCH, stored._BLOCK, repeated.HELD = 100_000, 50_000, 400_000
+batches.BATCH, stored.BLOCK, repeated.HELD = 100_000, 50_000, 400_000
 open_matches(sys.argv[1])  # what is loaded once
 before = peak()
 opened = open_matches(sys.argv[2])

@@ -18,12 +18,11 @@ from numpy.typing import NDArray
 
 from bayesdist.data import batches
 from bayesdist.data.columns.checked import COLUMNS, POSITIONS, SIGMAS
-from bayesdist.data.columns.joining import joined_columns
 from bayesdist.data.columns.labels import LABELS_OF_CODES, Labels
 from bayesdist.data.formats.files import exposure_names, input_files
 from bayesdist.data.matches import Matches
 from bayesdist.data.reading.options import ReadOptions, refuse_missing_errors
-from bayesdist.data.storage.stored import StoredFile, scan, stored_file, tangent_point_of
+from bayesdist.data.storage.stored import BLOCK, StoredFile, scan, stored_file, tangent_point_of
 from bayesdist.data.tables.parquet import describe_part
 from bayesdist.errors import FormatError, InputError
 
@@ -47,20 +46,30 @@ class StoredRows:
 
         InputError when a file is damaged, gone, or not what it was when it was opened.
         """
-        parts = [self._segment(*both) for both in zip(self.files, self.segments, strict=True)]
+        columns: dict[str, NDArray[Any]] = {}
+        names, end = set(COLUMNS), 0
+        for block in self._blocks():
+            first, end = end, end + len(block["x"])
+            names &= block.keys()
+            for name in names:
+                if first == 0:
+                    columns[name] = np.empty(len(self), block[name].dtype)
+                columns[name][first:end] = block[name]
         labels = self.labels.of_batch(len(self)).arguments()
-        return Matches.of_distinct_rows(**joined_columns(parts), **labels)
+        return Matches.of_distinct_rows(**{name: columns[name] for name in names}, **labels)
 
-    def _segment(self, file: StoredFile, segment: Segment) -> dict[str, NDArray[Any]]:
-        """Columns of the rows in one file."""
-        code, start, stop = segment
-        (block,) = file.blocks(start=start, stop=stop, size=stop - start)
-        out = {name: block[name] for name in COLUMNS if name in block}
-        for key in LABELS_OF_CODES:
-            out[key] = self.labels.codes(key, block, source=file.source)
-        out["row"] = np.arange(start, stop)
-        out["source"] = np.full(stop - start, code)
-        return out
+    def _blocks(self) -> Iterator[dict[str, NDArray[Any]]]:
+        """Columns of the rows, block by block."""
+        for file, (code, start, stop) in zip(self.files, self.segments, strict=True):
+            row = start
+            for block in file.blocks(start=start, stop=stop, size=BLOCK):
+                out = {name: block[name] for name in COLUMNS if name in block}
+                for key in LABELS_OF_CODES:
+                    out[key] = self.labels.codes(key, block, source=file.source)
+                out["row"] = np.arange(row, row + len(out["x"]))
+                out["source"] = np.full(len(out["x"]), code)
+                row += len(out["x"])
+                yield out
 
 
 def open_matches(path: PathLike | Sequence[PathLike], **options: Any) -> Matches:

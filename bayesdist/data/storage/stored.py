@@ -27,7 +27,7 @@ from bayesdist.data.tables.parquet import ParquetPart, RowBlock
 from bayesdist.data.tables.repeated import buckets_for, first_repetition
 from bayesdist.errors import InputError
 
-_BLOCK = 2**18  # rows scanned together
+BLOCK = 2**16  # rows read together
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,7 +81,7 @@ class StoredFile:
         """Sum of the directions of all its reference positions."""
         total = np.zeros(3, object)
         columns = [self.found["ra"], self.found["dec"]]
-        for block in self.part.blocks(columns, size=_BLOCK):
+        for block in self.part.blocks(columns, size=BLOCK):
             total += direction_sum(*sky_columns(self._quantities(block, self.found)))
         x, y, z = total.tolist()
         return x, y, z
@@ -137,7 +137,7 @@ class _Scan:
 
     def __call__(self) -> Iterator[list[NDArray[Any]]]:
         for one in self.parts:
-            for block in one.blocks(size=_BLOCK):
+            for block in one.blocks(size=BLOCK):
                 keys = [block[name] for name in ("x", "y", "u", "v")]
                 for key, known in self.numbers.items():
                     code_of_label = np.array(
