@@ -13,11 +13,11 @@ from typing import Any
 import numpy as np
 from scipy.special import logsumexp
 
+from bayesdist.infer.effective_draws import bulk_draws, mean_draws, split_rhat, tail_draws
 from bayesdist.utils.arrays import Float
 from bayesdist.utils.limits import DRAWS_PER_WALKER
 from bayesdist.utils.numbers import count
 
-AXES = {"chain_axis": 0, "draw_axis": 1}
 TAIL = (0.05, 0.95)  # quantiles whose effective sample sizes are those of the tails
 MIN_WEIGHTS = 25  # to a fifth of which a tail is fitted
 
@@ -129,11 +129,10 @@ def diagnose(
     by_walker = np.swapaxes(chains, 1, 2).reshape(E, W * T, D)
 
     # a parameter that never moved has no variance: no effective draws, no agreement
-    with np.errstate(invalid="ignore", divide="ignore"):
-        rhat = np.array(_arviz().rhat(in_time, **AXES), float)
+    rhat = split_rhat(in_time)
     rhat[~np.isfinite(rhat)] = np.inf
-    bulk = _effective_draws(by_walker, "bulk")
-    tail = _effective_draws(by_walker, "tail", prob=TAIL)
+    bulk = bulk_draws(by_walker)
+    tail = tail_draws(by_walker, TAIL)
     if coupled:
         low, high = np.quantile(in_time.reshape(-1, D), TAIL, axis=0)
         bulk = np.minimum(bulk, _coupled_ess(chains))
@@ -144,7 +143,7 @@ def diagnose(
     tail[frozen | ~np.isfinite(tail)] = 0.0
     spread = in_time.reshape(-1, D).std(axis=0)
     squares = (by_walker - by_walker.reshape(-1, D).mean(axis=0)) ** 2
-    ess_squares = np.maximum(_effective_draws(squares, "mean"), 1.0)
+    ess_squares = np.maximum(mean_draws(squares), 1.0)
     with np.errstate(invalid="ignore", divide="ignore"):  # by the delta method
         mcse_sd = squares.reshape(-1, D).std(axis=0) / np.sqrt(ess_squares) / (2 * spread)
     reasons = []
@@ -188,19 +187,6 @@ def diagnose(
     )
 
 
-def _arviz() -> Any:
-    """ArviZ's functions of arrays, whose import takes half a second."""
-    from arviz_stats.base import array_stats
-
-    return array_stats
-
-
-def _effective_draws(chains: Float, method: str, **options: Any) -> Float:
-    """Effective sample sizes (D,) of chains (C, N, D), by a method of ArviZ."""
-    with np.errstate(invalid="ignore", divide="ignore"):
-        return np.array(_arviz().ess(chains, method=method, **AXES, **options), float)
-
-
 def _coupled_ess(chains: Float) -> Float:
     """Effective sample size of the mean over ensembles that may move as one."""
     D = chains.shape[-1]
@@ -208,7 +194,7 @@ def _coupled_ess(chains: Float) -> Float:
     share = averages.reshape(-1, D).var(axis=0)
     total = chains.reshape(-1, D).var(axis=0)
     with np.errstate(invalid="ignore", divide="ignore"):
-        ess = _effective_draws(averages, "mean") * total / share
+        ess = mean_draws(averages) * total / share
     return np.where(np.isfinite(ess), ess, 0.0)
 
 
@@ -250,10 +236,12 @@ def _pareto_smoothed(log_weights: Float, independent: float) -> tuple[Float, flo
 
     k is infinite, and the weights are as they were, where there is no tail to be fitted.
     """
+    from arviz_stats.base import array_stats  # half a second
+
     try:
         with np.errstate(all="ignore"):  # draws of negligible weight
             # ArviZ takes log likelihoods, of which importance weights are the inverse
-            smoothed, k = _arviz().psislw(-log_weights, r_eff=independent)
+            smoothed, k = array_stats.psislw(-log_weights, r_eff=independent)
     except ValueError:  # equal weights in the tail, or too few
         return log_weights - logsumexp(log_weights), float("inf")
     return np.asarray(smoothed, float), float(k)
