@@ -94,6 +94,16 @@ def _document(bench: dict[str, Any], folder: Path, release: str | None) -> None:
             path.write_text(text, encoding="utf-8")
 
 
+def _compared(bench: dict[str, Any], history: list[dict[str, Any]]) -> int:
+    """Say which ratios are worse than at the latest release: the exit code."""
+    worse, latest, here = regressions(history, bench), history[-1], bench["machine"]["cpu"]
+    for sentence in worse:
+        say(sentence)
+    if worse and latest["processor"] != here:
+        say(f"{latest['release']} was measured on {latest['processor']}, this on {here}")
+    return 1 if worse else 0
+
+
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the parts that are asked for; the files are renewed after each.
 
@@ -134,8 +144,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         parser.error("--docs takes the whole benchmark: leave --quick and --only out")
     if options.release is not None and options.docs is None:
         parser.error("--release goes with --docs")
-    if options.against is not None and options.quick:
-        parser.error("--against takes problems of full size: leave --quick out")
+    if options.against is not None and (options.quick or len(options.only) < len(PARTS)):
+        parser.error("--against takes the whole benchmark: leave --quick and --only out")
     bench: dict[str, Any] = {
         "schema": 1,
         "quick": options.quick,
@@ -161,10 +171,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         _document(bench, options.docs, options.release)
         shutil.copy(options.output / FIGURE, options.docs / FIGURE)
     say(f"written: {options.output / 'bench.json'}, {options.output / 'bench.md'}")
-    worse = [] if options.against is None else regressions(read_history(options.against), bench)
-    for sentence in worse:
-        say(sentence)
-    return 1 if worse else 0
+    return 0 if options.against is None else _compared(bench, read_history(options.against))
 
 
 if __name__ == "__main__":

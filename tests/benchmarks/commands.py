@@ -28,7 +28,7 @@ class Sizes:
     repeats: int
 
 
-FULL = Sizes(stars=5_000, order=5, repeats=3)
+FULL = Sizes(stars=5_000, order=5, repeats=2)
 QUICK = Sizes(stars=300, order=2, repeats=1)
 
 

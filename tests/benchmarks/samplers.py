@@ -25,8 +25,6 @@ class Size:
     nuts: float
     ours: float
     bases: tuple[str, ...] = ("whitened",)  # of NUTS
-    nuts_warmup: int = 400
-    nuts_draws: int = 1000
 
 
 @dataclass(frozen=True)
@@ -37,38 +35,32 @@ class Sizes:
     each: tuple[Size, ...]
     rows: int  # most rows of a chain of walkers
     thin: int
+    nuts_warmup: int
+    nuts_draws: int
     most_ess: float
 
 
 FULL = Sizes(
     order=5,
     each=(
-        Size(5_000, stock_plain=6, stock_chain=80, de=20, nuts=20, ours=6),
-        Size(50_000, stock_plain=6, stock_chain=0, de=15, nuts=110, ours=6),
-        Size(1_000_000, stock_plain=8, stock_chain=0, de=10, nuts=0, ours=15, bases=()),
+        Size(5_000, stock_plain=4, stock_chain=40, de=10, nuts=30, ours=6),
+        Size(50_000, stock_plain=4, stock_chain=0, de=4, nuts=10, ours=6),
+        Size(1_000_000, stock_plain=8, stock_chain=0, de=4, nuts=0, ours=15, bases=()),
     ),
     rows=5_000,
     thin=10,
+    nuts_warmup=400,
+    nuts_draws=1000,
     most_ess=50_000,
 )
 
 QUICK = Sizes(
     order=1,
-    each=(
-        Size(
-            400,
-            stock_plain=0.5,
-            stock_chain=60,
-            de=60,
-            nuts=30,
-            ours=1,
-            nuts_warmup=300,
-            nuts_draws=500,
-            bases=nuts.BASES,
-        ),
-    ),
+    each=(Size(400, stock_plain=0.5, stock_chain=60, de=60, nuts=30, ours=1, bases=nuts.BASES),),
     rows=700,
     thin=5,
+    nuts_warmup=300,
+    nuts_draws=500,
     most_ess=3_000,
 )
 
@@ -87,6 +79,7 @@ def run(sizes: Sizes) -> dict[str, Any]:
     rows: list[dict[str, Any]] = []
     stretch: Tau | None = None
     evolution: Tau | None = None
+    chains: dict[str, nuts.Chains] = {}
     for size in sizes.each:
         problem = simulated(size.n, sizes.order)
         here = []
@@ -122,13 +115,14 @@ def run(sizes: Sizes) -> dict[str, Any]:
         done("emcee DEMove + kernel", row)
 
         for basis in size.bases:
-            row, draws = nuts.nuts(
+            row, chains[basis], draws = nuts.nuts(
                 problem,
                 white,
                 basis,
+                chains.get(basis),
                 seconds=size.nuts,
-                warmup=size.nuts_warmup,
-                draws=size.nuts_draws,
+                warmup=sizes.nuts_warmup,
+                draws=sizes.nuts_draws,
             )
             ess = min(row["ess_bulk"], row["ess_tail"])
             row |= {"basis": basis, "agreement": compare(draws, ess, reference, our_ess)}

@@ -28,17 +28,11 @@ class Sizes:
 
     order: int
     stars: tuple[int, ...]
-    fitted_from: int  # fewer stars do not enter the exponent
     seconds: float  # limit for each
 
 
-FULL = Sizes(
-    order=5,
-    stars=(10_000, 100_000, 316_000, 1_000_000, 10_000_000),
-    fitted_from=100_000,
-    seconds=240,
-)
-QUICK = Sizes(order=1, stars=(400, 1_200), fitted_from=0, seconds=60)
+FULL = Sizes(order=5, stars=(100_000, 316_000, 1_000_000, 10_000_000), seconds=240)
+QUICK = Sizes(order=1, stars=(400, 1_200), seconds=60)
 
 
 def measure(folder: str, order: int) -> dict[str, Any]:
@@ -113,5 +107,5 @@ def run(sizes: Sizes) -> dict[str, Any]:
         "rows": rows,
         "stopped": stopped,
         "limit_s": sizes.seconds,
-        "exponent": exponent([row for row in rows if row["n_stars"] >= sizes.fitted_from]),
+        "exponent": exponent(rows),
     }

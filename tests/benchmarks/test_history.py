@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import pytest
 from PIL import Image
 
+from tests.benchmarks import __main__ as program
 from tests.benchmarks.history import (
     HISTORY,
     ratios_of,
@@ -56,6 +59,32 @@ def test_a_ratio_that_is_gone_is_a_regression():
     del now["parts"]["kernel"]
     (sentence,) = regressions(with_run([], bench(5.0, 4000.0), "1.0"), now)
     assert sentence.startswith(KERNEL) and "was not measured" in sentence
+
+
+@pytest.mark.parametrize(("ns", "code"), [(5.5, 0), (6.5, 1)])
+def test_the_program_fails_for_it(ns, code, tmp_path, monkeypatch, capsys):
+    """What the workflow calls weekly: a kernel that takes `ns` in place of 5 at the release."""
+    row = {"order": 5, "n_stars": 50_000, "batch": 32, "ns_1": ns, "floor_1": 2.5}
+    roofline = {"fma_per_ns": 40.0, "bytes_per_ns": 60.0}
+    part = {"rows": [row], "roofline": roofline, "mixture_ops": 45}
+    likelihood = SimpleNamespace(FULL=None, run=lambda sizes: part)
+    monkeypatch.setattr(program, "PARTS", {"kernel": likelihood})
+    before = bench(5.0, 4000.0)
+    del before["parts"]["samplers"]
+    write_history(with_run([], before, "1.0"), tmp_path)
+    output = str(tmp_path / "build")
+    assert program.main(["--output", output, "--against", str(tmp_path / HISTORY)]) == code
+    said = capsys.readouterr().err
+    assert (f"{KERNEL}: 0.385, 23 % less than 0.5 at 1.0" in said) == bool(code)
+    assert ("1.0 was measured on a processor, this on" in said) == bool(code)
+
+
+@pytest.mark.parametrize("part", [["--quick"], ["--only", "kernel"]])
+def test_a_part_is_not_compared(part, tmp_path):
+    """The ratios that it lacks would count as lost."""
+    with pytest.raises(SystemExit):
+        program.main([*part, "--output", str(tmp_path), "--against", str(tmp_path / HISTORY)])
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_releases_are_kept_once_and_drawn(tmp_path):

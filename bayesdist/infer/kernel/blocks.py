@@ -9,6 +9,7 @@ import os
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
+from functools import cache
 from itertools import pairwise
 from typing import Any
 
@@ -80,9 +81,18 @@ def share_out(loop: Callable[..., None], n: int, *arguments: Any) -> None:
         loop(0, n, *arguments)
         return
     edges = [n * part // (PARTS * threads) for part in range(PARTS * threads + 1)]
-    with ThreadPoolExecutor(threads) as pool:
-        for done in [pool.submit(loop, a, e, *arguments) for a, e in pairwise(edges)]:
-            done.result()
+    for done in [_pool(threads).submit(loop, a, e, *arguments) for a, e in pairwise(edges)]:
+        done.result()
+
+
+@cache
+def _pool(threads: int) -> ThreadPoolExecutor:
+    """Threads that wait for passes: to start them takes longer than a pass over few stars."""
+    return ThreadPoolExecutor(threads)
+
+
+if hasattr(os, "register_at_fork"):  # not on Windows
+    os.register_at_fork(after_in_child=_pool.cache_clear)  # threads do not survive it
 
 
 def at_once(function: Callable[..., Any], *arguments: Iterable[Any]) -> list[Any]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import signal
 import subprocess
 import sys
 from collections.abc import Callable
@@ -241,6 +242,35 @@ def test_the_number_of_threads_does_not_matter(kind, which, monkeypatch):
         numba.set_num_threads(before)
     for one, two in zip(*values, strict=True):
         np.testing.assert_array_equal(one, two)
+
+
+@pytest.mark.filterwarnings("ignore:.*fork:DeprecationWarning")
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="this system cannot fork")
+def test_a_fork_has_threads_of_its_own():
+    """Those that wait for passes are not there any more in a child: it would wait for ever."""
+    if numba.config.NUMBA_NUM_THREADS < 2:
+        pytest.skip("one processor")
+    before = numba.get_num_threads()
+
+    def sums() -> np.ndarray:
+        out = np.zeros(2)
+        blocks.share_out(_fill, 2, out)
+        return out
+
+    try:
+        numba.set_num_threads(2)
+        np.testing.assert_array_equal(sums(), [1, 2])
+        child = os.fork()
+        if child == 0:
+            signal.alarm(20)
+            os._exit(0 if np.array_equal(sums(), [1, 2]) else 1)
+        assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 0
+    finally:
+        numba.set_num_threads(before)
+
+
+def _fill(first: int, end: int, out: np.ndarray) -> None:
+    out[first:end] = np.arange(first, end) + 1
 
 
 def test_little_work_has_one_thread_and_the_number_comes_back():
