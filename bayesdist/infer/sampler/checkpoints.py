@@ -1,76 +1,18 @@
-"""Checkpoint files of arrays for resumed runs, each with the fingerprint of its run.
-
-The steps of a chain are stored block by block.
-"""
+"""Checkpoints of chains for resumed runs, block by block of their steps."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
-import h5py
 import numpy as np
-from numpy.typing import NDArray
 
-from bayesdist.errors import InputError
-from bayesdist.files.atomic import atomic_path
 from bayesdist.files.faults import restoring
-from bayesdist.files.hdf5 import hdf5_arrays
+from bayesdist.files.hdf5 import read_arrays, write_arrays
 from bayesdist.utils.arrays import Float
 
 BLOCK_ARRAYS = ("coords", "log_prob", "accepted", "log_weights")
 END_ARRAYS = ("log_q", "random_keys", "random_state")
-
-
-@contextmanager
-def _new_hdf5(path: Path) -> Iterator[h5py.File]:
-    """Context with a file to be filled, which is written whole or not at all.
-
-    It is made in memory: where a disk is full, HDF5 fails again as it closes its file, and may end
-    the process.  InputError when the system refuses to write.
-    """
-    with atomic_path(path) as temporary:
-        with h5py.File(path.name, "w", driver="core", backing_store=False) as file:
-            yield file
-            file.flush()
-            content = file.id.get_file_image()
-        temporary.write_bytes(content)
-
-
-def read_arrays(
-    path: Path, fingerprint: str, names: Sequence[str] | None = None, *, do: str
-) -> dict[str, NDArray[Any]]:
-    """Arrays by name from a file of `write_arrays`.
-
-    `fingerprint` is that of data and settings; `names` are required, by default those in the file;
-    `do` is advice for a file that cannot be read.  InputError when it cannot, or belongs to other
-    data or settings.
-    """
-    try:
-        arrays, marks = hdf5_arrays(path, names)
-        known = marks["fingerprint"]
-    except InputError as error:
-        raise InputError(error.cause, where=error.where, do=do) from error
-    except Exception as error:  # HDF5 raises errors of all kinds on damaged files
-        raise InputError("the checkpoint cannot be read", where=str(path), do=do) from error
-    if not isinstance(known, str) or known != fingerprint:
-        raise InputError(
-            "the checkpoints belong to other data or settings",
-            where=str(path.parent),
-            do="restore them, or start again with --force",
-        )
-    return arrays
-
-
-def write_arrays(path: Path, fingerprint: str, arrays: Mapping[str, NDArray[Any]]) -> None:
-    """Write arrays by name to a file, whole or not at all."""
-    with _new_hdf5(path) as file:
-        for name, values in arrays.items():
-            file[name] = values
-        file.attrs["fingerprint"] = fingerprint
 
 
 @dataclass(frozen=True, eq=False)

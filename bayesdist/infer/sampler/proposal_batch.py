@@ -13,9 +13,9 @@ from pathlib import Path
 
 import numpy as np
 
+from bayesdist.files.hdf5 import read_arrays, write_arrays
 from bayesdist.infer.density.proposal import Proposal
 from bayesdist.infer.density.target import Density
-from bayesdist.infer.sampler.checkpoints import read_arrays, write_arrays
 from bayesdist.utils.arrays import Bool, Float
 
 ROWS = 8192  # proposals evaluated at a time

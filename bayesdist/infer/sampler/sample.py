@@ -12,6 +12,7 @@ import numpy as np
 
 from bayesdist.data.matches import Matches
 from bayesdist.errors import InputError
+from bayesdist.files.hdf5 import read_arrays, write_arrays
 from bayesdist.infer.convergence import Limits
 from bayesdist.infer.density.grid import build_proposal
 from bayesdist.infer.density.proposal import GridProposal
@@ -22,7 +23,6 @@ from bayesdist.infer.posterior import Posterior
 from bayesdist.infer.posterior.memberships import count_outliers
 from bayesdist.infer.sampler.certified import run_certified
 from bayesdist.infer.sampler.chains import Settings, ensemble_seeds, run_chains
-from bayesdist.infer.sampler.checkpoints import read_arrays, write_arrays
 from bayesdist.infer.solution.linear import LinearFit
 from bayesdist.infer.stars.loading import opened
 from bayesdist.infer.stars.mixture import OutlierMixture

@@ -23,8 +23,8 @@ from bayesdist.app.kinds.fitted import (
 )
 from bayesdist.app.kinds.selfcal.gauge import fixed_by, gauge_summary, gauge_table, gauge_words
 from bayesdist.app.kinds.selfcal.matched import SelfcalMatched, magnitude_errors_of, matches_of
+from bayesdist.files.hdf5 import read_arrays
 from bayesdist.infer import Compute, GaussianPriors, Posterior
-from bayesdist.infer.sampler.checkpoints import read_arrays
 from bayesdist.infer.selfcal import SelfCalibrationMode, sample_selfcal
 from bayesdist.infer.selfcal.elimination import Mixture
 from bayesdist.infer.selfcal.gauge import Decision

@@ -22,7 +22,7 @@ from bayesdist.data.detections import Detections
 from bayesdist.data.matches import Matches
 from bayesdist.files.documents import json_of
 from bayesdist.files.faults import restoring
-from bayesdist.infer.sampler.checkpoints import read_arrays, write_arrays
+from bayesdist.files.hdf5 import read_arrays, write_arrays
 from bayesdist.infer.selfcal import SelfCalibrationMode
 from bayesdist.infer.selfcal.calibrate import scatter_by_magnitude
 from bayesdist.infer.selfcal.elimination import Mixture, memberships
