@@ -35,56 +35,6 @@ def hdf5_arrays(
         return arrays, dict(file.attrs)
 
 
-@contextmanager
-def _new_hdf5(path: Path) -> Iterator[h5py.File]:
-    """Context with a file to be filled, which is written whole or not at all.
-
-    It is made in memory: where a disk is full, HDF5 fails again as it closes its file, and may end
-    the process.  InputError when the system refuses to write.
-    """
-    import h5py
-
-    with atomic_path(path) as temporary:
-        with h5py.File(path.name, "w", driver="core", backing_store=False) as file:
-            yield file
-            file.flush()
-            content = file.id.get_file_image()
-        temporary.write_bytes(content)
-
-
-def read_arrays(
-    path: Path, fingerprint: str, names: Sequence[str] | None = None, *, do: str
-) -> dict[str, NDArray[Any]]:
-    """Arrays by name from a file of `write_arrays`.
-
-    `fingerprint` is that of data and settings; `names` are required, by default those in the file;
-    `do` is advice for a file that cannot be read.  InputError when it cannot, or belongs to other
-    data or settings.
-    """
-    try:
-        arrays, marks = hdf5_arrays(path, names)
-        known = marks["fingerprint"]
-    except InputError as error:
-        raise InputError(error.cause, where=error.where, do=do) from error
-    except Exception as error:  # HDF5 raises errors of all kinds on damaged files
-        raise InputError("the checkpoint cannot be read", where=str(path), do=do) from error
-    if not isinstance(known, str) or known != fingerprint:
-        raise InputError(
-            "the checkpoints belong to other data or settings",
-            where=str(path.parent),
-            do="restore them, or start again with --force",
-        )
-    return arrays
-
-
-def write_arrays(path: Path, fingerprint: str, arrays: Mapping[str, NDArray[Any]]) -> None:
-    """Write arrays by name to a file, whole or not at all."""
-    with _new_hdf5(path) as file:
-        for name, values in arrays.items():
-            file[name] = values
-        file.attrs["fingerprint"] = fingerprint
-
-
 @dataclass(frozen=True)
 class NetcdfGroup:
     """Variables of a group of a netCDF file, in memory, and its attributes."""
@@ -150,3 +100,49 @@ def _bytes_of(group: h5py.Group, where: str) -> int:
                 f"{name!r} lies in another file", where=where, do="restore it, or make it again"
             )
     return total
+
+
+# -- arrays of our own, each file with the fingerprint of what it belongs to -----------------------
+
+
+def read_arrays(
+    path: Path, fingerprint: str, names: Sequence[str] | None = None, *, do: str
+) -> dict[str, NDArray[Any]]:
+    """Arrays by name from a file of `write_arrays`.
+
+    `fingerprint` is that of data and settings; `names` are required, by default those in the file;
+    `do` is advice for a file that cannot be read.  InputError when it cannot, or belongs to other
+    data or settings.
+    """
+    try:
+        arrays, marks = hdf5_arrays(path, names)
+        known = marks["fingerprint"]
+    except InputError as error:
+        raise InputError(error.cause, where=error.where, do=do) from error
+    except Exception as error:  # HDF5 raises errors of all kinds on damaged files
+        raise InputError("the checkpoint cannot be read", where=str(path), do=do) from error
+    if not isinstance(known, str) or known != fingerprint:
+        raise InputError(
+            "the checkpoints belong to other data or settings",
+            where=str(path.parent),
+            do="restore them, or start again with --force",
+        )
+    return arrays
+
+
+def write_arrays(path: Path, fingerprint: str, arrays: Mapping[str, NDArray[Any]]) -> None:
+    """Write arrays by name to a file, whole or not at all.
+
+    It is made in memory: where a disk is full, HDF5 fails again as it closes its file, and may end
+    the process.  InputError when the system refuses to write.
+    """
+    import h5py
+
+    with atomic_path(path) as temporary:
+        with h5py.File(path.name, "w", driver="core", backing_store=False) as file:
+            for name, values in arrays.items():
+                file[name] = values
+            file.attrs["fingerprint"] = fingerprint
+            file.flush()
+            content = file.id.get_file_image()
+        temporary.write_bytes(content)

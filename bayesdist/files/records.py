@@ -10,15 +10,37 @@ import json
 from collections.abc import Mapping
 from dataclasses import fields, is_dataclass
 from importlib import import_module
-from typing import Any, Protocol, Self, runtime_checkable
+from pathlib import Path
+from typing import Any, Protocol, Self, TypeVar, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
 
 from bayesdist.files.documents import json_of
+from bayesdist.files.faults import restoring
+from bayesdist.files.hdf5 import read_arrays, write_arrays
+
+T = TypeVar("T")
 
 TREE = "tree"
 PACKAGE = "bayesdist."  # classes of others are not made from files
+
+
+def write_record(path: Path, record: Any, fingerprint: str = "") -> None:
+    """Write a record to an HDF5 file, with the fingerprint of what it belongs to."""
+    write_arrays(path, fingerprint, record_to_arrays(record))
+
+
+def read_record(path: Path, kind: type[T], what: str, *, do: str, fingerprint: str = "") -> T:
+    """The record of a file.
+
+    `kind`, and `what` in words, with its article: what it has to be; `do`: by which the file is
+    made again. InputError for a file of another fingerprint, or one that holds no such record.
+    """
+    arrays = read_arrays(path, fingerprint, do=do)
+    with restoring(path, what, do=do):
+        found: T = record_from_arrays(arrays, kind)
+        return found
 
 
 def record_to_arrays(record: Any) -> dict[str, NDArray[Any]]:

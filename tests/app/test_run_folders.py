@@ -135,7 +135,7 @@ def test_a_record_that_names_files_elsewhere_is_refused(project, finished, tmp_p
     name = name.format(absolute=outside)
     record = Record.read(run / "run.json")
     if where == "artefact":
-        record.artefacts["evaluate"].files[name] = FileMark(8, 64 * "0")
+        record.artefacts["evaluate"].files[name] = FileMark(size=8, sha256=64 * "0")
     else:
         record.under_way = {"stage": "evaluate", "files": [name]}
     record.write(run / "run.json")

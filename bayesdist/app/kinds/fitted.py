@@ -18,8 +18,8 @@ from bayesdist.data.matches import Matches
 from bayesdist.diagnose.tables.between_nodes import BetweenNodes
 from bayesdist.errors import InputError
 from bayesdist.files.faults import restoring
-from bayesdist.files.hdf5 import read_arrays, write_arrays
-from bayesdist.files.records import record_from_arrays, record_to_arrays
+from bayesdist.files.hdf5 import write_arrays
+from bayesdist.files.records import read_record, write_record
 from bayesdist.infer import GaussianPriors, LinearFit, Posterior, load_fit, load_posterior, save_fit
 from bayesdist.infer.catalogue.added_errors import GroupedErrors
 from bayesdist.infer.nodes import corrected_matches, inside_chips, on_the_chips
@@ -75,7 +75,7 @@ class StoredLookupTables:
 def write_tables(path: Path, stored: StoredLookupTables) -> None:
     """Write look-up tables to a file; without tables there is none."""
     if stored.tables:
-        write_arrays(path, "", record_to_arrays(stored))
+        write_record(path, stored)
     else:
         path.unlink(missing_ok=True)
 
@@ -84,10 +84,7 @@ def read_tables(path: Path, *, do: str) -> StoredLookupTables:
     """Read what `write_tables` wrote; nothing where there is no file."""
     if not path.exists():
         return StoredLookupTables()
-    arrays = read_arrays(path, "", do=do)
-    with restoring(path, "a file of look-up tables", do=do):
-        found: StoredLookupTables = record_from_arrays(arrays, StoredLookupTables)
-        return found
+    return read_record(path, StoredLookupTables, "a file of look-up tables", do=do)
 
 
 @dataclass(frozen=True, eq=False)
@@ -136,8 +133,7 @@ class Fitted:
         if self.errors.by_magnitude is not None:
             write_table(Table(vars(self.errors.by_magnitude)), folder / MAGNITUDE_ERRORS)
         save_fit(self.linear, folder / FIT)
-        parts = {name: getattr(self, name) for name in RESTS_ON}
-        write_arrays(folder / PARTS, "", record_to_arrays(parts))
+        write_record(folder / PARTS, {name: getattr(self, name) for name in RESTS_ON})
         if self.solved is not None:
             self.solved.save(folder)
 
@@ -156,9 +152,9 @@ def load_errors(folder: Path) -> ErrorLaw:
 
 def _read_parts(folder: Path) -> dict[str, Any]:
     """What a fit rests on, by name."""
-    arrays = read_arrays(folder / PARTS, "", do=FIT_AGAIN)
-    with restoring(folder / PARTS, "what a fit rests on", do=FIT_AGAIN):
-        found = record_from_arrays(arrays, dict)
+    what = "what a fit rests on"
+    found = read_record(folder / PARTS, dict, what, do=FIT_AGAIN)
+    with restoring(folder / PARTS, what, do=FIT_AGAIN):
         return {name: found[name] for name in RESTS_ON}
 
 

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import platform
 import sys
-from collections.abc import Mapping, Set
+from collections.abc import Set
 from dataclasses import dataclass, field
 from functools import cache
 from importlib import metadata
 from pathlib import Path
 from typing import Annotated, Any
 
-from pydantic import BaseModel, ConfigDict, Field, TypeAdapter
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, TypeAdapter
 from pydantic_core import to_json
 
 from bayesdist.app.store.keys import as_json, digest_of, digest_of_plain
@@ -66,16 +66,38 @@ class _Head(_Part):
     versions: dict[str, str] = Field(default_factory=dict)
 
 
-class _FileMark(_Part):
+class FileMark(_Part):
+    """Size and SHA-256 of a file as it was written."""
+
     size: Annotated[int, Field(ge=0)]
     sha256: Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
 
+    @classmethod
+    def of(cls, path: Path) -> FileMark:
+        """Mark of a file as it is now."""
+        return cls(size=path.stat().st_size, sha256=sha256_of(path))
 
-class _Artefact(_Part):
-    key: str
+
+def _as_sections(raw: dict[str, Any]) -> dict[str, Any]:
+    """Sections of summary.json as they stand, if they are such."""
+    Sections.model_validate(raw)
+    return raw
+
+
+class Artefact(_Part):
+    """Ingredients of a stage, and the files that it wrote."""
+
+    key: str  # hash of `parts`
+    # revision of the stage, settings, and digests of the artefacts before it
     parts: dict[str, Any]
-    files: dict[str, _FileMark]
-    sections: Sections
+    files: dict[str, FileMark]  # by their path in the folder
+    sections: Annotated[dict[str, Any], AfterValidator(_as_sections)]  # of summary.json
+
+    @property
+    def digest(self) -> str:
+        """Hash of what was written; of what it was made from where nothing was."""
+        written = {name: mark.sha256 for name, mark in self.files.items()}
+        return digest_of([written, self.sections] if written or self.sections else self.parts)
 
 
 class _StageNote(_Part):
@@ -92,7 +114,7 @@ class _Whole(_Head):
     """Content of run.json."""
 
     sha256: str
-    artefacts: dict[str, _Artefact]
+    artefacts: dict[str, Artefact]
     stages: dict[str, _StageNote]
     under_way: _UnderWay | None
     checkpoints: dict[str, str]
@@ -108,42 +130,6 @@ class _Whole(_Head):
 
 
 _HEAD, _WHOLE = TypeAdapter(_Head), TypeAdapter(_Whole)
-
-
-@dataclass(frozen=True)
-class FileMark:
-    """Size and SHA-256 of a file as it was written."""
-
-    size: int
-    sha256: str
-
-    @classmethod
-    def of(cls, path: Path) -> FileMark:
-        """Mark of a file as it is now."""
-        return cls(path.stat().st_size, sha256_of(path))
-
-
-@dataclass(frozen=True)
-class Artefact:
-    """Ingredients of a stage, and the files that it wrote."""
-
-    key: str  # hash of `parts`
-    # revision of the stage, settings, and digests of the artefacts before it
-    parts: Mapping[str, Any]
-    files: Mapping[str, FileMark] = field(default_factory=dict)  # by their path in the folder
-    sections: Mapping[str, Any] = field(default_factory=dict)  # of summary.json
-
-    @property
-    def digest(self) -> str:
-        """Hash of what was written; of what it was made from where nothing was."""
-        written = {name: mark.sha256 for name, mark in self.files.items()}
-        return digest_of([written, self.sections] if written or self.sections else self.parts)
-
-    @classmethod
-    def from_json(cls, raw: Mapping[str, Any]) -> Artefact:
-        """Back from run.json."""
-        files = {name: FileMark(**mark) for name, mark in raw["files"].items()}
-        return cls(**{**raw, "files": files})
 
 
 @dataclass
@@ -173,18 +159,16 @@ class Record:
                 where=str(path),
                 do="use that version, or choose another folder",
             )
-        model_of(_WHOLE, facts, str(path), do=do)
+        whole = model_of(_WHOLE, facts, str(path), do=do)
         if facts.pop("sha256") != digest_of_plain(facts):
             raise InputError(
                 "was changed since bayesdist wrote it (its checksum is another)",
                 where=str(path),
                 do=do,
             )
-        found = facts.pop("artefacts")
-        artefacts = {name: Artefact.from_json(one) for name, one in found.items()}
+        del facts["schema"], facts["artefacts"]
         rest = {key: facts.pop(key) for key in ("stages", "under_way", "checkpoints")}
-        del facts["schema"]
-        return cls(facts, artefacts, **rest)
+        return cls(facts, whole.artefacts, **rest)
 
     def copied(self) -> Record:
         """The same content, of which entries can be put, replaced and removed."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from datetime import UTC, datetime
 from fnmatch import fnmatch
 from pathlib import Path
@@ -195,12 +195,13 @@ class ArtefactStore:
         with watched_writes(note):
             yield record.facts
         parts = self._parts(name, made_from) if known and made_from else {}
-        known = known or Artefact("", {})
+        known = known or Artefact(key="", parts={}, files={}, sections={})
         files = {one: FileMark.of(self.path / one) for one in written if self._is_there(one)}
         files = {one: mark for one, mark in known.files.items() if self._is_there(one)} | files
         sections = {**known.sections, **self._sections}
         key = digest_of(parts) if parts else ""
-        record.artefacts[name], self._sections = Artefact(key, parts, files, sections), {}
+        record.artefacts[name] = Artefact(key=key, parts=parts, files=files, sections=sections)
+        self._sections = {}
         self._write(record)
 
     def _begin(self, record: Record, name: str, checkpoints: str, harmed: str) -> None:
@@ -226,13 +227,13 @@ class ArtefactStore:
         self._write(record)  # first: what is half removed never counts
         self._remove({one for one in files if not _is_one_of(one, patterns)}, record)
 
-    def _end(self, name: str, key: str, parts: Mapping[str, Any], seconds: float) -> Artefact:
+    def _end(self, name: str, key: str, parts: dict[str, Any], seconds: float) -> Artefact:
         """Note that a stage has ended."""
         record = self.record
         written = {one for one in self._written if self._is_there(one)}
         written |= set(self._checkpoints(name))
         marks = {one: FileMark.of(self.path / one) for one in sorted(written)}
-        artefact = Artefact(key, parts, marks, self._sections)
+        artefact = Artefact(key=key, parts=parts, files=marks, sections=self._sections)
         self._drop_sections(record, name, artefact)
         record.artefacts[name], record.under_way, self._sections = artefact, None, {}
         ended = datetime.now(UTC).isoformat(timespec="seconds")
@@ -253,7 +254,7 @@ class ArtefactStore:
             ):
                 stale.add(later)
                 kept = {k: v for k, v in known.sections.items() if k not in artefact.sections}
-                record.artefacts[later] = replace(known, sections=kept)
+                record.artefacts[later] = known.model_copy(update={"sections": kept})
 
     def _in_order(self, found: dict[str, Any]) -> dict[str, Any]:
         """Entries of stages that are there, in the order of these."""
@@ -318,8 +319,7 @@ class ArtefactStore:
     def clear(self, *others: str) -> None:
         """Remove what the run wrote, and some other files; the record goes last."""
         record = self.record
-        files = {one for artefact in record.artefacts.values() for one in artefact.files}
-        files |= set((record.under_way or {}).get("files", ()))
+        files = record.file_names
         files |= {one for name in self.stages for one in self._checkpoints(name)}
         record.artefacts = {}
         self._remove({*files, *others, SUMMARY}, record)

@@ -14,10 +14,8 @@ from bayesdist.app.store.rundir import RunDirectory
 from bayesdist.diagnose.diagnostics import Diagnostics
 from bayesdist.diagnose.residuals.misfit import Misfit
 from bayesdist.diagnose.score.result import ScoreTest
-from bayesdist.errors import InputError, required
-from bayesdist.files.faults import restoring
-from bayesdist.files.hdf5 import read_arrays, write_arrays
-from bayesdist.files.records import record_from_arrays, record_to_arrays
+from bayesdist.errors import FormatError, InputError, required
+from bayesdist.files.records import read_record, write_record
 from bayesdist.infer import LinearFit, Posterior
 
 FILE = "diagnostics.h5"
@@ -38,7 +36,7 @@ def write_diagnostics(
 ) -> None:
     """Write diagnostics of a fit and a posterior, and their sections of summary.json."""
     correlated = required(found.correlated, "correlated errors are diagnosed of a posterior only")
-    write_arrays(run / FILE, fingerprint_of(fit, posterior), record_to_arrays(found))
+    write_record(run / FILE, found, fingerprint_of(fit, posterior))
     facts = correlated.facts
     run.summarise(
         discrepancy=dict(facts),
@@ -60,14 +58,14 @@ def load_diagnostics(run: RunDirectory, fit: LinearFit, posterior: Posterior) ->
     """Diagnostics of a fit and a posterior; None where there are none of just these."""
     if not (run / FILE).exists():
         return None
-    try:
-        arrays = read_arrays(run / FILE, fingerprint_of(fit, posterior), do="")
-    except InputError:
-        return None
     again = f"run 'bayesdist stage diagnose {run.path}' again"
-    with restoring(run / FILE, "diagnostics", do=again):
-        found: Diagnostics = record_from_arrays(arrays, Diagnostics)
-        return found
+    mark = fingerprint_of(fit, posterior)
+    try:
+        return read_record(run / FILE, Diagnostics, "diagnostics", do=again, fingerprint=mark)
+    except FormatError:
+        raise
+    except InputError:  # of another fit or posterior
+        return None
 
 
 def _row(test: ScoreTest) -> dict[str, Any]:

@@ -21,9 +21,7 @@ from bayesdist.assess.budget.budget import ErrorBudget
 from bayesdist.assess.coefficients import coefficient_table
 from bayesdist.assess.evaluation import Evaluation
 from bayesdist.assess.requirements.validity import ValidityPeriod
-from bayesdist.files.faults import restoring
-from bayesdist.files.hdf5 import read_arrays, write_arrays
-from bayesdist.files.records import record_from_arrays, record_to_arrays
+from bayesdist.files.records import read_record, write_record
 from bayesdist.infer import LinearFit, Posterior
 from bayesdist.products.maps_file import write_maps
 from bayesdist.utils.checks import warnings_of
@@ -64,7 +62,7 @@ def write_evaluation(
         budget=found.budget.rows(),
         warnings=list(warnings_of(found.checks)),
     )
-    _write(run, fit, posterior, found)
+    write_record(run / FILE, found, fingerprint_of(fit, posterior))
 
 
 def save_margins(
@@ -80,20 +78,14 @@ def save_margins(
     if (run / FILE).exists():
         found = load_evaluation(run, fit, posterior)
         found = replace(found, margins=tuple(margins), validity=tuple(validity))
-        _write(run, fit, posterior, found)
+        write_record(run / FILE, found, fingerprint_of(fit, posterior))
 
 
 def load_evaluation(run: RunDirectory, fit: LinearFit, posterior: Posterior) -> Evaluation:
     """The evaluation of a fit and a posterior; InputError where there is none of just these."""
     again = f"run 'bayesdist stage evaluate {run.path}' again"
-    arrays = read_arrays(run / FILE, fingerprint_of(fit, posterior), do=again)
-    with restoring(run / FILE, "an evaluation", do=again):
-        found: Evaluation = record_from_arrays(arrays, Evaluation)
-        return found
-
-
-def _write(run: RunDirectory, fit: LinearFit, posterior: Posterior, found: Evaluation) -> None:
-    write_arrays(run / FILE, fingerprint_of(fit, posterior), record_to_arrays(found))
+    mark = fingerprint_of(fit, posterior)
+    return read_record(run / FILE, Evaluation, "an evaluation", do=again, fingerprint=mark)
 
 
 def _budget_table(found: Evaluation, head: Mapping[str, Any]) -> Table:

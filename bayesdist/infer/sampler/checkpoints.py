@@ -1,4 +1,4 @@
-"""Checkpoint files of a chain, block by block of its steps, for runs that are resumed."""
+"""Checkpoints of chains for resumed runs, block by block of their steps."""
 
 from __future__ import annotations
 

@@ -31,8 +31,7 @@ from typing import Any, Self
 
 from bayesdist.data.matches import Matches
 from bayesdist.errors import InputError
-from bayesdist.files.hdf5 import read_arrays, write_arrays
-from bayesdist.files.records import record_from_arrays, record_to_arrays
+from bayesdist.files.records import read_record, write_record
 from bayesdist.infer import kernel
 from bayesdist.infer.stars.shards import (
     BRANCHES,
@@ -303,13 +302,13 @@ class _Written:
     def as_number(cls, k: int, record: Any, folder: tempfile.TemporaryDirectory[str]) -> _Written:
         """The record of a number, written to a folder."""
         path = Path(folder.name) / f"{k:06d}.h5"
-        write_arrays(path, "", record_to_arrays(record))
+        write_record(path, record)
         return cls(path)
 
     def read(self) -> Any:
         """The record; InputError where the file is not seen."""
         do = "name a folder in compute.scratch that all workers see under the same path"
-        return record_from_arrays(read_arrays(self.path, "", do=do))
+        return read_record(self.path, object, "a part of the data", do=do)
 
 
 def _made_from(make: Task, source: Any) -> Any:

@@ -274,7 +274,7 @@ def test_workers_read_pieces_from_files_again_where_one_is_lost(solution, comput
 
 
 def test_scratch_folder_that_workers_do_not_see(solution, compute, tmp_path, monkeypatch):
-    monkeypatch.setattr(cluster_module, "write_arrays", lambda *_: None)
+    monkeypatch.setattr(cluster_module, "write_record", lambda *_: None)
     given = solution.problem, solution.stars
     unseen, missing = (replace(compute, scratch=str(p)) for p in (tmp_path, tmp_path / "nowhere"))
     message = r"000000\.h5.*compute.scratch that all workers see"
