@@ -192,6 +192,9 @@ def evaluate(
     for chip in chips:
         local = errors.structure_sigma(_domain(solution, chip, settings))
         maps.append(with_local(uncertainty(solution, chip), local))
+    budget = budget_of(whole, settings.domain(errors))
+    margins = judged(errors, diagnostics, requirements, settings, rng, checks=every, drawn=whole)
+    del whole  # validity periods have draws of their own
     return Evaluation(
         settings=settings,
         formal=tuple(uncertainty(fit, chip) for chip in chips),
@@ -200,9 +203,9 @@ def evaluate(
         if null is None
         else tuple(_relative(solution, diagnostics, null, chip, settings) for chip in chips),
         areas=tuple(area_map(solution, grid=grid, epoch=epoch, chip=c.number) for c in chips),
-        budget=budget_of(whole, settings.domain(errors)),
+        budget=budget,
         surface=surface,
-        margins=judged(errors, diagnostics, requirements, settings, rng, checks=every, drawn=whole),
+        margins=margins,
         validity=validity_of(errors, diagnostics, requirements, settings, rng),
         checks=every,
     )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import os
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -130,19 +131,48 @@ def read_arrays(
     return arrays
 
 
+class _Written(io.FileIO):
+    """A file as HDF5 writes it; what the system refuses is raised once HDF5 has closed it.
+
+    Of an error in between HDF5 fails again as it closes its file, and may end the process.
+    """
+
+    _refused: OSError | None = None
+
+    def write(self, content: Any) -> int:
+        left = memoryview(content)
+        while len(left) and self._refused is None:
+            try:
+                left = left[super().write(left) :]
+            except OSError as error:
+                self._refused = error
+        return len(content)
+
+    def truncate(self, size: int | None = None) -> int:
+        try:
+            return super().truncate(size)
+        except OSError as error:
+            self._refused = self._refused or error
+            return size or 0
+
+    def close(self) -> None:
+        super().close()
+        if self._refused is not None:
+            raise self._refused
+
+
 def write_arrays(path: Path, fingerprint: str, arrays: Mapping[str, NDArray[Any]]) -> None:
     """Write arrays by name to a file, whole or not at all.
 
-    It is made in memory: where a disk is full, HDF5 fails again as it closes its file, and may end
-    the process.  InputError when the system refuses to write.
+    InputError when the system refuses to write.
     """
     import h5py
 
-    with atomic_path(path) as temporary:
-        with h5py.File(path.name, "w", driver="core", backing_store=False) as file:
-            for name, values in arrays.items():
-                file[name] = values
-            file.attrs["fingerprint"] = fingerprint
-            file.flush()
-            content = file.id.get_file_image()
-        temporary.write_bytes(content)
+    with (
+        atomic_path(path) as temporary,
+        _Written(temporary, "w+") as stream,
+        h5py.File(stream, "w") as file,
+    ):
+        for name, values in arrays.items():
+            file[name] = values
+        file.attrs["fingerprint"] = fingerprint

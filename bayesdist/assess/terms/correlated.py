@@ -121,9 +121,10 @@ def _bending(
 
 
 def _moved(discrepancy: Discrepancy, shift: Float, frames: bool) -> Float:
-    """Parameters (n, D) moved by shifts; without frames polynomials and drift alone."""
-    theta = np.tile(discrepancy.mean, (len(shift), 1))
-    D = theta.shape[1] if frames else discrepancy.model.n_distortion
+    """Parameters moved by shifts: all (n, D), or without frames of polynomials and drift alone."""
+    mean, model = discrepancy.mean, discrepancy.model
+    D, known = (len(mean), len(mean)) if frames else (model.n_distortion, model.n_global)
+    theta = np.tile(mean[:known], (len(shift), 1))
     theta[:, :D] += shift[:, :D]
     return theta
 

@@ -65,7 +65,7 @@ class CatalogueErrors:
         values, vectors = np.linalg.eigh(self.covariance[:D, :D] / np.outer(scale, scale))
         # the symmetric root: signs and order of eigenvectors do not change the draws
         root = (vectors * np.sqrt(np.maximum(values, 0.0))) @ vectors.T
-        theta = np.tile(mean, (n, 1))
+        theta = np.tile(mean[: self.model.n_global], (n, 1))
         theta[:, :D] += scale * (rng.standard_normal((n, D)) @ root)
         return Polynomials(self.rows[0], self.model, mean, theta)
 
@@ -135,8 +135,8 @@ class ScaleError:
                 position = np.stack([-position[1], position[0]])
             for s, change in zip(slices, position, strict=True):
                 moved[s] = change
-        sizes = self.sigma * rng.standard_normal((n, 1))
-        return Polynomials(self.rows[0], model, mean, mean + sizes * moved)
+        sizes, known = self.sigma * rng.standard_normal((n, 1)), slice(model.n_global)
+        return Polynomials(self.rows[0], model, mean, mean[known] + sizes * moved[known])
 
 
 # terms that a row of the configuration with one sigma makes, by its kind

@@ -7,7 +7,7 @@ chips and filters, the tangent point, and that no row is wrong or repeated.
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path

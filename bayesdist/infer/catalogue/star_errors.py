@@ -163,7 +163,7 @@ def star_covariance(
     if not frames:
         follow = np.linalg.solve(cov[:D, :D], cov[:D]).T
         parts, counted = (follow @ c @ follow.T for c in (parts, counted))
-    positions, *motions = (parts + np.swapaxes(parts, 1, 2)) / 2
+    positions, *motions = ((part + part.T) / 2 for part in parts)
     return StarCovariance(sum(motions, positions), (counted + counted.T) / 2, *motions)
 
 

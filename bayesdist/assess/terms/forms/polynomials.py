@@ -27,7 +27,8 @@ def polynomial_errors(
 ) -> Float:
     """Legendre coefficients (n, 2, K) of errors of parameters, along the axes of the gauge.
 
-    `mean`: (D,), where there is no error. `theta`: (n, D). `epoch`: decimal years. `chip`: chip
+    `mean`: (D,), where there is no error. `theta`: (n, D); without an exposure its first `n_global`
+    columns are enough. `epoch`: decimal years. `chip`: chip
     number. `exposure`: (n,), code of the exposure, of all draws or of each, whose frame is among
     the parameters that err; None for errors of the polynomials and their drift alone.
     """
@@ -81,7 +82,7 @@ class Polynomials:
     row: Row
     model: DistortionModel
     mean: Float  # (D,), where there is no error
-    theta: Float  # (n, D)
+    theta: Float  # (n, D), or (n, n_global) where no frame of an exposure errs
     # code of an exposure whose frame errs, and takes the place of any new one
     exposure: int | None = None
     frames: bool = False  # whether the frame of the exposure of each draw's star errs
