@@ -22,7 +22,7 @@ from bayesdist.app.cli import main
 from tests.app.selfcal.support import list_table, small, write_selfcal
 from tests.app.support import edit, good
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.filterwarnings("ignore:.*fork:DeprecationWarning")]
 
 CONFIG = """
 [data]
@@ -67,16 +67,14 @@ def _assert_same(one: Path, other: Path) -> None:
 
 
 class Forked:
-    """A command in a process whose modules are imported already, without what takes longest.
+    """A command in a fork of this process, without what takes longest.
 
-    That would be most of the time, and kills would find nothing else.
+    Imports, kernels that are loaded, and figures would be most of the time, and kills would find
+    nothing else.
     """
 
-    context = get_context("forkserver")
-    context.set_forkserver_preload(["tests.app.test_killed", "bayesdist.app.run"])
-
     def __init__(self, arguments: list[str]) -> None:
-        self._process = self.context.Process(target=_in_short, args=(arguments,))
+        self._process = get_context("fork").Process(target=_in_short, args=(arguments,))
         self._process.start()
 
     def poll(self) -> int | None:
@@ -106,7 +104,7 @@ def _in_full(arguments: list[str]) -> subprocess.Popen[bytes]:
 
 def _of_matches(folder: Path, full: bool) -> Path:
     """A run of matched stars whose sampler goes on to its last step."""
-    steps, stars = (1500, 3000) if full else (150, 1000)
+    steps, stars = (1500, 3000) if full else (100, 1000)
     good("simulate", "wise", "-o", folder, "--stars", stars, "-q")
     config = folder / "config.toml"
     config.write_text(CONFIG.format(steps=steps))
@@ -127,6 +125,7 @@ def _of_campaign(folder: Path, full: bool) -> Path:
             'method = "field"': 'step = [512.0, 512.0]\nmethod = "field"',
             "[assess]": "[sampler]\nensembles = 2\ntarget_ess = 50\ntarget_rhat = 1.2\n\n[assess]",
             "grid = [33, 17]": "grid = [5, 3]\ndraws = 100",
+            "order = 5": f"order = {5 if full else 3}",
         },
     )
 
