@@ -358,6 +358,8 @@ class DeadlyReader:
 
 
 class DeadlyMatches:
+    in_memory = False
+
     def __len__(self) -> int:
         return 1
 
