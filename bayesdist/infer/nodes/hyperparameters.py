@@ -14,6 +14,7 @@ from functools import cached_property, partial
 
 import numpy as np
 import scipy.linalg
+import scipy.optimize
 
 from bayesdist.infer.kernel.lapack import cholesky, inverse_of
 from bayesdist.infer.nodes.grid import NodeGrid
@@ -272,9 +273,8 @@ def _summit(
     here, longest = at(np.clip(start, low, high)), 1.0
     curvature = here.curvature
     for _ in range(STEPS):
-        step = np.asarray(np.linalg.solve(curvature, here.slope), float)
+        step = _step(curvature, here.slope, low - here.point, high - here.point)
         step *= min(1.0, longest / float(np.abs(step).max() + 1e-300))
-        step = np.clip(here.point + step, low, high) - here.point
         if here.slope @ step - 0.5 * step @ curvature @ step < SETTLED:
             break
         there = at(here.point + step)
@@ -285,6 +285,14 @@ def _summit(
             longest = 0.5 * float(np.abs(step).max())
         curvature = _corrected(here.curvature, step, change)
     return here
+
+
+def _step(curvature: Float, slope: Float, low: Float, high: Float) -> Float:
+    """Newton's step (2,) within bounds: at one of them, the best along it."""
+    root = np.linalg.cholesky(curvature)
+    target = scipy.linalg.solve_triangular(root, slope, lower=True)
+    found = scipy.optimize.lsq_linear(root.T, target, (low, high), method="bvls")
+    return np.asarray(found.x, float)
 
 
 def _corrected(curvature: Float, step: Float, change: Float) -> Float:

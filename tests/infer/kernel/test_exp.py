@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import ctypes.util
 import math
+import os
+import subprocess
+import sys
 
 import numba as nb
 import numpy as np
@@ -238,3 +241,20 @@ def test_inverse_root_is_within_two_units_of_the_last_digit():
     found = np.empty_like(x)
     loop(x, found)
     assert ulps(found, np.array([1.0 / math.sqrt(t) for t in x])).max() <= ULP
+
+
+def test_inverse_root_of_a_processor_without_avx_512(tmp_path):
+    """In a process that compiles for one: the test above, and that it is one."""
+    test = f"{__file__}::{test_inverse_root_is_within_two_units_of_the_last_digit.__name__}"
+    code = (
+        "import sys, pytest; from bayesdist.infer.kernel import lanes; assert not lanes.HAS_512; "
+        f"sys.exit(pytest.main(['-q', '-n', '0', {test!r}]))"
+    )
+    other = {"NUMBA_CPU_NAME": "generic", "NUMBA_CPU_FEATURES": ""}
+    done = subprocess.run(
+        [sys.executable, "-c", code],
+        env=os.environ | other | {"NUMBA_CACHE_DIR": str(tmp_path)},
+        capture_output=True,
+        text=True,
+    )
+    assert done.returncode == 0 and "1 passed" in done.stdout, done.stdout + done.stderr

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy.optimize import minimize_scalar
 
+from bayesdist.infer.nodes import hyperparameters
 from bayesdist.infer.nodes.hyperparameters import SMOOTHNESS, Evidence, Matern, fitted_field
 from bayesdist.infer.nodes.sums import node_sums
 from tests.infer.nodes.support import (
@@ -155,6 +157,28 @@ def test_search_ends_at_the_top(rng):
     assert (drop > 0).all()
     # one standard error away a Gaussian has fallen by one half
     assert abs(drop.mean() - 0.5) < 0.15
+
+
+@pytest.mark.parametrize("which", [0, 1])
+def test_search_at_a_bound_ends_at_the_best_point_along_it(rng, which, monkeypatch):
+    """Amplitude and length hang together: where one may not rise, the other makes up for it."""
+    evidence = evidence_of(*stars(rng, 5000))
+    top = fitted_field(evidence, (1.5,), thorough=True)
+    best = np.log([top.prior.amplitude, top.prior.length])
+    low, high = best - 3.0, best + 3.0
+    high[which] = best[which] - 1.0
+    monkeypatch.setattr(hyperparameters, "_bounds", lambda _: (low, high))
+    found = fitted_field(evidence, (1.5,), thorough=True)
+    at = np.log([found.prior.amplitude, found.prior.length])
+    np.testing.assert_allclose(at[which], high[which], rtol=1e-12)
+
+    def density(value: float) -> float:
+        point = high.copy()
+        point[1 - which] = value
+        return -evidence.at(Matern(*np.exp(point), 1.5)).log_evidence
+
+    along = minimize_scalar(density, bounds=(low[1 - which], high[1 - which]), method="bounded")
+    assert found.log_evidence > -along.fun - hyperparameters.SETTLED
 
 
 def test_the_start_on_tiles_is_near_the_end(rng):
