@@ -121,28 +121,27 @@ def field_table(
     ) -> tuple[float, float]:
         return jitter_variance(_residual(grid, px, py, r, sums, nodes), var, w, n)
 
-    def searched(sums: NodeSums, before: AxisField | None) -> AxisField:
-        if search == "none" and before is not None:
-            return before.following(sums)
-        evidence = Evidence(grid, sums)
+    def searched(evidence: Evidence) -> AxisField:
         return AxisField.of(evidence, fitted_field(evidence, smoothness, thorough=search == "chip"))
 
-    if earlier is None:
-        # a first value without any smoothing: there are no hyperparameters yet
-        sums = sums_at(0.0)
-        nodes = at_once(lambda s: Evidence(grid, s).rough, sums)
-        n = float(sum(np.count_nonzero(s.nodes.diagonal()) for s in sums))
-        before: Sequence[AxisField | None] = (None, None)
-    else:
-        sums, before = sums_at(earlier.jitter**2), earlier.axes
-        nodes = [axis.mean for axis in earlier.axes]
-        n = sum(axis.n_effective for axis in earlier.axes)
+    j2 = 0.0 if earlier is None else earlier.jitter**2
+    sums = sums_at(j2)
     if search == "none" and earlier is not None:
-        j2 = earlier.jitter**2
+        axes = at_once(AxisField.following, earlier.axes, sums)
     else:
-        j2, _ = jitter_at(sums, nodes, n)
-        sums = sums_at(j2)
-    axes = at_once(searched, sums, before)
+        evidences = [Evidence(grid, s) for s in sums]
+        if earlier is None:
+            # a first value without any smoothing: there are no hyperparameters yet
+            nodes = at_once(lambda evidence: evidence.rough, evidences)
+            n = float(sum(np.count_nonzero(s.nodes.diagonal()) for s in sums))
+        else:
+            nodes = [axis.mean for axis in earlier.axes]
+            n = sum(axis.n_effective for axis in earlier.axes)
+        before, (j2, _) = j2, jitter_at(sums, nodes, n)
+        if j2 != before:
+            sums = sums_at(j2)
+            evidences = [Evidence(grid, s) for s in sums]
+        axes = at_once(searched, evidences)
     typical = float(np.median(var))
     for _ in range(MAX_ITERATIONS):
         n = sum(axis.n_effective for axis in axes)

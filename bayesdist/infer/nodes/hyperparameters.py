@@ -34,6 +34,7 @@ LOG_LENGTH = (np.log(2.0), 1.0)  # prior of log(length / step): mean, standard d
 SETTLED = 0.02  # gain in log density at which the search stops
 STEPS = 30  # far more than it takes
 RULED_OUT = 10.0  # a smoothness so much worse on the tiles is not tried again
+UNFORESEEN = 5.0  # far more than the ratio of a gain in log density to what a step promises
 
 
 @dataclass(frozen=True)
@@ -238,13 +239,22 @@ def fitted_field(evidence: Evidence, smoothness: Sequence[float], *, thorough: b
 
     They are searched on tiles, and if `thorough` on the whole chip from there.
     """
-    found = {nu: _summit(evidence, evidence.at_tiles, evidence.start, nu) for nu in smoothness}
-    best = max(one.log_evidence for one in found.values())
-    likely = {nu: one for nu, one in found.items() if one.log_evidence > best - RULED_OUT}
-    if thorough:
-        whole = [_summit(evidence, evidence.at, one.point, nu) for nu, one in likely.items()]
-        return max(whole, key=lambda one: one.log_evidence)
-    return evidence.at(max(likely.values(), key=lambda one: one.log_evidence).prior)
+    starts = [evidence.at_tiles(_prior_at(evidence.start, nu)) for nu in smoothness]
+    tiles = [_summit(evidence, evidence.at_tiles, start) for start in starts]
+    best = max(one.log_evidence for one in tiles)
+    likely = [one for one in tiles if one.log_evidence > best - RULED_OUT]
+    if not thorough:
+        return evidence.at(max(likely, key=lambda one: one.log_evidence).prior)
+    whole = sorted((evidence.at(one.prior) for one in likely), key=lambda one: -one.log_evidence)
+    found = _summit(evidence, evidence.at, whole[0])
+    others = (_summit(evidence, evidence.at, one, found.log_evidence) for one in whole[1:])
+    return max((found, *others), key=lambda one: one.log_evidence)
+
+
+def _prior_at(point: Sequence[float] | Float, nu: float) -> Matern:
+    """Prior of a log amplitude and log length."""
+    amplitude, length = np.exp(point)
+    return Matern(float(amplitude), float(length), nu)
 
 
 def _bounds(evidence: Evidence) -> tuple[Float, Float]:
@@ -258,26 +268,24 @@ def _bounds(evidence: Evidence) -> tuple[Float, Float]:
 def _summit(
     evidence: Evidence,
     density: Callable[[Matern], FittedField],
-    start: Sequence[float] | Float,
-    nu: float,
+    here: FittedField,
+    best: float = -np.inf,
 ) -> FittedField:
-    """Most probable amplitude and length for one smoothness, by Newton's method.
+    """Most probable amplitude and length for one smoothness, from `here` on by Newton's method.
 
-    The curvature is corrected along the last step, by what the slope has changed there.
+    The curvature is corrected along the last step, by what the slope has changed there.  The search
+    ends early where it will not come near the log density `best`.
     """
-
-    def at(point: Float) -> FittedField:
-        return density(Matern(float(np.exp(point[0])), float(np.exp(point[1])), nu))
-
     low, high = _bounds(evidence)
-    here, longest = at(np.clip(start, low, high)), 1.0
+    longest = 1.0
     curvature = here.curvature
     for _ in range(STEPS):
         step = _step(curvature, here.slope, low - here.point, high - here.point)
         step *= min(1.0, longest / float(np.abs(step).max() + 1e-300))
-        if here.slope @ step - 0.5 * step @ curvature @ step < SETTLED:
+        gain = here.slope @ step - 0.5 * step @ curvature @ step
+        if gain < SETTLED or here.log_evidence + UNFORESEEN * gain < best:
             break
-        there = at(here.point + step)
+        there = density(_prior_at(here.point + step, here.prior.smoothness))
         change = here.slope - there.slope
         if there.log_evidence > here.log_evidence:
             here, longest = there, 1.0

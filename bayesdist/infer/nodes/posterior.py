@@ -23,29 +23,35 @@ SOLVED = 1e-10  # relative error of nodes that follow a change of the stars' wei
 
 
 @dataclass(frozen=True, eq=False)
-class AxisField:
-    """Posterior of the node values of one axis: Gaussian, the polynomial being integrated out."""
+class NodeCovariance:
+    """Posterior covariance of the node values of one axis, the polynomial being integrated out."""
 
     grid: NodeGrid
     sums: NodeSums  # normal equations of the stars
-    field: FittedField  # hyperparameters
-    mean: Float  # (n,) pixels
-    n_effective: float  # number of parameters, nodes and polynomial, that the stars determine
+    prior: Matern
 
-    @classmethod
-    def of(cls, evidence: Evidence, field: FittedField) -> AxisField:
-        """Posterior at the hyperparameters of a field of the same stars."""
-        sums = evidence.sums
-        n = len(sums.polynomial) + field.n_effective
-        return cls(evidence.grid, sums, field, field.mean, n)
+    @cached_property
+    def root(self) -> Float:
+        """R (n, n) with R R^T the covariance.
 
-    def at_same_prior(self, sums: NodeSums) -> AxisField:
-        """Posterior from other sums, at these hyperparameters."""
-        evidence = Evidence(self.grid, sums)
-        return AxisField.of(evidence, evidence.at(self.field.prior))
+        With d = L z, z ~ N(0, 1) and L the polynomial-free part of the Cholesky factor of the
+        prior, the precision of z is 1 + L^T A L: never singular, whatever bins are empty.
+        """
+        L = self.grid.without_polynomials(cholesky(self.prior.covariance(self.grid)))
+        informed = self.sums.informed(L)
+        M = np.zeros(L.shape)
+        for start in range(0, len(L), COLUMNS):
+            M[start : start + COLUMNS, start:] = (
+                L[:, start : start + COLUMNS].T @ informed[:, start:]
+            )
+        M[np.diag_indices_from(M)] += 1.0
+        # R^T = K^-1 L^T with K K^T = M
+        root = divided(cholesky(M), np.asfortranarray(L.T)).T
+        # the prior's factor has rounding errors of 1e-16 of its size in the polynomial space
+        return self.grid.without_polynomials(root)
 
-    def following(self, sums: NodeSums) -> AxisField:
-        """Posterior from sums of nearly the same stars, at these hyperparameters.
+    def mean(self, sums: NodeSums) -> Float | None:
+        """Node values (n,) from sums of nearly the same stars; None where they differ too much.
 
         With d = R z the precision of z is 1 + R^T dA R, dA being the change of the information:
         near 1, so that a few products with R are enough.
@@ -58,27 +64,47 @@ class AxisField:
 
         right = R.T @ sums.marginal_right
         z, unsolved = cg(LinearOperator(R.shape, precision, dtype=float), right, right, rtol=SOLVED)
-        return self.at_same_prior(sums) if unsolved else replace(self, sums=sums, mean=R @ z)
+        return None if unsolved else R @ z
 
-    @cached_property
-    def root(self) -> Float:
-        """R (n, n) with R R^T the covariance.
 
-        With d = L z, z ~ N(0, 1) and L the polynomial-free part of the Cholesky factor of the
-        prior, the precision of z is 1 + L^T A L: never singular, whatever bins are empty.
+@dataclass(frozen=True, eq=False)
+class AxisField:
+    """Posterior of the node values of one axis: Gaussian, the polynomial being integrated out."""
+
+    covariance: NodeCovariance
+    field: FittedField  # hyperparameters
+    mean: Float  # (n,) pixels
+    n_effective: float  # number of parameters, nodes and polynomial, that the stars determine
+
+    @classmethod
+    def of(cls, evidence: Evidence, field: FittedField) -> AxisField:
+        """Posterior at the hyperparameters of a field of the same stars."""
+        sums = evidence.sums
+        n = len(sums.polynomial) + field.n_effective
+        return cls(NodeCovariance(evidence.grid, sums, field.prior), field, field.mean, n)
+
+    def at_same_prior(self, sums: NodeSums) -> AxisField:
+        """Posterior from other sums, at these hyperparameters."""
+        evidence = Evidence(self.covariance.grid, sums)
+        return AxisField.of(evidence, evidence.at(self.field.prior))
+
+    def following(self, sums: NodeSums) -> AxisField:
+        """Posterior from sums of nearly the same stars, at these hyperparameters.
+
+        Its covariance stays: the weights of the stars change by a part in a thousand.
         """
-        L = self.grid.without_polynomials(cholesky(self.field.prior.covariance(self.grid)))
-        informed = self.sums.informed(L)
-        M = np.zeros(L.shape)
-        for start in range(0, len(L), COLUMNS):
-            M[start : start + COLUMNS, start:] = (
-                L[:, start : start + COLUMNS].T @ informed[:, start:]
-            )
-        M[np.diag_indices_from(M)] += 1.0
-        # R^T = K^-1 L^T with K K^T = M
-        root = divided(cholesky(M), np.asfortranarray(L.T)).T
-        # the prior's factor has rounding errors of 1e-16 of its size in the polynomial space
-        return self.grid.without_polynomials(root)
+        mean = self.covariance.mean(sums)
+        return self.at_same_prior(sums) if mean is None else replace(self, mean=mean)
+
+    @property
+    def sums(self) -> NodeSums:
+        """Normal equations of the stars that the covariance is from."""
+        return self.covariance.sums
+
+    @property
+    def root(self) -> Float:
+        """R (n, n) with R R^T the covariance."""
+        return self.covariance.root
 
     @property
     def sigma(self) -> Float:
