@@ -27,14 +27,15 @@ with kept_by_content():
         precisions,
         shear,
     )
-    from bayesdist.infer.kernel.star_modes import DOUBTFUL, FALSE, MEMBER
-    from bayesdist.infer.kernel.stars import memberships, residuals
-    from bayesdist.infer.kernel.stars_unknown import (
+    from bayesdist.infer.kernel.star_draws import (
+        DOUBTFUL,
+        FALSE,
+        MEMBER,
         MOST_DOUBTFUL,
-        eliminate_stars,
         log_marginals,
-        weighted_stars,
     )
+    from bayesdist.infer.kernel.stars import memberships, residuals
+    from bayesdist.infer.kernel.stars_unknown import eliminate_stars, weighted_stars
     from bayesdist.infer.kernel.truncated import (
         truncated_log_likelihood,
         truncated_memberships,

@@ -13,11 +13,6 @@ those of products: a detection takes one exponential.
 
 The detections of a star are one array (ROWS, n), a row for each quantity: sums over them are then
 vector instructions.
-
-Where it is doubtful which detections belong to the star, p has several modes, which come and go as
-z changes, and an expansion about one of them jumps.  The product over the detections is then
-written out: each choice of members is one Gaussian in p, whose integral is known, and these are
-added.
 """
 
 from __future__ import annotations
@@ -40,9 +35,6 @@ RANGE = 1e150  # of products before their logarithm is taken
 # rows of a star's detections: sky position, W (uu, uv, vv), variance, e + o
 PLACE_U, PLACE_V, UU, UV, VV, VAR, TERM = range(7)
 ROWS = 7
-
-# state of a detection, where the members of its star are chosen
-MEMBER, DOUBTFUL, FALSE = range(3)
 
 
 @nb.njit(cache=True, forceinline=True)
@@ -340,68 +332,3 @@ def log_root(A, q, least):
     for k in range(q):
         total += math.log(max(A[k, k], least) if k < 2 else A[k, k])
     return total
-
-
-@nb.njit(cache=True)
-def summed_over_members(own, state, j2, log_core, log_out, centre, precision, p, doubtful, least):
-    """Log density of a star without motion, integrated over position and summed over members.
-
-    own: as of `own_rows`, with positions.
-    state (n,): MEMBER, DOUBTFUL or FALSE; 2^k choices of k doubtful ones are added.
-    p (2,): a position near by, relative to which positions are taken.
-    doubtful (k or more, 7): scratch, for the contribution of each.
-    least: as of `to_mode`; without members and prior the star is somewhere in the match circle.
-
-    Apart from a factor of 2 pi it equals the expansion about a mode: density less `log_root`.
-    """
-    log_norm = log_core - math.log(2.0 * math.pi)
-    du, dv = centre[0] - p[0], centre[1] - p[1]
-    a00, a10, a11 = precision[0, 0], precision[1, 0], precision[1, 1]
-    b0, b1 = a00 * du + a10 * dv, a10 * du + a11 * dv
-    square, sure, n_doubtful = b0 * du + b1 * dv, 0.0, 0
-    for i in range(len(state)):
-        if state[i] == FALSE:
-            sure += log_out
-            continue
-        c00, c10, c11, g0, g1, more, log_one = _one_member(own, i, j2, log_norm, p)
-        if state[i] == DOUBTFUL:
-            one = doubtful[n_doubtful]
-            one[0], one[1], one[2], one[3], one[4] = c00, c10, c11, g0, g1
-            one[5], one[6] = more, log_one
-            n_doubtful += 1
-        else:
-            a00, a10, a11, b0, b1 = a00 + c00, a10 + c10, a11 + c11, b0 + g0, b1 + g1
-            square += more
-            sure += log_one
-    top, total, floor = -math.inf, 0.0, 2.0 * math.log(least)
-    for choice in range(1 << n_doubtful):
-        t00, t10, t11, s0, s1, t, value = a00, a10, a11, b0, b1, square, sure
-        for k in range(n_doubtful):
-            if not choice >> k & 1:
-                value += log_out
-                continue
-            one = doubtful[k]
-            t00, t10, t11 = t00 + one[0], t10 + one[1], t11 + one[2]
-            s0, s1, t, value = s0 + one[3], s1 + one[4], t + one[5], value + one[6]
-        det = t00 * t11 - t10 * t10
-        if det > 0.0:
-            t -= (t11 * s0 * s0 - 2.0 * t10 * s0 * s1 + t00 * s1 * s1) / det
-            value -= 0.5 * t + max(0.5 * math.log(det), floor)
-        else:
-            value -= floor
-        if value > top:
-            total = total * math.exp(top - value) + 1.0
-            top = value
-        else:
-            total += math.exp(value - top)
-    return top + math.log(total)
-
-
-@nb.njit(cache=True, forceinline=True)
-def _one_member(own, i, j2, log_norm, p):
-    """Curvature, gradient and square at p, and log of the norm, of one member."""
-    s2 = own[VAR, i] + j2
-    u, v = own[PLACE_U, i] - p[0], own[PLACE_V, i] - p[1]
-    c00, c10, c11 = own[UU, i] / s2, own[UV, i] / s2, own[VV, i] / s2
-    g0, g1 = c00 * u + c10 * v, c10 * u + c11 * v
-    return c00, c10, c11, g0, g1, g0 * u + g1 * v, log_norm - math.log(s2)

@@ -12,13 +12,11 @@ from typing import Any
 
 import numba as nb
 import numpy as np
-from numpy.typing import NDArray
 
 from bayesdist.infer.kernel.blocks import PASS, share_out
-from bayesdist.infer.kernel.lanes import FAST, WIDTH, load, put
+from bayesdist.infer.kernel.lanes import FAST
 from bayesdist.infer.kernel.sky_places import legendre
 from bayesdist.infer.kernel.star_modes import (
-    DOUBTFUL,
     MOST_STAR,
     PLACE_U,
     PLACE_V,
@@ -31,14 +29,10 @@ from bayesdist.infer.kernel.star_modes import (
     membership,
     own_rows,
     residual,
-    summed_over_members,
     to_mode,
 )
 from bayesdist.utils.arrays import Float, Int
 
-Flags = NDArray[np.int8]
-
-MOST_DOUBTFUL = 6  # most detections of a star over whose membership is summed
 PIECES = 8  # number of separate sums, whatever the number of threads
 
 
@@ -77,96 +71,6 @@ def weighted_stars(
         centre, precision, least, stars, member,
     )  # fmt: skip
     return member
-
-
-@nb.njit(**PASS)
-def _log_marginals(
-    start, stop, first, last, starts, group, X, Y, offset, W, var, time, factor, centre, precision,
-    stars, middles, response, state, coef, order, rows, least, sums,
-):  # fmt: skip
-    q, K, n_draws = stars.shape[1], coef.shape[2], len(rows)
-    step = -(-(last - first) // PIECES)
-    for piece in range(start, stop):
-        S, A, b = np.zeros((2, MOST_STAR)), np.zeros((MOST_STAR, MOST_STAR)), np.zeros(MOST_STAR)
-        px, py, phi = np.empty(order + 1), np.empty(order + 1), np.empty(K)
-        p, mean, doubtful = np.empty(q), np.empty((2, n_draws)), np.empty((MOST_DOUBTFUL, 7))
-        for s in range(first + piece * step, min(first + (piece + 1) * step, last)):
-            a, e = starts[s], starts[s + 1]
-            own = own_rows(W, var, a, e)
-            when = time[a:e] if q >= 4 else time
-            where = factor[a:e] if q == 5 else factor
-            at = np.empty((2, e - a, coef.shape[3]))
-            several = False
-            for i in range(a, e):
-                several |= state[i] == DOUBTFUL
-            mean[:] = 0.0
-            for i in range(a, e):
-                legendre(X[i], Y[i], order, px, py, phi)
-                u, v = at[0, i - a], at[1, i - a]
-                _place(coef[group[i]], phi, offset[i], u, v)
-                for axis in range(2):
-                    by_u, by_v = response[i, axis, 0], response[i, axis, 1]
-                    for d in range(n_draws):
-                        mean[axis, d] += by_u * u[d] + by_v * v[d]
-            for d in range(n_draws):
-                for i in range(e - a):
-                    own[PLACE_U, i], own[PLACE_V, i] = at[0, i, d], at[1, i, d]
-                for k in range(q):
-                    p[k] = stars[s, k]
-                p[0] += mean[0, d] - middles[s, 0]
-                p[1] += mean[1, d] - middles[s, 1]
-                if several:
-                    sums[piece, d] += summed_over_members(
-                        own, state[a:e], rows[d, 0], rows[d, 1], rows[d, 2], centre[s],
-                        precision[s], p, doubtful, least,
-                    )  # fmt: skip
-                    continue
-                value, _ = to_mode(
-                    own, e - a, rows[d, 0], rows[d, 1], rows[d, 2], when, where, centre[s],
-                    precision[s], p, S, A, b, True, least,
-                )  # fmt: skip
-                sums[piece, d] += value - log_root(A, q, least)
-
-
-def log_marginals(
-    first: int, last: int, detections: tuple[Any, ...], stars: Float,
-    middles: Float, response: Float, state: Flags, coef: Float, order: int, rows: Float,
-    least: float,
-) -> Float:  # fmt: skip
-    """Log densities (PIECES, D) of stars first..last, their parameters integrated out (Laplace).
-
-    `detections` are starts, group, X, Y, offset, W, var, time, factor, centre and precision.
-    Summed over all choices of members where some are doubtful: state (N,), as of
-    `summed_over_members`.
-
-    middles (S, 2), response (N, 2, 2): a star moves as its detections do, each times its response,
-    and lies at `stars` where the sum of these is `middles`.
-    coef (G, 2, K, D): of the Legendre products, draws last: one detection takes them together.
-    rows (D, 3): squared jitter, log of the core's fraction, log density of outliers.
-    least: root of the least curvature that a star's position may have.
-    """
-    sums = np.zeros((PIECES, len(rows)))
-    in_vectors = np.zeros((*coef.shape[:-1], -(-len(rows) // WIDTH) * WIDTH))
-    in_vectors[..., : len(rows)] = coef
-    share_out(
-        _log_marginals, PIECES, first, last, *detections, stars, middles, response, state,
-        in_vectors, order, rows, least, sums,
-    )  # fmt: skip
-    return sums
-
-
-@nb.njit(cache=True, forceinline=True, fastmath=FAST)
-def _place(coef, phi, offset, u, v):
-    """Write offset + sum of phi_k coef_k, for all draws, to u and v: coefficients (2, K, D)."""
-    of_u, of_v = coef[0], coef[1]
-    for d in range(0, len(u), WIDTH):
-        at_u = load(of_u[0], d) * phi[0] + offset[0]
-        at_v = load(of_v[0], d) * phi[0] + offset[1]
-        for k in range(1, len(phi)):
-            at_u = at_u + load(of_u[k], d) * phi[k]
-            at_v = at_v + load(of_v[k], d) * phi[k]
-        put(u, d, at_u)
-        put(v, d, at_v)
 
 
 @nb.njit(cache=True, forceinline=True, fastmath=FAST | {"reassoc"})
@@ -281,10 +185,12 @@ def eliminate_stars(
 ) -> tuple[Float, ...]:  # fmt: skip
     """Sums of a second-order expansion over stars first..last, these moved to their modes.
 
-    In addition to the arguments of `log_marginals`: coef (G, 2, K) of the Legendre products, and of
-    each group its chip (G,), the linear part (G, 2, 2) of its frame, the derivatives (G, m, 2, K)
-    by its other parameters and the indices of these (G, m), -1 for none; `seen`: curvature of the
-    mixture itself.
+    `detections` are starts, group, X, Y, offset, W, var, time, factor, centre and precision.
+    coef (G, 2, K): of the Legendre products; of each group its chip (G,), the linear part (G, 2, 2)
+    of its frame, the derivatives (G, m, 2, K) by its other parameters and the indices of these
+    (G, m), -1 for none.
+    least: root of the least curvature that a star's position may have.
+    seen: curvature of the mixture itself.
 
     Returns sums by group, with the Legendre functions up to twice the order, by which products of
     two are sums (`product_table`): weights (P, G, 3, M), of the curvature uu, uv, vv by position;

@@ -276,17 +276,14 @@ def log_marginal(problem: Problem, theta: Float, mixtures: Float, modes: StarMod
     step = max(8, SCRATCH // (16 * p.model.n_terms * len(p.groups)) // 8 * 8)
     for a in range(0, len(theta), step):
         some = slice(a, a + step)
-        coefficients = np.moveaxis(p.effective(theta[some]), 0, -1)
         with threads_for(MODE * len(p) * len(theta[some])):
             sums = kernel.log_marginals(
-                0,
-                p.n_stars,
                 p.columns,
                 modes.stars,
                 modes.middles,
                 modes.response,
                 modes.state,
-                coefficients,
+                p.effective(theta[some]),
                 p.model.order,
                 rows[some],
                 p.least_root,

@@ -1,0 +1,340 @@
+"""Stars of unknown position, integrated out for many draws of the model at once.
+
+Draws lie side by side in the vectors of the processor: a detection's own numbers are read once for
+all of them, and sums over the detections of a star need nothing from other lanes.  Where a search
+for a star's mode does not go straight to its end, that draw is left to `to_mode`.
+
+Where it is doubtful which detections belong to the star, its position has several modes, which come
+and go as the model changes, and an expansion about one of them jumps.  The product over the
+detections is then written out: each choice of members is one Gaussian in the position, whose
+integral is known, and these are added.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numba as nb
+import numpy as np
+from numpy.typing import NDArray
+
+from bayesdist.infer.kernel.blocks import PASS, share_out
+from bayesdist.infer.kernel.lanes import WIDTH, choose, larger, load, put, spread
+from bayesdist.infer.kernel.numeric import bits_of, exp_negative, from_bits
+from bayesdist.infer.kernel.sky_places import legendre
+from bayesdist.infer.kernel.star_modes import (
+    CLOSE,
+    MOST_STAR,
+    NEAR,
+    PLACE_U,
+    PLACE_V,
+    STILL,
+    log_root,
+    own_rows,
+    to_mode,
+)
+from bayesdist.utils.arrays import Float
+
+Flags = NDArray[np.int8]
+
+# state of a detection, where the members of its star are chosen
+MEMBER, DOUBTFUL, FALSE = range(3)
+MOST_DOUBTFUL = 6  # most detections of a star over whose membership is summed
+PIECES = 8  # number of separate sums, whatever the number of threads
+STEPS = 4  # evaluations after which a search has not gone straight to its end
+LEAST = 1e-300  # factor of a product, which is a number of full length
+LN2 = 0.6931471805599453
+LOG_2_PI = math.log(2.0 * math.pi)
+
+# rows of a step of the search, each of as many draws as there are lanes
+GAIN, FAR, MANTISSA, EXPONENT, DET = range(5)
+# of sums over members, and of each doubtful one: curvature uu, uv, vv, gradient u, v, square
+C00, C10, C11, G0, G1, SQUARE = range(6)
+
+
+@nb.njit(cache=True, forceinline=True)
+def _place(coef, start, phi, offset_u, offset_v):
+    """offset + sum of phi_k coef_k in lanes, of coefficients (2, K, WIDTH) from an index on."""
+    K = len(phi)
+    u, v = load(coef, start) * phi[0] + offset_u, load(coef, start + K * WIDTH) * phi[0] + offset_v
+    for k in range(1, K):
+        u = u + load(coef, start + k * WIDTH) * phi[k]
+        v = v + load(coef, start + (K + k) * WIDTH) * phi[k]
+    return u, v
+
+
+@nb.njit(cache=True, forceinline=True)
+def _times(mantissa, exponent, factor):
+    """Product with one more factor; mantissas from one to two, and exponents."""
+    bits = bits_of(mantissa * larger(factor, LEAST))
+    # an integer below 2^52 in the low bits of 2^52
+    exponent = exponent + (from_bits((bits >> 52) | 0x4330000000000000) - (2.0**52 + 1023.0))
+    return from_bits((bits & 0x000FFFFFFFFFFFFF) | 0x3FF0000000000000), exponent
+
+
+@nb.njit(cache=True)
+def _newton(n, a, W, var, at, d, constants, centre, precision, p, least, found):
+    """Newton step of a star at rest in lanes: moves p (2, WIDTH) and writes `found`.
+
+    What is found is the log density of the prior, with half the decrement of the step; the larger
+    one of its decrement and its square, in their limits, or infinity where the curvature is not
+    positive, or the step long; the product of the densities of the detections; the determinant of
+    the curvature.
+    """
+    jitter, far_odds = load(constants, d), load(constants, constants.shape[1] + d)
+    pu, pv = load(p, 0), load(p, WIDTH)
+    zero = spread(0.0, pu)
+    a00, a10, a11, b0, b1 = zero, zero, zero, zero, zero
+    mantissa, exponent = spread(1.0, pu), zero
+    for i in range(n):
+        uu, uv, vv = W[a + i, 0], W[a + i, 1], W[a + i, 2]
+        inverse = 1.0 / (jitter + var[a + i])
+        ru, rv = load(at, 2 * i * WIDTH) - pu, load(at, (2 * i + 1) * WIDTH) - pv
+        wu, wv = ru * uu + rv * uv, ru * uv + rv * vv
+        core = exp_negative((ru * wu + rv * wv) * inverse * -0.5) * inverse
+        density = core + far_odds
+        member = core / density
+        core = member * inverse
+        tie = (1.0 - member) * core * inverse
+        a00 += core * uu - tie * wu * wu
+        a10 += core * uv - tie * wu * wv
+        a11 += core * vv - tie * wv * wv
+        b0 += core * wu
+        b1 += core * wv
+        mantissa, exponent = _times(mantissa, exponent, density)
+    du, dv = centre[0] - pu, centre[1] - pv
+    g0 = du * precision[0, 0] + dv * precision[1, 0]
+    g1 = du * precision[1, 0] + dv * precision[1, 1]
+    gain = (du * g0 + dv * g1) * -0.5
+    a00, a10, a11 = a00 + precision[0, 0], a10 + precision[1, 0], a11 + precision[1, 1]
+    b0, b1 = b0 + g0, b1 + g1
+    rest = a11 - a10 * a10 / a00
+    z1 = b1 - a10 * b0 / a00
+    dv = z1 / rest
+    du = (b0 - a10 * dv) / a00
+    left = b0 * b0 / a00 + z1 * dv
+    square = du * du * W[a, 0] + du * dv * (2.0 * W[a, 1]) + dv * dv * W[a, 2]
+    far = larger(left / CLOSE, square / ((jitter + var[a]) * STILL))
+    far = choose(NEAR, left, math.inf, far)
+    far = choose(a00, least * least, math.inf, far)
+    far = choose(rest, least * least, math.inf, far)
+    put(p, 0, pu + du)
+    put(p, WIDTH, pv + dv)
+    put(found, GAIN * WIDTH, gain + left * 0.5)
+    put(found, FAR * WIDTH, far)
+    put(found, MANTISSA * WIDTH, mantissa)
+    put(found, EXPONENT * WIDTH, exponent)
+    put(found, DET * WIDTH, a00 * rest)
+
+
+@nb.njit(cache=True)
+def _members(n, a, W, var, at, d, constants, state, centre, precision, p, members, doubtful):
+    """Sums over the members of a star at rest, in lanes, at p (2, WIDTH); the number of doubtful.
+
+    Written to `members` (8, WIDTH): the sums, then mantissas and exponents of the product of the
+    densities of members where they are largest, each times 2 pi.  Those of each doubtful one are
+    written to `doubtful` (k or more, 7, WIDTH), its density last.
+    """
+    jitter = load(constants, d)
+    pu, pv = load(p, 0), load(p, WIDTH)
+    du, dv = centre[0] - pu, centre[1] - pv
+    g0 = du * precision[0, 0] + dv * precision[1, 0]
+    g1 = du * precision[1, 0] + dv * precision[1, 1]
+    square = du * g0 + dv * g1
+    zero = spread(0.0, pu)
+    c00, c10, c11 = zero + precision[0, 0], zero + precision[1, 0], zero + precision[1, 1]
+    mantissa, exponent, k = spread(1.0, pu), zero, 0
+    for i in range(n):
+        if state[a + i] == FALSE:
+            continue
+        inverse = 1.0 / (jitter + var[a + i])
+        u, v = load(at, 2 * i * WIDTH) - pu, load(at, (2 * i + 1) * WIDTH) - pv
+        uu, uv, vv = inverse * W[a + i, 0], inverse * W[a + i, 1], inverse * W[a + i, 2]
+        by_u, by_v = u * uu + v * uv, u * uv + v * vv
+        more = u * by_u + v * by_v
+        if state[a + i] == DOUBTFUL:
+            row = 7 * k * WIDTH
+            put(doubtful, row + C00 * WIDTH, uu)
+            put(doubtful, row + C10 * WIDTH, uv)
+            put(doubtful, row + C11 * WIDTH, vv)
+            put(doubtful, row + G0 * WIDTH, by_u)
+            put(doubtful, row + G1 * WIDTH, by_v)
+            put(doubtful, row + SQUARE * WIDTH, more)
+            put(doubtful, row + 6 * WIDTH, inverse)
+            k += 1
+            continue
+        c00, c10, c11 = c00 + uu, c10 + uv, c11 + vv
+        g0, g1, square = g0 + by_u, g1 + by_v, square + more
+        mantissa, exponent = _times(mantissa, exponent, inverse)
+    put(members, C00 * WIDTH, c00)
+    put(members, C10 * WIDTH, c10)
+    put(members, C11 * WIDTH, c11)
+    put(members, G0 * WIDTH, g0)
+    put(members, G1 * WIDTH, g1)
+    put(members, SQUARE * WIDTH, square)
+    put(members, 6 * WIDTH, mantissa)
+    put(members, 7 * WIDTH, exponent)
+    return k
+
+
+@nb.njit(cache=True)
+def _over_choices(members, doubtful, k, l, log_norm, log_out, least):
+    """Log density of the draw in lane l, integrated over position, of all 2^k choices of members.
+
+    Apart from a factor of 2 pi it equals the expansion about a mode: density less `log_root`.
+    Without members and prior the star is somewhere in the match circle.
+    """
+    top, total, floor = -math.inf, 0.0, 2.0 * math.log(least)
+    sure = math.log(members[6, l]) + LN2 * members[7, l]
+    for choice in range(1 << k):
+        c00, c10, c11 = members[C00, l], members[C10, l], members[C11, l]
+        g0, g1, square, value = members[G0, l], members[G1, l], members[SQUARE, l], sure
+        for i in range(k):
+            if not choice >> i & 1:
+                value += log_out
+                continue
+            one = doubtful[i]
+            c00, c10, c11 = c00 + one[C00, l], c10 + one[C10, l], c11 + one[C11, l]
+            g0, g1, square = g0 + one[G0, l], g1 + one[G1, l], square + one[SQUARE, l]
+            value += log_norm + math.log(one[6, l])
+        det = c00 * c11 - c10 * c10
+        if det > 0.0:
+            square -= (c11 * g0 * g0 - 2.0 * c10 * g0 * g1 + c00 * g1 * g1) / det
+            value -= 0.5 * square + max(0.5 * math.log(det), floor)
+        else:
+            value -= floor
+        if value > top:
+            total = total * math.exp(top - value) + 1.0
+            top = value
+        else:
+            total += math.exp(value - top)
+    return top + math.log(total)
+
+
+@nb.njit(cache=True)
+def _at_modes(n, a, W, var, at, d, constants, centre, precision, place, least, found, value):
+    """Write log densities of a star at rest, integrated over position (Laplace), in lanes.
+
+    The search for the mode begins at `place`, which is moved.  NaN where it does not go straight.
+    """
+    value[:] = math.nan
+    for _ in range(STEPS):
+        _newton(n, a, W, var, at, d, constants, centre, precision, place, least, found)
+        searching = False
+        for l in range(WIDTH):
+            if found[FAR, l] <= 1.0:
+                mantissa, exponent = found[MANTISSA, l], found[EXPONENT, l]
+                value[l] = found[GAIN, l] + LN2 * exponent + n * (constants[2, d + l] - LOG_2_PI)
+                value[l] += 0.5 * math.log(mantissa * mantissa / found[DET, l])
+                place[0, l] = math.nan
+            elif found[FAR, l] < math.inf:
+                searching = True
+            else:
+                place[0, l] = math.nan
+        if not searching:
+            break
+
+
+@nb.njit(**PASS)
+def _log_marginals(
+    start, stop, starts, group, X, Y, offset, W, var, time, factor, centre, precision, stars,
+    middles, response, state, coef, order, constants, least, sums,
+):  # fmt: skip
+    q, G, K, n_draws = stars.shape[1], coef.shape[1], coef.shape[3], sums.shape[1]
+    step = -(-len(stars) // PIECES)
+    for piece in range(start, stop):
+        S, A, b = np.zeros((2, MOST_STAR)), np.zeros((MOST_STAR, MOST_STAR)), np.zeros(MOST_STAR)
+        px, py, p = np.empty(order + 1), np.empty(order + 1), np.empty(q)
+        first, place, value = np.empty((2, WIDTH)), np.empty((2, WIDTH)), np.empty(WIDTH)
+        found, members = np.empty((5, WIDTH)), np.empty((8, WIDTH))
+        doubtful = np.empty((MOST_DOUBTFUL, 7, WIDTH))
+        phi, at = np.empty((16, K)), np.empty((16, 2, WIDTH))
+        for s in range(piece * step, min((piece + 1) * step, len(stars))):
+            a, n = starts[s], starts[s + 1] - starts[s]
+            if n > len(phi):
+                phi, at = np.empty((2 * n, K)), np.empty((2 * n, 2, WIDTH))
+            several, n_false = False, 0
+            for i in range(n):
+                legendre(X[a + i], Y[a + i], order, px, py, phi[i])
+                several |= state[a + i] == DOUBTFUL
+                n_false += state[a + i] == FALSE
+            for block in range(len(coef)):
+                d = block * WIDTH
+                pu = spread(stars[s, 0] - middles[s, 0], load(place, 0))
+                pv = spread(stars[s, 1] - middles[s, 1], pu)
+                for i in range(n):
+                    begin = (block * G + group[a + i]) * 2 * K * WIDTH
+                    u, v = _place(coef, begin, phi[i], offset[a + i, 0], offset[a + i, 1])
+                    pu += u * response[a + i, 0, 0] + v * response[a + i, 0, 1]
+                    pv += u * response[a + i, 1, 0] + v * response[a + i, 1, 1]
+                    put(at, 2 * i * WIDTH, u)
+                    put(at, (2 * i + 1) * WIDTH, v)
+                put(first, 0, pu)
+                put(first, WIDTH, pv)
+                if several:
+                    k = _members(
+                        n, a, W, var, at, d, constants, state, centre[s], precision[s], first,
+                        members, doubtful,
+                    )  # fmt: skip
+                    for l in range(min(WIDTH, n_draws - d)):
+                        log_norm, log_out = constants[2, d + l] - LOG_2_PI, constants[3, d + l]
+                        sums[piece, d + l] += n_false * log_out + (n - n_false - k) * log_norm
+                        sums[piece, d + l] += _over_choices(
+                            members, doubtful, k, l, log_norm, log_out, least
+                        )
+                    continue
+                value[:] = math.nan
+                if q == 2:
+                    place[:] = first
+                    _at_modes(
+                        n, a, W, var, at, d, constants, centre[s], precision[s], place, least,
+                        found, value,
+                    )  # fmt: skip
+                for l in range(min(WIDTH, n_draws - d)):
+                    if not math.isfinite(value[l]):
+                        own = own_rows(W, var, a, a + n)
+                        for i in range(n):
+                            own[PLACE_U, i], own[PLACE_V, i] = at[i, 0, l], at[i, 1, l]
+                        p[:] = stars[s]
+                        p[0], p[1] = first[0, l], first[1, l]
+                        value[l], _ = to_mode(
+                            own, n, constants[0, d + l], constants[2, d + l], constants[3, d + l],
+                            time[a : a + n] if q >= 4 else time,
+                            factor[a : a + n] if q == 5 else factor,
+                            centre[s], precision[s], p, S, A, b, True, least,
+                        )  # fmt: skip
+                        value[l] -= log_root(A, q, least)
+                    sums[piece, d + l] += value[l]
+
+
+def log_marginals(
+    detections: tuple[Any, ...], stars: Float, middles: Float, response: Float, state: Flags,
+    coef: Float, order: int, rows: Float, least: float,
+) -> Float:  # fmt: skip
+    """Log densities (PIECES, D) of stars, their parameters integrated out (Laplace).
+
+    `detections` are starts, group, X, Y, offset, W, var, time, factor, centre and precision.
+    Summed over all choices of members where some are doubtful: state (N,), `MEMBER`, `DOUBTFUL` or
+    `FALSE`.
+
+    middles (S, 2), response (N, 2, 2): a star moves as its detections do, each times its response,
+    and lies at `stars` where the sum of these is `middles`.
+    coef (D, G, 2, K): of the Legendre products.
+    rows (D, 3): squared jitter, log of the core's fraction, log density of outliers.
+    least: root of the least curvature that a star's position may have.
+    """
+    D, G, _, K = coef.shape
+    blocks = -(-D // WIDTH)
+    in_lanes = np.zeros((blocks, G, 2, K, WIDTH))
+    for block in range(blocks):
+        some = coef[block * WIDTH : (block + 1) * WIDTH]
+        in_lanes[block, ..., : len(some)] = np.moveaxis(some, 0, -1)
+    j2, log_core, log_out = np.pad(rows, ((0, -D % WIDTH), (0, 0)), mode="edge").T
+    constants = np.stack([j2, 2 * np.pi * np.exp(log_out - log_core), log_core, log_out])
+    sums = np.zeros((PIECES, D))
+    share_out(
+        _log_marginals, PIECES, *detections, stars, middles, response, state, in_lanes, order,
+        constants, least, sums,
+    )  # fmt: skip
+    return sums
