@@ -95,22 +95,21 @@ def _log_marginals(
             own = own_rows(W, var, a, e)
             when = time[a:e] if q >= 4 else time
             where = factor[a:e] if q == 5 else factor
-            at = np.empty((2, e - a, coef.shape[3]))
+            u, v = np.empty((e - a, coef.shape[3])), np.empty((e - a, coef.shape[3]))
             several = False
             for i in range(a, e):
                 several |= state[i] == DOUBTFUL
             mean[:] = 0.0
             for i in range(a, e):
                 legendre(X[i], Y[i], order, px, py, phi)
-                u, v = at[0, i - a], at[1, i - a]
-                _place(coef[group[i]], phi, offset[i], u, v)
+                _place(coef[group[i]], phi, offset[i], u, v, i - a)
                 for axis in range(2):
                     by_u, by_v = response[i, axis, 0], response[i, axis, 1]
                     for d in range(n_draws):
-                        mean[axis, d] += by_u * u[d] + by_v * v[d]
+                        mean[axis, d] += by_u * u[i - a, d] + by_v * v[i - a, d]
             for d in range(n_draws):
                 for i in range(e - a):
-                    own[PLACE_U, i], own[PLACE_V, i] = at[0, i, d], at[1, i, d]
+                    own[PLACE_U, i], own[PLACE_V, i] = u[i, d], v[i, d]
                 for k in range(q):
                     p[k] = stars[s, k]
                 p[0] += mean[0, d] - middles[s, 0]
@@ -156,17 +155,17 @@ def log_marginals(
 
 
 @nb.njit(cache=True, forceinline=True, fastmath=FAST)
-def _place(coef, phi, offset, u, v):
-    """Write offset + sum of phi_k coef_k, for all draws, to u and v: coefficients (2, K, D)."""
+def _place(coef, phi, offset, u, v, i):
+    """Write offset + sum of phi_k coef_k to rows i of u and v, for all draws of coef (2, K, D)."""
     of_u, of_v = coef[0], coef[1]
-    for d in range(0, len(u), WIDTH):
-        at_u = load(of_u[0], d) * phi[0] + offset[0]
-        at_v = load(of_v[0], d) * phi[0] + offset[1]
+    for d in range(0, u.shape[1], WIDTH):
+        at_u = load(of_u, 0, d) * phi[0] + offset[0]
+        at_v = load(of_v, 0, d) * phi[0] + offset[1]
         for k in range(1, len(phi)):
-            at_u = at_u + load(of_u[k], d) * phi[k]
-            at_v = at_v + load(of_v[k], d) * phi[k]
-        put(u, d, at_u)
-        put(v, d, at_v)
+            at_u = at_u + load(of_u, k, d) * phi[k]
+            at_v = at_v + load(of_v, k, d) * phi[k]
+        put(u, i, d, at_u)
+        put(v, i, d, at_v)
 
 
 @nb.njit(cache=True, forceinline=True, fastmath=FAST | {"reassoc"})
