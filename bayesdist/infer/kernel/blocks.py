@@ -5,6 +5,7 @@ Threads are Python's.  numba's own compile each pass several times over, and do 
 
 from __future__ import annotations
 
+import math
 import os
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
@@ -15,13 +16,18 @@ from typing import Any
 
 import numba as nb
 import numpy as np
-from numba.extending import overload
 
-from bayesdist.infer.kernel.lanes import FAST
-from bayesdist.utils.arrays import Int
+from bayesdist.infer.kernel.lanes import FAST, INNER, copy
+from bayesdist.utils.arrays import Float, Int
 
 # how a pass is compiled: without a check for division by zero, which would exclude vectors
-PASS: dict[str, Any] = {"cache": True, "nogil": True, "fastmath": FAST, "error_model": "numpy"}
+PASS: dict[str, Any] = {
+    "cache": True,
+    "no_cfunc_wrapper": True,
+    "nogil": True,
+    "fastmath": FAST,
+    "error_model": "numpy",
+}
 
 BLOCK = 256  # stars whose scratch arrays stay in the first-level cache
 THREADS_PAY = 200_000  # evaluations of a star below which one thread is faster
@@ -40,48 +46,58 @@ def pieces_of(starts: Int, size: int) -> Int:
     return np.column_stack([group, begin, end]).astype(np.int64)
 
 
-def scratch(n):
-    """Empty rows (n, BLOCK) that begin where a vector does not cross lines of the cache."""
-    room = np.empty(n * BLOCK + 8)
+def aligned(*shape: int) -> Float:
+    """Zeros that begin where a vector does not cross lines of the cache."""
+    size = math.prod(shape)
+    room = np.zeros(size + 8)
     first = -(room.ctypes.data // 8) % 8
-    return room[first : first + n * BLOCK].reshape(n, BLOCK)
+    return room[first : first + size].reshape(shape)
 
 
-@overload(scratch)
-def _scratch(n):
-    """`scratch` for any n; numba would compile it anew for each literal number of rows."""
-    return scratch
+def scratch(n: int) -> Float:
+    """Zeros (n, BLOCK), aligned."""
+    return aligned(n, BLOCK)
 
 
-@nb.njit(cache=True)
-def _copy(column, row):
-    n = len(column)
-    for s in range(n):
-        row[s] = column[s]
-    for s in range(n, BLOCK):
-        row[s] = 1.0
+@nb.njit(**INNER)
+def put_ones(rows, n):
+    """Write ones to rows of `scratch` behind the first n stars."""
+    for k in range(len(rows)):
+        for s in range(n, BLOCK):
+            rows[k, s] = 1.0
 
 
-@nb.njit(cache=True)
+@nb.njit(**INNER)
 def lay_out(columns, first, end, rows):
     """Copy X, Y, u, v, var_u, var_v of some stars to rows of `scratch`, and ones behind them."""
-    X, Y, u, v, var_u, var_v = columns[:6]
-    _copy(X[first:end], rows[0])
-    _copy(Y[first:end], rows[1])
-    _copy(u[first:end], rows[2])
-    _copy(v[first:end], rows[3])
-    _copy(var_u[first:end], rows[4])
-    _copy(var_v[first:end], rows[5])
+    n = end - first
+    copy(columns[0], first, n, rows, 0)
+    copy(columns[1], first, n, rows, 1)
+    copy(columns[2], first, n, rows, 2)
+    copy(columns[3], first, n, rows, 3)
+    copy(columns[4], first, n, rows, 4)
+    copy(columns[5], first, n, rows, 5)
+    put_ones(rows, n)
 
 
-def share_out(loop: Callable[..., None], n: int, *arguments: Any) -> None:
-    """Run loop(first, end, *arguments) over range(n), in parts if there are several threads."""
+def share_out(
+    loop: Callable[..., None],
+    n: int,
+    *arguments: Any,
+    room: Callable[[], tuple[Float, ...]] = tuple,
+) -> None:
+    """Run loop(first, end, *arguments) over range(n), in parts if there are several threads.
+
+    Each part has its own `room`, arrays to write to, which come before the other arguments.
+    """
     threads = min(nb.get_num_threads(), n)
     if threads < 2:
-        loop(0, n, *arguments)
+        loop(0, n, *room(), *arguments)
         return
     edges = [n * part // (PARTS * threads) for part in range(PARTS * threads + 1)]
-    for done in [_pool(threads).submit(loop, a, e, *arguments) for a, e in pairwise(edges)]:
+    pool = _pool(threads)
+    parts = [pool.submit(loop, a, e, *room(), *arguments) for a, e in pairwise(edges)]
+    for done in parts:
         done.result()
 
 

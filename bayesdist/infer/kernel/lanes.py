@@ -17,12 +17,15 @@ from llvmlite import ir
 from numba import config, types
 from numba.core import cgutils, typing
 from numba.core.codegen import get_host_cpu_features
+from numba.core.errors import TypingError
 from numba.core.typing.templates import AbstractTemplate, infer_global
 from numba.extending import intrinsic, lower_builtin, models, register_model
 
 # sums of products may be fused; nothing that would change NaN or infinity
 FAST = {"contract", "nsz", "arcp"}
 FLAGS = tuple(sorted(FAST))
+# how a function is compiled that only compiled ones call: Python could not
+INNER: dict[str, Any] = {"cache": True, "no_cpython_wrapper": True, "no_cfunc_wrapper": True}
 
 _FEATURES = get_host_cpu_features() if config.CPU_FEATURES is None else config.CPU_FEATURES
 HAS_512 = "+avx512f" in _FEATURES.split(",") and config.CPU_NAME is None
@@ -114,8 +117,19 @@ for _operation, _name in (
 # -- to memory and back ----------------------------------------------------------------------------
 
 
+# Arrays are written to and read from without views of their rows, whose compilation takes longer
+# than that of all the rest.
+
+
 def _start(context: Any, builder: Any, kind: Any, array: Any) -> Any:
     return context.make_array(kind)(context, builder, array).data
+
+
+def _element(context: Any, builder: Any, kind: Any, array: Any, k: Any, index: Any) -> Any:
+    """Pointer to an element of row k of an array (rows, n)."""
+    parts = context.make_array(kind)(context, builder, array)
+    row = builder.mul(k, builder.extract_value(parts.shape, 1))
+    return builder.gep(parts.data, [builder.add(row, index)])
 
 
 def _lanes_at(builder: Any, start: Any, index: Any, width: int) -> Any:
@@ -125,30 +139,54 @@ def _lanes_at(builder: Any, start: Any, index: Any, width: int) -> Any:
 
 def _loading(width: int) -> Any:
     @intrinsic
-    def loading(typingctx: Any, array: Any, index: Any) -> Any:
+    def loading(typingctx: Any, array: Any, k: Any, index: Any) -> Any:
         def build(context: Any, builder: Any, signature: Any, values: Any) -> Any:
-            start = _start(context, builder, signature.args[0], values[0])
-            return builder.load(_lanes_at(builder, start, values[1], width), align=8)
+            element = _element(context, builder, signature.args[0], *values)
+            return builder.load(builder.bitcast(element, _vector(width).as_pointer()), align=8)
 
-        return Lanes(width)(array, types.intp), build
+        return Lanes(width)(_rows(array), types.intp, types.intp), build
 
     return loading
 
 
-load, load_wide = _loading(WIDTH), _loading(WIDE)  # lanes from an index of an array (n,) on
+def _rows(array: Any, ndim: int = 2) -> Any:
+    """The type of an array of doubles, whose rows follow each other; TypingError for others."""
+    if not (array.layout == "C" and array.dtype == types.float64 and array.ndim == ndim):
+        raise TypingError(f"{array} is not a C array of float64 with {ndim} dimensions")
+    return array
+
+
+# lanes of row k of an array (rows, n), from an index on
+load, load_wide = _loading(WIDTH), _loading(WIDE)
 
 
 @intrinsic
-def put(typingctx: Any, array: Any, index: Any, lanes: Any) -> Any:
-    """Write lanes to an array (n,) from an index on."""
+def put(typingctx: Any, array: Any, k: Any, index: Any, lanes: Any) -> Any:
+    """Write lanes to row k of an array (rows, n), from an index on."""
 
     def build(context: Any, builder: Any, signature: Any, values: Any) -> Any:
-        start = _start(context, builder, signature.args[0], values[0])
-        where = _lanes_at(builder, start, values[1], signature.args[2].width)
-        builder.store(values[2], where, align=8)
+        element = _element(context, builder, signature.args[0], *values[:3])
+        vector = context.get_value_type(signature.args[3]).as_pointer()
+        builder.store(values[3], builder.bitcast(element, vector), align=8)
         return context.get_dummy_value()
 
-    return types.none(array, types.intp, lanes), build
+    return types.none(_rows(array), types.intp, types.intp, lanes), build
+
+
+@intrinsic
+def copy(typingctx: Any, column: Any, first: Any, n: Any, array: Any, k: Any) -> Any:
+    """Copy n numbers of a column (N,), from the first on, to row k of an array."""
+
+    def build(context: Any, builder: Any, signature: Any, values: Any) -> Any:
+        column, first, n, array, k = values
+        source = builder.gep(_start(context, builder, signature.args[0], column), [first])
+        zero = context.get_constant(types.intp, 0)
+        row = _element(context, builder, signature.args[3], array, k, zero)
+        cgutils.raw_memcpy(builder, row, source, n, 8)
+        return context.get_dummy_value()
+
+    whole = types.intp
+    return types.none(_rows(column, 1), whole, whole, _rows(array), whole), build
 
 
 @intrinsic
@@ -251,18 +289,20 @@ total, product = _across("fadd", "add"), _across("fmul", "mul")
 def tile(columns: int, length: int) -> Any:
     """Function that adds sums over n stars of weights times P_i Q_j, for so many j from one on.
 
-    function(n, weights, P, i, Q, j, sums): rows of the arrays have `length` numbers, and there are
-    `ROWS` weights.  Lanes of the sums are added to sums[i, j:], of shape (..., ROWS, WIDTH), and
-    stay in registers until all stars are added.
+    function(n, weights, g, P, i, Q, j, sums): rows of the arrays have `length` numbers, and the
+    weights are the `ROWS` of group g.  Lanes of the sums are added to sums[g, i, j:], of shape
+    (groups, T, T, ROWS, WIDTH), and stay in registers until all stars are added.
     """
 
     @intrinsic
-    def add(typingctx: Any, n: Any, weights: Any, P: Any, i: Any, Q: Any, j: Any, sums: Any) -> Any:
+    def add(
+        typingctx: Any, n: Any, weights: Any, g: Any, P: Any, i: Any, Q: Any, j: Any, sums: Any
+    ) -> Any:
         def build(context: Any, builder: Any, signature: Any, values: Any) -> Any:
-            n, *_, i, _, j, _ = values
+            n, _, g, _, i, _, j, _ = values
             kinds = signature.args
             w_start, p_start, q_start, sums_start = (
-                _start(context, builder, kinds[k], values[k]) for k in (1, 2, 4, 6)
+                _start(context, builder, kinds[k], values[k]) for k in (1, 3, 5, 7)
             )
 
             def whole(k: int) -> Any:
@@ -272,20 +312,25 @@ def tile(columns: int, length: int) -> Any:
                 index = builder.add(builder.mul(row, whole(length)), s)
                 return builder.load(_lanes_at(builder, start, index, WIDTH), align=8)
 
+            first_weight = builder.mul(g, whole(ROWS))
             zero = ir.Constant(_vector(WIDTH), [0.0] * WIDTH)
             found = [cgutils.alloca_once_value(builder, zero) for _ in range(columns * ROWS)]
             with cgutils.for_range_slice(builder, whole(0), n, whole(WIDTH)) as (s, _):
                 p = lanes(p_start, i, s)
-                weighted = [builder.fmul(lanes(w_start, whole(r), s), p) for r in range(ROWS)]
+                rows = [builder.add(first_weight, whole(r)) for r in range(ROWS)]
+                weighted = [builder.fmul(lanes(w_start, row, s), p) for row in rows]
                 for c in range(columns):
                     q = lanes(q_start, builder.add(j, whole(c)), s)
                     for r in range(ROWS):
                         one = found[c * ROWS + r]
                         more = builder.fmul(weighted[r], q, flags=FLAGS)
                         builder.store(builder.fadd(builder.load(one), more, flags=FLAGS), one)
-            sums_shape = context.make_array(kinds[6])(context, builder, values[6]).shape
-            wide = builder.extract_value(sums_shape, 1)
-            first = builder.mul(builder.add(builder.mul(i, wide), j), whole(ROWS * WIDTH))
+            wide = builder.extract_value(
+                context.make_array(kinds[7])(context, builder, values[7]).shape, 1
+            )
+            first = builder.add(builder.mul(g, wide), i)
+            first = builder.add(builder.mul(first, wide), j)
+            first = builder.mul(first, whole(ROWS * WIDTH))
             for k, one in enumerate(found):
                 index = builder.add(first, whole(k * WIDTH))
                 where = _lanes_at(builder, sums_start, index, WIDTH)
@@ -294,6 +339,7 @@ def tile(columns: int, length: int) -> Any:
             return context.get_dummy_value()
 
         whole = types.intp
-        return types.none(whole, weights, P, whole, Q, whole, sums), build
+        arrays = (_rows(weights), whole, _rows(P), whole, _rows(Q), whole, _rows(sums, 5))
+        return types.none(whole, *arrays), build
 
     return add

@@ -7,7 +7,7 @@ import math
 import numba as nb
 import numpy as np
 
-from bayesdist.infer.kernel.blocks import PASS, lay_out, scratch, share_out, threads_for
+from bayesdist.infer.kernel.blocks import PASS, lay_out, put_ones, scratch, share_out, threads_for
 from bayesdist.infer.kernel.lanes import (
     WIDTH,
     choose,
@@ -28,23 +28,24 @@ SCRATCH = 16_000_000  # bytes of partial sums in memory at a time
 
 
 @nb.njit(**PASS)
-def _partial_sums(first, end, blocks, columns, coef, order, rows, unit2, sums):
-    stars, model, density = scratch(6), scratch(2), scratch(1)[0]
+def _partial_sums(
+    first, end, stars, model, density, blocks, columns, coef, order, rows, unit2, sums
+):
     for b in range(first, end):
         g, a, e = blocks[b]
         n = e - a
         lay_out(columns, a, e, stars)
-        density[:] = 1.0
+        put_ones(density, n)
         for d in range(len(rows)):
-            evaluate(coef[d, g], order, stars[0], stars[1], n, model)
+            evaluate(coef[d, g], order, stars, n, model)
             j2, core, outlier = rows[d, 0], rows[d, 1], rows[d, 2]
             half, never = rows[d, 3], rows[d, 4]
-            exponents = spread(0.0, load(density, 0))
+            exponents = spread(0.0, load(density, 0, 0))
             for s in range(0, n, WIDTH):
-                ru = load(stars[2], s) - load(model[0], s)
-                rv = load(stars[3], s) - load(model[1], s)
+                ru = load(stars, 2, s) - load(model, 0, s)
+                rv = load(stars, 3, s) - load(model, 1, s)
                 ru, rv = ru * ru, rv * rv
-                au, av = load(stars[4], s) + j2, load(stars[5], s) + j2
+                au, av = load(stars, 4, s) + j2, load(stars, 5, s) + j2
                 root = inverse_root(au * av)
                 peak, inverse = core * root, root * root
                 q_in = 0.5 * (ru * av + rv * au) * inverse
@@ -55,7 +56,7 @@ def _partial_sums(first, end, blocks, columns, coef, order, rows, unit2, sums):
                 # the other product would be a denormal number for hopeless stars, which takes long
                 more = choose(q_in, q_out, peak, outlier)
                 both = more + t * choose(q_in, q_out, outlier, peak)
-                put(density, s, first_lanes(n - s, both, 1.0))
+                put(density, 0, s, first_lanes(n - s, both, 1.0))
                 exponents += first_lanes(n - s, low, 0.0)
             constant = total(exponents) + n * math.log(2 * math.pi * unit2)
             sums[b, d] = log_of_product(density) - constant
@@ -90,6 +91,7 @@ def log_likelihood(
                 rows[some],
                 constants.unit2,
                 sums,
+                room=lambda: (scratch(6), scratch(2), scratch(1)),
             )
             # draws along the first axis: else numpy adds in another order where there is but one
             out[some] = np.ascontiguousarray(sums.T).sum(axis=1)

@@ -13,7 +13,7 @@ import numba as nb
 import numpy as np
 
 from bayesdist.infer.kernel.blocks import BLOCK
-from bayesdist.infer.kernel.lanes import WIDTH, choose, load, product, spread, total
+from bayesdist.infer.kernel.lanes import INNER, WIDTH, choose, load, product, spread, total
 from bayesdist.infer.kernel.numeric import bits_of, from_bits
 from bayesdist.utils.arrays import Float
 
@@ -60,15 +60,15 @@ def packed(constants: Constants) -> Float:
     return np.ascontiguousarray(np.stack(rows, axis=1))
 
 
-@nb.njit(cache=True)
+@nb.njit(**INNER)
 def log_of_product(density):
-    """Sum of the logarithms of a block; one logarithm in all."""
-    mantissa = load(density, 0)
+    """Sum of the logarithms of a block (1, BLOCK); one logarithm in all."""
+    mantissa = load(density, 0, 0)
     exponent, mantissa, safe = spread(0, mantissa), spread(1.0, mantissa), spread(0.0, mantissa)
     for a in range(0, BLOCK, 8 * WIDTH):
-        eight = load(density, a)
+        eight = load(density, 0, a)
         for s in range(a + WIDTH, a + 8 * WIDTH, WIDTH):
-            eight = eight * load(density, s)
+            eight = eight * load(density, 0, s)
         safe += choose(LEAST, eight, choose(eight, MOST, 1.0, spread(0.0, eight)), 0.0)
         bits = bits_of(eight)
         exponent += (bits >> 52) - 1023
@@ -78,5 +78,5 @@ def log_of_product(density):
         return math.log(product(mantissa)) + total(exponent) * 0.6931471805599453
     result = 0.0
     for s in range(BLOCK):  # extreme errors or fractions: each star alone
-        result += math.log(density[s])
+        result += math.log(density[0, s])
     return result

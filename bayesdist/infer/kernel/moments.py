@@ -15,9 +15,19 @@ import numba as nb
 import numpy as np
 from numpy.polynomial import legendre as series
 
-from bayesdist.infer.kernel.blocks import BLOCK, PASS, lay_out, scratch, share_out, threads_for
+from bayesdist.infer.kernel.blocks import (
+    BLOCK,
+    PASS,
+    aligned,
+    lay_out,
+    put_ones,
+    scratch,
+    share_out,
+    threads_for,
+)
 from bayesdist.infer.kernel.lanes import (
     AT_MOST,
+    INNER,
     ROWS,
     WIDTH,
     choose,
@@ -89,109 +99,98 @@ def _matrices(moments: Float, order: int) -> Float:
 _ONE, _TWO, _THREE, _FOUR, _FIVE, _SIX = (tile(n, BLOCK) for n in range(1, 7))
 
 
-@nb.njit(cache=True)
-def add_moments(columns, n, P, Q, sums):
-    """Add lanes of the moments of three rows of columns with P_i Q_j to sums (T, T, 3, WIDTH).
+def room_for(order: int, columns: int) -> tuple[Float, ...]:
+    """Room for the stars of a block, two models, columns to be summed, P, Q, lanes of the sums.
 
-    i + j is less than T.
+    The lanes are those of the moments of three columns at a time, (columns / 3, T, T, 3, WIDTH)
+    with i + j < T; only the first three, the weights, are taken to twice the order.
     """
-    top = len(sums)
-    for i in range(top):
-        j = 0
-        while j < top - i:
-            left = top - i - j
-            some = left if left <= AT_MOST else min((left + 1) >> 1, AT_MOST)  # alike, rather
-            if some == 1:
-                _ONE(n, columns, P, i, Q, j, sums)
-            elif some == 2:
-                _TWO(n, columns, P, i, Q, j, sums)
-            elif some == 3:
-                _THREE(n, columns, P, i, Q, j, sums)
-            elif some == 4:
-                _FOUR(n, columns, P, i, Q, j, sums)
-            elif some == 5:
-                _FIVE(n, columns, P, i, Q, j, sums)
-            else:
-                _SIX(n, columns, P, i, Q, j, sums)
-            j += some
-
-
-@nb.njit(cache=True)
-def by_total_order(lanes, out):
-    """Write moments, (T, T, 3, WIDTH) with their lanes, to out (3, M)."""
-    for i in range(len(lanes)):
-        for j in range(len(lanes) - i):
-            at = (i + j) * (i + j + 1) // 2 + j
-            for k in range(3):
-                out[k, at] = total(load(lanes[i, j, k], 0))
-
-
-@nb.njit(cache=True)
-def empty_lanes(order, columns):
-    """Zeros for the moments of three weights, and of each three of the other columns."""
-    twice, once, others = 2 * order + 1, order + 1, columns // ROWS - 1
+    T = 2 * order + 1
     return (
-        np.zeros((twice, twice, ROWS, WIDTH)),
-        np.zeros((others, once, once, ROWS, WIDTH)),
+        *(scratch(n) for n in (6, 2, 2, columns, T, T)),
+        aligned(columns // ROWS, T, T, ROWS, WIDTH),
     )
 
 
-@nb.njit(cache=True)
+@nb.njit(**INNER)
 def add_columns(columns, n, P, Q, lanes):
-    """Add the moments of some stars: of the first three columns, the weights, and of the others."""
-    add_moments(columns, n, P, Q, lanes[0])
-    for k in range(len(lanes[1])):
-        add_moments(columns[ROWS * (k + 1) :], n, P, Q, lanes[1][k])
+    """Add the moments of some stars to lanes."""
+    for g in range(len(lanes)):
+        top = len(P) if g == 0 else (len(P) + 1) >> 1
+        for i in range(top):
+            j = 0
+            while j < top - i:
+                left = top - i - j
+                some = left if left <= AT_MOST else min((left + 1) >> 1, AT_MOST)  # alike, rather
+                if some == 1:
+                    _ONE(n, columns, g, P, i, Q, j, lanes)
+                elif some == 2:
+                    _TWO(n, columns, g, P, i, Q, j, lanes)
+                elif some == 3:
+                    _THREE(n, columns, g, P, i, Q, j, lanes)
+                elif some == 4:
+                    _FOUR(n, columns, g, P, i, Q, j, lanes)
+                elif some == 5:
+                    _FIVE(n, columns, g, P, i, Q, j, lanes)
+                else:
+                    _SIX(n, columns, g, P, i, Q, j, lanes)
+                j += some
 
 
-@nb.njit(cache=True)
+@nb.njit(**INNER)
 def write_columns(lanes, out):
-    """Write all moments to out (columns, M)."""
-    by_total_order(lanes[0], out)
-    for k in range(len(lanes[1])):
-        by_total_order(lanes[1][k], out[ROWS * (k + 1) :])
+    """Write moments to out (columns, M), by total order, and zeros to the lanes."""
+    T = lanes.shape[1]
+    for g in range(len(lanes)):
+        top = T if g == 0 else (T + 1) >> 1
+        for i in range(top):
+            for j in range(top - i):
+                at, one = (i + j) * (i + j + 1) // 2 + j, lanes[g, i, j]
+                for r in range(ROWS):
+                    sums = load(one, r, 0)
+                    out[ROWS * g + r, at] = total(sums)
+                    put(one, r, 0, spread(0.0, sums))
 
 
 @nb.njit(**PASS)
-def _least_squares(start, stop, pieces, columns, coef, order, rules, sums, scalars):
+def _least_squares(
+    start, stop, stars, about, test, weighted, P, Q, lanes,
+    pieces, columns, coef_about, coef_test, order, rules, sums, scalars,
+):  # fmt: skip
     chi2_limit, r2_limit, corner, power = rules[0], rules[1], rules[2], int(rules[3])
-    P, Q, stars = scratch(2 * order + 1), scratch(2 * order + 1), scratch(6)
-    about, test, weighted = scratch(2), scratch(2), scratch(6)
-    weighted[:] = 0.0  # the third and sixth stay so, since they are taken by three
-    zero = spread(0.0, load(about[0], 0))
+    zero = spread(0.0, load(about, 0, 0))
     for b in range(start, stop):
         g, first, end = pieces[b]
-        lanes = empty_lanes(order, len(weighted))
         used_sum = far_sum = chi2 = uu = vv = left_out = weighted_chi2 = u_sum = v_sum = zero
         for a in range(first, end, BLOCK):
             e = min(a + BLOCK, end)
             n = e - a
             lay_out(columns, a, e, stars)
-            evaluate(coef[g, :2], order, stars[0], stars[1], n, about)
-            evaluate(coef[g, 2:], order, stars[0], stars[1], n, test)
+            evaluate(coef_about[g], order, stars, n, about)
+            evaluate(coef_test[g], order, stars, n, test)
             for s in range(0, n, WIDTH):
-                x, y = load(stars[0], s), load(stars[1], s)
-                u, v = load(stars[2], s), load(stars[3], s)
-                iu, iv = 1.0 / load(stars[4], s), 1.0 / load(stars[5], s)
-                du, dv = u - load(test[0], s), v - load(test[1], s)
+                x, y = load(stars, 0, s), load(stars, 1, s)
+                u, v = load(stars, 2, s), load(stars, 3, s)
+                iu, iv = 1.0 / load(stars, 4, s), 1.0 / load(stars, 5, s)
+                du, dv = u - load(test, 0, s), v - load(test, 1, s)
                 there = first_lanes(n - s, spread(1.0, x), 0.0)
                 near = choose(du * du + dv * dv, r2_limit, there, 0.0)
                 used = choose(du * du * iu + dv * dv * iv, chi2_limit, near, 0.0)
                 extra = 1.0 + (corner - 1.0) * 0.5 * (x * x + y * y)
                 factor = used * extra * extra if power == 2 else used * extra
-                ru, rv = u - load(about[0], s), v - load(about[1], s)
+                ru, rv = u - load(about, 0, s), v - load(about, 1, s)
                 wu, wv = factor * iu, factor * iv
-                put(weighted[0], s, wu)
-                put(weighted[1], s, wv)
-                put(weighted[3], s, wu * ru)
-                put(weighted[4], s, wv * rv)
+                put(weighted, 0, s, wu)
+                put(weighted, 1, s, wv)
+                put(weighted, 3, s, wu * ru)
+                put(weighted, 4, s, wv * rv)
                 used_sum, far_sum = used_sum + used, far_sum + (there - near)
                 chi2 += used * (ru * ru * iu + rv * rv * iv)
                 uu, vv = uu + used * ru * ru, vv + used * rv * rv
                 left_out += (there - used) * (ru * ru + rv * rv)
                 weighted_chi2 += wu * ru * ru + wv * rv * rv
                 u_sum, v_sum = u_sum + used * ru, v_sum + used * rv
-            legendre(stars[0], stars[1], n, 2 * order, P, Q)
+            legendre(stars, n, 2 * order, P, Q)
             add_columns(weighted, n, P, Q, lanes)
         write_columns(lanes, sums[b])
         scalars[b, 0] = total(used_sum)
@@ -206,29 +205,28 @@ def _least_squares(start, stop, pieces, columns, coef, order, rules, sums, scala
 
 
 @nb.njit(**PASS)
-def _mixture(start, stop, pieces, columns, coef, order, row, unit2, em, sums, scalars):
-    P, Q, stars = scratch(2 * order + 1), scratch(2 * order + 1), scratch(6)
-    model, density = scratch(2), scratch(1)[0]
-    weighted = scratch(6 if em else COLUMNS)
+def _mixture(
+    start, stop, stars, model, density, weighted, P, Q, lanes,
+    pieces, columns, coef, order, row, unit2, em, sums, scalars,
+):  # fmt: skip
     wavering, log_unit = 0.0 if em else 1.0, math.log(2 * math.pi * unit2)
     j2, core, outlier, half, never = row[0], row[1], row[2], row[3], row[4]
     f, w = row[5], row[6]
-    zero = spread(0.0, load(density, 0))
+    zero = spread(0.0, load(density, 0, 0))
     for b in range(start, stop):
         g, first, end = pieces[b]
-        lanes = empty_lanes(order, len(weighted))
         low = by_j = outliers = by_s = jj = jf = js = pp = fs = ss = zero
         logs = 0.0
         for a in range(first, end, BLOCK):
             e = min(a + BLOCK, end)
             n = e - a
             lay_out(columns, a, e, stars)
-            evaluate(coef[g], order, stars[0], stars[1], n, model)
-            density[:] = 1.0
+            evaluate(coef[g], order, stars, n, model)
+            put_ones(density, n)
             for s in range(0, n, WIDTH):
-                ru = load(stars[2], s) - load(model[0], s)
-                rv = load(stars[3], s) - load(model[1], s)
-                au, av = load(stars[4], s) + j2, load(stars[5], s) + j2
+                ru = load(stars, 2, s) - load(model, 0, s)
+                rv = load(stars, 3, s) - load(model, 1, s)
+                au, av = load(stars, 4, s) + j2, load(stars, 5, s) + j2
                 root = inverse_root(au * av)
                 inverse = root * root
                 iu, iv = av * inverse, au * inverse
@@ -242,7 +240,7 @@ def _mixture(start, stop, pieces, columns, coef, order, row, unit2, em, sums, sc
                 d_in = peak * choose(q_in, q_out, 1.0, t)
                 d_out = outlier * choose(q_in, q_out, t, 1.0)
                 both = d_in + d_out
-                put(density, s, first_lanes(n - s, both, 1.0))
+                put(density, 0, s, first_lanes(n - s, both, 1.0))
                 low += first_lanes(n - s, least, 0.0)
                 whole = first_lanes(n - s, 1.0 / both, 0.0)
                 p, q = d_out * whole, d_in * whole
@@ -253,19 +251,18 @@ def _mixture(start, stop, pieces, columns, coef, order, row, unit2, em, sums, sc
                 D_s = 2.0 - r2 * w
                 turn = pq * wavering
                 wu, wv = q * iu + p * w, q * iv + p * w
-                put(weighted[0], s, wu - turn * D_u * D_u)
-                put(weighted[1], s, 0.0 - turn * D_u * D_v)
-                put(weighted[2], s, wv - turn * D_v * D_v)
-                put(weighted[3], s, wu * ru)
-                put(weighted[4], s, wv * rv)
-                put(weighted[5], s, q * 2.0 * j2 * ru * iu * iu + turn * D_j * D_u)
+                put(weighted, 0, s, wu - turn * D_u * D_u)
+                put(weighted, 1, s, 0.0 - turn * D_u * D_v)
+                put(weighted, 2, s, wv - turn * D_v * D_v)
+                put(weighted, 3, s, wu * ru)
+                put(weighted, 4, s, wv * rv)
+                put(weighted, 5, s, q * 2.0 * j2 * ru * iu * iu + turn * D_j * D_u)
                 if not em:
-                    put(weighted[6], s, q * 2.0 * j2 * rv * iv * iv + turn * D_j * D_v)
-                    put(weighted[7], s, 0.0 - turn * D_u)
-                    put(weighted[8], s, 0.0 - turn * D_v)
-                    put(weighted[9], s, p * 2.0 * ru * w + turn * D_s * D_u)
-                    put(weighted[10], s, p * 2.0 * rv * w + turn * D_s * D_v)
-                    put(weighted[11], s, zero)
+                    put(weighted, 6, s, q * 2.0 * j2 * rv * iv * iv + turn * D_j * D_v)
+                    put(weighted, 7, s, 0.0 - turn * D_u)
+                    put(weighted, 8, s, 0.0 - turn * D_v)
+                    put(weighted, 9, s, p * 2.0 * ru * w + turn * D_s * D_u)
+                    put(weighted, 10, s, p * 2.0 * rv * w + turn * D_s * D_v)
                 second = 2.0 * D_j + 2.0 * j2 * j2 * (
                     (1.0 - 2.0 * eu) * iu * iu + (1.0 - 2.0 * ev) * iv * iv
                 )
@@ -274,7 +271,7 @@ def _mixture(start, stop, pieces, columns, coef, order, row, unit2, em, sums, sc
                 js, pp, fs = js - pq * D_j * D_s, pp + pq, fs + pq * D_s
                 ss += 2.0 * p * r2 * w - pq * D_s * D_s
             logs += log_of_product(density) - n * log_unit
-            legendre(stars[0], stars[1], n, 2 * order, P, Q)
+            legendre(stars, n, 2 * order, P, Q)
             add_columns(weighted, n, P, Q, lanes)
         write_columns(lanes, sums[b])
         scalars[b, 0] = logs - total(low)
@@ -335,11 +332,13 @@ def least_squares_moments(
             len(pieces),
             pieces,
             columns,
-            np.concatenate([about, test], axis=1),
+            np.ascontiguousarray(about),
+            np.ascontiguousarray(test),
             order,
             rules,
             sums,
             scalars,
+            room=lambda: room_for(order, 6),
         )
     total = _by_group(sums, pieces)
     weight = np.zeros((len(about), 3, K, K))
@@ -382,6 +381,7 @@ def mixture_moments(
             em,
             sums,
             scalars,
+            room=lambda: room_for(order, 6 if em else COLUMNS),
         )
     return mixture_sums(_by_group(sums, pieces), scalars.sum(axis=0), order, em)
 

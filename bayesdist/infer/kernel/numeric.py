@@ -13,7 +13,7 @@ import numba as nb
 from numba import types
 from numba.extending import intrinsic
 
-from bayesdist.infer.kernel.lanes import HAS_512, Lanes, larger, near_inverse_root
+from bayesdist.infer.kernel.lanes import HAS_512, INNER, Lanes, larger, near_inverse_root
 
 
 def _same_bits(element: Any) -> Any:
@@ -42,7 +42,7 @@ LN2_HIGH, LN2_LOW = 6.93147180369123816490e-01, 1.90821492927058770002e-10
 # Inlined by LLVM, not by numba: inside a loop that may reorder its sums, adding and subtracting
 # ROUND must stay as it is. And always: a function that is called is compiled twice, and which
 # version is used, hence the last bit of a sum, would depend on whether the cache was warm.
-@nb.njit(cache=True, forceinline=True, fastmath={"contract"})
+@nb.njit(**INNER, forceinline=True, fastmath={"contract"})
 def exp_negative(x):
     """exp(x) for x <= 0, within two units of the last digit; below -700 as at -700."""
     x = larger(x, LOWEST)
@@ -66,7 +66,7 @@ def exp_negative(x):
     return from_bits(bits_of(p) + (bits_of(shifted) << 52))
 
 
-@nb.njit(cache=True, forceinline=True, fastmath={"contract"})
+@nb.njit(**INNER, forceinline=True, fastmath={"contract"})
 def _nearer(x, r):
     """1 / sqrt(x) from r, whose relative error is raised to the fourth power."""
     e = 1.0 - (x * r) * r
@@ -75,19 +75,19 @@ def _nearer(x, r):
 
 if HAS_512:
 
-    @nb.njit(cache=True, forceinline=True)
+    @nb.njit(**INNER, forceinline=True)
     def _near(x):
         return near_inverse_root(x)
 
 else:
 
-    @nb.njit(cache=True, forceinline=True)
+    @nb.njit(**INNER, forceinline=True)
     def _near(x):
         # halving and negating the exponent is right to 3.5 %
         return _nearer(x, from_bits(0x5FE6EB50C7B537A9 - (bits_of(x) >> 1)))
 
 
-@nb.njit(cache=True, forceinline=True)
+@nb.njit(**INNER, forceinline=True)
 def inverse_root(x):
     """1 / sqrt(x) of lanes, positive in the normal range, within two units of the last digit.
 

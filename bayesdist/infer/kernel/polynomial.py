@@ -4,18 +4,18 @@ from __future__ import annotations
 
 import numba as nb
 
-from bayesdist.infer.kernel.lanes import FAST, WIDE, load_wide, put, spread
+from bayesdist.infer.kernel.lanes import FAST, INNER, WIDE, load_wide, put, spread
 
 
-@nb.njit(cache=True, fastmath=FAST)
-def evaluate(coef, order, X, Y, n, out):
+@nb.njit(**INNER, fastmath=FAST)
+def evaluate(coef, order, stars, n, out):
     """Write sums of c_ij X^i Y^j with i + j <= order for both axes to out (2, BLOCK).
 
-    `coef` (2, K) are sorted as `polynomial_terms`; X and Y are rows of `blocks.scratch`.
+    `coef` (2, K) are sorted as `polynomial_terms`; X and Y are the first rows of `stars`.
     """
-    cu, cv, pu, pv = coef[0], coef[1], out[0], out[1]
+    cu, cv = coef[0], coef[1]
     for s in range(0, n, WIDE):
-        x, y = load_wide(X, s), load_wide(Y, s)
+        x, y = load_wide(stars, 0, s), load_wide(stars, 1, s)
         u = v = spread(0.0, x)
         for i in range(order, -1, -1):
             k = order * (order + 1) // 2 + (order - i)
@@ -24,22 +24,22 @@ def evaluate(coef, order, X, Y, n, out):
                 k = (i + j) * (i + j + 1) // 2 + j
                 inner_u, inner_v = inner_u * y + cu[k], inner_v * y + cv[k]
             u, v = u * x + inner_u, v * x + inner_v
-        put(pu, s, u)
-        put(pv, s, v)
+        put(out, 0, s, u)
+        put(out, 1, s, v)
 
 
-@nb.njit(cache=True, fastmath=FAST)
-def legendre(X, Y, n, top, P, Q):
-    """P[k, s] = P_k(X[s]) for k <= top, and Q of Y; X and Y are rows of `blocks.scratch`."""
+@nb.njit(**INNER, fastmath=FAST)
+def legendre(stars, n, top, P, Q):
+    """P[k, s] = P_k(X[s]) for k <= top, and Q of Y; X and Y are the first rows of `stars`."""
     for s in range(0, n, WIDE):
-        x, y = load_wide(X, s), load_wide(Y, s)
+        x, y = load_wide(stars, 0, s), load_wide(stars, 1, s)
         a = b = spread(1.0, x)
         p, q = x, y
-        put(P[0], s, a)
-        put(Q[0], s, a)
+        put(P, 0, s, a)
+        put(Q, 0, s, a)
         for k in range(1, top + 1):
-            put(P[k], s, p)
-            put(Q[k], s, q)
+            put(P, k, s, p)
+            put(Q, k, s, q)
             part = 1.0 / (k + 1)
             a, p = p, x * p * (2.0 - part) - a * (1.0 - part)
             b, q = q, y * q * (2.0 - part) - b * (1.0 - part)

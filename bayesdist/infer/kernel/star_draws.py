@@ -55,12 +55,12 @@ C00, C10, C11, G0, G1, SQUARE = range(6)
 
 @nb.njit(cache=True, forceinline=True)
 def _place(coef, start, phi, offset_u, offset_v):
-    """offset + sum of phi_k coef_k in lanes, of coefficients (2, K, WIDTH) from an index on."""
+    """offset + sum of phi_k coef_k in lanes, of coefficients in 2 K rows (WIDTH,) from one on."""
     K = len(phi)
-    u, v = load(coef, start) * phi[0] + offset_u, load(coef, start + K * WIDTH) * phi[0] + offset_v
+    u, v = load(coef, start, 0) * phi[0] + offset_u, load(coef, start + K, 0) * phi[0] + offset_v
     for k in range(1, K):
-        u = u + load(coef, start + k * WIDTH) * phi[k]
-        v = v + load(coef, start + (K + k) * WIDTH) * phi[k]
+        u = u + load(coef, start + k, 0) * phi[k]
+        v = v + load(coef, start + K + k, 0) * phi[k]
     return u, v
 
 
@@ -82,15 +82,15 @@ def _newton(n, a, W, var, at, d, constants, centre, precision, p, least, found):
     positive, or the step long; the product of the densities of the detections; the determinant of
     the curvature.
     """
-    jitter, far_odds = load(constants, d), load(constants, constants.shape[1] + d)
-    pu, pv = load(p, 0), load(p, WIDTH)
+    jitter, far_odds = load(constants, 0, d), load(constants, 1, d)
+    pu, pv = load(p, 0, 0), load(p, 1, 0)
     zero = spread(0.0, pu)
     a00, a10, a11, b0, b1 = zero, zero, zero, zero, zero
     mantissa, exponent = spread(1.0, pu), zero
     for i in range(n):
         uu, uv, vv = W[a + i, 0], W[a + i, 1], W[a + i, 2]
         inverse = 1.0 / (jitter + var[a + i])
-        ru, rv = load(at, 2 * i * WIDTH) - pu, load(at, (2 * i + 1) * WIDTH) - pv
+        ru, rv = load(at, 2 * i, 0) - pu, load(at, 2 * i + 1, 0) - pv
         wu, wv = ru * uu + rv * uv, ru * uv + rv * vv
         core = exp_negative((ru * wu + rv * wv) * inverse * -0.5) * inverse
         density = core + far_odds
@@ -119,13 +119,13 @@ def _newton(n, a, W, var, at, d, constants, centre, precision, p, least, found):
     far = choose(NEAR, left, math.inf, far)
     far = choose(a00, least * least, math.inf, far)
     far = choose(rest, least * least, math.inf, far)
-    put(p, 0, pu + du)
-    put(p, WIDTH, pv + dv)
-    put(found, GAIN * WIDTH, gain + left * 0.5)
-    put(found, FAR * WIDTH, far)
-    put(found, MANTISSA * WIDTH, mantissa)
-    put(found, EXPONENT * WIDTH, exponent)
-    put(found, DET * WIDTH, a00 * rest)
+    put(p, 0, 0, pu + du)
+    put(p, 1, 0, pv + dv)
+    put(found, GAIN, 0, gain + left * 0.5)
+    put(found, FAR, 0, far)
+    put(found, MANTISSA, 0, mantissa)
+    put(found, EXPONENT, 0, exponent)
+    put(found, DET, 0, a00 * rest)
 
 
 @nb.njit(cache=True)
@@ -134,10 +134,10 @@ def _members(n, a, W, var, at, d, constants, state, centre, precision, p, member
 
     Written to `members` (8, WIDTH): the sums, then mantissas and exponents of the product of the
     densities of members where they are largest, each times 2 pi.  Those of each doubtful one are
-    written to `doubtful` (k or more, 7, WIDTH), its density last.
+    written to `doubtful` (7 k rows or more, WIDTH), its density last.
     """
-    jitter = load(constants, d)
-    pu, pv = load(p, 0), load(p, WIDTH)
+    jitter = load(constants, 0, d)
+    pu, pv = load(p, 0, 0), load(p, 1, 0)
     du, dv = centre[0] - pu, centre[1] - pv
     g0 = du * precision[0, 0] + dv * precision[1, 0]
     g1 = du * precision[1, 0] + dv * precision[1, 1]
@@ -149,32 +149,32 @@ def _members(n, a, W, var, at, d, constants, state, centre, precision, p, member
         if state[a + i] == FALSE:
             continue
         inverse = 1.0 / (jitter + var[a + i])
-        u, v = load(at, 2 * i * WIDTH) - pu, load(at, (2 * i + 1) * WIDTH) - pv
+        u, v = load(at, 2 * i, 0) - pu, load(at, 2 * i + 1, 0) - pv
         uu, uv, vv = inverse * W[a + i, 0], inverse * W[a + i, 1], inverse * W[a + i, 2]
         by_u, by_v = u * uu + v * uv, u * uv + v * vv
         more = u * by_u + v * by_v
         if state[a + i] == DOUBTFUL:
-            row = 7 * k * WIDTH
-            put(doubtful, row + C00 * WIDTH, uu)
-            put(doubtful, row + C10 * WIDTH, uv)
-            put(doubtful, row + C11 * WIDTH, vv)
-            put(doubtful, row + G0 * WIDTH, by_u)
-            put(doubtful, row + G1 * WIDTH, by_v)
-            put(doubtful, row + SQUARE * WIDTH, more)
-            put(doubtful, row + 6 * WIDTH, inverse)
+            row = 7 * k
+            put(doubtful, row + C00, 0, uu)
+            put(doubtful, row + C10, 0, uv)
+            put(doubtful, row + C11, 0, vv)
+            put(doubtful, row + G0, 0, by_u)
+            put(doubtful, row + G1, 0, by_v)
+            put(doubtful, row + SQUARE, 0, more)
+            put(doubtful, row + 6, 0, inverse)
             k += 1
             continue
         c00, c10, c11 = c00 + uu, c10 + uv, c11 + vv
         g0, g1, square = g0 + by_u, g1 + by_v, square + more
         mantissa, exponent = _times(mantissa, exponent, inverse)
-    put(members, C00 * WIDTH, c00)
-    put(members, C10 * WIDTH, c10)
-    put(members, C11 * WIDTH, c11)
-    put(members, G0 * WIDTH, g0)
-    put(members, G1 * WIDTH, g1)
-    put(members, SQUARE * WIDTH, square)
-    put(members, 6 * WIDTH, mantissa)
-    put(members, 7 * WIDTH, exponent)
+    put(members, C00, 0, c00)
+    put(members, C10, 0, c10)
+    put(members, C11, 0, c11)
+    put(members, G0, 0, g0)
+    put(members, G1, 0, g1)
+    put(members, SQUARE, 0, square)
+    put(members, 6, 0, mantissa)
+    put(members, 7, 0, exponent)
     return k
 
 
@@ -194,10 +194,13 @@ def _over_choices(members, doubtful, k, l, log_norm, log_out, least):
             if not choice >> i & 1:
                 value += log_out
                 continue
-            one = doubtful[i]
-            c00, c10, c11 = c00 + one[C00, l], c10 + one[C10, l], c11 + one[C11, l]
-            g0, g1, square = g0 + one[G0, l], g1 + one[G1, l], square + one[SQUARE, l]
-            value += log_norm + math.log(one[6, l])
+            row = 7 * i
+            c00 += doubtful[row + C00, l]
+            c10 += doubtful[row + C10, l]
+            c11 += doubtful[row + C11, l]
+            g0, g1 = g0 + doubtful[row + G0, l], g1 + doubtful[row + G1, l]
+            square += doubtful[row + SQUARE, l]
+            value += log_norm + math.log(doubtful[row + 6, l])
         det = c00 * c11 - c10 * c10
         if det > 0.0:
             square -= (c11 * g0 * g0 - 2.0 * c10 * g0 * g1 + c00 * g1 * g1) / det
@@ -239,39 +242,39 @@ def _at_modes(n, a, W, var, at, d, constants, centre, precision, place, least, f
 @nb.njit(**PASS)
 def _log_marginals(
     start, stop, starts, group, X, Y, offset, W, var, time, factor, centre, precision, stars,
-    middles, response, state, coef, order, constants, least, sums,
+    middles, response, state, coef, G, order, constants, least, sums,
 ):  # fmt: skip
-    q, G, K, n_draws = stars.shape[1], coef.shape[1], coef.shape[3], sums.shape[1]
+    q, K, n_draws = stars.shape[1], (order + 1) * (order + 2) // 2, sums.shape[1]
     step = -(-len(stars) // PIECES)
     for piece in range(start, stop):
         S, A, b = np.zeros((2, MOST_STAR)), np.zeros((MOST_STAR, MOST_STAR)), np.zeros(MOST_STAR)
         px, py, p = np.empty(order + 1), np.empty(order + 1), np.empty(q)
         first, place, value = np.empty((2, WIDTH)), np.empty((2, WIDTH)), np.empty(WIDTH)
         found, members = np.empty((5, WIDTH)), np.empty((8, WIDTH))
-        doubtful = np.empty((MOST_DOUBTFUL, 7, WIDTH))
-        phi, at = np.empty((16, K)), np.empty((16, 2, WIDTH))
+        doubtful = np.empty((7 * MOST_DOUBTFUL, WIDTH))
+        phi, at = np.empty((16, K)), np.empty((32, WIDTH))
         for s in range(piece * step, min((piece + 1) * step, len(stars))):
             a, n = starts[s], starts[s + 1] - starts[s]
             if n > len(phi):
-                phi, at = np.empty((2 * n, K)), np.empty((2 * n, 2, WIDTH))
+                phi, at = np.empty((2 * n, K)), np.empty((4 * n, WIDTH))
             several, n_false = False, 0
             for i in range(n):
                 legendre(X[a + i], Y[a + i], order, px, py, phi[i])
                 several |= state[a + i] == DOUBTFUL
                 n_false += state[a + i] == FALSE
-            for block in range(len(coef)):
+            for block in range(constants.shape[1] // WIDTH):
                 d = block * WIDTH
-                pu = spread(stars[s, 0] - middles[s, 0], load(place, 0))
+                pu = spread(stars[s, 0] - middles[s, 0], load(place, 0, 0))
                 pv = spread(stars[s, 1] - middles[s, 1], pu)
                 for i in range(n):
-                    begin = (block * G + group[a + i]) * 2 * K * WIDTH
+                    begin = (block * G + group[a + i]) * 2 * K
                     u, v = _place(coef, begin, phi[i], offset[a + i, 0], offset[a + i, 1])
                     pu += u * response[a + i, 0, 0] + v * response[a + i, 0, 1]
                     pv += u * response[a + i, 1, 0] + v * response[a + i, 1, 1]
-                    put(at, 2 * i * WIDTH, u)
-                    put(at, (2 * i + 1) * WIDTH, v)
-                put(first, 0, pu)
-                put(first, WIDTH, pv)
+                    put(at, 2 * i, 0, u)
+                    put(at, 2 * i + 1, 0, v)
+                put(first, 0, 0, pu)
+                put(first, 1, 0, pv)
                 if several:
                     k = _members(
                         n, a, W, var, at, d, constants, state, centre[s], precision[s], first,
@@ -295,7 +298,7 @@ def _log_marginals(
                     if not math.isfinite(value[l]):
                         own = own_rows(W, var, a, a + n)
                         for i in range(n):
-                            own[PLACE_U, i], own[PLACE_V, i] = at[i, 0, l], at[i, 1, l]
+                            own[PLACE_U, i], own[PLACE_V, i] = at[2 * i, l], at[2 * i + 1, l]
                         p[:] = stars[s]
                         p[0], p[1] = first[0, l], first[1, l]
                         value[l], _ = to_mode(
@@ -334,7 +337,7 @@ def log_marginals(
     constants = np.stack([j2, 2 * np.pi * np.exp(log_out - log_core), log_core, log_out])
     sums = np.zeros((PIECES, D))
     share_out(
-        _log_marginals, PIECES, *detections, stars, middles, response, state, in_lanes, order,
-        constants, least, sums,
+        _log_marginals, PIECES, *detections, stars, middles, response, state,
+        in_lanes.reshape(-1, WIDTH), G, order, constants, least, sums,
     )  # fmt: skip
     return sums

@@ -15,12 +15,11 @@ from bayesdist.utils.arrays import Float, Int
 
 
 @nb.njit(**PASS)
-def _residuals(first, end, blocks, columns, coef, order, out):
-    stars, model = scratch(6), scratch(2)
+def _residuals(first, end, stars, model, blocks, columns, coef, order, out):
     for b in range(first, end):
         g, a, e = blocks[b]
         lay_out(columns, a, e, stars)
-        evaluate(coef[g], order, stars[0], stars[1], e - a, model)
+        evaluate(coef[g], order, stars, e - a, model)
         for s in range(e - a):
             out[a + s, 0] = stars[2, s] - model[0, s]
             out[a + s, 1] = stars[3, s] - model[1, s]
@@ -42,22 +41,22 @@ def residuals(blocks: Int, columns: tuple[Float, ...], coef: Float, order: int) 
             np.ascontiguousarray(coef),
             order,
             out,
+            room=lambda: (scratch(6), scratch(2)),
         )
     return out
 
 
 @nb.njit(**PASS)
-def _memberships(first, end, blocks, columns, coef, order, rows, unit2, out):
+def _memberships(first, end, stars, model, blocks, columns, coef, order, rows, unit2, out):
     each = len(rows) // len(out)
     share, constant = 1.0 / each, math.log(2 * math.pi * unit2)
-    stars, model = scratch(6), scratch(2)
     for b in range(first, end):
         g, a, e = blocks[b]
         n = e - a
         lay_out(columns, a, e, stars)
         for d in range(len(rows)):
             mean = out[d // each]
-            evaluate(coef[d, g], order, stars[0], stars[1], n, model)
+            evaluate(coef[d, g], order, stars, n, model)
             for s in range(n):
                 ru, rv = stars[2, s] - model[0, s], stars[3, s] - model[1, s]
                 iu, iv = 1.0 / (stars[4, s] + rows[d, 0]), 1.0 / (stars[5, s] + rows[d, 0])
@@ -99,5 +98,6 @@ def memberships(
             packed(constants),
             constants.unit2,
             out,
+            room=lambda: (scratch(6), scratch(2)),
         )
     return out

@@ -28,9 +28,9 @@ from bayesdist.infer.kernel.moments import (
     Moments,
     _by_group,
     add_columns,
-    empty_lanes,
     empty_sums,
     mixture_sums,
+    room_for,
     write_columns,
 )
 from bayesdist.infer.kernel.numeric import exp_negative
@@ -75,20 +75,21 @@ def _parts(star, row, circle, q, work):
 
 
 @nb.njit(**PASS)
-def _evaluated(first, end, blocks, stars, coef, order, rows, unit2, circle, sums, out):
+def _evaluated(
+    first, end, places, model, blocks, stars, coef, order, rows, unit2, circle, sums, out
+):
     """Log-likelihood (n, D) of each block; averages by star to out (D / each, 3, N) if any."""
     n_draws, wanted = len(rows), len(out) > 0
     each = n_draws // len(out) if wanted else 1
     share, constant = 1.0 / each, math.log(2 * math.pi * unit2)
     for b in range(first, end):
         g, a, e = blocks[b]
-        places, model = scratch(6), scratch(2)
         q, work = np.empty(MOST), np.empty(MOST)
         lay_out(stars, a, e, places)
         if wanted:
             out[:, :, a:e] = 0.0
         for d in range(n_draws):
-            evaluate(coef[d, g], order, places[0], places[1], e - a, model)
+            evaluate(coef[d, g], order, places, e - a, model)
             total = 0.0
             for i in range(a, e):
                 star = _residual(stars, i, model, i - a, rows[d, 0])
@@ -167,20 +168,21 @@ def _terms(star, row, circle, wavering, q, work, zc, zo, out):
 
 
 @nb.njit(**PASS)
-def _moments(start, stop, pieces, stars, coef, order, row, unit2, circle, em, sums, scalars):
-    P, Q, places, model = scratch(2 * order + 1), scratch(2 * order + 1), scratch(6), scratch(2)
+def _moments(
+    start, stop, places, model, _, weighted, P, Q, lanes,
+    pieces, stars, coef, order, row, unit2, circle, em, sums, scalars,
+):  # fmt: skip
     q, work, zc, zo = np.empty(MOST), np.empty(MOST), np.empty(10), np.empty(10)
-    one, weighted = np.empty(N_TERMS), scratch(6 if em else COLUMNS)
+    one = np.empty(N_TERMS)
     wavering, log_unit = 0.0 if em else 1.0, math.log(2 * math.pi * unit2)
     for b in range(start, stop):
         g, first, end = pieces[b]
-        lanes = empty_lanes(order, len(weighted))
         for a in range(first, end, BLOCK):
             e = min(a + BLOCK, end)
             n = e - a
             lay_out(stars, a, e, places)
-            evaluate(coef[g], order, places[0], places[1], n, model)
-            legendre(places[0], places[1], n, 2 * order, P, Q)
+            evaluate(coef[g], order, places, n, model)
+            legendre(places, n, 2 * order, P, Q)
             weighted[:] = 0.0
             for s in range(n):
                 star = _residual(stars, a + s, model, s, row[0])
@@ -195,20 +197,23 @@ def _moments(start, stop, pieces, stars, coef, order, row, unit2, circle, em, su
 
 
 @nb.njit(**PASS)
-def _scores(first, end, blocks, stars, coef, order, row, circle, out):
+def _scores(first, end, places, model, blocks, stars, coef, order, row, circle, out):
     for b in range(first, end):
         g, a, e = blocks[b]
-        places, model = scratch(6), scratch(2)
         q, work, zc, zo = np.empty(MOST), np.empty(MOST), np.empty(10), np.empty(10)
         one = np.empty(N_TERMS)
         lay_out(stars, a, e, places)
-        evaluate(coef[g], order, places[0], places[1], e - a, model)
+        evaluate(coef[g], order, places, e - a, model)
         for i in range(a, e):
             star = _residual(stars, i, model, i - a, row[0])
             _terms(star, row, circle, 1.0, q, work, zc, zo, one)
             out[0, i], out[1, i] = one[3], one[4]
             for k in range(3):
                 out[2 + k, i] = one[k]
+
+
+def _room() -> tuple[Float, ...]:
+    return scratch(6), scratch(2)
 
 
 def _circle(constants: Constants) -> tuple[Any, ...]:
@@ -248,6 +253,7 @@ def truncated_log_likelihood(
                 circle,
                 sums,
                 nothing,
+                room=_room,
             )
             # as in `log_likelihood`
             out[some] = np.ascontiguousarray(sums.T).sum(axis=1)
@@ -281,6 +287,7 @@ def truncated_memberships(
             _circle(constants),
             np.empty((len(blocks), len(coef))),
             out,
+            room=_room,
         )
     return out
 
@@ -317,6 +324,7 @@ def truncated_moments(
             em,
             sums,
             scalars,
+            room=lambda: room_for(order, 6 if em else COLUMNS),
         )
     return mixture_sums(_by_group(sums, pieces), scalars.sum(axis=0), order, em)
 
@@ -346,5 +354,6 @@ def truncated_scores(
             packed(constants)[0],
             _circle(constants),
             out,
+            room=_room,
         )
     return out
