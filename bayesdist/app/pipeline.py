@@ -24,8 +24,8 @@ from typing import Any
 
 from bayesdist.app.assessment.checks import run_checks
 from bayesdist.app.assessment.diagnosing import diagnose_run as diagnose
+from bayesdist.app.assessment.error_terms import assessment_rng, evaluation_settings
 from bayesdist.app.assessment.error_terms import errors_of_run as error_model
-from bayesdist.app.assessment.settings import assessment_rng, evaluation_settings
 from bayesdist.app.config import Config
 from bayesdist.app.kinds.fit_data import FitData, StarReader
 from bayesdist.app.kinds.kind import kind_of

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from bayesdist.app.assessment.error_terms import errors_of_fit
+from bayesdist.app.assessment.error_terms import assessment_rng, errors_of_fit, rehearsal_settings
 from bayesdist.app.assessment.periods import check_pairs
-from bayesdist.app.assessment.settings import assessment_rng, rehearsal_settings
 from bayesdist.app.config import Config
 from bayesdist.app.kinds.fit_data import FitData
 from bayesdist.app.products.made_files import made_files, product_input

@@ -11,8 +11,11 @@ from typing import Any, TypeVar
 
 from bayesdist.app.assessment.checks import run_checks
 from bayesdist.app.assessment.diagnosing import diagnose_residuals, diagnose_run
-from bayesdist.app.assessment.error_terms import errors_of_run
-from bayesdist.app.assessment.settings import assessment_epoch, evaluation_settings
+from bayesdist.app.assessment.error_terms import (
+    assessment_epoch,
+    errors_of_run,
+    evaluation_settings,
+)
 from bayesdist.app.config import Config
 from bayesdist.app.kinds.fit_data import FitData, StarReader
 from bayesdist.app.kinds.fitted import Fitted
@@ -21,8 +24,7 @@ from bayesdist.app.kinds.matched import Matched
 from bayesdist.app.kinds.matches.sources import RunInput, input_of_run
 from bayesdist.app.products.made_files import ProductInput, product_of, solution_of
 from bayesdist.app.store.rundir import RunDirectory
-from bayesdist.app.tables.diagnostics_files import load_diagnostics
-from bayesdist.app.tables.evaluation_files import load_evaluation
+from bayesdist.app.tables.result_files import load_diagnostics, load_evaluation
 from bayesdist.assess.evaluation import Evaluation, EvaluationSettings
 from bayesdist.assess.model import ErrorModel
 from bayesdist.diagnose.diagnostics import Diagnostics

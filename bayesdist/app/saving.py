@@ -9,9 +9,9 @@ from pathlib import Path
 from typing import Any
 
 from bayesdist.app.assessment.checks import frames_doubt, in_circle
-from bayesdist.app.assessment.holdout import holdout_summary, holdout_table
+from bayesdist.app.assessment.diagnosing import holdout_summary, holdout_table
+from bayesdist.app.assessment.error_terms import idle_dates
 from bayesdist.app.assessment.periods import periods_summary, periods_table
-from bayesdist.app.assessment.settings import idle_dates
 from bayesdist.app.config import Config
 from bayesdist.app.kinds.fit_data import FitData
 from bayesdist.app.kinds.fitted import Fitted
@@ -23,8 +23,7 @@ from bayesdist.app.store.keys import attributes
 from bayesdist.app.store.output import provenance_notes, write_table
 from bayesdist.app.store.rundir import part_files
 from bayesdist.app.store.summary import Sampler
-from bayesdist.app.tables.diagnostics_files import write_diagnostics
-from bayesdist.app.tables.evaluation_files import write_evaluation
+from bayesdist.app.tables.result_files import write_diagnostics, write_evaluation
 from bayesdist.data import Matches
 from bayesdist.data.storage.write import write_columns
 from bayesdist.diagnose.residuals.epoch_shift import epoch_shift

@@ -8,7 +8,7 @@ from unittest.mock import patch
 
 import numpy as np
 
-from bayesdist.app.assessment.settings import assessment_rng
+from bayesdist.app.assessment.error_terms import assessment_rng
 from bayesdist.app.config import load_config
 from bayesdist.app.results import Results
 from bayesdist.app.run import make_stages

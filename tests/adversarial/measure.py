@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from astropy.table import Table
 
-from bayesdist.app.assessment.settings import assessment_rng
+from bayesdist.app.assessment.error_terms import assessment_rng
 from bayesdist.app.commands.on_runs.judging import margins_of
 from bayesdist.app.config import load_config
 from bayesdist.app.results import Results

@@ -10,8 +10,7 @@ import pytest
 from bayesdist.app.pipeline import evaluate
 from bayesdist.app.results import open_results
 from bayesdist.app.store.rundir import RunDirectory
-from bayesdist.app.tables.diagnostics_files import load_diagnostics
-from bayesdist.app.tables.evaluation_files import load_evaluation
+from bayesdist.app.tables.result_files import load_diagnostics, load_evaluation
 from bayesdist.errors import InputError
 
 from .support import summary_of

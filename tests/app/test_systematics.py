@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from bayesdist.app.kinds.campaign.aberration import PERIOD, SWING, scale_error
-from bayesdist.app.kinds.campaign.catalogue import errors_by_star
+from bayesdist.app.kinds.campaign.inputs import errors_by_star
+from bayesdist.app.kinds.campaign.matched import PERIOD, SWING, scale_error
 from bayesdist.assess.model import with_shared_stars
 from bayesdist.assess.terms.parameters import CATALOGUE as POSITIONS
 from bayesdist.assess.terms.parameters import MOTIONS, catalogue_terms

@@ -12,15 +12,15 @@ from bayesdist.data import MagnitudeErrors
 from bayesdist.diagnose.overlap import OverlapTest, _binned, align
 from bayesdist.diagnose.residuals.binned import binned_residuals
 from bayesdist.model import LookupTable
-from bayesdist.report.campaign import (
+from bayesdist.report.context import (
     CampaignResults,
     CatalogStars,
     ChipResiduals,
     Detections,
     Footprints,
     LinearSeries,
+    ReportInput,
 )
-from bayesdist.report.context import ReportInput
 
 from .runs import report_input
 

@@ -21,7 +21,7 @@ from bayesdist.model import Chip, TimeDependence
 from bayesdist.report.run_report import render_report
 from bayesdist.report.sections import REPORT
 from bayesdist.report.sections.campaign.lookup import binned_of, largest_cell, rms_of_cells
-from bayesdist.report.sections.campaign.terms import course_of, line_error
+from bayesdist.report.sections.campaign.series import course_of, line_error
 from bayesdist.report.sections.run.coefficients import coefficient_tables
 from bayesdist.report.sections.run.fit import fit_tables
 from bayesdist.report.texttable import check_cells

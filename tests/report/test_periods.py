@@ -15,7 +15,7 @@ from bayesdist.diagnose.periods import PeriodSettings, time_variation
 from bayesdist.infer import fit_linear
 from bayesdist.infer.compare.order import select_order
 from bayesdist.model import Chip, DistortionModel
-from bayesdist.report.figures.order import order_comparison
+from bayesdist.report.figures.commands import order_comparison
 from bayesdist.report.figures.style import INK, PALE
 from bayesdist.report.run_report import render_report
 from bayesdist.report.sections.run.periods import period_tables

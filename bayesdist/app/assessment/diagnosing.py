@@ -1,20 +1,27 @@
-"""Diagnostics of the solution of a run, whatever it was made from."""
+"""Diagnostics of the solution of a run, stars that were held out among them."""
 
 from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
-from bayesdist.app.assessment.error_terms import errors_of_run
-from bayesdist.app.assessment.holdout import predictive_of_run
+import numpy as np
+from astropy.table import Table
+
+from bayesdist.app.assessment.error_terms import assessment_rng, errors_of_run, evaluation_settings
 from bayesdist.app.assessment.periods import period_settings
-from bayesdist.app.assessment.settings import assessment_rng, evaluation_settings
 from bayesdist.app.config import Config
 from bayesdist.app.kinds.fit_data import FitData
 from bayesdist.app.kinds.kind import kind_of
+from bayesdist.app.store.summary import CoverageRow, Holdout, HoldoutTest
+from bayesdist.assess.evaluation import EvaluationSettings
+from bayesdist.assess.model import ErrorModel, with_diagnosed_errors
 from bayesdist.diagnose.diagnostics import Diagnostics, diagnose, diagnose_fit
-from bayesdist.diagnose.holdout.validation import holdout_validation
+from bayesdist.diagnose.holdout.predictive import ExposureDeviations, Predictive, predictive_of
+from bayesdist.diagnose.holdout.validation import HoldoutValidation, holdout_validation
 from bayesdist.infer import Posterior
+from bayesdist.infer.catalogue.star_errors import StarInfluence, star_influence
 
 
 def diagnose_run(posterior: Posterior, data: FitData, config: Config, base: Path) -> Diagnostics:
@@ -66,4 +73,85 @@ def diagnose_residuals(posterior: Posterior | None, data: FitData, config: Confi
         centroid=fitted.errors.by_magnitude if measured else "residuals",
         things="pairs" if rows == "stars" else rows,
         known=fitted.priors.joint is not None,
+    )
+
+
+TOGETHER = 1.5  # steps between nodes over which tables err as one: what their covariance comes to
+
+
+def predictive_of_run(
+    posterior: Posterior,
+    found: Diagnostics,
+    errors: ErrorModel,
+    data: FitData,
+    settings: EvaluationSettings,
+) -> Predictive:
+    """The solution as it is assessed, as it predicts stars that are held out of `found`.
+
+    Quoted errors and jitter hold what the model leaves out at a position, as each star errs by it;
+    neighbours err by it together.  Exposures that were fitted jointly scatter, and have errors of
+    the catalogue and of tables.
+    """
+    scatter = data.fitted.scatter
+    if scatter is not None:
+        cell, tables = None, data.fitted.tables.tables
+        if tables:
+            across, up = tables[0].step
+            cell = TOGETHER * across, TOGETHER * up
+        return replace(
+            predictive_of(with_diagnosed_errors(posterior, found, data.fit)),
+            deviations=ExposureDeviations(scatter.kinds, scatter.tau),
+            stars=_known_stars(data),
+            local=errors.local_tables(settings.grid, settings.epoch),
+            cell=cell,
+        )
+    out = predictive_of(with_diagnosed_errors(posterior, found))
+    rows = None if found.correlated is None else found.correlated.facts.get("structure")
+    if not rows:
+        return out
+    side = max(row["length_pix"] for row in rows)
+    local = errors.local_tables(settings.grid, settings.epoch)
+    return replace(out, local=local, cell=(side, side), local_in_noise=True)
+
+
+def _known_stars(data: FitData) -> StarInfluence | None:
+    """Influence of the catalogue's errors on the fit, of stars of exposures held out whole.
+
+    These stars were in the fit, in other exposures: that is no part of their residuals.
+    """
+    errors, held = data.matched.star_errors, data.matched.held
+    if errors is None or held is None or held.star is None:
+        return None
+    whole = np.isin(held.exposure_names, data.matched.whole)
+    codes = np.unique(held.star[whole[held.exposure]])
+    return star_influence(data.fit, data.stars, errors, codes)
+
+
+def holdout_table(found: HoldoutValidation) -> Table:
+    """All tests, the most telling first."""
+    names = "name part is_omnibus where n value expected p_value p_corrected limit".split()
+    table = Table({name: [getattr(t, name) for t in found.tests] for name in names})
+    table["lo95"], table["hi95"] = np.array([t.interval for t in found.tests]).T
+    table["limit"].description = "of tails, in sigma; scatter of deviations"
+    table["value"].description = (
+        f"offset: {found.unit}; spread: factor on the predicted errors; distribution: largest "
+        "difference of distribution functions; tails: fraction of stars; deviation: in its own unit"
+    )
+    table.meta = {
+        "verdict": found.verdict,
+        "n": found.n,
+        "n_excluded": found.n_left_out,
+        "exposures": list(found.exposures),
+        "p_corrected": "Holm 1979, over all tests of this table",
+    }
+    return table
+
+
+def holdout_summary(found: HoldoutValidation) -> dict[str, Any]:
+    """Section 'holdout' of summary.json."""
+    return Holdout.row(
+        found,
+        n_excluded=found.n_left_out,
+        coverage=[CoverageRow.row(one, sigma=one.level) for one in found.coverage],
+        tests=[HoldoutTest.row(one) for one in found.tests],
     )

@@ -7,7 +7,7 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from bayesdist.app.assessment.settings import assessment_epoch
+from bayesdist.app.assessment.error_terms import assessment_epoch
 from bayesdist.app.config import Config
 from bayesdist.app.config.products import ReleaseBlock
 from bayesdist.app.kinds.fit_data import FitData

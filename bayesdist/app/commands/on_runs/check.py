@@ -7,7 +7,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 from bayesdist.app.assessment.checks import in_circle
-from bayesdist.app.assessment.settings import idle_dates
+from bayesdist.app.assessment.error_terms import idle_dates
 from bayesdist.app.config import Config, load_config
 from bayesdist.app.kinds.fit_data import FitData
 from bayesdist.app.kinds.matches.added_errors import grouping_sentence

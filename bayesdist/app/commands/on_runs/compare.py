@@ -30,7 +30,7 @@ from bayesdist.errors import InputError
 from bayesdist.model.grid import DEFAULT_GRID
 from bayesdist.products.formats.common.document import MissingSizeError
 from bayesdist.report.drawing import save_figures
-from bayesdist.report.figures.comparison import difference_vectors
+from bayesdist.report.figures.commands import difference_vectors
 
 
 def write_comparison(

@@ -205,7 +205,7 @@ def draw_filters(
     """Write filters_A_2.png and the like, and return their names."""
     # figures take seconds to import
     from bayesdist.report.drawing import save_figures
-    from bayesdist.report.figures.filters import FilterTerm, filters_figure
+    from bayesdist.report.figures.commands import FilterTerm, filters_figure
 
     model = next(iter(fits.values())).linear.model
     time = model.time

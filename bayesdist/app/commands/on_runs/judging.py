@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 
-from bayesdist.app.assessment.settings import assessment_rng
+from bayesdist.app.assessment.error_terms import assessment_rng
 from bayesdist.app.products.product_terms import file_errors
 from bayesdist.app.results import Results
 from bayesdist.assess import Margin, Requirement

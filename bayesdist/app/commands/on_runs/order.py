@@ -191,7 +191,7 @@ def _with_error(value: float | None, error: float | None) -> str:
 
 def _draw(found: OrderSelection, path: Path) -> None:
     from bayesdist.report.drawing import png_of  # figures take seconds to import
-    from bayesdist.report.figures.order import order_comparison
+    from bayesdist.report.figures.commands import order_comparison
 
     png = png_of(order_comparison(found))
     with atomic_path(path) as temporary:

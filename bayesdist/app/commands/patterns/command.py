@@ -89,7 +89,7 @@ def _text(found: Sequence[PlannedPattern], config: PlanConfig) -> str:
 
 def _write(output: Path, found: Sequence[PlannedPattern], config: PlanConfig, command: str) -> None:
     from bayesdist.report.drawing import save_figures  # figures take seconds to import
-    from bayesdist.report.figures.patterns import pattern_maps
+    from bayesdist.report.figures.commands import pattern_maps
 
     with record_folder(output, "plan.json", command) as (folder, record):
         write_table(_table(found), folder / "patterns.ecsv")

@@ -9,14 +9,13 @@ from typing import Any
 import numpy as np
 from astropy.table import Table
 
-from bayesdist.app.kinds.campaign.catalogue import parities_of
 from bayesdist.app.kinds.campaign.input_validation import (
     input_warnings,
     refuse_few,
     segment_counts,
     shear_warnings,
 )
-from bayesdist.app.kinds.campaign.inputs import Inputs
+from bayesdist.app.kinds.campaign.inputs import Inputs, parities_of
 from bayesdist.app.kinds.campaign.matched import CampaignMatched, matched_campaign
 from bayesdist.app.kinds.star_lists import StarLists, positions_by_chip, start_of
 from bayesdist.data import (

@@ -21,7 +21,7 @@ from bayesdist.infer.nodes import corrected_matches, inside_chips, pixel_shifts
 from bayesdist.infer.solution.linear import Rejection
 from bayesdist.model import DistortionModel
 from bayesdist.model.grid import outline_pixels
-from bayesdist.report.campaign import (
+from bayesdist.report.context import (
     CampaignResults,
     CatalogStars,
     ChipResiduals,

@@ -20,7 +20,7 @@ from bayesdist.app.kinds.matches.added_errors import compared_errors, knows_circ
 from bayesdist.app.kinds.matches.plausibility import doubts_on_stars, refuse_empty_segments
 from bayesdist.app.kinds.matches.sources import check_chips, read_configured
 from bayesdist.app.store.rundir import RunDirectory
-from bayesdist.app.tables.diagnostics_files import load_diagnostics
+from bayesdist.app.tables.result_files import load_diagnostics
 from bayesdist.assess.model import with_diagnosed_errors
 from bayesdist.calibration.calibration import Calibration, calibration_of
 from bayesdist.calibration.prior import CalibrationPrior, prior_of_calibration

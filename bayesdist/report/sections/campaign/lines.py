@@ -1,16 +1,14 @@
-"""Tables of the linear terms against time."""
+"""Tables of the linear terms against time, with published lines as missions know them."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
-from dataclasses import replace
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, replace
 from typing import Any
 
-from bayesdist.report.campaign import CampaignResults
 from bayesdist.report.contents import REPORT
-from bayesdist.report.context import ReportInput, needed
-from bayesdist.report.sections.campaign.published import Published, PublishedLine, published_terms
-from bayesdist.report.sections.campaign.terms import name_of_scatter, name_of_term
+from bayesdist.report.context import CampaignResults, ReportInput, needed
+from bayesdist.report.sections.campaign.series import name_of_scatter, name_of_term
 from bayesdist.report.texttable import TextTable, listing
 from bayesdist.utils.numbers import MISSING, count, display_scale, interval, number, rounded
 
@@ -210,3 +208,45 @@ def _scatter(c: CampaignResults) -> TextTable:
         words=(0, 1, 2),
         leading=n_joint,
     )
+
+
+@dataclass(frozen=True)
+class PublishedLine:
+    """Line alpha + beta (TIME - RDATE), with formal errors; for a constant term beta is 0."""
+
+    chip: str
+    rdate: float
+    alpha: float
+    sigma_alpha: float
+    beta: float = 0.0
+    sigma_beta: float = 0.0
+
+
+@dataclass(frozen=True)
+class Published:
+    """Lines of one term."""
+
+    source: str  # the publication
+    where: str  # in it
+    lines: tuple[PublishedLine, ...]
+
+
+Source = Callable[[Mapping[str, Any], str, tuple[str, ...]], Mapping[str, Published]]
+_SOURCES: list[Source] = []
+
+
+def publishes(source: Source) -> Source:
+    """Decorator of a function that gives published terms, of the arguments of `published_terms`."""
+    _SOURCES.append(source)
+    return source
+
+
+def published_terms(
+    config: Mapping[str, Any], filter: str, chips: tuple[str, ...]
+) -> dict[str, Published]:
+    """Published lines of the detector and filter of a run, by term.
+
+    `config`: the resolved configuration: the release names instrument and detector. `chips`: their
+    names.
+    """
+    return {k: v for source in _SOURCES for k, v in source(config, filter, chips).items()}

@@ -10,9 +10,8 @@ from matplotlib.axes import Axes
 from matplotlib.colors import Normalize
 
 from bayesdist.model import LookupTable
-from bayesdist.report.campaign import CampaignResults, ChipResiduals
 from bayesdist.report.contents import REPORT
-from bayesdist.report.context import ReportInput, needed
+from bayesdist.report.context import CampaignResults, ChipResiduals, ReportInput, needed
 from bayesdist.report.figures.arrows import Arrows, magnification_of, spacing, vector_map
 from bayesdist.report.figures.fields import Grid, scalar_map
 from bayesdist.report.figures.panels import ChipPanels

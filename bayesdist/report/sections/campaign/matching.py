@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 from matplotlib.ticker import ScalarFormatter
 
 from bayesdist.report.contents import REPORT
-from bayesdist.report.context import ReportInput, needed
+from bayesdist.report.context import CatalogStars, ReportInput, needed
 from bayesdist.report.figures.style import (
     GUIDE,
     INK,
@@ -24,9 +22,6 @@ from bayesdist.report.registry import Plot
 from bayesdist.report.texttable import TextTable, listing
 from bayesdist.utils.arrays import Float
 from bayesdist.utils.numbers import count, number, percent, size_of
-
-if TYPE_CHECKING:
-    from bayesdist.report.campaign import CatalogStars
 
 _DOT = "#8FA3B5"
 _LEFT_OUT = PALETTE["vermilion"]

@@ -1,9 +1,11 @@
-"""The evaluation of a run in its folder: maps, tables, sections of summary.json, and all of it."""
+"""Diagnostics and evaluation of a run in its folder: written by their stages, read later."""
 
 from __future__ import annotations
 
+import hashlib
+import logging
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -14,19 +16,93 @@ from bayesdist.app.store.keys import attributes
 from bayesdist.app.store.output import provenance_notes, write_table
 from bayesdist.app.store.rundir import RunDirectory
 from bayesdist.app.store.summary import ValidityRow
-from bayesdist.app.tables.diagnostics_files import fingerprint_of
 from bayesdist.app.tables.margins import margin_rows, margin_table
 from bayesdist.assess import Margin
 from bayesdist.assess.budget.budget import ErrorBudget
 from bayesdist.assess.coefficients import coefficient_table
 from bayesdist.assess.evaluation import Evaluation
 from bayesdist.assess.requirements.validity import ValidityPeriod
+from bayesdist.diagnose.diagnostics import Diagnostics
+from bayesdist.diagnose.residuals.misfit import Misfit
+from bayesdist.diagnose.score.result import ScoreTest
+from bayesdist.errors import FormatError, InputError, required
 from bayesdist.files.records import read_record, write_record
 from bayesdist.infer import LinearFit, Posterior
 from bayesdist.products.maps_file import write_maps
 from bayesdist.utils.checks import warnings_of
 
-FILE = "evaluation.h5"
+DIAGNOSTICS = "diagnostics.h5"
+
+log = logging.getLogger("bayesdist")
+
+
+def fingerprint_of(fit: LinearFit, posterior: Posterior) -> str:
+    """Hash of the numbers of a fit and of the posterior's draws, to which a file belongs."""
+    digest = hashlib.sha256()
+    for values in (fit.mean, fit.cov, posterior.theta):
+        digest.update(np.ascontiguousarray(values).tobytes())
+    return digest.hexdigest()
+
+
+def write_diagnostics(
+    run: RunDirectory, fit: LinearFit, posterior: Posterior, found: Diagnostics
+) -> None:
+    """Write diagnostics of a fit and a posterior, and their sections of summary.json."""
+    correlated = required(found.correlated, "correlated errors are diagnosed of a posterior only")
+    write_record(run / DIAGNOSTICS, found, fingerprint_of(fit, posterior))
+    facts = correlated.facts
+    run.summarise(
+        discrepancy=dict(facts),
+        score_tests=[_row(test) for test in found.score_tests],
+        misfit=_misfit_summary(found),
+    )
+    for row in facts.get("structure", []):
+        log.info(
+            "diagnose: structure beyond the model on chip %s, %s: %.2g %s rms, at most %.2g with "
+            "95 %% probability",
+            *(row["chip"], row["axis"], row["median"], facts["unit"], row["most"]),
+        )
+    for test in found.score_tests:
+        if test.significant:
+            log.info("diagnose: %s: %s", test.finding, test.remedy)
+
+
+def load_diagnostics(run: RunDirectory, fit: LinearFit, posterior: Posterior) -> Diagnostics | None:
+    """Diagnostics of a fit and a posterior; None where there are none of just these."""
+    path, again = run / DIAGNOSTICS, f"run 'bayesdist stage diagnose {run.path}' again"
+    if not path.exists():
+        return None
+    mark = fingerprint_of(fit, posterior)
+    try:
+        return read_record(path, Diagnostics, "diagnostics", do=again, fingerprint=mark)
+    except FormatError:
+        raise
+    except InputError:  # of another fit or posterior
+        return None
+
+
+def _row(test: ScoreTest) -> dict[str, Any]:
+    """A test as a row of summary.json."""
+    row = asdict(test)
+    del row["held_by"]
+    # JSON has no infinity: what no effect can show has no smallest size
+    return row | {"smallest": test.smallest if np.isfinite(test.smallest) else None}
+
+
+def _misfit_summary(found: Diagnostics) -> dict[str, Any]:
+    worst = found.misfit
+    out = _misfit_row(worst) | {"unit": worst.unit, "significant": worst.significant}
+    if len(found.misfits) > 1:
+        out["chips"] = [_misfit_row(m) for m in found.misfits]
+    return out
+
+
+def _misfit_row(m: Misfit) -> dict[str, Any]:
+    row = attributes(m, "p_value partition structure power")
+    return row if m.chip is None else row | {"chip": m.chip.number}
+
+
+EVALUATION = "evaluation.h5"
 COLUMNS = ("epoch", "probability", "low", "high", "value")
 
 
@@ -62,7 +138,7 @@ def write_evaluation(
         budget=found.budget.rows(),
         warnings=list(warnings_of(found.checks)),
     )
-    write_record(run / FILE, found, fingerprint_of(fit, posterior))
+    write_record(run / EVALUATION, found, fingerprint_of(fit, posterior))
 
 
 def save_margins(
@@ -75,17 +151,17 @@ def save_margins(
 ) -> None:
     """Replace the margins and validity periods of a run by others."""
     _write_margins(run, posterior, provenance_notes(posterior, gauge), margins, validity)
-    if (run / FILE).exists():
+    if (run / EVALUATION).exists():
         found = load_evaluation(run, fit, posterior)
         found = replace(found, margins=tuple(margins), validity=tuple(validity))
-        write_record(run / FILE, found, fingerprint_of(fit, posterior))
+        write_record(run / EVALUATION, found, fingerprint_of(fit, posterior))
 
 
 def load_evaluation(run: RunDirectory, fit: LinearFit, posterior: Posterior) -> Evaluation:
     """The evaluation of a fit and a posterior; InputError where there is none of just these."""
     again = f"run 'bayesdist stage evaluate {run.path}' again"
     mark = fingerprint_of(fit, posterior)
-    return read_record(run / FILE, Evaluation, "an evaluation", do=again, fingerprint=mark)
+    return read_record(run / EVALUATION, Evaluation, "an evaluation", do=again, fingerprint=mark)
 
 
 def _budget_table(found: Evaluation, head: Mapping[str, Any]) -> Table:

@@ -1,0 +1,335 @@
+"""Figures of commands: orders, dither patterns, differences of calibrations and of filters."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.colors import LinearSegmentedColormap, LogNorm
+from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
+
+from bayesdist.model.grid import mesh, outline_pixels
+from bayesdist.report.figures.arrows import Arrows, vector_map
+from bayesdist.report.figures.mosaic import Mosaic
+from bayesdist.report.figures.panels import ChipPanels
+from bayesdist.report.figures.style import (
+    COLORBAR,
+    CYCLE,
+    INK,
+    PALETTE,
+    SEQUENTIAL,
+    WIDTH,
+    figure_style,
+    guide_lines,
+    legend_above,
+    new_figure,
+    nice_below,
+)
+from bayesdist.utils.arrays import Float
+from bayesdist.utils.distributions import chi2_ppf, chi2_sf, norm_isf
+from bayesdist.utils.numbers import display_scale, size_of
+
+if TYPE_CHECKING:
+    from matplotlib.collections import QuadMesh
+
+    from bayesdist.assess.comparison.compare import Comparison
+    from bayesdist.assess.planning.dithers import PlannedPattern
+    from bayesdist.infer.compare.order_result import OrderSelection
+
+
+LEVELS = (0.0, 1.0, 2.0, 3.0, 4.0, 5.0)
+# from white to a blue on which black arrows are still seen
+_SHADES = LinearSegmentedColormap.from_list("significance", ["#FFFFFF", PALETTE["sky"]])
+
+
+def gaussian_sigmas(chi2: Float) -> Float:
+    """Sigmas of one axis that are as improbable as a chi-square of two axes.
+
+    NaN stays NaN; not above 37, where probabilities underflow.
+    """
+    p = np.clip(chi2_sf(chi2, 2), 1e-300, 1.0)
+    return np.asarray(norm_isf(p / 2))
+
+
+@figure_style()
+def difference_vectors(
+    found: Sequence[Comparison], *, names: tuple[str, str] = ("A", "B")
+) -> Figure:
+    """Arrows of A minus B, over shades of the significance of each by itself.
+
+    One chip is drawn above the other, on one scale; without shades where no covariance is known.
+    """
+    mosaic = Mosaic(
+        tuple((float(c.x.max()), float(c.y.max())) for c in found),
+        tuple(f"chip {c.a.chip}" for c in found),
+        tuple((k, 0) for k in range(len(found))),
+    )
+    chips = [Arrows.of_grid(c.x, c.y, c.du, c.dv) for c in found]
+    shaded = all(c.chi2 is not None for c in found)
+    largest = max(c.largest for c in found)
+    M = 1.0
+    if largest > 1e-12:
+        M = nice_below(1.5 * min(one.step for one in chips) / largest)
+    panels = ChipPanels(mosaic, colorbar=shaded)
+    panels.frame(M * largest + 0.02 * mosaic.longest_side)
+    titles = [
+        panels.title(
+            k, f"{names[0]} minus {names[1]}: rms {size_of(c.rms)}, largest {size_of(c.largest)}"
+        )
+        for k, c in enumerate(found)
+    ]
+    key = nice_below(largest / 1.5)
+    vector_map(panels, chips, titles, magnification=M, key=key, pad=20)
+    for c, (ax,) in zip(found, panels.axes, strict=True):
+        if not shaded or c.chi2 is None:
+            continue
+        sigmas = gaussian_sigmas(c.chi2)
+        shades = ax.contourf(c.x, c.y, sigmas, LEVELS, cmap=_SHADES, extend="max", zorder=1)
+    if shaded:
+        panels.figure.colorbar(
+            shades,
+            ax=panels.all_axes,
+            label="significance of each position separately [σ]",
+            **COLORBAR,
+        )
+    return panels.figure
+
+
+@figure_style()
+def change_over_time(first: Float, gain: Float, dof: int, p_value: float | None) -> Figure:
+    """Figure of the chi-square gains of a change from each first date (P,), in decimal years.
+
+    `dof` is that of a change, `p_value` that of the largest, the search over the dates accounted
+    for.
+    """
+    first, gain = np.asarray(first, float), np.asarray(gain, float)
+    low, high = chi2_ppf([0.025, 0.975], dof)
+    fig = new_figure(WIDTH, 2.8)
+    ax = fig.subplots()
+    ax.axhspan(low, high, color=PALETTE["sky"], alpha=0.3, lw=0, zorder=0)
+    ax.plot(first, gain, "o-", ms=4, color=PALETTE["blue"])
+    best = int(gain.argmax())
+    ax.plot(first[best], gain[best], "o", ms=9, mfc="none", mec=PALETTE["vermilion"], mew=1.3)
+    ax.set_ylim(0, 1.1 * max(float(gain.max()), float(high)))
+    ax.set_xlabel("a change from this date on [yr]")
+    ax.set_ylabel(f"chi-square it takes up ({dof} d.o.f.)")
+    note = ""
+    if p_value is not None:
+        p = "p < 1e-12" if p_value < 1e-12 else f"p = {p_value:.2g}"
+        note = f"; {p} for the largest of {len(gain)}"
+    ax.set_title(f"band: where 95 % of single dates lie by chance{note}")
+    return fig
+
+
+MARKERS = "os^Dvp"
+
+
+@dataclass(frozen=True, eq=False)
+class FilterTerm:
+    """Linear term of one filter on one chip, without its drift."""
+
+    filter: str
+    chip: str
+    epoch: Float  # (E,), of the exposures
+    value: Float  # (E,), per pixel
+    sigma: Float
+    alpha: Float  # (S,), released value of each segment at its reference date
+    sigma_alpha: Float
+
+
+@figure_style()
+def filters_figure(term: str, courses: Sequence[FilterTerm], breaks: Sequence[float]) -> Figure:
+    """Figure with a panel for each chip: points are exposures, lines the released values.
+
+    `courses` are of all chips and filters, the reference filter first, for a term as 'A_2';
+    `breaks` are the dates between which the released values hold.
+    """
+    by_chip: Mapping[str, list[FilterTerm]] = {
+        chip: [c for c in courses if c.chip == chip]
+        for chip in dict.fromkeys(c.chip for c in courses)
+    }
+    filters = list(dict.fromkeys(c.filter for c in courses))
+    fig = new_figure(WIDTH, 0.7 + 2.2 * len(by_chip))
+    panels = fig.subplots(len(by_chip), 1, sharex=True, squeeze=False)[:, 0]
+    for ax, (chip, mine) in zip(panels, by_chip.items(), strict=True):
+        reference = round(float(mine[0].alpha[0]), 5)
+        for one in mine:
+            k = filters.index(one.filter)
+            color = CYCLE[k % len(CYCLE)]
+            ax.errorbar(
+                one.epoch, 1e6 * (one.value - reference), 1e6 * one.sigma,
+                fmt=MARKERS[k % len(MARKERS)], ms=3, mec="none", elinewidth=0.6,
+                color=color, alpha=0.8, label=one.filter,
+            )  # fmt: skip
+            edges = (one.epoch.min() - 0.3, *breaks, one.epoch.max() + 0.3)
+            for s, (level, error) in enumerate(zip(one.alpha, one.sigma_alpha, strict=True)):
+                low, high = sorted((edges[s], edges[s + 1]))
+                y = 1e6 * (level - reference)
+                ax.plot((low, high), (y, y), color=color, lw=1.0)
+                ax.fill_between(
+                    (low, high), y - 1e6 * error, y + 1e6 * error,
+                    color=color, alpha=0.2, lw=0,
+                )  # fmt: skip
+        for date in breaks:
+            ax.axvline(date, color=INK, lw=0.6, ls=":")
+        sign = "−" if reference >= 0 else "+"
+        ax.set_ylabel(f"${term}$ {sign} {abs(reference):.10g} [10⁻⁶]")
+        ax.set_title(f"{chip}, drift taken out" if chip else "drift taken out")
+        guide_lines(ax)
+    panels[-1].set_xlabel("epoch [yr]")
+    legend_above(fig, panels[0])
+    return fig
+
+
+_NEAR = 10.0  # log density within which the right-hand axis is linear
+_APART = 0.12  # of an order, by which markers of one order are apart
+
+
+@figure_style()
+def order_comparison(found: OrderSelection) -> Figure:
+    """Figure with surfaces on the left, held-out stars and regions on the right."""
+    fig = new_figure(WIDTH, 3.1)
+    left, right = fig.subplots(1, 2)
+    _surfaces(left, found)
+    _held_out(right, found)
+    for ax in (left, right):
+        ax.axvspan(found.order - 0.35, found.order + 0.35, color="#E8ECF0", zorder=0)
+        ax.set_xlabel("order of the polynomial (chosen one shaded)")
+        ax.xaxis.set_major_locator(MaxNLocator(integer=True))
+        ax.set_xlim(found.orders[0] - 0.6, found.orders[-1] + 0.6)
+    return fig
+
+
+def _surfaces(ax: Axes, found: OrderSelection) -> None:
+    s = found.surfaces
+    scale = display_scale(found.unit, s.rms.ravel())
+    for axis, (name, color, mark) in enumerate(
+        (("u", PALETTE["blue"], "o"), ("v", PALETTE["vermilion"], "s"))
+    ):
+        ax.plot(s.orders, s.rms[:, axis] * scale.factor, f"{mark}-", ms=4, color=color, label=name)
+        noise = float(s.noise[axis]) * scale.factor
+        ax.axhline(noise, ls=":", lw=1.0, color=color, label=f"noise of the means, {name}")
+    ax.set_yscale("log")
+    ax.set_ylabel(f"rms of {s.n_bins} bins after the surface [{scale.unit}]")
+    ax.set_title("Binned surfaces")
+    ax.legend()
+
+
+def _held_out(ax: Axes, found: OrderSelection) -> None:
+    rows = found.rows()
+    for k, (key, color, mark) in enumerate(
+        (("stars", PALETTE["blue"], "o"), ("regions", PALETTE["orange"], "D"))
+    ):
+        value, error = (
+            np.array([0.0 if row[name] is None else row[name] for row in rows], float)
+            for name in (key, f"{key}_error")
+        )
+        x = np.array(found.orders) + (2 * k - 1) * _APART
+        ax.errorbar(x, value, error, fmt=mark, ms=4, lw=1.0, color=color, label=key)
+    ax.axhline(0.0, lw=0.7, color="#9AA5B1", zorder=1)
+    ax.set_yscale("symlog", linthresh=_NEAR)
+    ax.set_ylabel(f"log density minus that of order {found.order}")
+    ax.set_title("Held out (1 σ)")
+    ax.legend()
+
+
+SHOWN = ("gauge-free", "shape")
+ROW = 2.3  # inches
+UNBOUNDED = "#E8ECF0"
+FIRST = PALETTE["vermilion"]
+
+
+@figure_style()
+def pattern_maps(found: Sequence[PlannedPattern]) -> Figure:
+    """Footprints on one scale, each with its uncertainty per axis on one colour scale."""
+    bounded = [one.per_axis(kind) for one in found for kind in SHOWN if one.maps[kind] is not None]
+    values = np.concatenate(bounded)
+    norm = LogNorm(max(values.min(), 1e-4 * values.max()), values.max() * (1 + 1e-9))
+    outlines = [_outlines(one) for one in found]
+    limits = _limits(np.concatenate([o for of_one in outlines for o in of_one]))
+    fig = new_figure(WIDTH, ROW * len(found) + 0.5, layout="compressed")
+    axes = fig.subplots(len(found), 1 + len(SHOWN), squeeze=False)
+    filled: list[QuadMesh] = []
+    for k, (row, one, of_one) in enumerate(zip(axes, found, outlines, strict=True)):
+        last = k == len(found) - 1
+        _footprint(row[0], one, of_one, limits, last)
+        row[0].set_title(
+            f"first exposure in orange\n{one.pattern.name}" if not k else one.pattern.name
+        )
+        for ax, kind in zip(row[1:], SHOWN, strict=True):
+            filled += _map(ax, one, kind, norm, last)
+            if not k:
+                ax.set_title(f"{kind}, rms\n{ax.get_title(loc='left')}")
+    label = "per axis (1 σ) [pix]"
+    fig.colorbar(filled[0], ax=list(axes[:, 1:].ravel()), label=label, **COLORBAR)
+    return fig
+
+
+def _outlines(one: PlannedPattern) -> list[Float]:
+    """Outline (N, 2) of every chip in every exposure, on the sky."""
+    model, theta = one.solution.model, one.solution.mean
+    return [
+        model.predict(theta, *outline_pixels(chip.size), exposure=e, chip=chip.number)
+        for e in range(len(model.exposures))
+        for chip in model.chips
+    ]
+
+
+def _limits(points: Float) -> tuple[Float, Float]:
+    low, high = points.min(axis=0), points.max(axis=0)
+    middle, half = (low + high) / 2, 0.52 * float((high - low).max())
+    return middle - half, middle + half
+
+
+def _footprint(
+    ax: Axes,
+    one: PlannedPattern,
+    outlines: Sequence[Float],
+    limits: tuple[Float, Float],
+    last: bool,
+) -> None:
+    chips = len(one.camera.chips)
+    for k, outline in reversed(list(enumerate(outlines))):
+        first = k < chips
+        ax.plot(*outline.T, lw=1.1 if first else 0.5, color=FIRST if first else INK,
+                alpha=1.0 if first else 0.45)  # fmt: skip
+    (x0, y0), (x1, y1) = limits
+    ax.set(xlim=(x0, x1), ylim=(y0, y1), aspect="equal")
+    ax.set_ylabel("v [pix]")
+    _sky_axis(ax, last)
+
+
+def _map(ax: Axes, one: PlannedPattern, kind: str, norm: LogNorm, last: bool) -> list[QuadMesh]:
+    """Draw the chips where they are in the first exposure; words where errors are unbounded."""
+    model, theta, maps = one.solution.model, one.solution.mean, one.maps[kind]
+    outlines = [
+        model.predict(theta, *outline_pixels(c.size), exposure=0, chip=c.number)
+        for c in model.chips
+    ]
+    filled = []
+    for m in maps or ():
+        x, y = mesh(m.x, m.y)
+        u, v = model.predict(theta, x, y, exposure=0, chip=m.chip).T.reshape(2, len(m.y), len(m.x))
+        look: dict[str, Any] = {"cmap": SEQUENTIAL, "shading": "gouraud", "rasterized": True}
+        filled.append(ax.pcolormesh(u, v, m.per_axis, norm=norm, **look))
+    (x0, y0), (x1, y1) = _limits(np.concatenate(outlines))
+    ax.set(xlim=(x0, x1), ylim=(y0, y1), aspect="equal")
+    if maps is None:
+        ax.set_title("not bounded")
+        ax.set_facecolor(UNBOUNDED)
+    else:
+        ax.set_title(f"{one.rms(kind):.2g}, max {one.largest(kind):.2g} pix")
+    ax.tick_params(labelleft=False)
+    _sky_axis(ax, last)
+    return filled
+
+
+def _sky_axis(ax: Axes, last: bool) -> None:
+    ax.tick_params(labelbottom=last)
+    ax.locator_params(nbins=4)
+    if last:
+        ax.set_xlabel("u [pix]")
