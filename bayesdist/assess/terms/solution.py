@@ -9,7 +9,6 @@ from functools import partial
 import numpy as np
 
 from bayesdist.assess.domain import EvaluationDomain
-from bayesdist.assess.solution import place_of
 from bayesdist.assess.terms.forms import (
     Image,
     PolynomialField,
@@ -59,26 +58,26 @@ class SolutionErrors:
 
     def draw(self, n: int, rng: np.random.Generator) -> SolutionDraws:
         """Draws of the solution, and of what is shown beside them."""
-        theta = shown = np.asarray(self.solution.draws(n, rng), float)
+        joint = shown = self.solution.drawn_rows(n, rng)
         (own,) = rng.spawn(1)  # what is shown beside changes nothing of what follows
         if self.without is not None:
-            shown = np.asarray(self.without.draws(n, own), float)
-        return SolutionDraws(self, theta, shown, tuple(c.draw(n, own) for c in self.catalogue))
+            shown = self.without.drawn_rows(n, own)
+        return SolutionDraws(self, joint, shown, tuple(c.draw(n, own) for c in self.catalogue))
 
 
 @dataclass(frozen=True, eq=False)
 class SolutionDraws:
-    """Draws (n, D) of the parameters: of the joint error, and of that whose parts are shown."""
+    """Draws of the parameters, as of `drawn_rows`: of the joint error, and of its parts shown."""
 
     of: SolutionErrors
-    theta: Float
-    shown: Float
+    joint: tuple[Float, Int]
+    shown: tuple[Float, Int]
     catalogue: tuple[Polynomials, ...] = ()
 
     def on(self, domain: EvaluationDomain, image: Image) -> TogetherField:
         """The errors at the positions of a domain."""
         exact, shown = self.of.without is None, self.of.without or self.of.solution
-        parts = _parts(shown, self.shown, domain.epoch, image.exposure)
+        parts = _parts(shown, *self.shown, domain.epoch, image.exposure)
         fields = [
             # rows of another solution cannot be taken off the draws of this one
             PolynomialField.of((Row(name, in_total=exact),), domain, image, of)
@@ -86,11 +85,11 @@ class SolutionDraws:
             if name
         ]
         model, mean = self.of.solution.model, np.asarray(self.of.solution.mean, float)
+        theta, rows = self.joint
 
         def joint(chip: int) -> Float:
-            return polynomial_errors(
-                model, mean, self.theta, epoch=domain.epoch, chip=chip, exposure=image.exposure
-            )
+            at, e = domain.epoch, image.exposure
+            return polynomial_errors(model, mean, theta, epoch=at, chip=chip, exposure=e, rows=rows)
 
         whole = PolynomialField.of((), domain, image, joint)
         fields += [c.on(domain, image) for c in self.catalogue]
@@ -98,25 +97,27 @@ class SolutionDraws:
 
 
 def _parts(
-    solution: Solution, theta: Float, epoch: float | None, exposure: Int | None
+    solution: Solution, theta: Float, rows: Int, epoch: float | None, exposure: Int | None
 ) -> dict[str, Callable[[int], Float]]:
     """By name of the part, its Legendre coefficients (n, 2, K) by chip number."""
     model, mean = solution.model, np.asarray(solution.mean, float)
 
     def static(chip: int) -> Float:
         slices = [model.coefficient_slice(chip, axis) for axis in (0, 1)]
-        return np.stack([theta[:, s] - mean[s] for s in slices], axis=1)
+        return np.stack([theta[rows, s] - mean[s] for s in slices], axis=1)
 
     def drift(chip: int) -> Float:
-        gauge = place_of(model, epoch=epoch, chip=chip)
-        return gauge.polynomial(theta) - gauge.polynomial(mean) - static(chip)
+        whole = polynomial_errors(model, mean, theta, epoch=epoch, chip=chip, rows=rows)
+        return whole - static(chip)
 
     def frame(exposure: Int, chip: int) -> Float:
-        only = np.tile(mean, (len(theta), 1))
+        out = np.empty((len(rows), 2, model.n_terms))
         for e in np.unique(exposure):
-            rows, block = np.flatnonzero(exposure == e), model.frame_slice(int(e))
-            only[rows, block] = theta[rows, block]
-        return polynomial_errors(model, mean, only, epoch=epoch, chip=chip, exposure=exposure)
+            own, block = np.flatnonzero(exposure == e), model.frame_slice(int(e))
+            only = np.tile(mean, (len(own), 1))
+            only[:, block] = theta[rows[own], block]
+            out[own] = polynomial_errors(model, mean, only, epoch=epoch, chip=chip, exposure=int(e))
+        return out
 
     out: dict[str, Callable[[int], Float]] = {COEFFICIENTS: static}
     if model.time is not None:

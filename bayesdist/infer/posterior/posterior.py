@@ -12,7 +12,7 @@ from bayesdist.infer.solution.solution import Solution
 from bayesdist.infer.stars.likelihood import MixtureAt
 from bayesdist.infer.stars.mixture import Hyper, OutlierMixture
 from bayesdist.model import DistortionModel
-from bayesdist.utils.arrays import Float
+from bayesdist.utils.arrays import Float, Int
 
 
 @dataclass(frozen=True)
@@ -210,8 +210,13 @@ class Posterior(Solution):
         rng : numpy.random.Generator
             Source of the random numbers.
         """
+        theta, rows = self.drawn_rows(n, rng)
+        return theta[rows]
+
+    def drawn_rows(self, n: int, rng: np.random.Generator) -> tuple[Float, Int]:
+        """All draws of theta (m, D), and the rows (n,) among them that `draws` gives."""
         total = len(self.flat)
-        return self.flat[rng.choice(total, size=n, replace=n > total)]
+        return self.flat, rng.choice(total, size=n, replace=n > total)
 
     @property
     def sampled_points(self) -> tuple[Float, Float]:

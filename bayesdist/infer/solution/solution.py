@@ -11,7 +11,7 @@ import numpy as np
 
 from bayesdist.errors import InputError
 from bayesdist.model import DistortionModel
-from bayesdist.utils.arrays import Bool, Float
+from bayesdist.utils.arrays import Bool, Float, Int
 
 if TYPE_CHECKING:  # a file is inspected without what they import
     from bayesdist.data.matches import Matches
@@ -74,6 +74,10 @@ class Solution(ABC):
         -------
         ndarray, shape (n, D)
         """
+
+    def drawn_rows(self, n: int, rng: np.random.Generator) -> tuple[Float, Int]:
+        """Parameter vectors (m, D), and the rows (n,) among them that `draws` gives."""
+        return np.asarray(self.draws(n, rng), float), np.arange(n)
 
     @property
     def sigma(self) -> Float:

@@ -24,24 +24,28 @@ def polynomial_errors(
     epoch: float | None,
     chip: int,
     exposure: Int | int | None = None,
+    rows: Int | None = None,
 ) -> Float:
     """Legendre coefficients (n, 2, K) of errors of parameters, along the axes of the gauge.
 
     `mean`: (D,), where there is no error. `theta`: (n, D); without an exposure its first `n_global`
-    columns are enough. `epoch`: decimal years. `chip`: chip
+    columns are enough. `rows`: (n,), of those in `theta`, where these are others. `epoch`: decimal
+    years. `chip`: chip
     number. `exposure`: (n,), code of the exposure, of all draws or of each, whose frame is among
     the parameters that err; None for errors of the polynomials and their drift alone.
     """
     if isinstance(exposure, np.ndarray):
-        out = np.empty((len(theta), 2, model.n_terms))
+        rows = np.arange(len(theta)) if rows is None else rows
+        out = np.empty((len(rows), 2, model.n_terms))
         for e in np.unique(exposure):
-            rows = exposure == e
-            out[rows] = polynomial_errors(
-                model, mean, theta[rows], epoch=epoch, chip=chip, exposure=int(e)
+            own = exposure == e
+            out[own] = polynomial_errors(
+                model, mean, theta[rows[own]], epoch=epoch, chip=chip, exposure=int(e)
             )
         return out
     place = place_of(model, epoch=epoch, exposure=exposure, chip=chip)
     error = place.polynomial(theta) - place.polynomial(mean)
+    error = error if rows is None else error[rows]
     if exposure is None:
         return error
     return np.asarray(np.linalg.solve(model.frame(mean, exposure)[0], error), float)
