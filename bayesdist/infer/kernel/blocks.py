@@ -85,13 +85,19 @@ def share_out(loop: Callable[..., None], n: int, *arguments: Any) -> None:
             done.result()
 
 
-def at_once(function: Callable[..., Any], *arguments: Iterable[Any]) -> list[Any]:
+def in_turn(function: Callable[..., Any], *arguments: Iterable[Any]) -> Iterator[Any]:
     """Results of a function that is called as by `map`, on all threads at a time."""
     threads = nb.get_num_threads()
     if threads < 2:
-        return list(map(function, *arguments))
+        yield from map(function, *arguments)
+        return
     with ThreadPoolExecutor(threads) as pool:
-        return list(pool.map(function, *arguments))
+        yield from pool.map(function, *arguments)
+
+
+def at_once(function: Callable[..., Any], *arguments: Iterable[Any]) -> list[Any]:
+    """Results as of `in_turn`, all together."""
+    return list(in_turn(function, *arguments))
 
 
 @contextmanager
