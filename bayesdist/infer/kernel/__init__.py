@@ -35,7 +35,11 @@ with kept_by_content():
         log_marginals,
     )
     from bayesdist.infer.kernel.stars import memberships, residuals
-    from bayesdist.infer.kernel.stars_unknown import eliminate_stars, weighted_stars
+    from bayesdist.infer.kernel.stars_unknown import (
+        EliminationSums,
+        eliminate_stars,
+        weighted_stars,
+    )
     from bayesdist.infer.kernel.truncated import (
         truncated_log_likelihood,
         truncated_memberships,
@@ -54,6 +58,7 @@ __all__ = [
     "PIECE",
     "UNIFORM",
     "Constants",
+    "EliminationSums",
     "Moments",
     "densities",
     "draw_deviations",

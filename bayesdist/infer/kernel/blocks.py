@@ -111,13 +111,19 @@ if hasattr(os, "register_at_fork"):  # not on Windows
     os.register_at_fork(after_in_child=_pool.cache_clear)  # threads do not survive it
 
 
-def at_once(function: Callable[..., Any], *arguments: Iterable[Any]) -> list[Any]:
+def in_turn(function: Callable[..., Any], *arguments: Iterable[Any]) -> Iterator[Any]:
     """Results of a function that is called as by `map`, on all threads at a time."""
     threads = nb.get_num_threads()
     if threads < 2:
-        return list(map(function, *arguments))
+        yield from map(function, *arguments)
+        return
     with ThreadPoolExecutor(threads) as pool:
-        return list(pool.map(function, *arguments))
+        yield from pool.map(function, *arguments)
+
+
+def at_once(function: Callable[..., Any], *arguments: Iterable[Any]) -> list[Any]:
+    """Results as of `in_turn`, all together."""
+    return list(in_turn(function, *arguments))
 
 
 @contextmanager

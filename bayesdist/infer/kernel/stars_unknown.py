@@ -8,13 +8,13 @@ the error is, and a model that made pixels smaller would make errors smaller.
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import numba as nb
 import numpy as np
 
 from bayesdist.infer.kernel.blocks import PASS, share_out
-from bayesdist.infer.kernel.lanes import FAST
+from bayesdist.infer.kernel.lanes import WIDTH, load, put, total
 from bayesdist.infer.kernel.sky_places import legendre
 from bayesdist.infer.kernel.star_modes import (
     MOST_STAR,
@@ -32,8 +32,6 @@ from bayesdist.infer.kernel.star_modes import (
     to_mode,
 )
 from bayesdist.utils.arrays import Float, Int
-
-PIECES = 8  # number of separate sums, whatever the number of threads
 
 
 @nb.njit(**PASS)
@@ -73,117 +71,136 @@ def weighted_stars(
     return member
 
 
-@nb.njit(cache=True, forceinline=True, fastmath=FAST | {"reassoc"})
-def _dot(coef, phi):
-    """Sum of coef_k phi_k over the coefficients."""
-    total = 0.0
-    for k in range(len(coef)):
-        total += coef[k] * phi[k]
-    return total
+@nb.njit(cache=True, forceinline=True)
+def _dot(coef, at, phi, row, n):
+    """Sum of n products of numbers from two indices on; n fills whole vectors."""
+    lanes = load(coef, at) * load(phi, row)
+    for k in range(WIDTH, n, WIDTH):
+        lanes += load(coef, at + k) * load(phi, row + k)
+    return total(lanes)
 
 
-@nb.njit(cache=True, forceinline=True, fastmath=FAST)
-def _add_weights(h0, h1, h2, phi, out):
-    """Add h0 phi, h1 phi, h2 phi to out (3, M)."""
-    for k in range(len(phi)):
-        out[0, k] += h0 * phi[k]
-        out[1, k] += h1 * phi[k]
-        out[2, k] += h2 * phi[k]
+@nb.njit(cache=True, forceinline=True)
+def _add(out, at, phi, row, n, factor):
+    """Add so many times n numbers to those of `out` from an index on; n fills whole vectors."""
+    for k in range(0, n, WIDTH):
+        put(out, at + k, load(out, at + k) + load(phi, row + k) * factor)
 
 
 @nb.njit(**PASS)
 def _eliminate_stars(
-    start, stop, first, last, starts, group, X, Y, offset, W, var, time, factor, centre, precision,
-    stars, coef, chip, linear, extra, columns, n_params, order, j2, log_core, log_out, least, seen,
-    sums,
+    first, last, starts, group, X, Y, offset, W, var, time, factor, centre, precision, stars, coef,
+    chip, n_chips, linear, extra, columns, order, j2, log_core, log_out, least, seen, weights,
+    pulls, scalars, rows, factors,
 ):  # fmt: skip
-    q, K, m, odds = stars.shape[1], coef.shape[2], extra.shape[1], far_odds(log_core, log_out)
-    weights, pulls, scalars, rows, factors = sums
-    top = 2 * order
-    step = -(-(last - first) // PIECES)
-    for piece in range(start, stop):
-        S, A, b = np.zeros((2, MOST_STAR)), np.zeros((MOST_STAR, MOST_STAR)), np.zeros(MOST_STAR)
-        px, py, by = np.empty(top + 1), np.empty(top + 1), np.empty((2, m))
-        basis = np.empty((16, weights.shape[3]))
-        for s in range(first + piece * step, min(first + (piece + 1) * step, last)):
-            a, e = starts[s], starts[s + 1]
-            if e - a > len(basis):
-                basis = np.empty((2 * (e - a), weights.shape[3]))
-            mine = own_rows(W, var, a, e)
-            when = time[a:e] if q >= 4 else time
-            where = factor[a:e] if q == 5 else factor
-            for i in range(a, e):
-                phi, g = basis[i - a], group[i]
-                legendre(X[i], Y[i], top, px, py, phi)
-                mine[PLACE_U, i - a] = offset[i, 0] + _dot(coef[g, 0], phi)
-                mine[PLACE_V, i - a] = offset[i, 1] + _dot(coef[g, 1], phi)
-            p = stars[s]
-            value, observed = to_mode(
-                mine, e - a, j2, log_core, log_out, when, where, centre[s], precision[s], p, S,
-                A, b, seen, least,
-            )  # fmt: skip
-            scalars[piece, 0] += value - log_root(A, q, least)
-            row = (s - first) * q
-            for k in range(q):
-                for l in range(k + 1):
-                    factors[s - first, k, l] = A[k, l]
-                    A[k, l] = precision[s, k, l]
-            for i in range(a, e):
-                g = group[i]
-                phi = basis[i - a]
-                design(S, q, i - a, when, where)
-                wu, wv, square = residual(i - a, mine, S, p, q)
-                s2 = var[i] + j2
-                w = membership(odds, square, s2)
-                h0, h1, h2 = hessian(i - a, mine, wu, wv, s2, w, observed)
-                add_curvature(A, S, q, h0, h1, h2)
-                scalars[piece, 1] += w
-                scalars[piece, 2] += w * square / s2
-                _add_weights(h0, h1, h2, phi, weights[piece, g])
-                gu, gv = -w * wu / s2, -w * wv / s2
-                for k in range(K):
-                    pulls[piece, g, 0, k] += gu * phi[k]
-                    pulls[piece, g, 1, k] += gv * phi[k]
+    q, m, odds = stars.shape[1], extra.shape[1], far_odds(log_core, log_out)
+    K, low, top = (order + 1) * (order + 2) // 2, coef.shape[2], weights.shape[2]
+    n_params = rows.shape[1]
+    S, A, b = np.zeros((2, MOST_STAR)), np.zeros((MOST_STAR, MOST_STAR)), np.zeros(MOST_STAR)
+    px, py, by = np.empty(2 * order + 1), np.empty(2 * order + 1), np.empty((2, m))
+    basis, dense = np.zeros((16, top)), np.empty((q, n_chips, 2, low))
+    for s in range(first, last):
+        a, e = starts[s], starts[s + 1]
+        if e - a > len(basis):
+            basis = np.zeros((2 * (e - a), top))
+        mine = own_rows(W, var, a, e)
+        when = time[a:e] if q >= 4 else time
+        where = factor[a:e] if q == 5 else factor
+        for i in range(a, e):
+            at, phi = 2 * group[i] * low, (i - a) * top
+            legendre(X[i], Y[i], 2 * order, px, py, basis[i - a])
+            mine[PLACE_U, i - a] = offset[i, 0] + _dot(coef, at, basis, phi, low)
+            mine[PLACE_V, i - a] = offset[i, 1] + _dot(coef, at + low, basis, phi, low)
+        p = stars[s]
+        value, observed = to_mode(
+            mine, e - a, j2, log_core, log_out, when, where, centre[s], precision[s], p, S, A, b,
+            seen, least,
+        )  # fmt: skip
+        scalars[0] += value - log_root(A, q, least)
+        row = (s - first) * q
+        for k in range(q):
+            for l in range(k + 1):
+                factors[s - first, k, l] = A[k, l]
+                A[k, l] = precision[s, k, l]
+        dense[:] = 0.0
+        for i in range(a, e):
+            g, phi = group[i], (i - a) * top
+            design(S, q, i - a, when, where)
+            wu, wv, square = residual(i - a, mine, S, p, q)
+            s2 = var[i] + j2
+            w = membership(odds, square, s2)
+            h0, h1, h2 = hessian(i - a, mine, wu, wv, s2, w, observed)
+            add_curvature(A, S, q, h0, h1, h2)
+            scalars[1] += w
+            scalars[2] += w * square / s2
+            _add(weights, 3 * g * top, basis, phi, top, h0)
+            _add(weights, (3 * g + 1) * top, basis, phi, top, h1)
+            _add(weights, (3 * g + 2) * top, basis, phi, top, h2)
+            _add(pulls, 2 * g * low, basis, phi, low, -w * wu / s2)
+            _add(pulls, (2 * g + 1) * low, basis, phi, low, -w * wv / s2)
+            for n in range(m):
                 for axis in range(2):
-                    for n in range(m):
-                        by[axis, n] = _dot(extra[g, n, axis], phi)
-                at_u = 2 * K * chip[g]
-                for k in range(q):
-                    hu, hv = S[0, k] * h0 + S[1, k] * h1, S[0, k] * h1 + S[1, k] * h2
-                    mine_row = rows[row + k]
-                    # by coefficients before the frame, and by its parameters
-                    for axis in range(2):
-                        along = hu * linear[g, 0, axis] + hv * linear[g, 1, axis]
-                        for l in range(K):
-                            mine_row[at_u + axis * K + l] += along * phi[l]
-                    for n in range(m):
-                        if columns[g, n] >= 0:
-                            mine_row[columns[g, n]] += hu * by[0, n] + hv * by[1, n]
-            # of these terms exactly, else directions that detections leave free would not be free:
-            # those of the last step but one are slightly different
-            same = cholesky(A, q)
+                    at = (2 * (g * m + n) + axis) * low
+                    by[axis, n] = _dot(extra, at, basis, phi, low)
             for k in range(q):
-                for l in range(k + 1):
-                    if same:
-                        factors[s - first, k, l] = A[k, l]
-                    else:
-                        A[k, l] = factors[s - first, k, l]
-            # L^-1 of them: elimination subtracts their square
-            for k in range(q):
-                for l in range(k):
-                    below = A[k, l]
-                    for n in range(n_params):
-                        rows[row + k, n] -= below * rows[row + l, n]
+                hu, hv = S[0, k] * h0 + S[1, k] * h1, S[0, k] * h1 + S[1, k] * h2
+                # by coefficients before the frame, and by its parameters
+                for axis in range(2):
+                    along = hu * linear[g, 0, axis] + hv * linear[g, 1, axis]
+                    at = (2 * (k * n_chips + chip[g]) + axis) * low
+                    _add(dense, at, basis, phi, low, along)
+                for n in range(m):
+                    if columns[g, n] >= 0:
+                        rows[row + k, columns[g, n]] += hu * by[0, n] + hv * by[1, n]
+        for k in range(q):
+            for c in range(n_chips):
+                for axis in range(2):
+                    for l in range(K):
+                        rows[row + k, (2 * c + axis) * K + l] += dense[k, c, axis, l]
+        # of these terms exactly, else directions that detections leave free would not be free:
+        # those of the last step but one are slightly different
+        same = cholesky(A, q)
+        for k in range(q):
+            for l in range(k + 1):
+                if same:
+                    factors[s - first, k, l] = A[k, l]
+                else:
+                    A[k, l] = factors[s - first, k, l]
+        # L^-1 of them: elimination subtracts their square
+        for k in range(q):
+            for l in range(k):
+                below = A[k, l]
                 for n in range(n_params):
-                    rows[row + k, n] /= A[k, k]
+                    rows[row + k, n] -= below * rows[row + l, n]
+            for n in range(n_params):
+                rows[row + k, n] /= A[k, k]
+
+
+class EliminationSums(NamedTuple):
+    """Sums of a second-order expansion by group, in whole vectors: what is beyond is no sum.
+
+    With the Legendre functions up to twice the order, by which products of two are sums
+    (`product_table`).
+    """
+
+    weights: Float  # (G, 3, M or more) of the curvature uu, uv, vv by position
+    pulls: Float  # (G, 2, K or more) of its gradient
+    scalars: Float  # (3,) log density, sums of w, and of w times the squared normalised residual
+
+    @classmethod
+    def zero(cls, n_groups: int, order: int) -> EliminationSums:
+        """Sums over no star."""
+        K, M = (order + 1) * (order + 2) // 2, (order + 1) * (2 * order + 1)
+        shapes = (n_groups, 3, M + -M % WIDTH), (n_groups, 2, K + -K % WIDTH), (3,)
+        return cls(*map(np.zeros, shapes))
 
 
 def eliminate_stars(
     first: int, last: int, detections: tuple[Any, ...], stars: Float,
     coef: Float, chip: Int, linear: Float, extra: Float, columns: Int, n_params: int, order: int,
-    j2: float, log_core: float, log_out: float, least: float, seen: bool,
-) -> tuple[Float, ...]:  # fmt: skip
-    """Sums of a second-order expansion over stars first..last, these moved to their modes.
+    j2: float, log_core: float, log_out: float, least: float, seen: bool, sums: EliminationSums,
+) -> tuple[Float, Float]:  # fmt: skip
+    """Move stars first..last to their modes and add to the sums of a second-order expansion.
 
     `detections` are starts, group, X, Y, offset, W, var, time, factor, centre and precision.
     coef (G, 2, K): of the Legendre products; of each group its chip (G,), the linear part (G, 2, 2)
@@ -192,21 +209,21 @@ def eliminate_stars(
     least: root of the least curvature that a star's position may have.
     seen: curvature of the mixture itself.
 
-    Returns sums by group, with the Legendre functions up to twice the order, by which products of
-    two are sums (`product_table`): weights (P, G, 3, M), of the curvature uu, uv, vv by position;
-    pulls (P, G, 2, K), of its gradient; then scalars (P, 3): log density, sums of w, and of w times
-    the squared normalised residual; rows (S q, D): L^-1 B of each star; factors (S, q, q): L.
+    Returns rows (S q, D): L^-1 B of each star; factors (S, q, q): L.
     """
-    q, K = stars.shape[1], coef.shape[2]
-    sums = (
-        np.zeros((PIECES, len(coef), 3, (order + 1) * (2 * order + 1))),
-        np.zeros((PIECES, len(coef), 2, K)),
-        np.zeros((PIECES, 3)),
-        np.zeros(((last - first) * q, n_params)),
-        np.zeros((last - first, q, q)),
-    )
-    share_out(
-        _eliminate_stars, PIECES, first, last, *detections, stars, coef, chip, linear, extra,
-        columns, n_params, order, j2, log_core, log_out, least, seen, sums,
+    q = stars.shape[1]
+    rows, factors = np.zeros(((last - first) * q, n_params)), np.zeros((last - first, q, q))
+    _eliminate_stars(
+        first, last, *detections, stars, _in_vectors(coef), chip, int(chip.max()) + 1, linear,
+        _in_vectors(extra), columns, order, j2, log_core, log_out, least, seen, *sums, rows,
+        factors,
     )  # fmt: skip
-    return sums
+    return rows, factors
+
+
+def _in_vectors(coefficients: Float) -> Float:
+    """Coefficients (..., K) with zeros behind them that fill whole vectors."""
+    K = coefficients.shape[-1]
+    out = np.zeros((*coefficients.shape[:-1], K + -K % WIDTH))
+    out[..., :K] = coefficients
+    return out

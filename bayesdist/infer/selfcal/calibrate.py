@@ -53,10 +53,14 @@ class SelfCalibration:
 class _Iteration:
     """What the next iteration takes from one: no detections."""
 
-    friends: Friends
     n_detections: int  # of stars
     mixture: Mixture
     decision: Decision | None
+
+    @classmethod
+    def of(cls, mode: SelfCalibrationMode) -> _Iteration:
+        """What is taken from a mode."""
+        return cls(len(mode.problem), mode.mixture, mode.decision)
 
     def is_near(self, problem: Problem) -> bool:
         """True where errors and free directions are those of the next problem at first.
@@ -134,17 +138,43 @@ def self_calibrate(
     theta = np.array(theta, float)
     prior_at = prior_at or Prior.none
     measured = detections.sigma is None
-    if measured:
-        detections = replace(detections, sigma=np.full(len(detections), GUESS))
+    sigma = np.full(len(detections), GUESS) if detections.sigma is None else detections.sigma
+    detections = replace(detections, sigma=sigma)
     radius = max(start_radius or match_radius, match_radius)
     pixel = model.pixel_size(theta)
+    few = max(MAX_CHANGED * len(detections), MIN_CHANGED)
+    last = False
     before: _Iteration | None = None
+    solved: tuple[Friends, SelfCalibrationMode] | None = None
     each = partial(each_of, compute)
-    for turn in range(max_iterations):
+    for turn in range(max_iterations + 1):
         flat = detections if plane is None else plane.onto_it(model, detections, theta)
         friends = friends_of_friends(
             places_of(model, flat, theta, dilation), flat.exposure, radius * pixel, each=each
         )
+        # references and priors are linearised at the start of a solution: the first one's is far
+        if solved is not None and turn > 1 and last and _changed(solved[0], friends) <= few:
+            friends, mode = solved
+            if measured:  # with the errors of the last iteration
+                problem = replace(mode.problem, var=sigma[mode.problem.rows] ** 2)
+                mode = solve_in_gauge(
+                    problem,
+                    theta,
+                    prior_at,
+                    stars=mode.stars,
+                    jitter=jitter,
+                    mixture=mode.mixture,
+                    decision=mode.decision,
+                    compute=compute,
+                )
+            gauge = gauge_of(mode.problem, mode.theta, prior_at(mode.theta), mode)
+            found = replace(flat, star=friends.star)
+            return SelfCalibration(mode, gauge, friends, found, turn)
+        if turn == max_iterations:
+            break
+        if solved is not None:
+            before = _Iteration.of(solved[1])
+            solved = None  # else two problems are held
         found = replace(flat, star=friends.star)
         problem = prepare(
             model,
@@ -177,26 +207,9 @@ def self_calibrate(
         if measured:
             sigma = _errors_of(detections, mode)
             detections = replace(detections, sigma=sigma)
-        few = max(MAX_CHANGED * len(detections), MIN_CHANGED)
-        if last and before is not None and _changed(before.friends, friends) <= few:
-            if measured:  # with the errors of this iteration
-                problem = replace(mode.problem, var=sigma[mode.problem.rows] ** 2)
-                mode = solve_in_gauge(
-                    problem,
-                    theta,
-                    prior_at,
-                    stars=mode.stars,
-                    jitter=jitter,
-                    mixture=mode.mixture,
-                    decision=mode.decision,
-                    compute=compute,
-                )
-            gauge = gauge_of(mode.problem, mode.theta, prior_at(mode.theta), mode)
-            found = replace(found, sigma=detections.sigma)
-            return SelfCalibration(mode, gauge, friends, found, turn + 1)
-        before, scatter = _Iteration(friends, len(problem), mode.mixture, mode.decision), mode.error
+        scatter, solved = mode.error, (friends, mode)
         radius = max(match_radius, min(radius, max(SHRINK * radius, REACH * scatter)))
-        del flat, found, problem, mode  # else these are held while the next ones are made
+        del flat, found, problem, mode  # else these are held while detections are grouped again
     if last:
         raise NotSettledError(
             f"stars and solution still change after {max_iterations} iterations",

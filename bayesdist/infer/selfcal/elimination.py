@@ -18,13 +18,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bayesdist.infer import kernel
-from bayesdist.infer.kernel.blocks import threads_for
+from bayesdist.infer.kernel.blocks import in_turn, threads_for
 from bayesdist.infer.kernel.moments import product_table
 from bayesdist.infer.selfcal.problem import Problem
 from bayesdist.infer.stars.sums import Sums
 from bayesdist.utils.arrays import Float, Int
 
-STARS = 4096  # eliminated at a time
+STARS = 1024  # eliminated at a time
+PARTS = 8  # of the stars, whose sums are made separately whatever the number of threads
+ELIMINATION = 40  # evaluations of a polynomial that last as long as a detection's part in it
 SURE, NEVER = 0.99, 1e-6  # memberships beyond which no other choice is considered
 MODE = 10  # evaluations of a polynomial that last as long as the search for a star's mode
 NO_MODE = 1e-6  # relative determinant of a curvature that says nothing of where the mode is
@@ -96,21 +98,32 @@ def expand(
     """
     structure, D = PlaceDerivatives.at(problem, theta), problem.model.n_params
     order, K = problem.model.order, problem.model.n_terms
-    weights = np.zeros((len(problem.groups), 3, (order + 1) * (2 * order + 1)))
-    pulls, scalars = np.zeros((len(problem.groups), 2, K)), np.zeros(3)
+    sums = kernel.EliminationSums.zero(len(problem.groups), order)
     curvature, gradient = np.zeros((D, D)), np.zeros(D)
     found = stars.copy()
-    for *sums, rows, _ in _passes(problem, structure, mixture, found, observed):
-        for total, pieces in zip((weights, pulls, scalars), sums, strict=True):
-            total += pieces.sum(axis=0)
-        curvature -= rows.T @ rows
-    squares = np.einsum("gcm,klm->gckl", weights, product_table(order), optimize=True)
+
+    def part(first: int, last: int) -> tuple[kernel.EliminationSums, Float]:
+        mine = kernel.EliminationSums.zero(len(problem.groups), order)
+        absorbed = np.zeros((D, D))
+        for _, rows, _ in _passes(problem, structure, mixture, found, observed, first, last, mine):
+            absorbed += rows.T @ rows
+        return mine, absorbed
+
+    edges = np.arange(PARTS + 1) * problem.n_stars // PARTS
+    with threads_for(ELIMINATION * len(problem)):
+        for mine, absorbed in in_turn(part, edges[:-1], edges[1:]):
+            for total, more in zip(sums, mine, strict=True):
+                total += more
+            curvature -= absorbed
+    table = product_table(order)
+    weights, pulls = sums.weights[..., : table.shape[-1]], sums.pulls[..., :K]
+    squares = np.einsum("gcm,klm->gckl", weights, table, optimize=True)
     for (columns, by), (uu, uv, vv), pull in zip(structure.jacobian, squares, pulls, strict=True):
         by = by.reshape(2 * K, -1)
         curvature[np.ix_(columns, columns)] += by.T @ np.block([[uu, uv], [uv, vv]]) @ by
         gradient[columns] += pull.ravel() @ by
     curvature = (curvature + curvature.T) / 2
-    value, members, chi2 = scalars
+    value, members, chi2 = sums.scalars
     return Expansion(float(value), gradient, curvature, members, chi2), found
 
 
@@ -122,41 +135,47 @@ def eliminated_rows(
     Yields the stars, L^-1 B (n, q, D) of each, A = L L^T, and L (n, q, q).
     """
     structure, D, q = PlaceDerivatives.at(problem, theta), problem.model.n_params, problem.n_star
-    first = 0
-    for *_, rows, factors in _passes(problem, structure, mixture, stars.copy(), True):
-        n = len(factors)
-        yield slice(first, first + n), rows.reshape(n, q, D), factors
-        first += n
+    sums = kernel.EliminationSums.zero(len(problem.groups), problem.model.order)
+    whole = stars.copy(), True, 0, problem.n_stars, sums
+    for some, rows, factors in _passes(problem, structure, mixture, *whole):
+        yield some, rows.reshape(len(factors), q, D), factors
 
 
 def _passes(
-    problem: Problem, structure: PlaceDerivatives, mixture: Mixture, stars: Float, observed: bool
-) -> Iterator[tuple[Float, ...]]:
+    problem: Problem,
+    structure: PlaceDerivatives,
+    mixture: Mixture,
+    stars: Float,
+    observed: bool,
+    first: int,
+    last: int,
+    sums: kernel.EliminationSums,
+) -> Iterator[tuple[slice, Float, Float]]:
+    """Some of the stars first..last at a time, with the results of `kernel.eliminate_stars`."""
     p = problem
     j2, log_core, log_out = mixture.constants(p.log_outlier)
-    # products of the polynomials' terms: so many times their values
-    evaluations = 2 * p.model.n_terms * len(p) * min(1.0, STARS / p.n_stars)
-    for first in range(0, p.n_stars, STARS):
-        with threads_for(evaluations):
-            found = kernel.eliminate_stars(
-                first,
-                min(first + STARS, p.n_stars),
-                p.columns,
-                stars,
-                structure.coef,
-                p.groups.chip,
-                structure.linear,
-                structure.extra,
-                structure.columns,
-                p.model.n_params,
-                p.model.order,
-                j2,
-                log_core,
-                log_out,
-                p.least_root,
-                observed,
-            )
-        yield found
+    for begin in range(first, last, STARS):
+        some = slice(begin, min(begin + STARS, last))
+        found = kernel.eliminate_stars(
+            some.start,
+            some.stop,
+            p.columns,
+            stars,
+            structure.coef,
+            p.groups.chip,
+            structure.linear,
+            structure.extra,
+            structure.columns,
+            p.model.n_params,
+            p.model.order,
+            j2,
+            log_core,
+            log_out,
+            p.least_root,
+            observed,
+            sums,
+        )
+        yield some, *found
 
 
 def memberships(problem: Problem, theta: Float, mixture: Mixture, stars: Float) -> Float:

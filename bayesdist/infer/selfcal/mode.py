@@ -276,7 +276,9 @@ def _mixture(
     s2 = problem.var + mixture.jitter**2
     # chi-square changes by jitter^2 as the mean of 1 / s^2 does
     new = mixture.jitter**2 + (found.chi2 / dof - 1.0) / float(np.mean(1.0 / s2))
-    new = min(max(new, mixture.jitter**2 / 4), 4 * mixture.jitter**2 + float(np.median(s2)))
+    # errors shrink to half at most: as they do, so do the distances of detections from their stars
+    least = (mixture.jitter**2 - 3 * problem.sigma**2) / 4
+    new = min(max(new, least), 4 * mixture.jitter**2 + float(np.median(s2)))
     floor = (1e-2 * problem.sigma) ** 2
     return Mixture(float(np.sqrt(max(new, floor))), fraction)
 
