@@ -70,7 +70,7 @@ def _unmade(registry, results, *, pdf=False, processes=1):
     """A speck for each figure that the results have."""
     from matplotlib.figure import Figure
 
-    from bayesdist.report.registry import Plot
+    from bayesdist.report.contents import Plot
 
     names = [item.name for item in registry.items(results, "figure")]
     return {name: _sketch(Plot(Figure(), name, name, name), pdf=pdf) for name in names}

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -13,6 +13,7 @@ from bayesdist.app.assessment.checks import run_checks
 from bayesdist.app.assessment.diagnosing import diagnose_residuals, diagnose_run
 from bayesdist.app.assessment.error_terms import (
     assessment_epoch,
+    assessment_rng,
     errors_of_run,
     evaluation_settings,
 )
@@ -23,12 +24,24 @@ from bayesdist.app.kinds.kind import Kind, kind_of
 from bayesdist.app.kinds.matched import Matched
 from bayesdist.app.kinds.matches.sources import RunInput, input_of_run
 from bayesdist.app.products.made_files import ProductInput, product_of, solution_of
+from bayesdist.app.products.product_terms import file_errors
 from bayesdist.app.store.rundir import RunDirectory
 from bayesdist.app.tables.result_files import load_diagnostics, load_evaluation
-from bayesdist.assess.evaluation import Evaluation, EvaluationSettings
+from bayesdist.assess import Margin, Requirement
+from bayesdist.assess.drawn import DrawnErrors
+from bayesdist.assess.evaluation import (
+    Evaluation,
+    EvaluationSettings,
+    drawn_errors,
+    judged,
+    validity_of,
+)
 from bayesdist.assess.model import ErrorModel
+from bayesdist.assess.requirements.margins import judge
+from bayesdist.assess.requirements.validity import ValidityPeriod
 from bayesdist.diagnose.diagnostics import Diagnostics
 from bayesdist.infer import LinearFit, Posterior, load_posterior
+from bayesdist.infer.solution.solution import Solution
 from bayesdist.utils.checks import Check, in_order
 
 T = TypeVar("T")
@@ -227,3 +240,44 @@ def open_results(run: RunDirectory) -> Iterator[Results]:
         yield results
     finally:
         results.close()
+
+
+def errors_of(results: Results) -> DrawnErrors:
+    """Draws of all errors of a position, as budget and margins have them, and of files."""
+    files = file_errors(results.product, results.config, results.base)
+    given = results.errors, results.diagnostics, results.settings
+    return drawn_errors(*given, assessment_rng(results.config), files=files)
+
+
+def margins_of(results: Results, requirements: Sequence[Requirement]) -> tuple[Margin, ...]:
+    """Margins of a run against requirements."""
+    given = results.errors, results.diagnostics, requirements, results.settings
+    return judged(*given, assessment_rng(results.config), checks=results.checks)
+
+
+def validity_periods_of(
+    results: Results, requirements: Sequence[Requirement]
+) -> tuple[ValidityPeriod, ...]:
+    """Until when requirements are met by a run, where something depends on time."""
+    given = results.errors, results.diagnostics, requirements, results.settings
+    return validity_of(*given, assessment_rng(results.config))
+
+
+def probability_met(
+    results: Results, requirement: Requirement, candidate: Solution, n_draws: int
+) -> float:
+    """Probability that a requirement would be met by another solution in place of the run's.
+
+    The same random numbers serve every candidate.
+    """
+    errors, settings = results.errors, results.settings
+    errors = replace(errors, solution=replace(errors.solution, solution=candidate))
+    rng = assessment_rng(results.config)
+    [margin] = judge(
+        drawn_errors(errors, results.diagnostics, settings, rng, n=n_draws),
+        [requirement],
+        grid=settings.grid,
+        epoch=settings.epoch,
+        pixel_scale=settings.pixel_scale(errors),
+    )
+    return margin.probability_met

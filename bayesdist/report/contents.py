@@ -1,8 +1,156 @@
-"""Sections of the pages in their order, and the documentation that explains each."""
+"""Contents of a page: registry of its figures and tables, and the sections of the report."""
 
 from __future__ import annotations
 
-from bayesdist.report.registry import Registry, Section
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import reduce
+from typing import Any, Literal, TypeVar
+
+from matplotlib.figure import Figure
+
+from bayesdist.report.figures.style import figure_style
+
+Make = TypeVar("Make", bound=Callable[..., Any])
+Kind = Literal["figure", "table", "data"]
+When = Callable[[Any], bool]
+
+
+@dataclass(frozen=True, eq=False)
+class Plot:
+    """Figure and its words."""
+
+    figure: Figure
+    title: str
+    text: str  # explanation
+    alt: str  # text alternative to the picture
+
+
+@dataclass(frozen=True)
+class Section:
+    """Section of a page; title and `printed` (on paper) may be functions of the results."""
+
+    name: str
+    title: str | Callable[[Any], str]
+    empty: str = ""  # text in place of missing tables; a section without it is left out
+    parent: str = ""  # section that it is a part of
+    printed: bool | When = True
+
+    def title_of(self, results: Any) -> str:
+        """Title in the page of some results."""
+        return self.title if isinstance(self.title, str) else self.title(results)
+
+    def is_printed(self, results: Any) -> bool:
+        """True where the section is on paper."""
+        return self.printed(results) if callable(self.printed) else self.printed
+
+
+@dataclass(frozen=True)
+class Entry:
+    """Figure, table or data of a page; `each` gives name and argument of each of many figures."""
+
+    name: str  # of the function; of a figure also that of its files
+    section: str  # data belong to none
+    kind: Kind
+    make: Callable[..., Any]  # of the results and an item of `each`: Plot, TextTable(s) or data
+    needs: tuple[str, ...] = ()  # attributes of the results that must be neither None nor empty
+    when: When | None = None  # condition that no attribute states
+    each: Callable[[Any], Mapping[str, Any]] | None = None
+    printed: bool | When = False  # on paper
+
+    def applies(self, results: Any) -> bool:
+        """True where it can be made of these results."""
+        if not all(_present(results, path) for path in self.needs):
+            return False
+        return self.when is None or self.when(results)
+
+
+@dataclass(frozen=True)
+class Item:
+    """Entry in the page of some results; its function gets the results and `arguments`."""
+
+    name: str
+    section: str
+    make: Callable[..., Any]
+    arguments: tuple[Any, ...] = ()
+    printed: bool = False
+
+    def made(self, results: Any) -> Any:
+        """Figure, table or data made of the results."""
+        return self.make(results, *self.arguments)
+
+
+class Registry:
+    """Figures, tables and data that one kind of page can show, in sections in the page's order."""
+
+    def __init__(self, name: str, sections: Sequence[Section]) -> None:
+        self.name, self.sections = name, tuple(sections)
+        self._entries: list[Entry] = []
+
+    def figure(
+        self,
+        section: str,
+        *,
+        needs: tuple[str, ...] = (),
+        when: When | None = None,
+        each: Callable[[Any], Mapping[str, Any]] | None = None,
+        printed: bool | When = False,
+    ) -> Callable[[Make], Make]:
+        """Decorator of a function that makes a `Plot`, in our style; parameters as of `Entry`."""
+        options = {"needs": needs, "when": when, "each": each, "printed": printed}
+        return self._decorator(section, "figure", options)
+
+    def table(
+        self, section: str, *, needs: tuple[str, ...] = (), when: When | None = None
+    ) -> Callable[[Make], Make]:
+        """Decorator of a function that makes a `TextTable`, several, or None."""
+        return self._decorator(section, "table", {"needs": needs, "when": when})
+
+    def data(self, *, needs: tuple[str, ...] = ()) -> Callable[[Make], Make]:
+        """Decorator of a function that makes data for the scripts of the page."""
+        return self._decorator("", "data", {"needs": needs})
+
+    def _decorator(
+        self, section: str, kind: Kind, options: Mapping[str, Any]
+    ) -> Callable[[Make], Make]:
+        def register(make: Make) -> Make:
+            name = make.__name__
+            if any(entry.name == name and entry.kind == kind for entry in self._entries):
+                raise ValueError(f"{self.name}: two entries are called {name}")
+            styled = figure_style()(make) if kind == "figure" else make
+            self._entries.append(Entry(name, section, kind, styled, **options))
+            return styled
+
+        return register
+
+    @property
+    def entries(self) -> tuple[Entry, ...]:
+        """Entries in the order of sections, then of registration."""
+        order = ["", *(section.name for section in self.sections)]
+        return tuple(sorted(self._entries, key=lambda entry: order.index(entry.section)))
+
+    def items(self, results: Any, kind: Kind) -> tuple[Item, ...]:
+        """Items that can be made of some results, in the order of the page."""
+        out = []
+        for entry in self.entries:
+            if entry.kind != kind or not entry.applies(results):
+                continue
+            printed = entry.printed(results) if callable(entry.printed) else entry.printed
+            if entry.each is None:
+                out.append(Item(entry.name, entry.section, entry.make, printed=printed))
+                continue
+            for name, argument in entry.each(results).items():
+                out.append(Item(name, entry.section, entry.make, (argument,), printed))
+        return tuple(out)
+
+
+def _present(results: Any, path: str) -> bool:
+    """True where an attribute, or one of an attribute, is neither None nor empty."""
+    value = reduce(
+        lambda of, name: None if of is None else getattr(of, name), path.split("."), results
+    )
+    return value is not None and (not isinstance(value, tuple | Mapping) or bool(value))
+
 
 REPORT = Registry(
     "report",

@@ -25,9 +25,9 @@ from matplotlib.transforms import Bbox
 from PIL import Image
 
 from bayesdist.files.atomic import announce, atomic_path, made_folder
+from bayesdist.report.contents import Item, Plot, Registry
 from bayesdist.report.figures.figure_numbers import numbers_of
 from bayesdist.report.figures.style import figure_style, plain_ticks
-from bayesdist.report.registry import Item, Plot, Registry
 
 log = logging.getLogger("bayesdist")
 

@@ -13,10 +13,9 @@ from typing import Any
 import jinja2
 from markupsafe import Markup
 
-from bayesdist.report.contents import explanation_of, section_of
+from bayesdist.report.contents import Registry, explanation_of, section_of
 from bayesdist.report.drawing import Drawing
 from bayesdist.report.figures.style import HALF_WIDTH
-from bayesdist.report.registry import Registry
 from bayesdist.report.texttable import Level, TextTable
 from bayesdist.utils.numbers import MISSING
 

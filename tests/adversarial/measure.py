@@ -15,9 +15,8 @@ import numpy as np
 from astropy.table import Table
 
 from bayesdist.app.assessment.error_terms import assessment_rng
-from bayesdist.app.commands.on_runs.judging import margins_of
 from bayesdist.app.config import load_config
-from bayesdist.app.results import Results
+from bayesdist.app.results import Results, margins_of
 from bayesdist.app.store.rundir import RunDirectory
 from bayesdist.assess import Margin, Requirement
 from bayesdist.assess.statistics import field_statistic

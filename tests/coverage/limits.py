@@ -8,7 +8,7 @@ from tempfile import TemporaryDirectory
 
 import numpy as np
 
-from bayesdist.app.commands.on_runs.judging import margins_of
+from bayesdist.app.results import margins_of
 from bayesdist.assess import Margin, Requirement
 from bayesdist.assess.budget.surface import JOINT as MODEL
 from bayesdist.assess.statistics import field_statistic

@@ -11,7 +11,7 @@ import numba
 import numpy as np
 from scipy.stats import norm
 
-from bayesdist.app.commands.on_runs.judging import errors_of
+from bayesdist.app.results import errors_of
 from bayesdist.assess.budget.budget import TOTAL, place_budget
 from bayesdist.assess.budget.surface import JOINT as MODEL
 from bayesdist.assess.domain import EvaluationDomain

@@ -13,7 +13,7 @@ from tempfile import TemporaryDirectory
 
 import numpy as np
 
-from bayesdist.app.commands.on_runs.judging import errors_of, margins_of
+from bayesdist.app.results import errors_of, margins_of
 from bayesdist.assess import Requirement
 from bayesdist.assess.domain import EvaluationDomain
 from bayesdist.assess.statistics import field_statistic

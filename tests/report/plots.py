@@ -8,9 +8,9 @@ from functools import cache
 from matplotlib.figure import Figure
 from PIL import Image
 
+from bayesdist.report.contents import Plot
 from bayesdist.report.context import ReportInput
 from bayesdist.report.drawing import Drawing
-from bayesdist.report.registry import Plot
 from bayesdist.report.sections import REPORT
 
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from lxml import html as lxml_html
 
-from bayesdist.app.kinds.campaign.checks import campaign_checks
+from bayesdist.app.assessment.checks import campaign_checks
 from bayesdist.app.kinds.campaign.report import held_parameters
 from bayesdist.diagnose.checks import structure_checks
 from bayesdist.diagnose.residuals.misfit import Misfit

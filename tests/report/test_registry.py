@@ -13,9 +13,9 @@ from bayesdist.diagnose.holdout.validation import HoldoutValidation
 from bayesdist.infer import Posterior
 from bayesdist.missions.wise.bands.command import BANDS
 from bayesdist.missions.wise.bands.context import BandsInput
+from bayesdist.report.contents import Plot, Registry, Section
 from bayesdist.report.context import CampaignResults, ReportInput
 from bayesdist.report.page import parts_of
-from bayesdist.report.registry import Plot, Registry, Section
 from bayesdist.report.run_report import render_markdown, render_report
 from bayesdist.report.sections import REPORT
 from bayesdist.report.texttable import Level, TextTable

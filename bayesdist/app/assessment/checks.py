@@ -6,7 +6,6 @@ from collections.abc import Iterator, Mapping
 from typing import Any
 
 from bayesdist.app.config import Config
-from bayesdist.app.kinds.campaign.checks import campaign_checks
 from bayesdist.app.kinds.fit_data import FitData
 from bayesdist.app.kinds.kind import kind_of
 from bayesdist.app.kinds.matches.added_errors import knows_circle
@@ -15,8 +14,9 @@ from bayesdist.assess.units import pixel_doubt
 from bayesdist.diagnose.diagnostics import Diagnostics
 from bayesdist.infer import Posterior
 from bayesdist.infer.posterior.checks import fit_checks, sampling_checks
-from bayesdist.utils.checks import LARGER, Check
-from bayesdist.utils.limits import CHI2_TOO_LARGE
+from bayesdist.utils.checks import LARGER, Check, level_of
+from bayesdist.utils.limits import CHI2_TOO_LARGE, COMPLETENESS, FALSE_MATCHES
+from bayesdist.utils.numbers import count, percent
 
 
 def run_checks(
@@ -104,3 +104,65 @@ def frames_doubt(data: FitData, majority: str, config: Config) -> str:
     if not large or config.data is None or data.better_frames is None:
         return ""
     return f"the exposures lie differently: {data.better_frames.sentence}"
+
+
+GROUP = "Campaign"
+
+# sections whose warnings a reader has to know, with their names and what they do to verdicts;
+# deviations that go with time are in no draw of the errors of a later exposure
+WARNING = {
+    "matching": ("Matching", ""),
+    "deviations": ("Deviations of the exposures", LARGER),
+    "tables": ("Look-up tables", ""),
+    "time_dependence": ("Time dependence", ""),
+}
+
+
+def campaign_checks(summary: Mapping[str, Any]) -> tuple[Check, ...]:
+    """Criteria of matching, tables and series, and what their stages found odd."""
+    m, tables, time = (summary.get(k) or {} for k in ("matching", "tables", "time_dependence"))
+    least = float(m["completeness"]["least"])
+    false = float(m["false_fraction"])
+    out = [
+        Check(
+            GROUP,
+            "Matching: completeness of the exposures",
+            f"{percent(m['completeness']['median'])} at the median, {percent(least)} at least",
+            f"at least {percent(COMPLETENESS.value, 2)} in each",
+            level_of(COMPLETENESS.met_by(least), "warn"),
+        ),
+        Check(
+            GROUP,
+            "Matching: false pairs expected",
+            percent(false, 2),
+            f"at most {percent(FALSE_MATCHES.value, 2)}",
+            level_of(FALSE_MATCHES.met_by(false), "warn"),
+        ),
+    ]
+    if m.get("left_out"):
+        names = "; ".join(m["left_out"])
+        out.append(Check(GROUP, "Matching: exposures left out", names, "none", "warn"))
+    if "converged" in tables:
+        out.append(_converged("Look-up tables converged", tables))
+    if "converged" in time:
+        out.append(_converged("Series of linear terms converged", time))
+        off = len(time.get("outlying_exposures", ()))
+        out.append(Check(GROUP, "Exposures that lie off the lines", count(off)))
+    for what, key in (
+        ("Exposures that went wrong in the joint fit", "exposures_outlying"),
+        ("Exposures that could not be fitted alone", "exposures_skipped"),
+    ):
+        names = ", ".join(str(name) for name in summary.get(key) or ())
+        if names:
+            out.append(Check(GROUP, what, names, "none", "warn"))
+    out += [
+        Check(GROUP, name, level="warn", sentence=text, doubt=doubt)
+        for part, (name, doubt) in WARNING.items()
+        for text in summary.get(part, {}).get("warnings", [])
+    ]
+    return tuple(out)
+
+
+def _converged(what: str, section: Mapping[str, Any]) -> Check:
+    good = bool(section["converged"])
+    return Check(GROUP, what, "yes" if good else "NO", "yes", level_of(good, "warn"))

@@ -9,9 +9,13 @@ from pathlib import Path
 
 import numpy as np
 
-from bayesdist.app.commands.on_files.init_columns import column_lines, guessed_sigma
-from bayesdist.app.commands.on_files.init_detector import detector_lines, quoted
 from bayesdist.app.commands.on_files.init_draft import draft_of
+from bayesdist.app.commands.on_files.init_guesses import (
+    column_lines,
+    detector_lines,
+    guessed_sigma,
+    quoted,
+)
 from bayesdist.app.config import parse_config
 from bayesdist.app.config.data import data_sections
 from bayesdist.app.kinds.matches.sources import load_matches, mission_template

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from pathlib import Path
 
-from bayesdist.app.commands.on_files.init_detector import detector_lines, quoted
+from bayesdist.app.commands.on_files.init_guesses import detector_lines, quoted
 from bayesdist.app.config import parse_config
 from bayesdist.data import read_star_lists
 from bayesdist.data.formats.files import input_files, kind_of

@@ -6,9 +6,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from bayesdist.app.commands.on_runs.judging import errors_of
 from bayesdist.app.commands.options import chip_of
-from bayesdist.app.results import open_results
+from bayesdist.app.results import errors_of, open_results
 from bayesdist.app.screen import number, table_text
 from bayesdist.app.store.rundir import RunDirectory
 from bayesdist.assess.budget.budget import TOTAL, ErrorBudget, place_budget

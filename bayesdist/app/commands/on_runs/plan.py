@@ -7,8 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from bayesdist.app.commands.on_runs.judging import probability_met
-from bayesdist.app.results import Results, open_results
+from bayesdist.app.results import Results, open_results, probability_met
 from bayesdist.app.store.rundir import RunDirectory
 from bayesdist.app.tables.margins import judged_requirements
 from bayesdist.assess.planning.exposures import Schedule, exposures_needed

@@ -7,9 +7,8 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from bayesdist.app.assessment.error_terms import idle_dates
-from bayesdist.app.commands.on_runs.judging import margins_of, validity_periods_of
 from bayesdist.app.config import load_requirements
-from bayesdist.app.results import open_results
+from bayesdist.app.results import margins_of, open_results, validity_periods_of
 from bayesdist.app.store.rundir import RunDirectory
 from bayesdist.app.tables.margins import margin_rows, margins_text
 from bayesdist.app.tables.result_files import save_margins

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-from bayesdist.report.registry import Registry, Section
+from bayesdist.report.contents import Registry, Section
 
 if TYPE_CHECKING:
     from bayesdist.assess import UncertaintyMap, VectorMap

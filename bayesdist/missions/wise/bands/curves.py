@@ -6,8 +6,8 @@ import numpy as np
 
 from bayesdist.missions.wise.assess.residual_correlation import DRAWS
 from bayesdist.missions.wise.bands.context import BANDS, BandsInput
+from bayesdist.report.contents import Plot
 from bayesdist.report.figures.style import INK, PALETTE, WIDTH, legend_above, new_figure
-from bayesdist.report.registry import Plot
 from bayesdist.utils.numbers import probability
 
 # colour, width and dashes by case, drawn in this order

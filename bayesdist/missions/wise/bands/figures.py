@@ -10,11 +10,11 @@ from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 
 from bayesdist.missions.wise.bands.context import BANDS, BandsInput
+from bayesdist.report.contents import Plot
 from bayesdist.report.figures.arrows import Arrows, cross_map, magnification_of, spacing, vector_map
 from bayesdist.report.figures.fields import Grid, scalar_map
 from bayesdist.report.figures.panels import ArrayPanels
 from bayesdist.report.figures.style import nice_below
-from bayesdist.report.registry import Plot
 from bayesdist.utils.arrays import Float
 from bayesdist.utils.numbers import number, size_of
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from bayesdist.app.commands.on_files.init_columns import column_lines
+from bayesdist.app.commands.on_files.init_guesses import column_lines
 from bayesdist.data import input_files
 from bayesdist.data.tables.parquet import describe_part
 from bayesdist.errors import InputError

@@ -10,13 +10,12 @@ from matplotlib.axes import Axes
 from matplotlib.colors import Normalize
 
 from bayesdist.model import LookupTable
-from bayesdist.report.contents import REPORT
+from bayesdist.report.contents import REPORT, Plot
 from bayesdist.report.context import CampaignResults, ChipResiduals, ReportInput, needed
 from bayesdist.report.figures.arrows import Arrows, magnification_of, spacing, vector_map
 from bayesdist.report.figures.fields import Grid, scalar_map
 from bayesdist.report.figures.panels import ChipPanels
 from bayesdist.report.figures.style import OUTLINE, PALETTE, WIDTH, new_figure, nice_below
-from bayesdist.report.registry import Plot
 from bayesdist.report.sections.run.residuals import residual_panels
 from bayesdist.report.texttable import TextTable, listing, tabulated
 from bayesdist.utils.arrays import Float

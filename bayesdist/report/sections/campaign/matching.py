@@ -7,7 +7,7 @@ from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 from matplotlib.ticker import ScalarFormatter
 
-from bayesdist.report.contents import REPORT
+from bayesdist.report.contents import REPORT, Plot
 from bayesdist.report.context import CatalogStars, ReportInput, needed
 from bayesdist.report.figures.style import (
     GUIDE,
@@ -18,7 +18,6 @@ from bayesdist.report.figures.style import (
     guide_lines,
     new_figure,
 )
-from bayesdist.report.registry import Plot
 from bayesdist.report.texttable import TextTable, listing
 from bayesdist.utils.arrays import Float
 from bayesdist.utils.numbers import count, number, percent, size_of

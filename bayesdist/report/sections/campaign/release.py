@@ -7,12 +7,11 @@ from dataclasses import replace
 import numpy as np
 
 from bayesdist.diagnose.overlap import OverlapTest
-from bayesdist.report.contents import REPORT
+from bayesdist.report.contents import REPORT, Plot
 from bayesdist.report.context import ReportInput, needed
 from bayesdist.report.figures.arrows import Arrows, magnification_of, vector_map
 from bayesdist.report.figures.panels import Panels
 from bayesdist.report.figures.style import WIDTH, new_figure, nice_below
-from bayesdist.report.registry import Plot
 from bayesdist.report.texttable import TextTable, tabulated
 from bayesdist.utils.numbers import count, number, size_of
 

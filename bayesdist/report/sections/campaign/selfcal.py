@@ -10,10 +10,9 @@ from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 
 from bayesdist.assess.maps.uncertainty import per_axis
-from bayesdist.report.contents import REPORT
+from bayesdist.report.contents import REPORT, Plot
 from bayesdist.report.context import ReportInput, SelfcalResults, needed
 from bayesdist.report.figures.style import CYCLE, INK, PALE, WIDTH, new_figure
-from bayesdist.report.registry import Plot
 from bayesdist.report.texttable import MAX_ROWS, TextTable, further, listing, tabulated
 from bayesdist.utils.numbers import MISSING, count, display_scale, number, percent, with_mas
 

@@ -11,10 +11,9 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.ticker import MaxNLocator
 
-from bayesdist.report.contents import REPORT
+from bayesdist.report.contents import REPORT, Plot
 from bayesdist.report.context import CampaignResults, LinearSeries, ReportInput, needed
 from bayesdist.report.figures.style import CYCLE, INK, WIDTH, guide_lines, legend_above, new_figure
-from bayesdist.report.registry import Plot
 from bayesdist.utils.arrays import Bool, Float
 from bayesdist.utils.numbers import count, display_scale, number, size_of
 

@@ -13,7 +13,7 @@ from matplotlib.patches import Patch
 
 from bayesdist.assess.maps.uncertainty import circular_error, per_axis
 from bayesdist.assess.terms.forms import PRODUCT
-from bayesdist.report.contents import REPORT
+from bayesdist.report.contents import REPORT, Plot
 from bayesdist.report.context import ReportInput, needed
 from bayesdist.report.figures.fields import Grid, scalar_map
 from bayesdist.report.figures.panels import ChipPanels
@@ -25,7 +25,6 @@ from bayesdist.report.figures.style import (
     WIDTH,
     new_figure,
 )
-from bayesdist.report.registry import Plot
 from bayesdist.report.sections.gauge import gauge_of_new_exposure
 from bayesdist.report.texttable import TextTable
 from bayesdist.utils.numbers import (

@@ -8,12 +8,11 @@ import numpy as np
 from matplotlib.colors import LogNorm, Normalize
 from matplotlib.figure import Figure
 
-from bayesdist.report.contents import REPORT
+from bayesdist.report.contents import REPORT, Plot
 from bayesdist.report.context import ReportInput, needed
 from bayesdist.report.figures.fields import Grid, scalar_map
 from bayesdist.report.figures.panels import ChipPanels
 from bayesdist.report.figures.style import INK, PALETTE, SEQUENTIAL, WIDTH, new_figure
-from bayesdist.report.registry import Plot
 from bayesdist.report.texttable import (
     MAX_ROWS,
     TextTable,

@@ -11,11 +11,10 @@ from matplotlib.colors import TwoSlopeNorm
 from matplotlib.patches import Rectangle
 
 from bayesdist.diagnose.holdout.validation import HoldoutValidation
-from bayesdist.report.contents import REPORT
+from bayesdist.report.contents import REPORT, Plot
 from bayesdist.report.context import ReportInput, needed
 from bayesdist.report.figures.panels import chip_axes
 from bayesdist.report.figures.style import CYCLE, INK, WIDTH, new_figure
-from bayesdist.report.registry import Plot
 from bayesdist.report.texttable import TextTable, tabulated
 from bayesdist.utils.distributions import binom_ppf
 from bayesdist.utils.numbers import count, number

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from matplotlib.figure import Figure
 
-from bayesdist.report.contents import REPORT
+from bayesdist.report.contents import REPORT, Plot
 from bayesdist.report.context import ReportInput
 from bayesdist.report.figures.arrows import (
     Arrows,
@@ -21,7 +21,6 @@ from bayesdist.report.figures.arrows import (
 from bayesdist.report.figures.fields import Grid, contour_levels, scalar_map
 from bayesdist.report.figures.panels import ChipPanels
 from bayesdist.report.figures.style import nice_below
-from bayesdist.report.registry import Plot
 from bayesdist.report.sections.gauge import gauge_mark, gauge_of_maps
 from bayesdist.report.texttable import TextTable, tabulated
 from bayesdist.utils.numbers import display_scale, number, size_of, with_mas

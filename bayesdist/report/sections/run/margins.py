@@ -8,7 +8,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
 
-from bayesdist.report.contents import REPORT
+from bayesdist.report.contents import REPORT, Plot
 from bayesdist.report.context import ReportInput
 from bayesdist.report.figures.style import (
     CYCLE,
@@ -18,7 +18,6 @@ from bayesdist.report.figures.style import (
     WIDTH,
     new_figure,
 )
-from bayesdist.report.registry import Plot
 from bayesdist.report.sections.gauge import gauge_of_new_exposure
 from bayesdist.report.texttable import TextTable, tabulated
 from bayesdist.utils.arrays import Float

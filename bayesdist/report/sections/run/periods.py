@@ -6,12 +6,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from bayesdist.report.contents import REPORT
+from bayesdist.report.contents import REPORT, Plot
 from bayesdist.report.context import ReportInput, needed
 from bayesdist.report.figures.arrows import CHANCE, Arrows, magnification_of, spacing, vector_map
 from bayesdist.report.figures.panels import ChipPanels
 from bayesdist.report.figures.style import nice_below
-from bayesdist.report.registry import Plot
 from bayesdist.report.texttable import TextTable, listing, tabulated
 from bayesdist.utils.numbers import (
     MISSING,

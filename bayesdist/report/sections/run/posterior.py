@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from bayesdist.infer.catalogue.added_errors import DECISIVE
-from bayesdist.report.contents import REPORT
+from bayesdist.report.contents import REPORT, Plot
 from bayesdist.report.context import ReportInput, needed
 from bayesdist.report.figures.corners import Column, corner_figure
 from bayesdist.report.figures.style import (
@@ -20,7 +20,6 @@ from bayesdist.report.figures.style import (
     legend_above,
     new_figure,
 )
-from bayesdist.report.registry import Plot
 from bayesdist.report.texttable import TextTable, tabulated
 from bayesdist.utils.arrays import Float, Int
 from bayesdist.utils.numbers import (

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 from scipy.special import ndtr
 
 from bayesdist.errors import required
-from bayesdist.report.contents import REPORT
+from bayesdist.report.contents import REPORT, Plot
 from bayesdist.report.context import ReportInput
 from bayesdist.report.figures.arrows import (
     CHANCE,
@@ -25,7 +25,6 @@ from bayesdist.report.figures.arrows import (
 from bayesdist.report.figures.mosaic import Mosaic
 from bayesdist.report.figures.panels import ChipPanels, Panels
 from bayesdist.report.figures.style import PALETTE, WIDTH, legend_above, new_figure, nice_below
-from bayesdist.report.registry import Plot
 from bayesdist.utils.arrays import Float
 from bayesdist.utils.numbers import display_scale
 

@@ -10,7 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
-from bayesdist.report.contents import REPORT
+from bayesdist.report.contents import REPORT, Plot
 from bayesdist.report.context import ReportInput, needed
 from bayesdist.report.figures.style import (
     CYCLE,
@@ -22,7 +22,6 @@ from bayesdist.report.figures.style import (
     legend_above,
     new_figure,
 )
-from bayesdist.report.registry import Plot
 from bayesdist.utils.arrays import Bool, Float, Int
 from bayesdist.utils.numbers import count, display_scale, number
 
