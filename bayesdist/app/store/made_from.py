@@ -59,7 +59,7 @@ STAGES = {
     "match": Stage(),
     "fit": Stage(revision=3),
     "sample": Stage(revision=3, checkpoints=("chain-*.h5",)),
-    "diagnose": Stage(revision=4),
+    "diagnose": Stage(revision=5),
     "evaluate": Stage(revision=3),
     "export": Stage(),
     "report": Stage(),

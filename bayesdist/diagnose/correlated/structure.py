@@ -13,17 +13,20 @@ shows in neighbouring stars (`SharedVariance`), whose likelihood is a factor.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 from itertools import pairwise
+from typing import TypeVar
 
 import numpy as np
 
 from bayesdist.diagnose.correlated.functions import FINE, StructureFunctions
 from bayesdist.diagnose.correlated.neighbours import SharedVariance
 from bayesdist.diagnose.correlated.priors import AmplitudeGrid, log_half_cauchy, log_widths
-from bayesdist.utils.arrays import Float
+from bayesdist.utils.arrays import Float, Int
+
+Shared = TypeVar("Shared")
 
 # of the field, in longer half sides; all equally probable beforehand
 LENGTHS = np.geomspace(0.02, 0.6, 7)
@@ -78,6 +81,12 @@ class Field:
         along = vectors.T @ (self.terms_score - weighted @ self.score)
         return SizedField(self, amplitude, variance, np.maximum(values, 0.0), vectors, along)
 
+    def draws(self, terms: Float, variance: Float, rng: np.random.Generator) -> Float:
+        """Sines (m, n_sines), given terms (m, T) and variances (m, n_sines) of `SizedField`."""
+        along = variance * (self.score - terms @ self.tied.T)
+        along += np.sqrt(variance) * (rng.standard_normal(variance.shape) @ self.vectors)
+        return np.asarray((along @ self.vectors.T) * self.root)
+
 
 @dataclass(frozen=True, eq=False)
 class SizedField:
@@ -97,17 +106,12 @@ class SizedField:
         out += 0.5 * (self.score**2 / (self.values + amplitudes[:, None] ** -2)).sum(axis=1)
         return np.asarray(out - 0.5 * np.log1p(self.values * amplitudes[:, None] ** 2).sum(axis=1))
 
-    def draws(self, amplitude: Float, rng: np.random.Generator) -> tuple[Float, Float]:
-        """Terms (m, T) and sines (m, n_sines), given amplitudes (m,) of the terms."""
+    def draws(self, amplitude: Float, rng: np.random.Generator) -> Float:
+        """Terms (m, T), given their amplitudes (m,)."""
         precision = self.values + amplitude[:, None] ** -2
         # noise through symmetric roots, which signs and order of eigenvectors do not change
         noise = rng.standard_normal((len(precision), len(self.values))) @ self.vectors
-        terms = (self.score / precision + noise / np.sqrt(precision)) @ self.vectors.T
-        field = self.field
-        noise = rng.standard_normal((len(precision), len(field.values))) @ field.vectors
-        along = self.variance * (field.score - terms @ field.tied.T)
-        along += np.sqrt(self.variance) * noise
-        return terms, (along @ field.vectors.T) * field.root
+        return np.asarray((self.score / precision + noise / np.sqrt(precision)) @ self.vectors.T)
 
 
 @dataclass(frozen=True, eq=False)
@@ -131,30 +135,45 @@ class Structure:
 
     def draws(self, n: int, rng: np.random.Generator) -> list[Float]:
         """Coefficients (n, n_known + 2 FINE) of terms, sines and finer waves of each function."""
-        counts = rng.multinomial(n, self.weight.ravel()).reshape(self.weight.shape)
+        counts = rng.multinomial(n, self.weight.ravel())
+        drawn = rng.permutation(np.repeat(np.arange(len(counts)), counts))
+        point, by_terms = np.divmod(drawn, self.weight.shape[1])
+        amplitude = self.terms_amplitude[by_terms]
         out = []
-        for point, by_terms in zip(self.points, counts, strict=True):
-            if by_terms.any():
-                amplitude = np.repeat(self.terms_amplitude, by_terms)
-                out.append(self._draws_at(point, amplitude, rng))
-        order = rng.permutation(n)
-        return [np.concatenate(rows)[order] for rows in zip(*out, strict=True)]
-
-    def _draws_at(self, point: _Point, amplitude: Float, rng: np.random.Generator) -> list[Float]:
-        """Draws at one point, given amplitudes (m,) of the terms."""
-        out = []
-        for some, size, part in zip(self.functions, point.amplitudes, point.parts, strict=True):
-            terms, sines = part.draws(amplitude, rng)
-            fine = np.sqrt([one.finer(point.length) for one in some])
-            waves = rng.standard_normal((len(amplitude), len(some), 2 * FINE))
-            waves *= size * fine[:, None]
+        for k, some in enumerate(self.functions):
+            terms, sines = self._known(k, point, amplitude, rng)
+            waves = rng.standard_normal((len(some), n, 2 * FINE))
+            waves *= self._finer(k)[:, point, None]
             first, start = 0, 0
-            for k, one in enumerate(some):
-                own = terms[:, first : first + one.n_terms] * one.decline()
-                along = sines[:, start : start + one.n_sines]
-                out.append(np.concatenate([own, along, waves[:, k]], axis=1))
-                first, start = first + one.n_terms, start + one.n_sines
+            for own, wave in zip(some, waves, strict=True):
+                of_terms = terms[:, first : first + own.n_terms] * own.decline()
+                along = sines[:, start : start + own.n_sines]
+                out.append(np.concatenate([of_terms, along, wave], axis=1))
+                first, start = first + own.n_terms, start + own.n_sines
         return out
+
+    def _known(
+        self, part: int, point: Int, amplitude: Float, rng: np.random.Generator
+    ) -> tuple[Float, Float]:
+        """Terms (n, T) and sines (n, n_sines) of a part at these points, given amplitudes (n,)."""
+        sized = [p.parts[part] for p in self.points]  # many points have the same
+        terms = np.empty((len(point), len(sized[0].values)))
+        variance = np.empty((len(point), len(sized[0].variance)))
+        for one, rows in _rows_of(sized, point):
+            terms[rows] = one.draws(amplitude[rows], rng)
+            variance[rows] = one.variance
+        sines = np.empty_like(variance)
+        for field, rows in _rows_of([one.field for one in sized], point):
+            sines[rows] = field.draws(terms[rows], variance[rows], rng)
+        return terms, sines
+
+    def _finer(self, part: int) -> Float:
+        """Standard deviations (functions, points) of what is finer than the sines of a part."""
+        size, length = np.array([(p.amplitudes[part], p.length) for p in self.points]).T
+        lengths, of_point = np.unique(length, return_inverse=True)
+        some = self.functions[part]
+        fraction = np.array([[one.finer(value) for value in lengths] for one in some])
+        return np.asarray(size * np.sqrt(fraction)[:, of_point])
 
     @property
     def length(self) -> float:
@@ -162,6 +181,14 @@ class Structure:
         by_point = self.weight.sum(axis=1)
         by_point = by_point * [np.square(p.amplitudes).sum() for p in self.points]
         return float(by_point @ [p.length for p in self.points] / by_point.sum())
+
+
+def _rows_of(of_point: Sequence[Shared], point: Int) -> Iterator[tuple[Shared, Int]]:
+    """Each of what the points have, and which of these draws are at a point that has it."""
+    number = {one: k for k, one in enumerate(dict.fromkeys(of_point))}
+    drawn = np.array([number[one] for one in of_point])[point]
+    for one, k in number.items():
+        yield one, np.flatnonzero(drawn == k)
 
 
 def structure_posterior(

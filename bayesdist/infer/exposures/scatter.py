@@ -33,6 +33,7 @@ MESH = np.concatenate([np.arange(-10.0, -3.0), np.arange(-3.0, 4.25, 0.5), [5.0,
 WIDENED = 0.9  # factor on the logarithm of the proposals' density
 LEAST_CURVATURE = 0.3
 LEAST_EFFICIENCY = 0.05  # effective fraction of the proposals; below, a chain is run
+AT_ONCE = 2**18  # numbers in the edge of the matrices that are factored at a time
 PROPOSALS = 4  # for each draw of tau that is asked for
 # sweeps of a chain over all kinds, before the first draw and between draws
 BURN_IN, BETWEEN = 40, 3
@@ -58,15 +59,15 @@ class Scatter:
     caution: Float
 
     def precision(self, tau: Float) -> Float:
-        """Inverse variances (m,) of the deviations for known tau."""
-        return np.asarray(np.where(self.loose, self.scale[self.kind], tau[self.kind]) ** -2)
+        """Inverse variances (..., m) of the deviations for known tau (..., k)."""
+        return np.asarray(np.where(self.loose, self.scale[self.kind], tau[..., self.kind]) ** -2)
 
     def prior(self, tau: Float) -> Float:
         """Inverse variances (m,) of the deviations' prior, with caution."""
         return self.precision(self.caution * tau)
 
-    def _solved(self, precision: Float) -> tuple[ArrowFactor, Float, Float]:
-        """H + P factored, q, and (H + P)^-1 q."""
+    def _moments(self, precision: Float) -> tuple[Float, ArrowFactor]:
+        """Mean of theta (D,) and H + P factored, for precisions (m,)."""
         diagonal = np.zeros(len(self.about))
         diagonal[self.index] = precision
         border, local = self.matrix.split(diagonal)
@@ -75,26 +76,45 @@ class Scatter:
             self.matrix.edge,
             self.matrix.blocks + np.einsum("nq,qr->nqr", local, np.eye(local.shape[1])),
         ).factor()
-        q = self.right - diagonal * self.about
-        return factor, q, factor.solve(q)
+        return self.about + factor.solve(self.right - diagonal * self.about), factor
 
     def posterior(self, tau: Float) -> tuple[Float, ArrowFactor]:
         """Mean of theta (D,), and its precision factored, given tau (k,) and with caution."""
         return self._moments(self.prior(tau))
 
-    def _moments(self, precision: Float) -> tuple[Float, ArrowFactor]:
-        factor, _, step = self._solved(precision)
-        return self.about + step, factor
-
     def log_density(self, tau: Float) -> float:
-        """Log posterior density of log tau, up to a constant."""
-        if (tau > LARGEST * self.scale).any():
-            return -np.inf
+        """Log posterior density of log tau (k,), up to a constant."""
+        return float(self.log_densities(tau[None])[0])
+
+    def log_densities(self, tau: Float) -> Float:
+        """Log posterior densities (n,) of log tau (n, k), up to a constant: many at a time."""
         precision, b = self.precision(tau), self.about[self.index]
-        factor, q, step = self._solved(precision)
-        value = q @ step - factor.logdet + np.log(precision).sum() - precision @ b**2
+        some = max(1, AT_ONCE // max(self.matrix.edge.size, self.matrix.border.size))
+        parts = [self._evidence(precision[a : a + some]) for a in range(0, len(tau), some)]
+        value = np.concatenate(parts) + np.log(precision).sum(axis=1) - precision @ b**2
         prior = -0.5 * (DEGREES + 1) * np.log1p((tau / self.scale) ** 2 / DEGREES)
-        return float(0.5 * value + (prior + np.log(tau)).sum())
+        out = 0.5 * value + (prior + np.log(tau)).sum(axis=1)
+        return np.where((tau > LARGEST * self.scale).any(axis=1), -np.inf, out)
+
+    def _evidence(self, precision: Float) -> Float:
+        """q^T (H + P)^-1 q - log |H + P|, for precisions (n, m)."""
+        diagonal = np.zeros((len(precision), len(self.about)))
+        diagonal[:, self.index] = precision
+        border, local = self.matrix.split(diagonal)
+        right, right_local = self.matrix.split(self.right - diagonal * self.about)
+        n, (of_blocks, q), b = len(precision), local.shape[1:], border.shape[1]
+        blocks = np.linalg.cholesky(self.matrix.blocks + local[..., None] * np.eye(q))
+        # L^-1 times the right side and B^T of all blocks, one below the other
+        sides = np.empty((n, of_blocks, q, 1 + b))
+        sides[..., 0], sides[..., 1:] = right_local, self.matrix.edge.mT
+        rows = np.linalg.solve(blocks, sides).reshape(n, of_blocks * q, 1 + b)
+        product = rows.mT @ rows
+        top = self.matrix.border + border[..., None] * np.eye(b) - product[:, 1:, 1:]
+        top = np.linalg.cholesky(top)
+        rest = np.linalg.solve(top, (right - product[:, 0, 1:])[..., None])
+        logs = np.log(np.einsum("tnqq->tnq", blocks)).sum(axis=(1, 2))
+        logs += np.log(np.einsum("tbb->tb", top)).sum(axis=1)
+        return np.asarray(product[:, 0, 0] + (rest**2).sum(axis=(1, 2)) - 2 * logs)
 
     def gradient(self, tau: Float) -> Float:
         """Derivative of `log_density` by log tau, shape (k,)."""
@@ -188,7 +208,7 @@ class Scatter:
         u = rng.uniform(size=(PROPOSALS * n, len(proposals)))
         x = np.stack([one.quantile(p) for one, p in zip(proposals, u.T, strict=True)], axis=1)
         log_q = sum(one.log_density(t) for one, t in zip(proposals, x.T, strict=True))
-        log_w = np.array([self.log_density(t) for t in np.exp(x)]) - log_q
+        log_w = self.log_densities(np.exp(x)) - log_q
         w = np.exp(log_w - logsumexp(log_w))
         if 1 / (w**2).sum() < LEAST_EFFICIENCY * len(w):
             return np.exp(self._chain(x[int(np.argmax(w))], proposals, n, rng))
@@ -238,7 +258,7 @@ class Scatter:
             mesh = mode[k] + sigma * MESH
             mesh = mesh[mesh < np.log(LARGEST * self.scale[k])]
             points = mode + (mesh - mode[k])[:, None] * e
-            values = WIDENED * np.array([self.log_density(np.exp(t)) for t in points])
+            values = WIDENED * self.log_densities(np.exp(points))
             slopes = np.diff(values) / np.diff(mesh)
             out.append(
                 PiecewiseExponential(mesh, values, max(slopes[0], 0.5), min(slopes[-1], -0.5))

@@ -105,7 +105,8 @@ def test_conditional_means_are_those_of_dense_algebra():
         )
         precision = S[a] + np.diag(1 / variance)
         mean, cov = np.linalg.solve(precision, s[a]), np.linalg.inv(precision)
-        terms, sines = part.draws(np.full(40_000, amplitude), rng)
+        terms = part.draws(np.full(40_000, amplitude), rng)
+        sines = part.field.draws(terms, np.tile(part.variance, (len(terms), 1)), rng)
         drawn = np.concatenate([terms * decline, sines], axis=1)
         pull = (drawn.mean(axis=0) - mean) / np.sqrt(np.diag(cov) / len(drawn))
         assert np.abs(pull).max() < 5.0
