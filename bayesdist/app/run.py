@@ -38,6 +38,7 @@ from bayesdist.assess.evaluation import Evaluation
 from bayesdist.errors import InputError, NotConvergedError
 from bayesdist.infer import Posterior
 from bayesdist.infer.posterior.checks import convergence_check
+from bayesdist.utils.memory import release_memory
 
 __all__ = ["continue_stage", "make_stages", "run"]
 
@@ -138,6 +139,7 @@ def make_stages(
 
         if name in stages:
             r = run.make(name, made, force=force).value or r
+            release_memory()
 
     def fitted() -> Fitted:
         """The fit, unless the rehearsal has made it."""

@@ -21,6 +21,7 @@ from bayesdist.infer.stars.scratch import Store
 from bayesdist.infer.stars.stars import Stars, prepare
 from bayesdist.infer.stars.survey import Survey, survey
 from bayesdist.model import DistortionModel, Groups
+from bayesdist.utils.memory import release_memory
 
 Task = Callable[..., Any]
 
@@ -138,6 +139,8 @@ class LocalShards(Shards):
             self._store.add(stars)
             surveys.append(found)
         self.survey = total(surveys)
+        if not matches.in_memory:
+            release_memory()
 
     def sum(self, task: Task, *args: Any) -> Any:
         """Sum over the shards of ``task(stars, *args)``, in their order."""
