@@ -6,6 +6,7 @@ import json
 import pickle
 import subprocess
 import sys
+import tracemalloc
 from pathlib import Path
 
 import numpy as np
@@ -628,17 +629,39 @@ def test_nothing_half_written_stays(rng, tmp_path):
 
 # -- memory ---------------------------------------------------------------------------------------
 
+
+@pytest.mark.parametrize("take", ["a batch", "a sample"])
+def test_one_batch_at_a_time_is_in_memory(rng, tmp_path, monkeypatch, take):
+    """Beside its columns there is a block of rows, and no batch that came before."""
+    monkeypatch.setattr(batches, "BATCH", 200_000)
+    monkeypatch.setattr("bayesdist.data.storage.on_disk.BLOCK", 20_000)
+    for name in "abcd":
+        write(tmp_path / f"{name}.parquet", stars(rng, 100_000), group=100_000)
+    opened = open_matches(tmp_path)
+    first, _ = opened.readers()
+    held = sum(column.nbytes for column in first.load()._columns.values())
+    tracemalloc.start()
+    try:
+        kept = first.load() if take == "a batch" else opened.sample(100)
+        peak = tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+    assert len(kept) in (100, 200_000)
+    assert peak < 1.5 * held
+
+
 MEASURE = """
 import json, sys
 import numpy as np, pyarrow as pa
 from bayesdist.data import batches, open_matches
-from bayesdist.data.storage import stored
+from bayesdist.data.storage import on_disk, stored
 from bayesdist.data.tables import repeated
 
 def peak():
     return int(next(s for s in open("/proc/self/status") if s.startswith("VmHWM")).split()[1])
 
-batches.BATCH, stored.BLOCK, repeated.HELD = 100_000, 50_000, 400_000
+batches.BATCH, repeated.HELD = 100_000, 400_000
+on_disk.BLOCK = stored.BLOCK = 50_000
 open_matches(sys.argv[1])  # what is loaded once
 before = peak()
 opened = open_matches(sys.argv[2])

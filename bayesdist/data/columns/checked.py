@@ -162,8 +162,10 @@ def _completed(
     left = np.size(columns["x"])
     if left == 0:
         raise InputError("holds no rows", where=where, do="give a table with matched stars")
-    codes = {name: np.zeros(left, np.int64) for name in ("source", *LABELS_OF_CODES)}
-    columns = {"row": np.arange(left)} | codes | columns
+    absent_codes = {"source", *LABELS_OF_CODES} - columns.keys()
+    columns = columns | {name: np.zeros(left, np.int64) for name in absent_codes}
+    if "row" not in columns:
+        columns = columns | {"row": np.arange(left)}
     ordered = {name: columns[name] for name in COLUMNS if name in columns}
     return one_length(ordered, integers=_INTEGERS, where=where), n, rejected
 
