@@ -12,7 +12,6 @@ from collections.abc import Callable
 import numpy as np
 from scipy.fft import irfft, next_fast_len, rfft
 from scipy.special import ndtri
-from scipy.stats import rankdata
 
 from bayesdist.utils.arrays import Float
 
@@ -69,6 +68,8 @@ def _halves(chains: Float) -> Float:
 
 def _normal_scores(chains: Float) -> Float:
     """Normal quantiles of the ranks among all draws of a parameter (Blom 1958)."""
+    from scipy.stats import rankdata  # takes half a second to import: not where nothing is sampled
+
     ranks = rankdata(chains.reshape(len(chains), -1), axis=1)
     return ndtri((ranks - 3 / 8) / (ranks.shape[1] + 1 / 4)).reshape(chains.shape)
 
