@@ -22,7 +22,7 @@ from bayesdist.app.cli import main
 from tests.app.selfcal.support import list_table, small, write_selfcal
 from tests.app.support import edit, good
 
-pytestmark = [pytest.mark.slow, pytest.mark.filterwarnings("ignore:.*fork:DeprecationWarning")]
+pytestmark = [pytest.mark.slow, pytest.mark.filterwarnings("ignore:.*fork")]
 
 CONFIG = """
 [data]

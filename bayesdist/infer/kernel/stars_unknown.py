@@ -73,18 +73,18 @@ def weighted_stars(
 
 @nb.njit(cache=True, forceinline=True)
 def _dot(coef, at, phi, row, n):
-    """Sum of n products of numbers from two indices on; n fills whole vectors."""
-    lanes = load(coef, at) * load(phi, row)
+    """Sum of the first n products of two rows; n fills whole vectors."""
+    lanes = load(coef, at, 0) * load(phi, row, 0)
     for k in range(WIDTH, n, WIDTH):
-        lanes += load(coef, at + k) * load(phi, row + k)
+        lanes += load(coef, at, k) * load(phi, row, k)
     return total(lanes)
 
 
 @nb.njit(cache=True, forceinline=True)
 def _add(out, at, phi, row, n, factor):
-    """Add so many times n numbers to those of `out` from an index on; n fills whole vectors."""
+    """Add so many times the first n numbers of a row to one of `out`; n fills whole vectors."""
     for k in range(0, n, WIDTH):
-        put(out, at + k, load(out, at + k) + load(phi, row + k) * factor)
+        put(out, at, k, load(out, at, k) + load(phi, row, k) * factor)
 
 
 @nb.njit(**PASS)
@@ -93,12 +93,12 @@ def _eliminate_stars(
     chip, n_chips, linear, extra, columns, order, j2, log_core, log_out, least, seen, weights,
     pulls, scalars, rows, factors,
 ):  # fmt: skip
-    q, m, odds = stars.shape[1], extra.shape[1], far_odds(log_core, log_out)
-    K, low, top = (order + 1) * (order + 2) // 2, coef.shape[2], weights.shape[2]
+    q, m, odds = stars.shape[1], columns.shape[1], far_odds(log_core, log_out)
+    K, low, top = (order + 1) * (order + 2) // 2, coef.shape[1], weights.shape[1]
     n_params = rows.shape[1]
     S, A, b = np.zeros((2, MOST_STAR)), np.zeros((MOST_STAR, MOST_STAR)), np.zeros(MOST_STAR)
     px, py, by = np.empty(2 * order + 1), np.empty(2 * order + 1), np.empty((2, m))
-    basis, dense = np.zeros((16, top)), np.empty((q, n_chips, 2, low))
+    basis, dense = np.zeros((16, top)), np.empty((q * n_chips * 2, low))
     for s in range(first, last):
         a, e = starts[s], starts[s + 1]
         if e - a > len(basis):
@@ -107,10 +107,10 @@ def _eliminate_stars(
         when = time[a:e] if q >= 4 else time
         where = factor[a:e] if q == 5 else factor
         for i in range(a, e):
-            at, phi = 2 * group[i] * low, (i - a) * top
+            g = group[i]
             legendre(X[i], Y[i], 2 * order, px, py, basis[i - a])
-            mine[PLACE_U, i - a] = offset[i, 0] + _dot(coef, at, basis, phi, low)
-            mine[PLACE_V, i - a] = offset[i, 1] + _dot(coef, at + low, basis, phi, low)
+            mine[PLACE_U, i - a] = offset[i, 0] + _dot(coef, 2 * g, basis, i - a, low)
+            mine[PLACE_V, i - a] = offset[i, 1] + _dot(coef, 2 * g + 1, basis, i - a, low)
         p = stars[s]
         value, observed = to_mode(
             mine, e - a, j2, log_core, log_out, when, where, centre[s], precision[s], p, S, A, b,
@@ -124,7 +124,7 @@ def _eliminate_stars(
                 A[k, l] = precision[s, k, l]
         dense[:] = 0.0
         for i in range(a, e):
-            g, phi = group[i], (i - a) * top
+            g, phi = group[i], i - a
             design(S, q, i - a, when, where)
             wu, wv, square = residual(i - a, mine, S, p, q)
             s2 = var[i] + j2
@@ -133,30 +133,28 @@ def _eliminate_stars(
             add_curvature(A, S, q, h0, h1, h2)
             scalars[1] += w
             scalars[2] += w * square / s2
-            _add(weights, 3 * g * top, basis, phi, top, h0)
-            _add(weights, (3 * g + 1) * top, basis, phi, top, h1)
-            _add(weights, (3 * g + 2) * top, basis, phi, top, h2)
-            _add(pulls, 2 * g * low, basis, phi, low, -w * wu / s2)
-            _add(pulls, (2 * g + 1) * low, basis, phi, low, -w * wv / s2)
+            _add(weights, 3 * g, basis, phi, top, h0)
+            _add(weights, 3 * g + 1, basis, phi, top, h1)
+            _add(weights, 3 * g + 2, basis, phi, top, h2)
+            _add(pulls, 2 * g, basis, phi, low, -w * wu / s2)
+            _add(pulls, 2 * g + 1, basis, phi, low, -w * wv / s2)
             for n in range(m):
                 for axis in range(2):
-                    at = (2 * (g * m + n) + axis) * low
-                    by[axis, n] = _dot(extra, at, basis, phi, low)
+                    by[axis, n] = _dot(extra, 2 * (g * m + n) + axis, basis, phi, low)
             for k in range(q):
                 hu, hv = S[0, k] * h0 + S[1, k] * h1, S[0, k] * h1 + S[1, k] * h2
                 # by coefficients before the frame, and by its parameters
                 for axis in range(2):
                     along = hu * linear[g, 0, axis] + hv * linear[g, 1, axis]
-                    at = (2 * (k * n_chips + chip[g]) + axis) * low
+                    at = 2 * (k * n_chips + chip[g]) + axis
                     _add(dense, at, basis, phi, low, along)
                 for n in range(m):
                     if columns[g, n] >= 0:
                         rows[row + k, columns[g, n]] += hu * by[0, n] + hv * by[1, n]
         for k in range(q):
-            for c in range(n_chips):
-                for axis in range(2):
-                    for l in range(K):
-                        rows[row + k, (2 * c + axis) * K + l] += dense[k, c, axis, l]
+            for c in range(2 * n_chips):
+                for l in range(K):
+                    rows[row + k, c * K + l] += dense[2 * k * n_chips + c, l]
         # of these terms exactly, else directions that detections leave free would not be free:
         # those of the last step but one are slightly different
         same = cholesky(A, q)
@@ -215,15 +213,20 @@ def eliminate_stars(
     rows, factors = np.zeros(((last - first) * q, n_params)), np.zeros((last - first, q, q))
     _eliminate_stars(
         first, last, *detections, stars, _in_vectors(coef), chip, int(chip.max()) + 1, linear,
-        _in_vectors(extra), columns, order, j2, log_core, log_out, least, seen, *sums, rows,
-        factors,
+        _in_vectors(extra), columns, order, j2, log_core, log_out, least, seen,
+        *map(_rows, sums[:2]), sums.scalars, rows, factors,
     )  # fmt: skip
     return rows, factors
 
 
 def _in_vectors(coefficients: Float) -> Float:
-    """Coefficients (..., K) with zeros behind them that fill whole vectors."""
+    """Rows of coefficients (..., K) with zeros behind them that fill whole vectors."""
     K = coefficients.shape[-1]
     out = np.zeros((*coefficients.shape[:-1], K + -K % WIDTH))
     out[..., :K] = coefficients
-    return out
+    return _rows(out)
+
+
+def _rows(array: Float) -> Float:
+    """Rows (..., n) below each other, as a view."""
+    return array.reshape(-1, array.shape[-1])

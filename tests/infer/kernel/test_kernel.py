@@ -244,7 +244,7 @@ def test_the_number_of_threads_does_not_matter(kind, which, monkeypatch):
         np.testing.assert_array_equal(one, two)
 
 
-@pytest.mark.filterwarnings("ignore:.*fork:DeprecationWarning")
+@pytest.mark.filterwarnings("ignore:.*fork")
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="this system cannot fork")
 def test_a_fork_has_threads_of_its_own():
     """Those that wait for passes are not there any more in a child: it would wait for ever."""

@@ -168,6 +168,7 @@ def test_search_at_a_bound_ends_at_the_best_point_along_it(rng, which, monkeypat
     low, high = best - 3.0, best + 3.0
     high[which] = best[which] - 1.0
     monkeypatch.setattr(hyperparameters, "_bounds", lambda _: (low, high))
+    monkeypatch.setattr(Evidence, "start", (low + high) / 2)
     found = fitted_field(evidence, (1.5,), thorough=True)
     at = np.log([found.prior.amplitude, found.prior.length])
     np.testing.assert_allclose(at[which], high[which], rtol=1e-12)
