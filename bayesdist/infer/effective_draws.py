@@ -15,6 +15,7 @@ from scipy.special import ndtri
 
 from bayesdist.utils.arrays import Float
 
+FEWEST = 4  # draws in a chain whose halves can be compared
 AT_ONCE = 2**18  # draws of as many parameters as are transformed together fit into the cache
 
 
@@ -49,8 +50,13 @@ def mean_draws(chains: Float) -> Float:
 
 
 def _by_parameters(function: Callable[[Float], Float], chains: Float) -> Float:
-    """A function of (d, C, N) for all parameters, of which some are treated at once."""
+    """A function of (d, C, N) for all parameters, of which some are treated at once.
+
+    NaN for fewer than `FEWEST` draws in a chain.
+    """
     C, N, D = chains.shape
+    if N < FEWEST:
+        return np.full(D, np.nan)
     step = max(AT_ONCE // (C * N), 1)
     chains = np.moveaxis(chains, 2, 0)
     with np.errstate(invalid="ignore", divide="ignore"):  # parameters that never moved

@@ -43,6 +43,15 @@ def test_effective_sample_size_of_ar1(rho):
     assert found.ess_bulk_min == found.ess_bulk.min()
 
 
+@pytest.mark.parametrize("coupled", [False, True])
+@pytest.mark.parametrize(("steps", "walkers"), [(1, 8), (2, 8), (3, 8), (1, 1), (3, 1)])
+def test_so_few_draws_say_nothing(steps, walkers, coupled):
+    found = judged(ar1((E, steps, walkers, 3), 0.0, seed=6), coupled=coupled)
+    assert not found.converged
+    assert any(r.startswith("bulk ESS") for r in found.reasons)
+    assert (found.ess_bulk <= E * steps * walkers * 2).all() and (found.ess_bulk >= 0).all()
+
+
 def test_a_drift_that_all_walkers_share_counts():
     """x = (common + own) / sqrt 2: averaging over walkers does not help against the common part."""
     rho, shared, T = 0.9, 0.5, 8000  # long, as the estimate itself scatters

@@ -88,7 +88,8 @@ class Scatter:
 
     def log_densities(self, tau: Float) -> Float:
         """Log posterior densities (n,) of log tau (n, k), up to a constant: many at a time."""
-        precision, b = self.precision(tau), self.about[self.index]
+        within = np.minimum(tau, LARGEST * self.scale)  # else none can be factored any more
+        precision, b = self.precision(within), self.about[self.index]
         some = max(1, AT_ONCE // max(self.matrix.edge.size, self.matrix.border.size))
         parts = [self._evidence(precision[a : a + some]) for a in range(0, len(tau), some)]
         value = np.concatenate(parts) + np.log(precision).sum(axis=1) - precision @ b**2

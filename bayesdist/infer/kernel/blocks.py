@@ -95,7 +95,7 @@ def share_out(
         loop(0, n, *room(), *arguments)
         return
     edges = [n * part // (PARTS * threads) for part in range(PARTS * threads + 1)]
-    pool = _pool(threads)
+    pool = _pool(nb.get_num_threads())
     parts = [pool.submit(loop, a, e, *room(), *arguments) for a, e in pairwise(edges)]
     for done in parts:
         done.result()

@@ -209,7 +209,7 @@ def self_calibrate(
             detections = replace(detections, sigma=sigma)
         scatter, solved = mode.error, (friends, mode)
         radius = max(match_radius, min(radius, max(SHRINK * radius, REACH * scatter)))
-        del flat, found, problem, mode  # else these are held while detections are grouped again
+        del flat, found, problem, mode  # else two problems are held as the next is made
     if last:
         raise NotSettledError(
             f"stars and solution still change after {max_iterations} iterations",

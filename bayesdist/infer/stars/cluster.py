@@ -90,7 +90,12 @@ class ClusterPieces(MappedPieces):
         self._pieces: list[Future] = []
         self._loading: set[str] = set()  # workers that sources are tied to
         folder = None if compute.scratch is None else _folder_in(compute.scratch)
-        self._client, cluster = _connected(compute)
+        try:
+            self._client, cluster = _connected(compute)
+        except BaseException:
+            if folder is not None:
+                folder.cleanup()
+            raise
         self._where = self._client.scheduler.address
         self._lease = _Lease()
         self._end = weakref.finalize(self._lease, _end, self._client, cluster, folder)

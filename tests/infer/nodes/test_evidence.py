@@ -162,13 +162,14 @@ def test_search_ends_at_the_top(rng):
 @pytest.mark.parametrize("which", [0, 1])
 def test_search_at_a_bound_ends_at_the_best_point_along_it(rng, which, monkeypatch):
     """Amplitude and length hang together: where one may not rise, the other makes up for it."""
-    evidence = evidence_of(*stars(rng, 5000))
-    top = fitted_field(evidence, (1.5,), thorough=True)
+    data = stars(rng, 5000)
+    top = fitted_field(evidence_of(*data), (1.5,), thorough=True)
     best = np.log([top.prior.amplitude, top.prior.length])
     low, high = best - 3.0, best + 3.0
     high[which] = best[which] - 1.0
     monkeypatch.setattr(hyperparameters, "_bounds", lambda _: (low, high))
     monkeypatch.setattr(Evidence, "start", (low + high) / 2)
+    evidence = evidence_of(*data)
     found = fitted_field(evidence, (1.5,), thorough=True)
     at = np.log([found.prior.amplitude, found.prior.length])
     np.testing.assert_allclose(at[which], high[which], rtol=1e-12)
