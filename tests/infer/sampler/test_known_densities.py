@@ -199,7 +199,8 @@ WRONG = {
 def test_wrong_moves_are_found(move, monkeypatch):
     known = correlated_gaussian()
     monkeypatch.setattr(*WRONG[move])
-    found = deviations(known, move, STEPS[move])
+    # the error of differential evolution is small: it takes three times as long to stand out
+    found = deviations(known, move, STEPS[move] * (3 if move == "DE" else 1))
     worst = max(np.abs(found.mean).max(), np.abs(found.sd).max())
     assert worst > 2 * limit(2 * len(known.mean))
 
