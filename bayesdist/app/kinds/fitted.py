@@ -30,7 +30,6 @@ if TYPE_CHECKING:
     from bayesdist.infer.selfcal import Gauge, SelfCalibrationMode
     from bayesdist.infer.series import Series
 
-
 SOLUTION, GAUGE = "solution.h5", "gauge.ecsv"
 
 

@@ -59,6 +59,11 @@ def scratch(n: int) -> Float:
     return aligned(n, BLOCK)
 
 
+def star_room() -> tuple[Float, Float]:
+    """Room for the stars of a block, and for a model of them."""
+    return scratch(6), scratch(2)
+
+
 @nb.njit(**INNER)
 def put_ones(rows, n):
     """Write ones to rows of `scratch` behind the first n stars."""

@@ -7,7 +7,15 @@ import math
 import numba as nb
 import numpy as np
 
-from bayesdist.infer.kernel.blocks import PASS, lay_out, put_ones, scratch, share_out, threads_for
+from bayesdist.infer.kernel.blocks import (
+    PASS,
+    lay_out,
+    put_ones,
+    scratch,
+    share_out,
+    star_room,
+    threads_for,
+)
 from bayesdist.infer.kernel.lanes import (
     WIDTH,
     choose,
@@ -91,7 +99,7 @@ def log_likelihood(
                 rows[some],
                 constants.unit2,
                 sums,
-                room=lambda: (scratch(6), scratch(2), scratch(1)),
+                room=lambda: (*star_room(), scratch(1)),
             )
             # draws along the first axis: else numpy adds in another order where there is but one
             out[some] = np.ascontiguousarray(sums.T).sum(axis=1)

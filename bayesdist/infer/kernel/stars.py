@@ -7,7 +7,7 @@ import math
 import numba as nb
 import numpy as np
 
-from bayesdist.infer.kernel.blocks import PASS, lay_out, scratch, share_out, threads_for
+from bayesdist.infer.kernel.blocks import PASS, lay_out, share_out, star_room, threads_for
 from bayesdist.infer.kernel.mixture import Constants, packed
 from bayesdist.infer.kernel.numeric import exp_negative
 from bayesdist.infer.kernel.polynomial import evaluate
@@ -41,7 +41,7 @@ def residuals(blocks: Int, columns: tuple[Float, ...], coef: Float, order: int) 
             np.ascontiguousarray(coef),
             order,
             out,
-            room=lambda: (scratch(6), scratch(2)),
+            room=star_room,
         )
     return out
 
@@ -98,6 +98,6 @@ def memberships(
             packed(constants),
             constants.unit2,
             out,
-            room=lambda: (scratch(6), scratch(2)),
+            room=star_room,
         )
     return out

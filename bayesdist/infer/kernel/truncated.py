@@ -18,7 +18,14 @@ from typing import Any
 import numba as nb
 import numpy as np
 
-from bayesdist.infer.kernel.blocks import BLOCK, PASS, lay_out, scratch, share_out, threads_for
+from bayesdist.infer.kernel.blocks import (
+    BLOCK,
+    PASS,
+    lay_out,
+    share_out,
+    star_room,
+    threads_for,
+)
 from bayesdist.infer.kernel.circle import MOST, NODES, log_circle, slopes
 from bayesdist.infer.kernel.lanes import FAST
 from bayesdist.infer.kernel.mixture import GAUSSIAN, Constants, packed
@@ -212,10 +219,6 @@ def _scores(first, end, places, model, blocks, stars, coef, order, row, circle, 
                 out[2 + k, i] = one[k]
 
 
-def _room() -> tuple[Float, ...]:
-    return scratch(6), scratch(2)
-
-
 def _circle(constants: Constants) -> tuple[Any, ...]:
     return constants.kind == GAUSSIAN, constants.radius, *NODES
 
@@ -253,7 +256,7 @@ def truncated_log_likelihood(
                 circle,
                 sums,
                 nothing,
-                room=_room,
+                room=star_room,
             )
             # as in `log_likelihood`
             out[some] = np.ascontiguousarray(sums.T).sum(axis=1)
@@ -287,7 +290,7 @@ def truncated_memberships(
             _circle(constants),
             np.empty((len(blocks), len(coef))),
             out,
-            room=_room,
+            room=star_room,
         )
     return out
 
@@ -354,6 +357,6 @@ def truncated_scores(
             packed(constants)[0],
             _circle(constants),
             out,
-            room=_room,
+            room=star_room,
         )
     return out

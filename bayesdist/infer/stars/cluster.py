@@ -22,7 +22,7 @@ import threading
 import weakref
 from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import CancelledError
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -89,17 +89,13 @@ class ClusterPieces(MappedPieces):
     def __init__(self, make: Task, sources: Iterable[Any], compute: Compute) -> None:
         self._pieces: list[Future] = []
         self._loading: set[str] = set()  # workers that sources are tied to
-        folder = None if compute.scratch is None else _folder_in(compute.scratch)
-        try:
-            self._client, cluster = _connected(compute)
-        except BaseException:
-            if folder is not None:
-                folder.cleanup()
-            raise
+        self._client, cluster = _connected(compute)
         self._where = self._client.scheduler.address
         self._lease = _Lease()
-        self._end = weakref.finalize(self._lease, _end, self._client, cluster, folder)
+        files = ExitStack()
+        self._end = weakref.finalize(self._lease, _end, self._client, cluster, files)
         try:
+            folder = _folder_in(compute.scratch, files) if compute.scratch is not None else None
             places = _places(self._client)
             self._loading = set(places)
             _require_version(self._client)
@@ -304,9 +300,9 @@ class _Written:
     path: Path
 
     @classmethod
-    def as_number(cls, k: int, record: Any, folder: tempfile.TemporaryDirectory[str]) -> _Written:
+    def as_number(cls, k: int, record: Any, folder: Path) -> _Written:
         """The record of a number, written to a folder."""
-        path = Path(folder.name) / f"{k:06d}.h5"
+        path = folder / f"{k:06d}.h5"
         write_record(path, record)
         return cls(path)
 
@@ -445,10 +441,11 @@ def _large_graphs() -> Any:
     return dask.config.set({"distributed.admin.large-graph-warning-threshold": "1 PB"})
 
 
-def _folder_in(scratch: str) -> tempfile.TemporaryDirectory[str]:
-    """New folder in the scratch folder."""
+def _folder_in(scratch: str, files: ExitStack) -> Path:
+    """New folder in the scratch folder, which `files` removes."""
     try:
-        return tempfile.TemporaryDirectory(prefix="bayesdist-", dir=scratch)
+        made = tempfile.TemporaryDirectory(prefix="bayesdist-", dir=scratch)
+        return Path(files.enter_context(made))
     except OSError as error:
         raise InputError(
             f"no folder can be made in {scratch} ({error.strerror})",
@@ -457,17 +454,14 @@ def _folder_in(scratch: str) -> tempfile.TemporaryDirectory[str]:
         ) from error
 
 
-def _end(
-    client: Any, cluster: LocalCluster | None, folder: tempfile.TemporaryDirectory[str] | None
-) -> None:
-    """Close the client and its own cluster, and remove the sources' folder."""
+def _end(client: Any, cluster: LocalCluster | None, files: ExitStack) -> None:
+    """Close the client and its own cluster, and remove the files of the sources."""
 
     def close() -> None:
         client.close()
         if cluster is not None:
             cluster.close()
-        if folder is not None:
-            folder.cleanup()
+        files.close()
 
     # garbage may be collected in the thread that closing has to wait for
     if client.loop.asyncio_loop is _running_loop():

@@ -30,9 +30,9 @@ def polynomial_errors(
 
     `mean`: (D,), where there is no error. `theta`: (n, D); without an exposure its first `n_global`
     columns are enough. `rows`: (n,), of those in `theta`, where these are others. `epoch`: decimal
-    years. `chip`: chip
-    number. `exposure`: (n,), code of the exposure, of all draws or of each, whose frame is among
-    the parameters that err; None for errors of the polynomials and their drift alone.
+    years. `chip`: chip number. `exposure`: (n,), code of the exposure, of all draws or of each,
+    whose frame is among the parameters that err; None for errors of the polynomials and their drift
+    alone.
     """
     if isinstance(exposure, np.ndarray):
         rows = np.arange(len(theta)) if rows is None else rows
