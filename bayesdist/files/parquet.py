@@ -6,10 +6,12 @@ import os
 from collections import Counter
 from collections.abc import Collection
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
+import numpy as np
 from astropy.table import Column, MaskedColumn, Table
 from astropy.table.meta import get_header_from_yaml
+from numpy.typing import NDArray
 
 from bayesdist.errors import FormatError
 from bayesdist.files.regular import opened
@@ -65,7 +67,37 @@ def parquet_column(values: pyarrow.ChunkedArray, unit: str | None) -> Column:
     if values.null_count:
         mask = values.is_null().to_numpy()
         return MaskedColumn(values.to_numpy(), mask=mask, unit=unit)
-    return Column(values.to_numpy(), unit=unit)
+    return Column(numpy_array(values.combine_chunks()), unit=unit)
+
+
+def numpy_array(values: pyarrow.Array) -> NDArray[Any]:
+    """Values (N,) of an Arrow array without nulls; numbers as a view that cannot be written to.
+
+    Arrow's own conversion imports pandas, which takes longer than to read a small table.
+    """
+    from pyarrow import types
+
+    if types.is_floating(values.type) or types.is_integer(values.type):
+        return np.from_dlpack(values)
+    if types.is_string(values.type):
+        return np.array(values.to_pylist(), object)
+    return values.to_numpy(zero_copy_only=False)
+
+
+def arrow_array(values: NDArray[Any]) -> pyarrow.Array:
+    """Arrow array of values (N,), a view of theirs where they are numbers; without pandas, too."""
+    import pyarrow
+
+    if values.dtype.kind in "iuf":
+        held = pyarrow.py_buffer(np.ascontiguousarray(values))
+        kind = pyarrow.from_numpy_dtype(values.dtype)
+        return pyarrow.Array.from_buffers(kind, len(values), [None, held])
+    if values.dtype.kind == "U":
+        texts = [str(one).encode() for one in values]
+        ends = np.cumsum([0, *map(len, texts)], dtype=np.int32)
+        held = [None, pyarrow.py_buffer(ends), pyarrow.py_buffer(b"".join(texts))]
+        return pyarrow.Array.from_buffers(pyarrow.string(), len(values), held)
+    return pyarrow.array(values)
 
 
 def parquet_units(schema: pyarrow.Schema) -> dict[str, str]:

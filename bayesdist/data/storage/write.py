@@ -7,6 +7,7 @@ from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 from numpy.typing import NDArray
 
 from bayesdist.data.batches import BATCH
@@ -15,6 +16,7 @@ from bayesdist.data.matches import Matches
 from bayesdist.data.tables.checks import columns_of
 from bayesdist.errors import InputError
 from bayesdist.files.atomic import atomic_path, made_folder
+from bayesdist.files.parquet import arrow_array
 from bayesdist.utils.arrays import Int
 
 if TYPE_CHECKING:
@@ -147,7 +149,7 @@ def write_columns(
 
     fields, arrays = [], []
     for name, values in columns.items():
-        array = _labelled(*values) if isinstance(values, tuple) else pyarrow.array(values)
+        array = _labelled(*values) if isinstance(values, tuple) else arrow_array(values)
         metadata = {"unit": units[name]} if name in units else None
         fields.append(pyarrow.field(name, array.type, nullable=False, metadata=metadata))
         arrays.append(array)
@@ -171,5 +173,5 @@ def _labelled(codes: Int, labels: Sequence[str | int]) -> pyarrow.DictionaryArra
     import pyarrow
 
     return pyarrow.DictionaryArray.from_arrays(
-        pyarrow.array(codes, pyarrow.int32()), pyarrow.array(labels)
+        arrow_array(codes.astype(np.int32)), arrow_array(np.asarray(labels))
     )

@@ -19,7 +19,7 @@ from bayesdist.data.tables.checks import Place
 from bayesdist.data.tables.column import EncodedColumn
 from bayesdist.errors import InputError
 from bayesdist.files.faults import naming_faults
-from bayesdist.files.parquet import open_parquet, parquet_column, parquet_units
+from bayesdist.files.parquet import numpy_array, open_parquet, parquet_column, parquet_units
 from bayesdist.utils.arrays import Int
 
 if TYPE_CHECKING:
@@ -247,8 +247,8 @@ def _encoded(values: pyarrow.ChunkedArray, unit: str | None) -> EncodedColumn | 
         return None
     if array.null_count or array.dictionary.null_count:
         return None
-    labels = array.dictionary.to_numpy(zero_copy_only=False)
-    codes = array.indices.to_numpy().astype(np.int64)
+    labels = numpy_array(array.dictionary)
+    codes = numpy_array(array.indices).astype(np.int64)
     # the dictionary of a file may have another order, and labels that no row has
     n = len(codes)
     first = np.full(len(labels), n)
