@@ -17,7 +17,7 @@ BIN     = $(VENV)/bin
 # else each process that tests and commands start compiles all modules again: seconds, dozens of times
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: demo test types imports test-full docs bench bench-check lint clean
+.PHONY: demo test types imports suite test-full docs bench bench-check lint clean
 
 demo: $(VENV)/.installed
 	$(BIN)/bayesdist demo -o demo-run --force
@@ -25,15 +25,17 @@ demo: $(VENV)/.installed
 test: $(VENV)/.installed-test
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
-	$(MAKE) --no-print-directory -j2 types imports
-	$(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder
+	$(MAKE) --no-print-directory -j3 types imports suite
 
-# mypy takes a minute of processor time at first, lint-imports less: both at once
+# all at once: mypy takes a minute of one core at first, and the tests wait for each other at times
 types: $(VENV)/.installed-test
 	$(BIN)/mypy
 
 imports: $(VENV)/.installed-test
 	$(BIN)/lint-imports
+
+suite: $(VENV)/.installed-test
+	$(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder
 
 test-full: $(VENV)/.installed-test
 	BAYESDIST_FULL=1 $(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder
