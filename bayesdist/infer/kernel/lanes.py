@@ -24,8 +24,8 @@ from numba.extending import intrinsic, lower_builtin, models, register_model
 # sums of products may be fused; nothing that would change NaN or infinity
 FAST = {"contract", "nsz", "arcp"}
 FLAGS = tuple(sorted(FAST))
-# how a function is compiled that only compiled ones call: Python could not
-INNER: dict[str, Any] = {"cache": True, "no_cpython_wrapper": True, "no_cfunc_wrapper": True}
+# how a function is compiled that only compiled ones call, which keep it as a part of theirs
+INNER: dict[str, Any] = {"no_cpython_wrapper": True, "no_cfunc_wrapper": True}
 
 _FEATURES = get_host_cpu_features() if config.CPU_FEATURES is None else config.CPU_FEATURES
 HAS_512 = "+avx512f" in _FEATURES.split(",") and config.CPU_NAME is None
