@@ -89,6 +89,11 @@ def outlier_table(r: ReportInput) -> TextTable:
     if mixture.outlier_scale is not None:
         note += f"; prior of s_out: about {number(mixture.outlier_scale)} {r.unit}"
     note += "." if mixture.model == "none" else f"; prior of f: Beta({a:g}, {b:g})."
+    if mixture.model != "none":
+        note += (
+            f" The errors of f and s_out are those for {words.false_rows} of this shape; of another"
+            " one, which shows in the wings of the residuals, f may be off by more."
+        )
     if grouped is not None and grouped.added is not None:
         note += f" Errors differ by {grouped.grouping}: j is the least of those beyond the quoted."
     return TextTable(
