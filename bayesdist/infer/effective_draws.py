@@ -46,8 +46,10 @@ def tail_draws(chains: Float, tails: tuple[float, float]) -> Float:
     """Effective sample size (D,) of the tails: the smaller one of two quantiles."""
 
     def smaller(some: Float) -> Float:
-        limits = np.quantile(some, tails, axis=(1, 2))[..., None, None]
-        return np.min([_effective(_halves((some <= q).astype(float))) for q in limits], axis=0)
+        limits = np.quantile(some, tails, axis=(1, 2))
+        sides = [_effective(_halves((some <= q[:, None, None]).astype(float))) for q in limits]
+        # no draw lies beyond a limit that is not a number, as if none had ever moved
+        return np.where(np.isnan(limits).any(axis=0), np.nan, np.min(sides, axis=0))
 
     return _by_parameters(smaller, chains)
 

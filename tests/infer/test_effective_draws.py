@@ -59,7 +59,7 @@ def test_a_parameter_that_never_moved_and_one_that_is_not_a_number():
     chains[2, 50, 2] = np.nan
     rhat, bulk = rhat_and_bulk_draws(chains)
     assert np.isnan(rhat).tolist() == [False, True, True]
-    for found in (bulk, mean_draws(chains)):
+    for found in (bulk, tail_draws(chains, TAILS), mean_draws(chains)):
         assert found[1] == 400 and np.isnan(found).tolist() == [False, False, True]
 
 
