@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import os
+import sys
 from dataclasses import dataclass
+from types import FrameType
 from typing import Any
 
 import numpy as np
@@ -57,6 +59,26 @@ def test_a_damaged_file_is_called_what_it_has_to_be(tmp_path, kept):
     os.truncate(path, int(kept * path.stat().st_size))
     with pytest.raises(FormatError, match=r"record\.h5: this is not an evaluation .*; fit again"):
         read_record(path, dict, "an evaluation", do="fit again", fingerprint="mark")
+
+
+def test_a_file_is_not_damaged_where_its_reader_is_interrupted(tmp_path):
+    """HDF5 calls back to list the attributes; interrupted there, it fails with a SystemError."""
+
+    def interrupt(frame: FrameType, event: str, _: Any) -> None:
+        if event == "call" and frame.f_code.co_name == "iter_cb":
+            sys.setprofile(None)
+            raise KeyboardInterrupt
+
+    path = tmp_path / "record.h5"
+    write_record(path, {"a": 1})
+    sys.setprofile(interrupt)
+    try:
+        with pytest.raises(KeyboardInterrupt) as found:
+            read_record(path, dict, "an evaluation", do="fit again")
+    finally:
+        sys.setprofile(None)
+    assert isinstance(found.value.__cause__, SystemError)
+    assert read_record(path, dict, "an evaluation", do="fit again") == {"a": 1}
 
 
 def test_a_file_of_other_data_and_none_are_not_called_damaged(tmp_path):
