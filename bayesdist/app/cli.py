@@ -13,6 +13,7 @@ import click
 from bayesdist.app.commands.options import LazyGroup
 from bayesdist.app.screen import open_streams
 from bayesdist.errors import BayesdistError, RenamedError
+from bayesdist.files.faults import raising_interrupts
 from bayesdist.mission import load_mission, mission_names, missions
 from bayesdist.version import __version__
 
@@ -111,7 +112,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _exit_code(call: Callable[[], int | None], command: str) -> int:
     """Exit code of a call whose errors are said in one sentence."""
     try:
-        return call() or 0
+        with raising_interrupts():
+            return call() or 0
     except click.exceptions.Exit as end:  # after help was shown
         return end.exit_code
     except click.ClickException as error:

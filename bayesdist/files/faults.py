@@ -12,6 +12,35 @@ from bayesdist.errors import BayesdistError, FormatError, InputError
 
 
 @contextmanager
+def raising_interrupts() -> Iterator[None]:
+    """Raise KeyboardInterrupt for an error that comes of one.
+
+    A library that is interrupted in a callback, or as it closes a file, may fail in a way of its
+    own: HDF5 does so with a SystemError.
+    """
+    try:
+        yield
+    except Exception as error:
+        if _comes_of_interrupt(error):
+            raise KeyboardInterrupt from error
+        raise
+
+
+def _comes_of_interrupt(error: BaseException) -> bool:
+    """Whether a KeyboardInterrupt is among what an error was raised from, or during."""
+    seen: set[int] = set()
+    open_ends: list[BaseException | None] = [error]
+    while open_ends:
+        one = open_ends.pop()
+        if isinstance(one, KeyboardInterrupt):
+            return True
+        if one is not None and id(one) not in seen:
+            seen.add(id(one))
+            open_ends += [one.__cause__, one.__context__]
+    return False
+
+
+@contextmanager
 def naming_faults(path: Path, where: str = "") -> Iterator[None]:
     """Turn any failure while a file is read into an error that names the file, or `where` in it.
 
@@ -20,7 +49,8 @@ def naming_faults(path: Path, where: str = "") -> Iterator[None]:
     the format demands.
     """
     try:
-        yield
+        with raising_interrupts():
+            yield
     except InputError:
         raise
     except FileNotFoundError as error:
@@ -47,7 +77,7 @@ def restoring(path: Path, what: str, *, do: str) -> Iterator[None]:
     `what`: with its article, as in 'a posterior'. `do`: by which the file is made again.
     """
     try:
-        with warnings.catch_warnings():
+        with raising_interrupts(), warnings.catch_warnings():
             warnings.simplefilter("ignore")  # of foreign files
             yield
     except BayesdistError as error:

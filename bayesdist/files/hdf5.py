@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from bayesdist.errors import FormatError, InputError
 from bayesdist.files.atomic import atomic_path
+from bayesdist.files.faults import restoring
 from bayesdist.files.regular import opened
 from bayesdist.files.unpacked import refuse_inflated
 
@@ -107,26 +108,26 @@ def _bytes_of(group: h5py.Group, where: str) -> int:
 
 
 def read_arrays(
-    path: Path, fingerprint: str, names: Sequence[str] | None = None, *, do: str
+    path: Path, fingerprint: str, what: str, names: Sequence[str] | None = None, *, do: str
 ) -> dict[str, NDArray[Any]]:
     """Arrays by name from a file of `write_arrays`.
 
-    `fingerprint` is that of data and settings; `names` are required, by default those in the file;
-    `do` is advice for a file that cannot be read.  InputError when it cannot, or belongs to other
-    data or settings.
+    `fingerprint` is that of data and settings; `what`, with its article, is what the file has to
+    be; `names` are required, by default those in the file; `do` is advice for a file that cannot be
+    read.  FormatError when it is damaged, InputError when it is not there, or belongs to other data
+    or settings.
     """
     try:
-        arrays, marks = hdf5_arrays(path, names)
-        known = marks["fingerprint"]
-    except InputError as error:
-        raise InputError(error.cause, where=error.where, do=do) from error
-    except Exception as error:  # HDF5 raises errors of all kinds on damaged files
-        raise InputError("the checkpoint cannot be read", where=str(path), do=do) from error
+        with restoring(path, what, do=do):
+            arrays, marks = hdf5_arrays(path, names)
+            known = marks["fingerprint"]
+    except InputError as error:  # of the path: its reader does not know what to do
+        raise type(error)(error.cause, where=error.where, do=do) from error
     if not isinstance(known, str) or known != fingerprint:
         raise InputError(
-            "the checkpoints belong to other data or settings",
-            where=str(path.parent),
-            do="restore them, or start again with --force",
+            f"this is {what} of other data or settings",
+            where=str(path),
+            do="restore it, or start again with --force",
         )
     return arrays
 

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from scipy.special import logsumexp
 
-from bayesdist.infer.effective_draws import bulk_draws, mean_draws, split_rhat, tail_draws
+from bayesdist.infer.effective_draws import mean_draws, rhat_and_bulk_draws, tail_draws
 from bayesdist.utils.arrays import Float
 from bayesdist.utils.limits import DRAWS_PER_WALKER
 from bayesdist.utils.numbers import count
@@ -129,9 +129,8 @@ def diagnose(
     by_walker = np.swapaxes(chains, 1, 2).reshape(E, W * T, D)
 
     # a parameter that never moved has no variance: no effective draws, no agreement
-    rhat = split_rhat(in_time)
+    rhat, bulk = rhat_and_bulk_draws(in_time, W)
     rhat[~np.isfinite(rhat)] = np.inf
-    bulk = bulk_draws(by_walker)
     tail = tail_draws(by_walker, TAIL)
     if coupled:
         low, high = np.quantile(in_time.reshape(-1, D), TAIL, axis=0)

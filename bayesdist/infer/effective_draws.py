@@ -19,27 +19,37 @@ FEWEST = 4  # draws in a chain whose halves can be compared
 AT_ONCE = 2**18  # draws of as many parameters as are transformed together fit into the cache
 
 
-def split_rhat(chains: Float) -> Float:
-    """Rank-normalised split R-hat (D,): the larger one of bulk and tails."""
+def rhat_and_bulk_draws(chains: Float, walkers: int = 1) -> Float:
+    """Rank-normalised split R-hat and effective sample size of the bulk (2, D).
 
-    def larger(halves: Float) -> Float:
+    A chain has the draws of all its walkers at one step after the other.  So R-hat goes through
+    them: it is the larger one of bulk and tails.  The sample size, that of the normal scores' mean,
+    goes through one walker after the other.
+    """
+
+    def both(some: Float) -> Float:
+        halves = _halves(some)
+        if some.shape[2] % 2:  # the middle draw is another one
+            scores = _normal_scores(halves)
+            by_walker = _normal_scores(_halves(_by_walker(some, walkers)))
+        else:
+            every = _normal_scores(some)
+            scores, by_walker = _halves(every), _halves(_by_walker(every, walkers))
         folded = np.abs(halves - np.median(halves, axis=(1, 2), keepdims=True))
-        return np.maximum(_rhat(_normal_scores(halves)), _rhat(_normal_scores(folded)))
+        rhat = np.maximum(_rhat(scores), _rhat(_normal_scores(folded)))
+        return np.stack([rhat, _effective(by_walker)])
 
-    return _by_parameters(lambda some: larger(_halves(some)), chains)
-
-
-def bulk_draws(chains: Float) -> Float:
-    """Effective sample size (D,) of the bulk: that of the normal scores' mean."""
-    return _by_parameters(lambda some: _effective(_normal_scores(_halves(some))), chains)
+    return _by_parameters(both, chains, 2)
 
 
 def tail_draws(chains: Float, tails: tuple[float, float]) -> Float:
     """Effective sample size (D,) of the tails: the smaller one of two quantiles."""
 
     def smaller(some: Float) -> Float:
-        limits = np.quantile(some, tails, axis=(1, 2))[..., None, None]
-        return np.min([_effective(_halves((some <= q).astype(float))) for q in limits], axis=0)
+        limits = np.quantile(some, tails, axis=(1, 2))
+        sides = [_effective(_halves((some <= q[:, None, None]).astype(float))) for q in limits]
+        # no draw lies beyond a limit that is not a number, as if none had ever moved
+        return np.where(np.isnan(limits).any(axis=0), np.nan, np.min(sides, axis=0))
 
     return _by_parameters(smaller, chains)
 
@@ -49,27 +59,33 @@ def mean_draws(chains: Float) -> Float:
     return _by_parameters(lambda some: _effective(_halves(some)), chains)
 
 
-def _by_parameters(function: Callable[[Float], Float], chains: Float) -> Float:
+def _by_parameters(function: Callable[[Float], Float], chains: Float, *numbers: int) -> Float:
     """A function of (d, C, N) for all parameters, of which some are treated at once.
 
-    NaN for fewer than `FEWEST` draws in a chain.
+    NaN for fewer than `FEWEST` draws in a chain.  It returns as many `numbers` (n, d), or one (d,).
     """
     C, N, D = chains.shape
     if N < FEWEST:
-        return np.full(D, np.nan)
+        return np.full((*numbers, D), np.nan)
     step = max(AT_ONCE // (C * N), 1)
     chains = np.moveaxis(chains, 2, 0)
     with np.errstate(invalid="ignore", divide="ignore"):  # parameters that never moved
         parts = [
             function(np.ascontiguousarray(chains[k : k + step], float)) for k in range(0, D, step)
         ]
-    return np.concatenate(parts)
+    return np.concatenate(parts, axis=-1)
 
 
 def _halves(chains: Float) -> Float:
     """First and last half of each chain, (d, 2 C, N / 2), without a middle draw."""
     half = chains.shape[2] // 2
     return np.concatenate([chains[..., :half], chains[..., -half:]], axis=1)
+
+
+def _by_walker(chains: Float, walkers: int) -> Float:
+    """Draws of one walker after the other, (d, C, N), of those at one step after the other."""
+    d, C, N = chains.shape
+    return np.swapaxes(chains.reshape(d, C, N // walkers, walkers), 2, 3).reshape(d, C, N)
 
 
 def _normal_scores(chains: Float) -> Float:

@@ -45,6 +45,28 @@ def test_an_exception_of_any_kind(tmp_path, monkeypatch, error, code, words):
         assert text.startswith("command   bayesdist inspect\nbayesdist ")
 
 
+def test_an_error_that_comes_of_an_interrupt_is_one(tmp_path, monkeypatch):
+    """As when a file that is interrupted while it is made cannot be closed."""
+
+    class HalfMade:
+        def __enter__(self) -> None:
+            raise KeyboardInterrupt
+
+    @click.command()
+    def fails() -> None:
+        half = HalfMade()
+        try:
+            half.__enter__()
+        finally:
+            half.close()  # type: ignore[attr-defined]
+
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(commands.LazyGroup, "load", staticmethod(lambda target: fails))
+    result = cli("inspect")
+    assert (result.code, result.err) == (130, "bayesdist: interrupted; resume with --resume\n")
+    assert not list(tmp_path.iterdir())
+
+
 def test_endless_recursion(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
 

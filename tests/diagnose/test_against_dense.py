@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy import stats
@@ -257,7 +259,7 @@ def test_deviations_of_exposures_are_those_of_dense_matrices(case, shared):
         Z, _, U = dense.projected(fields * (table.exposure == e)[:, None, None])
         psi = dense.summed(np.einsum("naq,na->nq", Z, whole))
         V, own = psi.T @ psi, psi[np.unique(dense.star[table.exposure == e])]
-        share = np.trace(own.T @ own) / np.trace(V)
+        share = np.trace(np.linalg.solve(V, own.T @ own)) / n
         here = int((table.exposure == e).sum())
         N = 1 / (share**2 / here + (1 - share) ** 2 / (len(table) - here))
         p = stats.beta.sf(U @ np.linalg.solve(V, U) / N, len(U) / 2, (N - len(U)) / 2)
@@ -270,6 +272,20 @@ def test_deviations_of_exposures_are_those_of_dense_matrices(case, shared):
     assert found.dof == pytest.approx(dof, rel=1e-6)
     assert found.statistic == pytest.approx(T * dof / (n * len(whitened)), rel=1e-6)
     assert found.p_value == pytest.approx(stats.chi2.sf(found.statistic, dof), rel=1e-9)
+
+
+def test_deviations_of_exposures_do_not_depend_on_the_unit_of_positions():
+    """Shifts have it, and scales have none."""
+    scene = Scene(300, 2, "none", 4)
+    model, table = scene.data(5)
+    p = []
+    for unit in (1.0, 1e-3):
+        there = {name: unit * getattr(table, name) for name in ("u", "v", "sigma_u", "sigma_v")}
+        origin = (unit * model.origin[0], unit * model.origin[1])
+        part = table.with_columns(**there)
+        fit = scene.solve(replace(model, origin=origin), part)
+        p.append(exposure_test(projected(part, fit)).p_value)
+    assert p[1] == pytest.approx(p[0], rel=1e-6)
 
 
 @pytest.mark.parametrize("order", [1, 3])

@@ -7,7 +7,7 @@ import pytest
 from arviz_stats.base import array_stats
 from scipy.signal import lfilter
 
-from bayesdist.infer.effective_draws import bulk_draws, mean_draws, split_rhat, tail_draws
+from bayesdist.infer.effective_draws import mean_draws, rhat_and_bulk_draws, tail_draws
 
 AXES = {"chain_axis": 0, "draw_axis": 1}
 TAILS = (0.05, 0.95)
@@ -31,21 +31,35 @@ def chains_of(C: int, N: int) -> np.ndarray:
 def test_numbers_are_those_of_arviz(C, N):
     """Halves with and without a middle draw; short ones; more draws than are treated at once."""
     chains = chains_of(C, N)[..., :: 1 if N < 1000 else 20]
+    rhat, bulk = rhat_and_bulk_draws(chains)
     for found, expected in (
-        (split_rhat(chains), array_stats.rhat(chains, **AXES)),
-        (bulk_draws(chains), array_stats.ess(chains, method="bulk", **AXES)),
+        (rhat, array_stats.rhat(chains, **AXES)),
+        (bulk, array_stats.ess(chains, method="bulk", **AXES)),
         (tail_draws(chains, TAILS), array_stats.ess(chains, method="tail", prob=TAILS, **AXES)),
         (mean_draws(chains), array_stats.ess(chains, method="mean", **AXES)),
     ):
         np.testing.assert_allclose(found, expected, rtol=1e-10)
 
 
+@pytest.mark.parametrize(("C", "T", "W"), [(4, 50, 8), (3, 25, 6), (3, 25, 7)], ids=str)
+def test_bulk_goes_through_one_walker_after_the_other(C, T, W):
+    """And R-hat through one step after the other; with a middle draw, and without one."""
+    in_time = chains_of(C, T * W)
+    by_walker = np.swapaxes(in_time.reshape(C, T, W, -1), 1, 2).reshape(C, T * W, -1)
+    rhat, bulk = rhat_and_bulk_draws(in_time, W)
+    np.testing.assert_array_equal(rhat, rhat_and_bulk_draws(in_time)[0])
+    np.testing.assert_array_equal(bulk, rhat_and_bulk_draws(by_walker)[1])
+    expected = array_stats.ess(by_walker, method="bulk", **AXES)
+    np.testing.assert_allclose(bulk, expected, rtol=1e-10)
+
+
 def test_a_parameter_that_never_moved_and_one_that_is_not_a_number():
     chains = chains_of(4, 100)[..., :3]
     chains[..., 1] = 3.0
     chains[2, 50, 2] = np.nan
-    assert np.isnan(split_rhat(chains)).tolist() == [False, True, True]
-    for found in (bulk_draws(chains), mean_draws(chains)):
+    rhat, bulk = rhat_and_bulk_draws(chains)
+    assert np.isnan(rhat).tolist() == [False, True, True]
+    for found in (bulk, tail_draws(chains, TAILS), mean_draws(chains)):
         assert found[1] == 400 and np.isnan(found).tolist() == [False, False, True]
 
 

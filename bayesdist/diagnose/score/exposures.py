@@ -48,8 +48,19 @@ class _Deviations:
     cross: Float  # (n, G) with the global parameters
     covariance: Float  # (n, n) of the score, from those of single detections
     square: Float  # (n, n) mean square of the deviations over the detector
-    # stars that the covariance is known from, those of other exposures by what they add to it
-    n_stars: float
+    of_own: Float  # (n, n) what its own stars add to this covariance
+    n_own: int  # stars of the exposure, and of all others
+    n_others: int
+
+    @property
+    def n_stars(self) -> float:
+        """Stars that the covariance is known from, those of others by what they add to it.
+
+        What its own stars add is a fraction of each direction's variance: shifts and scales have
+        different units.
+        """
+        share = float(np.trace(np.linalg.solve(self.covariance, self.of_own))) / len(self.score)
+        return 1.0 / (share**2 / self.n_own + (1.0 - share) ** 2 / self.n_others)
 
     @property
     def statistic(self) -> float:
@@ -66,7 +77,9 @@ class _Deviations:
             N.T @ self.cross,
             N.T @ self.covariance @ N,
             N.T @ self.square @ N,
-            self.n_stars,
+            N.T @ self.of_own @ N,
+            self.n_own,
+            self.n_others,
         )
 
 
@@ -198,7 +211,6 @@ def _of_exposure(
     by_global = cross[rows].T @ projection.following[rows]
     of_own, of_others = _covariances(projection, blocks, fields, left, meat)
     covariance = of_own + of_others
-    share = float(np.trace(of_own) / np.trace(covariance))
     n_own = sum(int(sample.used[block.rows].sum()) for block in blocks)
     n_others = max(int(sample.used.sum()) - n_own, 1)
     return whole, _Deviations(
@@ -208,7 +220,9 @@ def _of_exposure(
         by_global,
         (covariance + covariance.T) / 2,
         square,
-        1.0 / (share**2 / n_own + (1.0 - share) ** 2 / n_others),
+        of_own,
+        n_own,
+        n_others,
     )
 
 

@@ -1,4 +1,4 @@
-"""Factors of large symmetric matrices, in place, while other threads work.
+"""Sums and factors of large symmetric matrices, in place, while other threads work.
 
 The routines are those of SciPy's LAPACK and BLAS.  SciPy's own wrappers hold Python's lock while
 they run: two threads would take turns.  Calls by ctypes release it.
@@ -21,7 +21,18 @@ def _routine(module: str, name: str, n_arguments: int) -> Any:
 
 
 _POTRF, _POTRI = (_routine("cython_lapack", name, 5) for name in ("dpotrf", "dpotri"))
-_TRSM = _routine("cython_blas", "dtrsm", 11)
+_TRSM, _SYRK = _routine("cython_blas", "dtrsm", 11), _routine("cython_blas", "dsyrk", 10)
+
+
+def add_square(total: Float, rows: Float) -> None:
+    """Add R^T R of rows (m, n) to the lower triangle of a matrix (n, n): C arrays of float64."""
+    n, m, one = _order(total, total.flags.c_contiguous), ctypes.c_int(len(rows)), ctypes.c_double(1)
+    fits = rows.shape == (len(rows), n.value) and rows.flags.c_contiguous
+    if not (fits and rows.dtype == np.float64):
+        raise ValueError("rows of float64 as long as those of the matrix are expected, contiguous")
+    # as BLAS sees C arrays, the lower triangle is the upper one, and the rows are columns
+    at = (_at(one), rows.ctypes.data, _at(n), _at(one), total.ctypes.data, _at(n))
+    _SYRK(b"U", b"N", _at(n), _at(m), *at)
 
 
 def cholesky(matrix: Float) -> Float:

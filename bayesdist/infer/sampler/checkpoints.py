@@ -11,6 +11,7 @@ from bayesdist.files.faults import restoring
 from bayesdist.files.hdf5 import read_arrays, write_arrays
 from bayesdist.utils.arrays import Float
 
+CHECKPOINT = "a checkpoint"  # what its file has to be
 BLOCK_ARRAYS = ("coords", "log_prob", "accepted", "log_weights")
 END_ARRAYS = ("log_q", "random_keys", "random_state")
 
@@ -47,8 +48,8 @@ class Block:
     def read(cls, path: Path, mark: str) -> Block:
         """Block from a file; InputError when it cannot be read, or has another mark."""
         do = "delete it and resume: its steps are run again"
-        stored = read_arrays(path, mark, (*BLOCK_ARRAYS, *END_ARRAYS), do=do)
-        with restoring(path, "a checkpoint", do=do):
+        stored = read_arrays(path, mark, CHECKPOINT, (*BLOCK_ARRAYS, *END_ARRAYS), do=do)
+        with restoring(path, CHECKPOINT, do=do):
             log_q, keys, (position, has_gauss, gauss) = (stored.pop(name) for name in END_ARRAYS)
             random = ("MT19937", keys, int(position), int(has_gauss), float(gauss))
             np.random.RandomState().set_state(random)  # refuses what is no such state

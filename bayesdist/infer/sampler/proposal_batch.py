@@ -16,6 +16,7 @@ import numpy as np
 from bayesdist.files.hdf5 import read_arrays, write_arrays
 from bayesdist.infer.density.proposal import Proposal
 from bayesdist.infer.density.target import Density
+from bayesdist.infer.sampler.checkpoints import CHECKPOINT
 from bayesdist.utils.arrays import Bool, Float
 
 ROWS = 8192  # proposals evaluated at a time
@@ -100,7 +101,7 @@ def pilot_batch(
     path = None if folder is None else folder / f"chain-0-{name}.h5"
     if path is not None and path.exists():
         do = "delete it and resume: its proposals are evaluated again"
-        known = read_arrays(path, fingerprint, ("log_prob", "log_q"), do=do)
+        known = read_arrays(path, fingerprint, CHECKPOINT, ("log_prob", "log_q"), do=do)
         return ProposalBatch(_drawn(proposal, seeds, key, n), **known)
     batch = draw_batch(target, proposal, seeds, key, n)
     if path is not None:

@@ -23,6 +23,7 @@ from bayesdist.infer.posterior import Posterior
 from bayesdist.infer.posterior.memberships import count_outliers
 from bayesdist.infer.sampler.certified import run_certified
 from bayesdist.infer.sampler.chains import Settings, ensemble_seeds, run_chains
+from bayesdist.infer.sampler.checkpoints import CHECKPOINT
 from bayesdist.infer.solution.linear import LinearFit
 from bayesdist.infer.stars.loading import opened
 from bayesdist.infer.stars.mixture import OutlierMixture
@@ -205,7 +206,7 @@ def _proposal(
     """Proposal, stored in a file so that a resumed run has exactly this one."""
     path = None if folder is None else folder / "chain-0-proposal.h5"
     if path is not None and path.exists():
-        arrays = read_arrays(path, fingerprint, do="start again with --force")
+        arrays = read_arrays(path, fingerprint, CHECKPOINT, do="start again with --force")
         return GridProposal.from_arrays(target.n_theta, target.mixture.hyper, arrays)
     proposal = build_proposal(target, fit)
     if path is not None:

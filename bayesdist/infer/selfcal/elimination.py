@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from bayesdist.infer import kernel
 from bayesdist.infer.kernel.blocks import in_turn, threads_for
+from bayesdist.infer.kernel.lapack import add_square
 from bayesdist.infer.kernel.moments import product_table
 from bayesdist.infer.selfcal.problem import Problem
 from bayesdist.infer.stars.sums import Sums
@@ -106,7 +107,7 @@ def expand(
         mine = kernel.EliminationSums.zero(len(problem.groups), order)
         absorbed = np.zeros((D, D))
         for _, rows, _ in _passes(problem, structure, mixture, found, observed, first, last, mine):
-            absorbed += rows.T @ rows
+            add_square(absorbed, rows)
         return mine, absorbed
 
     edges = np.arange(PARTS + 1) * problem.n_stars // PARTS
@@ -115,6 +116,8 @@ def expand(
             for total, more in zip(sums, mine, strict=True):
                 total += more
             curvature -= absorbed
+            del absorbed  # as large as the curvature, while the next parts are summed
+    curvature += np.tril(curvature, -1).T  # squares are lower triangles
     table = product_table(order)
     weights, pulls = sums.weights[..., : table.shape[-1]], sums.pulls[..., :K]
     squares = np.einsum("gcm,klm->gckl", weights, table, optimize=True)
@@ -122,7 +125,8 @@ def expand(
         by = by.reshape(2 * K, -1)
         curvature[np.ix_(columns, columns)] += by.T @ np.block([[uu, uv], [uv, vv]]) @ by
         gradient[columns] += pull.ravel() @ by
-    curvature = (curvature + curvature.T) / 2
+    curvature += curvature.T
+    curvature /= 2
     value, members, chi2 = sums.scalars
     return Expansion(float(value), gradient, curvature, members, chi2), found
 

@@ -30,7 +30,7 @@ from time import monotonic
 from typing import Any, Self
 
 from bayesdist.data.matches import Matches
-from bayesdist.errors import InputError
+from bayesdist.errors import FormatError, InputError
 from bayesdist.files.records import read_record, write_record
 from bayesdist.infer import kernel
 from bayesdist.infer.stars.shards import (
@@ -307,9 +307,15 @@ class _Written:
         return cls(path)
 
     def read(self) -> Any:
-        """The record; InputError where the file is not seen."""
-        do = "name a folder in compute.scratch that all workers see under the same path"
-        return read_record(self.path, object, "a part of the data", do=do)
+        """The record; InputError where the file is not seen, FormatError where it is damaged."""
+        do = "resume the run, which writes it anew, and check the disk of compute.scratch"
+        try:
+            return read_record(self.path, object, "a part of the data", do=do)
+        except FormatError:
+            raise
+        except InputError as error:
+            do = "name a folder in compute.scratch that all workers see under the same path"
+            raise InputError(error.cause, where=error.where, do=do) from error
 
 
 def _made_from(make: Task, source: Any) -> Any:

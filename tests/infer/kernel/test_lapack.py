@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from bayesdist.infer.kernel.lapack import cholesky, divided, inverse_of
+from bayesdist.infer.kernel.lapack import add_square, cholesky, divided, inverse_of
 
 
 @pytest.fixture
@@ -32,6 +32,23 @@ def test_solution(matrix, rng):
     )
 
 
+def test_squares_are_added_to_the_lower_triangle(matrix, rng):
+    total, rows = matrix.copy(), rng.normal(size=(50, 37))
+    add_square(total, rows)
+    add_square(total, rows[:0])
+    np.testing.assert_array_equal(np.triu(total, 1), np.triu(matrix, 1))
+    np.testing.assert_allclose(np.tril(total), np.tril(matrix + rows.T @ rows), atol=1e-11)
+
+
+def test_rows_that_do_not_fit_are_refused(matrix, rng):
+    rows = rng.normal(size=(50, 40))
+    for other in (rows, rows[:, :37], np.asfortranarray(rows[:, :37]), rows[0, :37]):
+        with pytest.raises(ValueError, match="rows of float64 as long as those of the matrix"):
+            add_square(matrix, other)
+    with pytest.raises(ValueError, match="rows of float64"):
+        add_square(matrix, rows[:, :37].astype(np.float32))
+
+
 def test_no_factor_of_what_is_not_positive_definite(matrix):
     matrix[5, 5] = -1.0
     with pytest.raises(np.linalg.LinAlgError):
@@ -51,5 +68,7 @@ def test_no_factor_of_what_is_not_positive_definite(matrix):
 def test_what_lapack_would_write_beside_is_refused(matrix, other):
     with pytest.raises(ValueError, match="square matrix of float64"):
         cholesky(other(matrix))
+    with pytest.raises(ValueError, match="square matrix of float64"):
+        add_square(other(matrix), matrix)
     with pytest.raises(ValueError, match="square matrix of float64"):
         inverse_of(other(matrix.T).T)

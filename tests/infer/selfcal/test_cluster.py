@@ -19,6 +19,7 @@ import pytest
 from bayesdist.data.matching import friends
 from bayesdist.data.matching.friends import friends_of_friends, grouped
 from bayesdist.errors import InputError
+from bayesdist.files.records import write_record
 from bayesdist.infer import Compute
 from bayesdist.infer.equations.priors import Prior
 from bayesdist.infer.selfcal import pieces, sample_selfcal, self_calibrate, star_catalogue
@@ -284,6 +285,22 @@ def test_scratch_folder_that_workers_do_not_see(solution, compute, tmp_path, mon
     message = r"compute\.scratch: .*nowhere.*name a folder"
     with pytest.raises(InputError, match=message), in_pieces(*given, missing):
         pass
+
+
+def test_damaged_file_in_the_scratch_folder(solution, compute, tmp_path, monkeypatch):
+    def cut(path, record):
+        write_record(path, record)
+        os.truncate(path, path.stat().st_size // 2)
+
+    monkeypatch.setattr(cluster_module, "write_record", cut)
+    compute = replace(compute, scratch=str(tmp_path))
+    message = r"000000\.h5: this is not a part of the data .* damaged .*; resume the run.*disk"
+    with (
+        pytest.raises(InputError, match=message),
+        in_pieces(solution.problem, solution.stars, compute),
+    ):
+        pass
+    assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.slow

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tracemalloc
 from dataclasses import replace
 
 import numpy as np
@@ -9,6 +10,7 @@ import pytest
 from scipy.special import logsumexp
 
 from bayesdist.infer import kernel
+from bayesdist.infer.selfcal import elimination
 from bayesdist.infer.selfcal.elimination import Mixture, StarModes, expand, log_marginal
 from bayesdist.infer.selfcal.problem import Problem
 from bayesdist.model import TimeDependence
@@ -75,6 +77,24 @@ def test_elimination_is_the_schur_complement(kind, motion):
     found, _ = expand(problem, theta, NO_FALSE, stars)
     dense = _dense(problem, theta)
     assert np.abs(found.curvature - dense).max() < 1e-9 * np.abs(dense).max()
+
+
+def test_few_matrices_of_all_parameters_are_in_memory_at_a_time(monkeypatch):
+    """One thread has the curvature, the sum of its stars, and nothing else as large."""
+    simulated = field(1, 150, 60, frames="affine")
+    problem, stars = problem_of(simulated)
+    monkeypatch.setattr(elimination, "STARS", 8)
+    monkeypatch.setattr(elimination, "ELIMINATION", 0)  # too little for a second thread
+    matrix = 8 * problem.model.n_params**2
+    assert matrix > 5e6
+    expand(problem, simulated.theta, NO_FALSE, stars)
+    tracemalloc.start()
+    try:
+        expand(problem, simulated.theta, NO_FALSE, stars)
+        peak = tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+    assert peak < 2.7 * matrix
 
 
 def test_gradient_is_that_of_the_density():

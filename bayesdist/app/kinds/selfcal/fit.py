@@ -57,7 +57,7 @@ def load_selfcal(folder: Path, matched: Callable[[], SelfcalMatched]) -> Fitted:
     fitted = load_fitted(folder)
     found = matched()
     compute = found.inputs.config.resources()
-    arrays = read_arrays(folder / SOLUTION, "", ARRAYS, do=FIT_AGAIN)
+    arrays = read_arrays(folder / SOLUTION, "", "a solution of detections", ARRAYS, do=FIT_AGAIN)
     return replace(fitted, solved=solved_of(found, fitted.linear.model, arrays, compute))
 
 

@@ -135,9 +135,9 @@ def load_matched_selfcal(
     folder: Path, inputs: Inputs, summary: Mapping[str, Any]
 ) -> SelfcalMatched:
     """The detections of an earlier stage."""
-    arrays = read_arrays(folder / DETECTIONS, "", ARRAYS, do="run the stage 'match' again")
-    path = folder / DETECTIONS
-    with restoring(path, "a file of detections", do="run the stage 'match' again"):
+    path, what, do = folder / DETECTIONS, "a file of detections", "run the stage 'match' again"
+    arrays = read_arrays(path, "", what, ARRAYS, do=do)
+    with restoring(path, what, do=do):
         text = arrays["model"].astype(np.uint8).tobytes().decode()
         model = DistortionModel.from_dict(json_of(text, str(path)))
         detections = replace(

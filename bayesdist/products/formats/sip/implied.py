@@ -121,9 +121,9 @@ def implied_values(sip: SipHeader, size: tuple[int, int] | None = None) -> tuple
     unmet = {p for p in "AB" if maxima is not None and not maxima.met(p)}
     found, scores = [], []
     for family, order, terms in families(sip):
-        for powers in (k for k in terms if sum(k) <= order):
+        used = [powers for powers in terms if sum(powers) <= order]
+        for powers, (posterior, score) in zip(used, closure.solved(family, used), strict=True):
             keyword = sip_keyword(family, *powers)
-            posterior, score = closure.solved(sip, family, powers)
             share, sources = 1.0, ["A, B" if family in ("AP", "BP") else "AP, BP"]
             nodes = posterior.nodes
             if maxima is not None and family in ("A", "B"):
@@ -143,7 +143,7 @@ def implied_values(sip: SipHeader, size: tuple[int, int] | None = None) -> tuple
             printed,
             float(nodes.mean()),
             float(nodes.std()),
-            (float(np.quantile(nodes, 0.025)), float(np.quantile(nodes, 0.975))),
+            tuple(np.quantile(nodes, (0.025, 0.975)).tolist()),
             float(p),
             sources,
         )
@@ -166,9 +166,10 @@ def _cut(t: _Student, intervals: list[tuple[float, float]]) -> tuple[float, Floa
 class _Closure:
     """Projection of closures on orthonormal Legendre products, by Gauss-Legendre quadrature."""
 
-    x: Float
-    y: Float
-    projector: Float  # (K, N)
+    sip: SipHeader
+    pixels: tuple[Float, Float]  # (N,)
+    forth: tuple[Float, Float]  # corrected offsets (N,) of these pixels, by A and B
+    projector: Float  # (N, K)
     odd: Bool  # (2 K,): components of odd total degree
 
     @classmethod
@@ -180,43 +181,57 @@ class _Closure:
         i, j = np.array(polynomial_terms(order)).T
         values = legendre.legvander(X, order)[:, i] * legendre.legvander(Y, order)[:, j]
         values *= np.sqrt((2 * i + 1) * (2 * j + 1))
+        values *= np.outer(w, w).ravel()[:, None] / 4
         x, y = ((n + 1) / 2 + n / 2 * T for n, T in zip(size, (X, Y), strict=True))
-        return cls(
-            x, y, (values * np.outer(w, w).ravel()[:, None] / 4).T, np.tile(i + j, 2) % 2 > 0
-        )
+        return cls(sip, (x, y), sip.forward(x, y), values, np.tile(i + j, 2) % 2 > 0)
 
-    def components(self, sip: SipHeader) -> Float:
-        """Components (2 K,) of the closure along x, then y; pixels."""
-        back_x, back_y = sip.inverse(*sip.forward(self.x, self.y))
+    def components(self, family: str, moves: Float) -> Float:
+        """Components (n, 2 K) of closures along x, then y; pixels.
+
+        In each of them the polynomial of a family has further values: `moves` (n, N).
+        """
+        more: dict[str, Float | float] = dict.fromkeys(("A", "B", "AP", "BP"), 0.0)
+        more[family] = moves
+        x, y = self.sip.inverse(self.forth[0] + more["A"], self.forth[1] + more["B"])
+        backs = (x + more["AP"] - self.pixels[0], y + more["BP"] - self.pixels[1])
         return np.concatenate(
-            [self.projector @ (back_x - self.x), self.projector @ (back_y - self.y)]
+            [np.broadcast_to(back, moves.shape) @ self.projector for back in backs], axis=1
         )
 
-    def solved(
-        self, sip: SipHeader, family: str, powers: tuple[int, int]
-    ) -> tuple[_Student, float]:
-        """Distribution of one coefficient, and the logarithm of its evidence."""
-        keyword = sip_keyword(family, *powers)
-
-        def components(value: float) -> Float:
-            return self.components(with_coefficient(sip, keyword, value))
-
-        reach = np.ptp(self.x) / 2, np.ptp(self.y) / 2
-        step = 0.1 / (reach[0] ** powers[0] * reach[1] ** powers[1])  # a tenth of a pixel
-        value = getattr(sip, family.lower())[powers]
-        rest = components(value)
-        mask = self.odd if sum(powers) % 2 else ~self.odd
-        d = ((components(value + step) - rest) / step)[mask]
-        for _ in range(_STEPS):  # with one slope: a distortion is nearly linear in its coefficients
-            value -= (d @ rest[mask]) / (d @ d)
-            rest = components(value)
+    def solved(self, family: str, powers: list[tuple[int, int]]) -> list[tuple[_Student, float]]:
+        """Distribution of each coefficient of a family, and the logarithm of its evidence."""
         from scipy.special import betaln
 
-        dof = int(mask.sum()) - 1
-        inside, outside = (float(r @ r) + r.size * _ROUNDING**2 for r in (rest[mask], rest[~mask]))
-        score = betaln(0.5, dof / 2) - dof / 2 * np.log(inside)
-        score -= (~mask).sum() / 2 * np.log(outside)
-        return _Student(dof, float(value), float(np.sqrt(inside / dof / (d @ d)))), float(score)
+        pixels = [one - middle for one, middle in zip(self.pixels, self.sip.crpix, strict=True)]
+        i, j = np.reshape(powers, (-1, 2)).T
+        u, v = self.forth if family in ("AP", "BP") else pixels
+        monomials = u ** i[:, None] * v ** j[:, None]
+
+        def components(changes: Float) -> Float:
+            return self.components(family, changes[:, None] * monomials)
+
+        width, height = (np.ptp(one) / 2 for one in self.pixels)
+        step = 0.1 / (width**i * height**j)  # a tenth of a pixel
+        mask = self.odd == ((i + j) % 2 > 0)[:, None]
+        changes = np.zeros(len(powers))
+        rest = components(changes)
+        d = np.where(mask, components(step) - rest, 0.0) / step[:, None]
+        norm = (d**2).sum(axis=1)
+        for _ in range(_STEPS):  # with one slope: a distortion is nearly linear in its coefficients
+            changes -= (d * rest).sum(axis=1) / norm
+            rest = components(changes)
+        n_inside, n_outside = mask.sum(axis=1), (~mask).sum(axis=1)
+        dof = n_inside - 1
+        inside = np.where(mask, rest**2, 0.0).sum(axis=1) + n_inside * _ROUNDING**2
+        outside = np.where(mask, 0.0, rest**2).sum(axis=1) + n_outside * _ROUNDING**2
+        score = betaln(0.5, dof / 2) - dof / 2 * np.log(inside) - n_outside / 2 * np.log(outside)
+        printed = getattr(self.sip, family.lower())
+        return [
+            (_Student(int(n), printed[k] + float(change), float(scale)), float(one))
+            for k, n, change, scale, one in zip(
+                powers, dof, changes, np.sqrt(inside / dof / norm), score, strict=True
+            )
+        ]
 
 
 @dataclass(frozen=True, eq=False)
