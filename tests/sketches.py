@@ -42,6 +42,7 @@ def quick() -> Iterator[None]:
     Posteriors leave out what those of large runs do, the likelihood of each star at each draw: a
     fifth of a small run, and tests/infer/posterior/test_files looks at it.  Structure that a fit
     leaves out is integrated over a coarse grid of its sizes: a tenth, which tests/diagnose tests.
+    Requirements are followed through time at few dates.
     """
     structure = "bayesdist.diagnose.correlated.structure"
     with (
@@ -49,6 +50,7 @@ def quick() -> Iterator[None]:
         patch("bayesdist.infer.posterior.files.LARGEST", 0),
         patch(f"{structure}.LENGTHS", np.geomspace(0.02, 0.6, 3)),
         patch(f"{structure}.HALVINGS", 2),
+        patch("bayesdist.assess.evaluation.VALIDITY_EPOCHS", 10),
     ):
         yield
 

@@ -22,7 +22,7 @@ PAGE = DOCS / "new_instrument.md"
 FILE = "megacam_gaia/megacam744331p_gaiadr1_pairs_8arcsec.csv"
 POSITIONS = [f"{z}_{which}_arcsec" for which in ("hdrwcs", "gaia") for z in "xy"]
 MIDDLE = ((-640.4, 148.0), (-950.0, -40.0))  # arcsec: two CCDs side by side
-FEW_DRAWS = "[sampler]\nmax_steps = 100\n"
+FEW_DRAWS = "[sampler]\nmax_steps = 20\n"
 
 
 def named_blocks() -> dict[str, str]:

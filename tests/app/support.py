@@ -213,12 +213,18 @@ def edit(config: Path, changes: Mapping[str, str]) -> Path:
     return config
 
 
-def write_job(folder: Path, table: Table | None = None, **sections: Any) -> Path:
-    """stars.ecsv and config.toml in a folder; the configuration's path."""
+def write_job(
+    folder: Path, table: Table | None = None, *, stars: str = "stars.ecsv", **sections: Any
+) -> Path:
+    """A table of stars and config.toml in a folder; the configuration's path.
+
+    Thousands of stars are written and read in a moment where `stars` is no text.
+    """
     folder.mkdir(parents=True, exist_ok=True)
     table = as_table(simulated()[0]) if table is None else table
-    table.write(folder / "stars.ecsv")
-    return write_config(folder / "config.toml", **({"budget": [EXACT]} | sections))
+    table.write(folder / stars)
+    known = {"budget": [EXACT], "data": {"matches": stars}}
+    return write_config(folder / "config.toml", **(known | sections))
 
 
 def begin(folder: Path, config: Path) -> Path:

@@ -62,7 +62,8 @@ def test_a_fit_that_is_read_gives_the_same_stars(data, tmp_path):
     path = write_job(
         tmp_path / "input",
         table,
-        data={"matches": "stars.ecsv", **data},
+        stars="stars.parquet",
+        data={"matches": "stars.parquet", **data},
         holdout={"fraction": 0.3},
     )
     config, _ = load_config(path)

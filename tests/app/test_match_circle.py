@@ -35,7 +35,7 @@ def in_circles(n=1500, about=(0.03, -0.02)):
 def test_a_run_knows_of_the_circle(tmp_path, no_report):
     table, truth = in_circles()
     outliers = {"model": "none", "match_radius": RADIUS}
-    config = write_job(tmp_path, table, outliers=outliers)
+    config = write_job(tmp_path, table, stars="stars.parquet", outliers=outliers)
     said = good("check", config).out
     # a side of the distribution is cut off at 0.7 sigma: the variance that is left is half of it
     assert "the match circle cuts the residuals" in said
@@ -47,8 +47,8 @@ def test_a_run_knows_of_the_circle(tmp_path, no_report):
     assert not any("quoted errors are too large" in text for text in summary["warnings"])
     # and without the nominal positions: the least-squares answer
     plain = write_job(
-        tmp_path / "plain", table, outliers=outliers,
-        data={"matches": "stars.ecsv", "columns": {"u_nominal": "", "v_nominal": ""}},
+        tmp_path / "plain", table, stars="stars.parquet", outliers=outliers,
+        data={"matches": "stars.parquet", "columns": {"u_nominal": "", "v_nominal": ""}},
     )  # fmt: skip
     good("run", plain, "-o", tmp_path / "plain" / "run")
     other = summary_of(tmp_path / "plain" / "run")

@@ -33,7 +33,7 @@ def job(tmp_path_factory):
     """Pairs of order 2 with equal errors and without false ones; the configuration says 3."""
     matches, _ = simulated(20_000, fraction=0.0, jitter=0.0)
     folder = tmp_path_factory.mktemp("order")
-    config = write_job(folder, as_table(matches), model={"order": 3})
+    config = write_job(folder, as_table(matches), stars="stars.parquet", model={"order": 3})
     result = good(
         "select-order",
         config,
@@ -117,8 +117,8 @@ def test_errors_by_magnitude_are_found_on_the_way(tmp_path):
     table = as_table(matches)
     table.remove_columns(["sigma_u", "sigma_v"])
     config = write_job(
-        tmp_path, table, data={"matches": "stars.ecsv", "sigma": "by_magnitude"},
-        model={"order": 1},
+        tmp_path, table, stars="stars.parquet", model={"order": 1},
+        data={"matches": "stars.parquet", "sigma": "by_magnitude"},
     )  # fmt: skip
     good("select-order", config, "--orders", 1, 4, "-o", tmp_path / "o.ecsv")
     out = Table.read(tmp_path / "o.ecsv")

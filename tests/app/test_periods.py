@@ -73,7 +73,7 @@ def job(folder, matches, **sections):
 
 
 def assessed(folder, matches, **sections):
-    config = job(folder / "input", matches, **sections)
+    config = job(folder / "input", matches, stars="stars.parquet", **sections)
     return partly_run(folder / "run", config, "fit", "sample", "assess")
 
 
@@ -94,6 +94,7 @@ def moved(tmp_path_factory):
     config = job(
         folder / "input",
         matches,
+        stars="stars.parquet",
         requirement=[
             {"name": "loose", "statistic": "rms", "limit": 0.5},
             {"name": "tight", "statistic": "max", "limit": 0.1, "unit": "mas"},

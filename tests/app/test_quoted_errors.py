@@ -29,7 +29,7 @@ def stars(factor, n=800):
 
 def job(folder, factor):
     folder.mkdir()
-    return write_job(folder, stars(factor), model={"order": 3})
+    return write_job(folder, stars(factor), stars="stars.parquet", model={"order": 3})
 
 
 def summary_of(folder, factor):

@@ -117,7 +117,7 @@ def stars(n: int = 3000, epochs=EPOCHS) -> Table:
 @pytest.fixture(scope="module")
 def run(tmp_path_factory):
     folder = tmp_path_factory.mktemp("chips")
-    config = write_job(folder / "input", stars(), **SETTINGS)
+    config = write_job(folder / "input", stars(), stars="stars.parquet", **SETTINGS)
     good("run", config, "-o", folder / "run")
     return folder / "run"
 

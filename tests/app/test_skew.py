@@ -33,7 +33,8 @@ def angle(model, theta):
     x, y = CENTRE
     places = np.array([[x + 1, y], [x - 1, y], [x, y + 1], [x, y - 1]])
     p = model.predict(theta, *places.T)
-    of_x, of_y = (np.arctan2(*(p[k] - p[k + 1])[::-1]) for k in (0, 2))
+    steps = (p[..., k, :] - p[..., k + 1, :] for k in (0, 2))
+    of_x, of_y = (np.arctan2(step[..., 1], step[..., 0]) for step in steps)
     return of_y - of_x - np.pi / 2
 
 
@@ -44,7 +45,8 @@ def pair(tmp_path_factory):
     table = as_table(simulated(2000)[0])
     out = []
     for name, fit in (("without", {}), ("with", {"skew": True})):
-        config = write_job(folder / name, table, fit=fit, products={"sip": {}})
+        given = {"fit": fit, "products": {"sip": {}}}
+        config = write_job(folder / name, table, stars="stars.parquet", **given)
         stages = ("fit", "sample", "assess", "export", *(("report",) if fit else ()))
         out.append(partly_run(folder / name / "run", config, *stages))
     return out
@@ -58,7 +60,7 @@ def test_it_is_the_angle_between_the_axes(pair):
     # steps of a pixel see terms of the third order, of which there are none
     assert found["value_rad"] == pytest.approx(angle(fit.model, fit.mean), abs=1e-10)
     draws = fit.draws(4000, np.random.default_rng(1))
-    spread = np.std([angle(fit.model, one) for one in draws])
+    spread = np.std(angle(fit.model, draws))
     assert found["sigma_rad"] == pytest.approx(spread, rel=0.05)
     assert found["significance"] == pytest.approx(found["value_rad"] / found["sigma_rad"])
     truth = angle(model_of(), truth_of(model_of()))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import re
 import warnings
+from functools import lru_cache
 
 import numpy as np
 from astropy.io import fits
@@ -125,10 +126,15 @@ def _written(hdus) -> bytes:
     return out.getvalue()
 
 
+@lru_cache(1)  # many kinds of damage ask for those of one file
+def _extensions(content: bytes) -> list[int]:
+    with _opened(content) as hdus:
+        return [k for k, hdu in enumerate(hdus) if k and hdu.data is not None]
+
+
 def _of_an_extension(**more):
     def arguments(content: bytes):
-        with _opened(content) as hdus:
-            found = [k for k, hdu in enumerate(hdus) if k and hdu.data is not None]
+        found = _extensions(content)
         return st.fixed_dictionaries({"hdu": st.sampled_from(found), **more}) if found else None
 
     return arguments

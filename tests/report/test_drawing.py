@@ -2,9 +2,12 @@
 
 import base64
 import io
+import os
+import pickle
 import re
 from concurrent.futures.process import BrokenProcessPool
 from functools import partial
+from multiprocessing import get_context
 from types import SimpleNamespace
 from xml.etree import ElementTree
 
@@ -189,10 +192,21 @@ def alone(converged):
     return drawing.draw_all(Few, converged)
 
 
-def test_several_processes_draw_what_one_draws(converged, alone, monkeypatch):
+@pytest.mark.filterwarnings("ignore:.*fork")
+def test_several_processes_draw_what_one_draws(converged, alone, monkeypatch, full):
+    """Reduced, they are forks of this one, and need not import anew what draws."""
+    here, render = os.getpid(), drawing.render
+
+    def elsewhere(plot, *options, **more):
+        assert os.getpid() != here, "it was drawn here"
+        return render(plot, *options, **more)
+
     monkeypatch.setattr(drawing, "MIN_FIGURES_SHARED", 1)
-    monkeypatch.setattr(drawing, "render", lambda plot: pytest.fail("it was drawn here"))
-    both = drawing.draw_all(Few, converged, processes=2)
+    monkeypatch.setattr(drawing, "render", elsewhere)
+    if not full:
+        monkeypatch.setattr(drawing, "get_context", lambda _: get_context("fork"))
+    sent = pickle.loads(pickle.dumps(converged))  # as it reaches processes that are no forks
+    both = drawing.draw_all(Few, sent, processes=2)
     assert list(both) == list(alone) and both == alone
 
 

@@ -38,7 +38,7 @@ from tests.app.support import (
 from tests.reduced import only_in_full
 from tests.sketches import quick, sketched
 
-PAIRS = 20_000
+PAIRS = 8_000
 BINS = 9
 BANDS = ("W1", "W4")
 

@@ -207,20 +207,20 @@ def test_an_end_before_it_settled_is_said(scene):
     assert "has NOT settled in 2 rounds" in up.sentence
 
 
-def write_lists(scene, folder):
+def write_lists(scene, folder, end="ecsv"):
     """The two lists as files, and an optical model."""
     for name in ("detections", "reference"):
         stars = getattr(scene, name)
         table = Table({key: getattr(stars, key) for key in ("x", "y", "sigma")})
         table["frame"] = [f"{k:02d}a" for k in stars.exposure]
-        table.write(folder / f"{name}.ecsv")
+        table.write(folder / f"{name}.{end}")
     write_optical_model(folder / "optical.hdr")
-    return folder / "detections.ecsv", folder / "reference.ecsv"
+    return folder / f"detections.{end}", folder / f"reference.{end}"
 
 
 @pytest.mark.parametrize("optical", [case_in_full(False, instead="a start is read as well"), True])
 def test_the_command_gives_the_pairs_of_the_function(scene, ups, tmp_path, optical):
-    lists, out = write_lists(scene, tmp_path), tmp_path / "out"
+    lists, out = write_lists(scene, tmp_path, "parquet"), tmp_path / "out"
     start = ("--optical", tmp_path / "optical.hdr") if optical else ()
     shown = good("wise", "bring-up", *lists, "-o", out, "--band", "W2", "--radius", RULE.centre,
                  "--corner-radius", RULE.corner, *start)  # fmt: skip
@@ -235,8 +235,9 @@ def test_the_command_gives_the_pairs_of_the_function(scene, ups, tmp_path, optic
         np.testing.assert_array_equal(getattr(found.matches, name), getattr(up.matches, name))
 
 
-def test_lists_without_errors_are_refused(scene, tmp_path):
-    detections, reference = write_lists(scene, tmp_path)
+def test_lists_without_errors_are_refused(tmp_path):
+    few = simulate_unpaired(2, rng=np.random.default_rng(8), density=2e-4)
+    detections, reference = write_lists(few, tmp_path)
     table = Table.read(detections)
     table.remove_column("sigma")
     table.write(detections, overwrite=True)
