@@ -263,7 +263,7 @@ def test_covariance_over_filters_by_steps(solutions) -> None:
         ).covariance, o
 
     rng = np.random.default_rng(6)
-    steps_a, steps_b = (1e-4 * rng.normal(size=(4, base.mean.size)) for _ in range(2))
+    steps_a, steps_b = (1e-4 * rng.normal(size=(2, base.mean.size)) for _ in range(2))
     few_a = replace(base, cov=steps_a.T @ steps_a)
     few_b = replace(other, cov=steps_b.T @ steps_b)
     table, o = made(few_a, few_b)

@@ -185,9 +185,9 @@ class _Closure:
             x, y, (values * np.outer(w, w).ravel()[:, None] / 4).T, np.tile(i + j, 2) % 2 > 0
         )
 
-    def components(self, sip: SipHeader) -> Float:
-        """Components (2 K,) of the closure along x, then y; pixels."""
-        back_x, back_y = sip.inverse(*sip.forward(self.x, self.y))
+    def components(self, sip: SipHeader, there: tuple[Float, Float]) -> Float:
+        """Components (2 K,) of the closure along x, then y, with the pixels `there`; pixels."""
+        back_x, back_y = sip.inverse(*there)
         return np.concatenate(
             [self.projector @ (back_x - self.x), self.projector @ (back_y - self.y)]
         )
@@ -197,9 +197,12 @@ class _Closure:
     ) -> tuple[_Student, float]:
         """Distribution of one coefficient, and the logarithm of its evidence."""
         keyword = sip_keyword(family, *powers)
+        there = sip.forward(self.x, self.y)
 
         def components(value: float) -> Float:
-            return self.components(with_coefficient(sip, keyword, value))
+            changed = with_coefficient(sip, keyword, value)
+            moved = changed.forward(self.x, self.y) if family in ("A", "B") else there
+            return self.components(changed, moved)
 
         reach = np.ptp(self.x) / 2, np.ptp(self.y) / 2
         step = 0.1 / (reach[0] ** powers[0] * reach[1] ** powers[1])  # a tenth of a pixel
