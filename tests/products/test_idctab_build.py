@@ -118,7 +118,7 @@ def with_time(terms, breaks=(), sigma: float = 1.0) -> StandIn:
 
 
 def test_covariance_is_that_of_the_numbers_in_the_file() -> None:
-    """Every number is linear in the parameters: steps of all of them give the covariance exactly."""
+    """Every number is linear in the parameters: steps of all give the covariance exactly."""
     terms = (("u", 1, 0), ("v", 1, 0), ("v", 0, 1))
     given = with_time(terms)
     steps = np.random.default_rng(9).normal(size=(8, given.mean.size))
