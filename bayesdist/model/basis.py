@@ -53,15 +53,19 @@ def polynomial_values(coefficients: Float, x: ArrayLike, y: ArrayLike) -> Float:
     """
     x, y = np.broadcast_arrays(np.asarray(x, float), np.asarray(y, float))
     out = np.zeros(x.shape)
-    for row in coefficients[::-1]:
+    for row in coefficients[::-1].tolist():  # at few points numpy takes longer for a row than for y
         out *= x
-        used = np.flatnonzero(row)
-        if not used.size:
+        while row and row[-1] == 0.0:
+            row.pop()
+        if not row:
             continue
-        inner = np.full(x.shape, row[used[-1]])
-        for value in row[: used[-1]][::-1]:
+        inner = row.pop()
+        if row:
+            inner = inner * y
+            inner += row.pop()
+        while row:
             inner *= y
-            inner += value
+            inner += row.pop()
         out += inner
     return out
 

@@ -66,8 +66,8 @@ def test_errors_alone_make_a_chi_square(keep, rng) -> None:
     """Of pairs in other frames, orders, units: chi-square(dof), and p-values that are uniform."""
     A, B = covariance(2 * BASIS.n_terms, 1), covariance(2 * LOW.n_terms, 2)
     turn, mirror, unit = (1.0, False, "pix") if keep else (0.05 * np.exp(2.3j), True, "arcsec")
-    values, dofs, p_z, p_map, pulls = [], set(), [], [], []
-    for _ in range(200):
+    values, dofs, p_z, p_map, pulls, n = [], set(), [], [], [], 120
+    for _ in range(n):
         a = drawn(rng, truth(), A)
         b, B_moved = moved(
             drawn(rng, truth()[:, : LOW.n_terms], B), B, turn, 0j if keep else 7, mirror
@@ -92,9 +92,9 @@ def test_errors_alone_make_a_chi_square(keep, rng) -> None:
     assert dofs == {30 if keep else 26}
     assert kstest(values, chi2(dofs.pop()).cdf).pvalue > 1e-3
     for p in (p_z, p_map):  # multiples of 1 / 100: made continuous, else the test sees the steps
-        assert kstest(np.array(p) - rng.uniform(size=200) / 100, "uniform").pvalue > 1e-3
+        assert kstest(np.array(p) - rng.uniform(size=n) / 100, "uniform").pvalue > 1e-3
     for pull in np.transpose(pulls):
-        assert (pull**2).sum() == pytest.approx(200, abs=3.3 * np.sqrt(2 * 200))
+        assert (pull**2).sum() == pytest.approx(n, abs=3.3 * np.sqrt(2 * n))
 
 
 def test_shift_rotation_and_scale_are_told_and_taken_out(rng) -> None:

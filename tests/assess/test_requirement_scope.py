@@ -98,10 +98,12 @@ def test_a_common_offset_is_no_relative_error(solution_of):
 @pytest.mark.parametrize("statistic", ["max", case_in_full("u_max", instead="max is judged")])
 def test_the_largest_relative_error_of_a_scale_is_that_from_edge_to_edge(solution_of, statistic):
     solution = with_sigma(solution_of, FLAT, u_1_0=S)
-    m = margin_of(solution, Requirement("r", statistic, 1.5 * S, relative=True))
-    assert near(m.probability_met, 4000, stats.halfnorm(scale=2 * S * EDGE).cdf(1.5 * S))
-    m = margin_of(solution, Requirement("r", statistic, 0.2 * S, relative=True, separation=10.0))
-    assert near(m.probability_met, 4000, stats.halfnorm(scale=0.2 * S * EDGE).cdf(0.2 * S))
+    n = 1500
+    m = margin_of(solution, Requirement("r", statistic, 1.5 * S, relative=True), n_draws=n)
+    assert near(m.probability_met, n, stats.halfnorm(scale=2 * S * EDGE).cdf(1.5 * S))
+    near_by = Requirement("r", statistic, 0.2 * S, relative=True, separation=10.0)
+    m = margin_of(solution, near_by, n_draws=n)
+    assert near(m.probability_met, n, stats.halfnorm(scale=0.2 * S * EDGE).cdf(0.2 * S))
 
 
 def test_relative_random_errors_are_those_of_two_stars(solution_of):

@@ -57,7 +57,7 @@ def start(x, y, chip, epoch):
     return np.column_stack([x, y + np.where(chip == 1, GAP[1], 0.0)])
 
 
-def campaign(rng, n, *, stars=12_000, side=6000.0, motion=0.01, **options):
+def campaign(rng, n, *, stars=5000, side=6000.0, motion=0.01, **options):
     """Catalogue, lists, log, and the true rows of each list."""
     uv, mag = positions(rng, stars, side)
     pm = rng.normal(0, motion, (2, stars))

@@ -349,14 +349,15 @@ def test_large_row_groups_are_split_evenly(rng, tmp_path, monkeypatch):
 
 # -- bad input ------------------------------------------------------------------------------------
 
-N, GROUP = 100_000, 10_000
-BAD_ROW = 76_543  # counted from 1: in row group 8 of 10
+N, GROUP = 10_000, 1000
+BAD_ROW = 7_654  # counted from 1: in row group 8 of 10
 
 
 @pytest.fixture(scope="module")
 def good():
     rng = np.random.default_rng(4)
-    return stars(rng, N, mag=rng.uniform(8, 15, N), exp=np.array(["a", "b"])[np.arange(N) // 50000])
+    exposure = np.tile(["a", "b"], N // 2)
+    return stars(rng, N, mag=rng.uniform(8, 15, N), exp=exposure)
 
 
 def planted(good, name, value):
@@ -424,7 +425,7 @@ def test_a_damaged_row_group_is_named(good, tmp_path, column, use_dictionary):
     path = write(tmp_path / "a.parquet", good, group=GROUP, use_dictionary=use_dictionary)
     opened = open_matches(path)
     flipped(path, 6, column)
-    where = r"a\.parquet, row group 7 of 10 \(rows 60001 to 70000\): cannot be read"
+    where = r"a\.parquet, row group 7 of 10 \(rows 6001 to 7000\): cannot be read"
     with pytest.raises(FormatError, match=where) as raised:
         open_matches(path)
     assert_one_sentence(raised)
@@ -503,24 +504,24 @@ def test_empty_parts(rng, tmp_path):
 def test_a_repeated_row_names_both_places(good, tmp_path, monkeypatch):
     """In another file, and whatever the errors say; in as many buckets as the memory asks for."""
     write(tmp_path / "p0.parquet", good, group=GROUP)
-    again = {k: v[:20_000] for k, v in good.items()}
+    again = {k: v[:2000] for k, v in good.items()}
     rng = np.random.default_rng(5)
-    again |= {k: rng.uniform(1, 100, 20_000) for k in "xyuv"}
+    again |= {k: rng.uniform(1, 100, 2000) for k in "xyuv"}
     for k in "xyuv":
-        again[k][15_320] = good[k][43_209]
+        again[k][1532] = good[k][4320]
     write(tmp_path / "p1.parquet", again, group=GROUP)
     where = (
-        r"p1\.parquet, row group 2 of 2, row 15321: repeats "
-        r".*p0\.parquet, row group 5 of 10, row 43210:"
+        r"p1\.parquet, row group 2 of 2, row 1533: repeats "
+        r".*p0\.parquet, row group 5 of 10, row 4321:"
     )
-    for held in (duplicates_module.HELD, 50_000, 7_000):
+    for held in (duplicates_module.HELD, 5000, 700):
         monkeypatch.setattr(duplicates_module, "HELD", held)
         with pytest.raises(InputError, match=where):
             open_matches(tmp_path)
     # measured in another exposure, it is another measurement
-    again["exp"] = np.full(20_000, "c")
+    again["exp"] = np.full(2000, "c")
     write(tmp_path / "p1.parquet", again, group=GROUP)
-    assert len(open_matches(tmp_path)) == N + 20_000
+    assert len(open_matches(tmp_path)) == N + 2000
 
 
 def test_signed_zeros_are_equal_on_disk_too(tmp_path):

@@ -17,7 +17,7 @@ from bayesdist.model import Chip
 CHIP = Chip(1, "A", (512.0, 512.0), (256.0, 256.0))
 STEP, FINE = (128.0, 128.0), (16.0, 16.0)
 ORDER, STARS, EXPOSURES, SIGMA = 2, 9000, 12, 0.03
-DETECTORS = 12
+DETECTORS = 8
 
 
 @lru_cache(maxsize=1)
@@ -80,7 +80,7 @@ def measured(kind, seed):
 
 @pytest.mark.parametrize("kind", ["fine", "nodes"])
 def test_the_mean_square_is_the_true_one_within_its_error(kind):
-    """Of 12 detectors and two axes: neither bias nor errors of the wrong size."""
+    """Of eight detectors and two axes: neither bias nor errors of the wrong size."""
     found = [measured(kind, seed) for seed in range(DETECTORS)]
     pull = np.concatenate([(seen.square - true) / seen.error for seen, true in found])
     n = len(pull)

@@ -7,6 +7,7 @@ import pytest
 
 from bayesdist.diagnose import score_tests
 from bayesdist.infer import Rejection, fit_linear
+from tests.reduced import case_in_full
 
 from ..infer.support import residual_of
 from .support import SIGMA, Scene, by_name, student, unequal
@@ -28,8 +29,14 @@ def truncation(table, solution, **options):
     return by_name(score_tests(table, solution, **options))["truncation"]
 
 
-@pytest.mark.parametrize(("n", "sigmas"), [(800, 2.4), (4000, 3.0), (60_000, 4.0)])
-@pytest.mark.parametrize("known", [True, False])
+@pytest.mark.parametrize(
+    ("n", "sigmas", "known"),
+    [
+        *((n, sigmas, known) for n, sigmas in ((800, 2.4), (4000, 3.0)) for known in (True, False)),
+        (60_000, 4.0, False),
+        case_in_full(60_000, 4.0, True, instead="a radius that is not known is found"),
+    ],
+)
 def test_cuts_are_recognised(n, sigmas, known):
     """As far as stars are missing: beyond 4 sigma, 20 of 60,000."""
     radius = sigmas * SIGMA if known else None

@@ -150,7 +150,7 @@ def test_derivatives_are_those_of_the_fit(truth) -> None:
 
 def test_error_of_the_reference_is_what_its_terms_scatter_by(truth) -> None:
     """Maps whose terms are all wrong by the same amount: the stated covariance covers."""
-    n, sigma = 150, 4e-3
+    n, sigma = 80, 4e-3
     rng = np.random.default_rng(8)
     i, j = np.array(truth.model.basis(2).terms).T
     norm = np.sqrt((2 * i + 1) * (2 * j + 1))  # to functions of mean square 1 over the chip

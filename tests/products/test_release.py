@@ -22,6 +22,7 @@ from bayesdist.products import idctab_from_solution, lint_idctab, read_idctab
 from bayesdist.products.formats.idctab.drift import storable
 from bayesdist.products.formats.idctab.hst import combination_of
 from bayesdist.products.release import Period, Release, write_release
+from tests.reduced import case_in_full
 
 from .acs_offline import Pointing, to_sky
 from .acs_offline import corrected as corrected_by_stwcs
@@ -117,7 +118,13 @@ class Sky:
 
 @pytest.mark.parametrize(
     ("date", "period"),
-    [("2003-01-01", "pre"), ("2008-07-01", "pre"), ("2010-01-01", "post"), ("2014-01-01", "post")],
+    [
+        *[("2003-01-01", "pre"), ("2014-01-01", "post")],
+        *(
+            case_in_full(*one, instead="a date of each period is run")
+            for one in (("2008-07-01", "pre"), ("2010-01-01", "post"))
+        ),
+    ],
 )
 def test_stwcs_sees_the_sky_of_our_model(
     date, period, release, solutions, orientation, tables, tmp_path
@@ -263,7 +270,7 @@ def test_covariance_over_filters_by_steps(solutions) -> None:
         ).covariance, o
 
     rng = np.random.default_rng(6)
-    steps_a, steps_b = (1e-4 * rng.normal(size=(4, base.mean.size)) for _ in range(2))
+    steps_a, steps_b = (1e-4 * rng.normal(size=(2, base.mean.size)) for _ in range(2))
     few_a = replace(base, cov=steps_a.T @ steps_a)
     few_b = replace(other, cov=steps_b.T @ steps_b)
     table, o = made(few_a, few_b)

@@ -36,12 +36,13 @@ def imager(
 
 
 def tables(size: tuple[float, float], *filters: str) -> tuple[LookupTable, ...]:
-    """Tables of 0.05 pixels with errors, one for each filter."""
+    """Tables of 0.05 pixels with errors, one for each filter; of few nodes, as asdf is slow."""
     rng = np.random.default_rng(8)
-    n = int(size[0]) // 64, int(size[1]) // 64
+    step = 256
+    first, n = (step + 1) / 2, [int(side) // step for side in size]
     return tuple(
         LookupTable(
-            1, 0.05 * rng.normal(size=(2, n[1], n[0])), name,
+            1, 0.05 * rng.normal(size=(2, n[1], n[0])), name, (first, first), (step, step),
             sigma=rng.uniform(0.001, 0.01, (2, n[1], n[0])),
         )
         for name in filters

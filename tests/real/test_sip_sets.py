@@ -68,11 +68,11 @@ def test_both_directions_are_those_of_astropy(sets) -> None:
 
 
 def test_written_headers_come_back_and_astropy_reads_them(sets, tmp_path, full) -> None:
-    """All sets, or one in five and the odd orders."""
+    """All sets, or one in twenty-five and the odd orders."""
     x, y = random_pixels(SIZE, 100)
     path = tmp_path / "tess.hdr"
     for number, one in enumerate(sets):
-        if not full and number % 5 and one.sip.order[0] <= 5:
+        if not full and number % 25 and one.sip.order[0] <= 5:
             continue
         write_sip(one.sip, path)
         back = read_sip(path)
@@ -87,13 +87,15 @@ def test_written_headers_come_back_and_astropy_reads_them(sets, tmp_path, full) 
 
 
 def test_turned_headers_agree_with_astropy_at_turned_pixels(sets, full) -> None:
-    """All sets, or one in five, each in one of the eight orientations; some of them in all."""
+    """All sets, or one in twenty-five, each in one of the eight orientations; some in all."""
     x, y = random_pixels(SIZE, 50)
     for number, one in enumerate(sets):
         whole = (one.sector == 13 and full) or one.sip.order[0] > 5
-        if not full and number % 5 and not whole:
+        if not full and number % 25 and not whole:
             continue
         before = by_astropy(one, x, y)
+        if whole:
+            sky = astropy_wcs(sip_header(one.sip)).all_pix2world(x, y, 1)
         for k, (turn, mirror) in enumerate(TURNS):
             if not whole and k != number % len(TURNS):
                 continue
@@ -105,7 +107,6 @@ def test_turned_headers_agree_with_astropy_at_turned_pixels(sets, full) -> None:
                 after = astropy_wcs(sip_header(turned))
                 found = after.sip_pix2foc(np.stack(at, axis=1), 1).T
                 assert_allclose(found, expected, atol=EXACT, rtol=0)
-                sky = astropy_wcs(sip_header(one.sip)).all_pix2world(x, y, 1)
                 assert_allclose(after.all_pix2world(*at, 1), sky, atol=1e-13 * 360, rtol=0)
 
 

@@ -83,7 +83,8 @@ def epoch_shift(table: Matches, solution: Solution) -> EpochShift | None:
         return None
     residual, P = _left_over(sample, known * sample.inlier, sample.residual, motion)
     grid = np.linspace(-FARTHEST, FARTHEST, STEPS)
-    sizes = [float(np.median(np.abs((residual + dt * P)[:, known]))) for dt in grid]
+    seen, moved = residual[:, known], P[:, known]
+    sizes = [float(np.median(np.abs(seen + dt * moved))) for dt in grid]
     dt = float(grid[int(np.argmin(sizes))])
     before = _scatter(residual[:, known])
     weight = information = np.zeros(0)

@@ -58,6 +58,7 @@ LEAST_ACCEPTED = 1e-3
 
 SHARES = np.concatenate([[0.0], np.geomspace(1e-4, 1.0, 9)])  # prior sd: linear terms over core
 STRENGTHS = np.geomspace(1e-9, 1e5, 43)  # of the ridge, for each pilot
+LEAST_FREE = 1e-6  # of a pilot's residual, from which it counts as predicted by the others
 
 
 @dataclass(frozen=True, eq=False)
@@ -206,16 +207,18 @@ def _ridge(core: Float, linear: Float, y: Float) -> Float:
         # in the space of the pilots: there may be more features than pilots
         values, U = np.linalg.eigh(core @ core.T + share**2 * (linear @ linear.T))
         values, along = np.maximum(values, 0.0), U.T @ y
-        for strength in n * STRENGTHS:
-            left = strength / (values + strength)
-            free = U**2 @ left - 1 / n  # of each residual; the constant is fitted too
-            if free.min() < 1e-6:
-                continue  # a pilot that determines its own value gives no information about others
-            error = float((((U @ (left * along)) / free) ** 2).sum())
-            if error < least:
-                dual = U @ (along / (values + strength))
-                best = np.concatenate([core.T @ dual, share**2 * (linear.T @ dual)])
-                least = error
+        strengths = n * STRENGTHS
+        left = strengths / (values[:, None] + strengths)
+        free = U**2 @ left - 1 / n  # of each residual; the constant is fitted too
+        misses = (U @ (left * along[:, None])) / np.maximum(free, LEAST_FREE)
+        errors = (misses**2).sum(axis=0)
+        # a pilot that determines its own value gives no information about others
+        errors[free.min(axis=0) < LEAST_FREE] = np.inf
+        k = int(np.argmin(errors))
+        if errors[k] < least:
+            dual = U @ (along / (values + strengths[k]))
+            best = np.concatenate([core.T @ dual, share**2 * (linear.T @ dual)])
+            least = float(errors[k])
     return best
 
 

@@ -45,7 +45,7 @@ def test_area_is_that_of_a_pixel_mapped_by_the_model(cubic):
 
 def test_sigma_is_the_scatter_of_areas(cubic):
     m = area_map(cubic, grid=(4, 3))
-    n = 1500
+    n = 500
     X, Y = (a.ravel() for a in np.meshgrid(m.x, m.y))
     areas = []
     for theta in cubic.draws(n, np.random.default_rng(5)):

@@ -18,6 +18,7 @@ from bayesdist.infer.selfcal.mode import SelfCalibrationMode, gauge_of, mode_at,
 from bayesdist.infer.selfcal.problem import Problem
 from bayesdist.model import TimeDependence
 from tests.infer.selfcal.fields import field, problem_of
+from tests.reduced import case_in_full
 
 NO_FALSE = Mixture(0.0, 1e-300)
 
@@ -81,8 +82,20 @@ def with_drift(simulated):
     return replace(simulated, model=replace(model, time=time), theta=theta)
 
 
-@pytest.mark.parametrize("motion", ["none", "proper_motion", "parallax"])
-@pytest.mark.parametrize("kind", ["one chip", "two chips", "scale", "drift"])
+@pytest.mark.parametrize(
+    ("kind", "motion"),
+    [
+        *((kind, "none") for kind in ("one chip", "two chips", "scale", "drift")),
+        *[("one chip", "proper_motion"), ("two chips", "parallax")],
+        *(
+            case_in_full(kind, motion, instead="each motion is run, and each kind without any")
+            for kind, motion in (
+                *[("two chips", "proper_motion"), ("one chip", "parallax")],
+                *((kind, m) for kind in ("scale", "drift") for m in ("proper_motion", "parallax")),
+            )
+        ),
+    ],
+)
 def test_sums_are_those_with_all_stars_explicit(kind, motion, rng):
     simulated = field(
         1,

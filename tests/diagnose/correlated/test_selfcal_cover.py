@@ -38,7 +38,7 @@ def waves(rng, length):
 def solved(seed: int, rms: float):
     """The solution of a field with structure, the field and the structure at scaled positions."""
     rng = np.random.default_rng(900 + seed)
-    simulated = field(seed, 12, 2500, sigma=0.02, disturbed=0.02)
+    simulated = field(seed, 12, 1200, sigma=0.02, disturbed=0.02)
     structure, size = waves(rng, 0.5), rms
     d = simulated.detections
     X, Y = (2 * z / SIZE[0] - (SIZE[0] + 1) / SIZE[0] for z in (d.x, d.y))

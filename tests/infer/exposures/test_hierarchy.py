@@ -137,7 +137,7 @@ def test_draws_of_tau_are_its_posterior(full):
         b = true * rng.standard_normal(n) + 1e-6 * rng.standard_normal(n)
         scatter = dense(("scale",), np.zeros(n, int), S, S @ b, 1e-4)
         x = np.linspace(-30, -5, 1501)
-        density = np.array([scatter.log_density(np.exp([t])) for t in x])
+        density = scatter.log_densities(np.exp(x[:, None]))
         cdf = np.cumsum(np.exp(density - density.max()))
         draws = np.log(scatter.draws(4000 if full else 1500, rng)[:, 0])
         p = np.interp(draws, x, cdf / cdf[-1])
@@ -157,7 +157,8 @@ def test_kinds_that_are_hard_to_tell_apart_are_sampled_by_a_chain(monkeypatch):
     b = np.concatenate([2e-5 * rng.standard_normal(n), np.zeros(n)])
     scatter = dense(KINDS[:2], np.repeat([0, 1], n), S, S @ b, 1e-4)
     x = np.linspace(-20, -7, 90)
-    density = np.array([[scatter.log_density(np.exp([s, t])) for t in x] for s in x])
+    mesh = np.stack(np.meshgrid(x, x, indexing="ij"), axis=-1)
+    density = scatter.log_densities(np.exp(mesh.reshape(-1, 2))).reshape(len(x), len(x))
     weight = np.exp(density - density.max())
     monkeypatch.setattr(scatter_module, "LEAST_EFFICIENCY", 2.0)  # whatever the proposals reach
     draws = np.log(scatter.draws(800, rng))

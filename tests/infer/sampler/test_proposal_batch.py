@@ -263,7 +263,7 @@ def test_a_fair_proposal_is_mixed_with_crank_nicolson():
     assert found.passes == target.points
 
 
-@pytest.mark.parametrize("n_stars", [MANY, FEW])
+@pytest.mark.parametrize("n_stars", [case_in_full(MANY, instead="few stars are run"), FEW])
 def test_what_never_mixes_is_not_converged(n_stars):
     """Two modes thirty sigma apart: no move ever leads from one to the other."""
     n = 4

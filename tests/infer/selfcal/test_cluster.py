@@ -43,7 +43,8 @@ from tests.infer.selfcal import fields
 from tests.infer.workers import local_workers
 from tests.reduced import only_in_full
 
-PIECE = 200  # detections: some ten pieces on two workers
+PIECE = 320  # detections: three pieces on two workers
+SMALL = 150  # of which there are more, for trees and files
 
 pytestmark = [pytest.mark.usefixtures("forked_workers"), pytest.mark.timeout(300)]
 
@@ -186,6 +187,7 @@ def test_density_and_slope_are_those_of_the_whole(solution, compute):
 
 def test_sums_by_a_tree_of_workers_are_those_of_one_process(solution, compute, monkeypatch):
     """In the same order, bit for bit; and only the last branches come back."""
+    monkeypatch.setattr(pieces, "PIECE", SMALL)
     monkeypatch.setattr(shards, "BRANCHES", 2)
     monkeypatch.setattr(cluster_module, "BRANCHES", 2)
     fetched, inner = [], ClusterPieces._results
@@ -258,15 +260,18 @@ def test_stars_are_those_of_one_process(compute, by_files, tmp_path):
     assert not list(tmp_path.iterdir())
 
 
-def test_workers_read_pieces_from_files_again_where_one_is_lost(solution, compute, tmp_path):
+def test_workers_read_pieces_from_files_again_where_one_is_lost(
+    solution, compute, tmp_path, monkeypatch
+):
     """The scheduler has their paths alone; they are removed at the end."""
+    monkeypatch.setattr(pieces, "PIECE", SMALL)
     folder, mark = tmp_path / "scratch", tmp_path / "mark"
     folder.mkdir()
     compute = replace(compute, scratch=str(folder))
     with in_pieces(solution.problem, solution.stars, compute) as there:
         files = list(folder.glob("bayesdist-*/*.h5"))
-        pieces = list(there.each(content))
-        assert len(files) == len(pieces) > 4
+        parts = list(there.each(content))
+        assert len(files) == len(parts) > 4
         assert sum(f.stat().st_size for f in files) > 80 * len(solution.problem)
         there.sum(die_once, mark, solution.problem.X[0])
         assert mark.exists()

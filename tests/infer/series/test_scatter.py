@@ -18,11 +18,10 @@ from bayesdist.infer.series.scatter import (
 
 def prior_draws(k: int, n: int, rng: np.random.Generator) -> np.ndarray:
     """Covariances (n, k, k) from the hierarchy of Huang and Wand, by scipy."""
-    out = np.empty((n, k, k))
-    for i in range(n):
-        a = 1 / rng.gamma(0.5, PRIOR_SCALE**2, size=k)
-        out[i] = stats.invwishart(NU + k - 1, 2 * NU * np.diag(1 / a)).rvs(random_state=rng)
-    return out
+    a = 1 / rng.gamma(0.5, PRIOR_SCALE**2, size=(n, k))
+    standard = stats.invwishart.rvs(NU + k - 1, np.eye(k), size=n, random_state=rng)
+    root = np.sqrt(2 * NU / a)  # B X B' is inverse Wishart, too, with B before and after its matrix
+    return root[:, :, None] * standard.reshape(n, k, k) * root[:, None]
 
 
 def test_hierarchy_is_half_student_t_and_uniform(rng):
