@@ -19,7 +19,6 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from astropy.io import fits
@@ -35,11 +34,6 @@ from bayesdist.products.formats.common.cards import card_images, header_of
 from bayesdist.utils.arrays import Float
 
 _CARD = re.compile(r"[A-Z0-9_-]{1,8} *=|(COMMENT|HISTORY| {8})")
-# of binary tables: what names and describes a column, and what makes other numbers of its content
-_COLUMN = re.compile(r"(T(?:TYPE|FORM)[1-9]\d{0,2}) *= '([^'&]*)'")
-_SPECIAL = re.compile(r"(TSCAL|TZERO|TNULL|TDIM|THEAP|CONTINUE|PCOUNT  = +[1-9])")
-_KINDS = {"B": "u1", "I": ">i2", "J": ">i4", "K": ">i8", "E": ">f4", "D": ">f8"}
-_FORM = re.compile(r"([1-9]\d{0,5})?([ABIJKED])")
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,19 +73,16 @@ class Hdu:
 
         FormatError when this is no binary table, or one with cards that cannot be read.
         """
-        header = self.header
-        if header.get("XTENSION", "").strip() != "BINTABLE":
+        if self.header.get("XTENSION", "").strip() != "BINTABLE":
             raise FormatError(f"HDU {self.name!r} is no binary table")
         try:
-            table = _plain_rows(self.cards, header, self.data)
-            if table is None:
-                table = fits.BinTableHDU.fromstring(self.to_bytes()).data
+            table = fits.BinTableHDU.fromstring(self.to_bytes()).data
         except Exception as error:  # astropy raises all kinds on cards that no file should have
             raise FormatError(
                 f"HDU {self.name!r} cannot be read ({reason_of(error)})",
                 do="it is damaged: fetch or write it again",
             ) from error
-        columns = {name: np.asarray(table[name]) for name in table.dtype.names or ()}
+        columns = {name: np.asarray(table[name]) for name in table.names}
         columns = {
             n: np.strings.rstrip(c) if c.dtype.kind == "U" else c for n, c in columns.items()
         }
@@ -106,46 +97,6 @@ class Hdu:
     def image(self) -> Float:
         """Pixels of an image extension."""
         return np.asarray(fits.ImageHDU.fromstring(self.to_bytes()).data, float)
-
-
-def _plain_rows(cards: Iterable[str], header: fits.Header, data: bytes) -> NDArray[np.void] | None:
-    """Rows of a binary table that holds text and numbers as they are; None for any other.
-
-    astropy takes many times as long for the columns of an IDCTAB, of which there are few rows.
-    """
-    texts: dict[str, str] = {}
-    for card in cards:
-        found = _COLUMN.match(card)
-        if _SPECIAL.match(card) or (found and found[1] in texts):
-            return None
-        if found:
-            texts[found[1]] = found[2].rstrip()
-    sizes = [header.get(key) for key in ("TFIELDS", "NAXIS1", "NAXIS2")]
-    if not all(isinstance(size, int) and size >= 0 for size in sizes):
-        return None
-    n, width, rows = sizes
-    names = [texts.get(f"TTYPE{k}", "") for k in range(1, len(texts) // 2 + 1)]
-    forms = [_FORM.fullmatch(texts.get(f"TFORM{k}", "")) for k in range(1, len(names) + 1)]
-    if len(texts) != 2 * n or not all(names) or len({name.upper() for name in names}) < n:
-        return None
-    stored, meant = list[tuple[Any, ...]](), list[tuple[Any, ...]]()
-    for name, form in zip(names, forms, strict=True):
-        if form is None:
-            return None
-        many, kind = int(form[1] or 1), form[2]
-        if kind == "A":
-            stored.append((name, f"S{many}"))
-            meant.append((name, f"U{many}"))
-        else:
-            stored.append((name, _KINDS[kind], (many,) if many > 1 else ()))
-            meant.append(stored[-1])
-    raw = np.dtype(stored)
-    if raw.itemsize != width or len(data) < width * rows:
-        return None
-    try:
-        return np.frombuffer(data, raw, rows).astype(meant)
-    except UnicodeDecodeError:
-        return None
 
 
 @dataclass(frozen=True, eq=False)
