@@ -375,7 +375,7 @@ def test_run_that_was_interrupted_on_a_cluster_is_resumed(solution, compute, tmp
 class Strike:
     """Kills one worker before a pass."""
 
-    at: int = 12
+    at: int = 8
     passes: int = 0
     victims: list[int] = field(default_factory=list)
 
