@@ -135,15 +135,6 @@ def test_pixels_that_count_from_zero_are_noticed(names, more, header, origin):
     assert (matches_from_table(t, ReadOptions(unit="pix", pixel_origin=1)).x == t[names[0]]).all()
 
 
-@pytest.mark.parametrize("name", ["phot_g_mean_mag", "Gmag", "G", "g"])
-def test_magnitudes_of_gaia(name):
-    t = stars()
-    t[name] = 15.0 + np.arange(6)
-    assert (matches_from_table(t, ReadOptions(unit="pix")).mag == t[name]).all()
-    t["MAG_AUTO"] = 20.0  # the star's own on the detector comes first
-    assert (matches_from_table(t, ReadOptions(unit="pix")).mag == 20.0).all()
-
-
 def test_names_of_a_pair_go_together():
     t = stars(X_IMAGE=np.ones(6), y_image=np.ones(6))
     t.rename_column("x", "XWIN_IMAGE")  # without its partner

@@ -68,7 +68,7 @@ ALIASES: dict[str, tuple[str, ...]] = {
     "filter": ("filter", "filt", "filter_name", "band"),
     "mag": (
         *(*BASIC["mag"], "mag_psf", "mag_auto", "mag_iso", "mag_best", "mag_fit"),
-        *("phot_g_mean_mag", "gmag", "w1mpro", "g"),
+        *("phot_g_mean_mag", "gmag", "w1mpro"),
     ),
     "flux": (
         *("flux", "flux_psf", "flux_auto", "flux_fit", "kron_flux", "segment_flux"),
