@@ -1,7 +1,7 @@
 # Six targets do everything on a bare machine with Python 3.11 or newer:
 #   make demo    the environment, then `bayesdist demo`
-#   make test    the environment with the test extra, checks of the code, then the tests: ten
-#                to twenty minutes on two cores
+#   make test    the environment with the test extra, checks of the code and the tests: some ten
+#                minutes on two cores
 #   make test-full  the same, with the statistical suites in full: some hours on two cores
 #   make bench   the same environment, then the benchmarks: build/bench/bench.json, and
 #                docs/benchmarks.md with what other pages state of it (docs/measured.toml);

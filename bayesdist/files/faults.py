@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import struct
+import sys
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -16,27 +17,29 @@ def raising_interrupts() -> Iterator[None]:
     """Raise KeyboardInterrupt for an error that comes of one.
 
     A library that is interrupted in a callback, or as it closes a file, may fail in a way of its
-    own: HDF5 does so with a SystemError.
+    own: HDF5 does so with a SystemError.  An interrupt that a script was handling before is none.
     """
+    before = sys.exception()
     try:
         yield
     except Exception as error:
-        if _comes_of_interrupt(error):
+        if _comes_of_interrupt(error, before):
             raise KeyboardInterrupt from error
         raise
 
 
-def _comes_of_interrupt(error: BaseException) -> bool:
-    """Whether a KeyboardInterrupt is among what an error was raised from, or during."""
-    seen: set[int] = set()
+def _comes_of_interrupt(error: BaseException, before: BaseException | None) -> bool:
+    """Boolean: an error was raised from a KeyboardInterrupt, or during one after `before`."""
+    seen = {id(before)}
     open_ends: list[BaseException | None] = [error]
     while open_ends:
         one = open_ends.pop()
+        if one is None or id(one) in seen:
+            continue
         if isinstance(one, KeyboardInterrupt):
             return True
-        if one is not None and id(one) not in seen:
-            seen.add(id(one))
-            open_ends += [one.__cause__, one.__context__]
+        seen.add(id(one))
+        open_ends += [one.__cause__, one.__context__]
     return False
 
 

@@ -88,11 +88,12 @@ def arrow_array(values: NDArray[Any]) -> pyarrow.Array:
     """Arrow array of values (N,), a view of theirs where they are numbers; without pandas, too."""
     import pyarrow
 
-    if values.dtype.kind in "iuf":
+    plain = type(values) is np.ndarray and values.ndim == 1 and values.dtype.isnative
+    if plain and values.dtype.kind in "iuf":
         held = pyarrow.py_buffer(np.ascontiguousarray(values))
         kind = pyarrow.from_numpy_dtype(values.dtype)
         return pyarrow.Array.from_buffers(kind, len(values), [None, held])
-    if values.dtype.kind == "U":
+    if plain and values.dtype.kind == "U":
         texts = [str(one).encode() for one in values]
         ends = np.cumsum([0, *map(len, texts)], dtype=np.int32)
         held = [None, pyarrow.py_buffer(ends), pyarrow.py_buffer(b"".join(texts))]

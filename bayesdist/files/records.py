@@ -35,7 +35,8 @@ def read_record(path: Path, kind: type[T], what: str, *, do: str, fingerprint: s
     """The record of a file.
 
     `kind`, and `what` in words, with its article: what it has to be; `do`: by which the file is
-    made again. InputError for a file of another fingerprint, or one that holds no such record.
+    made again. InputError for a file of another fingerprint, FormatError for one that holds no such
+    record.
     """
     arrays = read_arrays(path, fingerprint, what, do=do)
     with restoring(path, what, do=do):

@@ -81,6 +81,14 @@ def test_a_file_is_not_damaged_where_its_reader_is_interrupted(tmp_path):
     assert read_record(path, dict, "an evaluation", do="fit again") == {"a": 1}
 
 
+def test_an_interrupt_that_a_script_is_handling_is_none_of_the_file(tmp_path):
+    try:
+        raise KeyboardInterrupt
+    except KeyboardInterrupt:
+        with pytest.raises(InputError, match="does not exist"):
+            read_record(tmp_path / "none.h5", dict, "an evaluation", do="fit again")
+
+
 def test_a_file_of_other_data_and_none_are_not_called_damaged(tmp_path):
     path, what = tmp_path / "record.h5", {"what": "an evaluation", "do": "fit again"}
     with pytest.raises(InputError, match=r"record\.h5: does not exist; fit again") as found:

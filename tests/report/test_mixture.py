@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.stats import norm
 
 from bayesdist.diagnose.residuals.binned import binned_residuals
 from bayesdist.report.figures.arrows import CHANCE, significant_cells
+from bayesdist.report.sections.run.posterior import outlier_table
 from bayesdist.report.sections.run.residuals import MixtureCurve
 
 
@@ -17,6 +20,22 @@ def test_counts_add_up_to_the_stars():
         good, bad = MixtureCurve(sigma, 0.2, 0.01, scale, outliers).expected([-50.0, 50.0])
         assert good.sum() + bad.sum() == pytest.approx(5000, rel=1e-12)
         assert bad.sum() == pytest.approx(0.0 if outliers == "none" else 1000.0, rel=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("model", "said"),
+    [("gaussian", "errors of f and s_out are"), ("uniform", "error of f is"), ("none", None)],
+)
+def test_the_table_says_what_its_errors_hold_for(converged, model, said):
+    post = converged.posterior
+    hyper = {k: v for k, v in post.hyper.items() if k != "s_out" or model == "gaussian"}
+    radius = 3.0 if model == "uniform" else None
+    mixture = replace(post.mixture, model=model, match_radius=radius)
+    note = outlier_table(
+        replace(converged, posterior=replace(post, mixture=mixture, hyper=hyper))
+    ).note
+    assert said is None or f"The {said} for false matches of this shape" in note
+    assert ("of this shape" in note) == (said is not None)
 
 
 def test_many_errors_in_few_steps_are_the_sum_over_stars():

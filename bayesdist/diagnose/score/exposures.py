@@ -59,8 +59,8 @@ class _Deviations:
         What its own stars add is a fraction of each direction's variance: shifts and scales have
         different units.
         """
-        share = float(np.trace(np.linalg.solve(self.covariance, self.of_own))) / len(self.score)
-        return 1.0 / (share**2 / self.n_own + (1.0 - share) ** 2 / self.n_others)
+        fraction = float(np.trace(np.linalg.solve(self.covariance, self.of_own))) / len(self.score)
+        return 1.0 / (fraction**2 / self.n_own + (1.0 - fraction) ** 2 / self.n_others)
 
     @property
     def statistic(self) -> float:

@@ -135,15 +135,14 @@ RATIOS = {
     "strongly skewed": lambda w: -3 * (np.expm1(w[:, 0] / 2) - w[:, 0] / 2 - w[:, 0] ** 2 / 8),
 }
 
+REDUCED = ("log-gamma", "step", "tilted")
+
 
 @pytest.mark.parametrize(
     "kind",
     [
-        *("log-gamma", "step", "tilted"),
-        *(
-            case_in_full(kind, instead="other ratios are run")
-            for kind in ("wave", "fifth power", "strongly skewed")
-        ),
+        kind if kind in REDUCED else case_in_full(kind, instead="other ratios are run")
+        for kind in RATIOS
     ],
 )
 def test_the_bound_holds(kind, full):

@@ -90,9 +90,10 @@ def outlier_table(r: ReportInput) -> TextTable:
         note += f"; prior of s_out: about {number(mixture.outlier_scale)} {r.unit}"
     note += "." if mixture.model == "none" else f"; prior of f: Beta({a:g}, {b:g})."
     if mixture.model != "none":
+        errors = "errors of f and s_out are" if "s_out" in post.hyper else "error of f is"
         note += (
-            f" The errors of f and s_out are those for {words.false_rows} of this shape; of another"
-            " one, which shows in the wings of the residuals, f may be off by more."
+            f" The {errors} for {words.false_rows} of this shape; of another one, which shows in"
+            " the wings of the residuals, f may be off by more."
         )
     if grouped is not None and grouped.added is not None:
         note += f" Errors differ by {grouped.grouping}: j is the least of those beyond the quoted."
