@@ -198,7 +198,7 @@ def _kernel(part: dict[str, Any]) -> list[str]:
             cells += [_number(mine), _number(floor), share]
         numpy_ns, one = r.get("ns_numpy"), r.get("ns_1")
         times = None if numpy_ns is None or one is None else numpy_ns / one
-        body.append([*cells, *map(_number, (numpy_ns, times, r["ns_expansion"]))])
+        body.append([*cells, *map(_number, (numpy_ns, times, r.get("ns_expansion")))])
     return out + _table(head, body)
 
 
