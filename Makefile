@@ -5,7 +5,7 @@
 #   make test-full  the same, with the statistical suites in full: some hours on two cores
 #   make bench   the same environment, then the benchmarks: build/bench/bench.json, and
 #                docs/benchmarks.md with what other pages state of it (docs/measured.toml);
-#                some 14 minutes on two cores that have nothing else to do; with RELEASE=NAME the
+#                some 10 minutes on two cores that have nothing else to do; with RELEASE=NAME the
 #                ratios are kept in docs/benchmark_history.json, and drawn over time
 #   make bench-check  the benchmarks alone; fails where a ratio is a fifth worse than at the release
 #   make docs    the environment with the docs extra, then the site: build/docs/index.html; a
