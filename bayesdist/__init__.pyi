@@ -1,7 +1,7 @@
 """Names of the package, each with the module where it is at home; loaded when first used."""
 
 from .app.commands.on_files.sky import apply_to_sky as apply_to_sky
-from .app.run import run as run
+from .app.stages import run as run
 from .assess import (
     ErrorBudget as ErrorBudget,
     Margin as Margin,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -107,7 +107,12 @@ def run(
 
 
 def make_stages(
-    results: Results, stages: Collection[str], *, force: bool = False, pdf: bool = False
+    results: Results,
+    stages: Collection[str],
+    *,
+    force: bool = False,
+    pdf: bool = False,
+    ready: Mapping[str, Any] | None = None,
 ) -> Results:
     """Results with the artefacts of some stages: each that does not stand is made and saved.
 
@@ -121,9 +126,11 @@ def make_stages(
         Make them also where they stand.
     pdf : bool
         Draw figures as PDF, too.
+    ready : mapping of str to object, optional
+        Artefacts that were computed before and are only to be saved, by name.
     """
     r, run, config, base = results, results.run, results.config, results.base
-    source = str(run.path)
+    source, ready = str(run.path), ready or {}
 
     def stage(
         name: str, artefact: str, make: Callable[[], Any], save: Callable[[Results], None]
@@ -132,10 +139,11 @@ def make_stages(
         nonlocal r
 
         def made() -> Results:
-            found = r.having(**{artefact: make()})
-            save(found)
+            value = ready[artefact] if artefact in ready else make()
+            results_of_stage = r.having(**{artefact: value})
+            save(results_of_stage)
             # matches are read back: their rows may name the files that they lie in from now on
-            return found if name != "match" else r.having(inputs=r.inputs)
+            return results_of_stage if name != "match" else r.having(inputs=r.inputs)
 
         if name in stages:
             r = run.make(name, made, force=force).value or r
@@ -144,13 +152,6 @@ def make_stages(
     def fitted() -> Fitted:
         """The fit, unless the rehearsal has made it."""
         return r.made.get("fitted") or fit(r.matched, config, base, r.reader).fitted
-
-    def evaluated() -> Evaluation:
-        posterior, found, data = r.posterior, r.diagnostics, r.data
-        errors = error_model(posterior, found, data, config)
-        return evaluate(
-            errors, posterior, found, data, config, base, source=source, series=r.series
-        )
 
     def exported() -> list[dict[str, Any]]:
         evaluation, posterior = r.stored_evaluation, r.posterior
@@ -162,10 +163,25 @@ def make_stages(
     stage("fit", "fitted", fitted, save_fit)
     stage("sample", "posterior", lambda: _sampled(r), save_sampled)
     stage("diagnose", "stored", lambda: diagnose(r.posterior, r.data, config, base), save_diagnosed)
-    stage("evaluate", "evaluation", evaluated, save_evaluation)
+    stage("evaluate", "evaluation", lambda: evaluated(r), save_evaluation)
     stage("export", "products", exported, save_products)
     stage("report", "figures", lambda: report(r, pdf=pdf), save_figures)
     return r
+
+
+def evaluated(results: Results) -> Evaluation:
+    """Maps, budget, margins and validity periods of a run that has been sampled and diagnosed."""
+    posterior, diagnostics, data = results.posterior, results.diagnostics, results.data
+    return evaluate(
+        error_model(posterior, diagnostics, data, results.config),
+        posterior,
+        diagnostics,
+        data,
+        results.config,
+        results.base,
+        source=results.source_name,
+        series=results.series,
+    )
 
 
 def _sampled(r: Results) -> Posterior:
