@@ -51,7 +51,6 @@ from .preparing import (
 )
 from .read import read_matches as read_matches
 from .reading.options import ReadOptions as ReadOptions
-from .reading.table import matches_from_table as matches_from_table
 from .sky.earth import velocity_aberration as velocity_aberration
 from .sky.tangent import (
     mean_direction as mean_direction,
