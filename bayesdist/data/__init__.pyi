@@ -30,6 +30,7 @@ from .matching.campaign import (
 )
 from .matching.linear_map import LinearMap as LinearMap
 from .matching.reports import ExposureReport as ExposureReport
+from .matching.rough_wcs import match as match
 from .matching.search_radius import (
     SearchRadius as SearchRadius,
     search_radius as search_radius,

@@ -110,7 +110,10 @@ def numpy_array(values: pyarrow.Array) -> NDArray[Any]:
     if types.is_boolean(kind):
         return numpy_array(values.cast(pyarrow.uint8())).astype(bool)
     if types.is_dictionary(kind):
-        return numpy_array(values.dictionary_decode())
+        labels, codes = numpy_array(values.dictionary), numpy_array(values.indices)
+        if not len(labels):
+            return np.full(len(codes), None)
+        return labels.take(codes.astype(np.int64), mode="clip")  # codes of nulls are arbitrary
     if types.is_string(kind) or types.is_large_string(kind) or _is_string_view(kind):
         return np.array(values.to_pylist(), object)
     return values.to_numpy(zero_copy_only=False)

@@ -91,12 +91,12 @@ def merged_codes(
 
 def _common_radius(tables: Sequence[MatchColumns]) -> float | None:
     """Match radius of all tables; None if one has none.  InputError if they differ."""
-    radii = {table.match_radius for table in tables}
-    if None in radii:
+    radii = {table.match_radius for table in tables if table.match_radius is not None}
+    if any(table.match_radius is None for table in tables):
         return None
     if len(radii) > 1:
         raise InputError(
-            f"match radii differ: {', '.join(f'{r:g}' for r in sorted(map(float, radii)))}",
+            f"match radii differ: {', '.join(f'{radius:g}' for radius in sorted(radii))}",
             where=", ".join(source for table in tables for source in table.sources),
             do="match all tables with one radius",
         )

@@ -21,8 +21,9 @@ def sky_table(x: Any, y: Any, sky: SkyCoord, *, sigma: Any, epoch: Any, **column
     `sigma` is one error, one of each star, or a pair of these, plain numbers being arcsec; `epoch`
     becomes a column if it has one value for each star.
     """
-    table = QTable({"x": _column(x, "x", None), "y": _column(y, "y", None)})
+    table = QTable({"x": _column(x, "x", None)})
     n = len(table)
+    table["y"] = _column(y, "y", n)
     table[SKY_COLUMN] = icrs_of(sky, n)
     if sigma is not None:
         pair = sigma if isinstance(sigma, tuple) else (sigma, sigma)
