@@ -24,8 +24,8 @@ from bayesdist.data.formats.record import read_written_matches
 from bayesdist.data.matches import Matches
 from bayesdist.data.matching.table import match_table
 from bayesdist.data.reading.columns import numbered, text_labels
-from bayesdist.data.reading.options import ReadOptions, refuse_missing_errors
-from bayesdist.data.reading.table import matches_from_table, sky_positions
+from bayesdist.data.reading.options import ReadOptions
+from bayesdist.data.reading.table import is_table, match_arguments, sky_positions
 from bayesdist.data.sky.tangent import mean_direction
 from bayesdist.data.tables.checks import absent
 from bayesdist.data.tables.column import SourceColumn
@@ -33,9 +33,9 @@ from bayesdist.data.tables.names import ALIASES, find_columns
 from bayesdist.errors import InputError
 from bayesdist.files.regular import read_lines
 from bayesdist.files.tables import read_table
+from bayesdist.utils.quantities import Direction, Epoch, Number
 
 PathLike = str | os.PathLike[str]
-IN_MEMORY = "table"  # name of a table that is no file, in errors
 # the other quantities are left out: 'mag', if there is one, is the index star's
 _CORR = dict.fromkeys(ALIASES, "") | CORR_COLUMNS
 
@@ -46,11 +46,11 @@ def read_matches(
     format: str = "auto",
     columns: Mapping[str, str] | None = None,
     unit: str | None = None,
-    sigma: str | float = "columns",
+    sigma: str | Number = "columns",
     pixel_origin: int | None = None,
-    tangent_point: tuple[float, float] | None = None,
-    epoch: float | str | None = None,
-    catalogue_epoch: float | None = None,
+    tangent_point: Direction | None = None,
+    epoch: Epoch | None = None,
+    catalogue_epoch: Epoch | None = None,
     chips: Mapping[str, int] | None = None,
     not_finite: str = "refuse",
 ) -> Matches:
@@ -61,7 +61,7 @@ def read_matches(
     path : path-like, sequence of path-like, or table
         A file, a list of files, a pattern, or a folder of Parquet files (parts of one table).  Of
         several files each is one exposure, named for the file, where it has no column of exposures.
-        Also an astropy Table or QTable, a pandas DataFrame, or a mapping of arrays.
+        Objects with columns are passed on to `Matches.from_table`.
     format : str, optional
         'table' (.ecsv, .csv, .fits, .parquet, .vot, .tbl and text of several kinds),
         'hst1pass' (lists with raw and corrected positions),
@@ -104,14 +104,14 @@ def read_matches(
         chips,
         not_finite,
     )
-    if isinstance(path, Table | Mapping) or hasattr(path, "to_parquet"):  # a DataFrame
+    if is_table(path):
         if format not in ("auto", "table"):
             raise InputError(
                 f"format is {format!r}, but a table is given, no file",
                 where="format",
                 do="leave it out",
             )
-        return _with_errors(matches_from_table(path, options, source=IN_MEMORY), sigma)
+        return Matches(**match_arguments(path, options)).as_read(sigma)
     files = input_files(path)
     kinds = [kind_of(file, columns) if format == "auto" else format for file in files]
     masters = [file for file, kind in zip(files, kinds, strict=True) if kind == "matchup"]
@@ -120,14 +120,7 @@ def read_matches(
     else:
         in_parts = isinstance(path, str | os.PathLike) and Path(path).is_dir()
         table = _read_plain(files, kinds, options, in_parts=in_parts)
-    return _with_errors(table, sigma)
-
-
-def _with_errors(table: Matches, sigma: str | float) -> Matches:
-    refuse_missing_errors(sigma, table.has_sigma, table.has_mag, where=", ".join(table.sources))
-    if isinstance(sigma, str):
-        return table
-    return table.with_errors(float(sigma))
+    return table.as_read(sigma)
 
 
 def _read_plain(
@@ -148,8 +141,8 @@ def _read_plain(
         "hst1pass": lambda file, name: _read_list(file, name, options),
         "bayesdist": lambda file, _: _read_record(file, options),
         "astrometry.net": lambda file, name: _read_corr(file, tables[file], name, options),
-        "table": lambda file, name: matches_from_table(
-            tables[file], options, source=str(file), exposure_name=name
+        "table": lambda file, name: Matches(
+            **match_arguments(tables[file], options, source=str(file), exposure_name=name)
         ),
     }
     readers |= dict.fromkeys(own, readers["table"])
@@ -214,7 +207,7 @@ def _read_corr(file: Path, table: Table, name: str | None, options: ReadOptions)
         options.refuse(str(file), "astrometry.net", "unit")
     columns = _CORR | ({"flux": "FLUX"} if "FLUX" in table.colnames else {})
     options = replace(options, columns=columns, unit=None, sigma="by_magnitude")
-    return matches_from_table(table, options, source=str(file), exposure_name=name)
+    return Matches(**match_arguments(table, options, source=str(file), exposure_name=name))
 
 
 def _read_with_master(files: Sequence[Path], kinds: Sequence[str], options: ReadOptions) -> Matches:
