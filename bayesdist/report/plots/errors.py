@@ -16,7 +16,15 @@ from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
 from bayesdist.assess.maps.uncertainty import per_axis
 from bayesdist.assess.terms.forms import PRODUCT
 from bayesdist.errors import InputError
-from bayesdist.report.figures.style import CYCLE, LEVEL_COLORS, OUTLINE, PALETTE, Tones, small_font
+from bayesdist.report.figures.style import (
+    CYCLE,
+    INK,
+    LEVEL_COLORS,
+    OUTLINE,
+    PALETTE,
+    Tones,
+    small_font,
+)
 from bayesdist.report.plots.axes import axes_of, scale_of, set_title
 from bayesdist.utils.arrays import Float
 from bayesdist.utils.numbers import Scale, counted, display_scale, number
@@ -35,6 +43,14 @@ KIND_COLORS = {
     PRODUCT: OUTLINE,
 }
 # marker and vertical shift of each axis: u and v are often equal
+# of the markers: yellow with a dark edge is seen on bars of all colours
+MARKER_STYLE: dict[str, Any] = {
+    "ms": 5.5,
+    "color": PALETTE["yellow"],
+    "mec": INK,
+    "mew": 0.7,
+    "zorder": 4,
+}
 AXIS_MARKERS = {"u": ("o", -0.15), "v": ("s", 0.15)}
 LETTERS_PER_LINE = 26  # of the name of a term
 
@@ -141,7 +157,7 @@ def budget_handles(ax: Axes, rows: Sequence[Row]) -> list[Artist]:
     handles.append(Patch(color=Tones.of(ax).ink, label="total, per axis"))
     for axis, (marker, _) in AXIS_MARKERS.items():
         look: dict[str, Any] = {"marker": marker, "ls": "none", "label": f"{axis} alone"}
-        handles.append(Line2D([], [], **look, **_marker_look(ax)))
+        handles.append(Line2D([], [], **look, **MARKER_STYLE))
     return handles
 
 
@@ -156,11 +172,6 @@ def _on_chip(budget: ErrorBudget, chip: int) -> ErrorBudget:
     return budget.chips[numbers.index(chip)]
 
 
-def _marker_look(ax: Axes) -> dict[str, Any]:
-    look = {"ms": 5.5, "color": PALETTE["yellow"], "mew": 0.7, "zorder": 4}
-    return look | {"mec": Tones.of(ax).ink}
-
-
 def _bars(ax: Axes, rows: Sequence[Row], scale: Scale) -> None:
     place = np.arange(len(rows))
     sizes = np.array([row_per_axis(row) for row in rows]) * scale.factor
@@ -169,7 +180,7 @@ def _bars(ax: Axes, rows: Sequence[Row], scale: Scale) -> None:
     ax.barh(place, sizes, height=0.62, color=colors, zorder=2)
     for axis, (marker, shift) in AXIS_MARKERS.items():
         values = np.array([row[axis] for row in rows], float) * scale.factor
-        ax.plot(values, place + shift, marker, **_marker_look(ax))
+        ax.plot(values, place + shift, marker, **MARKER_STYLE)
     # beyond the bar and its markers
     ends = np.array([max(float(row["u"]), float(row["v"])) for row in rows]) * scale.factor
     for k, (value, end) in enumerate(zip(sizes, ends, strict=True)):
@@ -330,5 +341,6 @@ def plot_validity(
     ax.set_xlim(period.epoch[0], period.epoch[-1])
     ax.set_ylabel("P(met) [no unit]")
     ax.set_xlabel("epoch [yr]")
+    ax.ticklabel_format(axis="x", useOffset=False)
     set_title(ax, title, period.sentence)
     return ax

@@ -21,7 +21,7 @@ from bayesdist.report.figures.arrows import (
 from bayesdist.report.figures.fields import Grid, contour_levels, draw_grid
 from bayesdist.report.figures.panels import chip_axes
 from bayesdist.report.figures.style import COLORBAR, nice_below
-from bayesdist.report.plots.axes import axes_of, scale_of, set_title
+from bayesdist.report.plots.axes import add_colorbar, axes_of, scale_of, set_title
 from bayesdist.utils.numbers import number, size_of
 
 if TYPE_CHECKING:
@@ -41,6 +41,7 @@ def plot_map(
     levels: ArrayLike | None = None,
     magnification: float | None = None,
     colorbar: bool | Sequence[Axes] = True,
+    name: str = "",
     title: str | None = None,
 ) -> Axes:
     """Plot the uncertainty of the position over a chip.
@@ -63,6 +64,8 @@ def plot_map(
         Length of the crosses in pixels of the axes for an error of 1; a round number by default.
     colorbar : bool or sequence of matplotlib.axes.Axes
         True for a colour bar of the contours beside `ax`; or all axes that share this colour bar.
+    name : str
+        Name of the chip, which begins the default title.
     title : str, optional
         By default the solution and its range of errors; an empty title for none.
 
@@ -96,17 +99,20 @@ def plot_map(
         largest = float(m.per_axis.max())
         scale = scale_of(m.unit, largest, scale_mas)
         default = f"{m.kind}, largest {scale.text(largest)} per axis"
-        set_title(ax, title, default, pad=KEY_PAD)
+        set_title(ax, title, default, name, pad=KEY_PAD)
         return ax
     chip_axes(ax, size)
     scale = scale_of(m.unit, float(m.per_axis.max()), scale_mas)
     grid = Grid(m.x, m.y, m.per_axis * scale.factor, m.position_of_max)
     shown = contour_levels(grid.values) if levels is None else np.asarray(levels) * scale.factor
     drawn = draw_grid(ax, grid, levels=shown)
-    if colorbar is not False:
-        beside = [ax] if colorbar is True else list(colorbar)
-        ax.figure.colorbar(drawn, ax=beside, label=f"per axis (1 σ) [{scale.unit}]", **COLORBAR)
-    set_title(ax, title, f"{m.kind}: {number(grid.values.min())} to {number(grid.values.max())}")
+    label = f"per axis (1 σ) [{scale.unit}]"
+    if colorbar is True:
+        add_colorbar(ax, drawn, label)
+    elif colorbar is not False:
+        ax.figure.colorbar(drawn, ax=list(colorbar), label=label, **COLORBAR)
+    low, high = number(grid.values.min()), number(grid.values.max())
+    set_title(ax, title, f"{m.kind}: {low} to {high}", name)
     return ax
 
 
@@ -117,6 +123,7 @@ def plot_distortion(
     scale_mas: float | None = None,
     magnification: float | None = None,
     key: float | None = None,
+    name: str = "",
     title: str | None = None,
 ) -> Axes:
     """Plot the distortion of a chip as vectors, with a ring around the origin of the longest.
@@ -136,6 +143,8 @@ def plot_distortion(
         By which vectors are enlarged; a round number by default.
     key : float, optional
         Length of the vector above the axes, in pixels; a round number by default.
+    name : str
+        Name of the chip, which begins the default title.
     title : str, optional
         By default the largest length; an empty title for none.
 
@@ -161,7 +170,7 @@ def plot_distortion(
     length = _key_length(largest / 1.5, "pix", scale_mas) if key is None else key
     draw_key(ax, length, magnification=M, scale_mas=scale_mas)
     shown = size_of(largest, digits=4) if scale_mas is None else size_of(largest * scale_mas, "mas")
-    set_title(ax, title, f"largest {shown}", pad=KEY_PAD)
+    set_title(ax, title, f"largest {shown}", name, pad=KEY_PAD)
     return ax
 
 

@@ -6,12 +6,10 @@ from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.colors import to_rgba
 from matplotlib.figure import Figure, SubFigure
-from matplotlib.font_manager import FontProperties
 from matplotlib.patches import Patch
 from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
@@ -92,7 +90,9 @@ def plot_corner(
         from matplotlib import pyplot
 
         side = 2.0 * len(columns) + 1.2
-        fig = pyplot.figure(figsize=(side, side))
+        fig = pyplot.figure(figsize=(side, side), layout="constrained")
+    elif isinstance(fig, Figure) and fig.get_layout_engine() is None:
+        fig.set_layout_engine("constrained")  # else the labels of a large style do not fit
     if fig.axes:
         raise InputError("the figure has axes", where="plot_corner", do="give an empty figure")
     return draw_corner(fig, columns)
@@ -138,7 +138,7 @@ def draw_corner(fig: Figure | SubFigure, columns: Sequence[Column]) -> NDArray[A
     draws = np.stack([column.draws for column in columns]) * factors[:, None]
     ends = limits * factors[:, None]
     edges = [np.linspace(low, high, CORNER_BINS + 1) for low, high in ends]
-    panels = fig.subplots(n, n, squeeze=False)
+    panels = fig.subplots(n, n, squeeze=False, gridspec_kw={"wspace": 0.03, "hspace": 0.03})
     for i in range(n):
         for j in range(n):
             if j < i:
@@ -164,7 +164,6 @@ def draw_corner(fig: Figure | SubFigure, columns: Sequence[Column]) -> NDArray[A
         color = to_rgba(PALETTE["blue"], 0.6)
         handles = [Patch(fc=color, label="posterior\n(1 σ and 2 σ)")]
         fig.legend(handles=handles, loc="upper right")
-    _place(fig)
     return np.asarray(panels)
 
 
@@ -221,21 +220,6 @@ def _numbers(ax: Axes, *, below: bool, beside: bool) -> None:
     """Show numbers at the ticks only at the edges of the figure."""
     ax.tick_params(axis="x", labelbottom=below, labelrotation=45)
     ax.tick_params(axis="y", labelleft=beside, labelrotation=45)
-
-
-def _place(fig: Figure | SubFigure) -> None:
-    """Place the panels, with room for labels whose size depends on the style."""
-    letter = FontProperties(size=matplotlib.rcParams["axes.labelsize"]).get_size_in_points() / 72
-    width, height = fig.bbox.width / fig.figure.dpi, fig.bbox.height / fig.figure.dpi
-    room = 6.5 * letter
-    fig.subplots_adjust(
-        left=room / width,
-        bottom=room / height,
-        right=0.985,
-        top=0.985,
-        wspace=0.06,
-        hspace=0.06,
-    )
 
 
 # -- correlations ---------------------------------------------------------------------------------

@@ -23,7 +23,7 @@ from bayesdist.report.figures.arrows import (
 )
 from bayesdist.report.figures.panels import chip_axes
 from bayesdist.report.figures.style import PALETTE, SEQUENTIAL, Tones, nice_below
-from bayesdist.report.plots.axes import axes_of, scale_of, set_title
+from bayesdist.report.plots.axes import add_colorbar, axes_of, scale_of, set_title
 from bayesdist.utils.arrays import Float
 from bayesdist.utils.numbers import Scale, count
 
@@ -48,6 +48,7 @@ def plot_residual_vectors(
     scale_mas: float | None = None,
     magnification: float | None = None,
     key: float | None = None,
+    name: str = "",
     title: str | None = None,
 ) -> Axes:
     """Plot the mean residual of each cell of a chip as a vector.
@@ -67,6 +68,8 @@ def plot_residual_vectors(
         Length of a vector in pixels of the axes for a residual of 1; a round number by default.
     key : float, optional
         Length of the vector above the axes, in `unit`; a round number by default.
+    name : str
+        Name of the chip, which begins the default title.
     title : str, optional
         By default the number of significant vectors; an empty title for none.
 
@@ -83,7 +86,7 @@ def plot_residual_vectors(
     draw_arrows(ax, arrows, magnification=M)
     length = scale[1] if key is None else key
     draw_key(ax, length, magnification=M, unit=unit, scale_mas=scale_mas)
-    set_title(ax, title, significant(arrows), pad=VECTOR_PAD)
+    set_title(ax, title, significant(arrows), name, pad=VECTOR_PAD)
     return ax
 
 
@@ -354,7 +357,7 @@ def plot_residual_density(
     ax.set_xlabel("magnitude [mag]")
     ax.set_ylabel(f"residual in {axis} [{scale.unit}]")
     if colorbar:
-        ax.figure.colorbar(drawn, ax=ax, label=f"{shown} per hexagon")
+        add_colorbar(ax, drawn, f"{shown} per hexagon")
     return ax
 
 

@@ -230,6 +230,7 @@ def plot_residual_means(
         scale = scale_of(solution.model.unit, mean.reach or 1.0, None)
         default = draw_property_means(ax, mean, axis, against, scale)
         ax.set_xlabel(label)
+        ax.ticklabel_format(axis="x", useOffset=False)  # years are numbers of four digits
     ax.set_ylabel(f"residual d{axis} [{scale.unit}]")
     set_title(ax, title, default)
     return ax

@@ -129,7 +129,7 @@ def outliers_corner(r: ReportInput) -> Plot:
     posterior = needed(r.posterior)
     columns = [mixture_column(posterior, name) for name in MIXTURE if name in posterior.hyper]
     side = WIDTH if len(columns) > 3 else 1.6 * len(columns) + 0.9
-    figure = new_figure(side, side, layout="none")
+    figure = new_figure(side, side)
     draw_corner(figure, columns)
     text = "Joint posterior of the mixture's parameters; dashed lines hold 68 %."
     if "f" in posterior.hyper:
