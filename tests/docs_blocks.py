@@ -2,7 +2,8 @@
 
 Blocks of ``toml`` that begin with a comment ``# NAME`` become files; ``console`` lines after ``$``
 are commands; ``python`` blocks share one namespace; ``text`` is what the block before it prints,
-numbers aside, in pieces where ``...`` stands.
+numbers aside, in pieces where ``...`` stands.  The cells of notebooks in MyST Markdown are run by
+`run_notebook`.
 """
 
 from __future__ import annotations
@@ -11,21 +12,43 @@ import contextlib
 import io
 import re
 import shlex
-from collections.abc import Container
+from collections.abc import Container, Mapping
 from pathlib import Path
 
 from bayesdist.app.cli import main
 
-__all__ = ["DOCS", "blocks", "run_page"]
+__all__ = ["DOCS", "blocks", "cells", "run_notebook", "run_page"]
 
 DOCS = Path(__file__).resolve().parents[1] / "docs"
 _FENCE = re.compile(r"^```(\w+)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
+_CELL = re.compile(r"^```\{code-cell\} ipython3\n((?:^:.*\n)*)(.*?)^```$", re.MULTILINE | re.DOTALL)
 _EXIT = re.compile(r"\s+# exits with (\d)$")
 
 
 def blocks(page: Path) -> list[tuple[str, str]]:
     """Language and text of the fenced blocks of a page."""
     return _FENCE.findall(page.read_text(encoding="utf-8"))
+
+
+def cells(page: Path) -> list[str]:
+    """Code of the cells of a notebook in MyST Markdown."""
+    return [code for _, code in _CELL.findall(page.read_text(encoding="utf-8"))]
+
+
+def run_notebook(page: Path, changes: Mapping[str, str] | None = None) -> dict[str, object]:
+    """Run the cells of a notebook in the current folder; their namespace.
+
+    `changes` replaces pieces of code, each of which must be there, to make a test smaller.
+    """
+    code = cells(page)
+    for before, after in (changes or {}).items():
+        assert any(before in cell for cell in code), f"{page.name}: has no {before!r}"
+        code = [cell.replace(before, after) for cell in code]
+    namespace: dict[str, object] = {}
+    for number, cell in enumerate(code, start=1):
+        with contextlib.redirect_stdout(io.StringIO()):
+            exec(compile(cell, f"{page.name}, cell {number}", "exec"), namespace)
+    return namespace
 
 
 ALL = frozenset({"toml", "console", "python", "text"})
