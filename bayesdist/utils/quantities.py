@@ -210,10 +210,10 @@ def direction_in(point: Direction, what: str, *, where: str = "") -> tuple[float
     (15.0, -30.0)
     """
     do = "give a SkyCoord of one direction, or right ascension and declination in degrees"
-    if hasattr(point, "icrs"):
-        if np.ndim(point):
-            raise InputError(f"{what} holds {np.size(point)} directions", where=where, do=do)
-        icrs = point.icrs
+    icrs = getattr(point, "icrs", None)
+    if icrs is not None:
+        if icrs.shape:
+            raise InputError(f"{what} holds {icrs.size} directions", where=where, do=do)
         return float(icrs.ra.deg), float(icrs.dec.deg)
     try:
         ra, dec = point
