@@ -188,10 +188,7 @@ def evaluate(
     if _contradiction(diagnostics, settings) is None:
         years = _years(solution, diagnostics, epoch)
         surface = budget_surface(whole, grid, epoch=epoch, years=years)
-    maps = []
-    for chip in chips:
-        local = errors.structure_sigma(_domain(solution, chip, settings))
-        maps.append(with_local(uncertainty(solution, chip), local))
+    maps = [position_map(errors, solution, settings, chip) for chip in chips]
     budget = budget_of(whole, settings.domain(errors))
     margins = judged(errors, diagnostics, requirements, settings, rng, checks=every, drawn=whole)
     del whole  # validity periods have draws of their own
@@ -209,6 +206,27 @@ def evaluate(
         validity=validity_of(errors, diagnostics, requirements, settings, rng),
         checks=every,
     )
+
+
+def position_map(
+    errors: ErrorModel, solution: Posterior, settings: EvaluationSettings, chip: Chip
+) -> UncertaintyMap:
+    """Map of all errors that neighbouring positions share, at the epoch and grid of the settings.
+
+    Parameters
+    ----------
+    errors : ErrorModel
+    solution : Posterior
+        With all errors of the parameters in its draws.
+    settings : EvaluationSettings
+    chip : Chip
+
+    Returns
+    -------
+    UncertaintyMap
+    """
+    shared = uncertainty_map(solution, grid=settings.grid, epoch=settings.epoch, chip=chip.number)
+    return with_local(shared, errors.structure_sigma(_domain(solution, chip, settings)))
 
 
 def drawn_errors(
