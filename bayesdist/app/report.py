@@ -20,6 +20,7 @@ from bayesdist.assess.evaluation import Evaluation
 from bayesdist.assess.solution import chip_places
 from bayesdist.assess.vectors import diagram_vectors
 from bayesdist.diagnose.diagnostics import Diagnostics
+from bayesdist.files.atomic import atomic_path
 from bayesdist.files.tables import read_ecsv
 from bayesdist.infer import Posterior
 from bayesdist.model.grid import outline_pixels
@@ -44,6 +45,27 @@ def report(results: Results, *, pdf: bool = False) -> list[str]:
     run.summarise(verdict={"level": found.level, "headline": found.headline})
     log.info("report: %s", run / "report.html")
     return names
+
+
+def write_html_report(results: Results, path: Path) -> None:
+    """Write the report of a run to one HTML file.
+
+    Parameters
+    ----------
+    results : Results
+    path : pathlib.Path
+
+    Raises
+    ------
+    InputError
+        If the file cannot be written.
+    """
+    from bayesdist.report.run_report import draw_report, render_report
+
+    inputs = report_input(results)
+    text = render_report(inputs, draw_report(inputs))
+    with atomic_path(path) as temporary:
+        temporary.write_text(text, encoding="utf-8")
 
 
 def _is_command_line() -> bool:
