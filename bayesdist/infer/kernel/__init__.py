@@ -6,9 +6,7 @@ not depend on the number of threads.
 """
 
 from bayesdist.infer.kernel.cache import kept_by_content
-from bayesdist.infer.kernel.vectors import use_whole_vectors
 
-use_whole_vectors()
 with kept_by_content():
     from bayesdist.infer.kernel.blocks import BLOCK, pieces_of, set_threads
     from bayesdist.infer.kernel.likelihood import log_likelihood

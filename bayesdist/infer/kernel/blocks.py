@@ -18,6 +18,7 @@ import numba as nb
 import numpy as np
 
 from bayesdist.infer.kernel.lanes import FAST, INNER, copy
+from bayesdist.infer.kernel.vectors import whole_vectors
 from bayesdist.utils.arrays import Float, Int
 
 # how a pass is compiled: without a check for division by zero, which would exclude vectors
@@ -67,6 +68,7 @@ def star_room() -> tuple[Float, Float]:
 @nb.njit(**INNER)
 def put_ones(rows, n):
     """Write ones to rows of `scratch` behind the first n stars."""
+    whole_vectors()
     for k in range(len(rows)):
         for s in range(n, BLOCK):
             rows[k, s] = 1.0
@@ -75,6 +77,7 @@ def put_ones(rows, n):
 @nb.njit(**INNER)
 def lay_out(columns, first, end, rows):
     """Copy X, Y, u, v, var_u, var_v of some stars to rows of `scratch`, and ones behind them."""
+    whole_vectors()
     n = end - first
     copy(columns[0], first, n, rows, 0)
     copy(columns[1], first, n, rows, 1)
