@@ -21,6 +21,7 @@ import sys
 import threading
 import warnings
 from contextlib import suppress
+from pathlib import Path
 from typing import Any
 
 PACKAGE = "bayesdist"
@@ -54,7 +55,7 @@ def snapshot() -> dict[str, Any]:
     settings = {name: getattr(numba.config, name) for name in dir(numba.config) if name.isupper()}
     state = {
         "environment": dict(os.environ),
-        "working directory": os.getcwd(),
+        "working directory": Path.cwd(),
         "sys.path": sys.path,
         "numba.config": settings,
         "garbage collector": (gc.get_threshold(), gc.isenabled(), gc.get_freeze_count()),
@@ -62,7 +63,7 @@ def snapshot() -> dict[str, Any]:
         "warnings": (warnings.filters, warnings.showwarning),
         "numpy errors": np.geterr(),
         "numpy printing": np.get_printoptions(),
-        "random numbers": (random.getstate(), np.random.get_state()),
+        "random numbers": (random.getstate(), np.random.get_state()),  # noqa: NPY002  it is what is watched
         "locale": locale.setlocale(locale.LC_ALL),
         "root logger": (root.level, root.handlers, logging.root.manager.disable),
         "package's logger": (package.level, package.propagate, package.handlers),
@@ -81,7 +82,6 @@ def use() -> None:
     import numpy as np
 
     import bayesdist as bd
-    from bayesdist.simulate.camera import camera  # noqa: F401  what simulators import
 
     rng = np.random.default_rng(1)
     x, y = rng.uniform(1, 1000, (2, 300))

@@ -1,4 +1,4 @@
-"""The environments of `make test-matrix` and of the workflow are those that pyproject.toml admits."""
+"""The environments of `make test-matrix`, of the workflow and of pyproject.toml are the same."""
 
 from __future__ import annotations
 

@@ -8,7 +8,7 @@ not depend on the number of threads.
 from bayesdist.infer.kernel.cache import kept_by_content
 
 with kept_by_content():
-    from bayesdist.infer.kernel.blocks import BLOCK, pieces_of, set_threads
+    from bayesdist.infer.kernel.blocks import BLOCK, get_threads, pieces_of, set_threads
     from bayesdist.infer.kernel.likelihood import log_likelihood
     from bayesdist.infer.kernel.mixture import GAUSSIAN, NO_OUTLIERS, UNIFORM, Constants
     from bayesdist.infer.kernel.moments import (
@@ -62,6 +62,7 @@ __all__ = [
     "draw_deviations",
     "eliminate_stars",
     "gaussians",
+    "get_threads",
     "least_squares_moments",
     "linearised",
     "log_likelihood",
