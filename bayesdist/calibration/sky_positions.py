@@ -137,8 +137,8 @@ def placement_of(
 
     `point` (degrees) is the sky position of (u, v) = (0, 0), in place of that of the plane.
     `position_angle` (degrees, from north to east) is that of the v axis, 0 by default, or of V3 for
-    a plane in an aperture with known axes; u is 90 degrees east of v, or west if `mirrored`.  `pixel_scale`
-    are arcseconds per pixel, for u and v in pixels.
+    a plane in an aperture with known axes; u is 90 degrees east of v, or west if `mirrored`.
+    `pixel_scale` is the size of a pixel in arcsec, for u and v in pixels.
     InputError for a plane in an aperture without position angle, a plane without point, and u and v
     in pixels of unknown size.
     """

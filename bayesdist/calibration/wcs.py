@@ -360,8 +360,10 @@ class CalibrationWCS(BaseLowLevelWCS, HighLevelWCSMixin):
         Returns
         -------
         gwcs.WCS
-            From a frame ``detector`` in pixels to a frame ``world``: ICRS, or u and v.  Its
-            bounding box is the chip.
+            From a frame ``detector`` in pixels to a frame ``world``: ICRS, or u and v.  It has no
+            bounding box.  With one, as in ``w.bounding_box = wcs.bounding_box``, gwcs refuses
+            positions outside the range of the four corners, some pixels at curved edges and all
+            around a celestial pole among them.
 
         Raises
         ------
@@ -390,7 +392,6 @@ class CalibrationWCS(BaseLowLevelWCS, HighLevelWCSMixin):
                 name="world", reference_frame=ICRS(), unit=(units.deg, units.deg)
             )
         out = gwcs.WCS([(detector, self.to_model()), (world, None)])
-        out.bounding_box = self.bounding_box
         out.pixel_shape = self.pixel_shape
         return out
 
