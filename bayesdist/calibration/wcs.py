@@ -460,9 +460,8 @@ class CalibrationWCS(BaseLowLevelWCS, HighLevelWCSMixin):
 
     def __repr__(self) -> str:
         nx, ny = self.pixel_shape
-        lines = [
-            f"<CalibrationWCS of {self.calibration.name!r}, chip {self.chip}, {nx} x {ny} pixels"
-        ]
+        name = self.calibration.name.rpartition("/")[2]
+        lines = [f"<CalibrationWCS of {name!r}, chip {self.chip}, {nx} x {ny} pixels"]
         x, y = (nx - 1) / 2, (ny - 1) / 2
         try:
             lines += self._centre_lines(x, y)
