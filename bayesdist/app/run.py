@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, Self, TypeAlias
 import numpy as np
 
 from bayesdist.app.products.made_files import further_errors
-from bayesdist.app.report import write_html_report
+from bayesdist.app.report import title_of, write_html_report
 from bayesdist.app.results import Results, errors_of, margins_of, results_of
 from bayesdist.app.run_folder import copy_run, save_run
 from bayesdist.app.stages import evaluated
@@ -24,17 +24,30 @@ from bayesdist.assess import ErrorBudget, Margin, Requirement, UncertaintyMap
 from bayesdist.assess.budget.budget import budget_of, place_budget
 from bayesdist.assess.drawn import DrawnErrors
 from bayesdist.assess.evaluation import Evaluation, position_map
-from bayesdist.calibration.calibration import Calibration
+from bayesdist.calibration.calibration import Calibration, calibration_of_exposure
 from bayesdist.data import Matches
 from bayesdist.diagnose.diagnostics import Diagnostics
 from bayesdist.errors import InputError
 from bayesdist.infer import LinearFit, Posterior
 from bayesdist.model import DistortionModel
+from bayesdist.report.html import (
+    RunSummary,
+    budget_rows,
+    margin_rows,
+    summary_html,
+    summary_text,
+)
 from bayesdist.utils.checks import warnings_of
+from bayesdist.utils.numbers import with_mas
 from bayesdist.utils.quantities import year_of
 
 if TYPE_CHECKING:
+    from astropy.modeling import Model
+    from xarray import DataTree
+
     from bayesdist.app.config import Config
+    from bayesdist.calibration.wcs import CalibrationWCS
+    from bayesdist.report.run_plots import RunPlots
 
 __all__ = ["Run", "open_run", "run"]
 
@@ -270,6 +283,174 @@ class Run:
                 do=f"give one of {', '.join(map(str, numbers))}",
             )
         return number
+
+    # -- objects of other packages ----------------------------------------------------------------
+
+    @property
+    def plot(self) -> RunPlots:
+        """Plots of the run: ``run.plot.map()``, ``run.plot.residuals()``, and others."""
+        from bayesdist.report.run_plots import RunPlots  # matplotlib is only loaded for plots
+
+        results = self.results
+        return RunPlots(
+            fit=self.fit,
+            posterior=self.posterior,
+            diagnostics=self.diagnostics,
+            evaluation=self.evaluation,
+            solution=self.solution,
+            scale_mas=results.config.detector.scale_mas,
+            magnitude_errors=results.fitted.errors.by_magnitude,
+            rows=results.kind.rows,
+        )
+
+    def wcs(
+        self,
+        chip: int | None = None,
+        *,
+        exposure: str | None = None,
+        epoch: Any = None,
+        **sky: Any,
+    ) -> CalibrationWCS:
+        """World coordinate system of a chip with its errors, as in APE 14.
+
+        Parameters
+        ----------
+        chip : int, optional
+            Number of the chip, needed if there are several.
+        exposure : str, optional
+            Name of an exposure whose own shift, rotation and scale are part of the result; by
+            default those of the reference frame.
+        epoch : float or Time, optional
+            Decimal years.  If the model depends on time, the default is the date of the exposure,
+            or of the evaluation without an exposure.
+        **sky
+            Position of the plane of u and v on the sky, if the matches do not have it: `point`,
+            `position_angle`, `mirrored` and `pixel_scale`, as for `Calibration.wcs`.
+
+        Returns
+        -------
+        CalibrationWCS
+            Its pixels count from 0, unlike those of all other functions of this package.
+
+        Raises
+        ------
+        InputError
+            If there is no such chip or exposure, or a position on the sky is needed and not given.
+        """
+        date = self._date(exposure, epoch)
+        if exposure is None:
+            return self.calibration.wcs(chip, epoch=date, **sky)
+        plain = self.calibration
+        of_exposure = calibration_of_exposure(
+            self.solution,
+            exposure,
+            epoch=date,
+            plane=replace(plain.plane, note=""),
+            detector=plain.detector,
+            filter=plain.filter,
+            scale=None if plain.scale is None else (plain.scale, plain.scale_from),
+        )
+        return replace(of_exposure, further=plain.further).wcs(chip, **sky)
+
+    def _date(self, exposure: str | None, epoch: Any) -> float | None:
+        """Decimal year of a calibration; None if the model does not depend on time."""
+        if self.model.time is None:
+            return None
+        if epoch is not None:
+            return year_of(epoch)
+        stars = self.results.data.sample
+        if exposure in stars.exposure_names and stars.epoch is not None:
+            rows = stars.exposure == stars.exposure_names.index(exposure)
+            if rows.any():
+                return float(stars.epoch[rows].mean())
+        return self.results.epoch
+
+    def to_model(self, chip: int | None = None, *, epoch: Any = None, **sky: Any) -> Model:
+        """Compound model of astropy.modeling from 0-based pixels to the sky, or to u and v.
+
+        Parameters
+        ----------
+        chip, epoch, **sky
+            As for `wcs`.
+
+        Returns
+        -------
+        astropy.modeling.Model
+            Two inputs and two outputs; it has an inverse.
+
+        Raises
+        ------
+        InputError
+            As for `wcs`.
+        """
+        return self.wcs(chip, epoch=epoch, **sky).to_model()
+
+    def to_datatree(self) -> DataTree:
+        """Posterior as an xarray DataTree, which ArviZ reads.
+
+        Returns
+        -------
+        xarray.DataTree
+        """
+        return self.posterior.to_datatree()
+
+    # -- representations --------------------------------------------------------------------------
+
+    def __repr__(self) -> str:
+        return summary_text(self._summary)
+
+    def _repr_html_(self) -> str:
+        return summary_html(self._summary)
+
+    @property
+    def _summary(self) -> RunSummary:
+        """Content of the representations of a run: verdicts, warnings, a few facts."""
+        evaluation, fit, config = self.evaluation, self.fit, self.results.config
+        convergence = self.posterior.convergence
+        scale_mas = config.detector.scale_mas
+        largest = max(float(one.per_axis.max()) for one in evaluation.maps)
+        exposures = len(self.results.data.placed.exposures)
+        state = f"yes, R-hat {convergence.rhat_max:.3f}, ESS {convergence.ess_bulk_min:.0f}"
+        facts = [
+            (self.results.kind.rows.capitalize(), f"{fit.n_rows}, {fit.n_used} used in the fit"),
+            ("Exposures", str(exposures)),
+            ("Model", f"order {fit.model.order}, {fit.model.n_params} parameters"),
+            ("Converged", state if self.converged else f"NO: {'; '.join(convergence.reasons)}"),
+            ("Largest uncertainty per axis", with_mas(largest, fit.unit, scale_mas)),
+        ]
+        if self.folder is not None:
+            facts.append(("Folder", str(self.folder)))
+        return RunSummary(
+            title=title_of(config) or "calibration",
+            verdict_level=self._level,
+            headline=self._headline,
+            warnings=self.warnings,
+            facts=facts,
+            margins_rows=margin_rows(self.margins),
+            budget_rows=budget_rows(evaluation.budget, scale_mas=scale_mas),
+        )
+
+    @property
+    def _level(self) -> str:
+        """Level of the verdict: that of the worst margin, or of the checks without margins."""
+        return self.evaluation.verdict[0] if self.converged else "fail"
+
+    @property
+    def _headline(self) -> str:
+        """Verdict in words, with the number of requirements that each verdict is given to."""
+        if not self.converged:
+            return "Not converged: no number of this run can be relied on"
+        if not self.margins:
+            return "No requirement was given"
+        verdicts = [margin.verdict for margin in self.margins]
+        if len(verdicts) == 1:
+            row = margin_rows(self.margins)[0]
+            value = f"{row['Limit']}, now {row['Value']}, P(met) {row['P(met)']}"
+            return f"{verdicts[0].upper()}: {row['Requirement']}: {value}"
+        counts = [(verdicts.count(name), name) for name in ("missed", "undecided", "met")]
+        return f"{len(verdicts)} requirements: " + ", ".join(
+            f"{count} {name}" for count, name in counts if count
+        )
 
     # -- files ------------------------------------------------------------------------------------
 

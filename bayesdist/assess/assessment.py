@@ -292,6 +292,8 @@ def _settings(
 ) -> EvaluationSettings:
     """Settings of an evaluation, as a run makes them of its configuration."""
     require_known(exposure, EXPOSURES, "exposure", where="exposure")
+    if diagnostics is not None:
+        _posterior_of(solution, diagnostics)  # refuses diagnostics of another solution
     scale_mas = None if pixel_scale is None else value_in(pixel_scale, "mas", "pixel_scale")
     year = None if epoch is None else year_of(epoch)
     dates = np.zeros(0) if diagnostics is None else diagnostics.dates
