@@ -30,7 +30,10 @@ from .data import (
     read_matchup as read_matchup,
     write_partitioned as write_partitioned,
 )
-from .diagnose.diagnostics import diagnose as diagnose
+from .diagnose.diagnostics import (
+    Diagnostics as Diagnostics,
+    diagnose as diagnose,
+)
 from .errors import (
     BayesdistError as BayesdistError,
     InputError as InputError,
