@@ -114,7 +114,8 @@ def _touching(
         raise InputError(
             "does not say where its plane touches the sky",
             where=calibration.name,
-            do="give --point RA DEC, the sky position of u, v = 0, if u is east and v is north",
+            do="give the point (--point RA DEC on the command line), the sky position of u, v = 0, "
+            "if u is east and v is north",
         )
     if calibration.unit not in ARCSEC:
         raise InputError(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 
@@ -98,7 +99,7 @@ def side_file(calibration: Calibration, chip: int, epoch: float | None, header: 
     """File with the parameters of one chip at a date, to stand beside a header."""
     date = epoch if calibration.model.time is not None else None
     one = calibration.only(chip, date)
-    name = f"{header.removesuffix('.hdr')}_parameters.fits"
+    name = f"{Path(header).stem}_parameters.fits"
     return Built(name, PARAMETERS, parameters_content(one), one, chip)
 
 
