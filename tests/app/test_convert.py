@@ -170,7 +170,10 @@ def test_bad_requests_get_a_sentence(tmp_path):
     new = ("-o", tmp_path / "x")
     for arguments, message in (
         ((path, "--to", "fit", *new), "there is no format 'fit' that can be built"),
-        ((path, "--to", "tpv", "--option", "colour=red", *new), "unknown setting of tpv 'colour'; choose one of crval"),
+        (
+            (path, "--to", "tpv", "--option", "colour=red", *new),
+            "setting of tpv 'colour'; choose one of crval",
+        ),
         ((path, "--to", "tpv", "--option", "crval", *new), "is not KEY=VALUE"),
         ((path, "--to", "jwst", *new), "needs useafter, pedigree, author, instrument"),
         ((notes, "--to", "jwst", *new), "notes.txt: is of no kind that is understood"),
