@@ -331,9 +331,9 @@ def test_the_reference_names_all_that_is_public():
     assert {p.stem for p in (DOCS / "api").glob("*.md")} == set(modules)
     for name in modules:
         module = import_module(name)
-        for public in getattr(module, "__all__", ()):
-            member = getattr(module, public)
-            assert not callable(member) or member.__doc__, f"{name}.{public}"
+        for offered in getattr(module, "__all__", ()):
+            member = getattr(module, offered)
+            assert not callable(member) or member.__doc__, f"{name}.{offered}"
 
 
 @pytest.mark.slow

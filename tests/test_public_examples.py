@@ -54,7 +54,7 @@ def test_parameters_are_those_of_the_signature(name):
     }
     assert told == asked
     if inspect.isfunction(thing):
-        assert text["Raises"]
+        assert text["Raises"] or not asked
         returns = inspect.signature(thing).return_annotation
         assert bool(text["Returns"]) == (returns != "None")
 
