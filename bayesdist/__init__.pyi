@@ -1,8 +1,14 @@
 """Names of the package, each with the module where it is at home; loaded when first used."""
 
+from .app.calibrate import calibrate as calibrate
 from .app.commands.on_files.calibrations import read_calibration as read_calibration
-from .app.run import run as run
+from .app.run import (
+    Run as Run,
+    open_run as open_run,
+    run as run,
+)
 from .assess import (
+    Catalogue as Catalogue,
     ErrorBudget as ErrorBudget,
     Margin as Margin,
     Requirement as Requirement,
@@ -16,11 +22,13 @@ from .calibration.calibration import Calibration as Calibration
 from .data import (
     Matches as Matches,
     ReferenceCatalog as ReferenceCatalog,
+    match as match,
     match_table as match_table,
     open_matches as open_matches,
     read_catalog as read_catalog,
     read_matches as read_matches,
 )
+from .diagnose.diagnostics import diagnose as diagnose
 from .errors import (
     BayesdistError as BayesdistError,
     InputError as InputError,

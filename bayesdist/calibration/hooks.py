@@ -6,3 +6,5 @@ when they are called; this is the only place where a lower layer names an upper 
 
 WRITE = "bayesdist.products.writing:write_calibration"
 TO_SKY = "bayesdist.calibration.sky_table:table_on_sky"
+WCS = "bayesdist.calibration.wcs:wcs_of_chip"
+SIP = "bayesdist.products.formats.sip.build:sip_wcs"

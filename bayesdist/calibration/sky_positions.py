@@ -11,6 +11,7 @@ centroid in pixels and J the slope of the map.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -18,8 +19,7 @@ from numpy.typing import ArrayLike
 
 from bayesdist.calibration.calibration import Calibration
 from bayesdist.calibration.chip_map import ChipMap
-from bayesdist.calibration.plane import ARCSEC
-from bayesdist.data.sky.tangent import sky_of_plane, tangent_jacobian
+from bayesdist.calibration.plane import ARCSEC, SkyPlacement
 from bayesdist.errors import InputError
 from bayesdist.utils.arrays import Float, Int
 
@@ -49,60 +49,101 @@ def sky_positions(
     *,
     epoch: float | None = None,
     point: tuple[float, float] | None = None,
+    placement: SkyPlacement | None = None,
     centroids: tuple[ArrayLike, ArrayLike] | None = None,
     joint: bool = False,
 ) -> SkyPositions:
     """Positions on the sky of FITS 1-based pixels (N,), with all errors that the calibration knows.
 
     `chip` is the chip number of each, or of all.  `point` is the sky position of (u, v) = (0, 0) in
-    degrees, u to the east and v to the north, in place of the calibration's own; `centroids` are
-    standard deviations of x and y in pixels; with `joint` the covariance of all stars is there.
+    degrees, u to the east and v to the north, in place of the calibration's own; `placement` gives
+    other directions of u and v; `centroids` are standard deviations of x and y in pixels; with
+    `joint` the covariance of all stars is there.
     InputError for a plane that does not touch the sky and no point, or a unit that is no angle.
     """
     x, y = np.atleast_1d(np.asarray(x, float)), np.atleast_1d(np.asarray(y, float))
     chip = np.broadcast_to(np.asarray(chip, np.int64), x.shape)
-    point, unit = _touching(calibration, point)
+    placement = placement or placement_of(calibration, point)
     maps = calibration.with_tables(calibration.at(epoch, origin="stated"))
     plane = np.full((2, x.size), np.nan)
-    slope = np.full((x.size, 2, 2), np.nan)
-    for number, one in maps.items():
-        mine = chip == number
-        plane[:, mine] = one.at(x[mine], y[mine])
-        slope[mine] = one.slope(x[mine], y[mine])
-    ra, dec = sky_of_plane(unit * plane[0], unit * plane[1], point)
-    step = np.full((x.size, 2, 2), np.nan)
-    known = np.isfinite(ra)
-    # mas on the sky by a unit of the plane
-    step[known] = 1e3 * unit * np.linalg.inv(tangent_jacobian(ra[known], dec[known], point))
-    if calibration.errors == "none" and not calibration.further and centroids is None:
+    for number, chip_map in maps.items():
+        rows = chip == number
+        plane[:, rows] = chip_map.at(x[rows], y[rows])
+    ra, dec = placement.sky(plane)
+    steps = placement.steps(ra, dec)
+    single, whole = plane_covariances(
+        calibration, maps, x, y, chip, epoch=epoch, centroids=centroids, joint=joint
+    )
+    if single is None:
         return SkyPositions(ra, dec, None)
+    cov = np.einsum("nab,nbc,ndc->nad", steps, single, steps)
+    if whole is None:
+        return SkyPositions(ra, dec, cov)
+    whole = np.einsum("nab,nbmc,mdc->namd", steps, whole, steps, optimize=True)
+    return SkyPositions(ra, dec, cov, whole.reshape(2 * x.size, 2 * x.size))
+
+
+def plane_covariances(
+    calibration: Calibration,
+    maps: Mapping[int, ChipMap],
+    x: Float,
+    y: Float,
+    chip: Int,
+    *,
+    epoch: float | None = None,
+    centroids: tuple[ArrayLike, ArrayLike] | None = None,
+    joint: bool = False,
+) -> tuple[Float | None, Float | None]:
+    """Covariances of u, v at FITS 1-based pixels (N,), with all errors that the calibration knows.
+
+    `maps` are those of all chips at the epoch, look-up tables included; other arguments as for
+    `sky_positions`.  The first result (N, 2, 2) is for each position and the second (N, 2, N, 2)
+    for all, None unless it is asked for with `joint`; both are None if no errors are known.
+    """
+    if calibration.errors == "none" and not calibration.further and centroids is None:
+        return None, None
+    slope = np.full((x.size, 2, 2), np.nan)
+    for number, chip_map in maps.items():
+        rows = chip == number
+        slope[rows] = chip_map.slope(x[rows], y[rows])
     own = _own(calibration, slope, centroids)
     shared = np.diag([sum(r.u**2 for r in calibration.further if r.shared),
                       sum(r.v**2 for r in calibration.further if r.shared)])  # fmt: skip
     single = own + shared
-    for number, one in maps.items():
-        mine = chip == number
-        found = one.covariance_at(x[mine], y[mine])
-        if found is not None:
-            single[mine] += found
-    cov = np.einsum("nab,nbc,ndc->nad", step, single, step)
+    for number, chip_map in maps.items():
+        rows = chip == number
+        from_coefficients = chip_map.covariance_at(x[rows], y[rows])
+        if from_coefficients is not None:
+            single[rows] += from_coefficients
     if not joint:
-        return SkyPositions(ra, dec, cov)
+        return single, None
     design = _designs(calibration, maps, x, y, chip)
     whole = np.einsum("nak,kl,mbl->namb", design, _coefficients(calibration, epoch), design)
     whole += shared[None, :, None, :]
     rows = np.arange(x.size)
     whole[rows, :, rows, :] += own
-    whole = np.einsum("nab,nbmc,mdc->namd", step, whole, step, optimize=True)
-    return SkyPositions(ra, dec, cov, whole.reshape(2 * x.size, 2 * x.size))
+    return single, whole
 
 
-def _touching(
-    calibration: Calibration, point: tuple[float, float] | None
-) -> tuple[tuple[float, float], float]:
-    """Point where the plane touches the sky, and arcseconds in its unit."""
+def placement_of(
+    calibration: Calibration,
+    point: tuple[float, float] | None = None,
+    *,
+    position_angle: float | None = None,
+    mirrored: bool = False,
+    pixel_scale: float | None = None,
+) -> SkyPlacement:
+    """Placement of the plane of a calibration on the sky.
+
+    `point` (degrees) is the sky position of (u, v) = (0, 0), in place of that of the plane.
+    `position_angle` (degrees, from north to east) is that of the v axis, 0 by default, or of V3 for
+    a plane in an aperture; u is then 90 degrees east of v, or west if `mirrored`.  `pixel_scale`
+    are arcseconds per pixel, for u and v in pixels.
+    InputError for a plane in an aperture without position angle, a plane without point, and u and v
+    in pixels of unknown size.
+    """
     plane = calibration.plane
-    if plane.kind == "aperture":
+    if plane.kind == "aperture" and position_angle is None:
         raise InputError(
             "lies in V2, V3 or the Ideal system of an aperture, and not on the sky",
             where=calibration.name,
@@ -117,13 +158,27 @@ def _touching(
             do="give the point (--point RA DEC on the command line), the sky position of u, v = 0, "
             "if u is east and v is north",
         )
-    if calibration.unit not in ARCSEC:
+    if calibration.unit in ARCSEC:
+        unit = ARCSEC[calibration.unit]
+    elif pixel_scale is not None:
+        unit = pixel_scale
+    else:
         raise InputError(
             f"is in {calibration.unit}, which is no angle on the sky",
             where=calibration.name,
             do="give a calibration in arcsec, mas or deg",
         )
-    return point, ARCSEC[calibration.unit]
+    matrix = np.eye(2)
+    if position_angle is not None:
+        c, s = np.cos(np.radians(position_angle)), np.sin(np.radians(position_angle))
+        matrix = np.array([[c, s], [-s, c]])
+        if mirrored:
+            matrix = matrix @ np.diag([-1.0, 1.0])
+        if plane.kind == "aperture" and plane.to_v2v3 is not None:
+            matrix = matrix @ plane.to_v2v3
+    elif mirrored:
+        matrix = np.diag([-1.0, 1.0])
+    return SkyPlacement(point, unit * matrix)
 
 
 def _own(
@@ -148,7 +203,7 @@ def _coefficients(calibration: Calibration, epoch: float | None) -> Float:
 
 
 def _designs(
-    calibration: Calibration, maps: dict[int, ChipMap], x: Float, y: Float, chip: Int
+    calibration: Calibration, maps: Mapping[int, ChipMap], x: Float, y: Float, chip: Int
 ) -> Float:
     """Derivatives (N, 2, n) of positions by the coefficients of all chips."""
     K = calibration.model.n_terms

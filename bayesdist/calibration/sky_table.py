@@ -15,6 +15,7 @@ from bayesdist.calibration.calibration import Calibration
 from bayesdist.calibration.sky_positions import sky_positions
 from bayesdist.errors import InputError
 from bayesdist.utils.arrays import Float, Int
+from bayesdist.utils.quantities import Direction, Epoch, direction_in, year_of
 
 if TYPE_CHECKING:
     import pandas
@@ -33,8 +34,8 @@ def table_on_sky(
     centroids: Sequence[str] | None = None,
     pixel_origin: float = 1.0,
     chip: int | None = None,
-    epoch: float | None = None,
-    point: tuple[float, float] | None = None,
+    epoch: Epoch | None = None,
+    point: Direction | None = None,
     covariance: bool = False,
     name: str = "table",
 ) -> QTable:
@@ -51,8 +52,16 @@ def table_on_sky(
         sigma_x, sigma_y = (position_column(plain, c, name) for c in centroids)
         sigma = sigma_x, sigma_y
     numbers = chip_numbers(plain, chip, list(calibration.numbers), calibration.name, name)
+    year = None if epoch is None else year_of(epoch)
     at = sky_positions(
-        calibration, x, y, numbers, epoch=epoch, point=point, centroids=sigma, joint=covariance
+        calibration,
+        x,
+        y,
+        numbers,
+        epoch=year,
+        point=None if point is None else direction_in(point, "point"),
+        centroids=sigma,
+        joint=covariance,
     )
     new = COLUMNS if at.sigma is not None else COLUMNS[:2]
     refuse_columns(rows, new, name)
@@ -66,7 +75,7 @@ def table_on_sky(
         )
     outside = sum(
         int((~on_chip(m, x[numbers == n], y[numbers == n]) & np.isfinite(x[numbers == n])).sum())
-        for n, m in calibration.at(epoch).items()
+        for n, m in calibration.at(year).items()
     )
     rows.meta = {
         "calibration": calibration.name,

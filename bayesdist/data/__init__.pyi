@@ -30,6 +30,7 @@ from .matching.campaign import (
 )
 from .matching.linear_map import LinearMap as LinearMap
 from .matching.reports import ExposureReport as ExposureReport
+from .matching.rough_wcs import match as match
 from .matching.search_radius import (
     SearchRadius as SearchRadius,
     search_radius as search_radius,
@@ -51,7 +52,6 @@ from .preparing import (
 )
 from .read import read_matches as read_matches
 from .reading.options import ReadOptions as ReadOptions
-from .reading.table import matches_from_table as matches_from_table
 from .sky.earth import velocity_aberration as velocity_aberration
 from .sky.tangent import (
     mean_direction as mean_direction,

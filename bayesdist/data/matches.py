@@ -6,20 +6,29 @@ from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import MISSING, dataclass, field, fields, replace
 from functools import partial
 from itertools import pairwise
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from bayesdist.data.batches import batch_edges, every_kth
-from bayesdist.data.columns.checked import SIGMAS, MatchColumns, refuse_repeated
+from bayesdist.data.columns.checked import COLUMNS, SIGMAS, MatchColumns, refuse_repeated
 from bayesdist.data.columns.joining import joined_arguments, joined_columns
 from bayesdist.data.columns.labels import Labels, merged_counts
+from bayesdist.data.columns.output import arrow_stream, html_of, table_of
 from bayesdist.data.magnitude_errors import AddedErrors, MagnitudeErrors, no_magnitudes
+from bayesdist.data.reading.options import ReadOptions, refuse_missing_errors
+from bayesdist.data.reading.sky_table import sky_table
+from bayesdist.data.reading.table import match_arguments
 from bayesdist.errors import InputError
 from bayesdist.utils.arrays import Float
+from bayesdist.utils.quantities import Direction, Epoch, Number, values_in
 
-Errors = MagnitudeErrors | AddedErrors | float | tuple[ArrayLike, ArrayLike]
+if TYPE_CHECKING:
+    from astropy.coordinates import SkyCoord
+    from astropy.table import QTable
+
+Errors = MagnitudeErrors | AddedErrors | Number | tuple[ArrayLike, ArrayLike]
 
 
 class BatchReader(Protocol):
@@ -91,6 +100,8 @@ class Matches(MatchColumns):
         Names of the chips of `chip_numbers`, where the file has names in place of numbers.
     notes : tuple of str
         Treatment in reading, as clauses.
+    match_radius : float, optional
+        Largest distance in `unit` of a match from its nominal position, if `match` looked for it.
 
     Raises
     ------
@@ -145,6 +156,161 @@ class Matches(MatchColumns):
         return matches
 
     @classmethod
+    def from_table(
+        cls,
+        table: Any,
+        *,
+        columns: Mapping[str, str] | None = None,
+        unit: str | None = None,
+        sigma: str | Number = "columns",
+        pixel_origin: int | None = None,
+        tangent_point: Direction | None = None,
+        epoch: Epoch | None = None,
+        catalogue_epoch: Epoch | None = None,
+        chips: Mapping[str, int] | None = None,
+        not_finite: str = "refuse",
+    ) -> Matches:
+        """Matches from any object with columns.
+
+        Columns are recognised by the same names and units as those of files, and the same rules
+        hold for proper motions, missing values and pixels that count from 0: see `read_matches`.
+
+        Parameters
+        ----------
+        table : table
+            An astropy Table or QTable, also with Time and SkyCoord columns; a pandas DataFrame, in
+            which NaN is a missing value; an object with an Arrow stream (a polars DataFrame, a
+            pyarrow Table, a DuckDB result); a mapping of arrays or lists; a structured array.
+        columns, unit, sigma, pixel_origin, tangent_point, epoch, catalogue_epoch, chips, not_finite
+            As for `ReadOptions`.
+
+        Returns
+        -------
+        Matches
+
+        Raises
+        ------
+        InputError
+            For a missing column, text among numbers, values that are not finite, units that are
+            missing or contradict each other, missing errors, and no rows.
+
+        Examples
+        --------
+        >>> stars = {"x": [10.5, 900.0], "y": [20.0, 500.0], "u": [0.1, 8.9], "v": [0.2, 4.8]}
+        >>> bd.Matches.from_table(stars, unit="arcsec", sigma=0.01)
+        <2 matches in memory: 1 exposure, 1 chip, u and v in arcsec, median error 0.01 arcsec>
+        """
+        options = ReadOptions(
+            columns,
+            unit,
+            sigma,
+            pixel_origin,
+            tangent_point,
+            epoch,
+            catalogue_epoch,
+            chips,
+            not_finite,
+        )
+        return cls(**match_arguments(table, options)).as_read(sigma)
+
+    @classmethod
+    def from_sky(
+        cls,
+        x: ArrayLike,
+        y: ArrayLike,
+        sky: SkyCoord,
+        *,
+        sigma: Number | ArrayLike | tuple[ArrayLike, ArrayLike] | None = None,
+        mag: ArrayLike | None = None,
+        exposure: ArrayLike | None = None,
+        chip: ArrayLike | None = None,
+        epoch: Epoch | ArrayLike | None = None,
+        tangent_point: Direction | None = None,
+        pixel_origin: int = 1,
+        not_finite: str = "refuse",
+    ) -> Matches:
+        """Matches of pixels with sky coordinates.
+
+        Coordinates of any frame are transformed to ICRS.  If they have proper motions and an
+        `obstime`, they are moved to the epoch of the exposures, as those of a table are.
+
+        Parameters
+        ----------
+        x, y : array_like, shape (N,)
+            Raw detector positions in pixels.
+        sky : SkyCoord, shape (N,)
+            Reference positions.  Distances are not used.
+        sigma : float, Quantity, array_like or pair of array_like, optional
+            Standard error of the match: one number, one for each star, or errors to the east and to
+            the north.  Plain numbers are in arcsec.  Without it the errors are estimated from the
+            residuals by magnitude, which needs `mag`.
+        mag, exposure, chip : array_like, shape (N,), optional
+            Magnitudes, names of the exposures, and numbers or names of the chips.
+        epoch : float, str, Time, date, Quantity or array_like, optional
+            Epoch of the exposures: one, or one for each star.
+        tangent_point : SkyCoord, or pair of float or Quantity, optional
+            By default the mean direction of the stars.
+        pixel_origin : {0, 1}, optional
+            Coordinate of the centre of the first pixel: 1 as in FITS, 0 as in photutils.
+        not_finite : {'refuse', 'reject'}, optional
+            As for `ReadOptions`.
+
+        Returns
+        -------
+        Matches
+            With u, v on the tangent plane in arcsec.
+
+        Raises
+        ------
+        InputError
+            For unequal lengths, coordinates that cannot be transformed to ICRS, units that do not
+            fit, and all that `from_table` refuses.
+
+        Examples
+        --------
+        >>> from astropy.coordinates import SkyCoord
+        >>> sky = SkyCoord([10.0, 10.01], [-30.0, -30.01], unit="deg")
+        >>> matches = bd.Matches.from_sky([5.0, 800.0], [7.0, 900.0], sky, sigma=0.01)
+        >>> matches.unit
+        'arcsec'
+        """
+        table = sky_table(
+            x, y, sky, sigma=sigma, mag=mag, exposure=exposure, chip=chip, epoch=epoch
+        )
+        dated = "epoch" in table.colnames
+        return cls.from_table(
+            table,
+            sigma="columns" if "sigma_u" in table.colnames else "by_magnitude",
+            pixel_origin=pixel_origin,
+            tangent_point=tangent_point,
+            epoch=None if dated else epoch,
+            not_finite=not_finite,
+        )
+
+    def as_read(self, sigma: str | Number) -> Matches:
+        """These stars with the errors that the option `sigma` of reading asks for.
+
+        Parameters
+        ----------
+        sigma : {'columns', 'by_magnitude'}, float or Quantity
+            As for `ReadOptions`.
+
+        Returns
+        -------
+        Matches
+
+        Raises
+        ------
+        InputError
+            If they have neither errors nor magnitudes where `sigma` needs them.
+        """
+        where = ", ".join(self.sources)
+        if isinstance(sigma, str):
+            refuse_missing_errors(sigma, self.has_sigma, self.has_mag, where=where)
+            return self
+        return self.with_errors(sigma)
+
+    @classmethod
     def from_readers(
         cls, readers: Sequence[BatchReader], labels: Labels, columns: Collection[str]
     ) -> Matches:
@@ -174,7 +340,58 @@ class Matches(MatchColumns):
 
     def __repr__(self) -> str:
         place = "in memory" if self.in_memory else "on disk"
-        return f"<{len(self)} matches {place} from {', '.join(self.sources)}>"
+        return f"<{len(self)} matches {place}: {', '.join(text for _, text in self._facts())}>"
+
+    def _repr_html_(self) -> str:
+        place = "memory" if self.in_memory else "disk"
+        facts = (*self._facts(), ("files", ", ".join(self.sources)), ("place", place))
+        return html_of(len(self), facts)
+
+    def _facts(self) -> tuple[tuple[str, str], ...]:
+        """Names and words of what a reader wants to know first."""
+        n, chips = len(self.exposures), len(self.chip_numbers)
+        return (
+            ("exposures", f"{n} exposure{'s' if n > 1 else ''}"),
+            ("chips", f"{chips} chip{'s' if chips > 1 else ''}"),
+            ("unit", f"u and v in {self.unit}"),
+            ("errors", self._error_words()),
+        )
+
+    def _error_words(self) -> str:
+        if not self.has_sigma:
+            return "no errors"
+        if not self.in_memory or self.sigma_u is None or self.sigma_v is None:
+            return "with errors"
+        median = float(np.median(np.concatenate([self.sigma_u, self.sigma_v])))
+        return f"median error {median:.3g} {self.unit}"
+
+    def to_table(self) -> QTable:
+        """These stars as an astropy table.
+
+        Returns
+        -------
+        QTable
+            With units, and the names of exposures and filters and the numbers or names of chips in
+            place of codes.  ``meta["bayesdist"]`` has the tangent point, the match radius, counts
+            and notes.
+
+        Raises
+        ------
+        InputError
+            If the stars are on disk and a file cannot be read.
+
+        Examples
+        --------
+        >>> matches = bd.Matches([1.0, 2.0], [3.0, 4.0], [0.1, 0.2], [0.3, 0.4], unit="arcsec")
+        >>> matches.to_table()["u"].to("mas").value.tolist()
+        [100.0, 200.0]
+        """
+        return table_of(self.load())
+
+    def __arrow_c_stream__(self, requested_schema: object | None = None) -> object:
+        """Arrow stream of the columns of `to_table`, by the Arrow PyCapsule interface."""
+        names = [name for name in COLUMNS if self.has(name)]
+        return arrow_stream(self, self.batches(), names).__arrow_c_stream__(requested_schema)
 
     @property
     def in_memory(self) -> bool:
@@ -477,9 +694,9 @@ class Matches(MatchColumns):
 
         Parameters
         ----------
-        errors : MagnitudeErrors, AddedErrors, float or pair of array_like
+        errors : MagnitudeErrors, AddedErrors, float, Quantity or pair of array_like
             By magnitude; by groups of stars; one for all; or of u and of v, each a number or, in
-            memory, of shape (N,).  In `unit`.
+            memory, of shape (N,).  Plain numbers are in `unit`.
         in_quadrature : bool, optional
             Add them to the errors that the stars have, if any, in quadrature.
 
@@ -495,8 +712,8 @@ class Matches(MatchColumns):
         if isinstance(errors, MagnitudeErrors) and not self.has_mag:
             raise no_magnitudes(", ".join(self.sources))
         if not self.in_memory:
-            if isinstance(errors, float | int | tuple):
-                errors = _checked_numbers(errors)
+            if not isinstance(errors, MagnitudeErrors | AddedErrors):
+                errors = _checked_numbers(errors, self.unit)
             step = partial(Matches.with_errors, errors=errors, in_quadrature=in_quadrature)
             return self.mapped(step, adds=SIGMAS)
         sigma_u, sigma_v = self._errors(errors)
@@ -512,7 +729,7 @@ class Matches(MatchColumns):
             return errors.at(*self.grouped(errors.by))
         pair = errors if isinstance(errors, tuple) else (errors, errors)
         shape = (len(self),)
-        u, v = (np.broadcast_to(np.asarray(one, float), shape) for one in pair)
+        u, v = (np.broadcast_to(values_in(one, self.unit, "sigma"), shape) for one in pair)
         return u, v
 
     def with_scaled_errors(self, factor: float) -> Matches:
@@ -580,12 +797,15 @@ def _by_bits(batch: Matches, bits: NDArray[np.uint8]) -> Matches:
     return batch.select(np.unpackbits(bits, count=len(batch)).astype(bool))
 
 
-def _checked_numbers(errors: float | tuple[ArrayLike, ArrayLike]) -> tuple[float, float]:
-    """Errors of u and v that are one number each, finite and positive."""
+def _checked_numbers(
+    errors: Number | tuple[ArrayLike, ArrayLike], unit: str
+) -> tuple[float, float]:
+    """Errors of u and v in `unit` that are one number each, finite and positive."""
     pair = errors if isinstance(errors, tuple) else (errors, errors)
     numbers = []
-    for name, sigma in zip(SIGMAS, pair, strict=True):
-        if not isinstance(sigma, float | int):
+    for name, given in zip(SIGMAS, pair, strict=True):
+        sigma = values_in(given, unit, name)
+        if sigma.ndim:
             raise InputError(
                 "errors of single stars are given, and the stars are on disk",
                 do="write them into the files, or load() the stars",

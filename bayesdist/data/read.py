@@ -20,11 +20,12 @@ from bayesdist.data.formats.files import (
     mission_formats,
 )
 from bayesdist.data.formats.hst1pass import is_matchup, read_hst1pass, read_matchup
+from bayesdist.data.formats.record import read_written_matches
 from bayesdist.data.matches import Matches
 from bayesdist.data.matching.table import match_table
 from bayesdist.data.reading.columns import numbered, text_labels
-from bayesdist.data.reading.options import ReadOptions, refuse_missing_errors
-from bayesdist.data.reading.table import matches_from_table, sky_positions
+from bayesdist.data.reading.options import ReadOptions
+from bayesdist.data.reading.table import is_table, match_arguments, sky_positions
 from bayesdist.data.sky.tangent import mean_direction
 from bayesdist.data.tables.checks import absent
 from bayesdist.data.tables.column import SourceColumn
@@ -32,9 +33,9 @@ from bayesdist.data.tables.names import ALIASES, find_columns
 from bayesdist.errors import InputError
 from bayesdist.files.regular import read_lines
 from bayesdist.files.tables import read_table
+from bayesdist.utils.quantities import Direction, Epoch, Number
 
 PathLike = str | os.PathLike[str]
-IN_MEMORY = "table"  # name of a table that is no file, in errors
 # the other quantities are left out: 'mag', if there is one, is the index star's
 _CORR = dict.fromkeys(ALIASES, "") | CORR_COLUMNS
 
@@ -45,11 +46,11 @@ def read_matches(
     format: str = "auto",
     columns: Mapping[str, str] | None = None,
     unit: str | None = None,
-    sigma: str | float = "columns",
+    sigma: str | Number = "columns",
     pixel_origin: int | None = None,
-    tangent_point: tuple[float, float] | None = None,
-    epoch: float | str | None = None,
-    catalogue_epoch: float | None = None,
+    tangent_point: Direction | None = None,
+    epoch: Epoch | None = None,
+    catalogue_epoch: Epoch | None = None,
     chips: Mapping[str, int] | None = None,
     not_finite: str = "refuse",
 ) -> Matches:
@@ -60,12 +61,13 @@ def read_matches(
     path : path-like, sequence of path-like, or table
         A file, a list of files, a pattern, or a folder of Parquet files (parts of one table).  Of
         several files each is one exposure, named for the file, where it has no column of exposures.
-        Also an astropy Table or QTable, a pandas DataFrame, or a mapping of arrays.
+        Objects with columns are passed on to `Matches.from_table`.
     format : str, optional
         'table' (.ecsv, .csv, .fits, .parquet, .vot, .tbl and text of several kinds),
         'hst1pass' (lists with raw and corrected positions),
         'matchup' (such lists with the MATCHUP master that they are then matched with),
-        'astrometry.net' (corr.fits), one that a mission adds, or 'auto': by name and content.
+        'astrometry.net' (corr.fits), 'bayesdist' (matches.h5 of a saved run), one that a mission
+        adds, or 'auto': by name and content.
     columns, unit, sigma, pixel_origin, tangent_point, epoch, catalogue_epoch, chips, not_finite
         As `ReadOptions`.
 
@@ -102,14 +104,14 @@ def read_matches(
         chips,
         not_finite,
     )
-    if isinstance(path, Table | Mapping) or hasattr(path, "to_parquet"):  # a DataFrame
+    if is_table(path):
         if format not in ("auto", "table"):
             raise InputError(
                 f"format is {format!r}, but a table is given, no file",
                 where="format",
                 do="leave it out",
             )
-        return _with_errors(matches_from_table(path, options, source=IN_MEMORY), sigma)
+        return Matches(**match_arguments(path, options)).as_read(sigma)
     files = input_files(path)
     kinds = [kind_of(file, columns) if format == "auto" else format for file in files]
     masters = [file for file, kind in zip(files, kinds, strict=True) if kind == "matchup"]
@@ -118,14 +120,7 @@ def read_matches(
     else:
         in_parts = isinstance(path, str | os.PathLike) and Path(path).is_dir()
         table = _read_plain(files, kinds, options, in_parts=in_parts)
-    return _with_errors(table, sigma)
-
-
-def _with_errors(table: Matches, sigma: str | float) -> Matches:
-    refuse_missing_errors(sigma, table.has_sigma, table.has_mag, where=", ".join(table.sources))
-    if isinstance(sigma, str):
-        return table
-    return table.with_errors(float(sigma))
+    return table.as_read(sigma)
 
 
 def _read_plain(
@@ -134,7 +129,7 @@ def _read_plain(
     """Matches from files that hold them."""
     own = mission_formats()
     names: Sequence[str | None] = exposure_names(files)
-    if in_parts or (len(files) == 1 and kinds[0] in ("table", *own)):
+    if in_parts or (len(files) == 1 and kinds[0] in ("table", "bayesdist", *own)):
         names = [None] * len(files)
     tables = {
         file: own[kind].read(file) if kind in own else read_table(file)
@@ -144,9 +139,10 @@ def _read_plain(
     options = _with_common_chips(tables, _with_common_point(tables, kinds, options))
     readers: dict[str, Callable[[Path, str | None], Matches]] = {
         "hst1pass": lambda file, name: _read_list(file, name, options),
+        "bayesdist": lambda file, _: _read_record(file, options),
         "astrometry.net": lambda file, name: _read_corr(file, tables[file], name, options),
-        "table": lambda file, name: matches_from_table(
-            tables[file], options, source=str(file), exposure_name=name
+        "table": lambda file, name: Matches(
+            **match_arguments(tables[file], options, source=str(file), exposure_name=name)
         ),
     }
     readers |= dict.fromkeys(own, readers["table"])
@@ -192,6 +188,13 @@ def _read_list(file: Path, name: str | None, options: ReadOptions) -> Matches:
     return read_hst1pass(file).matches(name=name)
 
 
+def _read_record(file: Path, options: ReadOptions) -> Matches:
+    """Matches of a file that bayesdist wrote, which states all that the options could."""
+    names = "columns unit pixel_origin tangent_point epoch catalogue_epoch chips".split()
+    options.refuse(str(file), "bayesdist", *names)
+    return read_written_matches(file)
+
+
 def _read_corr(file: Path, table: Table, name: str | None, options: ReadOptions) -> Matches:
     """Matches from a `corr.fits`, which fixes columns, origin and unit.
 
@@ -204,7 +207,7 @@ def _read_corr(file: Path, table: Table, name: str | None, options: ReadOptions)
         options.refuse(str(file), "astrometry.net", "unit")
     columns = _CORR | ({"flux": "FLUX"} if "FLUX" in table.colnames else {})
     options = replace(options, columns=columns, unit=None, sigma="by_magnitude")
-    return matches_from_table(table, options, source=str(file), exposure_name=name)
+    return Matches(**match_arguments(table, options, source=str(file), exposure_name=name))
 
 
 def _read_with_master(files: Sequence[Path], kinds: Sequence[str], options: ReadOptions) -> Matches:

@@ -62,26 +62,66 @@ def parquet_table(path: Path) -> Table:
     return table
 
 
+def arrow_table(data: Any) -> Table:
+    """Rows of an object with an Arrow stream (`__arrow_c_stream__`) as an astropy Table.
+
+    Its nulls are masked; units come from the metadata of its fields.
+    """
+    import pyarrow
+
+    rows = pyarrow.RecordBatchReader.from_stream(data).read_all()
+    units = parquet_units(rows.schema)
+    names = rows.column_names
+    return Table(
+        [parquet_column(one, units.get(n)) for n, one in zip(names, rows.columns, strict=True)],
+        names=names,
+    )
+
+
 def parquet_column(values: pyarrow.ChunkedArray, unit: str | None) -> Column:
-    """A column of a Parquet file as one of an astropy Table; its nulls are masked."""
-    if values.null_count:
-        mask = values.is_null().to_numpy()
-        return MaskedColumn(values.to_numpy(), mask=mask, unit=unit)
-    return Column(numpy_array(values.combine_chunks()), unit=unit)
+    """A column of Arrow data as one of an astropy Table; its nulls are masked."""
+    array = values.combine_chunks()
+    if not array.null_count:
+        return Column(numpy_array(array), unit=unit)
+    import pyarrow
+
+    mask = numpy_array(array.is_null().cast(pyarrow.uint8())).astype(bool)
+    return MaskedColumn(numpy_array(array), mask=mask, unit=unit)
 
 
 def numpy_array(values: pyarrow.Array) -> NDArray[Any]:
-    """Values (N,) of an Arrow array without nulls; numbers as a view that cannot be written to.
+    """Values (N,) of an Arrow array, arbitrary where null; numbers as a view that is read-only.
 
     Arrow's own conversion imports pandas, which takes longer than to read a small table.
     """
+    import pyarrow
     from pyarrow import types
 
-    if types.is_floating(values.type) or types.is_integer(values.type):
+    kind = values.type
+    if types.is_floating(kind) or types.is_integer(kind):
+        if values.null_count:  # numbers without the bitmap of nulls
+            held = [None, values.buffers()[1]]
+            values = pyarrow.Array.from_buffers(kind, len(values), held, offset=values.offset)
         return np.from_dlpack(values)
-    if types.is_string(values.type):
+    if types.is_timestamp(kind):
+        return numpy_array(values.view(pyarrow.int64())).view(f"M8[{kind.unit}]")
+    if types.is_date32(kind):
+        return numpy_array(values.view(pyarrow.int32())).astype("M8[D]")
+    if types.is_boolean(kind):
+        return numpy_array(values.cast(pyarrow.uint8())).astype(bool)
+    if types.is_dictionary(kind):
+        labels, codes = numpy_array(values.dictionary), numpy_array(values.indices)
+        if not len(labels):
+            return np.full(len(codes), None)
+        return labels.take(codes.astype(np.int64), mode="clip")  # codes of nulls are arbitrary
+    if types.is_string(kind) or types.is_large_string(kind) or _is_string_view(kind):
         return np.array(values.to_pylist(), object)
     return values.to_numpy(zero_copy_only=False)
+
+
+def _is_string_view(kind: pyarrow.DataType) -> bool:
+    """True for the strings of polars, which older versions of pyarrow do not know."""
+    return str(kind) == "string_view"
 
 
 def arrow_array(values: NDArray[Any]) -> pyarrow.Array:

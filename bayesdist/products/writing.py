@@ -13,7 +13,7 @@ from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from pydantic import ValidationError
@@ -30,9 +30,7 @@ from bayesdist.products.formats.common.document import (
 )
 from bayesdist.products.registry import build, format_of, product_settings
 from bayesdist.utils.arrays import Float
-
-if TYPE_CHECKING:
-    from astropy.units import Quantity
+from bayesdist.utils.quantities import Epoch, Number, value_in, year_of
 
 log = logging.getLogger("bayesdist")
 
@@ -44,8 +42,8 @@ def write_calibration(
     format: str,
     file: str | os.PathLike[str],
     *,
-    epoch: float | None = None,
-    scale_mas: float | Quantity | None = None,
+    epoch: Epoch | None = None,
+    scale_mas: Number | None = None,
     order: int | None = None,
     overwrite: bool = False,
     **settings: Any,
@@ -53,18 +51,17 @@ def write_calibration(
     """Write a calibration in a format; arguments and errors as for `Calibration.write`."""
     target = format_of(format)
     chosen = settings_of(format, settings)
-    if epoch is not None and not np.isfinite(epoch):
-        raise InputError(f"the epoch is {epoch}", do="give it in decimal years")
+    year = None if epoch is None else year_of(epoch)
     if calibration.model.time is not None:
-        if epoch is None and (order is not None or not target.holds_time):
+        if year is None and (order is not None or not target.holds_time):
             with_order = "" if order is None else f" of order {order}"
             raise InputError(
                 f"depends on time, and {target.title}{with_order} cannot hold that",
                 where=calibration.name,
                 do="give the epoch at which it is written, in decimal years, or choose idctab",
             )
-        if epoch is not None and target.holds_time:
-            calibration = calibration.at_date(epoch)
+        if year is not None and target.holds_time:
+            calibration = calibration.at_date(year)
     if order is None and (calibration.before or calibration.after) and not target.holds_tables:
         raise InputError(
             f"has look-up tables, and {target.title} cannot hold them",
@@ -72,7 +69,7 @@ def write_calibration(
             do="give the order of a polynomial that is fitted to them, at most "
             f"{target.highest_order}, or choose one of {', '.join(_formats_with_tables())}",
         )
-    calibration, notes = representable(calibration, target, order, epoch)
+    calibration, notes = representable(calibration, target, order, year)
     scale = _mas(scale_mas)
     if scale is None:
         scale = calibration.pixel_mas
@@ -83,7 +80,7 @@ def write_calibration(
             "the folder does not exist", where=str(path.parent), do="make it, or choose another"
         )
     arcsec = None if scale is None else scale / 1000
-    built = built_for(format, calibration, chosen, BuildOptions(epoch, arcsec), path)
+    built = built_for(format, calibration, chosen, BuildOptions(year, arcsec), path)
     places = places_of(built, path)
     for place in places:
         if place.exists() and not overwrite:
@@ -226,18 +223,11 @@ def _formats_with_tables() -> list[str]:
     return [key for key in product_settings() if format_of(key).holds_tables]
 
 
-def _mas(scale: float | Quantity | None) -> float | None:
+def _mas(scale: Number | None) -> float | None:
     """Scale in mas; InputError if it is no angle, or not positive."""
     if scale is None:
         return None
-    from astropy.units import Quantity, UnitConversionError
-
-    try:
-        value = float(scale.to_value("mas") if isinstance(scale, Quantity) else scale)
-    except (TypeError, ValueError, UnitConversionError):
-        raise InputError(
-            f"scale_mas is {scale}", do="give the size of a pixel in mas, or as an angle"
-        ) from None
+    value = value_in(scale, "mas", "scale_mas")
     if not (np.isfinite(value) and value > 0):
         raise InputError(f"scale_mas is {value}", do="give a positive number")
     return value

@@ -6,8 +6,9 @@ import pytest
 from astropy.table import MaskedColumn, QTable, Table
 from astropy.time import Time
 
-from bayesdist.data import ReadOptions, matches_from_table, tangent_plane
+from bayesdist.data import ReadOptions, tangent_plane
 from bayesdist.errors import InputError
+from tests.data.tables import matches_from_table
 
 
 def stars(n=6, **more):

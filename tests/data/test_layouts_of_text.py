@@ -10,12 +10,13 @@ import pytest
 from astropy.io import fits
 from astropy.table import Table
 
-from bayesdist.data import ReadOptions, matches_from_table, open_matches, read_matches
+from bayesdist.data import ReadOptions, open_matches, read_matches
 from bayesdist.data.reading.columns import numbered
 from bayesdist.data.tables.names import ALIASES
 from bayesdist.errors import InputError
 from bayesdist.files.tables import read_table
 from bayesdist.files.text_tables import is_text_table
+from tests.data.tables import matches_from_table
 
 
 def stars(n=6, **more):

@@ -9,8 +9,9 @@ from astropy.coordinates import SkyCoord, get_body_barycentric
 from astropy.table import MaskedColumn, QTable, Table
 from astropy.time import Time
 
-from bayesdist.data import ReadOptions, matches_from_table, read_catalog, tangent_plane
+from bayesdist.data import ReadOptions, read_catalog, tangent_plane
 from bayesdist.errors import InputError
+from tests.data.tables import matches_from_table
 
 POINT = (83.0, -66.0)  # near the pole of the ecliptic: parallaxes on both axes
 MAS = np.radians(1 / 3600e3)

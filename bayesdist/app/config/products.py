@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 from pydantic import AfterValidator, Field, PositiveFloat, create_model
 
 from bayesdist.app.config.section import Section
-from bayesdist.data.tables.column import year_of
 from bayesdist.errors import InputError
 from bayesdist.products.formats.common.document import FormatSettings
 from bayesdist.products.registry import product_settings
+from bayesdist.utils.quantities import year_of
 
 _USEAFTER = ("%b %d %Y %H:%M:%S", "%b %d %Y")  # as reference files of HST have it
 

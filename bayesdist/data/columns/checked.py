@@ -73,6 +73,7 @@ class MatchColumns:
     sigma_pm_v: Float | None = None
     chip_names: tuple[str, ...] = ()
     notes: tuple[str, ...] = ()
+    match_radius: float | None = None
 
     def _complete(self) -> None:
         """Fill in the defaults, give every array its type, and check the values."""
@@ -148,6 +149,16 @@ for _name in COLUMNS:
     setattr(MatchColumns, _name, _Column(_name))
 
 
+def column_unit(name: str, unit: str) -> str | None:
+    """Unit of a column where u and v are in `unit`; None for whole numbers."""
+    if name not in _NUMBERS:
+        return None
+    if name in _MOTIONS:
+        return f"{unit} / yr"
+    units = {"x": "pix", "y": "pix", "epoch": "yr", "mag": "mag", "colour": "mag"}
+    return units.get(name, unit)
+
+
 def _completed(
     given: Mapping[str, Any], *, unit: str, where: str
 ) -> tuple[dict[str, NDArray[Any]], int, dict[str, int]]:
@@ -172,13 +183,12 @@ def _completed(
 
 def _without_units(given: Mapping[str, Any], unit: str, where: str) -> dict[str, Any]:
     """Columns with quantities replaced by numbers in `unit`."""
-    units = dict.fromkeys(("x", "y"), "pix") | dict.fromkeys(_MOTIONS, f"{unit} / yr")
-    units |= {"epoch": "yr", "mag": "mag", "colour": "mag"}
     out = dict(given)
     for name in _NUMBERS:
         own = unit_of(out.get(name), where=f"column {name!r}")
-        if own is not None:
-            factor = conversion(own, units.get(name, unit), where=f"{where}, column {name!r}")
+        to = column_unit(name, unit)
+        if own is not None and to is not None:
+            factor = conversion(own, to, where=f"{where}, column {name!r}")
             out[name] = factor * without_unit(out[name])
     return out
 

@@ -56,6 +56,7 @@ def joined_arguments(tables: Sequence[MatchColumns]) -> dict[str, Any]:
         "notes": tuple(dict.fromkeys(note for t in tables for note in t.notes)),
         "unit": first.unit,
         "tangent_point": first.tangent_point,
+        "match_radius": _common_radius(tables),
         "n_rows": sum(t.n_rows for t in tables),
         "rejected": merged_counts([t.rejected for t in tables]),
     }
@@ -86,6 +87,20 @@ def merged_codes(
         for code, own in zip(codes, labels, strict=True)
     ]
     return np.concatenate(renumbered), tuple(every)
+
+
+def _common_radius(tables: Sequence[MatchColumns]) -> float | None:
+    """Match radius of all tables; None if one has none.  InputError if they differ."""
+    radii = {table.match_radius for table in tables if table.match_radius is not None}
+    if any(table.match_radius is None for table in tables):
+        return None
+    if len(radii) > 1:
+        raise InputError(
+            f"match radii differ: {', '.join(f'{radius:g}' for radius in sorted(radii))}",
+            where=", ".join(source for table in tables for source in table.sources),
+            do="match all tables with one radius",
+        )
+    return radii.pop()
 
 
 def merged_optional(

@@ -34,6 +34,7 @@ class Labels:
     chip_names: tuple[str, ...] = ()
     rejected: Mapping[str, int] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
+    match_radius: float | None = None
 
     def arguments(self) -> dict[str, Any]:
         """Arguments of `Matches` by name."""

@@ -103,7 +103,7 @@ def match_exposure(
         raise failure
     middle = 0.5 * (plane.min(axis=0) + plane.max(axis=0))
     rho = np.hypot(*(points - middle).T)
-    pairs = _iterated_pairs(
+    pairs = iterated_pairs(
         linear(points), chip, rho, reference, tree, largest, fixed=radius is not None
     )
     if pairs is None:
@@ -169,7 +169,7 @@ def _astray(asked: Mapping[int, int], matched: Mapping[int, int]) -> tuple[int, 
 
 
 @dataclass(frozen=True, eq=False)
-class _Pairs:
+class Pairs:
     """Pairs, the positions of all detections after the maps, and the largest distance of a pair."""
 
     moved: Float
@@ -179,7 +179,7 @@ class _Pairs:
     distance: Float
 
 
-def _iterated_pairs(
+def iterated_pairs(
     start: Float,
     chip: Int,
     rho: Float,
@@ -188,8 +188,11 @@ def _iterated_pairs(
     largest: float,
     *,
     fixed: bool,
-) -> _Pairs | None:
-    """Pairs after a cubic for each chip; None where there are none but by chance.
+) -> Pairs | None:
+    """Pairs of positions `start` (N, 2) with `reference` (M, 2), after a cubic for each chip.
+
+    `rho` (N,) are distances from the middle of the detections, `tree` is of `reference`, `largest`
+    is the largest distance of a pair.  None if there are no pairs but by chance.
 
     While the cubic brings in more pairs the radius stays at its largest; then it shrinks to that
     which the pairs need, unless it is fixed, and the cubic is fitted once more.
@@ -223,10 +226,10 @@ def _iterated_pairs(
     sample = moved[:: -(-len(moved) // _MAX_CHECKED)]
     if len(index) < MIN_PAIRS or not beats_chance(sample, reference, tree, distance):
         return None
-    return _Pairs(moved, allowed, index, partner, distance)
+    return Pairs(moved, allowed, index, partner, distance)
 
 
-def _false_rate(pairs: _Pairs, rho: Float, reference: Float, step: float) -> float:
+def _false_rate(pairs: Pairs, rho: Float, reference: Float, step: float) -> float:
     """Probability that a detection without counterpart finds a star that is still free.
 
     Unpaired detections show where such detections lie; where they are few, all detections are used.

@@ -13,7 +13,7 @@ from bayesdist.data.reading.options import ReadOptions
 from bayesdist.data.sky.positions import SKY_QUANTITIES, reference_sky
 from bayesdist.data.sky.tangent import onto_plane
 from bayesdist.data.tables.checks import refuse_half
-from bayesdist.data.tables.column import EncodedColumn, Quantities, SourceColumn, year_of
+from bayesdist.data.tables.column import EncodedColumn, Quantities, SourceColumn
 from bayesdist.data.tables.names import ALIASES, PAIRS, find_columns, origin_of
 from bayesdist.data.tables.units import check_unit
 from bayesdist.errors import InputError
@@ -157,8 +157,7 @@ def match_columns(quantities: Quantities, options: ReadOptions) -> dict[str, Any
             )
         out["epoch"] = column("epoch").years()
     elif options.epoch is not None:
-        year = year_of(options.epoch, where="data.epoch")
-        out["epoch"] = np.full(len(quantities), year)
+        out["epoch"] = np.full(len(quantities), options.epoch)
     if "ra" in found:
         out |= _projected(quantities, options, out.get("epoch"))
     else:

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
 from bayesdist.data.magnitude_errors import no_magnitudes
 from bayesdist.data.tables.checks import check_not_finite
 from bayesdist.errors import InputError
+from bayesdist.utils.quantities import Number, direction_in, year_of
 
 
 @dataclass(frozen=True)
@@ -26,20 +28,20 @@ class ReadOptions:
         name leaves a quantity out.  With ra and dec, u and v are the tangent plane in arcsec.
     unit : {'pix', 'arcsec', 'mas', 'deg'}, optional
         Unit of u and v, where the file states none.
-    sigma : {'columns', 'by_magnitude'} or float, optional
+    sigma : {'columns', 'by_magnitude'}, float or Quantity, optional
         Source of errors: columns; left to be estimated from residuals by magnitude (they
-        are then None); or one number, in the unit of u and v.
+        are then None); or one number, in the unit of u and v or with a unit of its own.
     pixel_origin : {0, 1}, optional
         Coordinate of the centre of the first pixel; by default 1, or 0 where names or header are
         those of a program that counts from 0.
-    tangent_point : tuple of float, optional
-        RA and Dec in degrees of the plane for sky positions; by default the mean direction of all
-        stars.
-    epoch : float or str, optional
-        Decimal year or ISO date of all exposures, where the table has no column of it.  Reference
-        positions with proper motions are brought to it.
-    catalogue_epoch : float, optional
-        Decimal year of the reference positions, where the table has no column of it.
+    tangent_point : SkyCoord, or pair of float or Quantity, optional
+        Point where the plane for sky positions touches the sky (numbers: ICRS degrees); by default
+        the mean direction of all stars.
+    epoch : float, str, Time, date or Quantity, optional
+        Decimal year, ISO date or time of all exposures, where the table has no column of it.
+        Reference positions with proper motions are brought to it.
+    catalogue_epoch : float, str, Time, date or Quantity, optional
+        The same of the reference positions, where the table has no column of it.
     chips : mapping of str to int, optional
         Numbers of the chips, where the table has their names; by default from 1 in the order of the
         names.
@@ -55,17 +57,24 @@ class ReadOptions:
 
     columns: Mapping[str, str] | None = None
     unit: str | None = None
-    sigma: str | float = "columns"
+    sigma: str | Number = "columns"
     pixel_origin: int | None = None
-    tangent_point: tuple[float, float] | None = None
-    epoch: float | str | None = None
-    catalogue_epoch: float | None = None
+    tangent_point: Any = None  # (ra, dec) in degrees once it is made
+    epoch: Any = None  # decimal year once it is made
+    catalogue_epoch: Any = None  # the same
     chips: Mapping[str, int] | None = None
     not_finite: str = "refuse"
 
     def __post_init__(self) -> None:
         check_sigma(self.sigma)
         check_not_finite(self.not_finite)
+        if self.tangent_point is not None:
+            point = direction_in(self.tangent_point, "tangent_point", where="data.tangent_point")
+            object.__setattr__(self, "tangent_point", point)
+        for key in ("epoch", "catalogue_epoch"):
+            if getattr(self, key) is not None:
+                year = year_of(getattr(self, key), where=f"data.{key}")
+                object.__setattr__(self, key, year)
 
     @property
     def read_sigma(self) -> bool:
@@ -83,22 +92,24 @@ class ReadOptions:
                 )
 
 
-def check_sigma(sigma: str | float) -> None:
+def check_sigma(sigma: str | Number) -> None:
     """Refuse an invalid option `sigma`."""
     if isinstance(sigma, str):
         good = sigma in ("columns", "by_magnitude")
+    elif hasattr(sigma, "value"):  # its unit is compared with that of u and v later
+        good = np.ndim(sigma) == 0 and bool(np.isfinite(sigma.value)) and sigma.value > 0
     else:
         good = not isinstance(sigma, bool) and bool(np.isfinite(sigma)) and sigma > 0
     if not good:
         raise InputError(
             f"sigma is {sigma!r}",
             where="data.sigma",
-            do="set it to 'columns', 'by_magnitude' or a positive number",
+            do="set it to 'columns', 'by_magnitude', a positive number or a Quantity",
         )
 
 
 def refuse_missing_errors(
-    sigma: str | float, has_sigma: bool, has_mag: bool, *, where: str
+    sigma: str | Number, has_sigma: bool, has_mag: bool, *, where: str
 ) -> None:
     """Refuse matches that lack the columns which the option `sigma` asks for."""
     if sigma == "columns" and not has_sigma:

@@ -1,4 +1,4 @@
-"""Matches from any object with columns."""
+"""Columns of Matches from any object with columns: astropy, pandas, Arrow, mappings, records."""
 
 from __future__ import annotations
 
@@ -7,10 +7,10 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from astropy.table import Column, Table
+from astropy.table import Column, MaskedColumn, Table
 from astropy.time import Time
 
-from bayesdist.data.matches import Matches
+from bayesdist.data.columns.output import header_arguments
 from bayesdist.data.reading.columns import columns_read, is_on_sky, match_columns
 from bayesdist.data.reading.options import ReadOptions
 from bayesdist.data.sky.positions import MOTIONS, SPARED, sky_columns
@@ -18,24 +18,84 @@ from bayesdist.data.tables.checks import absent, row_number, without_missing
 from bayesdist.data.tables.column import Quantities
 from bayesdist.data.tables.names import ALIASES, PAIRS, find_columns
 from bayesdist.errors import InputError
+from bayesdist.files.parquet import arrow_table
 from bayesdist.utils.arrays import Float
 
 _MOTION = "mas / yr"
 _SPARED = frozenset((*SPARED, "colour", "flux"))  # optional: a star may lack them
+_KINDS = (
+    "an astropy Table or QTable, a pandas or polars DataFrame, an Arrow table, a mapping of arrays "
+    "or a structured array"
+)
 
 
-def _as_table(data: Any, source: str) -> Table:
-    """Astropy Table from any object with columns."""
+def is_table(data: Any) -> bool:
+    """True for objects that `as_table` takes."""
+    return (
+        isinstance(data, Table | Mapping)
+        or _is_pandas(data)
+        or hasattr(data, "__arrow_c_stream__")
+        or (isinstance(data, np.ndarray) and data.dtype.names is not None)
+    )
+
+
+def _is_pandas(data: Any) -> bool:
+    return hasattr(data, "iloc") and hasattr(data, "to_parquet")
+
+
+def as_table(data: Any, source: str) -> Table:
+    """Astropy Table of any object with columns.
+
+    Parameters
+    ----------
+    data : table
+        An astropy Table or QTable; a pandas DataFrame, whose NaN are missing values; any object
+        with an Arrow stream (polars, pyarrow, DuckDB), whose nulls are missing values; a mapping of
+        arrays or lists, in which None is a missing value; or a structured array of numpy.
+    source : str
+        Name of the table, for errors.
+
+    Returns
+    -------
+    Table
+        An astropy Table as it is; others as views of their columns where possible.
+
+    Raises
+    ------
+    InputError
+        If it is no such object, or its columns have different lengths.
+    """
     if isinstance(data, Table):
         return data
+    if not is_table(data):
+        file = isinstance(data, str) or hasattr(data, "__fspath__")
+        raise InputError(
+            f"is a {type(data).__name__}, which is no table",
+            where=source,
+            do="read files with read_matches" if file else f"give {_KINDS}",
+        )
     try:
-        if hasattr(data, "to_parquet"):  # a DataFrame, whose NaN are missing values
+        if _is_pandas(data):
             return Table.from_pandas(data)
-        return Table(dict(data))
+        if hasattr(data, "__arrow_c_stream__"):
+            return arrow_table(data)
+        if isinstance(data, Mapping):
+            return Table({name: _without_none(column) for name, column in data.items()})
+        return Table(data)
     except (TypeError, ValueError) as error:
         raise InputError(
             f"columns do not make a table ({error})", where=source, do="give columns of one length"
         ) from error
+
+
+def _without_none(column: Any) -> Any:
+    """Column of a mapping; lists that hold None become masked columns."""
+    if not isinstance(column, list | tuple) or not any(value is None for value in column):
+        return column
+    mask = [value is None for value in column]
+    filling = next((value for value in column if value is not None), 0)
+    return MaskedColumn([filling if gone else v for v, gone in zip(column, mask, strict=True)],
+                        mask=mask)  # fmt: skip
 
 
 def sky_positions(
@@ -57,7 +117,9 @@ def with_sky_columns(table: Table) -> Table:
     """Table whose SkyCoord columns are columns of ra and dec, in degrees.
 
     `skycoord` becomes `skycoord.ra`, `skycoord.dec` (ICRS), and its motions and the time of its
-    positions `pmra`, `pmdec` and `ref_epoch`; without such it is the table itself.
+    positions `pmra`, `pmdec` and `ref_epoch`.  A single SkyCoord column of any other name is also
+    available as `skycoord`.  Distances are not used.  A table without such columns is returned as
+    it is.
     """
     others = [name for name in table.colnames if not isinstance(table[name], Column)]
     if not others:
@@ -70,7 +132,9 @@ def with_sky_columns(table: Table) -> Table:
     out = table.copy(copy_data=False)
     for name in coordinates:
         sky = table[name].icrs
-        out[f"{name}.ra"], out[f"{name}.dec"] = sky.ra.deg, sky.dec.deg
+        usual = len(coordinates) > 1 or f"{name}.ra".lower() in ALIASES["ra"]
+        for title in (name,) if usual else (name, "skycoord"):
+            out[f"{title}.ra"], out[f"{title}.dec"] = sky.ra.deg, sky.dec.deg
         if "s" in sky.data.differentials and "pmra" not in out.colnames:
             out["pmra"] = sky.pm_ra_cosdec.to(_MOTION)
             out["pmdec"] = sky.pm_dec.to(_MOTION)
@@ -80,18 +144,19 @@ def with_sky_columns(table: Table) -> Table:
     return out
 
 
-def matches_from_table(
+def match_arguments(
     data: Any,
     options: ReadOptions | None = None,
     *,
     source: str = "table",
     exposure_name: str | None = None,
-) -> Matches:
-    """Matches from a table's columns.
+) -> dict[str, Any]:
+    """Arguments of `Matches` from a table's columns.
 
     Parameters
     ----------
-    data : astropy Table or QTable, pandas DataFrame, or mapping of arrays
+    data : table
+        As for `as_table`.
     options : ReadOptions, optional
     source : str, optional
         File, for errors.
@@ -100,17 +165,17 @@ def matches_from_table(
 
     Returns
     -------
-    Matches
-        Without errors where these do not come from columns.
+    dict
+        Without errors of the matches if these do not come from columns.
 
     Raises
     ------
     InputError
         For a missing column, text among numbers, values that are not finite, units that are missing
-        or contradict each other, no rows, and all that `Matches` refuses.
+        or contradict each other, and no rows.
     """
     options = options or ReadOptions()
-    table = with_sky_columns(_as_table(data, source))
+    table = with_sky_columns(as_table(data, source))
     found, options, notes = columns_read(table.colnames, table.meta, options, source=source)
     if len(table) == 0:
         raise InputError("holds no rows", where=source, do="give a table with matched stars")
@@ -134,10 +199,12 @@ def matches_from_table(
             return row_number(int(rows[index]))
 
     out = match_columns(Quantities(table, found, source, place), options)
+    if "ra" not in found:
+        out |= header_arguments(table.meta)
     if exposure_name is not None:
         out.setdefault("exposure_names", (exposure_name,))
     out["notes"] = (*notes, *out.get("notes", ()))
-    return Matches(**out, sources=(source,), row=rows, n_rows=n, rejected=rejected)
+    return out | {"sources": (source,), "row": rows, "n_rows": n, "rejected": rejected}
 
 
 def own_epoch(header: Mapping[str, Any]) -> float | str | None:

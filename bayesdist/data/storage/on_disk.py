@@ -135,7 +135,7 @@ def open_matches(path: PathLike | Sequence[PathLike], **options: Any) -> Matches
         stored = [replace(one, options=replace(one.options, tangent_point=point)) for one in stored]
     labels = scan(stored)
     matches = Matches.from_readers(_readers(labels, stored), labels, _columns_of(first))
-    return matches if isinstance(sigma, str) else matches.with_errors(float(sigma))
+    return matches if isinstance(sigma, str) else matches.with_errors(sigma)
 
 
 def _readers(labels: Labels, files: Sequence[StoredFile]) -> list[StoredRows]:

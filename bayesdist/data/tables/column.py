@@ -18,11 +18,11 @@ from bayesdist.data.tables.names import known_unit
 from bayesdist.data.tables.units import conversion, unit_of
 from bayesdist.errors import InputError
 from bayesdist.utils.arrays import Float, Int
+from bayesdist.utils.quantities import YEARS
 
 log = logging.getLogger("bayesdist")
 
 Array = TypeVar("Array", Float, Int)
-_YEARS = (1800.0, 2200.0)  # epochs outside are a wrong unit, not a date
 
 
 def encoded(values: NDArray[Any], *, ordered: bool = False) -> tuple[Int, tuple[Any, ...]]:
@@ -245,7 +245,7 @@ class SourceColumn:
                 out = self._dates(values)
             else:
                 out = self._numeric_years()
-        good = (out >= _YEARS[0]) & (out <= _YEARS[1])
+        good = (out >= YEARS[0]) & (out <= YEARS[1])
         if not good.all():
             bad = int(np.argmin(good))
             raise self.fail(
@@ -313,11 +313,6 @@ def _all_numbers(texts: Iterable[Any]) -> bool:
     except (ValueError, TypeError):
         return False
     return True
-
-
-def year_of(date: float | str, *, where: str) -> float:
-    """Decimal year of a year or an ISO date; anything else is refused."""
-    return float(SourceColumn(np.array([date]), where, "epoch").years()[0])
 
 
 class Columns(Protocol):

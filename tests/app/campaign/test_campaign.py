@@ -264,7 +264,7 @@ def test_the_calibration_of_a_run_has_its_tables(run, tmp_path):
     """Written as look-up tables, or into a polynomial on request, and never left out silently."""
     own = read_tables(run / "tables.h5", do="").tables
     found = bd.read_calibration(run)
-    assert found.before and found.filter == "F606W"
+    assert len(found.before) == len(own)
     x, y = np.random.default_rng(3).uniform(1, 2000, (2, 200))
     for chip in found.numbers:
         px, py = corrected(own, x, y, chip=chip, filter="F606W")

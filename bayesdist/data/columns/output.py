@@ -1,0 +1,157 @@
+"""Matches as objects of other packages: an astropy QTable, an Arrow stream, HTML."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from html import escape
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bayesdist.data.columns.checked import COLUMNS, MatchColumns, column_unit
+from bayesdist.files.parquet import arrow_array
+
+if TYPE_CHECKING:
+    import pyarrow
+    from astropy.table import QTable
+
+META = "bayesdist"  # key of the header of a table for what no column holds
+_LEFT_OUT = frozenset(("source",))  # the header names the files
+
+
+def table_of(matches: MatchColumns) -> QTable:
+    """QTable of matches in memory, with units and with names in place of codes.
+
+    Columns that the matches do not have are omitted; so is a filter without a name.  The tangent
+    point, the match radius, counts and notes are in ``meta["bayesdist"]``.
+    """
+    from astropy import units as apu
+    from astropy.table import QTable
+
+    table = QTable()
+    for name, values in _plain_columns(matches).items():
+        unit = column_unit(name, matches.unit)
+        labels = _labels(matches, name)
+        if labels is not None:
+            values = labels[values]
+        table[name] = values if unit is None else values * apu.Unit(unit)
+    header = {
+        "sources": list(matches.sources),
+        "n_rows": matches.n_rows,
+        "rejected": dict(matches.rejected),
+        "notes": list(matches.notes),
+    }
+    if matches.tangent_point is not None:
+        header["tangent_point"] = list(matches.tangent_point)
+    if matches.match_radius is not None:
+        header["match_radius"] = matches.match_radius
+    table.meta[META] = header
+    return table
+
+
+def header_arguments(header: Mapping[str, Any]) -> dict[str, Any]:
+    """Arguments of `Matches` in the header of a table that `table_of` made; else nothing."""
+    own = header.get(META)
+    if not isinstance(own, Mapping):
+        return {}
+    out: dict[str, Any] = {}
+    point, radius = own.get("tangent_point"), own.get("match_radius")
+    if isinstance(point, list | tuple) and len(point) == 2:
+        out["tangent_point"] = (float(point[0]), float(point[1]))
+    if isinstance(radius, float):
+        out["match_radius"] = radius
+    return out
+
+
+def arrow_stream(
+    matches: MatchColumns, batches: Iterable[MatchColumns], columns: Iterable[str]
+) -> pyarrow.RecordBatchReader:
+    """Arrow stream of matches, batch by batch.
+
+    Parameters
+    ----------
+    matches : MatchColumns
+        Whose labels are those of all batches.
+    batches : iterable of MatchColumns
+        In memory; read one after another.
+    columns : iterable of str
+        Columns that all batches have.
+
+    Returns
+    -------
+    pyarrow.RecordBatchReader
+        Columns as in `table_of`, with their units as metadata of the fields; names of exposures,
+        filters and chips are dictionaries.
+    """
+    import pyarrow
+
+    columns = set(columns)
+    names = [name for name in COLUMNS if name in columns and _is_told(matches, name)]
+    fields = []
+    for name in names:
+        labels, unit = _labels(matches, name), column_unit(name, matches.unit)
+        kind = pyarrow.float64() if unit is not None else pyarrow.int64()
+        if labels is not None and labels.dtype.kind == "U":
+            kind = pyarrow.dictionary(pyarrow.int32(), pyarrow.string())
+        elif name in ("mag", "colour", "epoch"):
+            kind = pyarrow.float64()
+        metadata = None if unit is None else {"unit": unit}
+        fields.append(pyarrow.field(name, kind, nullable=False, metadata=metadata))
+    schema = pyarrow.schema(fields)
+
+    def made() -> Iterable[pyarrow.RecordBatch]:
+        for batch in batches:
+            arrays = [_arrow_column(batch, name) for name in names]
+            yield pyarrow.RecordBatch.from_arrays(arrays, schema=schema)
+
+    return pyarrow.RecordBatchReader.from_batches(schema, made())
+
+
+def _arrow_column(matches: MatchColumns, name: str) -> pyarrow.Array:
+    import pyarrow
+
+    values, labels = np.asarray(getattr(matches, name)), _labels(matches, name)
+    if labels is None:
+        return arrow_array(values)
+    if labels.dtype.kind != "U":
+        return arrow_array(labels[values])
+    codes = arrow_array(values.astype(np.int32))
+    return pyarrow.DictionaryArray.from_arrays(codes, arrow_array(labels))
+
+
+def html_of(n: int, facts: Iterable[tuple[str, str]]) -> str:
+    """Short HTML table with the number of matches and facts about them."""
+    rows = "".join(
+        f"<tr><th style='text-align:left'>{escape(key)}</th>"
+        f"<td style='text-align:left'>{escape(value)}</td></tr>"
+        for key, value in facts
+    )
+    return f"<table><caption><b>{n:,} matches</b></caption>{rows}</table>"
+
+
+def _plain_columns(matches: MatchColumns) -> dict[str, NDArray[Any]]:
+    """Columns that the matches have and that a reader of a table is told."""
+    return {
+        name: np.asarray(values)
+        for name in COLUMNS
+        if _is_told(matches, name) and (values := getattr(matches, name)) is not None
+    }
+
+
+def _is_told(matches: MatchColumns, name: str) -> bool:
+    """False for columns that say nothing: codes of files, and a filter without a name."""
+    if name in _LEFT_OUT:
+        return False
+    return name != "filter" or matches.filter_names != ("",)
+
+
+def _labels(matches: MatchColumns, name: str) -> NDArray[Any] | None:
+    """Names or numbers of the codes of a column; None for a column that holds no codes."""
+    if name == "exposure":
+        return np.array(matches.exposure_names)
+    if name == "filter":
+        return np.array(matches.filter_names)
+    if name == "chip":
+        return np.array(matches.chip_names or matches.chip_numbers)
+    return None

@@ -1,0 +1,689 @@
+"""Matches of a table of detections with a catalogue on the sky, by way of a rough WCS.
+
+The rough positions of the detections are brought onto the catalogue by a shift, rotation and scale
+(found by the patterns of the stars where the WCS is too far off) and, with enough pairs, a cubic.
+Pairs are mutual nearest neighbours within the match radius after that.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from astropy.table import Column, MaskedColumn, QTable, Table
+from scipy.spatial import cKDTree
+
+from bayesdist.data.catalog import ReferenceCatalog
+from bayesdist.data.matches import Matches
+from bayesdist.data.matching.exposure import Pairs, iterated_pairs
+from bayesdist.data.matching.linear_map import MIN_PAIRS, LinearMap, best_similarity, iterated_map
+from bayesdist.data.matching.pairs import beats_chance, chance_rate, mutual_pairs, overlap
+from bayesdist.data.matching.similarity import (
+    brightest,
+    find_similarity,
+    grown_map,
+    pattern_index,
+)
+from bayesdist.data.reading.options import ReadOptions
+from bayesdist.data.reading.sky_table import SKY_COLUMN, icrs_of
+from bayesdist.data.reading.table import as_table, match_arguments, own_epoch, with_sky_columns
+from bayesdist.data.sky.positions import MOTIONS, SKY_QUANTITIES, reference_sky, sky_columns
+from bayesdist.data.sky.tangent import mean_direction, sky_of_plane, tangent_plane
+from bayesdist.data.tables.checks import without_missing
+from bayesdist.data.tables.column import Quantities
+from bayesdist.data.tables.names import ALIASES, PAIRS, find_columns, origin_of
+from bayesdist.data.tables.units import unit_of
+from bayesdist.errors import InputError
+from bayesdist.files.tables import read_table
+from bayesdist.utils.arrays import Float, Int
+from bayesdist.utils.quantities import Direction, Epoch, Number, value_in
+
+if TYPE_CHECKING:
+    pass
+
+DETECTIONS, CATALOGUE = "detections", "catalogue"
+UNMATCHED = "no counterpart in the catalogue"
+OUTSIDE = "outside the field of the WCS"
+_FROM_DETECTIONS = (
+    *("exposure", "chip", "filter", "epoch", "mag", "flux", "colour", "sigma_u", "sigma_v"),
+)
+_FROM_CATALOGUE = ("ra", "dec", *SKY_QUANTITIES, "mag", "flux", "colour", "star")
+_MARGIN = 0.5  # field radii around the detections in which catalogue stars are looked for
+_NARROW = 0.25  # mean distances between reference stars: reach of the last pairs of the linear map
+_CONVINCING_PAIRS = 15  # pairs that convince although most stars have none
+_DISPLACEMENT = 10.0  # radii by which detections are displaced to count chance pairs
+
+
+def match(
+    detections: Any,
+    catalogue: Any,
+    *,
+    radius: Number,
+    wcs: Any = None,
+    columns: Mapping[str, str] | None = None,
+    catalogue_columns: Mapping[str, str] | None = None,
+    sigma: str | Number = "columns",
+    epoch: Epoch | None = None,
+    catalogue_epoch: Epoch | None = None,
+    pixel_origin: int | None = None,
+    tangent_point: Direction | None = None,
+    chips: Mapping[str, int] | None = None,
+    not_finite: str = "refuse",
+) -> Matches:
+    """Match detections with a catalogue on the sky.
+
+    The rough positions of the detections come from a WCS or from their own columns of ra and dec.
+    They may be off by a shift, a rotation and a few per cent of the scale, which are fitted first;
+    with at least 200 pairs a cubic is fitted as well, so that a distortion which the rough WCS does
+    not include does not lose stars in the corners.  Each chip of each exposure is matched by
+    itself.
+
+    Parameters
+    ----------
+    detections : table or path
+        With detector positions in pixels: whatever `Matches.from_table` takes, or a file.
+    catalogue : table, SkyCoord, ReferenceCatalog or path
+        Reference positions on the sky.  With proper motions they are moved to the epoch of the
+        detections.
+    radius : Quantity or float
+        Match radius, largest distance of a pair; a plain number is in arcsec.
+    wcs : WCS, or mapping of WCS, optional
+        Any WCS of the common Python interface (APE 14): `astropy.wcs.WCS`, a gwcs, that of a run.
+        A mapping gives one for each exposure or each chip number.  By default `detections` has
+        columns of ra and dec.
+    columns, catalogue_columns : mapping of str to str, optional
+        Column of each quantity in the two tables, as for `ReadOptions`.
+    sigma, epoch, catalogue_epoch, pixel_origin, tangent_point, chips, not_finite
+        As for `ReadOptions`.  The tangent point is the mean direction of the detections by default.
+
+    Returns
+    -------
+    Matches
+        Magnitudes, fluxes and errors of the match come from the detections if they have them, and
+        otherwise from the catalogue.  `star` is the column of that name of the catalogue, or else
+        its row from 0.  `u_nominal` and `v_nominal` are the positions by the refined WCS, and
+        `match_radius` is the radius in arcsec.  `notes` say how many were matched and how the WCS
+        was refined; `rejected` counts the others.
+
+    Raises
+    ------
+    InputError
+        For a radius that is not positive, an empty table, proper motions without an epoch, and
+        detections that do not match the catalogue, with the separation of the two fields.
+
+    Examples
+    --------
+    >>> from astropy.wcs import WCS
+    >>> wcs = WCS(naxis=2)
+    >>> wcs.wcs.ctype, wcs.wcs.crval = ["RA---TAN", "DEC--TAN"], [30.0, 5.0]
+    >>> wcs.wcs.crpix, wcs.wcs.cdelt = [500.5, 500.5], [-1e-4, 1e-4]
+    >>> x, y = np.random.default_rng(1).uniform(1, 1000, (2, 100))
+    >>> sky = wcs.pixel_to_world(x - 1, y - 1)
+    >>> seen = {"x": x + 4.0, "y": y - 3.0}  # the pointing is 5 pixels off
+    >>> len(bd.match(seen, sky, radius=0.5, wcs=wcs, sigma=0.01))
+    100
+    """
+    reach = value_in(radius, "arcsec", "radius")
+    if not (np.isfinite(reach) and reach > 0):
+        raise InputError(
+            f"radius is {radius}", where="match", do="give a positive number of arcsec or an angle"
+        )
+    options = ReadOptions(
+        None, None, sigma, pixel_origin, tangent_point, epoch, catalogue_epoch, chips, not_finite
+    )
+    stars = _reference(catalogue, catalogue_columns, options)
+    seen = _detections(detections, columns, wcs, options)
+    point = options.tangent_point or mean_direction(seen.ra, seen.dec)
+    found = _Found(seen, stars)
+    for group in seen.groups():
+        found.add(group, point, reach)
+    return found.matches(point, reach, options)
+
+
+# -- the two tables -------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class _Stars:
+    """Catalogue stars that have a position, and a motion if the catalogue has motions."""
+
+    columns: Quantities
+    rows: Int  # (M,), in the catalogue
+    moving: bool
+    epoch: float | None  # of the positions, if it is no column
+    mag: Float | None  # (M,), infinite where it is not known
+    notes: tuple[str, ...]
+
+    def at(self, epoch: float | None) -> tuple[Float, Float]:
+        """Right ascension and declination (M,) at an epoch, degrees."""
+        if not self.moving:
+            return sky_columns(self.columns)
+        if epoch is None:
+            raise InputError(
+                "has proper motions, and the epoch of the detections is not given",
+                where=CATALOGUE,
+                do="give epoch, or leave the motions out: "
+                'catalogue_columns={"pm_ra": "", "pm_dec": ""}',
+            )
+        dates = np.full(len(self.rows), epoch)
+        sky = reference_sky(self.columns, epoch=dates, catalogue_epoch=self.epoch)
+        return sky.ra, sky.dec
+
+
+@dataclass(frozen=True, eq=False)
+class _Group:
+    """Detections of one chip of one exposure."""
+
+    rows: Int
+    name: str
+    epoch: float | None
+
+
+@dataclass(frozen=True, eq=False)
+class _Seen:
+    """Detections with a rough position on the sky."""
+
+    columns: Quantities
+    rows: Int  # (N,), in the table
+    n_rows: int
+    rejected: dict[str, int]
+    ra: Float  # (N,), degrees, by the rough WCS
+    dec: Float
+    mag: Float | None
+    epoch: Float | None  # (N,), decimal years
+    exposure: Int  # (N,), codes
+    chip: Int
+    names: tuple[tuple[str, ...], tuple[str, ...]]  # of exposures and chips; empty without columns
+    origin: int
+    notes: tuple[str, ...]
+
+    def groups(self) -> Iterator[_Group]:
+        """Detections of each chip of each exposure."""
+        for exposure in np.unique(self.exposure):
+            for chip in np.unique(self.chip[self.exposure == exposure]):
+                rows = np.flatnonzero((self.exposure == exposure) & (self.chip == chip))
+                words = [
+                    f"{key} {names[code]}"
+                    for key, names, code in zip(
+                        ("exposure", "chip"), self.names, (exposure, chip), strict=True
+                    )
+                    if names
+                ]
+                epoch = None if self.epoch is None else float(self.epoch[rows].mean())
+                yield _Group(rows, ", ".join((DETECTIONS, *words)), epoch)
+
+
+def _table_of(data: Any, source: str) -> Table:
+    """Table with at least one row of an object or a file."""
+    if isinstance(data, str | os.PathLike):
+        data = read_table(Path(data))
+    if isinstance(data, Matches):
+        data = data.to_table()
+    table = with_sky_columns(as_table(data, source))
+    if not len(table):
+        raise InputError("holds no rows", where=source, do="give a table with stars")
+    return table
+
+
+def _catalogue_table(catalogue: Any) -> Table:
+    from astropy.coordinates import SkyCoord
+
+    if isinstance(catalogue, SkyCoord):
+        return _table_of(QTable({SKY_COLUMN: icrs_of(catalogue, None, where=CATALOGUE)}), CATALOGUE)
+    if isinstance(catalogue, ReferenceCatalog):
+        return _table_of(_sky_table_of(catalogue), CATALOGUE)
+    return _table_of(catalogue, CATALOGUE)
+
+
+def _sky_table_of(catalogue: ReferenceCatalog) -> QTable:
+    """Table on the sky of a catalogue on a tangent plane."""
+    from astropy import units as apu
+
+    if catalogue.tangent_point is None or catalogue.unit == "pix":
+        raise InputError(
+            "does not lie on the sky: its tangent point or its angles are not known",
+            where=catalogue.source,
+            do="read it from ra and dec, or match positions on a plane with match_table",
+        )
+    catalogue = catalogue.rescaled(float(apu.Unit(catalogue.unit).to("arcsec")), "arcsec")
+    ra, dec = sky_of_plane(catalogue.u, catalogue.v, catalogue.tangent_point or (0.0, 0.0))
+    table = QTable({"ra": ra * apu.deg, "dec": dec * apu.deg, "star": catalogue.star})
+    names = {"ra_error": "sigma_u", "dec_error": "sigma_v", "parallax": "parallax"}
+    motions = {"pmra": "pm_u", "pmdec": "pm_v", "pmra_error": "sigma_pm_u",
+               "pmdec_error": "sigma_pm_v"}  # fmt: skip
+    for columns, unit in ((names, apu.arcsec), (motions, apu.arcsec / apu.yr)):
+        for name, key in columns.items():
+            if getattr(catalogue, key) is not None:
+                table[name] = getattr(catalogue, key) * unit
+    if catalogue.mag is not None:
+        table["mag"] = catalogue.mag
+    if catalogue.epoch is not None:
+        table["ref_epoch"] = np.broadcast_to(catalogue.epoch, len(catalogue))
+    return table
+
+
+def _reference(catalogue: Any, columns: Mapping[str, str] | None, options: ReadOptions) -> _Stars:
+    """Catalogue stars with the quantities that are read."""
+    table = _catalogue_table(catalogue)
+    found = find_columns(
+        table.colnames, columns, ALIASES, source=CATALOGUE, pairs=PAIRS, needed=("ra", "dec")
+    )
+    if "epoch" in found:
+        found.setdefault("catalogue_epoch", found["epoch"])
+    found = {key: name for key, name in found.items() if key in _FROM_CATALOGUE}
+    epoch = options.catalogue_epoch if "catalogue_epoch" not in found else None
+    moving = "pm_ra" in found
+    if moving and "catalogue_epoch" not in found and epoch is None:
+        raise InputError(
+            "has proper motions, and the epoch of its positions is not given",
+            where=CATALOGUE,
+            do="give catalogue_epoch, or leave the motions out: "
+            'catalogue_columns={"pm_ra": "", "pm_dec": ""}',
+        )
+    read = {key: name for key, name in found.items() if key in ("ra", "dec", *MOTIONS)}
+    stay, counts = without_missing(
+        table,
+        read,
+        source=CATALOGUE,
+        reject=options.not_finite == "reject",
+        spared=frozenset(),
+        motions=frozenset(MOTIONS),
+    )
+    rows = np.flatnonzero(stay)
+    notes = tuple(f"{n} catalogue stars are left out: {reason}" for reason, n in counts.items())
+    quantities = Quantities(table[rows], found, CATALOGUE, names=table.colnames)
+    mag = None
+    if "mag" in found:
+        mag = np.nan_to_num(quantities["mag"].known_numbers(), nan=np.inf)
+    return _Stars(quantities, rows, moving, epoch, mag, notes)
+
+
+def _detections(
+    detections: Any, columns: Mapping[str, str] | None, wcs: Any, options: ReadOptions
+) -> _Seen:
+    """Detections with rough positions by the WCS, or by columns of ra and dec."""
+    table = _table_of(detections, DETECTIONS)
+    if isinstance(detections, Matches) and detections.tangent_point is not None:
+        _add_sky(table, detections)
+    found = find_columns(
+        table.colnames, columns, ALIASES, source=DETECTIONS, pairs=PAIRS, needed=("x", "y")
+    )
+    if wcs is None and not {"ra", "dec"} <= found.keys():
+        raise InputError(
+            "has no columns of ra and dec, and no WCS is given",
+            where=DETECTIONS,
+            do="give wcs, for example astropy.wcs.WCS(header)",
+        )
+    rough = () if wcs is not None else ("ra", "dec")
+    found = {k: name for k, name in found.items() if k in ("x", "y", *rough, *_FROM_DETECTIONS)}
+    stay, rejected = without_missing(
+        table,
+        found,
+        source=DETECTIONS,
+        reject=options.not_finite == "reject",
+        spared=frozenset(("colour", "flux")),
+        motions=frozenset(),
+    )
+    rows = np.flatnonzero(stay)
+    origin, notes = options.pixel_origin, ()
+    if origin is None:
+        origin, why = origin_of(found["x"], table.colnames, table.meta)
+        notes = (f"the first pixel is taken as {origin}: {why}",) if why else ()
+    quantities = Quantities(table[rows], found, DETECTIONS, names=table.colnames)
+    codes = {
+        key: quantities[key].labels() if key in found else (np.zeros(len(rows), np.int64), ())
+        for key in ("exposure", "chip")
+    }
+    if wcs is None:
+        ra, dec = sky_columns(quantities)
+    else:
+        x, y = (quantities[key].numbers() - origin for key in ("x", "y"))
+        ra, dec = _by_wcs(wcs, x, y, codes)
+    inside = np.isfinite(ra) & np.isfinite(dec)
+    if not inside.any():
+        raise InputError(
+            "all positions lie outside the field of the WCS",
+            where=DETECTIONS,
+            do="give the WCS of this image",
+        )
+    if not inside.all():
+        rejected = rejected | {OUTSIDE: int((~inside).sum())}
+        quantities = Quantities(quantities.table[inside], found, DETECTIONS, names=table.colnames)
+    mag = None
+    if "mag" in found:
+        mag = quantities["mag"].numbers()
+    elif "flux" in found:
+        mag = quantities["flux"].magnitudes_of_fluxes()
+    return _Seen(
+        columns=quantities,
+        rows=rows[inside],
+        n_rows=len(table),
+        rejected=rejected,
+        ra=ra[inside],
+        dec=dec[inside],
+        mag=mag,
+        epoch=_epochs(quantities, table.meta, options),
+        exposure=codes["exposure"][0][inside],
+        chip=codes["chip"][0][inside],
+        names=(codes["exposure"][1], codes["chip"][1]),
+        origin=origin,
+        notes=notes,
+    )
+
+
+def _epochs(
+    quantities: Quantities, header: Mapping[str, Any], options: ReadOptions
+) -> Float | None:
+    """Epochs (N,) of the detections: of the option, of their column, or of the header."""
+    if options.epoch is not None and "epoch" in quantities:
+        raise InputError(
+            "an epoch of the exposures is given, and the table has a column of it",
+            where=quantities["epoch"].where,
+            do='leave one of them out (columns={"epoch": ""})',
+        )
+    if options.epoch is not None:
+        return np.full(len(quantities), options.epoch)
+    if "epoch" in quantities:
+        return quantities["epoch"].years()
+    stated = ReadOptions(epoch=own_epoch(header)).epoch
+    return None if stated is None else np.full(len(quantities), stated)
+
+
+def _add_sky(table: Table, matches: Matches) -> None:
+    """Add ra and dec of matches on a tangent plane to their table."""
+    from astropy import units as apu
+
+    factor = float(apu.Unit(matches.unit).to("arcsec"))
+    point = matches.tangent_point or (0.0, 0.0)
+    ra, dec = sky_of_plane(factor * matches.u, factor * matches.v, point)
+    table["ra"], table["dec"] = ra * apu.deg, dec * apu.deg
+
+
+# -- rough positions ------------------------------------------------------------------------------
+
+
+def _by_wcs(
+    wcs: Any, x: Float, y: Float, codes: Mapping[str, tuple[Int, tuple[str, ...]]]
+) -> tuple[Float, Float]:
+    """Rough positions (N,) in degrees of 0-based pixels (N,)."""
+    if not isinstance(wcs, Mapping) or hasattr(wcs, "cards"):  # a FITS header is a mapping, too
+        if len(codes["chip"][1]) > 1:
+            raise InputError(
+                f"has {len(codes['chip'][1])} chips, and one WCS is given",
+                where=DETECTIONS,
+                do="give wcs as a mapping from chip number to WCS",
+            )
+        return sky_of_pixels(wcs, x, y)
+    ra, dec = np.full(len(x), np.nan), np.full(len(x), np.nan)
+    by_name = {str(key): value for key, value in wcs.items()}
+    key = next((k for k, (_, names) in codes.items() if by_name.keys() & set(names)), None)
+    if key is None:
+        raise InputError(
+            f"wcs has the keys {', '.join(by_name)}, which are neither exposures nor chips of the "
+            "detections",
+            where=DETECTIONS,
+            do="give a WCS for each exposure, or for each chip number",
+        )
+    code, names = codes[key]
+    for number, name in enumerate(names):
+        rows = np.flatnonzero(code == number)
+        if len(rows) and name not in by_name:
+            raise InputError(
+                f"wcs has no key for {key} {name}", where=DETECTIONS, do="add its WCS to wcs"
+            )
+        if len(rows):
+            ra[rows], dec[rows] = sky_of_pixels(by_name[name], x[rows], y[rows])
+    return ra, dec
+
+
+def sky_of_pixels(wcs: Any, x: Float, y: Float) -> tuple[Float, Float]:
+    """Right ascension and declination (ICRS, degrees) of 0-based pixels by any APE 14 WCS.
+
+    NaN where the WCS gives no position.  InputError for other objects, and for a WCS that does not
+    map two pixel axes to the sky.
+    """
+    low = getattr(wcs, "low_level_wcs", wcs)
+    if not hasattr(low, "pixel_to_world_values"):
+        raise InputError(
+            f"is a {type(wcs).__name__}, which has no pixel_to_world",
+            where="wcs",
+            do="give a WCS object, for example astropy.wcs.WCS(header)",
+        )
+    if low.pixel_n_dim != 2:
+        raise InputError(
+            f"has {low.pixel_n_dim} pixel axes",
+            where="wcs",
+            do="give its two celestial axes, for example wcs.celestial",
+        )
+    from astropy.coordinates import SkyCoord
+    from astropy.wcs.wcsapi import HighLevelWCSWrapper
+
+    high = wcs if hasattr(wcs, "pixel_to_world") else HighLevelWCSWrapper(low)
+    try:
+        world = high.pixel_to_world(x, y)
+    except Exception as error:  # each kind of WCS has exceptions of its own
+        raise InputError(
+            f"gives no positions of the detections ({error})",
+            where="wcs",
+            do="check that it is the WCS of this image",
+        ) from error
+    world = world if isinstance(world, list | tuple) else [world]
+    sky = next((one for one in world if isinstance(one, SkyCoord)), None)
+    if sky is None:
+        raise InputError(
+            "has no celestial axes", where="wcs", do="give a WCS that maps pixels to the sky"
+        )
+    icrs = sky.icrs
+    return np.asarray(icrs.ra.deg, float), np.asarray(icrs.dec.deg, float)
+
+
+# -- pairs ----------------------------------------------------------------------------------------
+
+
+class _Found:
+    """Pairs of all groups of detections, collected one after another."""
+
+    def __init__(self, seen: _Seen, stars: _Stars) -> None:
+        self.seen, self.stars = seen, stars
+        self.index: list[Int] = []  # rows among the detections
+        self.partner: list[Int] = []  # rows among the catalogue stars
+        self.nominal: list[Float] = []  # (n, 2), arcsec
+        self.notes: list[str] = []
+
+    def add(self, group: _Group, point: tuple[float, float], radius: float) -> None:
+        """Find the pairs of one group."""
+        seen = self.seen
+        ra, dec = self.stars.at(group.epoch)
+        nearby, place = _nearby(seen.ra[group.rows], seen.dec[group.rows], ra, dec)
+        if len(nearby) < MIN_PAIRS:
+            raise InputError(
+                f"{len(nearby)} catalogue stars lie in the field of the detections: {place}",
+                where=group.name,
+                do="give the WCS of this image, or a catalogue of its field",
+            )
+        points = np.column_stack(tangent_plane(seen.ra[group.rows], seen.dec[group.rows], point))
+        reference = np.column_stack(tangent_plane(ra[nearby], dec[nearby], point))
+        mag = None if seen.mag is None else seen.mag[group.rows]
+        mags = None if mag is None or self.stars.mag is None else (mag, self.stars.mag[nearby])
+        pairs = _aligned_pairs(points, reference, mags, radius, group.name, place)
+        self.index.append(group.rows[pairs.index])
+        self.partner.append(nearby[pairs.partner])
+        self.nominal.append(pairs.moved[pairs.index])
+        self.notes.append(_words(group, points, reference, pairs, radius))
+
+    def matches(self, point: tuple[float, float], radius: float, options: ReadOptions) -> Matches:
+        """Matches of all pairs, in the order of the detections."""
+        seen, stars = self.seen, self.stars
+        index, partner = np.concatenate(self.index), np.concatenate(self.partner)
+        nominal = np.concatenate(self.nominal)
+        order = np.argsort(index, kind="stable")
+        index, partner, nominal = index[order], partner[order], nominal[order]
+        table = Table()
+        taken = {key: seen.columns for key in ("x", "y", *_FROM_DETECTIONS) if key in seen.columns}
+        for key in _FROM_CATALOGUE:
+            if key in stars.columns and not ({key} | _INSTEAD.get(key, set())) & taken.keys():
+                taken[key] = stars.columns
+        for key, columns in taken.items():
+            table[key] = _column(columns, key, index if columns is seen.columns else partner)
+        if "star" not in table.colnames:
+            table["star"] = stars.rows[partner]
+        table["u_nominal"], table["v_nominal"] = nominal.T
+        if seen.epoch is not None and "epoch" not in table.colnames:
+            table["epoch"] = seen.epoch[index]
+        every = dict.fromkeys(ALIASES, "")
+        settings = ReadOptions(
+            columns=every | {name: name for name in table.colnames},
+            sigma=options.sigma,
+            pixel_origin=seen.origin,
+            tangent_point=point,
+            catalogue_epoch=stars.epoch,
+            chips=options.chips,
+            not_finite=options.not_finite,
+        )
+        arguments = match_arguments(table, settings, source=DETECTIONS)
+        lost = {UNMATCHED: len(seen.rows) - len(index)} if len(seen.rows) > len(index) else {}
+        arguments |= {
+            "row": seen.rows[index][arguments["row"]],
+            "n_rows": seen.n_rows,
+            "rejected": {**seen.rejected, **lost, **arguments["rejected"]},
+            "match_radius": radius,
+            "notes": (*seen.notes, *stars.notes, *self.notes, *arguments["notes"]),
+        }
+        matches = Matches.of_distinct_rows(**arguments).as_read(options.sigma)
+        u, v = (matches.column(name) for name in ("u_nominal", "v_nominal"))
+        away = np.hypot(matches.u - u, matches.v - v)
+        # the dates of single detections and the rounding of the plane may move a star
+        return (
+            matches if (away <= radius).all() else matches.select(away <= radius, reason=UNMATCHED)
+        )
+
+
+# quantities of the catalogue that are not read beside others of the detections
+_INSTEAD = {"mag": {"flux"}, "flux": {"mag"}}
+
+
+def _column(columns: Quantities, key: str, rows: Int) -> Any:
+    """Rows of the column of a quantity, with the unit that its name implies."""
+    column = columns[key]
+    values = column.values[rows]
+    if column.usual_unit is None or unit_of(values, where=column.where) is not None:
+        return values
+    kind = MaskedColumn if hasattr(values, "mask") else Column
+    return kind(values, unit=column.usual_unit)
+
+
+def _nearby(ra: Float, dec: Float, star_ra: Float, star_dec: Float) -> tuple[Int, str]:
+    """Catalogue stars in and around the field, and words on where the two fields are."""
+    centre = mean_direction(ra, dec)
+    size = float(separation(centre, ra, dec).max())
+    away = separation(centre, star_ra, star_dec)
+    there = mean_direction(star_ra, star_dec)
+    apart = float(separation(centre, np.array([there[0]]), np.array([there[1]]))[0])
+    place = (
+        f"the detections lie around RA {centre[0]:.4f}, Dec {centre[1]:+.4f} by the rough WCS and "
+        f"the catalogue around RA {there[0]:.4f}, Dec {there[1]:+.4f}, {_angle(apart)} away"
+    )
+    return np.flatnonzero(away <= (1.0 + _MARGIN) * size), place
+
+
+def separation(point: tuple[float, float], ra: Float, dec: Float) -> Float:
+    """Angles (N,) between a point and positions (N,), all in degrees (Vincenty's formula)."""
+    a0, d0, a, d = np.radians(point[0]), np.radians(point[1]), np.radians(ra), np.radians(dec)
+    cos_a, sin_a = np.cos(a - a0), np.sin(a - a0)
+    across = np.hypot(np.cos(d) * sin_a, np.cos(d0) * np.sin(d) - np.sin(d0) * np.cos(d) * cos_a)
+    along = np.sin(d0) * np.sin(d) + np.cos(d0) * np.cos(d) * cos_a
+    return np.asarray(np.degrees(np.arctan2(across, along)))
+
+
+def _angle(degrees: float) -> str:
+    """Angle in words."""
+    if degrees >= 1.0:
+        return f"{degrees:.3g} degrees"
+    return f"{60 * degrees:.3g} arcmin" if degrees >= 1 / 60 else f"{3600 * degrees:.3g} arcsec"
+
+
+def _aligned_pairs(
+    points: Float,
+    reference: Float,
+    mags: tuple[Float, Float] | None,
+    radius: float,
+    name: str,
+    place: str,
+) -> Pairs:
+    """Pairs after the rough positions (N, 2) were brought onto the reference positions (M, 2).
+
+    `mags` are the magnitudes of both, if both have some: the bright stars are then tried first.
+    """
+    failure = InputError(
+        f"does not match the catalogue: {place}",
+        where=name,
+        do="give the WCS of this image or a catalogue of its field, and check that the scale and "
+        "the parity are right within 3 per cent",
+    )
+    tree = cKDTree(reference)
+    middle = 0.5 * (points.min(axis=0) + points.max(axis=0))
+    start = LinearMap(np.eye(2), np.zeros(2), middle)
+    reach = radius
+    if not _agrees(points, reference, tree, radius):
+        mag, star_mag = mags or (None, None)
+        patterns = pattern_index(reference, star_mag)
+        try:
+            found = find_similarity(points, patterns, mag=mag, source=name)
+        except InputError:
+            raise failure from None
+        start = grown_map(brightest(points, mag), found, patterns, narrow=_NARROW)
+        reach = max(_NARROW * patterns.spacing, radius)
+    linear = iterated_map(points, reference, tree, start, reach, radius)
+    if linear is None:
+        raise failure
+    rho = np.hypot(*(points - middle).T)
+    chip = np.zeros(len(points), np.int64)
+    pairs = iterated_pairs(linear(points), chip, rho, reference, tree, radius, fixed=True)
+    if pairs is None or not _enough(len(pairs.index), pairs.moved, reference):
+        raise failure
+    return pairs
+
+
+def _agrees(points: Float, reference: Float, tree: cKDTree, radius: float) -> bool:
+    """True if the rough positions alone give more pairs than chance does."""
+    index, _, distance = mutual_pairs(points, reference, radius, tree=tree)
+    return _enough(len(index), points, reference) and beats_chance(
+        points, reference, tree, distance
+    )
+
+
+def _enough(n: int, points: Float, reference: Float) -> bool:
+    """True if n pairs are enough to convince."""
+    return n >= MIN_PAIRS and n >= min(
+        _CONVINCING_PAIRS, 0.5 * min(len(points), overlap(points, reference)[0])
+    )
+
+
+def _words(group: _Group, points: Float, reference: Float, pairs: Pairs, radius: float) -> str:
+    """Clause on the pairs of a group and the refinement of its WCS."""
+    tree, n = cKDTree(reference), len(pairs.index)
+    stars = tree.query_ball_point(pairs.moved[pairs.index], radius, return_length=True)
+    around = cKDTree(pairs.moved).query_ball_point(
+        reference[pairs.partner], radius, return_length=True
+    )
+    ambiguous = int(((stars > 1) | (around > 1)).sum())
+    onto = best_similarity(points[pairs.index], reference[pairs.partner])
+    turn, shift = complex(*onto.matrix[:, 0]), np.hypot(*onto.shift)
+    free = np.ones(len(reference), bool)
+    free[pairs.partner] = False
+    chance = 0.0
+    if free.any():
+        lost = cKDTree(reference[free])
+        chance = chance_rate(pairs.moved, lost, radius, _DISPLACEMENT * radius)
+    return (
+        f"{group.name}: {n} of {len(points)} were matched within {radius:.3g} arcsec, "
+        f"{len(points) - n} have no counterpart, {ambiguous} matches are ambiguous (another star "
+        f"or detection lies within the radius), and a detection without counterpart finds a star "
+        f"by chance with probability {chance:.2g}; the rough WCS was refined by "
+        f"{shift:.3g} arcsec, {np.degrees(np.angle(turn)):.3g} degrees and a scale of "
+        f"{abs(turn):.6g}"
+    )

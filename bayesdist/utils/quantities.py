@@ -1,0 +1,259 @@
+"""Quantities, dates, directions and seeds that users give, as the plain values of this package."""
+
+from __future__ import annotations
+
+from datetime import date
+from typing import TYPE_CHECKING, Any, TypeAlias, Union
+
+import numpy as np
+
+from bayesdist.errors import InputError
+from bayesdist.utils.arrays import Float
+
+if TYPE_CHECKING:
+    from astropy.coordinates import SkyCoord
+    from astropy.time import Time
+    from astropy.units import Quantity
+
+__all__ = [
+    "Direction",
+    "Epoch",
+    "Number",
+    "Random",
+    "direction_in",
+    "generator_of",
+    "unit_name",
+    "value_in",
+    "values_in",
+    "year_of",
+]
+
+Number: TypeAlias = Union[float, "Quantity"]
+Epoch: TypeAlias = Union[float, str, date, "Time", "Quantity"]
+Direction: TypeAlias = Union[tuple[float, float], "SkyCoord", tuple["Quantity", "Quantity"]]
+Random: TypeAlias = int | np.random.Generator
+
+YEARS = (1800.0, 2200.0)  # decimal years; an epoch outside is in another unit or no date
+UNITS = ("pix", "arcsec", "mas", "deg")
+
+
+def value_in(value: Number, unit: str, what: str, *, where: str = "") -> float:
+    """Value of a number or a Quantity in a unit.
+
+    Parameters
+    ----------
+    value : float or astropy.units.Quantity
+        A plain number is in `unit` already.
+    unit : str
+        Unit of the result, as astropy writes it.
+    what : str
+        Name of the argument, for the error.
+    where : str, optional
+        File or key, for the error.
+
+    Returns
+    -------
+    float
+
+    Raises
+    ------
+    InputError
+        If the Quantity cannot be converted to `unit`, or holds more than one value.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> value_in(0.5 * u.arcsec, "mas", "match_radius"), value_in(3, "mas", "match_radius")
+    (500.0, 3.0)
+    """
+    values = values_in(value, unit, what, where=where)
+    if values.ndim:
+        raise InputError(
+            f"{what} holds {values.size} values", where=where, do=f"give one number in {unit}"
+        )
+    return float(values)
+
+
+def values_in(values: Any, unit: str, what: str, *, where: str = "") -> Float:
+    """Values of numbers or a Quantity in a unit, as an array; see `value_in`."""
+    if hasattr(values, "to_value"):
+        import astropy.units as apu
+
+        try:
+            return np.asarray(values.to_value(apu.Unit(unit)), float)
+        except apu.UnitConversionError:
+            given = str(values.unit) or "no unit"
+            raise InputError(
+                f"{what} is given in {given}, which cannot be converted to {unit}",
+                where=where,
+                do=f"give {what} in {unit}",
+            ) from None
+    if isinstance(values, tuple | list) and any(hasattr(one, "to_value") for one in values):
+        return np.array([value_in(one, unit, what, where=where) for one in values])
+    try:
+        return np.asarray(values, float)
+    except (TypeError, ValueError):
+        raise InputError(
+            f"{what} is {values!r}, which is no number",
+            where=where,
+            do=f"give a number in {unit}, or a Quantity",
+        ) from None
+
+
+def unit_name(value: Any, what: str, *, where: str = "") -> str | None:
+    """Name among 'pix', 'arcsec', 'mas' and 'deg' of the unit of a Quantity; None for a number.
+
+    Other angles are named 'mas'; InputError for a unit that is neither an angle nor the pixel.
+    """
+    if not hasattr(value, "to_value"):
+        return None
+    name = str(value.unit)
+    if name in UNITS:
+        return name
+    values_in(value, "mas", what, where=where)
+    return "mas"
+
+
+def year_of(epoch: Epoch, what: str = "epoch", *, where: str = "") -> float:
+    """Decimal year of a date.
+
+    Parameters
+    ----------
+    epoch : float, str, datetime.date, astropy.time.Time or astropy.units.Quantity
+        Decimal year; text with a decimal year or an ISO date; a date; a time; a number of years; or
+        a Modified Julian Date as a number of days.
+    what, where : str, optional
+        As for `value_in`.
+
+    Returns
+    -------
+    float
+
+    Raises
+    ------
+    InputError
+        If it is no date between 1800 and 2200.
+
+    Examples
+    --------
+    >>> year_of(2016.5), year_of("2016-01-01")
+    (2016.5, 2016.0)
+    """
+    year = _year(epoch)
+    if year is None:
+        raise InputError(
+            f"{what} is {epoch!r}, which is no date",
+            where=where,
+            do="give a decimal year, an ISO date or an astropy Time",
+        )
+    if not YEARS[0] <= year <= YEARS[1]:
+        raise InputError(
+            f"{what} is {year:g}, which is no year",
+            where=where,
+            do="give a decimal year, an ISO date or an astropy Time",
+        )
+    return year
+
+
+def _year(epoch: Any) -> float | None:
+    """Decimal year, unchecked; None if `epoch` is no date."""
+    if isinstance(epoch, str):
+        try:
+            return float(epoch)
+        except ValueError:
+            pass
+    elif not isinstance(epoch, date | np.datetime64) and not hasattr(epoch, "unit"):
+        if hasattr(epoch, "decimalyear"):
+            return None if np.ndim(epoch) else float(epoch.decimalyear)
+        try:
+            return float(epoch)
+        except (TypeError, ValueError):
+            return None
+    import astropy.units as apu
+    from astropy.time import Time
+
+    try:
+        if hasattr(epoch, "unit"):
+            if epoch.unit != apu.d:
+                return float(epoch.to_value(apu.yr))
+            return float(Time(epoch.value, format="mjd", scale="tt").decimalyear)
+        # TT has no leap seconds: dates stay as they are written
+        return float(Time(np.datetime64(epoch) if isinstance(epoch, date) else epoch,
+                          scale="tt").decimalyear)  # fmt: skip
+    except (TypeError, ValueError, apu.UnitsError):
+        return None
+
+
+def direction_in(point: Direction, what: str, *, where: str = "") -> tuple[float, float]:
+    """Right ascension and declination (ICRS) in degrees of a direction.
+
+    Parameters
+    ----------
+    point : SkyCoord, or pair of float or Quantity
+        Plain numbers are degrees.  A SkyCoord of another frame is transformed to ICRS.
+    what, where : str, optional
+        As for `value_in`.
+
+    Returns
+    -------
+    ra, dec : float
+
+    Raises
+    ------
+    InputError
+        If it is not one direction.
+
+    Examples
+    --------
+    >>> import astropy.units as u
+    >>> direction_in((1 * u.hourangle, -30), "tangent_point")
+    (15.0, -30.0)
+    """
+    do = "give a SkyCoord of one direction, or right ascension and declination in degrees"
+    icrs = getattr(point, "icrs", None)
+    if icrs is not None:
+        if icrs.shape:
+            raise InputError(f"{what} holds {icrs.size} directions", where=where, do=do)
+        return float(icrs.ra.deg), float(icrs.dec.deg)
+    try:
+        ra, dec = point
+    except (TypeError, ValueError):
+        raise InputError(
+            f"{what} is {point!r}, which is no direction", where=where, do=do
+        ) from None
+    ra, dec = (value_in(one, "deg", what, where=where) for one in (ra, dec))
+    if not (np.isfinite(ra) and abs(dec) <= 90.0):
+        raise InputError(f"{what} is ({ra:g}, {dec:g}), which is no direction", where=where, do=do)
+    return ra, dec
+
+
+def generator_of(rng: Random) -> np.random.Generator:
+    """Random generator from a seed; a generator is returned as it is.
+
+    Parameters
+    ----------
+    rng : int or numpy.random.Generator
+
+    Returns
+    -------
+    numpy.random.Generator
+
+    Raises
+    ------
+    InputError
+        If it is neither.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> generator_of(1).normal() == np.random.default_rng(1).normal()
+    True
+    """
+    if isinstance(rng, np.random.Generator):
+        return rng
+    if isinstance(rng, int | np.integer) and not isinstance(rng, bool) and rng >= 0:
+        return np.random.default_rng(int(rng))
+    raise InputError(
+        f"rng is {rng!r}, which is neither a seed nor a generator",
+        do="give a whole number of 0 or more, or numpy.random.default_rng(seed)",
+    )
