@@ -13,9 +13,10 @@ posterior = bd.sample(fit, matches, seed=1)
 print("converged:", posterior.convergence.converged, *posterior.convergence.reasons)
 print("largest radius, formal:   ", bd.uncertainty_map(fit).radius_max, model.unit)
 print("largest radius, posterior:", bd.uncertainty_map(posterior).radius_max, model.unit)
-catalogue = bd.UserTerm("reference catalogue", "systematic", 0.005, 0.005)
-print(bd.error_budget(posterior, terms=[catalogue], rng=rng).rows()[-1])
+diagnostics = bd.diagnose(posterior, matches, fit=fit)  # what the model leaves out
+given = {"diagnostics": diagnostics, "catalogue": bd.Catalogue("2MASS", 0.005, "pix")}
+print(bd.error_budget(posterior, **given))
 field_wide = bd.Requirement("field-wide", "p95", 0.03, probability=0.95)
-print(bd.check_requirements(posterior, [field_wide], terms=[catalogue], rng=rng)[0].verdict)
+print(bd.check_requirements(posterior, [field_wide], **given)[0].verdict)
 calibration = bd.Calibration.from_solution(posterior, name="W2")
 calibration.write("sip", "w2.hdr", linear="sip", scale_mas=2750)
