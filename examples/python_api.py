@@ -3,9 +3,10 @@
 import numpy as np
 
 import bayesdist as bd
+from bayesdist.missions.wise import simulate_wise
 
 rng = np.random.default_rng(1)
-matches, truth = bd.simulate_wise(6000, rng=rng)  # or bd.read_matches("stars.ecsv")
+matches, truth = simulate_wise(6000, rng=rng)  # or bd.read_matches("stars.ecsv")
 model = bd.build_model(matches, order=4, size=(1016, 1016))
 fit = bd.fit_linear(matches, model)
 posterior = bd.sample(fit, matches, seed=1)
@@ -17,4 +18,5 @@ given = {"diagnostics": diagnostics, "catalogue": bd.Catalogue("2MASS", 0.005, "
 print(bd.error_budget(posterior, **given))
 field_wide = bd.Requirement("field-wide", "p95", 0.03, probability=0.95)
 print(bd.check_requirements(posterior, [field_wide], **given)[0].verdict)
-bd.write_sip(bd.sip_from_solution(posterior, linear="sip", scale_arcsec=2.75), "w2.hdr")
+calibration = bd.Calibration.from_solution(posterior, name="W2")
+calibration.write("sip", "w2.hdr", linear="sip", scale_mas=2750)

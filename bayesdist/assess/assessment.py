@@ -111,7 +111,8 @@ def error_budget(
 
     Examples
     --------
-    >>> matches, truth = bd.simulate_wise(500, rng=np.random.default_rng(1))
+    >>> from bayesdist.missions.wise import simulate_wise
+    >>> matches, truth = simulate_wise(500, rng=np.random.default_rng(1))
     >>> model = bd.build_model(matches, order=2, size=(1016, 1016))
     >>> fit = bd.fit_linear(matches, model)
     >>> catalogue = bd.Catalogue("2MASS", 0.005, "pix")
@@ -218,7 +219,8 @@ def check_requirements(
 
     Examples
     --------
-    >>> matches, truth = bd.simulate_wise(500, rng=np.random.default_rng(1))
+    >>> from bayesdist.missions.wise import simulate_wise
+    >>> matches, truth = simulate_wise(500, rng=np.random.default_rng(1))
     >>> model = bd.build_model(matches, order=4, size=(1016, 1016))
     >>> posterior = bd.sample(bd.fit_linear(matches, model), matches)
     >>> need, gaia = bd.Requirement("field-wide", "p95", 1.0), bd.Catalogue("Gaia", 0.001, "pix")

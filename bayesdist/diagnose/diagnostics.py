@@ -113,7 +113,8 @@ class Diagnostics:
 
     Examples
     --------
-    >>> matches, truth = bd.simulate_wise(500, rng=np.random.default_rng(1))
+    >>> from bayesdist.missions.wise import simulate_wise
+    >>> matches, truth = simulate_wise(500, rng=np.random.default_rng(1))
     >>> model = bd.build_model(matches, order=4, size=(1016, 1016))
     >>> posterior = bd.sample(bd.fit_linear(matches, model), matches, target_ess=100)
     >>> diagnostics = bd.diagnose(posterior, matches)
@@ -241,7 +242,8 @@ def diagnose(
 
     Examples
     --------
-    >>> matches, truth = bd.simulate_wise(500, rng=np.random.default_rng(1))
+    >>> from bayesdist.missions.wise import simulate_wise
+    >>> matches, truth = simulate_wise(500, rng=np.random.default_rng(1))
     >>> model = bd.build_model(matches, order=2, size=(1016, 1016))
     >>> fit = bd.fit_linear(matches, model)
     >>> posterior = bd.sample(fit, matches, seed=1, target_ess=100)

@@ -92,7 +92,8 @@ def simulate_matches(
 
     Examples
     --------
-    >>> model, theta = bd.wise_solution("W2")
+    >>> from bayesdist.missions.wise import wise_solution
+    >>> model, theta = wise_solution("W2")
     >>> matches, truth = bd.simulate_matches(model, theta, 400, rng=np.random.default_rng(1))
     >>> len(matches), truth.false.shape
     (400, (400,))
@@ -166,9 +167,11 @@ def simulate_partitioned(
 
     Examples
     --------
-    >>> model, theta = bd.wise_solution("W2")
+    >>> from bayesdist.missions.wise import wise_solution
+    >>> from bayesdist.simulate import simulate_partitioned
+    >>> model, theta = wise_solution("W2")
     >>> rng = np.random.default_rng(1)
-    >>> truth = bd.simulate_partitioned(
+    >>> truth = simulate_partitioned(
     ...     "many", 400, lambda n: bd.simulate_matches(model, theta, n, rng=rng)
     ... )
     >>> bd.open_matches("many").n_rows

@@ -38,7 +38,8 @@ def wise_solution(band: str = "W2") -> tuple[DistortionModel, Float]:
 
     Examples
     --------
-    >>> model, theta = bd.wise_solution("W4")
+    >>> from bayesdist.missions.wise import wise_solution
+    >>> model, theta = wise_solution("W4")
     >>> model.order, theta.shape
     (4, (30,))
     """
@@ -103,7 +104,8 @@ def simulate_wise(
 
     Examples
     --------
-    >>> matches, truth = bd.simulate_wise(400, band="W2", rng=np.random.default_rng(1))
+    >>> from bayesdist.missions.wise import simulate_wise
+    >>> matches, truth = simulate_wise(400, band="W2", rng=np.random.default_rng(1))
     >>> len(matches), matches.unit
     (400, 'pix')
     """
@@ -159,7 +161,8 @@ def simulate_wise_partitioned(
 
     Examples
     --------
-    >>> truth = bd.simulate_wise_partitioned("pairs", 400, rng=np.random.default_rng(1))
+    >>> from bayesdist.missions.wise import simulate_wise_partitioned
+    >>> truth = simulate_wise_partitioned("pairs", 400, rng=np.random.default_rng(1))
     >>> bd.open_matches("pairs").n_rows
     400
     """
