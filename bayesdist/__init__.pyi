@@ -1,8 +1,14 @@
 """Names of the package, each with the module where it is at home; loaded when first used."""
 
 from .app.commands.on_files.sky import apply_to_sky as apply_to_sky
-from .app.run import run as run
+from .app.calibrate import calibrate as calibrate
+from .app.run import (
+    Run as Run,
+    open_run as open_run,
+    run as run,
+)
 from .assess import (
+    Catalogue as Catalogue,
     ErrorBudget as ErrorBudget,
     Margin as Margin,
     Requirement as Requirement,
@@ -15,6 +21,7 @@ from .assess import (
 from .data import (
     Matches as Matches,
     ReferenceCatalog as ReferenceCatalog,
+    match as match,
     match_table as match_table,
     open_matches as open_matches,
     read_catalog as read_catalog,
@@ -23,6 +30,7 @@ from .data import (
     read_matchup as read_matchup,
     write_partitioned as write_partitioned,
 )
+from .diagnose.diagnostics import diagnose as diagnose
 from .errors import (
     BayesdistError as BayesdistError,
     InputError as InputError,

@@ -22,14 +22,12 @@ def sketched(*, made: bool = True) -> Iterator[None]:
 
     Figures of a run that are not `made` have their names in place of words.
     """
-    from matplotlib.figure import Figure
-
     from bayesdist.report import drawing, run_report
     from bayesdist.report.sections.run import posterior
 
     with (
         patch.object(drawing, "render", _sketch),
-        patch.object(posterior, "corner_figure", lambda *_, **__: Figure()),
+        patch.object(posterior, "draw_corner", lambda *_, **__: None),
         patch.object(run_report, "draw_all", drawing.draw_all if made else _unmade),
     ):
         yield

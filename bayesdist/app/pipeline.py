@@ -12,7 +12,7 @@ A configuration says what is asked for, and paths in it are relative to `base`::
     export(evaluation, posterior, found, data, config, base, Path("products"))
 
 What `bayesdist run` makes of the same configuration is the same to the last bit: it makes these
-calls in `bayesdist.app.run.make_stages`, and writes what they give.  A `report` shows the
+calls in `bayesdist.app.stages.make_stages`, and writes what they give.  A `report` shows the
 `Results` of a run's folder (`bayesdist.app.results`).
 """
 

@@ -15,21 +15,19 @@ from bayesdist.app.kinds.fitted import Fitted, required
 from bayesdist.app.results import Results
 from bayesdist.app.store import as_json
 from bayesdist.app.store.rundir import RunDirectory
-from bayesdist.assess import VectorMap, distortion_vectors
 from bayesdist.assess.coefficients import coefficient_table
 from bayesdist.assess.evaluation import Evaluation
 from bayesdist.assess.solution import chip_places
+from bayesdist.assess.vectors import diagram_vectors
 from bayesdist.diagnose.diagnostics import Diagnostics
+from bayesdist.files.atomic import atomic_path
 from bayesdist.files.tables import read_ecsv
 from bayesdist.infer import Posterior
-from bayesdist.model import Chip
 from bayesdist.model.grid import outline_pixels
 from bayesdist.report.context import ChipResults, Product, ReportInput, SelfcalResults
 from bayesdist.utils.checks import Check
 
 log = logging.getLogger("bayesdist")
-
-VECTOR_GRID = 17  # vectors along the longer side of a diagram: more would hide each other
 
 
 def report(results: Results, *, pdf: bool = False) -> list[str]:
@@ -47,6 +45,27 @@ def report(results: Results, *, pdf: bool = False) -> list[str]:
     run.summarise(verdict={"level": found.level, "headline": found.headline})
     log.info("report: %s", run / "report.html")
     return names
+
+
+def write_html_report(results: Results, path: Path) -> None:
+    """Write the report of a run to one HTML file.
+
+    Parameters
+    ----------
+    results : Results
+    path : pathlib.Path
+
+    Raises
+    ------
+    InputError
+        If the file cannot be written.
+    """
+    from bayesdist.report.run_report import draw_report, render_report
+
+    inputs = report_input(results)
+    text = render_report(inputs, draw_report(inputs))
+    with atomic_path(path) as temporary:
+        temporary.write_text(text, encoding="utf-8")
 
 
 def _is_command_line() -> bool:
@@ -119,8 +138,8 @@ def _chip_results(
             chip=chip,
             formal_map=formal,
             posterior_map=with_errors,
-            displacement=_vectors(solution, "no_constant", chip, epoch),
-            non_linear=_vectors(solution, "non_linear", chip, epoch),
+            displacement=diagram_vectors(solution, chip, part="no_constant", epoch=epoch),
+            non_linear=diagram_vectors(solution, chip, part="non_linear", epoch=epoch),
             area=area,
             binned=sums.residuals(),
             place=place,
@@ -137,11 +156,6 @@ def _chip_results(
             strict=True,
         )
     )
-
-
-def _vectors(solution: Posterior, part: str, chip: Chip, epoch: float | None) -> VectorMap:
-    nx, ny = (max(3, round(VECTOR_GRID * s / max(chip.size))) for s in chip.size)
-    return distortion_vectors(solution, part=part, grid=(nx, ny), epoch=epoch, chip=chip.number)
 
 
 def _product_checks(product: dict[str, Any]) -> tuple[Check, ...]:

@@ -210,8 +210,12 @@ class Results:
     @property
     def product(self) -> ProductInput:
         """Ingredients of the files of the solution."""
-        source = str(self.run.path)
-        return product_of(self.posterior, self.stored, self.data, self.config, source)
+        return product_of(self.posterior, self.stored, self.data, self.config, self.source_name)
+
+    @property
+    def source_name(self) -> str:
+        """Name of the run in the files of its solution; empty if it has no folder."""
+        return "" if self.run.in_memory else str(self.run.path)
 
     @property
     def series(self) -> Mapping[str, Any]:

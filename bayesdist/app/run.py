@@ -1,238 +1,625 @@
-"""The whole job: a configuration in, a finished run directory out."""
+"""`bayesdist.Run`: everything known about one calibration, in memory or in a folder."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterator
-from contextlib import contextmanager
+import os
+import tempfile
+import webbrowser
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, Self, TypeAlias
 
-from bayesdist.app.config import load_config
-from bayesdist.app.kinds.fitted import Fitted
-from bayesdist.app.kinds.kind import kind_of
-from bayesdist.app.pipeline import (
-    diagnose,
-    error_model,
-    evaluate,
-    export,
-    fit,
-    match,
-    report,
-    sample,
-)
-from bayesdist.app.rehearsal import rehearse
-from bayesdist.app.results import Results, open_results
-from bayesdist.app.saving import (
-    save_diagnosed,
-    save_evaluation,
-    save_figures,
-    save_fit,
-    save_matches,
-    save_products,
-    save_sampled,
-)
-from bayesdist.app.screen import log_file, progress_bar
-from bayesdist.app.store.made_from import NEEDS, STAGES
+import numpy as np
+
+from bayesdist.app.products.made_files import further_errors
+from bayesdist.app.report import title_of, write_html_report
+from bayesdist.app.results import Results, errors_of, margins_of, results_of
+from bayesdist.app.run_folder import copy_run, save_run
+from bayesdist.app.stages import evaluated
+from bayesdist.app.stages import run as run_configuration
 from bayesdist.app.store.rundir import RunDirectory
-from bayesdist.assess.evaluation import Evaluation
-from bayesdist.errors import InputError, NotConvergedError
-from bayesdist.infer import Posterior
-from bayesdist.infer.posterior.checks import convergence_check
-from bayesdist.utils.memory import release_memory
+from bayesdist.assess import ErrorBudget, Margin, Requirement, UncertaintyMap
+from bayesdist.assess.budget.budget import budget_of, place_budget
+from bayesdist.assess.drawn import DrawnErrors
+from bayesdist.assess.evaluation import Evaluation, position_map
+from bayesdist.calibration.calibration import Calibration, calibration_of_exposure
+from bayesdist.data import Matches
+from bayesdist.diagnose.diagnostics import Diagnostics
+from bayesdist.errors import InputError
+from bayesdist.infer import LinearFit, Posterior
+from bayesdist.model import DistortionModel
+from bayesdist.report.html import (
+    RunSummary,
+    budget_rows,
+    margin_rows,
+    summary_html,
+    summary_text,
+)
+from bayesdist.utils.checks import warnings_of
+from bayesdist.utils.numbers import with_mas
+from bayesdist.utils.quantities import year_of
 
-__all__ = ["continue_stage", "make_stages", "run"]
+if TYPE_CHECKING:
+    from astropy.modeling import Model
+    from xarray import DataTree
 
-ASSESS = ("diagnose", "evaluate")
+    from bayesdist.app.config import Config
+    from bayesdist.calibration.wcs import CalibrationWCS
+    from bayesdist.report.run_plots import RunPlots
 
+__all__ = ["Run", "open_run", "run"]
 
-def run(
-    config: str | Path,
-    output: str | Path,
-    *,
-    resume: bool = False,
-    force: bool = False,
-    strict: bool = False,
-    seed: int | None = None,
-    command: str = "",
-) -> Path:
-    """Match, fit, sample, diagnose, evaluate, export and report, as a configuration says.
-
-    Parameters
-    ----------
-    config : path
-        TOML file; paths in it are relative to it.
-    output : path
-        Run directory.
-    resume : bool
-        Resume the run that is there: stages that stand are skipped, checkpoints are used.
-    force : bool
-        Replace the run that is there.
-    strict : bool
-        Raise when the sampler has not converged (after everything has been written).
-    seed : int, optional
-        In place of the configured one.
-    command : str
-        For the record.
-
-    Returns
-    -------
-    Path
-        The run directory.
-
-    Raises
-    ------
-    BayesdistError
-
-    Examples
-    --------
-    >>> directory = bd.run("config.toml", "run")  # doctest: +SKIP
-    >>> posterior = bd.load_posterior(directory / "posterior.nc")  # doctest: +SKIP
-    """
-    settings, text = load_config(config)
-    directory = RunDirectory.plan(
-        output,
-        settings,
-        text,
-        Path(config).resolve().parent,
-        resume=resume,
-        force=force,
-        seed=seed,
-        command=command,
-    )
-    with initialized(directory) as results:
-        names = list(STAGES)
-        results = make_stages(results, names[names.index(results.kind.begins_with) :])
-        _require_converged(results, strict)
-    return directory.path
+Positions: TypeAlias = tuple[float, float] | Sequence[tuple[float, float]]
 
 
-def make_stages(
-    results: Results, stages: Collection[str], *, force: bool = False, pdf: bool = False
-) -> Results:
-    """Results with the artefacts of some stages: each that does not stand is made and saved.
+@dataclass(frozen=True, eq=False, repr=False)
+class Run:
+    """Everything known about one calibration: stars, model, posterior, diagnostics, evaluation.
 
-    What the other stages made is loaded where it is needed.
+    A run is made by `bayesdist.calibrate` or `bayesdist.run`, or opened with `bayesdist.open_run`.
+    It may be used as a context manager, which closes it.
 
     Parameters
     ----------
     results : Results
-    stages : collection of str
-    force : bool
-        Make them also where they stand.
-    pdf : bool
-        Draw figures as PDF, too.
+        Artefacts of the run.
+
+    Examples
+    --------
+    >>> chip = bd.Chip(1, "camera", (2048, 2048), (1024.5, 1024.5))
+    >>> model = bd.DistortionModel(1, (chip,), "pix")
+    >>> truth, rng = [0, 1000, 0, 0, 0, 1000], np.random.default_rng(1)
+    >>> stars, _ = bd.simulate_matches(model, truth, 500, sigma=0.01, rng=rng)
+    >>> run = bd.calibrate(stars, order=1, size=(2048, 2048))
+    >>> run.map().unit
+    'pix'
+    >>> run.check(bd.Requirement("whole field", "p95", 0.1))[0].verdict
+    'undecided'
     """
-    r, run, config, base = results, results.run, results.config, results.base
-    source = str(run.path)
 
-    def stage(
-        name: str, artefact: str, make: Callable[[], Any], save: Callable[[Results], None]
-    ) -> None:
-        """Make and save an artefact, where its stage is among them."""
-        nonlocal r
+    results: Results
 
-        def made() -> Results:
-            found = r.having(**{artefact: make()})
-            save(found)
-            # matches are read back: their rows may name the files that they lie in from now on
-            return found if name != "match" else r.having(inputs=r.inputs)
+    # -- content ----------------------------------------------------------------------------------
 
-        if name in stages:
-            r = run.make(name, made, force=force).value or r
-            release_memory()
+    @property
+    def config(self) -> Config:
+        """Resolved configuration."""
+        return self.results.config
 
-    def fitted() -> Fitted:
-        """The fit, unless the rehearsal has made it."""
-        return r.made.get("fitted") or fit(r.matched, config, base, r.reader).fitted
+    @property
+    def folder(self) -> Path | None:
+        """Folder of the run; None if it is in memory."""
+        return None if self.results.run.in_memory else self.results.run.path
 
-    def evaluated() -> Evaluation:
-        posterior, found, data = r.posterior, r.diagnostics, r.data
-        errors = error_model(posterior, found, data, config)
-        return evaluate(
-            errors, posterior, found, data, config, base, source=source, series=r.series
+    @property
+    def matches(self) -> Matches:
+        """Stars of the fit, with the errors that it used."""
+        return self.results.data.stars
+
+    @property
+    def held_out(self) -> Matches | None:
+        """Stars that were set aside to test the result; None if there are none."""
+        return self.results.data.held
+
+    @property
+    def model(self) -> DistortionModel:
+        """Structure and parameter layout of the distortion."""
+        return self.results.fit.model
+
+    @property
+    def fit(self) -> LinearFit:
+        """Least-squares fit, with formal errors."""
+        return self.results.fit
+
+    @property
+    def posterior(self) -> Posterior:
+        """Posterior as it was sampled, under the assumptions of its likelihood."""
+        return self.results.posterior
+
+    @property
+    def solution(self) -> Posterior:
+        """Posterior with all errors of the parameters that the diagnostics found, as exported."""
+        return self.results.solution
+
+    @property
+    def diagnostics(self) -> Diagnostics:
+        """Results of the tests of the residuals."""
+        return self.results.diagnostics
+
+    @cached_property
+    def evaluation(self) -> Evaluation:
+        """Maps, budget, margins, validity periods and checks."""
+        return self.results.stored_evaluation or evaluated(self.results)
+
+    @cached_property
+    def calibration(self) -> Calibration:
+        """Calibration of the detector as it is written to files, with all errors of positions."""
+        product = self.results.product
+        budget = self.evaluation.budget.rows()
+        return replace(product.calibration, further=further_errors(budget))
+
+    @property
+    def converged(self) -> bool:
+        """True if the sampler reached its targets."""
+        return self.posterior.convergence.converged
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """Sentences that a reader of the numbers has to know."""
+        return warnings_of(self.evaluation.checks)
+
+    @property
+    def margins(self) -> tuple[Margin, ...]:
+        """Margins of the requirements that the run was given."""
+        return self.evaluation.margins
+
+    # -- questions --------------------------------------------------------------------------------
+
+    def budget(
+        self,
+        *,
+        at: Positions | None = None,
+        to: Positions | None = None,
+        chip: int | None = None,
+        epoch: Any = None,
+        magnitude: float | None = None,
+    ) -> ErrorBudget:
+        """Error budget over the detector, of some positions, or of separations.
+
+        Parameters
+        ----------
+        at : (x, y) or sequence of (x, y), optional
+            FITS 1-based pixels of one chip; by default the grid of all chips.
+        to : (x, y) or sequence of (x, y), optional
+            Pixels of the same image: the budget is then that of their separations from the one
+            position `at`.
+        chip : int, optional
+            Number of the chip, needed with `at` if there are several.
+        epoch : float or Time, optional
+            Decimal years; that of the evaluation by default.
+        magnitude : float, optional
+            Magnitude of the star: the error of its centroid is then a term.
+
+        Returns
+        -------
+        ErrorBudget
+
+        Raises
+        ------
+        InputError
+            If a position is off the chip, the chip is unknown or not given, or `to` is given
+            without one position `at`.
+        """
+        if to is not None and (at is None or len(_pairs(at, "at")) != 1):
+            raise InputError(
+                "a separation is measured from one position", where="budget", do="give at=(x, y)"
+            )
+        date = None if epoch is None else year_of(epoch)
+        if at is None:
+            if date is None and magnitude is None:
+                return self.evaluation.budget
+            domain = self.results.settings.domain(self.results.errors)
+            domain = replace(domain, magnitude=magnitude)
+            return budget_of(self._drawn, domain if date is None else domain.at(date))
+        points = [*_pairs(at, "at"), *([] if to is None else _pairs(to, "to"))]
+        x, y = zip(*points, strict=True)
+        return place_budget(
+            self._drawn,
+            x,
+            y,
+            chip=self._chip(chip),
+            epoch=self.results.epoch if date is None else date,
+            magnitude=magnitude,
+            relative=to is not None,
         )
 
-    def exported() -> list[dict[str, Any]]:
-        evaluation, posterior = r.stored_evaluation, r.posterior
-        return export(
-            evaluation, posterior, r.stored, r.data, config, base, run.path, source=source
+    @cached_property
+    def _drawn(self) -> DrawnErrors:
+        """Draws of all errors of a position."""
+        return errors_of(self.results)
+
+    def check(
+        self, requirements: Requirement | Sequence[Requirement] | None = None
+    ) -> tuple[Margin, ...]:
+        """Margins of requirements, judged with everything that the diagnostics found.
+
+        Parameters
+        ----------
+        requirements : Requirement or sequence of Requirement, optional
+            Those that the run was given by default.
+
+        Returns
+        -------
+        tuple of Margin
+
+        Raises
+        ------
+        InputError
+            If a requirement cannot be judged.
+        """
+        if requirements is None:
+            return self.margins
+        return margins_of(self.results, as_requirements(requirements))
+
+    def map(self, *, chip: int | None = None, epoch: Any = None) -> UncertaintyMap:
+        """Map of the position uncertainty over a chip.
+
+        Parameters
+        ----------
+        chip : int, optional
+            Number of the chip, needed if there are several.
+        epoch : float or Time, optional
+            Decimal years; that of the evaluation by default.
+
+        Returns
+        -------
+        UncertaintyMap
+
+        Raises
+        ------
+        InputError
+            If the chip is unknown or not given.
+        """
+        number = self._chip(chip)
+        date = None if epoch is None else year_of(epoch)
+        if date is None:
+            return next(one for one in self.evaluation.maps if one.chip == number)
+        results = self.results
+        settings = replace(results.settings, epoch=date)
+        chip_of_map = next(one for one in self.model.chips if one.number == number)
+        return position_map(results.errors, results.solution, settings, chip_of_map)
+
+    def _chip(self, number: int | None) -> int:
+        """Number of a chip of the model; it has to be given if there are several."""
+        numbers = [chip.number for chip in self.model.chips]
+        if number is None and len(numbers) == 1:
+            return numbers[0]
+        if number not in numbers:
+            raise InputError(
+                "the run has several chips" if number is None else f"there is no chip {number}",
+                where="chip",
+                do=f"give one of {', '.join(map(str, numbers))}",
+            )
+        return number
+
+    # -- objects of other packages ----------------------------------------------------------------
+
+    @property
+    def plot(self) -> RunPlots:
+        """Plots of the run: ``run.plot.map()``, ``run.plot.residuals()``, and others."""
+        from bayesdist.report.run_plots import RunPlots  # matplotlib is only loaded for plots
+
+        results = self.results
+        return RunPlots(
+            fit=self.fit,
+            posterior=self.posterior,
+            diagnostics=self.diagnostics,
+            evaluation=self.evaluation,
+            solution=self.solution,
+            scale_mas=results.config.detector.scale_mas,
+            magnitude_errors=results.fitted.errors.by_magnitude,
+            rows=results.kind.rows,
         )
 
-    stage("match", "matched", lambda: match(r.inputs, config), save_matches)
-    stage("fit", "fitted", fitted, save_fit)
-    stage("sample", "posterior", lambda: _sampled(r), save_sampled)
-    stage("diagnose", "stored", lambda: diagnose(r.posterior, r.data, config, base), save_diagnosed)
-    stage("evaluate", "evaluation", evaluated, save_evaluation)
-    stage("export", "products", exported, save_products)
-    stage("report", "figures", lambda: report(r, pdf=pdf), save_figures)
-    return r
+    def wcs(
+        self,
+        chip: int | None = None,
+        *,
+        exposure: str | None = None,
+        epoch: Any = None,
+        **sky: Any,
+    ) -> CalibrationWCS:
+        """World coordinate system of a chip with its errors, as in APE 14.
+
+        Parameters
+        ----------
+        chip : int, optional
+            Number of the chip, needed if there are several.
+        exposure : str, optional
+            Name of an exposure whose own shift, rotation and scale are part of the result; by
+            default those of the reference frame.
+        epoch : float or Time, optional
+            Decimal years.  If the model depends on time, the default is the date of the exposure,
+            or of the evaluation without an exposure.
+        **sky
+            Position of the plane of u and v on the sky, if the matches do not have it: `point`,
+            `position_angle`, `mirrored` and `pixel_scale`, as for `Calibration.wcs`.
+
+        Returns
+        -------
+        CalibrationWCS
+            Its pixels count from 0, unlike those of all other functions of this package.
+
+        Raises
+        ------
+        InputError
+            If there is no such chip or exposure, or a position on the sky is needed and not given.
+        """
+        date = self._date(exposure, epoch)
+        if exposure is None:
+            return self.calibration.wcs(chip, epoch=date, **sky)
+        plain = self.calibration
+        of_exposure = calibration_of_exposure(
+            self.solution,
+            exposure,
+            epoch=date,
+            plane=replace(plain.plane, note=""),
+            detector=plain.detector,
+            filter=plain.filter,
+            scale=None if plain.scale is None else (plain.scale, plain.scale_from),
+        )
+        return replace(of_exposure, further=plain.further).wcs(chip, **sky)
+
+    def _date(self, exposure: str | None, epoch: Any) -> float | None:
+        """Decimal year of a calibration; None if the model does not depend on time."""
+        if self.model.time is None:
+            return None
+        if epoch is not None:
+            return year_of(epoch)
+        stars = self.results.data.sample
+        if exposure in stars.exposure_names and stars.epoch is not None:
+            rows = stars.exposure == stars.exposure_names.index(exposure)
+            if rows.any():
+                return float(stars.epoch[rows].mean())
+        return self.results.epoch
+
+    def to_model(self, chip: int | None = None, *, epoch: Any = None, **sky: Any) -> Model:
+        """Compound model of astropy.modeling from 0-based pixels to the sky, or to u and v.
+
+        Parameters
+        ----------
+        chip, epoch, **sky
+            As for `wcs`.
+
+        Returns
+        -------
+        astropy.modeling.Model
+            Two inputs and two outputs; it has an inverse.
+
+        Raises
+        ------
+        InputError
+            As for `wcs`.
+        """
+        return self.wcs(chip, epoch=epoch, **sky).to_model()
+
+    def to_datatree(self) -> DataTree:
+        """Posterior as an xarray DataTree, which ArviZ reads.
+
+        Returns
+        -------
+        xarray.DataTree
+        """
+        return self.posterior.to_datatree()
+
+    # -- representations --------------------------------------------------------------------------
+
+    def __repr__(self) -> str:
+        return summary_text(self._summary)
+
+    def _repr_html_(self) -> str:
+        return summary_html(self._summary)
+
+    @property
+    def _summary(self) -> RunSummary:
+        """Content of the representations of a run: verdicts, warnings, a few facts."""
+        evaluation, fit, config = self.evaluation, self.fit, self.results.config
+        convergence = self.posterior.convergence
+        scale_mas = config.detector.scale_mas
+        largest = max(float(one.per_axis.max()) for one in evaluation.maps)
+        exposures = len(self.results.data.placed.exposures)
+        state = f"yes, R-hat {convergence.rhat_max:.3f}, ESS {convergence.ess_bulk_min:.0f}"
+        facts = [
+            (self.results.kind.rows.capitalize(), f"{fit.n_rows}, {fit.n_used} used in the fit"),
+            ("Exposures", str(exposures)),
+            ("Model", f"order {fit.model.order}, {fit.model.n_params} parameters"),
+            ("Converged", state if self.converged else f"NO: {'; '.join(convergence.reasons)}"),
+            ("Largest uncertainty per axis", with_mas(largest, fit.unit, scale_mas)),
+        ]
+        if self.folder is not None:
+            facts.append(("Folder", str(self.folder)))
+        return RunSummary(
+            title=title_of(config) or "calibration",
+            verdict_level=self._level,
+            headline=self._headline,
+            warnings=self.warnings,
+            facts=facts,
+            margins_rows=margin_rows(self.margins),
+            budget_rows=budget_rows(evaluation.budget, scale_mas=scale_mas),
+        )
+
+    @property
+    def _level(self) -> str:
+        """Level of the verdict: that of the worst margin, or of the checks without margins."""
+        return self.evaluation.verdict[0] if self.converged else "fail"
+
+    @property
+    def _headline(self) -> str:
+        """Verdict in words, with the number of requirements that each verdict is given to."""
+        if not self.converged:
+            return "Not converged: no number of this run can be relied on"
+        if not self.margins:
+            return "No requirement was given"
+        verdicts = [margin.verdict for margin in self.margins]
+        if len(verdicts) == 1:
+            row = margin_rows(self.margins)[0]
+            value = f"{row['Limit']}, now {row['Value']}, P(met) {row['P(met)']}"
+            return f"{verdicts[0].upper()}: {row['Requirement']}: {value}"
+        counts = [(verdicts.count(name), name) for name in ("missed", "undecided", "met")]
+        return f"{len(verdicts)} requirements: " + ", ".join(
+            f"{count} {name}" for count, name in counts if count
+        )
+
+    # -- files ------------------------------------------------------------------------------------
+
+    def report(self, path: str | os.PathLike[str]) -> Path:
+        """Write the report of the run as one HTML file.
+
+        Parameters
+        ----------
+        path : path-like
+            Name of the file, which ends in ``.html``.
+
+        Returns
+        -------
+        pathlib.Path
+
+        Raises
+        ------
+        InputError
+            If the file cannot be written.
+        """
+        write_html_report(self.results, Path(path))
+        return Path(path)
+
+    def show(self) -> None:
+        """Open the report in a web browser."""
+        folder = Path(tempfile.mkdtemp(prefix="bayesdist-"))
+        webbrowser.open(self.report(folder / "report.html").as_uri())
+
+    def save(self, folder: str | os.PathLike[str], *, overwrite: bool = False) -> Path:
+        """Write the run to a folder, which `open_run` and all commands read.
+
+        Parameters
+        ----------
+        folder : path-like
+        overwrite : bool
+            Replace a run that is in the folder.
+
+        Returns
+        -------
+        pathlib.Path
+            The folder.
+
+        Raises
+        ------
+        InputError
+            If the folder holds other files, or another run that is not to be replaced.
+        """
+        folder = Path(folder)
+        if self.results.run.in_memory:
+            save_run(self.results, folder, overwrite=overwrite)
+        else:
+            copy_run(self.results.run, folder, overwrite=overwrite)
+        return folder
+
+    def close(self) -> None:
+        """Release the stars, and the processes that hold them."""
+        self.results.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
 
 
-def _sampled(r: Results) -> Posterior:
-    """The posterior, with a progress bar."""
-    with progress_bar("sample") as progress:
-        return sample(r.data, r.config, folder=r.run.path, progress=progress)
-
-
-def continue_stage(
-    path: str | Path, stage: str, *, strict: bool = False, pdf: bool = False
-) -> RunDirectory:
-    """One stage of a run; 'assess' stands for 'diagnose' and 'evaluate'.
+def open_run(folder: str | os.PathLike[str]) -> Run:
+    """Open a run that is in a folder.
 
     Parameters
     ----------
-    path : path
-        Run directory.
-    stage : str
-    strict : bool
-        Of 'sample': as of `run`.
-    pdf : bool
-        Of 'report': whether figures are drawn as PDF, too.
+    folder : path-like
+
+    Returns
+    -------
+    Run
+        Its parts are read when they are first used.
 
     Raises
     ------
-    BayesdistError
+    InputError
+        If the folder holds no run, the run has not been sampled, or its inputs have changed.
+
+    Examples
+    --------
+    >>> chip = bd.Chip(1, "camera", (2048, 2048), (1024.5, 1024.5))
+    >>> model = bd.DistortionModel(1, (chip,), "pix")
+    >>> truth, rng = [0, 1000, 0, 0, 0, 1000], np.random.default_rng(1)
+    >>> stars, _ = bd.simulate_matches(model, truth, 500, sigma=0.01, rng=rng)
+    >>> folder = bd.calibrate(stars, order=1, size=(2048, 2048)).save("camera-run")
+    >>> bd.open_run("camera-run").model.order
+    1
     """
-    directory = RunDirectory.open(path)
-    begins_with = kind_of(directory.config).begins_with
-    if stage == "match" != begins_with:
+    directory = RunDirectory.open(Path(folder))
+    if directory.is_planned:
         raise InputError(
-            "has no star lists to match", where=str(path), do="begin with the stage 'fit'"
+            "the run has not begun", where=str(folder), do="make it with bayesdist.run"
         )
-    stages = ASSESS if stage == "assess" else (stage,)
-    needs = (begins_with,) if stage == "fit" != begins_with else NEEDS[stages[0]]
-    directory.require(stage, needs)
-    with initialized(directory) as results:
-        results = make_stages(results, stages, force=True, pdf=pdf)
-        if stage == "sample":
-            _require_converged(results, strict)
-    return directory
+    directory.require("open_run", ("fit", "sample", "diagnose"))
+    return Run(results_of(directory))
 
 
-@contextmanager
-def initialized(directory: RunDirectory) -> Iterator[Results]:
-    """Results of a run whose folder is there, once it is known that it can be carried out."""
-    with open_results(directory) as results:
-        begins = directory.is_planned
-        if begins:
-            results = rehearse(results)
-        with directory.locked():
-            directory.begin()
-            if begins:
-                results = results.adopting_inputs()
-            with log_file(directory / "bayesdist.log"):
-                yield results
+def run(
+    config: str | os.PathLike[str],
+    folder: str | os.PathLike[str],
+    *,
+    resume: bool = False,
+    overwrite: bool = False,
+    seed: int | None = None,
+) -> Run:
+    """Make the run of a configuration file, as ``bayesdist run`` does.
+
+    Parameters
+    ----------
+    config : path-like
+        TOML file; paths in it are relative to it.
+    folder : path-like
+        Folder of the run.
+    resume : bool
+        Resume the run that is in the folder.
+    overwrite : bool
+        Replace the run that is in the folder.
+    seed : int, optional
+        Seed in place of the configured one.
+
+    Returns
+    -------
+    Run
+
+    Raises
+    ------
+    InputError
+        If the configuration or its inputs cannot be used, or the folder holds something else.
+
+    Examples
+    --------
+    >>> run = bd.run("config.toml", "run")  # doctest: +SKIP
+    """
+    return open_run(
+        run_configuration(Path(config), Path(folder), resume=resume, force=overwrite, seed=seed)
+    )
 
 
-def _require_converged(results: Results, strict: bool) -> None:
-    """Raise where a sampler has not converged, if that is asked for."""
-    posterior = results.posterior
-    if strict and convergence_check(posterior.convergence).level == "fail":
-        exact = posterior.sampler.exact
-        raise NotConvergedError(
-            f"the sampler has not converged ({'; '.join(posterior.convergence.reasons)})",
-            where=str(results.run.path),
-            do="raise sampler.max_steps and resume, or simplify the model"
-            if exact
-            else "set sampler.second_stage = 'always' and run with --force",
+def as_requirements(requirements: Requirement | Sequence[Requirement]) -> list[Requirement]:
+    """Requirements as a list; one requirement alone becomes a list of one.
+
+    Raises
+    ------
+    InputError
+        If one of them is something else.
+    """
+    several = [requirements] if isinstance(requirements, Requirement) else list(requirements)
+    for requirement in several:
+        if not isinstance(requirement, Requirement):
+            raise InputError(
+                f"{requirement!r} is no requirement",
+                where="requirements",
+                do="give bayesdist.Requirement(name, statistic, limit)",
+            )
+    return several
+
+
+def _pairs(positions: Positions, name: str) -> list[tuple[float, float]]:
+    """Positions (x, y) as a list; one position alone becomes a list of one."""
+    try:
+        pairs = np.atleast_2d(np.asarray(positions, float))
+    except (TypeError, ValueError):
+        pairs = np.zeros((0, 0))
+    if pairs.ndim != 2 or pairs.shape[1] != 2:
+        raise InputError(
+            f"{name} is {positions!r}", where="budget", do="give (x, y), or a list of such pairs"
         )
+    return [(float(x), float(y)) for x, y in pairs]

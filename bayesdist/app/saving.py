@@ -8,7 +8,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from bayesdist.app.assessment.checks import frames_doubt, in_circle
+from bayesdist.app.assessment.checks import in_circle
 from bayesdist.app.assessment.diagnosing import holdout_summary, holdout_table
 from bayesdist.app.assessment.error_terms import idle_dates
 from bayesdist.app.assessment.periods import periods_summary, periods_table
@@ -26,6 +26,7 @@ from bayesdist.app.store.summary import Sampler
 from bayesdist.app.tables.result_files import write_diagnostics, write_evaluation
 from bayesdist.data import Matches
 from bayesdist.data.storage.write import write_columns
+from bayesdist.diagnose.checks import frames_doubt
 from bayesdist.diagnose.residuals.epoch_shift import epoch_shift
 from bayesdist.diagnose.residuals.quoted import majority_sentence
 from bayesdist.files.atomic import made_folder, remove_leftovers
@@ -83,7 +84,8 @@ def _log_matches(data: FitData, config: Config) -> None:
     majority = majority_sentence(fit)
     if data.error_scale_sentence:
         log.warning("fit: WARNING: %s", data.error_scale_sentence)
-    if text := frames_doubt(data, majority, config):
+    suspicious = bool(majority or data.error_scale_sentence)
+    if text := frames_doubt(fit, data.sample, suspicious=suspicious):
         log.warning("fit: WARNING: %s", text)
     if data.fitted.grouped is not None:
         log.info("fit: %s", grouping_sentence(data.fitted.grouped, fit.unit))

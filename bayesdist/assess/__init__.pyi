@@ -11,8 +11,11 @@ from .budget.budget import (
 from .domain import EvaluationDomain as EvaluationDomain
 from .model import (
     ErrorModel as ErrorModel,
-    error_budget as error_budget,
     error_model as error_model,
+)
+from .assessment import (
+    check_requirements as check_requirements,
+    error_budget as error_budget,
 )
 from .evaluation import (
     Evaluation as Evaluation,
@@ -26,7 +29,6 @@ from .maps.uncertainty import (
 from .requirements.margins import (
     Margin as Margin,
     Requirement as Requirement,
-    check_requirements as check_requirements,
 )
 from .solution import chip_places as chip_places
 from .statistics import (
@@ -35,6 +37,7 @@ from .statistics import (
 )
 from .terms.given import (
     TERM_KINDS as TERM_KINDS,
+    Catalogue as Catalogue,
     UserTerm as UserTerm,
 )
 from .terms.local import LocalErrors as LocalErrors

@@ -1,4 +1,4 @@
-"""Checks of what an evaluation takes for granted: the matching, the catalogue, the dates."""
+"""Checks of what an evaluation takes for granted: residuals, catalogue and dates."""
 
 from __future__ import annotations
 
@@ -6,34 +6,56 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from bayesdist.diagnose.diagnostics import Diagnostics
+from bayesdist.infer import Posterior
+from bayesdist.infer.posterior.checks import sampling_checks
 from bayesdist.model.timedep import TimeDependence
 from bayesdist.utils.arrays import Float
 from bayesdist.utils.checks import EITHER, LARGER, Check
-from bayesdist.utils.limits import MATCH_RADIUS
 
 GROUP = "Assumptions"
 
+UNEXAMINED = Check(
+    "Fit",
+    "Residuals",
+    "not examined",
+    "bd.diagnose",
+    "warn",
+    "the residuals were not examined; give diagnostics=bd.diagnose(posterior, matches)",
+    # structure would make errors larger; quoted errors that are too large make them smaller
+    EITHER,
+)
 
-def matching_checks(
-    match_radius: float | None, sigma: float, *, in_circle: bool
-) -> Iterator[Check]:
-    """Check of residuals that the match circle may have cut off, unknown to the likelihood.
 
-    `match_radius`: in the unit of u and v. `sigma`: usual error of a star. `in_circle`: True if the
-    likelihood knows of the circles.
+def assumption_checks(
+    posterior: Posterior | None,
+    diagnostics: Diagnostics,
+    time: TimeDependence | None,
+    *,
+    catalogue_stated: bool | None,
+    motions_stated: bool | None,
+) -> tuple[Check, ...]:
+    """Checks of the sampling, the fit, the matching, the catalogue and the dates.
+
+    A verdict takes all of these for granted, in addition to `Diagnostics.checks`.
+
+    Parameters
+    ----------
+    posterior : Posterior or None
+        None for a fit that was not sampled.
+    diagnostics : Diagnostics
+        Of the posterior, or of the fit.
+    time : TimeDependence or None
+        Of the model.
+    catalogue_stated, motions_stated : bool or None
+        True if errors of the reference catalogue's positions, and of its proper motions, are
+        stated; None without a catalogue.
     """
-    if in_circle or match_radius is None or MATCH_RADIUS.met_by(match_radius / sigma):
-        return
-    yield Check(
-        GROUP,
-        "Match radius, in errors of a star",
-        match_radius / sigma,
-        MATCH_RADIUS.words,
-        "warn",
-        f"stars were matched within {match_radius / sigma:.1f} of their errors of nominal "
-        "positions that are not given, which cuts the scatter and draws the fit: match again with "
-        "a wider match radius, or give the columns u_nominal and v_nominal",
-        LARGER,
+    return (
+        *sampling_checks(posterior),
+        *diagnostics.input_checks,
+        *catalogue_checks(catalogue_stated),
+        *time_checks(time, diagnostics.dates, motions_stated),
     )
 
 
@@ -47,7 +69,8 @@ def catalogue_checks(catalogue_stated: bool | None) -> Iterator[Check]:
         return
     sentence = (
         "no error of the reference catalogue is stated: give a [[budget]] row that names the "
-        "catalogue ('reference catalogue', 'Gaia DR3'), of size 0 with its source where it has none"
+        "catalogue ('reference catalogue', 'Gaia DR3'), in Python catalogue=bd.Catalogue(...), of "
+        "size 0 with its source where it has none"
     )
     yield Check(GROUP, name, "not stated", limit, "warn", sentence, LARGER)
 

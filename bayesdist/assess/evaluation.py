@@ -181,17 +181,14 @@ def evaluate(
     def uncertainty(of: Solution, chip: Chip) -> UncertaintyMap:
         return uncertainty_map(of, grid=grid, epoch=epoch, chip=chip.number)
 
-    own = _own_checks(errors, diagnostics, settings)
+    own = request_checks(errors, diagnostics, settings)
     every = in_order((*checks, *diagnostics.checks, *own))
     whole = drawn_errors(errors, diagnostics, settings, rng, files=files)
     surface = None
     if _contradiction(diagnostics, settings) is None:
         years = _years(solution, diagnostics, epoch)
         surface = budget_surface(whole, grid, epoch=epoch, years=years)
-    maps = []
-    for chip in chips:
-        local = errors.structure_sigma(_domain(solution, chip, settings))
-        maps.append(with_local(uncertainty(solution, chip), local))
+    maps = [position_map(errors, solution, settings, chip) for chip in chips]
     budget = budget_of(whole, settings.domain(errors))
     margins = judged(errors, diagnostics, requirements, settings, rng, checks=every, drawn=whole)
     del whole  # validity periods have draws of their own
@@ -211,6 +208,27 @@ def evaluate(
     )
 
 
+def position_map(
+    errors: ErrorModel, solution: Posterior, settings: EvaluationSettings, chip: Chip
+) -> UncertaintyMap:
+    """Map of all errors that neighbouring positions share, at the epoch and grid of the settings.
+
+    Parameters
+    ----------
+    errors : ErrorModel
+    solution : Posterior
+        With all errors of the parameters in its draws.
+    settings : EvaluationSettings
+    chip : Chip
+
+    Returns
+    -------
+    UncertaintyMap
+    """
+    shared = uncertainty_map(solution, grid=settings.grid, epoch=settings.epoch, chip=chip.number)
+    return with_local(shared, errors.structure_sigma(_domain(solution, chip, settings)))
+
+
 def drawn_errors(
     errors: ErrorModel,
     diagnostics: Diagnostics,
@@ -224,10 +242,17 @@ def drawn_errors(
 
     `errors`, `diagnostics`, `settings`, `rng`, `files`: as `evaluate`. `n`: number of draws.
     """
+    model = with_measured_centroids(errors, diagnostics, settings).with_terms(*files)
+    return model.drawn(n or settings.draws, restarted(rng))
+
+
+def with_measured_centroids(
+    errors: ErrorModel, diagnostics: Diagnostics, settings: EvaluationSettings
+) -> ErrorModel:
+    """Error model with the errors of centroids by magnitude, as the residuals scatter."""
     known = _contradiction(diagnostics, settings) is None
     centroids = centroids_of(diagnostics, settings.contained) if known else None
-    model = errors.with_terms(Centroids(centroids), *files)
-    return model.drawn(n or settings.draws, restarted(rng))
+    return errors.with_terms(Centroids(centroids))
 
 
 def judged(
@@ -239,12 +264,14 @@ def judged(
     *,
     checks: Sequence[Check] = (),
     drawn: DrawnErrors | None = None,
+    chip: int | None = None,
 ) -> tuple[Margin, ...]:
     """Margins of requirements, and what they rest on.
 
     `errors`, `diagnostics`, `requirements`, `settings`, `rng`: as `evaluate`. `checks`: all of
-    them: their doubts keep verdicts from being given. `drawn`: as of `drawn_errors`. InputError for
-    a requirement that cannot be judged.
+    them: their doubts keep verdicts from being given. `drawn`: as of `drawn_errors`. `chip`: number
+    of the chip for requirements that name none; all chips by default. InputError for a requirement
+    that cannot be judged.
     """
     if not requirements:
         return ()
@@ -258,6 +285,7 @@ def judged(
         requirements,
         grid=settings.grid,
         epoch=settings.epoch,
+        chip=chip,
         pixel_scale=settings.pixel_scale(errors),
         checks=checks,
     )
@@ -269,7 +297,7 @@ def judged(
                 diagnostics,
                 margin.epoch,
                 given=settings.given,
-                aligned=errors.aligned,
+                aligned=errors.of_new_exposure,
                 single=settings.single,
                 dates=settings.dates,
             ),
@@ -309,19 +337,19 @@ def validity_of(
     )
 
 
-def _own_checks(
+def request_checks(
     errors: ErrorModel, diagnostics: Diagnostics, settings: EvaluationSettings
 ) -> Iterator[Check]:
-    """Checks of requests that cannot be met."""
+    """Checks of requests that cannot be met: errors of single exposures, contradicting terms."""
     linear = None if diagnostics.correlated is None else diagnostics.correlated.linear
-    measured = errors.aligned or (linear is not None and bool(linear.kinds))
+    measured = errors.of_new_exposure or (linear is not None and bool(linear.kinds))
     if settings.single and not measured:
         yield Check(
             ERRORS,
             "Errors of single exposures",
             level="warn",
-            sentence="assess.exposure is 'single', and how single exposures deviate is not known "
-            "here, so that errors are those in their mean",
+            sentence="errors of a single exposure are asked for, and how single exposures deviate "
+            "is not known here, so that they are errors in their mean",
         )
     error = _contradiction(diagnostics, settings)
     if error is not None:

@@ -14,12 +14,11 @@ from scipy.linalg import solve_triangular
 from bayesdist.assess.budget.budget import ErrorBudget, budget_of
 from bayesdist.assess.domain import EvaluationDomain
 from bayesdist.assess.drawn import DrawnErrors, generators
-from bayesdist.assess.solution import place_of
 from bayesdist.assess.terms.correlated import Deviations, StructureErrors
 from bayesdist.assess.terms.forms import ErrorTerm, Image
 from bayesdist.assess.terms.given import Centroids, UserTerm
 from bayesdist.assess.terms.local import LocalErrors, table_of
-from bayesdist.assess.terms.parameters import catalogue_terms
+from bayesdist.assess.terms.parameters import ExposureVariation, catalogue_terms
 from bayesdist.assess.terms.solution import SolutionErrors
 from bayesdist.assess.units import pixel_scale_of
 from bayesdist.diagnose.diagnostics import Diagnostics
@@ -29,7 +28,6 @@ from bayesdist.infer.catalogue.star_errors import StarCovariance
 from bayesdist.infer.equations.scaled import recolouring, scaled_cholesky
 from bayesdist.infer.solution.solution import Solution
 from bayesdist.model import LookupTable
-from bayesdist.model.grid import DEFAULT_GRID
 from bayesdist.utils.arrays import Float
 from bayesdist.utils.memory import require_memory
 
@@ -53,6 +51,11 @@ class ErrorModel:
     solution: SolutionErrors
     terms: tuple[ErrorTerm, ...] = ()
     aligned: bool = False
+
+    @property
+    def of_new_exposure(self) -> bool:
+        """True if the star lies in a new exposure, which deviates as those at hand scatter."""
+        return self.aligned and any(isinstance(term, ExposureVariation) for term in self.terms)
 
     def drawn(self, n: int, rng: np.random.Generator) -> DrawnErrors:
         """Draws of all errors.
@@ -218,71 +221,6 @@ def diagnosed_error_model(
         own = replace(own, without=posterior, catalogue=of_catalogue)
     found = error_model(posterior, terms, aligned=aligned, pixel_scale=pixel_scale)
     return replace(found, solution=own, terms=(*measured, *found.terms))
-
-
-def error_budget(
-    solution: Solution,
-    *,
-    terms: Sequence[ErrorTerm] = (),
-    aligned: bool = False,
-    grid: tuple[int, int] = DEFAULT_GRID,
-    epoch: float | None = None,
-    chip: int | None = None,
-    n_draws: int = 4000,
-    rng: np.random.Generator,
-    pixel_scale: float | None = None,
-) -> ErrorBudget:
-    """The error budget of a solution over a grid on a chip, at an epoch.
-
-    The parts of the model are combined by joint draws, for they are correlated; other terms are
-    independent and added in quadrature.
-
-    Parameters
-    ----------
-    solution : LinearFit or Posterior
-    terms : sequence of ErrorTerm
-        Of the user, and others; each gives one row or more.
-    aligned : bool
-        Whether shift and rotation of the exposure are the observer's to fit, as of `ErrorModel`.
-    grid : tuple of int
-        Points on x and y.
-    epoch : float, optional
-        Decimal years; needed by a model with time dependence.
-    chip : int, optional
-        Chip number; the first chip by default.
-    n_draws : int
-    rng : numpy.random.Generator
-    pixel_scale : float, optional
-        Size of one pixel in mas; `pixel_scale_of` the solution by default.
-
-    Returns
-    -------
-    ErrorBudget
-        In the unit of u, v.
-
-    Raises
-    ------
-    InputError
-        For an unknown chip, a missing epoch, a bad grid, fewer than two draws, or a term whose unit
-        needs a pixel scale that is not known.
-
-    Examples
-    --------
-    >>> rng = np.random.default_rng(1)
-    >>> matches, truth = bd.simulate_wise(500, rng=rng)
-    >>> model = bd.build_model(matches, order=2, size=(1016, 1016))
-    >>> fit = bd.fit_linear(matches, model)
-    >>> catalogue = bd.UserTerm("catalogue", "systematic", 0.005, 0.005)
-    >>> budget = bd.error_budget(fit, terms=[catalogue], grid=(5, 3), n_draws=100, rng=rng)
-    >>> [row["name"] for row in budget.rows()]
-    ['coefficients', 'catalogue', 'total']
-    """
-    chip = place_of(solution.model, epoch=epoch, chip=chip).chip.number
-    if pixel_scale is None:
-        pixel_scale = pixel_scale_of(solution, chip)
-    errors = error_model(solution, terms=terms, aligned=aligned, pixel_scale=pixel_scale)
-    domain = EvaluationDomain.of_chips(solution.model, grid, chips=(chip,), epoch=epoch)
-    return errors.at(domain, n=n_draws, rng=rng)
 
 
 def with_shared_stars(posterior: Posterior, fit: LinearFit, stars: StarCovariance) -> Posterior:

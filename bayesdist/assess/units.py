@@ -7,7 +7,6 @@ import math
 from bayesdist.data.tables.units import UNITS
 from bayesdist.errors import InputError, require_known
 from bayesdist.infer.solution.solution import Solution
-from bayesdist.utils.limits import PIXEL_SIZE
 
 _MAS = {"mas": 1.0, "arcsec": 1e3, "deg": 3.6e6}
 
@@ -81,18 +80,3 @@ def pixel_scale_of(
     if model.unit == "pix":
         return None
     return convert(model.pixel_size(solution.mean, chip), model.unit, "mas")
-
-
-def pixel_doubt(solution: Solution) -> str:
-    """Doubt about u and v that are called pixels and are not, as a clause; empty without one."""
-    model = solution.model
-    if model.unit != "pix":
-        return ""
-    size = model.linear_scale(solution.mean)
-    if 1 / PIXEL_SIZE.value <= size <= PIXEL_SIZE.value:
-        return ""
-    return (
-        f"u and v are called pixels, and one pixel of x, y is {size:.4g} of theirs: if they are "
-        f"millimetres, divide them and their errors by {size:.4g}; if they are angles, give their "
-        "unit; as they are, every error in 'pix' is in the unit of u and v"
-    )

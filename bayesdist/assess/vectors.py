@@ -9,11 +9,13 @@ import numpy as np
 from bayesdist.assess.comparison.frame import turn_matrix
 from bayesdist.assess.solution import Place, Solution, place_of
 from bayesdist.errors import InputError, require_known
+from bayesdist.model import Chip
 from bayesdist.model.basis import point_blocks
 from bayesdist.model.grid import DEFAULT_GRID, grid_pixels, mesh, position_of_largest
 from bayesdist.utils.arrays import Float
 
 PARTS = ("no_constant", "non_linear")
+VECTORS_ALONG = 17  # the longer side of a chip in a diagram: more would hide each other
 
 # u, v in pixels count as positions on the array itself when the best similarity is as near to the
 # identity as this (scale 0.9 to 1.1, rotation below 6 degrees).
@@ -130,6 +132,17 @@ def distortion_vectors(
     d = [left @ basis.evaluate(X[rows], Y[rows]).T for rows in point_blocks(X.size)]
     du, dv = np.concatenate(d, axis=1).reshape(2, y.size, x.size)
     return VectorMap(x, y, du, dv, solution.model.unit, part, note, similarity)
+
+
+def diagram_vectors(
+    solution: Solution, chip: Chip, *, part: str = "no_constant", epoch: float | None = None
+) -> VectorMap:
+    """The distortion of a chip on a grid for a diagram, which is equally fine on both axes.
+
+    Parameters as of `distortion_vectors`.
+    """
+    nx, ny = (max(3, round(VECTORS_ALONG * side / max(chip.size))) for side in chip.size)
+    return distortion_vectors(solution, part=part, grid=(nx, ny), epoch=epoch, chip=chip.number)
 
 
 def _similarity(place: Place, polynomial: Float, pixels: Float) -> tuple[Float, str]:

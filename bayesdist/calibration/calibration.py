@@ -9,20 +9,28 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from bayesdist.calibration import hooks
 from bayesdist.calibration.chip_map import ChipMap, chip_of, sampling_of
 from bayesdist.calibration.further import FurtherError
 from bayesdist.calibration.inverse import ExplicitInverse
 from bayesdist.calibration.plane import Plane
 from bayesdist.errors import InputError
 from bayesdist.infer.solution.solution import Solution
-from bayesdist.infer.solution.transforms import without_frames
+from bayesdist.infer.solution.transforms import at_exposure, without_frames
+from bayesdist.mission import load_object
 from bayesdist.model import Chip, DistortionModel, LookupTable, TimeDependence, corrected
 from bayesdist.utils.arrays import Float
+from bayesdist.utils.quantities import Direction, Epoch, Number, year_of
+
+if TYPE_CHECKING:
+    from astropy.modeling import Model
+
+    from bayesdist.calibration.wcs import CalibrationWCS
 
 ORIGINS = ("stated", "reference", "chip")
 FOLLOWING_ORDER = 9  # of the polynomial that stands for look-up tables where two are compared
@@ -271,6 +279,84 @@ class Calibration:
             )
         return float(np.sqrt(area)), "the pixel at the zero point"
 
+    # -- objects of astropy -----------------------------------------------------------------------
+
+    def wcs(
+        self,
+        chip: int | None = None,
+        *,
+        epoch: Epoch | None = None,
+        point: Direction | None = None,
+        position_angle: Number | None = None,
+        mirrored: bool = False,
+        pixel_scale: Number | None = None,
+    ) -> CalibrationWCS:
+        """World coordinate system of a chip, with its errors.
+
+        A calibration whose plane touches the sky needs no further argument.  Any other one is put
+        on the sky with `point`; without it the world coordinates are u and v.
+
+        Parameters
+        ----------
+        chip : int, optional
+            Number of the chip; needed if there are several.
+        epoch : float, str or Time, optional
+            Date; needed if the calibration depends on time and states no reference date.
+        point : SkyCoord or tuple of float, optional
+            Sky position of (u, v) = (0, 0), right ascension and declination (ICRS) in degrees, in
+            place of the calibration's.
+        position_angle : float or Quantity, optional
+            Position angle of the v axis at `point`, in degrees from north to east, 0 by default.
+            For a calibration in the plane of an aperture it is that of V3, and has to be given.
+        mirrored : bool
+            True if u is 90 degrees west of v; by default it is 90 degrees east of it.
+        pixel_scale : float or Quantity, optional
+            Size of a pixel in arcsec; needed on the sky if u and v are in pixels.
+
+        Returns
+        -------
+        CalibrationWCS
+
+        Raises
+        ------
+        InputError
+            If the chip is unknown or not given, the epoch is missing, or the direction or scale of
+            u and v on the sky is needed and not given.
+        """
+        wcs: CalibrationWCS = load_object(hooks.WCS)(
+            self,
+            chip,
+            epoch=epoch,
+            point=point,
+            position_angle=position_angle,
+            mirrored=mirrored,
+            pixel_scale=pixel_scale,
+        )
+        return wcs
+
+    def to_model(self, chip: int | None = None, *, epoch: Epoch | None = None, **sky: Any) -> Model:
+        """Compound model of astropy.modeling from 0-based pixels to the sky, or to u and v.
+
+        Parameters
+        ----------
+        chip, epoch
+            As for `wcs`.
+        **sky
+            Position on the sky: `point`, `position_angle`, `mirrored` and `pixel_scale` of `wcs`.
+
+        Returns
+        -------
+        astropy.modeling.Model
+            Two inputs, x and y; two outputs, right ascension and declination in degrees, or u and
+            v.  It has an inverse.
+
+        Raises
+        ------
+        InputError
+            As for `wcs`.
+        """
+        return self.wcs(chip, epoch=epoch, **sky).to_model()
+
 
 @dataclass(frozen=True, eq=False)
 class GaussianSolution(Solution):
@@ -311,6 +397,56 @@ def calibration_of(
         filter=filter,
         scale=size,
         scale_from=source,
+    )
+
+
+def calibration_of_exposure(
+    solution: Solution,
+    exposure: str,
+    name: str = "",
+    *,
+    epoch: Epoch | None = None,
+    plane: Plane | None = None,
+    detector: str = "",
+    filter: str = "",
+    scale: tuple[float, str] | None = None,
+) -> Calibration:
+    """Calibration of one exposure of a fit or a posterior, with its frame applied.
+
+    The frame of an exposure (shift, rotation, scale, shear) becomes part of the polynomials, with
+    its covariance and its draws.
+
+    Parameters
+    ----------
+    solution : Solution
+        Fit or posterior of a model with frames.
+    exposure : str
+        Name of the exposure.
+    name : str, optional
+        Name for messages, that of the exposure by default.
+    epoch : float, str or Time, optional
+        Date of the exposure; needed by a model with time dependence.
+    plane, detector, filter, scale
+        As for `calibration_of`.
+
+    Returns
+    -------
+    Calibration
+        Without time dependence.
+
+    Raises
+    ------
+    InputError
+        If there is no such exposure, or the epoch is missing.
+    """
+    date = None if epoch is None else year_of(epoch)
+    return calibration_of(
+        at_exposure(solution, exposure=exposure, epoch=date),
+        name or f"exposure {exposure}",
+        plane=plane,
+        detector=detector,
+        filter=filter,
+        scale=scale,
     )
 
 

@@ -6,6 +6,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from bayesdist.data.sky.tangent import (
+    is_on_plane,
+    sky_of_plane,
+    tangent_jacobian,
+    tangent_plane,
+)
 from bayesdist.infer.solution.solution import Solution
 from bayesdist.utils.arrays import Float
 
@@ -90,3 +96,38 @@ class Plane:
             return None
         c, s = np.cos(np.radians(self.v3_angle)), np.sin(np.radians(self.v3_angle))
         return np.array([[self.parity * c, s], [-self.parity * s, c]])
+
+
+@dataclass(frozen=True, eq=False)
+class SkyPlacement:
+    """Tangent point of a plane (u, v) on the sky, and the directions of its axes there.
+
+    (xi, eta) = matrix (u, v) are standard coordinates in arcsec: xi increases to the east and eta
+    to the north.
+    """
+
+    point: tuple[float, float]  # RA and Dec of (u, v) = 0, degrees
+    matrix: Float  # (2, 2), arcsec in one unit of u, v
+
+    def sky(self, plane: Float) -> tuple[Float, Float]:
+        """Right ascension and declination (N,) in degrees of positions (2, N) of the plane."""
+        (a, b), (c, d) = self.matrix
+        u, v = plane
+        return sky_of_plane(a * u + b * v, c * u + d * v, self.point)
+
+    def plane(self, ra: Float, dec: Float) -> Float:
+        """Positions (2, N) on the plane; NaN 90 degrees or more from the tangent point."""
+        out = np.full((2, *np.shape(ra)), np.nan)
+        seen = is_on_plane(ra, dec, self.point)
+        out[:, seen] = np.linalg.solve(
+            self.matrix, np.stack(tangent_plane(ra[seen], dec[seen], self.point))
+        )
+        return out
+
+    def steps(self, ra: Float, dec: Float) -> Float:
+        """Steps (N, 2, 2) to the east and north, in mas, per unit of u, v; NaN where RA is NaN."""
+        out = np.full((*np.shape(ra), 2, 2), np.nan)
+        known = np.isfinite(ra)
+        back = np.linalg.inv(tangent_jacobian(ra[known], dec[known], self.point))
+        out[known] = 1e3 * (back @ self.matrix)
+        return out

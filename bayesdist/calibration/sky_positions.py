@@ -11,30 +11,18 @@ centroid in pixels and J the slope of the map.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from bayesdist.calibration.calibration import Calibration
 from bayesdist.calibration.chip_map import ChipMap
-from bayesdist.calibration.plane import ARCSEC
-from bayesdist.data.sky.tangent import plane_axes, sky_of_plane, tangent_jacobian
+from bayesdist.calibration.plane import ARCSEC, SkyPlacement
 from bayesdist.errors import InputError
 from bayesdist.utils.arrays import Float, Int
-from bayesdist.utils.quantities import (
-    Direction,
-    Epoch,
-    Random,
-    direction_in,
-    generator_of,
-    values_in,
-    year_of,
-)
-
-if TYPE_CHECKING:
-    from astropy.coordinates import SkyCoord
+from bayesdist.utils.quantities import Direction, Epoch, direction_in, values_in, year_of
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,216 +50,146 @@ def sky_positions(
     *,
     epoch: Epoch | None = None,
     point: Direction | None = None,
+    placement: SkyPlacement | None = None,
     centroids: tuple[ArrayLike, ArrayLike] | None = None,
     joint: bool = False,
 ) -> SkyPositions:
     """Positions on the sky of FITS 1-based pixels (N,), with all errors that the calibration knows.
 
     `chip` is the chip number of each, or of all.  `point` is the sky position of (u, v) = (0, 0) in
-    degrees, u to the east and v to the north, in place of the calibration's own; `centroids` are
-    standard deviations of x and y in pixels; with `joint` the covariance of all stars is there.
+    degrees, u to the east and v to the north, in place of the calibration's own; `placement` gives
+    other directions of u and v; `centroids` are standard deviations of x and y in pixels; with
+    `joint` the covariance of all stars is there.
     InputError for a plane that does not touch the sky and no point, or a unit that is no angle.
     """
+    x, y = (np.atleast_1d(values_in(a, "pix", name)) for name, a in (("x", x), ("y", y)))
     epoch = None if epoch is None else year_of(epoch)
-    at = _placed(calibration, x, y, chip, epoch, point)
-    step = at.step
-    if calibration.errors == "none" and not calibration.further and centroids is None:
-        return SkyPositions(at.ra, at.dec, None)
-    own, shared = _own(calibration, at.slope, centroids), _shared(calibration)
-    single = own + shared
-    for number, one in at.maps.items():
-        mine = at.chip == number
-        found = one.covariance_at(at.x[mine], at.y[mine])
-        if found is not None:
-            single[mine] += found
-    cov = np.einsum("nab,nbc,ndc->nad", step, single, step)
-    if not joint:
-        return SkyPositions(at.ra, at.dec, cov)
-    design = _designs(calibration, at.maps, at.x, at.y, at.chip)
-    whole = np.einsum("nak,kl,mbl->namb", design, _coefficients(calibration, epoch), design)
-    whole += shared[None, :, None, :]
-    rows = np.arange(at.x.size)
-    whole[rows, :, rows, :] += own
-    whole = np.einsum("nab,nbmc,mdc->namd", step, whole, step, optimize=True)
-    return SkyPositions(at.ra, at.dec, cov, whole.reshape(2 * at.x.size, 2 * at.x.size))
-
-
-def sky_distribution(
-    calibration: Calibration,
-    x: ArrayLike,
-    y: ArrayLike,
-    *,
-    n_draws: int = 1000,
-    rng: Random,
-    chip: ArrayLike | None = None,
-    epoch: Epoch | None = None,
-    point: Direction | None = None,
-    centroids: tuple[ArrayLike, ArrayLike] | None = None,
-) -> SkyCoord:
-    """Random draws of positions on the sky, as a SkyCoord of distributions.
-
-    Parameters
-    ----------
-    calibration : Calibration
-    x, y : array_like, shape (N,)
-        FITS 1-based pixels.
-    n_draws : int
-    rng : int or numpy.random.Generator
-        Seed, or source of the random numbers.
-    chip : array_like, optional
-        Chip number of each position, or of all; it may be left out for a single chip.
-    epoch : float, str, Time, date or Quantity, optional
-        Needed by a calibration that depends on time.
-    point : SkyCoord, or pair of float or Quantity, optional
-        Sky position of (u, v) = (0, 0), u to the east and v to the north, in place of the
-        calibration's own.
-    centroids : pair of array_like, optional
-        Standard deviations of x and y in pixels.
-
-    Returns
-    -------
-    SkyCoord, shape (N,)
-        ICRS, with `astropy.uncertainty.Distribution` of `n_draws` values as ra and dec.  A draw has
-        the same errors of the calibration for all stars, so that the covariance between positions
-        is that of ``sky_positions(..., joint=True)`` within its Monte-Carlo error.
-
-    Raises
-    ------
-    InputError
-        For fewer than two draws, a calibration without errors, a plane that does not touch the sky
-        and no point, or a unit that is no angle.
-
-    Notes
-    -----
-    ``sky.ra.pdf_std()``, transformations to other frames, offsets and the separation from a plain
-    SkyCoord work on distributions.  Indexing with a single number and the separation of two such
-    objects do not in astropy 8; for these ``SkyCoord(sky.ra.distribution, sky.dec.distribution)``
-    is a plain SkyCoord of shape (N, n_draws).
-    """
-    from astropy import units as apu
-    from astropy.coordinates import SkyCoord
-    from astropy.uncertainty import Distribution
-
-    if n_draws < 2:
-        raise InputError(f"n_draws is {n_draws}", do="ask for two draws or more")
-    if calibration.errors == "none" and not calibration.further and centroids is None:
-        raise InputError(
-            "has no errors to draw from",
-            where=calibration.name,
-            do="give a calibration with a covariance, or the errors of the centroids",
-        )
-    if chip is None and len(calibration.numbers) > 1:
-        raise InputError(
-            "has several chips, and none is named",
-            where=calibration.name,
-            do=f"give chip, one of {', '.join(map(str, calibration.numbers))}",
-        )
-    generator = generator_of(rng)
-    epoch = None if epoch is None else year_of(epoch)
-    numbers = calibration.numbers[0] if chip is None else chip
-    at = _placed(calibration, x, y, numbers, epoch, point)
-    design = _designs(calibration, at.maps, at.x, at.y, at.chip)
-    root = _root(_coefficients(calibration, epoch))
-    plane = design @ (root @ generator.standard_normal((len(root), n_draws)))  # (N, 2, n_draws)
-    plane += _root(_shared(calibration)) @ generator.standard_normal((2, n_draws))
-    own = _root(_own(calibration, at.slope, centroids))
-    plane += own @ generator.standard_normal((at.x.size, 2, n_draws))
-    east, north = np.moveaxis(np.radians((at.step @ plane) / 3.6e6), 1, 0)
-    axes = np.stack([plane_axes((ra, dec)) for ra, dec in zip(at.ra, at.dec, strict=True)])
-    vectors = (
-        axes[:, 2, :, None]
-        + east[:, None] * axes[:, 0, :, None]
-        + north[:, None] * axes[:, 1, :, None]
-    )
-    ra = np.degrees(np.arctan2(vectors[:, 1], vectors[:, 0]))
-    # draws on one side of the meridian of each star, so that their mean and scatter make sense
-    ra = at.ra[:, None] + (ra - at.ra[:, None] + 180.0) % 360.0 - 180.0
-    dec = np.degrees(np.arctan2(vectors[:, 2], np.hypot(vectors[:, 0], vectors[:, 1])))
-    return SkyCoord(Distribution(ra * apu.deg), Distribution(dec * apu.deg))
-
-
-@dataclass(frozen=True, eq=False)
-class _Placed:
-    """Pixels (N,) with their positions on the sky."""
-
-    maps: dict[int, ChipMap]
-    x: Float
-    y: Float
-    chip: Int
-    ra: Float  # degrees; NaN for a pixel that is no number
-    dec: Float
-    slope: Float  # (N, 2, 2), derivatives of (u, v) with respect to (x, y)
-    step: Float  # (N, 2, 2), of (east, north) in mas with respect to (u, v)
-
-
-def _placed(
-    calibration: Calibration,
-    x: ArrayLike,
-    y: ArrayLike,
-    chip: ArrayLike,
-    epoch: float | None,
-    point: Direction | None,
-) -> _Placed:
-    px, py = (np.atleast_1d(values_in(one, "pix", name)) for name, one in (("x", x), ("y", y)))
-    numbers = np.broadcast_to(np.asarray(chip, np.int64), px.shape)
-    touching = None if point is None else direction_in(point, "point")
-    origin, unit = _touching(calibration, touching)
+    chip = np.broadcast_to(np.asarray(chip, np.int64), x.shape)
+    placement = placement or placement_of(calibration, point)
     maps = calibration.with_tables(calibration.at(epoch, origin="stated"))
-    plane = np.full((2, px.size), np.nan)
-    slope = np.full((px.size, 2, 2), np.nan)
-    for number, one in maps.items():
-        mine = numbers == number
-        plane[:, mine] = one.at(px[mine], py[mine])
-        slope[mine] = one.slope(px[mine], py[mine])
-    ra, dec = sky_of_plane(unit * plane[0], unit * plane[1], origin)
-    step = np.full((px.size, 2, 2), np.nan)
-    known = np.isfinite(ra)
-    # mas on the sky by a unit of the plane
-    step[known] = 1e3 * unit * np.linalg.inv(tangent_jacobian(ra[known], dec[known], origin))
-    return _Placed(maps, px, py, numbers, ra, dec, slope, step)
+    plane = np.full((2, x.size), np.nan)
+    for number, chip_map in maps.items():
+        rows = chip == number
+        plane[:, rows] = chip_map.at(x[rows], y[rows])
+    ra, dec = placement.sky(plane)
+    steps = placement.steps(ra, dec)
+    single, whole = plane_covariances(
+        calibration, maps, x, y, chip, epoch=epoch, centroids=centroids, joint=joint
+    )
+    if single is None:
+        return SkyPositions(ra, dec, None)
+    cov = np.einsum("nab,nbc,ndc->nad", steps, single, steps)
+    if whole is None:
+        return SkyPositions(ra, dec, cov)
+    whole = np.einsum("nab,nbmc,mdc->namd", steps, whole, steps, optimize=True)
+    return SkyPositions(ra, dec, cov, whole.reshape(2 * x.size, 2 * x.size))
 
 
-def _shared(calibration: Calibration) -> Float:
-    """Covariance (2, 2) on the plane of errors that all stars of an image share."""
-    rows = [row for row in calibration.further if row.shared]
-    return np.diag([float(sum(r.u**2 for r in rows)), float(sum(r.v**2 for r in rows))])
+def plane_covariances(
+    calibration: Calibration,
+    maps: Mapping[int, ChipMap],
+    x: Float,
+    y: Float,
+    chip: Int,
+    *,
+    epoch: float | None = None,
+    centroids: tuple[ArrayLike, ArrayLike] | None = None,
+    joint: bool = False,
+) -> tuple[Float | None, Float | None]:
+    """Covariances of u, v at FITS 1-based pixels (N,), with all errors that the calibration knows.
+
+    `maps` are those of all chips at the epoch, look-up tables included; other arguments as for
+    `sky_positions`.  The first result (N, 2, 2) is for each position and the second (N, 2, N, 2)
+    for all, None unless it is asked for with `joint`; both are None if no errors are known.
+    """
+    if calibration.errors == "none" and not calibration.further and centroids is None:
+        return None, None
+    slope = np.full((x.size, 2, 2), np.nan)
+    for number, chip_map in maps.items():
+        rows = chip == number
+        slope[rows] = chip_map.slope(x[rows], y[rows])
+    own = own_covariances(calibration, slope, centroids)
+    shared = shared_covariance(calibration)
+    single = own + shared
+    for number, chip_map in maps.items():
+        rows = chip == number
+        from_coefficients = chip_map.covariance_at(x[rows], y[rows])
+        if from_coefficients is not None:
+            single[rows] += from_coefficients
+    if not joint:
+        return single, None
+    design = designs(calibration, maps, x, y, chip)
+    whole = np.einsum(
+        "nak,kl,mbl->namb", design, coefficient_covariance(calibration, epoch), design
+    )
+    whole += shared[None, :, None, :]
+    rows = np.arange(x.size)
+    whole[rows, :, rows, :] += own
+    return single, whole
 
 
-def _root(cov: Float) -> Float:
-    """Matrices R with R R^T equal to covariances (..., n, n), which may be singular."""
-    values, vectors = np.linalg.eigh(cov)
-    return np.asarray(vectors * np.sqrt(np.maximum(values, 0.0))[..., None, :])
+def placement_of(
+    calibration: Calibration,
+    point: Direction | None = None,
+    *,
+    position_angle: float | None = None,
+    mirrored: bool = False,
+    pixel_scale: float | None = None,
+) -> SkyPlacement:
+    """Placement of the plane of a calibration on the sky.
 
-
-def _touching(
-    calibration: Calibration, point: tuple[float, float] | None
-) -> tuple[tuple[float, float], float]:
-    """Point where the plane touches the sky, and arcseconds in its unit."""
+    `point` (degrees) is the sky position of (u, v) = (0, 0), in place of that of the plane.
+    `position_angle` (degrees, from north to east) is that of the v axis, 0 by default, or of V3 for
+    a plane in an aperture; u is then 90 degrees east of v, or west if `mirrored`.  `pixel_scale`
+    are arcseconds per pixel, for u and v in pixels.
+    InputError for a plane in an aperture without position angle, a plane without point, and u and v
+    in pixels of unknown size.
+    """
     plane = calibration.plane
-    if plane.kind == "aperture":
+    if plane.kind == "aperture" and position_angle is None:
         raise InputError(
             "lies in V2, V3 or the Ideal system of an aperture, and not on the sky",
             where=calibration.name,
             do="put it into the image's header by a pipeline, or give a file in TPV or SIP",
         )
-    if point is None:
-        point = plane.point
-    if point is None:
+    place = plane.point if point is None else direction_in(point, "point")
+    if place is None:
         raise InputError(
             "does not say where its plane touches the sky",
             where=calibration.name,
-            do="give --point RA DEC, the sky position of u, v = 0, if u is east and v is north",
+            do="give the point (--point RA DEC on the command line), the sky position of u, v = 0, "
+            "if u is east and v is north",
         )
-    if calibration.unit not in ARCSEC:
+    if calibration.unit in ARCSEC:
+        unit = ARCSEC[calibration.unit]
+    elif pixel_scale is not None:
+        unit = pixel_scale
+    else:
         raise InputError(
             f"is in {calibration.unit}, which is no angle on the sky",
             where=calibration.name,
             do="give a calibration in arcsec, mas or deg",
         )
-    return point, ARCSEC[calibration.unit]
+    matrix = np.eye(2)
+    if position_angle is not None:
+        c, s = np.cos(np.radians(position_angle)), np.sin(np.radians(position_angle))
+        matrix = np.array([[c, s], [-s, c]])
+        if mirrored:
+            matrix = matrix @ np.diag([-1.0, 1.0])
+        if plane.kind == "aperture" and plane.to_v2v3 is not None:
+            matrix = matrix @ plane.to_v2v3
+    elif mirrored:
+        matrix = np.diag([-1.0, 1.0])
+    return SkyPlacement(place, unit * matrix)
 
 
-def _own(
+def shared_covariance(calibration: Calibration) -> Float:
+    """Covariance (2, 2) on the plane of errors that all stars of an image share."""
+    rows = [row for row in calibration.further if row.shared]
+    return np.diag([float(sum(r.u**2 for r in rows)), float(sum(r.v**2 for r in rows))])
+
+
+def own_covariances(
     calibration: Calibration, slope: Float, centroids: tuple[ArrayLike, ArrayLike] | None
 ) -> Float:
     """Covariances (N, 2, 2) on the plane of errors that each star has by itself."""
@@ -287,15 +205,15 @@ def _own(
     return out
 
 
-def _coefficients(calibration: Calibration, epoch: float | None) -> Float:
+def coefficient_covariance(calibration: Calibration, epoch: float | None) -> Float:
     """Covariance of the coefficients of all chips; zero where there is none."""
     found = calibration.joint_covariance(calibration.numbers, epoch, origin="stated")
     n = 2 * calibration.model.n_terms * len(calibration.numbers)
     return np.zeros((n, n)) if found is None else found
 
 
-def _designs(
-    calibration: Calibration, maps: dict[int, ChipMap], x: Float, y: Float, chip: Int
+def designs(
+    calibration: Calibration, maps: Mapping[int, ChipMap], x: Float, y: Float, chip: Int
 ) -> Float:
     """Derivatives (N, 2, n) of positions by the coefficients of all chips."""
     K = calibration.model.n_terms

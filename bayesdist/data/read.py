@@ -20,6 +20,7 @@ from bayesdist.data.formats.files import (
     mission_formats,
 )
 from bayesdist.data.formats.hst1pass import is_matchup, read_hst1pass, read_matchup
+from bayesdist.data.formats.record import read_written_matches
 from bayesdist.data.matches import Matches
 from bayesdist.data.matching.table import match_table
 from bayesdist.data.reading.columns import numbered, text_labels
@@ -65,7 +66,8 @@ def read_matches(
         'table' (.ecsv, .csv, .fits, .parquet, .vot, .tbl and text of several kinds),
         'hst1pass' (lists with raw and corrected positions),
         'matchup' (such lists with the MATCHUP master that they are then matched with),
-        'astrometry.net' (corr.fits), one that a mission adds, or 'auto': by name and content.
+        'astrometry.net' (corr.fits), 'bayesdist' (matches.h5 of a saved run), one that a mission
+        adds, or 'auto': by name and content.
     columns, unit, sigma, pixel_origin, tangent_point, epoch, catalogue_epoch, chips, not_finite
         As `ReadOptions`.
 
@@ -127,7 +129,7 @@ def _read_plain(
     """Matches from files that hold them."""
     own = mission_formats()
     names: Sequence[str | None] = exposure_names(files)
-    if in_parts or (len(files) == 1 and kinds[0] in ("table", *own)):
+    if in_parts or (len(files) == 1 and kinds[0] in ("table", "bayesdist", *own)):
         names = [None] * len(files)
     tables = {
         file: own[kind].read(file) if kind in own else read_table(file)
@@ -137,6 +139,7 @@ def _read_plain(
     options = _with_common_chips(tables, _with_common_point(tables, kinds, options))
     readers: dict[str, Callable[[Path, str | None], Matches]] = {
         "hst1pass": lambda file, name: _read_list(file, name, options),
+        "bayesdist": lambda file, _: _read_record(file, options),
         "astrometry.net": lambda file, name: _read_corr(file, tables[file], name, options),
         "table": lambda file, name: Matches(
             **match_arguments(tables[file], options, source=str(file), exposure_name=name)
@@ -183,6 +186,13 @@ def _read_list(file: Path, name: str | None, options: ReadOptions) -> Matches:
     if options.unit not in (None, "pix"):
         options.refuse(str(file), "hst1pass", "unit")
     return read_hst1pass(file).matches(name=name)
+
+
+def _read_record(file: Path, options: ReadOptions) -> Matches:
+    """Matches of a file that bayesdist wrote, which states all that the options could."""
+    names = "columns unit pixel_origin tangent_point epoch catalogue_epoch chips".split()
+    options.refuse(str(file), "bayesdist", *names)
+    return read_written_matches(file)
 
 
 def _read_corr(file: Path, table: Table, name: str | None, options: ReadOptions) -> Matches:

@@ -1,9 +1,10 @@
-"""Checks of what residuals and held-out stars say."""
+"""Checks of a fit, of its matching, and of what residuals and held-out stars say."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 
+from bayesdist.data.matches import Matches
 from bayesdist.diagnose.correlated import Discrepancy
 from bayesdist.diagnose.correlated.deviations import CURVATURE
 from bayesdist.diagnose.holdout.validation import HoldoutValidation
@@ -11,10 +12,15 @@ from bayesdist.diagnose.residuals.coverage import Coverage
 from bayesdist.diagnose.residuals.misfit import Misfit, worst_misfit
 from bayesdist.diagnose.residuals.sample import ExposureScatter
 from bayesdist.diagnose.score.result import ScoreTest
+from bayesdist.infer import LinearFit
+from bayesdist.infer.exposures.frame_choice import frames_that_help
+from bayesdist.infer.posterior.checks import fit_checks, pixel_doubt
 from bayesdist.utils.checks import LARGER, Check
 from bayesdist.utils.limits import (
+    CHI2_TOO_LARGE,
     EXPOSURE_CHI2,
     HELD_OUT_DOUBTFUL,
+    MATCH_RADIUS,
     STRUCTURE,
     STRUCTURE_IN_BUDGET,
     STRUCTURE_SEEN,
@@ -23,6 +29,98 @@ from bayesdist.utils.limits import SCORE_TESTS as SCORE_LIMIT
 from bayesdist.utils.numbers import count, number, percent, probability, size_of
 
 FIT, HELD_OUT, SCORE_TESTS = "Fit", "Held-out truth", "Score tests"
+MATCHING, ASSUMPTIONS = "Matching", "Assumptions"
+
+
+def input_checks(
+    fit: LinearFit,
+    table: Matches,
+    *,
+    reference_sigma: float,
+    match_radius: float | None,
+    in_circle: bool,
+    majority: str,
+    error_scale: str,
+    matched_before: bool,
+    rows: str,
+    chooser: str,
+) -> Iterator[Check]:
+    """Checks of a fit, of the frames and errors of its stars, and of how they were matched.
+
+    Parameters
+    ----------
+    fit : LinearFit
+    table : Matches
+        Stars of the fit, or an evenly spread sample of them.
+    reference_sigma : float
+        Median quoted error of one axis, in the unit of u and v.
+    match_radius : float or None
+        Radius within which the stars were matched, in the unit of u and v.
+    in_circle : bool
+        True if the likelihood accounts for the circles that the stars were matched in.
+    majority : str
+        Sentence on most pairs being false; empty if they are not.
+    error_scale : str
+        Sentence on quoted errors that were multiplied; empty if they were not.
+    matched_before : bool
+        True if the stars were matched by the user, so that frames and nominal positions can be
+        wrong or missing.
+    rows, chooser : str
+        As `things` and `chooser` of `bayesdist.infer.posterior.checks.fit_checks`.
+    """
+    yield from fit_checks(fit, in_circle=in_circle, things=rows, chooser=chooser)
+    if doubt := pixel_doubt(fit):
+        yield Check(FIT, "Size of a pixel", level="warn", sentence=doubt)
+    suspicious = bool(majority or error_scale)
+    if matched_before and (text := frames_doubt(fit, table, suspicious=suspicious)):
+        yield Check(FIT, "Frames of the exposures", level="warn", sentence=text)
+    if error_scale:
+        name = "Scale of the quoted errors"
+        yield Check(FIT, name, level="warn", sentence=error_scale, doubt=LARGER)
+    if matched_before and not in_circle and table.has_nominal:
+        yield Check(
+            MATCHING,
+            "Match radius",
+            level="warn",
+            sentence="the matches have nominal positions, and outliers.match_radius is not given: "
+            "the likelihood does not know that they were selected",
+        )
+    yield from matching_checks(match_radius, reference_sigma, in_circle=in_circle)
+
+
+def frames_doubt(fit: LinearFit, table: Matches, *, suspicious: bool) -> str:
+    """Clause on frames that would make the residuals far smaller; empty if there are none.
+
+    Other frames are tried only if the residuals are larger than their errors, or if the fit is
+    `suspicious` for another reason. `table`: stars of the fit, or a sample of them.
+    """
+    if not suspicious and fit.chi2 <= CHI2_TOO_LARGE.value * fit.dof:
+        return ""
+    better = frames_that_help(table, fit.model)
+    return "" if better is None else f"the exposures lie differently: {better.sentence}"
+
+
+def matching_checks(
+    match_radius: float | None, sigma: float, *, in_circle: bool
+) -> Iterator[Check]:
+    """Check of residuals that the match circle may have cut off, unknown to the likelihood.
+
+    `match_radius`: in the unit of u and v. `sigma`: usual error of a star. `in_circle`: True if the
+    likelihood knows of the circles.
+    """
+    if in_circle or match_radius is None or MATCH_RADIUS.met_by(match_radius / sigma):
+        return
+    yield Check(
+        ASSUMPTIONS,
+        "Match radius, in errors of a star",
+        match_radius / sigma,
+        MATCH_RADIUS.words,
+        "warn",
+        f"stars were matched within {match_radius / sigma:.1f} of their errors of nominal "
+        "positions that are not given, which cuts the scatter and draws the fit: match again with "
+        "a wider match radius, or give the columns u_nominal and v_nominal",
+        LARGER,
+    )
 
 
 def structure_checks(

@@ -14,6 +14,7 @@ from bayesdist.diagnose.checks import (
     coverage_checks,
     exposure_checks,
     holdout_checks,
+    input_checks,
     score_checks,
     structure_checks,
 )
@@ -34,22 +35,27 @@ from bayesdist.diagnose.residuals.misfit import (
 )
 from bayesdist.diagnose.residuals.quoted import majority_sentence
 from bayesdist.diagnose.residuals.sample import (
+    SAMPLE,
     StarSample,
     centroid_scatter,
+    dates_of,
     likelihood_shown,
     star_sample,
 )
 from bayesdist.diagnose.residuals.star_sums import StarSums, flagged_by_exposure, star_sums
 from bayesdist.diagnose.score.result import ScoreTest
 from bayesdist.diagnose.score.tests import score_tests
-from bayesdist.infer import GaussianPriors, LinearFit, Posterior, Shards
+from bayesdist.errors import InputError
+from bayesdist.infer import Compute, GaussianPriors, LinearFit, Posterior, Shards, fit_linear
 from bayesdist.infer.catalogue.star_errors import StarCovariance, StarErrors, star_covariance
 from bayesdist.infer.equations.scaled import one_thread
 from bayesdist.infer.exposures.chip_offsets import Settling
 from bayesdist.infer.stars.likelihood import Likelihood
+from bayesdist.infer.stars.loading import opened
 from bayesdist.utils.arrays import Float, Int
-from bayesdist.utils.checks import EITHER, Check
-from bayesdist.utils.streams import restarted
+from bayesdist.utils.checks import EITHER, Check, warnings_of
+from bayesdist.utils.quantities import Number, Random, value_in
+from bayesdist.utils.streams import assessment_rng, restarted
 
 if TYPE_CHECKING:
     from bayesdist.infer.selfcal import SelfCalibrationMode
@@ -63,7 +69,20 @@ log = logging.getLogger("bayesdist")
 
 @dataclass(frozen=True, eq=False)
 class Diagnostics:
-    """Misfit, score tests, correlated errors and further results by the residuals of a solution."""
+    """Misfit, score tests, correlated errors and further results by the residuals of a solution.
+
+    `diagnose` makes it.  `error_budget` and `check_requirements` take it, so that a verdict counts
+    what the residuals show; printed, it says how many tests there were and what was found.
+
+    Examples
+    --------
+    >>> matches, truth = bd.simulate_wise(500, rng=np.random.default_rng(1))
+    >>> model = bd.build_model(matches, order=4, size=(1016, 1016))
+    >>> posterior = bd.sample(bd.fit_linear(matches, model), matches, target_ess=100)
+    >>> diagnostics = bd.diagnose(posterior, matches)
+    >>> diagnostics.correlated.structure_rms < 0.1  # pixels
+    True
+    """
 
     sums: StarSums  # of residuals over all stars
     # bins of each chip, by its number and the name of the partition
@@ -72,6 +91,9 @@ class Diagnostics:
     misfits: tuple[Misfit, ...]
     coverage: tuple[Coverage, ...]  # the area of each chip that its stars cover
     sample: StarSample  # some stars, or all of them, and what residuals and probabilities of each
+    # of the fit, the frames, the quoted errors and the matching: what only the data can tell
+    input_checks: tuple[Check, ...]
+    dates: Float  # (T,), distinct dates of the stars, ascending decimal years; empty without dates
     majority: str = ""  # what it means that most pairs are false; empty where they are not
     epoch_shift: EpochShift | None = None  # error of the epochs; None without proper motions
     # scatter of residuals by magnitude, where stars have magnitudes
@@ -89,6 +111,23 @@ class Diagnostics:
     holdout: HoldoutValidation | None = None
     # two exposures far apart in time laid on each other, of a campaign
     overlap: OverlapTest | None = None
+
+    def __repr__(self) -> str:
+        warnings = warnings_of((*self.input_checks, *self.checks))
+        significant = sum(test.significant for test in self.score_tests)
+        n_tests = len(self.score_tests)
+        tests = f"{significant} of {n_tests} tests of the residuals found something"
+        if not n_tests:
+            tests = "the residuals were not tested"
+        elif not significant:
+            tests = f"{n_tests} tests of the residuals found nothing"
+        head = f"Diagnostics of {self.sample.n_total} stars: {tests}"
+        rms = None if self.correlated is None else self.correlated.structure_rms
+        if self.correlated is not None and rms is not None:
+            head += f"; structure beyond the model {rms:.2g} {self.correlated.model.unit} rms"
+        if self.holdout is not None:
+            head += f"; {self.holdout.verdict}"
+        return "\n".join([head, *(f"  - {text}" for text in warnings)])
 
     @property
     def misfit(self) -> Misfit:
@@ -124,6 +163,146 @@ class Diagnostics:
         return tuple(out)
 
 
+def diagnose(
+    posterior: Posterior,
+    matches: Matches,
+    *,
+    fit: LinearFit | None = None,
+    rng: Random = 1,
+    priors: GaussianPriors | None = None,
+    match_radius: Number | None = None,
+    discrepancy: DiscrepancyPriors | None = None,
+    compute: Compute | None = None,
+) -> Diagnostics:
+    """Examine the residuals of a posterior: what the model leaves out, and how noisy the stars are.
+
+    Correlated errors beyond the model (structure over the detector, differences between exposures)
+    are estimated with priors on their size, targeted tests look for what the model may lack, and
+    the scatter of the stars is compared with their quoted errors.  `bayesdist run` makes the same
+    diagnostics: the same stars, settings and seed give the same numbers.
+
+    Parameters
+    ----------
+    posterior : Posterior
+        As `sample` returned it.
+    matches : Matches
+        The N stars that the posterior was made from, with the same errors.
+    fit : LinearFit, optional
+        The fit that the sampler started from; by default a fit with the default rejection limits
+        is made.  Give it if it was made with other limits.
+    rng : int or numpy.random.Generator
+        Seed of a run.  Of a generator the numbers are used from their beginning.
+    priors : GaussianPriors, optional
+        Priors of the parameters, as given to `sample`; flat by default.
+    match_radius : float or Quantity, optional
+        Radius within which the stars were matched, in the unit of u and v; that of the posterior's
+        mixture by default.
+    discrepancy : DiscrepancyPriors, optional
+        Prior medians of the sizes of what the model may leave out.
+    compute : Compute, optional
+        Where the work is done; one process with threads by default.
+
+    Returns
+    -------
+    Diagnostics
+
+    Raises
+    ------
+    InputError
+        For a fit that was not sampled, matches that are not those of the posterior, a posterior of
+        a campaign or of a self-calibration, a radius that is not positive, and a wrong seed.
+
+    Examples
+    --------
+    >>> matches, truth = bd.simulate_wise(500, rng=np.random.default_rng(1))
+    >>> model = bd.build_model(matches, order=2, size=(1016, 1016))
+    >>> fit = bd.fit_linear(matches, model)
+    >>> posterior = bd.sample(fit, matches, seed=1, target_ess=100)
+    >>> diagnostics = bd.diagnose(posterior, matches, fit=fit, rng=1)
+    >>> any(test.significant for test in diagnostics.score_tests)  # order 4 is needed
+    True
+    """
+    _refuse_other_posterior(posterior, matches, fit)
+    rng = assessment_rng(rng)
+    priors = priors or GaussianPriors.none(posterior.model)
+    circle = posterior.mixture.match_radius
+    radius = circle if match_radius is None else _radius(match_radius, matches.unit)
+    with opened(posterior.model, matches, compute) as shards:
+        fit = fit or fit_linear(shards, posterior.model, priors=priors)
+        table = matches.sample(SAMPLE)
+        found = diagnose_fit(
+            fit,
+            posterior,
+            matches,
+            shards,
+            table,
+            eliminated=None,
+            centroid="residuals",
+            known=priors.joint is not None,
+            match_radius=radius,
+            in_circle=circle is not None and matches.has_nominal,
+            matched_before=True,
+        )
+        return diagnose_posterior(
+            found,
+            fit,
+            posterior,
+            matches,
+            shards,
+            rng=rng,
+            tested=table,
+            discrepancy=discrepancy or DiscrepancyPriors(),
+            priors=priors,
+            match_radius=radius,
+            structure=True,
+            exposures=True,
+            settling=None,
+            catalogue=None,
+            eliminated=None,
+            periods=None,
+        )
+
+
+def _refuse_other_posterior(posterior: Posterior, matches: Matches, fit: LinearFit | None) -> None:
+    """Refuse what is no posterior of these matches, or of exposures that were fitted jointly."""
+    if not isinstance(posterior, Posterior):
+        raise InputError(
+            f"a {type(posterior).__name__} has no posterior to examine",
+            where="diagnose",
+            do="give what bd.sample returned",
+        )
+    if posterior.own_places or posterior.model.gauge == "held":
+        kind = "self-calibration" if posterior.own_places else "campaign"
+        raise InputError(
+            f"the posterior is that of a {kind}, which is more than its stars and its model",
+            where="diagnose",
+            do="use the diagnostics of its run",
+        )
+    if posterior.n_stars != len(matches):
+        raise InputError(
+            f"the posterior was made from {posterior.n_stars} stars, and these are {len(matches)}",
+            where="diagnose",
+            do="give the matches that were given to bd.sample",
+        )
+    if fit is not None and fit.model != posterior.model:
+        raise InputError(
+            "the fit and the posterior have different models",
+            where="diagnose",
+            do="give the fit that was given to bd.sample, or leave fit out",
+        )
+
+
+def _radius(value: Number, unit: str) -> float:
+    """Radius in the unit of u and v, from a number or a Quantity."""
+    radius = value_in(value, unit, "match_radius")
+    if not (np.isfinite(radius) and radius > 0):
+        raise InputError(
+            f"the match radius is {radius:g} {unit}",
+            do="give a positive number, or leave it out",
+        )
+    return radius
+
+
 @one_thread
 def diagnose_fit(
     fit: LinearFit,
@@ -134,16 +313,22 @@ def diagnose_fit(
     *,
     eliminated: SelfCalibrationMode | None,
     centroid: MagnitudeErrors | Literal["residuals"] | None,
-    things: str,
     known: bool,
+    match_radius: float | None,
+    in_circle: bool,
+    matched_before: bool,
+    error_scale: str = "",
+    rows: str = "stars",
+    chooser: str = "least-squares fit",
 ) -> Diagnostics:
     """Diagnostics by residuals alone, of a posterior where there is one; nothing is estimated.
 
     `stars`: those that were fitted, with errors. `shards`: the same, as passes go over them.
     `table`: evenly spread ones of them, or all. `eliminated`: the solution with its stars, where
     places of stars were fitted too. `centroid`: errors of the centroids where the fit has found
-    them; else they are the scatter of the residuals. `things`: what is true or false. `known`:
-    whether an earlier calibration says where no stars are.
+    them; else they are the scatter of the residuals. `known`: whether an earlier calibration says
+    where no stars are. `match_radius`, `in_circle`, `matched_before`, `error_scale`, `rows`,
+    `chooser`: as of `input_checks`.
     """
     model, survey = fit.model, shards.survey
     shown = likelihood_shown(fit, posterior)
@@ -159,6 +344,20 @@ def diagnose_fit(
         sample = replace(sample, taken=_taken(eliminated, sample.table.row))
     if centroid == "residuals":
         centroid = centroid_scatter(sample, n_params=model.n_params)
+    sigma, things = survey.reference_sigma, "pairs" if rows == "stars" else rows
+    majority = majority_sentence(fit, posterior, quoted=sigma, things=things)
+    checks = input_checks(
+        fit,
+        table,
+        reference_sigma=sigma,
+        match_radius=match_radius,
+        in_circle=in_circle,
+        majority=majority,
+        error_scale=error_scale,
+        matched_before=matched_before,
+        rows=rows,
+        chooser=chooser,
+    )
     return Diagnostics(
         sums=sums,
         partitions=partitions,
@@ -176,7 +375,9 @@ def diagnose_fit(
             )
         ),
         sample=sample,
-        majority=majority_sentence(fit, posterior, quoted=survey.reference_sigma, things=things),
+        input_checks=tuple(checks),
+        dates=dates_of(stars if stars.in_memory else table),
+        majority=majority,
         epoch_shift=epoch_shift(table, fit),
         centroid=centroid,
     )
@@ -228,7 +429,7 @@ def _taken(eliminated: SelfCalibrationMode, rows: Int) -> Float:
 
 
 @one_thread
-def diagnose(
+def diagnose_posterior(
     found: Diagnostics,
     fit: LinearFit,
     posterior: Posterior,

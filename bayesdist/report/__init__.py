@@ -1,1 +1,1 @@
-"""Figures and the report: the only room that uses matplotlib and corner."""
+"""Figures and the report: the only room that uses matplotlib."""

@@ -5,6 +5,36 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from bayesdist.utils.quantities import Random, generator_of
+
+ASSESSMENT = (
+    2  # of the random streams that follow from the seed of a run; the sampler has the first
+)
+
+
+def assessment_rng(seed: Random) -> np.random.Generator:
+    """Random numbers of the assessment: of the seed of a run, or a generator that is given.
+
+    Parameters
+    ----------
+    seed : int or numpy.random.Generator
+        Seed of a run, 0 or more; a generator is returned unchanged.
+
+    Raises
+    ------
+    InputError
+        For anything else.
+
+    Examples
+    --------
+    >>> bool(assessment_rng(3).normal() == np.random.default_rng([3, ASSESSMENT]).normal())
+    True
+    """
+    if isinstance(seed, np.random.Generator):
+        return seed
+    generator_of(seed)  # refuses what is no seed
+    return np.random.default_rng([seed, ASSESSMENT])
+
 
 def restarted(rng: np.random.Generator) -> np.random.Generator:
     """A generator of the same numbers from their beginning.

@@ -11,7 +11,7 @@ import numpy as np
 from bayesdist.app.assessment.error_terms import assessment_rng
 from bayesdist.app.config import load_config
 from bayesdist.app.results import Results
-from bayesdist.app.run import make_stages
+from bayesdist.app.stages import make_stages
 from bayesdist.app.store.rundir import RunDirectory
 from bayesdist.assess import LocalErrors
 from bayesdist.assess.domain import EvaluationDomain

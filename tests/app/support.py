@@ -20,8 +20,8 @@ from astropy.table import Table
 from bayesdist.app.cli import main
 from bayesdist.app.rehearsal import rehearse
 from bayesdist.app.results import Results, results_of
-from bayesdist.app.run import ASSESS, initialized, make_stages
 from bayesdist.app.screen import start_logging
+from bayesdist.app.stages import ASSESS, initialized, make_stages
 from bayesdist.app.store.rundir import RunDirectory
 from bayesdist.data import Matches
 from bayesdist.model import Chip, DistortionModel

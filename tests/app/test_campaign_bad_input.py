@@ -592,7 +592,7 @@ def test_resuming_after_a_list_was_removed(resumable):
 @pytest.mark.slow
 @only_in_full("each damage is matched alone, and tests/app/campaign runs to its end")
 def test_a_damaged_campaign_is_calibrated_and_says_so(campaign, monkeypatch):
-    monkeypatch.setattr("bayesdist.app.run.report", lambda results, pdf: [])
+    monkeypatch.setattr("bayesdist.app.stages.report", lambda results, pdf: [])
     # how linear terms went with time takes longer than all the rest, and is not asked here
     monkeypatch.setattr("bayesdist.app.assessment.series.write_series_tables", lambda *_: None)
     campaign.lists(scattered, ONE).lists(lambda t: t[t["chip"] == 1], "f606w-006")

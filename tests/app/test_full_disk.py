@@ -10,7 +10,7 @@ import h5py
 import numpy as np
 import pytest
 
-from bayesdist.app.run import run
+from bayesdist.app.stages import run
 from bayesdist.infer import load_posterior
 from tests.app.support import cli, one_sentence, process, snapshot, write_job
 from tests.reduced import only_in_full
@@ -85,7 +85,7 @@ def _assert_same_draws(a: Path, b: Path) -> None:
 @pytest.fixture(scope="module")
 def undisturbed(job, tmp_path_factory) -> Path:
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("bayesdist.app.run.report", lambda results, pdf: [])
+        patch.setattr("bayesdist.app.stages.report", lambda results, pdf: [])
         return run(job, tmp_path_factory.mktemp("undisturbed") / "run")
 
 

@@ -92,7 +92,7 @@ class Forked:
 
 def _in_short(arguments: list[str]) -> int:
     """Exit code of the command, without figures."""
-    with patch("bayesdist.app.run.report", lambda results, pdf: []):
+    with patch("bayesdist.app.stages.report", lambda results, pdf: []):
         return main(arguments)
 
 

@@ -41,7 +41,7 @@ def summary_of(folder, factor):
 def both(tmp_path_factory):
     folder = tmp_path_factory.mktemp("quoted")
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("bayesdist.app.run.report", lambda results, pdf: [])
+        patch.setattr("bayesdist.app.stages.report", lambda results, pdf: [])
         return summary_of(folder / "right", 1.0), summary_of(folder / "small", FACTOR)
 
 

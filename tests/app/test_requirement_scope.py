@@ -44,7 +44,7 @@ def run(tmp_path_factory):
         },
     )
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("bayesdist.app.run.report", lambda results, pdf: [])
+        patch.setattr("bayesdist.app.stages.report", lambda results, pdf: [])
         assert main(["run", str(config), "-o", str(folder / "run"), "-q"]) == 0
     return folder / "run"
 

@@ -39,7 +39,7 @@ def unreported(finished, tmp_path_factory) -> Path:
     """A finished run, whose report has been made as these tests make it: not at all."""
     path = shutil.copytree(finished.path, tmp_path_factory.mktemp("unreported") / "run")
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("bayesdist.app.run.report", lambda results, pdf: [])
+        patch.setattr("bayesdist.app.stages.report", lambda results, pdf: [])
         good("stage", "report", path)
     return path
 

@@ -500,12 +500,12 @@ def test_an_interrupted_run_goes_on(finished, posterior, tmp_path, monkeypatch):
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
-        patch.setattr("bayesdist.app.run.diagnose", interrupt)
+        patch.setattr("bayesdist.app.stages.diagnose", interrupt)
         result = cli("run", finished.config, "-o", tmp_path / "run")
     assert result.code == 130 and "--resume" in result.err and "Traceback" not in result.err
     record = json.loads((tmp_path / "run" / "run.json").read_text())
     assert list(record["stages"]) == ["fit", "sample"]
-    monkeypatch.setattr("bayesdist.app.run.report", lambda results, pdf: [])
+    monkeypatch.setattr("bayesdist.app.stages.report", lambda results, pdf: [])
     result = good("run", finished.config, "-o", tmp_path / "run", "--resume")
     assert "sample: done before" in result.err
     np.testing.assert_array_equal(load_posterior(tmp_path / "run").theta, posterior.theta)

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from bayesdist.assess import Requirement, UserTerm, check_requirements
+from bayesdist.assess import Requirement, UserTerm
 from bayesdist.assess.budget.budget import budget_of, place_budget
 from bayesdist.assess.budget.surface import budget_surface
 from bayesdist.assess.domain import EvaluationDomain
@@ -33,6 +33,7 @@ from bayesdist.diagnose.tables.between_nodes import MeanSquare
 from bayesdist.model import Chip, DistortionModel, TimeDependence
 from tests.budgets import detector_budget
 
+from .by_draws import margins_by_draws
 from .conftest import StandIn
 
 SIZE, GRID, DRAWS = (201.0, 101.0), (4, 3), 2000
@@ -317,9 +318,7 @@ def test_a_term_that_is_new_is_in_every_result():
     highest = np.abs(np.sin(budget.x / 20)).max()
     limit = 0.05
     asked = Requirement("edge", "max", limit, epoch=EPOCH)
-    (margin,) = check_requirements(
-        CERTAIN, [asked], terms=[toy], n_draws=DRAWS, rng=rng, grid=(9, 3)
-    )
+    (margin,) = margins_by_draws(CERTAIN, [asked], terms=[toy], n_draws=DRAWS, rng=rng, grid=(9, 3))
     expected = stats.rayleigh(scale=0.03 * highest).cdf(limit)
     assert margin.probability_met == pytest.approx(expected, abs=5 * np.sqrt(0.25 / DRAWS))
     assert margin.verdict == "missed" and margin.remedy.term == "ripple"

@@ -5,7 +5,7 @@ import pytest
 from scipy import stats
 from scipy.spatial.distance import pdist
 
-from bayesdist.assess import Requirement, UserTerm, check_requirements
+from bayesdist.assess import Requirement, UserTerm
 from bayesdist.assess.model import error_model
 from bayesdist.assess.requirements.validity import validity_period
 from bayesdist.assess.statistics import extent
@@ -15,6 +15,8 @@ from bayesdist.diagnose.significance import clopper_pearson
 from bayesdist.errors import InputError
 from bayesdist.model import Chip, DistortionModel, TimeDependence
 from tests.reduced import case_in_full
+
+from .by_draws import margins_by_draws
 
 S = 0.03
 SIZE = (101.0, 81.0)
@@ -28,7 +30,7 @@ DRIFTING = DistortionModel(
 
 def margin_of(solution, requirement, seed=1, **options):
     options = {"n_draws": 4000, "grid": (21, 17)} | options
-    [m] = check_requirements(solution, [requirement], rng=np.random.default_rng(seed), **options)
+    [m] = margins_by_draws(solution, [requirement], rng=np.random.default_rng(seed), **options)
     return m
 
 

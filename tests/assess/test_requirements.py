@@ -5,13 +5,15 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from bayesdist.assess import STATISTICS, Requirement, UserTerm, check_requirements, drawn
+from bayesdist.assess import STATISTICS, Requirement, UserTerm, drawn
 from bayesdist.diagnose.significance import clopper_pearson
 from bayesdist.errors import InputError
 from bayesdist.infer.posterior.checks import scatter_too_small
 from bayesdist.model import Chip, DistortionModel
 from bayesdist.utils.checks import EITHER, LARGER, Check
 from tests.reduced import case_in_full
+
+from .by_draws import margins_by_draws
 
 RADIAL = [s for s in STATISTICS if s[:2] not in ("u_", "v_")]
 S = 0.03
@@ -20,7 +22,7 @@ RANDOM = [UserTerm("centroids", "random", S, S)]
 
 
 def margins_of(s, reqs, seed=1, **options):
-    return check_requirements(s, reqs, rng=np.random.default_rng(seed), **options)
+    return margins_by_draws(s, reqs, rng=np.random.default_rng(seed), **options)
 
 
 def near(counted, n, probability):

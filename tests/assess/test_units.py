@@ -4,8 +4,8 @@ import astropy.units as u
 import pytest
 
 from bayesdist.assess import UNITS, convert, pixel_scale_of
-from bayesdist.assess.units import pixel_doubt
 from bayesdist.errors import InputError
+from bayesdist.infer.posterior.checks import pixel_doubt
 
 SCALE = 49.7  # mas, ACS/WFC
 

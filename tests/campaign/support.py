@@ -17,7 +17,7 @@ from bayesdist.app.kinds.campaign import fit as stage
 from bayesdist.app.kinds.campaign.matched import CampaignMatched
 from bayesdist.app.kinds.fit_data import FitData
 from bayesdist.app.results import Results, open_results
-from bayesdist.app.run import make_stages
+from bayesdist.app.stages import make_stages
 from bayesdist.app.store.rundir import RunDirectory
 from bayesdist.infer.catalogue.star_errors import StarErrors, star_covariance
 from bayesdist.infer.exposures.hierarchy import HierarchicalFit

@@ -11,7 +11,7 @@ from scipy.interpolate import RegularGridInterpolator
 
 from bayesdist.app.config import load_config
 from bayesdist.app.results import Results, results_of
-from bayesdist.app.run import make_stages
+from bayesdist.app.stages import make_stages
 from bayesdist.app.store.rundir import RunDirectory
 from bayesdist.model import Chip, DistortionModel, TimeDependence
 from bayesdist.simulate import simulate_matches

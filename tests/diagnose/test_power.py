@@ -94,6 +94,29 @@ def test_trails_that_stay_do_not_grow():
     assert not any(one["magnitude in time"].significant for one in found)
 
 
+@pytest.mark.parametrize("scene", [Scene(1500, 3), Scene(3000, 2, "shift_rotation", 5)])
+def test_the_phase_of_the_pixel_is_found(scene):
+    """A wave of one pixel, 0.006 pixels high along u: a fourth of the scatter of one star."""
+
+    def wave(table):
+        return 0.006 * np.sin(2 * np.pi * table.x + 0.7)[:, None] * [[1.0, 0.0]]
+
+    found = [scene.with_pattern(k, wave) for k in FEW]
+    assert median_p(found, "pixel phase") < 1e-6
+    assert sizes(found, "pixel phase") == pytest.approx(0.006 / np.sqrt(2), rel=0.25)
+    others = [t for one in found for t in one.values() if t.name != "pixel phase"]
+    assert not any(one.significant for one in others)
+    assert found[0]["pixel phase"].held_by == ""
+
+
+def test_pixels_without_phases_are_not_asked():
+    """Positions that were rounded to whole pixels have one phase."""
+    model, table = Scene(1500, 2).data(1)
+    whole = table.with_columns(x=np.round(table.x), y=np.round(table.y))
+    fit = Scene(1500, 2).solve(model, whole)
+    assert "pixel phase" not in by_name(score_tests(whole, fit))
+
+
 def test_refraction_by_colour_is_found():
     def refraction(table):
         return (0.01 * (table.colour - 1))[:, None] * [[1.0, 0.5]]

@@ -68,6 +68,7 @@ def test_noncentrality_has_the_power(dof, dof_residual):
 def test_every_question_has_a_row_where_the_data_can_be_asked():
     one = Scene(1500, 2)
     always = {"order 3", "order 4", "magnitude", "colour", "truncation", "edges"}
+    always |= {"pixel phase"}
     always |= {"repeating pattern"}
     always |= {"noise by position", "noise by magnitude", "noise by axis"}
     assert set(one.tests(1)) == always

@@ -17,7 +17,6 @@ from bayesdist.assess import (
     Requirement,
     UserTerm,
     area_map,
-    check_requirements,
     distortion_vectors,
     uncertainty_map,
 )
@@ -35,6 +34,7 @@ from bayesdist.infer.stars.mixture import OutlierMixture
 from bayesdist.model import Chip, DistortionModel, TimeDependence
 from bayesdist.report.context import ChipResults, Product, ReportInput
 from bayesdist.utils.checks import Check
+from tests.assess.by_draws import margins_by_draws
 from tests.budgets import detector_budget
 
 SIZE = (1016.0, 1016.0)
@@ -259,7 +259,7 @@ def report_input(
         budget=detector_budget(
             solution, terms=TERMS, n_draws=500, rng=rng, pixel_scale=2757.0, **place
         ),
-        margins=check_requirements(
+        margins=margins_by_draws(
             solution, REQUIREMENTS, terms=TERMS, n_draws=500, rng=rng, pixel_scale=2757.0, **place
         ),
         products=(

@@ -20,13 +20,14 @@ from bayesdist.report.figures.fields import contour_levels
 from bayesdist.report.figures.mosaic import Mosaic
 from bayesdist.report.figures.panels import ChipPanels
 from bayesdist.report.figures.style import figure_style, nice_below
-from bayesdist.report.sections.run.data import _density
-from bayesdist.report.sections.run.posterior import (
+from bayesdist.report.plots.posterior import (
     correlation_matrix,
     rank_counts,
     slowest_parameters,
 )
-from bayesdist.report.sections.run.residuals import MixtureCurve, _histograms
+from bayesdist.report.plots.residuals import MixtureCurve
+from bayesdist.report.sections.run.data import _density
+from bayesdist.report.sections.run.residuals import _histograms
 from tests.reduced import case_in_full
 
 from .plots import figures_of

@@ -10,8 +10,8 @@ from scipy.stats import norm
 
 from bayesdist.diagnose.residuals.binned import binned_residuals
 from bayesdist.report.figures.arrows import CHANCE, significant_cells
+from bayesdist.report.plots.residuals import MixtureCurve
 from bayesdist.report.sections.run.posterior import outlier_table
-from bayesdist.report.sections.run.residuals import MixtureCurve
 
 
 def test_counts_add_up_to_the_stars():

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from bayesdist.infer.stars.stars import prepare
-from bayesdist.report.sections.run.trends import means_in_bins
+from bayesdist.report.plots.trends import means_in_bins
 
 from .plots import plot_of
 from .runs import report_input

@@ -2,20 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from typing import Any
 
 from bayesdist.app.config import Config
 from bayesdist.app.kinds.fit_data import FitData
-from bayesdist.app.kinds.kind import kind_of
 from bayesdist.app.kinds.matches.added_errors import knows_circle
-from bayesdist.assess.checks import catalogue_checks, matching_checks, time_checks
-from bayesdist.assess.units import pixel_doubt
+from bayesdist.assess.checks import assumption_checks
 from bayesdist.diagnose.diagnostics import Diagnostics
 from bayesdist.infer import Posterior
-from bayesdist.infer.posterior.checks import fit_checks, sampling_checks
 from bayesdist.utils.checks import LARGER, Check, level_of
-from bayesdist.utils.limits import CHI2_TOO_LARGE, COMPLETENESS, FALSE_MATCHES
+from bayesdist.utils.limits import COMPLETENESS, FALSE_MATCHES
 from bayesdist.utils.numbers import count, percent
 
 
@@ -30,21 +27,19 @@ def run_checks(
 
     `series` is the section 'time_dependence' of summary.json, of runs that have one.
     """
-    kind, circle = kind_of(config), in_circle(data, config)
-    errors = motions = None
+    catalogue = motions = None
     if data.matched.has_catalogue:
-        errors = data.matched.states_errors or config.states_catalogue
+        catalogue = data.matched.states_errors or config.states_catalogue
         motions = data.matched.states_motion_errors or config.states_motions
     return (
         *_kind_checks(data, series),
-        *sampling_checks(posterior),
-        *fit_checks(data.fit, in_circle=circle, things=kind.rows, chooser=kind.chooser),
-        *_remarks(data, found.majority, config),
-        *matching_checks(
-            config.outliers.match_radius, data.shards.survey.reference_sigma, in_circle=circle
+        *assumption_checks(
+            posterior,
+            found,
+            data.model.time,
+            catalogue_stated=catalogue,
+            motions_stated=motions,
         ),
-        *catalogue_checks(errors),
-        *time_checks(data.model.time, data.dates, motions),
     )
 
 
@@ -72,38 +67,6 @@ def _kind_checks(data: FitData, series: Mapping[str, Any] | None) -> tuple[Check
         return ()
     facts = {matched.section: matched.facts, **fitted.facts, "time_dependence": series or {}}
     return campaign_checks(facts)
-
-
-def _remarks(data: FitData, majority: str, config: Config) -> Iterator[Check]:
-    if doubt := pixel_doubt(data.fit):
-        yield Check("Fit", "Size of a pixel", level="warn", sentence=doubt)
-    if text := frames_doubt(data, majority, config):
-        yield Check("Fit", "Frames of the exposures", level="warn", sentence=text)
-    if data.error_scale_sentence:
-        text = data.error_scale_sentence
-        yield Check("Fit", "Scale of the quoted errors", level="warn", sentence=text, doubt=LARGER)
-    if config.data is None or in_circle(data, config) or not data.placed.has_nominal:
-        return
-    yield Check(
-        "Matching",
-        "Match radius",
-        level="warn",
-        sentence="the matches have nominal positions, and outliers.match_radius is not given: the "
-        "likelihood does not know that they were selected",
-    )
-
-
-def frames_doubt(data: FitData, majority: str, config: Config) -> str:
-    """Frames of the exposures that would make residuals far smaller; empty where none would.
-
-    Asked where the residuals are larger than their errors, or most pairs are false.
-    """
-    fit = data.fit
-    too_large = fit.chi2 > CHI2_TOO_LARGE.value * fit.dof
-    large = majority or data.fitted.errors.factor != 1.0 or too_large
-    if not large or config.data is None or data.better_frames is None:
-        return ""
-    return f"the exposures lie differently: {data.better_frames.sentence}"
 
 
 GROUP = "Campaign"

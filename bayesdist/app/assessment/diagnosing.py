@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from astropy.table import Table
 
+from bayesdist.app.assessment.checks import in_circle
 from bayesdist.app.assessment.error_terms import assessment_rng, errors_of_run, evaluation_settings
 from bayesdist.app.assessment.periods import period_settings
 from bayesdist.app.config import Config
@@ -17,7 +18,7 @@ from bayesdist.app.kinds.kind import kind_of
 from bayesdist.app.store.summary import CoverageRow, Holdout, HoldoutTest
 from bayesdist.assess.evaluation import EvaluationSettings
 from bayesdist.assess.model import ErrorModel, with_diagnosed_errors
-from bayesdist.diagnose.diagnostics import Diagnostics, diagnose, diagnose_fit
+from bayesdist.diagnose.diagnostics import Diagnostics, diagnose_fit, diagnose_posterior
 from bayesdist.diagnose.holdout.predictive import ExposureDeviations, Predictive, predictive_of
 from bayesdist.diagnose.holdout.validation import HoldoutValidation, holdout_validation
 from bayesdist.infer import Posterior
@@ -28,7 +29,7 @@ def diagnose_run(posterior: Posterior, data: FitData, config: Config, base: Path
     """Diagnostics of a posterior, and of the stars that were held out."""
     fitted = data.fitted
     scatter, tables = fitted.scatter, fitted.tables.tables
-    found = diagnose(
+    found = diagnose_posterior(
         diagnose_residuals(posterior, data, config),
         data.fit,
         posterior,
@@ -60,7 +61,7 @@ def diagnose_run(posterior: Posterior, data: FitData, config: Config, base: Path
 
 def diagnose_residuals(posterior: Posterior | None, data: FitData, config: Config) -> Diagnostics:
     """Diagnostics by residuals, of a posterior or of a fit alone."""
-    fitted, rows = data.fitted, kind_of(config).rows
+    fitted, kind = data.fitted, kind_of(config)
     # errors of centroids that the fit has found
     measured = fitted.scatter is not None or fitted.solved is not None
     return diagnose_fit(
@@ -71,8 +72,13 @@ def diagnose_residuals(posterior: Posterior | None, data: FitData, config: Confi
         data.sample,
         eliminated=None if fitted.solved is None else fitted.solved.mode,
         centroid=fitted.errors.by_magnitude if measured else "residuals",
-        things="pairs" if rows == "stars" else rows,
         known=fitted.priors.joint is not None,
+        match_radius=config.outliers.match_radius,
+        in_circle=in_circle(data, config),
+        matched_before=config.data is not None,
+        error_scale=data.error_scale_sentence,
+        rows=kind.rows,
+        chooser=kind.chooser,
     )
 
 

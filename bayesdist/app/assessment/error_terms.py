@@ -22,13 +22,12 @@ from bayesdist.diagnose.diagnostics import Diagnostics
 from bayesdist.infer import Posterior
 from bayesdist.infer.solution.solution import Solution
 from bayesdist.model import LookupTable
-
-ASSESSMENT = 2  # of the random streams that follow from the one seed; the sampler has the first
+from bayesdist.utils import streams
 
 
 def assessment_rng(config: Config) -> np.random.Generator:
     """Random numbers of the assessment, from their beginning."""
-    return np.random.default_rng([config.sampler.seed, ASSESSMENT])
+    return streams.assessment_rng(config.sampler.seed)
 
 
 def assessment_epoch(data: FitData, config: Config) -> float | None:

@@ -70,7 +70,7 @@ def run(line: str, config: str, output: str, **options: Any) -> None:
     """Calibrate: match, fit, sample, diagnose, evaluate, export, report."""
     if options["resume"] and options["force"]:
         raise click.UsageError("--resume and --force exclude each other.")
-    from bayesdist.app.run import run as whole_job
+    from bayesdist.app.stages import run as whole_job
     from bayesdist.app.store.rundir import RunDirectory
     from bayesdist.app.tables.margins import results_text
 
@@ -94,7 +94,7 @@ def stage(name: str, run: str, strict: bool, pdf: bool) -> None:
         raise click.UsageError("--strict is an option of the stage 'sample'.")
     if pdf and name != "report":
         raise click.UsageError("--pdf is an option of the stage 'report'.")
-    from bayesdist.app.run import continue_stage
+    from bayesdist.app.stages import continue_stage
 
     continue_stage(run, name, strict=strict, pdf=pdf)
 
@@ -146,7 +146,7 @@ def report(runs: tuple[str, ...], output: str | None) -> None:
     For one run without -o this draws its own report.html again, as 'bayesdist stage report RUN'.
     """
     if len(runs) == 1 and output is None:
-        from bayesdist.app.run import continue_stage
+        from bayesdist.app.stages import continue_stage
 
         continue_stage(runs[0], "report")
         click.echo(f"{runs[0]}/report.html")

@@ -11,18 +11,17 @@ from pydantic_core import PydanticCustomError
 from bayesdist.app.config.section import Epoch, Section, Unit
 from bayesdist.assess.terms.correlated import DEVIATIONS, STRUCTURE, STRUCTURE_IN_FIT
 from bayesdist.assess.terms.forms import GIVEN
-from bayesdist.assess.terms.given import TERM_KINDS
+from bayesdist.assess.terms.given import (
+    TERM_KINDS,
+    is_stated,
+    names_catalogue,
+    names_motions,
+)
 from bayesdist.assess.terms.parameters import one_size_kinds
 from bayesdist.assess.terms.solution import COEFFICIENTS, EXPOSURE_FRAME, TIME_DEPENDENCE
 
 Probability = Annotated[float, Field(gt=0, lt=1)]
 GridPoints = Annotated[int, Field(ge=2, le=10_000)]  # more than a detector has pixels says nothing
-
-# by which a row of the budget says that it is the error of the reference catalogue
-CATALOGUE_WORDS = (
-    *("catalog", "reference", "gaia", "2mass", "hipparcos", "tycho", "ucac", "urat", "usno"),
-    *("pan-starrs", "panstarrs", "ps1", "sdss", "skymapper", "hsc", "des dr"),
-)
 
 # rows of every budget, and what its totals are called
 MEASURED_TERMS = (
@@ -62,25 +61,20 @@ class BudgetBlock(Section):
             raise PydanticCustomError("literal_error", f"Input should be {listed} or {last!r}")
         return kind
 
-    def names(self, *words: str) -> bool:
-        """Boolean: one of some words is in the row's name."""
-        return any(word in self.name.lower() for word in words)
-
     @property
     def of_catalogue(self) -> bool:
         """Boolean: the row is the error of the reference catalogue's positions."""
-        return self.names(*CATALOGUE_WORDS) and not self.of_motions
+        return names_catalogue(self.name)
 
     @property
     def of_motions(self) -> bool:
         """Boolean: the row is the error of proper motions."""
-        return self.names("motion")
+        return names_motions(self.name)
 
     @property
     def stated(self) -> bool:
         """Boolean: the row states an error; one of size 0 does so with its source only."""
-        sizes = (self.sigma_u, self.sigma_v, self.sigma)
-        return any(sizes) or self.source != GIVEN
+        return is_stated((self.sigma_u, self.sigma_v, self.sigma), self.source)
 
     def faults(self) -> Iterator[str]:
         """A sigma that is not as the kind has it."""

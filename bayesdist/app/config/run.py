@@ -156,7 +156,7 @@ class RunConfig(Section):
                 b.sigma_v,
                 b.unit or "pix",
                 said_by_user(b.source),
-                varies=b.of_catalogue,
+                included_in_scatter=b.included_in_scatter,
             )
             for b in self.budget
             if b.stated and b.sigma_u is not None and b.sigma_v is not None
@@ -172,8 +172,7 @@ class RunConfig(Section):
 
     def in_residuals(self) -> tuple[UserTerm, ...]:
         """User's terms that the scatter of the residuals includes."""
-        included = {b.name for b in self.budget if b.included_in_scatter}
-        return tuple(t for t in self.user_terms() if t.name in included)
+        return tuple(term for term in self.user_terms() if term.included_in_scatter)
 
     def held_in_residuals(self, unit: str) -> list[tuple[str, float, float]]:
         """Name and standard deviation on each axis of these terms, in the unit of u and v."""

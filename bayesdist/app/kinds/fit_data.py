@@ -12,9 +12,8 @@ from bayesdist.app.kinds.fitted import Fitted
 from bayesdist.app.kinds.matched import Matched
 from bayesdist.data.matches import Matches
 from bayesdist.diagnose.residuals.quoted import error_scale_sentence
-from bayesdist.diagnose.residuals.sample import SAMPLE
+from bayesdist.diagnose.residuals.sample import SAMPLE, dates_of
 from bayesdist.infer import LinearFit, Shards, load
-from bayesdist.infer.exposures.frame_choice import FrameChoice, frames_that_help
 from bayesdist.infer.stars.shards import Compute
 from bayesdist.model import DistortionModel
 from bayesdist.utils.arrays import Float
@@ -124,8 +123,7 @@ class FitData:
     @cached_property
     def dates(self) -> Float:
         """Distinct dates of the stars, decimal years; none where they have none."""
-        table = self.placed if self.placed.in_memory else self.sample
-        return np.zeros(0) if table.epoch is None else np.unique(table.epoch)
+        return dates_of(self.placed if self.placed.in_memory else self.sample)
 
     @cached_property
     def last_epoch(self) -> float:
@@ -133,11 +131,6 @@ class FitData:
         if self.placed.in_memory:
             return float(np.max(self.placed.column("epoch")))
         return float(np.max(self.shards.groups.epoch))
-
-    @cached_property
-    def better_frames(self) -> FrameChoice | None:
-        """Frames with which matches of several exposures scatter far less; None where none do."""
-        return frames_that_help(self.placed.sample(SAMPLE), self.model)
 
     @property
     def error_scale_sentence(self) -> str:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -26,14 +26,16 @@ def refuse_inside_input(folder: Path, config: Config, base: Path) -> None:
             )
 
 
-def refuse_foreign_files(folder: Path, text: str) -> None:
-    """Refuse to begin in a folder that holds other files.
+def refuse_foreign_files(folder: Path, text: str, inputs: Iterable[Path] = ()) -> None:
+    """Raise InputError if a run would begin in a folder that holds other files.
 
-    A config.toml with the text of the configuration is no obstacle: a stage may be run on it.
+    A config.toml with the text of the configuration is allowed, because a stage may be run on it,
+    and so are inputs of the run.
     """
     if not folder.is_dir():
         return
     names = {path.name for path in folder.iterdir() if not is_leftover(path.name)} - {LOCK}
+    names -= {path.name for path in inputs if path.parent.resolve() == folder.resolve()}
     if "config.toml" in names and load_text(folder / "config.toml") == text:
         names.remove("config.toml")
     if names:

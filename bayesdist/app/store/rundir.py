@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from datetime import UTC, datetime
 from pathlib import Path
@@ -12,6 +12,7 @@ from bayesdist.app.config import (
     Config,
     config_of_record,
     load_config,
+    load_text,
 )
 from bayesdist.app.store import ArtefactStore, Made, Record, as_json, versions
 from bayesdist.app.store.made_from import (
@@ -38,6 +39,7 @@ from bayesdist.files.atomic import atomic_path, made_folder, remove_leftovers
 T = TypeVar("T")
 
 PAIRS = "pairs"  # folder of matches, of a campaign and of formats that are selected from
+UNSAVED = Path("a run in memory")  # stands for the folder of a run that has none
 
 
 def part_files(folder: Path) -> list[Path]:
@@ -94,18 +96,38 @@ class RunDirectory(ArtefactStore):
         if run.is_initialized:
             run.record  # noqa: B018 - refuse to replace what nobody can tell from other files
         else:
-            refuse_foreign_files(run.path, text)
+            refuse_foreign_files(run.path, text, (base / name for name in inputs))
+        run._plan(with_seed(config, seed), text, base, inputs, command)
+        return run
+
+    @classmethod
+    def unsaved(cls, config: Config, text: str) -> RunDirectory:
+        """Run in memory that has no folder yet; files are relative to the current folder.
+
+        Parameters
+        ----------
+        config : Config
+        text : str
+            The configuration as TOML.
+        """
+        run = cls(UNSAVED)
+        run._plan(config, text, Path.cwd(), {}, "")
+        return run
+
+    def _plan(
+        self, config: Config, text: str, base: Path, inputs: Mapping[str, str], command: str
+    ) -> None:
+        """Set the record with which the run will begin."""
         facts = {
-            "config": with_seed(config, seed).model_dump(),
-            **places_of(base, run.path),
+            "config": config.model_dump(),
+            **places_of(base, self.path),
             "inputs": inputs,
-            "seed": config.sampler.seed if seed is None else seed,
+            "seed": config.sampler.seed,
             "versions": versions(),
             "command": command,
             "created": datetime.now(UTC).isoformat(timespec="seconds"),
         }
-        run._planned, run._text = Record(as_json(facts)), text
-        return run
+        self._planned, self._text = Record(as_json(facts)), text
 
     @property
     def is_initialized(self) -> bool:
@@ -114,8 +136,18 @@ class RunDirectory(ArtefactStore):
 
     @property
     def is_planned(self) -> bool:
-        """Boolean: nothing of this run has been written yet."""
+        """True if nothing of this run has been written yet."""
         return self._planned is not None
+
+    @property
+    def in_memory(self) -> bool:
+        """True if the run has no folder."""
+        return self.path == UNSAVED
+
+    @property
+    def text(self) -> str:
+        """The configuration as its user wrote it, in TOML."""
+        return self._text if self.is_planned else load_text(self / "config.toml")
 
     def begin(self) -> None:
         """Write down what is about to be done.

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from typing import Any
+from html import escape
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -13,6 +14,9 @@ from bayesdist.assess.domain import EvaluationDomain
 from bayesdist.assess.drawn import DrawnErrors
 from bayesdist.assess.terms.forms import PRODUCT
 from bayesdist.utils.arrays import Float, Int
+
+if TYPE_CHECKING:
+    from astropy.table import QTable
 
 TOTAL = "total"
 TOGETHER = "all terms but products, combined by draws"
@@ -65,6 +69,9 @@ class ErrorBudget:
         Draws behind the model's parts: their relative error is about 1 / sqrt(2 n_draws).
     products : tuple of BudgetTerm
         What files differ by from the solution: in no total.
+    notes : tuple of str
+        Sentences on what the budget lacks, such as measured terms if the residuals were not
+        examined.
 
     Examples
     --------
@@ -83,6 +90,90 @@ class ErrorBudget:
     total: BudgetTerm
     n_draws: int
     products: tuple[BudgetTerm, ...] = ()
+    notes: tuple[str, ...] = ()
+
+    def __repr__(self) -> str:
+        *_, total = self.rows()
+        largest = max(self.rows()[:-1], key=lambda row: row["radial"], default=total)
+        head = (
+            f"ErrorBudget(total {total['radial']:.3g} {self.unit} radial rms {self._where}; "
+            f"largest of {len(self.terms)} terms: {largest['name']}, "
+            f"{largest['radial']:.3g} {self.unit})"
+        )
+        return "\n".join([head, *(f"  - {note}" for note in self.notes)])
+
+    def __str__(self) -> str:
+        head, *cells = self._cells()
+        widths = [max(map(len, column)) for column in zip(head, *cells, strict=True)]
+        lines = [
+            "  ".join(
+                cell.rjust(width) if 0 < k < 5 else cell.ljust(width)
+                for k, (cell, width) in enumerate(zip(row, widths, strict=True))
+            ).rstrip()
+            for row in (head, *cells)
+        ]
+        return "\n".join([f"Errors {self._where}", *lines, *(f"- {note}" for note in self.notes)])
+
+    def _repr_html_(self) -> str:
+        head, *cells = self._cells()
+        rows = [f"<tr>{''.join(f'<th>{escape(cell)}</th>' for cell in head)}</tr>"]
+        rows += [f"<tr>{''.join(f'<td>{escape(cell)}</td>' for cell in row)}</tr>" for row in cells]
+        notes = "".join(f"<p>{escape(note)}</p>" for note in self.notes)
+        caption = f"<caption>Errors {escape(self._where)}</caption>"
+        return f"<table>{caption}{''.join(rows)}</table>{notes}"
+
+    @property
+    def _where(self) -> str:
+        """Words on the positions and the epoch."""
+        chips = ", ".join(map(str, self.domain.chips))
+        several = "s" if len(self.domain.chips) > 1 else ""
+        words = f"at {self.x.size} positions on chip{several} {chips}"
+        return words if self.epoch is None else f"{words} in {self.epoch:.2f}"
+
+    def _cells(self) -> list[tuple[str, ...]]:
+        """Texts of a table: its head, and one row for each term."""
+        units = [f"{name} [{self.unit}]" for name in ("u", "v", "radial")]
+        out = [("term", *units, "relative error", "kind", "source")]
+        for row in self.rows():
+            sizes = [f"{row[name]:.3g}" for name in ("u", "v", "radial")]
+            relative = _relative_error(row)
+            known = f"{100 * relative:.1f} %" if np.isfinite(relative) else "unknown"
+            out.append((row["name"], *sizes, known, row["kind"], row["source"]))
+        return out
+
+    def to_table(self) -> QTable:
+        """The budget as an astropy table with units: one row per term, the total last.
+
+        Returns
+        -------
+        astropy.table.QTable
+            Columns name; u, v and radial, root mean squares over the positions, in the unit of the
+            budget; relative_error (nan if it is not known), kind and source.  Notes, epoch and
+            chips are in `meta`.
+
+        Examples
+        --------
+        >>> table = budget.to_table()  # doctest: +SKIP
+        >>> table["radial"].to("mas")  # doctest: +SKIP
+        """
+        import astropy.units as apu
+        from astropy.table import QTable
+
+        rows = self.rows()
+        table = QTable()
+        table["name"] = [row["name"] for row in rows]
+        for name in ("u", "v", "radial"):
+            table[name] = np.array([row[name] for row in rows]) * apu.Unit(self.unit)
+        table["relative_error"] = [_relative_error(row) for row in rows]
+        table["kind"] = [row["kind"] for row in rows]
+        table["source"] = [row["source"] for row in rows]
+        table.meta = {
+            "statistic": "rms over the positions",
+            "epoch": self.epoch,
+            "chips": list(self.domain.chips),
+            "notes": list(self.notes),
+        }
+        return table
 
     @property
     def x(self) -> Float:
@@ -159,7 +250,8 @@ class ErrorBudget:
         """The budget as a table: one row for each term and each product, the total last.
 
         The total is known as well as its terms are: not where one of them was given without an
-        error.
+        error.  A budget made without diagnostics has no rows of measured errors beyond those of the
+        parameters: structure, differences between exposures; see `notes`.
 
         Returns
         -------
@@ -198,6 +290,13 @@ class ErrorBudget:
         alone = zip(self.domain.chips, self.chips, strict=True)
         parts = [("all", self.rows()), *((str(chip), b.rows()) for chip, b in alone)]
         return [{"chip": chip} | row for chip, rows in parts for row in rows]
+
+
+def _relative_error(row: Mapping[str, Any]) -> float:
+    """Relative error of the radial size of a row; nan if it is not known."""
+    if row["radial_error"] is None or not row["radial"] > 0:
+        return float("nan")
+    return float(row["radial_error"] / row["radial"])
 
 
 def budget_of(errors: DrawnErrors, domain: EvaluationDomain) -> ErrorBudget:

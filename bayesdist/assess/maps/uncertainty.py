@@ -62,6 +62,15 @@ class UncertaintyMap:
     epoch: float | None
     kind: str
 
+    def __repr__(self) -> str:
+        x, y = position_of_largest(self.per_axis, self.x, self.y)
+        when = "" if self.epoch is None else f" in {self.epoch:.2f}"
+        return (
+            f"UncertaintyMap({self.kind}, chip {self.chip}{when}, {self.x.size} x {self.y.size} "
+            f"positions: at most {float(self.per_axis.max()):.3g} {self.unit} per axis, at pixel "
+            f"({x:g}, {y:g}))"
+        )
+
     @property
     def radius(self) -> Float:
         """hypot(sigma_u, sigma_v), (ny, nx): half the diagonal of the +-1 sigma error box."""

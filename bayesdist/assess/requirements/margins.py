@@ -5,21 +5,18 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from html import escape
 
 import numpy as np
 
 from bayesdist.assess.domain import EvaluationDomain, WorstPosition
 from bayesdist.assess.drawn import DrawnErrors
-from bayesdist.assess.model import error_model
 from bayesdist.assess.requirements.reduction import RequiredReduction, required_reduction
 from bayesdist.assess.requirements.requirement import Requirement
 from bayesdist.assess.requirements.verdict import counting_error, verdict_of
 from bayesdist.assess.solution import place_of
-from bayesdist.assess.terms.forms import ErrorTerm
-from bayesdist.assess.units import convert, pixel_scale_of
+from bayesdist.assess.units import convert
 from bayesdist.errors import InputError
-from bayesdist.infer.posterior.checks import convergence_check
-from bayesdist.infer.solution.solution import Solution
 from bayesdist.model import Chip, DistortionModel
 from bayesdist.model.grid import DEFAULT_GRID
 from bayesdist.utils.arrays import Float
@@ -94,107 +91,31 @@ class Margin:
     remedy: RequiredReduction | None = None
     rests_on: tuple[str, ...] = ()
 
+    def __repr__(self) -> str:
+        return f"Margin({self.sentence})"
+
+    def __str__(self) -> str:
+        return self.sentence
+
+    def _repr_html_(self) -> str:
+        verdict, sentence = escape(self.verdict), escape(self.sentence)
+        return f"<p>{sentence.replace(verdict, f'<b>{verdict}</b>', 1)}</p>"
+
+    @property
+    def sentence(self) -> str:
+        """Requirement, verdict, probability and reason in one line."""
+        r = self.requirement
+        where = "" if self.epoch is None else f" in {self.epoch:.2f}"
+        scope = f" {r.scope}" if r.scope else ""
+        return (
+            f"{r.name}: {self.verdict}: {r.statistic} at most {r.limit:g} {r.unit}{scope}{where} "
+            f"with P = {self.probability_met:.3f}, {r.probability:g} asked for: {self.reason}"
+        )
+
     @property
     def percent(self) -> float:
         """The margin in percent of the limit."""
         return 100.0 * self.margin / self.requirement.limit
-
-
-def check_requirements(
-    solution: Solution,
-    requirements: Sequence[Requirement],
-    *,
-    terms: Sequence[ErrorTerm] = (),
-    aligned: bool = False,
-    grid: tuple[int, int] = DEFAULT_GRID,
-    epoch: float | None = None,
-    chip: int | None = None,
-    n_draws: int = 2000,
-    rng: np.random.Generator,
-    pixel_scale: float | None = None,
-    checks: Sequence[Check] = (),
-) -> tuple[Margin, ...]:
-    """Judge requirements on draws of the position error.
-
-    Each draw is an error field over the grid: a draw of the solution minus its mean (all parts of
-    the model jointly, so with the correlation between positions), plus a draw of every term: of a
-    systematic one of the user one Gaussian offset of each axis for the whole field, of random and
-    local ones an independent Gaussian error at every grid point.  The statistic of each field gives
-    a distribution, and the fraction of draws at or under the limit is compared with the probability
-    asked for.
-
-    The field is that of all chips: the same grid on each of them, so that each has the same weight.
-    A draw of the solution and an offset are common to all chips.
-
-    Of a relative error the statistic is that of the differences between two positions, over all
-    pairs of points.  Over a range of epochs the draws of everything are the same throughout, and
-    that of the statistic is the largest over nine epochs and the breaks between them.
-
-    Parameters
-    ----------
-    solution : LinearFit or Posterior
-    requirements : sequence of Requirement
-    terms : sequence of ErrorTerm
-        For requirements that name a magnitude `Centroids` among them.
-    aligned : bool
-        Whether shift and rotation of the exposure are the observer's to fit, as of `ErrorModel`:
-        over all chips, also where one is judged.  Terms that are no polynomials stay as they are.
-    grid : tuple of int
-        Points on x and y.
-    epoch : float, optional
-        For requirements that name none; decimal years.
-    chip : int, optional
-        Chip number, for requirements that name none; all chips by default.
-    n_draws : int
-    rng : numpy.random.Generator
-    pixel_scale : float, optional
-        Size of one pixel in mas; `pixel_scale_of` the solution by default.
-    checks : sequence of Check
-        Reasons why the errors may not be as stated are among them, beside a posterior that is not
-        converged: its verdicts are all 'undecided'.
-
-    Returns
-    -------
-    tuple of Margin
-        In the order of the requirements.
-
-    Raises
-    ------
-    InputError
-        For a requirement without an epoch where the model depends on time, units that need a pixel
-        scale that is not known, an unknown chip, a bad grid, a region without points of the grid, a
-        magnitude without errors by magnitude, or fewer than two draws.
-
-    Examples
-    --------
-    >>> rng = np.random.default_rng(1)
-    >>> matches, truth = bd.simulate_wise(500, rng=rng)
-    >>> model = bd.build_model(matches, order=2, size=(1016, 1016))
-    >>> fit = bd.fit_linear(matches, model)
-    >>> need = bd.Requirement("field-wide", "p95", 1.0)
-    >>> (margin,) = bd.check_requirements(fit, [need], grid=(5, 3), n_draws=400, rng=rng)
-    >>> margin.verdict
-    'met'
-    """
-    if pixel_scale is None:
-        pixel_scale = pixel_scale_of(solution, chip)
-    for r in requirements:
-        convert(r.limit, r.unit, solution.model.unit, pixel_scale, where=r.where)
-    model = error_model(solution, terms=terms, aligned=aligned, pixel_scale=pixel_scale)
-    if not requirements:  # terms in units that need a scale are refused all the same
-        return ()
-    converged = solution.convergence
-    if converged is not None:
-        checks = (convergence_check(converged), *checks)
-    return judge(
-        model.drawn(n_draws, rng),
-        requirements,
-        grid=grid,
-        epoch=epoch,
-        chip=chip,
-        pixel_scale=pixel_scale,
-        checks=checks,
-    )
 
 
 def judge(
@@ -207,10 +128,25 @@ def judge(
     pixel_scale: float | None = None,
     checks: Sequence[Check] = (),
 ) -> tuple[Margin, ...]:
-    """Judge requirements on draws that are there.
+    """Margins of requirements on drawn errors, in the order of the requirements.
 
-    `requirements`, `grid`, `epoch`, `chip`, `pixel_scale`: as `check_requirements`. `checks`: that
-    of convergence among them. InputError as `check_requirements`.
+    Parameters
+    ----------
+    errors : DrawnErrors
+    requirements : sequence of Requirement
+    grid : tuple of int
+        Points on x and y of each chip.
+    epoch, chip : float and int, optional
+        For requirements that name none: decimal years; the chip number, by default all chips.
+    pixel_scale : float, optional
+        Size of one pixel in mas.
+    checks : sequence of Check
+        Their doubts keep verdicts from being given; that of convergence is among them.
+
+    Raises
+    ------
+    InputError
+        As `check_requirements`.
     """
     if not requirements:
         return ()

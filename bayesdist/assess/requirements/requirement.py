@@ -18,6 +18,7 @@ from bayesdist.diagnose.residuals.coverage import Coverage
 from bayesdist.errors import InputError, require_known
 from bayesdist.model.grid import grid_pixels, mesh
 from bayesdist.utils.limits import BEYOND_STARS
+from bayesdist.utils.quantities import unit_name, value_in
 
 
 @dataclass(frozen=True)
@@ -29,10 +30,10 @@ class Requirement:
     name : str
     statistic : str
         One of `STATISTICS`.
-    limit : float
-        Positive, in `unit`.
+    limit : float or Quantity
+        Positive; stored as a number in `unit`.
     unit : str
-        'pix', 'arcsec', 'mas' or 'deg'.
+        'pix', 'arcsec', 'mas' or 'deg'; of a Quantity it is its own.
     probability : float
         With which the statistic must be at or under the limit, between 0 and 1.
     epoch : float, optional
@@ -79,6 +80,9 @@ class Requirement:
     def __post_init__(self) -> None:
         require_known(self.statistic, STATISTICS, "statistic", where=self.where)
         require_known(self.unit, UNITS, "unit", where=self.where)
+        unit = unit_name(self.limit, "limit", where=self.where) or self.unit
+        object.__setattr__(self, "limit", value_in(self.limit, unit, "limit", where=self.where))
+        object.__setattr__(self, "unit", unit)
         object.__setattr__(self, "region", check_region(self.region, self.where))
         if self.epochs is not None:
             object.__setattr__(self, "epochs", tuple(self.epochs))

@@ -6,7 +6,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -26,12 +26,19 @@ from bayesdist.errors import InputError, require_known
 from bayesdist.model import DistortionModel, PolynomialBasis
 from bayesdist.model.grid import DEFAULT_GRID, grid_pixels, mesh
 from bayesdist.utils.arrays import Float
+from bayesdist.utils.quantities import Number, unit_name, value_in
 
 if TYPE_CHECKING:
     from bayesdist.diagnose.diagnostics import Diagnostics
 
 TERM_KINDS = ("random", "systematic")
 CENTROID = "centroid"
+
+# words by which the name of a row says that it is the error of the reference catalogue
+CATALOGUE_WORDS = (
+    *("catalog", "reference", "gaia", "2mass", "hipparcos", "tycho", "ucac", "urat", "usno"),
+    *("pan-starrs", "panstarrs", "ps1", "sdss", "skymapper", "hsc", "des dr"),
+)
 
 SMOOTH_ORDER = 3  # of fields that stand for what may vary over the detector
 SMOOTH_DRAWS = 1000
@@ -49,6 +56,49 @@ def said_by_user(source: str) -> str:
     return f"{GIVEN}: {text}" if text else GIVEN
 
 
+def names_motions(name: str) -> bool:
+    """True if a row of this name is the error of proper motions."""
+    return "motion" in name.lower()
+
+
+def names_catalogue(name: str) -> bool:
+    """True if a row of this name is the error of the reference catalogue's positions."""
+    return any(word in name.lower() for word in CATALOGUE_WORDS) and not names_motions(name)
+
+
+def is_stated(sizes: Sequence[float | None], source: str) -> bool:
+    """True if a row states an error: one of size 0 does so with its source only."""
+    return any(sizes) or said_by_user(source) != GIVEN
+
+
+def stated_names(terms: Sequence[ErrorTerm]) -> tuple[str, ...]:
+    """Names of the terms that state an error, in their order."""
+    names = []
+    for term in terms:
+        sizes = [getattr(term, "sigma", 1.0)]  # terms of one size, or of a size of their own
+        if isinstance(term, UserTerm):
+            sizes = [term.sigma_u, term.sigma_v]
+        row = term.rows[0]
+        if is_stated(sizes, row.source):
+            names.append(row.name)
+    return tuple(names)
+
+
+def _sizes(
+    sizes: Sequence[Number], unit: str, what: str, where: str
+) -> tuple[tuple[float, ...], str]:
+    """Standard deviations with their unit: `unit` of plain numbers, else that of the Quantities."""
+    units = [unit_name(size, what, where=where) for size in sizes]
+    if None in units and any(units):
+        raise InputError(
+            f"one {what} has a unit and the other has none",
+            where=where,
+            do="give Quantities for both, or numbers in `unit`",
+        )
+    named = unit if units[0] is None else units[0]
+    return tuple(value_in(size, named, what, where=where) for size in sizes), named
+
+
 @dataclass(frozen=True)
 class UserTerm:
     """A Gaussian error given by the user, the same at every position of the detector.
@@ -58,21 +108,25 @@ class UserTerm:
     name : str
     kind : str
         'random': independent at every position; 'systematic': one offset shared by the whole field.
-    sigma_u, sigma_v : float
-        Standard deviation of each axis.
+    sigma_u, sigma_v : float or Quantity
+        Standard deviation of each axis; stored as numbers.
     unit : str
-        'pix', 'arcsec', 'mas' or 'deg'.
+        'pix', 'arcsec', 'mas' or 'deg'; of Quantities it is their own.
     source : str
         Where the number comes from: 'given by the user', or a publication.
-    varies : bool
-        Of a systematic term: true if it may differ from position to position in a way that is not
+    varies : bool, optional
+        For a systematic term: True if it may differ from position to position in a way that is not
         known, as the errors of a catalogue do.  Requirements are then judged for one offset of the
-        whole field, for a smooth field, and for independent errors at every position.
+        whole field, for a smooth field, and for independent errors at every position.  By default
+        it is True if the name is that of a reference catalogue, such as 'Gaia DR3'.
+    included_in_scatter : bool
+        For a random term: True if the residuals contain it in addition to the errors of centroids.
 
     Raises
     ------
     InputError
-        For an unknown kind or unit, or a sigma that is negative or not finite.
+        For an unknown kind or unit, a sigma that is negative or not finite, and a systematic term
+        that is included in the scatter.
 
     Examples
     --------
@@ -87,12 +141,28 @@ class UserTerm:
     sigma_v: float
     unit: str = "pix"
     source: str = GIVEN
-    varies: bool = False
+    varies: bool | None = None
+    included_in_scatter: bool = False
 
     def __post_init__(self) -> None:
         where = f"budget term {self.name!r}"
         require_known(self.kind, TERM_KINDS, "kind", where=where)
         require_known(self.unit, UNITS, "unit", where=where)
+        (sigma_u, sigma_v), unit = _sizes((self.sigma_u, self.sigma_v), self.unit, "sigma", where)
+        varies = names_catalogue(self.name) if self.varies is None else self.varies
+        for name, value in (
+            ("sigma_u", sigma_u),
+            ("sigma_v", sigma_v),
+            ("unit", unit),
+            ("varies", varies),
+        ):
+            object.__setattr__(self, name, value)
+        if self.included_in_scatter and self.kind != "random":
+            raise InputError(
+                "included_in_scatter is of a random budget term, which scatters from star to star",
+                where=where,
+                do="leave it out",
+            )
         for axis, sigma in (("u", self.sigma_u), ("v", self.sigma_v)):
             if not (math.isfinite(sigma) and sigma >= 0):
                 raise InputError(
@@ -150,6 +220,116 @@ class UserTerm:
         if not (self.varies and self.kind == "systematic" and (self.sigma_u or self.sigma_v)):
             return ()
         return SmoothTerm(self, model, grid or DEFAULT_GRID), replace(self, kind="random")
+
+
+@dataclass(frozen=True, init=False)
+class Catalogue:
+    """The systematic error of the positions of the reference catalogue, as the user states it.
+
+    It is the ``[[budget]]`` row of a configuration with the same name, sizes and source.  A verdict
+    needs it: matched stars cannot show an error that the catalogue has in common for all of them.
+
+    Parameters
+    ----------
+    name : str
+        Name of the catalogue, such as 'Gaia DR3'.
+    sigma : float or Quantity, or a pair of them
+        Standard deviation of the positions, of both axes or along u and v; stored as a pair.
+    unit : str
+        'pix', 'arcsec', 'mas' or 'deg'; of a Quantity it is its own.
+    source : str
+        Where the number comes from.  A size of 0 needs a source.
+    sigma_mas : float, optional
+        In place of `sigma`: the size in milliarcseconds.
+
+    Raises
+    ------
+    InputError
+        For an empty name or that of proper motions, no size or two, a size that is negative or not
+        finite, a size of 0 without a source, and an unknown unit.
+
+    Examples
+    --------
+    >>> catalogue = bd.Catalogue("Gaia DR3", sigma_mas=0.3, source="Lindegren et al. 2021")
+    >>> catalogue.sigma, catalogue.unit
+    ((0.3, 0.3), 'mas')
+    >>> catalogue.term().source
+    'given by the user: Lindegren et al. 2021'
+    """
+
+    name: str
+    sigma: tuple[float, float]
+    unit: str
+    source: str
+
+    def __init__(
+        self,
+        name: str,
+        sigma: Number | tuple[Number, Number] | None = None,
+        unit: str = "mas",
+        source: str = "",
+        *,
+        sigma_mas: float | None = None,
+    ) -> None:
+        if not (isinstance(name, str) and name.strip()):
+            raise InputError(
+                f"the reference catalogue has the name {name!r}",
+                where="catalogue",
+                do="give its name, as in bd.Catalogue('Gaia DR3', sigma_mas=0.3)",
+            )
+        where = f"catalogue {name!r}"
+        if names_motions(name):
+            raise InputError(
+                "the name is that of proper motions, and the error is that of positions",
+                where=where,
+                do="name the catalogue, and give errors of its motions as a UserTerm",
+            )
+        require_known(unit, UNITS, "unit", where=where)
+        if (sigma is None) == (sigma_mas is None):
+            problem = "missing" if sigma is None else "given twice"
+            raise InputError(
+                f"the size of its error is {problem}",
+                where=where,
+                do="give sigma_mas, or sigma with its unit; 0 with its source where it has none",
+            )
+        given: Any = sigma if sigma_mas is None else sigma_mas
+        several = isinstance(given, tuple | list) or getattr(given, "ndim", 0)
+        pair = tuple(given) if several else (given, given)
+        if len(pair) != 2:
+            raise InputError(
+                f"its error has {len(pair)} sizes", where=where, do="give one, or those of u and v"
+            )
+        sizes, unit = _sizes(pair, unit if sigma_mas is None else "mas", "sigma", where)
+        for size in sizes:
+            if not (math.isfinite(size) and size >= 0):
+                raise InputError(
+                    f"its error is {size} {unit}", where=where, do="give a number of 0 or more"
+                )
+        if not is_stated(sizes, source):
+            raise InputError(
+                "its error is 0, and no source is given for that",
+                where=where,
+                do="give the source, or the size of its error",
+            )
+        for field, value in (("name", name), ("sigma", sizes), ("unit", unit), ("source", source)):
+            object.__setattr__(self, field, value)
+
+    @property
+    def row_name(self) -> str:
+        """Name of its row of the budget, which says that it is a catalogue's."""
+        return self.name if names_catalogue(self.name) else f"reference catalogue {self.name}"
+
+    def term(self) -> UserTerm:
+        """Term of the error budget, as the command line makes it of the row."""
+        source = said_by_user(self.source)
+        return UserTerm(self.row_name, "systematic", *self.sigma, self.unit, source, varies=True)
+
+    def budget_row(self) -> dict[str, str | float]:
+        """Keys and values of its ``[[budget]]`` row in a configuration."""
+        sigma_u, sigma_v = self.sigma
+        row: dict[str, str | float] = {"name": self.row_name, "kind": "systematic"}
+        row |= {"sigma_u": sigma_u, "sigma_v": sigma_v, "unit": self.unit}
+        return row | ({"source": self.source} if self.source.strip() else {})
 
 
 def _everywhere(size: Float, domain: EvaluationDomain) -> Float:

@@ -11,6 +11,7 @@ from pathlib import Path
 from astropy.table import Table
 
 from bayesdist.data.formats.hst1pass import is_hst1pass, is_matchup
+from bayesdist.data.formats.record import SUFFIX
 from bayesdist.errors import FormatError, InputError
 from bayesdist.files.regular import read_lines
 from bayesdist.files.tables import TABLE_SUFFIXES, is_binary, is_fits, read_table
@@ -21,7 +22,7 @@ PathLike = str | os.PathLike[str]
 
 # of the correspondences of astrometry.net (`corr.fits`): detections with their index stars
 CORR_COLUMNS = {"x": "field_x", "y": "field_y", "ra": "index_ra", "dec": "index_dec"}
-FORMATS = ("auto", "table", "hst1pass", "matchup", "astrometry.net")
+FORMATS = ("auto", "table", "bayesdist", "hst1pass", "matchup", "astrometry.net")
 
 
 @dataclass(frozen=True)
@@ -109,6 +110,8 @@ def kind_of(file: Path, columns: Mapping[str, str] | None) -> str:
             return "astrometry.net" if corr else "table"
         return "table"
     lines = [] if is_binary(file) else read_lines(file)
+    if name.endswith(SUFFIX):
+        return "bayesdist"
     if is_matchup(lines):
         return "matchup"
     if is_hst1pass(file, lines):

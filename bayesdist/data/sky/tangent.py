@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike
 
 from bayesdist.data.tables.checks import Place, row_number
 from bayesdist.errors import InputError
-from bayesdist.utils.arrays import Float
+from bayesdist.utils.arrays import Bool, Float
 
 ARCSEC = np.degrees(1.0) * 3600.0  # seconds of arc in a radian
 
@@ -65,10 +65,7 @@ def _angles(
     ra: ArrayLike, dec: ArrayLike, point: tuple[float, float], where: str, place: Place
 ) -> tuple[Float, Float, float, Float]:
     """Hour angle from the point, declination, the point's declination, and D; radians."""
-    delta = np.radians(np.asarray(ra, float) - point[0])
-    d = np.radians(np.asarray(dec, float))
-    d0 = float(np.radians(point[1]))
-    D = np.sin(d) * np.sin(d0) + np.cos(d) * np.cos(d0) * np.cos(delta)
+    delta, d, d0, D = _distances(ra, dec, point)
     if np.any(D <= 0):
         row = place(int(np.argmax(D <= 0)))
         raise InputError(
@@ -77,6 +74,20 @@ def _angles(
             do="give a tangent point inside the field",
         )
     return delta, d, d0, D
+
+
+def _distances(
+    ra: ArrayLike, dec: ArrayLike, point: tuple[float, float]
+) -> tuple[Float, Float, float, Float]:
+    delta = np.radians(np.asarray(ra, float) - point[0])
+    d = np.radians(np.asarray(dec, float))
+    d0 = float(np.radians(point[1]))
+    return delta, d, d0, np.sin(d) * np.sin(d0) + np.cos(d) * np.cos(d0) * np.cos(delta)
+
+
+def is_on_plane(ra: ArrayLike, dec: ArrayLike, point: tuple[float, float]) -> Bool:
+    """Boolean mask (N,) of positions that `tangent_plane` can project; False for NaN."""
+    return np.asarray(_distances(ra, dec, point)[3] > 0)
 
 
 def tangent_plane(

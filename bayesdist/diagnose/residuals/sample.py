@@ -136,6 +136,11 @@ def star_sample(
     )
 
 
+def dates_of(table: Matches) -> Float:
+    """Distinct dates of the stars of a table in memory, ascending; empty if they have none."""
+    return np.zeros(0) if table.epoch is None else np.unique(table.epoch)
+
+
 def likelihood_shown(fit: LinearFit, posterior: Posterior | None) -> Likelihood:
     """Likelihood at the solution whose residuals are shown: the posterior's, where there is one.
 

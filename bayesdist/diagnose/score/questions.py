@@ -24,6 +24,7 @@ CONSTANT, LINEAR = polynomial_terms(0), polynomial_terms(1)
 HIGHER = 2  # orders above the model's that are tested
 OUTSIDE = 0.5  # per cent of the values at either end that are moved to the others
 MIN_AT_EDGES = 200  # detections: some in each margin
+MIN_OF_PHASES = 200  # detections: some at each phase of a pixel
 NEAR_EDGE = 0.05  # of half a side, over which what is at an edge falls off
 SHORTEST = 0.1  # years over which a drift is looked for
 # of the information of a direction, left by the parameters: below, it is theirs
@@ -80,6 +81,12 @@ EDGES = Family(
     "leave out the margins of the detector, or fit a look-up table",
     "the residuals rise towards the edges of the detector",
     "the residuals do not rise towards the edges of the detector",
+)
+PIXEL_PHASE = Family(
+    "pixel phase",
+    "correct the centroids for it, as an effective point-spread function does",
+    "the residuals go with the position of the stars within their pixel",
+    "the residuals do not go with the position of the stars within their pixel",
 )
 MAGNITUDE_IN_TIME = Family(
     "magnitude in time",
@@ -143,7 +150,21 @@ def questions(sample: ScoredSample) -> Iterator[Question]:
         edges = tuple(Products(CONSTANT, one - one.mean()) for one in rising)
         # a missing order rises towards the edges as well
         yield Question(EDGES, edges, adjusted_for="orders")
+    if len(sample) >= MIN_OF_PHASES:
+        yield Question(PIXEL_PHASE, tuple(Products(CONSTANT, wave) for wave in _phases(sample)))
     yield from _of_time(sample)
+
+
+def _phases(sample: ScoredSample) -> Iterator[Float]:
+    """Sine and cosine (N,) of the phase of each detection along the columns and rows of pixels.
+
+    A wave of one pixel is too short for the test of repeating patterns, and looks like noise.
+    """
+    size = np.array([chip.size for chip in sample.model.chips])[sample.chip]
+    for scaled, pixels in zip((sample.X, sample.Y), size.T, strict=True):
+        phase = np.pi * (scaled + 1.0) * pixels  # 2 pi per pixel, 0 at the edge of the first one
+        for wave in (np.sin(phase), np.cos(phase)):
+            yield wave - wave.mean()
 
 
 def _of_time(sample: ScoredSample) -> Iterator[Question]:

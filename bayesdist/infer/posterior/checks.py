@@ -7,6 +7,7 @@ import numpy as np
 from bayesdist.infer.convergence import Convergence
 from bayesdist.infer.posterior import Posterior
 from bayesdist.infer.solution.linear import LinearFit
+from bayesdist.infer.solution.solution import Solution
 from bayesdist.utils.checks import EITHER, Check, level_of
 from bayesdist.utils.distributions import chi2_cdf
 from bayesdist.utils.limits import (
@@ -18,6 +19,7 @@ from bayesdist.utils.limits import (
     LEFT_OUT,
     MEAN_ERROR,
     PARETO_K,
+    PIXEL_SIZE,
 )
 from bayesdist.utils.numbers import count, number, percent
 
@@ -93,6 +95,21 @@ def _of_chi2(fit: LinearFit, small: bool, in_circle: bool) -> str:
             "small, which the jitter takes up, or the model does not fit"
         )
     return ""
+
+
+def pixel_doubt(solution: Solution) -> str:
+    """Doubt about u and v that are called pixels and are not, as a clause; empty without one."""
+    model = solution.model
+    if model.unit != "pix":
+        return ""
+    size = model.linear_scale(solution.mean)
+    if 1 / PIXEL_SIZE.value <= size <= PIXEL_SIZE.value:
+        return ""
+    return (
+        f"u and v are called pixels, and one pixel of x, y is {size:.4g} of theirs: if they are "
+        f"millimetres, divide them and their errors by {size:.4g}; if they are angles, give their "
+        "unit; as they are, every error in 'pix' is in the unit of u and v"
+    )
 
 
 def convergence_check(c: Convergence) -> Check:

@@ -219,6 +219,16 @@ class TransformedSolution(DerivedSolution):
 
 
 @dataclass(frozen=True, eq=False)
+class LinearMap:
+    """Linear map of parameters (..., n) by a matrix (m, n); it can be pickled."""
+
+    matrix: Float
+
+    def __call__(self, theta: Float) -> Float:
+        return theta[..., : self.matrix.shape[1]] @ self.matrix.T
+
+
+@dataclass(frozen=True, eq=False)
 class GaugedSolution(TransformedSolution):
     """A solution rotated and shifted to the reference gauge."""
 

@@ -6,6 +6,7 @@ covariance is the source's through the exact Jacobian of that transformation at 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -19,11 +20,13 @@ from bayesdist.infer.solution.solution import (
     root_of_diagonal,
 )
 from bayesdist.model import DistortionModel, TimeDependence
+from bayesdist.model.grouping import Groups
 from bayesdist.model.similarity import turned, turned_model
 from bayesdist.utils.arrays import Complex, Float
 
 # constant, x and y of both axes as ACS ISR 2015-06 numbers them (Equations 1-2)
 LINEAR_TERMS = ("A_1", "A_2", "A_3", "B_1", "B_2", "B_3")
+MAX_NAMES = 12  # exposures that an error message lists
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,7 +97,92 @@ def without_frames(solution: Solution) -> TransformedSolution:
         'first', those from which all exposures deviate in gauge 'held'.
     """
     n = solution.model.n_distortion
-    return solution.transformed(bare_model(solution.model), lambda theta: theta[..., :n], np.eye(n))
+    return solution.transformed(bare_model(solution.model), _FirstParameters(n), np.eye(n))
+
+
+def at_exposure(
+    solution: Solution,
+    *,
+    exposure: str | None = None,
+    epoch: float | None = None,
+    chips: Sequence[int] | None = None,
+) -> TransformedSolution:
+    """Polynomials of one exposure at one date, with the frame of the exposure applied to them.
+
+    Parameters
+    ----------
+    solution : Solution
+    exposure : str, optional
+        Name of an exposure of the model.  By default no frame is applied.
+    epoch : float, optional
+        Decimal years; needed by a model with time dependence.
+    chips : sequence of int, optional
+        Numbers of the chips of the result; all chips by default.
+
+    Returns
+    -------
+    TransformedSolution
+        Solution of a model without frames and without time dependence.  Its covariance contains
+        that of the frame, and its draws are those of `solution`.
+
+    Raises
+    ------
+    InputError
+        If there is no such exposure or chip, or the epoch is missing.
+    """
+    model = solution.model
+    if exposure is not None and (not model.n_frame or exposure not in model.exposures):
+        names, more = model.exposures[:MAX_NAMES], len(model.exposures) - MAX_NAMES
+        listed = ", ".join(names) + (f" and {more} more" if more > 0 else "")
+        raise InputError(
+            f"there is no exposure {exposure!r}",
+            where="exposure",
+            do=f"choose one of {listed}"
+            if model.n_frame
+            else "leave it out: the model has no frames of exposures",
+        )
+    if model.time is not None and epoch is None:
+        raise InputError(
+            "the model depends on time and no epoch is given",
+            where="epoch",
+            do="give it in decimal years",
+        )
+    codes = [model.chip_code(number) for number in chips or [c.number for c in model.chips]]
+    groups = tuple(
+        model.groups(1, epoch=epoch, exposure=exposure, chip=model.chips[code].number)
+        for code in codes
+    )
+    bare = replace(bare_model(model), time=None, chips=tuple(model.chips[code] for code in codes))
+    mean = np.asarray(solution.mean, float)
+    jacobian = np.zeros((len(codes), 2, model.n_terms, mean.size))
+    for row, group in zip(jacobian, groups, strict=True):
+        [(columns, derivative)] = model.effective_jacobian(mean, group)
+        row[:, :, columns] = derivative
+    return solution.transformed(
+        bare, _EffectivePolynomials(model, groups), jacobian.reshape(bare.n_params, -1)
+    )
+
+
+@dataclass(frozen=True)
+class _FirstParameters:
+    """The first n parameters.  A class, because a function inside a function cannot be pickled."""
+
+    n: int
+
+    def __call__(self, theta: Float) -> Float:
+        return theta[..., : self.n]
+
+
+@dataclass(frozen=True, eq=False)
+class _EffectivePolynomials:
+    """Effective coefficients of groups of stars, one after the other."""
+
+    model: DistortionModel
+    groups: tuple[Groups, ...]  # each of one chip
+
+    def __call__(self, theta: Float) -> Float:
+        parts = [self.model.effective(theta, group) for group in self.groups]
+        return np.concatenate(parts, axis=-3).reshape(*theta.shape[:-1], -1)
 
 
 def segment(solution: Solution, s: int) -> TransformedSolution:

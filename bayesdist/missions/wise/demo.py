@@ -11,8 +11,8 @@ from astropy.table import QTable
 
 from bayesdist.app.commands.on_files.convert import convert
 from bayesdist.app.results import results_of
-from bayesdist.app.run import run
 from bayesdist.app.screen import number, table_text
+from bayesdist.app.stages import run
 from bayesdist.app.store.output import write_table
 from bayesdist.app.store.record import write_text
 from bayesdist.app.store.rundir import RunDirectory

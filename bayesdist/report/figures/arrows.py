@@ -11,7 +11,14 @@ from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 
 from bayesdist.report.figures.panels import Panels
-from bayesdist.report.figures.style import CYCLE, INK, PALE, PALETTE, figure_style, nice_below
+from bayesdist.report.figures.style import (
+    CYCLE,
+    PALETTE,
+    Tones,
+    figure_style,
+    nice_below,
+    small_font,
+)
 from bayesdist.utils.arrays import Bool, Float
 from bayesdist.utils.distributions import f_isf
 from bayesdist.utils.numbers import size_of
@@ -155,23 +162,29 @@ def vector_map(
         if arrows is None:
             continue
         ax = panels.axes[k][0]
-        _draw(ax, arrows, panels.offset(k), magnification, fine=fine)
+        draw_arrows(ax, arrows, panels.offset(k), magnification=magnification, fine=fine)
         keys.setdefault(ax, float(one))
     for ax, title in zip(panels.all_axes, titles, strict=True):
         ax.set_title(title, pad=pad)
     for ax, length in keys.items():
-        _key(ax, length, magnification=magnification, unit=unit)
+        draw_key(ax, length, magnification=magnification, unit=unit)
 
 
-def _draw(
-    ax: Axes, arrows: Arrows, offset: tuple[float, float], magnification: float, *, fine: bool
+def draw_arrows(
+    ax: Axes,
+    arrows: Arrows,
+    offset: tuple[float, float] = (0.0, 0.0),
+    *,
+    magnification: float,
+    fine: bool = False,
 ) -> None:
     """Arrows from (x, y) to (x + M du, y + M dv), in the axes' own pixels; pale unless clear."""
+    tones = Tones.of(ax)
     x, y = arrows.x + offset[0], arrows.y + offset[1]
-    parts: list[tuple[Any, str]] = [(slice(None), INK)]
+    parts: list[tuple[Any, str]] = [(slice(None), tones.ink)]
     if arrows.clear is not None:
-        parts = [(~arrows.clear, PALE), (arrows.clear, INK)]
-        ax.plot(x, y, ".", ms=1.2, color=PALE, zorder=2)
+        parts = [(~arrows.clear, tones.pale), (arrows.clear, tones.ink)]
+        ax.plot(x, y, ".", ms=1.2, color=tones.pale, zorder=2)
     heads = (3.2, 4.0, 3.6) if fine else (4.0, 5.0, 4.5)
     head: dict[str, Any] = dict(
         zip(("headwidth", "headlength", "headaxislength"), heads, strict=True)
@@ -197,12 +210,23 @@ def _draw(
         ax.plot(*at, "o", ms=5, mfc="none", mec=PALETTE["vermilion"], mew=1.3, zorder=5)
 
 
-def _key(ax: Axes, length: float, *, magnification: float, unit: str) -> None:
-    """Arrow of a stated length above the axes' right end; their limits must be final."""
+def draw_key(
+    ax: Axes,
+    length: float,
+    *,
+    magnification: float,
+    unit: str = "pix",
+    scale_mas: float | None = None,
+) -> None:
+    """Arrow of a stated length above the axes' right end; their limits must be final.
+
+    The length is in `unit`, and stated in mas if it is in pixels and `scale_mas`, the size of a
+    pixel, is given.
+    """
     end = ax.get_xlim()[1]
     drawn = length * magnification
     start = end - drawn
-    transform = ax.get_xaxis_transform()
+    transform, color = ax.get_xaxis_transform(), Tones.of(ax).ink
     times = f"×{magnification:,.6g}".replace(",", "\u202f")
     how = times if unit == "pix" else f"as {drawn:.3g} pix"
     ax.annotate(
@@ -216,13 +240,16 @@ def _key(ax: Axes, length: float, *, magnification: float, unit: str) -> None:
             "shrinkA": 0,
             "shrinkB": 0,
             "lw": 1.0,
-            "color": INK,
+            "color": color,
             "mutation_scale": 9,
         },
         annotation_clip=False,
     )
-    text = f"{size_of(length, unit)}, drawn {how} "
-    ax.text(start, 1.035, text, transform=transform, ha="right", va="center", fontsize=7.5)
+    stated = size_of(length, unit)
+    if scale_mas is not None and unit == "pix":
+        stated = size_of(length * scale_mas, "mas")
+    text = ax.text(start, 1.035, f"{stated}, drawn {how} ", transform=transform)
+    text.set(ha="right", va="center", fontsize=small_font(), color=color)
 
 
 # -- crosses --------------------------------------------------------------------------------------
@@ -246,11 +273,29 @@ def cross_map(
     places = [(column, ax) for several in panels.axes for column, ax in enumerate(several)]
     scales, keys = (np.broadcast_to(np.asarray(a, float), len(maps)) for a in (magnification, key))
     for (column, ax), one, title, M, length in zip(places, maps, titles, scales, keys, strict=True):
-        segments = list(_crosses(one, float(M), every))
-        ax.add_collection(LineCollection(segments, colors=CYCLE[column], linewidths=0.8))
+        draw_crosses(ax, one, magnification=float(M), every=every, color=CYCLE[column])
         ax.set_title(title, pad=20)
         # one key serves all panels, but a panel that is cut out must state its scale too
-        _key(ax, float(length), magnification=float(M), unit=one.unit)
+        draw_key(ax, float(length), magnification=float(M), unit=one.unit)
+
+
+def draw_crosses(
+    ax: Axes, errors: UncertaintyMap, *, magnification: float, every: int = 1, color: str = CYCLE[0]
+) -> None:
+    """Draw four vectors from each point of a map, to all combinations of (±sigma_u, ±sigma_v)."""
+    segments = list(_crosses(errors, magnification, every))
+    ax.add_collection(LineCollection(segments, colors=color, linewidths=0.8))
+
+
+def crosses_magnification(maps: Sequence[UncertaintyMap], every: int = 1) -> float:
+    """Round factor that draws the largest error of some maps as 0.8 of a grid step, or less."""
+    widest = max(max(m.sigma_u_max, m.sigma_v_max) for m in maps)
+    steps = []
+    for m in maps:
+        rows, columns = square_cells(m.x, m.y, every)
+        steps.append(spacing(m.x[columns], m.y[rows]))
+    # beyond half a grid step crosses overlap: a few do, in the corners, so that the inner ones show
+    return nice_below(0.8 * min(steps) / max(widest, 1e-300))
 
 
 def _crosses(m: UncertaintyMap, magnification: float, every: int) -> Float:

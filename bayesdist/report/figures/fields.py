@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from matplotlib import colormaps
@@ -16,7 +17,7 @@ from numpy.typing import ArrayLike
 from scipy.interpolate import RectBivariateSpline
 
 from bayesdist.report.figures.panels import Panels
-from bayesdist.report.figures.style import COLORBAR, INK, SEQUENTIAL, figure_style
+from bayesdist.report.figures.style import COLORBAR, INK, SEQUENTIAL, figure_style, small_font
 from bayesdist.utils.arrays import Float
 
 EMPTY = "#D9DEE3"  # of a cell without a value
@@ -75,17 +76,8 @@ def scalar_map(
     for (k, ax), grid, one in zip(places, grids, norms, strict=True):
         if grid is None:
             continue
-        px, py = panels.offset(k)
-        if levels is not None:
-            drawn[ax] = _contours(ax, grid, (px, py), levels, labelled=labelled)
-        else:
-            drawn[ax] = _cells(ax, grid, (px, py), one, cmap)
-        if grid.ring is not None:
-            at = np.add(grid.ring, (px, py))
-            for color, width, order in (("white", 2.2, 5), (INK, 1.0, 6)):
-                ax.plot(
-                    *at, "o", ms=5, mfc="none", mec=color, mew=width, clip_on=False, zorder=order
-                )
+        look: dict[str, Any] = {"levels": levels, "norm": one, "cmap": cmap, "labelled": labelled}
+        drawn[ax] = draw_grid(ax, grid, panels.offset(k), **look)
     for ax, title in zip(panels.all_axes, titles, strict=True):
         ax.set_title(title)
     if not label or not drawn:
@@ -100,6 +92,32 @@ def scalar_map(
         for ax, image in drawn.items():
             look["extend"] = _extend([grids[panels.all_axes.index(ax)]], image.get_clim())
             panels.figure.colorbar(image, ax=ax, **look)
+
+
+def draw_grid(
+    ax: Axes,
+    grid: Grid,
+    offset: tuple[float, float] = (0.0, 0.0),
+    *,
+    levels: Float | None = None,
+    norm: Normalize | None = None,
+    cmap: str | Colormap = SEQUENTIAL,
+    labelled: bool = False,
+) -> QuadContourSet | AxesImage:
+    """Draw the values of one grid as contours between `levels`, else as cells, with its ring.
+
+    `offset` is that of the grid's pixels in the axes; `labelled` contours show their values.
+    """
+    if levels is None:
+        drawn: QuadContourSet | AxesImage = _cells(ax, grid, offset, norm, cmap)
+    else:
+        drawn = _contours(ax, grid, offset, levels, labelled=labelled)
+    if grid.ring is not None:
+        at = np.add(grid.ring, offset)
+        # dark on light, so that it is seen on every colour of the map in every style
+        for color, width, order in (("white", 2.2, 5), (INK, 1.0, 6)):
+            ax.plot(*at, "o", ms=5, mfc="none", mec=color, mew=width, clip_on=False, zorder=order)
+    return drawn
 
 
 def _contours(
@@ -120,7 +138,9 @@ def _contours(
         lines = ax.contour(*at, fine, crossed, colors="white", linewidths=0.6)
         if labelled:
             digits = max(len(f"{v:.10g}".partition(".")[2]) for v in levels)
-            ax.clabel(lines, fontsize=7.5, fmt=lambda v: f"{v:.{digits}f}".replace("-", "−"))
+            ax.clabel(
+                lines, fontsize=small_font(), fmt=lambda v: f"{v:.{digits}f}".replace("-", "−")
+            )
     return filled
 
 

@@ -14,6 +14,7 @@ from bayesdist.report.figures.style import (
     HALF_WIDTH,
     OUTLINE,
     WIDTH,
+    Tones,
     figure_style,
     new_figure,
 )
@@ -80,6 +81,7 @@ class ChipPanels(Panels):
         for size, maps in zip(self.mosaic.sizes, self.axes, strict=True):
             for ax in maps:
                 chip_axes(ax, largest, margin=margin)
+                ax.label_outer()
                 if self.mosaic.several:
                     _label_edges(ax)
                 if size != largest:
@@ -115,6 +117,7 @@ class ArrayPanels(Panels):
         n, differ = len(self.sizes), len(set(self.sizes)) > 1
         for k, (size, (ax,)) in enumerate(zip(self.sizes, self.axes, strict=True)):
             chip_axes(ax, size, margin=margin * max(size))
+            ax.label_outer()
             if differ:  # then a neighbour's numbers do not serve
                 ax.tick_params(labelbottom=True, labelleft=True)
             # nothing stands below it in a last row that is not full
@@ -173,17 +176,17 @@ class OneArray(Panels):
 def chip_axes(ax: Axes, size: Size, *, margin: float = 0.0) -> None:
     """Make axes a map of a chip: x to the right, y up, pixels square, outline drawn.
 
-    `margin` is the room beyond the outline, in pixels.
+    `margin` is the width of the border around the outline, in pixels.
     """
     nx, ny = size
     ax.set_aspect("equal")
     ax.set_xlim(0.5 - margin, nx + 0.5 + margin)
     ax.set_ylim(0.5 - margin, ny + 0.5 + margin)
     if margin > 0:
-        ax.add_patch(Rectangle((0.5, 0.5), nx, ny, fill=False, lw=0.7, ec=OUTLINE, zorder=0))
+        color = Tones.of(ax).outline
+        ax.add_patch(Rectangle((0.5, 0.5), nx, ny, fill=False, lw=0.7, ec=color, zorder=0))
     ax.set_xlabel("x [pix]")
     ax.set_ylabel("y [pix]")
-    ax.label_outer()
 
 
 def _label_edges(ax: Axes) -> None:

@@ -9,11 +9,14 @@ import math
 import re
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
 from typing import Any, Literal
 
 import matplotlib
+import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.colors import to_hex, to_rgba
 from matplotlib.figure import Figure
 from matplotlib.rcsetup import cycler
 from matplotlib.ticker import LogFormatterSciNotation, ScalarFormatter
@@ -44,6 +47,8 @@ INK = "#1F2A37"
 PALE = "#A9B4C0"  # vectors that may be noise alone, and stars in the background
 OUTLINE = "#9AA5B1"  # of chips, and lines at zero
 GUIDE = "#E3E8ED"  # lines of a grid behind data
+BARS = "#C5CED8"  # of a histogram behind a curve
+PAPER = "#FFFFFF"
 COLORBAR: dict[str, Any] = {"fraction": 0.05, "pad": 0.02}  # next to maps
 WIDTH = 7.2  # inches: the text width of an A4 or Letter page
 HALF_WIDTH = WIDTH / 2  # of figures that stand side by side
@@ -110,6 +115,42 @@ def new_figure(
     return fig
 
 
+@dataclass(frozen=True)
+class Tones:
+    """Neutral colours of a panel: those of the report, or shades of the user's own style.
+
+    Colours that carry meaning (of a verdict, an axis, a kind of error) are the same in all styles.
+    """
+
+    ink: str = INK  # vectors, lines at zero
+    pale: str = PALE
+    outline: str = OUTLINE
+    guide: str = GUIDE
+    bars: str = BARS
+    paper: str = PAPER  # background
+
+    @classmethod
+    def of(cls, ax: Axes) -> Tones:
+        """Colours that stand out from the background of a panel as its labels do."""
+        ink = to_hex(ax.xaxis.label.get_color()).upper()
+        layers = (ax.get_facecolor(), ax.figure.get_facecolor())
+        paper = next((to_hex(c).upper() for c in layers if to_rgba(c)[3] > 0), PAPER)
+        if (ink, paper) == (INK.upper(), PAPER):
+            return cls()
+        dark, light = np.array(to_rgba(ink)[:3]), np.array(to_rgba(paper)[:3])
+
+        def shade(part: float) -> str:
+            """Colour between text (0) and background (1)."""
+            return to_hex(dark + part * (light - dark))
+
+        return cls(ink, shade(0.6), shade(0.5), shade(0.85), shade(0.72), paper)
+
+
+def small_font() -> Any:
+    """Font size of what stands inside a panel or beside it: that of legends."""
+    return matplotlib.rcParams["legend.fontsize"]
+
+
 def legend_above(figure: Figure, ax: Axes, **look: Any) -> None:
     """Draw the legend of one panel above all panels, in one row."""
     handles, labels = ax.get_legend_handles_labels()
@@ -118,7 +159,7 @@ def legend_above(figure: Figure, ax: Axes, **look: Any) -> None:
 
 def guide_lines(ax: Axes) -> None:
     """Draw lines of a grid behind the data."""
-    ax.grid(True, lw=0.4, color=GUIDE)
+    ax.grid(True, lw=0.4, color=Tones.of(ax).guide)
     ax.set_axisbelow(True)
 
 

@@ -36,7 +36,7 @@ def run(data_dir, tmp_path_factory):
         sampler={"seed": 1},
     )
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("bayesdist.app.run.report", lambda results, pdf: [])
+        patch.setattr("bayesdist.app.stages.report", lambda results, pdf: [])
         good("run", config, "-o", folder / "run")
     return folder / "run"
 

@@ -215,7 +215,7 @@ def test_a_run_that_was_killed_goes_on(three_rolls, tmp_path, monkeypatch, no_re
 
     for stage, flag in (("fit", ()), ("sample", ("--resume",)), ("diagnose", ("--resume",))):
         with monkeypatch.context() as patch:
-            patch.setattr(f"bayesdist.app.run.{stage}", killed)
+            patch.setattr(f"bayesdist.app.stages.{stage}", killed)
             with pytest.raises(Killed):
                 cli("run", config, "-o", run, *flag)
     good("run", config, "-o", run, "--resume")

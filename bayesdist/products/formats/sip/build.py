@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -28,7 +29,11 @@ from bayesdist.products.formats.common.coefficients import (
 )
 from bayesdist.products.formats.sip.families import offset_ranges
 from bayesdist.products.formats.sip.header import LINEAR_AXES, SIP_ORDERS, SipHeader, worst_closure
+from bayesdist.products.formats.sip.write import sip_header
 from bayesdist.utils.arrays import Float
+
+if TYPE_CHECKING:
+    from astropy.wcs import WCS
 
 # How far from the identity the linear part may be when it is to be a correction of pixels.
 _NEAR_IDENTITY = 0.5
@@ -187,6 +192,19 @@ def sip_from_solution(
         bp=bp,
     )
     return replace(sip, closure=worst_closure(sip, size))
+
+
+def sip_wcs(calibration: Calibration, crval: tuple[float, float]) -> WCS:
+    """WCS of astropy.wcs with the SIP header of a calibration of one chip on the sky.
+
+    `crval` is the position of the tangent point in degrees, so that the polynomial stays as it is.
+    """
+    from astropy.wcs import WCS  # slow to import
+
+    wcs = WCS(sip_header(sip_from_solution(calibration, crval=crval)))
+    [chip] = calibration.model.chips
+    wcs.pixel_shape = round(chip.size[0]), round(chip.size[1])
+    return wcs
 
 
 def _check_options(

@@ -3,34 +3,30 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from textwrap import fill
 from typing import Any
 
 import numpy as np
-from matplotlib.axes import Axes
 from matplotlib.colors import BoundaryNorm, ListedColormap
 from matplotlib.patches import Patch
 
-from bayesdist.assess.maps.uncertainty import circular_error, per_axis
+from bayesdist.assess.maps.uncertainty import circular_error
 from bayesdist.assess.terms.forms import PRODUCT
 from bayesdist.report.contents import REPORT, Plot
 from bayesdist.report.context import ReportInput, needed
 from bayesdist.report.figures.fields import Grid, scalar_map
 from bayesdist.report.figures.panels import ChipPanels
-from bayesdist.report.figures.style import (
-    CYCLE,
-    INK,
-    OUTLINE,
-    PALETTE,
-    WIDTH,
-    new_figure,
+from bayesdist.report.figures.style import CYCLE, WIDTH, new_figure
+from bayesdist.report.plots.errors import (
+    budget_handles,
+    largest_error,
+    plot_budget,
+    row_per_axis,
 )
 from bayesdist.report.sections.gauge import gauge_of_new_exposure
 from bayesdist.report.texttable import TextTable
 from bayesdist.utils.numbers import (
     MISSING,
     Scale,
-    display_scale,
     length_scale,
     number,
     percent,
@@ -40,26 +36,6 @@ from bayesdist.utils.numbers import (
 AS_ABOVE = "as above"  # of the rows of single chips
 _LETTERS = 31  # of a label beside another one, over a narrow figure
 _MOST_PANELS = 3  # chips whose bars are shown with those of the detector
-_KIND_COLORS = {
-    "random": PALETTE["sky"],
-    "systematic": PALETTE["blue"],
-    "local": PALETTE["green"],
-    PRODUCT: OUTLINE,
-}
-# one above the other, as both axes are often equal
-_AXIS_MARKERS = {"u": ("o", -0.15), "v": ("s", 0.15)}
-_MARKER_STYLE: dict[str, Any] = {
-    "ms": 5.5,
-    "color": PALETTE["yellow"],
-    "mec": INK,
-    "mew": 0.7,
-    "zorder": 4,
-}
-
-
-def is_total(row: Mapping[str, str | float]) -> bool:
-    """True where a row of `ErrorBudget.rows` is the sum of the others."""
-    return row["kind"] == "total"
 
 
 @REPORT.table("budget", needs=("budget",))
@@ -69,7 +45,7 @@ def budget_table(r: ReportInput) -> TextTable:
     unit, mas = budget.unit, r.scale_mas
     names = {str(c.chip.number): c.chip.name for c in r.chips} | {"all": "all"}
     rows = budget.rows_by_chip() if r.several else budget.rows()
-    typical = _per_axis(budget.rows()[-1])
+    typical = row_per_axis(budget.rows()[-1])
     scale = length_scale(unit, typical)
     out = [
         (
@@ -107,15 +83,11 @@ def _sizes(
     """Errors of u, of v, per axis (in mas as well), CE68 and CE95, rms over the detector."""
     u, v = float(row["u"]), float(row["v"])
     circles = (float(circular_error(u, v, 0.0, p)) for p in (0.68, 0.95))
-    sizes = [number(scale.factor * size) for size in (u, v, _per_axis(row), *circles)]
+    sizes = [number(scale.factor * size) for size in (u, v, row_per_axis(row), *circles)]
     if mas is not None and scale.unit == "pix":
-        angle = with_mas(_per_axis(row) * mas, "mas", None, like=typical * mas)
+        angle = with_mas(row_per_axis(row) * mas, "mas", None, like=typical * mas)
         sizes[2] += f" ({angle})"
     return tuple(sizes)
-
-
-def _per_axis(row: Mapping[str, Any]) -> float:
-    return float(per_axis(row["u"], row["v"]))
 
 
 def _known_to(row: Mapping[str, Any]) -> str:
@@ -146,49 +118,26 @@ def budget_terms(r: ReportInput) -> Plot:
     parts = {"all chips": rows}
     if 1 < len(budget.chips) <= _MOST_PANELS:
         parts |= {n: b.rows() for n, b in zip(r.mosaic.names, budget.chips, strict=True)}
-    largest = max(max(float(row["u"]), float(row["v"])) for part in parts.values() for row in part)
-    scale = display_scale(budget.unit, largest)
+    largest = largest_error(list(parts.values()))
     fig = new_figure(WIDTH, (1.1 if len(parts) == 1 else 1.3) + 0.34 * len(rows))
     axes = fig.subplots(1, len(parts), sharey=True, squeeze=False)[0]
-    for ax, (name, part) in zip(axes, parts.items(), strict=True):
-        _bars(ax, part, scale.factor)
-        # a number beyond its bar takes more of a narrow panel
-        room = 1.12 if len(parts) == 1 else 1.12 + 0.12 * len(parts)
-        ax.set_xlim(0, largest * scale.factor * room or 1.0)
+    shown = [budget, *budget.chips][: len(parts)]
+    for ax, (name, part) in zip(axes, zip(parts, shown, strict=True), strict=True):
         over = "the detector" if len(parts) == 1 else name
-        ax.set_xlabel(f"rms over {over} [{scale.unit}]")
-    axes[0].set_yticks(np.arange(len(rows)), [fill(str(row["name"]), 26) for row in rows])
-    axes[0].invert_yaxis()
-    present = {row["kind"] for row in rows if not is_total(row)}
-    kinds = [k for k in _KIND_COLORS if k in present]
-    handles = [Patch(color=_KIND_COLORS[k], label=f"{k}, per axis") for k in kinds]
-    handles.append(Patch(color=INK, label="total, per axis"))
-    for key, (marker, _) in _AXIS_MARKERS.items():
-        handles += axes[0].plot([], [], marker, label=f"{key} alone", **_MARKER_STYLE)
+        plot_budget(part, ax, largest=largest, over=over, names=ax is axes[0], legend=False)
+        if len(parts) > 1:  # a number beyond its bar takes more of a narrow panel
+            ax.set_xlim(0, ax.get_xlim()[1] * (1.12 + 0.12 * len(parts)) / 1.2)
+    handles = budget_handles(axes[0], rows)
     fig.legend(handles=handles, loc="outside upper left", ncols=len(handles))
     *terms, total = (row for row in rows if row["kind"] != PRODUCT)
-    top = max(terms, key=_per_axis)
+    top = max(terms, key=row_per_axis)
     return Plot(
         fig,
         "Error budget by term",
-        f"The largest term is {top['name']}, {r.length(_per_axis(top))}, of a total of"
-        f" {r.length(_per_axis(total))} (rms over the detector, per axis).",
+        f"The largest term is {top['name']}, {r.length(row_per_axis(top))}, of a total of"
+        f" {r.length(row_per_axis(total))} (rms over the detector, per axis).",
         f"Bars of the budget's terms; the largest is {top['name']}.",
     )
-
-
-def _bars(ax: Axes, rows: Sequence[Mapping[str, str | float]], factor: float) -> None:
-    place = np.arange(len(rows))
-    sizes = np.array([_per_axis(row) for row in rows]) * factor
-    colors = [INK if is_total(row) else _KIND_COLORS.get(str(row["kind"]), OUTLINE) for row in rows]
-    ax.barh(place, sizes, height=0.62, color=colors, zorder=2)
-    for key, (marker, shift) in _AXIS_MARKERS.items():
-        values = np.array([row[key] for row in rows], float) * factor
-        ax.plot(values, place + shift, marker, **_MARKER_STYLE)
-    for k, value in enumerate(sizes):
-        ax.annotate(number(value), (value, k), (5, 0), textcoords="offset points", va="center")
-    ax.spines[["top", "right"]].set_visible(False)
-    ax.tick_params(axis="y", length=0)
 
 
 @REPORT.figure("budget", needs=("budget",))

@@ -5,14 +5,15 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import numpy as np
-from matplotlib.colors import LogNorm, Normalize
+from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 
 from bayesdist.report.contents import REPORT, Plot
 from bayesdist.report.context import ReportInput, needed
 from bayesdist.report.figures.fields import Grid, scalar_map
 from bayesdist.report.figures.panels import ChipPanels
-from bayesdist.report.figures.style import INK, PALETTE, SEQUENTIAL, WIDTH, new_figure
+from bayesdist.report.figures.style import WIDTH, new_figure
+from bayesdist.report.plots.residuals import draw_density
 from bayesdist.report.texttable import (
     MAX_ROWS,
     TextTable,
@@ -171,44 +172,12 @@ def _density(
     mag: Float, residual: Float, *, unit: str, errors: MagnitudeErrors | None, shown: str
 ) -> Figure:
     """Figure with hexagons that count residuals, an axis of these in each panel."""
-    reach = _magnitude_reach(residual, errors)
-    scale = display_scale(unit, reach)
-    low, high = np.quantile(mag, [0.002, 0.998])  # a few very bright stars must not fill the plot
-    pad = 0.02 * max(high - low, 0.1)
     fig = new_figure(WIDTH, 3.2)
     axes = fig.subplots(1, 2, sharey=True)
-    for ax, axis, values in zip(axes, "uv", residual.T, strict=True):
-        inside = (np.abs(values) <= reach) & (np.abs(2 * mag - low - high) <= high - low + 2 * pad)
-        hexagons = ax.hexbin(
-            mag[inside],
-            values[inside] * scale.factor,
-            gridsize=(45, 30),
-            extent=(low - pad, high + pad, -reach * scale.factor, reach * scale.factor),
-            mincnt=1,
-            norm=LogNorm(vmin=1),
-            cmap=SEQUENTIAL,
-            linewidths=0.1,
-        )
-        if errors is not None:
-            grid = np.linspace(low - pad, high + pad, 200)
-            sigma = np.asarray(errors.at(grid)["uv".index(axis)]) * scale.factor
-            for edge in (-sigma, sigma):
-                ax.plot(grid, edge, color="white", lw=2.6)
-                ax.plot(grid, edge, color=PALETTE["vermilion"], lw=1.3)
-        ax.axhline(0.0, color=INK, lw=0.5)
-        ax.set_xlim(low - pad, high + pad)
-        ax.set_ylim(-reach * scale.factor, reach * scale.factor)
-        outside = f"{count((~inside).sum())} of {count(values.size)}"
+    for ax, axis in zip(axes, "uv", strict=True):
+        hexagons, scale, outside = draw_density(ax, mag, residual, axis, unit=unit, errors=errors)
         ax.set_title(f"{axis}: {outside} {shown} lie outside")
         ax.set_xlabel("magnitude [mag]")
     axes[0].set_ylabel(f"residual [{scale.unit}]")
     fig.colorbar(hexagons, ax=axes, label=f"{shown} per hexagon", fraction=0.04, pad=0.01)
     return fig
-
-
-def _magnitude_reach(residual: Float, errors: MagnitudeErrors | None) -> float:
-    """Height of the plot: the faintest stars' errors with room, and not the outliers."""
-    if errors is not None:
-        return 4.0 * float(max(np.max(errors.sigma_u), np.max(errors.sigma_v)))
-    scatter = 1.4826 * float(np.median(np.abs(residual)))
-    return 8.0 * scatter or 1.0

@@ -162,6 +162,7 @@ def _regions(
     drawn.set_array(found.region_scale[mine])
     ax.add_collection(drawn)
     chip_axes(ax, size)
+    ax.label_outer()
     if not mine:
         return drawn
     edges = np.array([found.regions[b].limits for b in mine])

@@ -13,14 +13,13 @@ from bayesdist.report.context import ReportInput
 from bayesdist.report.figures.arrows import (
     Arrows,
     cross_map,
-    magnification_of,
-    spacing,
-    square_cells,
+    crosses_magnification,
     vector_map,
 )
 from bayesdist.report.figures.fields import Grid, contour_levels, scalar_map
 from bayesdist.report.figures.panels import ChipPanels
 from bayesdist.report.figures.style import nice_below
+from bayesdist.report.plots.maps import BORDER, distortion_magnification
 from bayesdist.report.sections.gauge import gauge_mark, gauge_of_maps
 from bayesdist.report.texttable import TextTable, tabulated
 from bayesdist.utils.numbers import display_scale, number, size_of, with_mas
@@ -142,13 +141,10 @@ def _flow(r: ReportInput, vectors: Sequence[VectorMap]) -> Figure:
     """Vectors along x and y of each chip, in its pixels, whatever the unit of u and v."""
     chips, sizes = [Arrows.of_map(v) for v in vectors], [c.chip.size for c in r.chips]
     lengths = [float(np.hypot(*v.on_detector).max()) for v in vectors]
-    # one and a half grid steps do not yet hide neighbours, as they flow alike
-    M = min(
-        magnification_of(1.5 * one.step, length) for one, length in zip(chips, lengths, strict=True)
-    )
+    M = distortion_magnification(vectors)
     reach = max(one.reach(M, size) for one, size in zip(chips, sizes, strict=True))
     panels = ChipPanels(r.mosaic)
-    panels.frame(reach + 0.02 * r.mosaic.longest_side)
+    panels.frame(reach + BORDER * r.mosaic.longest_side)
     titles = [
         panels.title(k, f"largest {size_of(length, digits=4)}") for k, length in enumerate(lengths)
     ]
@@ -173,15 +169,10 @@ def formal_uncertainty(r: ReportInput) -> Plot:
     maps = [m for c in r.chips for m in c.maps]
     largest = max(m.radius_max for m in maps)
     widest = max(max(m.sigma_u_max, m.sigma_v_max) for m in maps)
-    # beyond half a grid step crosses overlap: a few do, in the corners, so that the inner ones show
     every = 2 if r.several else 1  # panels of several chips are small
-    steps = []
-    for m in maps:
-        rows, columns = square_cells(m.x, m.y, every)
-        steps.append(spacing(m.x[columns], m.y[rows]))
-    M = nice_below(0.8 * min(steps) / max(widest, 1e-300))
+    M = crosses_magnification(maps, every)
     panels = ChipPanels(r.mosaic, len(r.chips[0].maps))
-    panels.frame(M * widest + 0.02 * r.mosaic.longest_side)
+    panels.frame(M * widest + BORDER * r.mosaic.longest_side)
     titles = [
         panels.title(
             k, f"{m.kind}, largest {size_of(float(m.per_axis.max()), m.unit)} per axis", ", "

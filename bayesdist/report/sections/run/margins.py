@@ -4,27 +4,15 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-import numpy as np
-from matplotlib.axes import Axes
-from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
-
 from bayesdist.report.contents import REPORT, Plot
 from bayesdist.report.context import ReportInput
-from bayesdist.report.figures.style import (
-    CYCLE,
-    INK,
-    LEVEL_COLORS,
-    PALETTE,
-    WIDTH,
-    new_figure,
-)
+from bayesdist.report.figures.style import WIDTH, new_figure
+from bayesdist.report.plots.errors import plot_margins, plot_validity
 from bayesdist.report.sections.gauge import gauge_of_new_exposure
 from bayesdist.report.texttable import TextTable, tabulated
-from bayesdist.utils.arrays import Float
 from bayesdist.utils.numbers import (
     count,
     counted,
-    display_scale,
     interval,
     number,
     percent,
@@ -33,10 +21,6 @@ from bayesdist.utils.numbers import (
 
 if TYPE_CHECKING:
     from bayesdist.assess import Margin
-
-VERDICT_LEVELS = {"met": "pass", "undecided": "warn", "missed": "fail"}
-_SHOWN = (0.001, 0.999)  # quantiles of the draws that a histogram runs between
-_MARKERS = {"met": "o", "undecided": "D", "missed": "X"}  # shape as well as colour
 
 
 @REPORT.table("margins", needs=("margins",))
@@ -110,40 +94,7 @@ def margins(r: ReportInput) -> Plot:
     """Each requirement's statistic in units of its own limit: its draws and their central 95 %."""
     margins = r.margins
     fig = new_figure(WIDTH, 0.9 + 0.62 * len(margins))
-    ax = fig.subplots()
-    ends = []
-    for k, m in enumerate(margins):
-        limit = m.requirement.limit
-        values = m.draws / limit
-        color = LEVEL_COLORS[VERDICT_LEVELS[m.verdict]]
-        _ridge(ax, k, values, color)
-        low, high = (end / limit for end in m.interval)
-        ends += [low, high, *np.quantile(values, _SHOWN)]
-        ax.plot([low, high], [k, k], color=color, lw=2.5, solid_capstyle="butt", zorder=3)
-        ax.plot(m.value / limit, k, _MARKERS[m.verdict], ms=8, color=color, mec="white", zorder=4)
-        ax.annotate(
-            _statement(m),
-            (1.02, k),
-            xycoords=ax.get_yaxis_transform(),
-            va="center",
-            fontsize=7.5,
-            annotation_clip=False,
-        )
-    ax.axvline(1.0, color=INK, lw=1.2, zorder=2)
-    low, high = min([*ends, 1.0]), max([*ends, 1.0])
-    if low > 0 and high / low > 10:
-        ax.set_xscale("log")
-        ax.set_xlim(low / 1.4, high * 1.4)
-        ax.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
-        ax.xaxis.set_major_formatter(FuncFormatter(lambda v, _: f"{v:g}"))
-        ax.xaxis.set_minor_locator(NullLocator())
-    else:
-        ax.set_xlim(0, high * 1.08)
-    ax.set_ylim(len(margins) - 0.5, -0.75)
-    ax.set_yticks(range(len(margins)), [_label(m) for m in margins])
-    ax.set_xlabel("statistic / limit [no unit]; the limit is the line at 1")
-    ax.spines[["top", "right"]].set_visible(False)
-    ax.tick_params(axis="y", length=0)
+    plot_margins(margins, fig.subplots())
     met = sum(m.verdict == "met" for m in margins)
     verb = "is" if 1 in (met, len(margins)) else "are"
     return Plot(
@@ -156,66 +107,15 @@ def margins(r: ReportInput) -> Plot:
     )
 
 
-def _ridge(ax: Axes, k: int, values: Float, color: str) -> None:
-    """Draw a histogram of the draws, standing on row k."""
-    low, high = np.quantile(values, _SHOWN)
-    counts, edges = np.histogram(values, bins=40, range=(low, high if high > low else low + 1e-9))
-    top = k - 0.6 * counts / max(counts.max(), 1)
-    ax.stairs(top, edges, baseline=k, fill=True, color=color, alpha=0.3, zorder=1)
-
-
-def _label(m: Margin) -> str:
-    r = m.requirement
-    epoch = "" if m.epoch is None else f", {m.epoch:.6g}"
-    chip = "" if r.chip is None else f", chip {r.chip}"
-    return f"{r.name}\n{r.statistic}{epoch}{chip}"
-
-
-def _statement(m: Margin) -> str:
-    scale = display_scale(m.unit, m.requirement.limit)
-    limit = scale.text(m.requirement.limit)
-    met = counted(m.probability_met, m.mc_error, m.n_effective)
-    return (
-        f"{m.verdict}: {number(m.value * scale.factor)} of {limit}\n"
-        f"P(≤ limit): {met}, asked {m.requirement.probability:.3g}"
-    )
-
-
 @REPORT.figure("margins", needs=("validity",), printed=True)
 def validity_period(r: ReportInput) -> Plot:
     """Probability of meeting each requirement against time, and when it becomes too low."""
     periods = r.validity
     fig = new_figure(WIDTH, 0.7 + 1.5 * len(periods))
     panels = fig.subplots(len(periods), 1, sharex=True, squeeze=False)[:, 0]
-    for ax, one in zip(panels, periods, strict=True):
-        asked = one.requirement.probability
-        ax.fill_between(one.epoch, one.low, one.high, color=CYCLE[0], alpha=0.25, lw=0)
-        ax.plot(one.epoch, one.probability, color=CYCLE[0])
-        ax.axhline(asked, color=INK, lw=0.8, ls="--")
-        ax.annotate(
-            f"asked: {asked:g}",
-            (1.0, asked),
-            xycoords=ax.get_yaxis_transform(),
-            xytext=(3, 0),
-            textcoords="offset points",
-            va="center",
-            fontsize=7.5,
-        )
-        if one.date is not None:
-            early, late = one.interval
-            ax.axvspan(
-                one.epoch[0] if early is None else early,
-                one.epoch[-1] if late is None else late,
-                color=PALETTE["vermilion"],
-                alpha=0.2,
-                lw=0,
-            )
-            ax.axvline(one.date, color=PALETTE["vermilion"])
-        ax.set_ylim(-0.03, 1.03)
-        ax.set_xlim(one.epoch[0], one.epoch[-1])
-        ax.set_ylabel("P(met) [no unit]")
-        ax.set_title(one.sentence)
-    panels[-1].set_xlabel("epoch [yr]")
+    for ax, period in zip(panels, periods, strict=True):
+        plot_validity(period, ax)
+        ax.label_outer()
     return Plot(
         fig,
         "How long the requirements are met",

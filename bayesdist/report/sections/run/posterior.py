@@ -2,30 +2,26 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
-from typing import TYPE_CHECKING
-
 import numpy as np
 
 from bayesdist.infer.catalogue.added_errors import DECISIVE
 from bayesdist.report.contents import REPORT, Plot
 from bayesdist.report.context import ReportInput, needed
-from bayesdist.report.figures.corners import Column, corner_figure
-from bayesdist.report.figures.style import (
-    COLORBAR,
-    CYCLE,
-    DIVERGING,
-    OUTLINE,
-    WIDTH,
-    legend_above,
-    new_figure,
+from bayesdist.report.figures.style import WIDTH, legend_above, new_figure
+from bayesdist.report.plots.posterior import (
+    MIXTURE,
+    correlation_matrix,
+    draw_corner,
+    draw_ranks,
+    mixture_column,
+    plot_correlations,
+    rank_band,
+    slowest_parameters,
 )
 from bayesdist.report.texttable import TextTable, tabulated
-from bayesdist.utils.arrays import Float, Int
 from bayesdist.utils.numbers import (
     MISSING,
     Scale,
-    broken_name,
     count,
     display_scale,
     interval,
@@ -34,14 +30,6 @@ from bayesdist.utils.numbers import (
     rounded,
 )
 
-if TYPE_CHECKING:
-    from bayesdist.infer import Posterior
-
-_MIXTURE = ("f", "j", "s_out")
-_MAX_POINTS = 20_000  # draws that enter a corner plot
-N_SLOWEST = 4  # parameters whose ranks are shown
-_NAMED = 25  # coefficients that have room for their names
-RANK_BINS = 20
 _INDEPENDENCE = (
     "Independence sampling draws each proposal from a fixed approximation of the posterior,"
     " whatever the current position, and accepts it by the ratio of true to approximate density:"
@@ -139,15 +127,15 @@ def added_errors_table(r: ReportInput) -> TextTable:
 def outliers_corner(r: ReportInput) -> Plot:
     """Corner plot of the outlier fraction, jitter and outlier scale, of those that were sampled."""
     posterior = needed(r.posterior)
-    columns = [
-        Column(label, unit, draws.ravel()[:: max(1, draws.size // _MAX_POINTS)])
-        for label, unit, draws in _mixture_draws(posterior)
-    ]
+    columns = [mixture_column(posterior, name) for name in MIXTURE if name in posterior.hyper]
+    side = WIDTH if len(columns) > 3 else 1.6 * len(columns) + 0.9
+    figure = new_figure(side, side)
+    draw_corner(figure, columns)
     text = "Joint posterior of the mixture's parameters; dashed lines hold 68 %."
     if "f" in posterior.hyper:
         text += f" The fraction of {r.words.false_rows} is {percent(r.sampled_mean('f'))}."
     return Plot(
-        corner_figure(columns),
+        figure,
         "Outlier fraction, jitter and outlier scale",
         text,
         "Corner plot of f, j and s_out, as sampled.",
@@ -160,14 +148,7 @@ def correlations(r: ReportInput) -> Plot:
     posterior = needed(r.posterior)
     names, matrix = correlation_matrix(posterior)
     fig = new_figure(0.72 * WIDTH, 0.62 * WIDTH, layout="compressed")
-    ax = fig.subplots()
-    image = ax.imshow(matrix, vmin=-1, vmax=1, cmap=DIVERGING, interpolation="nearest")
-    step = -(-len(names) // _NAMED)
-    ax.set_xticks(range(0, len(names), step), names[::step], rotation=90)
-    ax.set_yticks(range(0, len(names), step), names[::step])
-    ax.set_xlabel("coefficient [name]")
-    ax.set_ylabel("coefficient [name]")
-    fig.colorbar(image, ax=ax, label="correlation [no unit]", **COLORBAR)
+    plot_correlations(posterior, fig.subplots())
     upper = np.triu(np.abs(matrix), k=1)
     i, j = np.unravel_index(int(upper.argmax()), upper.shape)
     sd, formal = np.sqrt(np.diag(posterior.cov)), np.sqrt(np.diag(r.fit.cov))
@@ -189,61 +170,28 @@ def correlations(r: ReportInput) -> Plot:
     )
 
 
-def correlation_matrix(posterior: Posterior) -> tuple[list[str], Float]:
-    """Names, and correlations (n, n), of coefficients that are free and no exposure's frame."""
-    moves = np.ptp(posterior.flat, axis=0) > 0
-    kinds = [p.kind for p in posterior.model.parameters]
-    chosen = [k for k, kind in enumerate(kinds) if kind != "frame" and moves[k]]
-    cov = np.asarray(posterior.cov)[np.ix_(chosen, chosen)]
-    sd = np.sqrt(np.diag(cov))
-    return [posterior.model.names[k] for k in chosen], cov / np.outer(sd, sd)
-
-
-def _mixture_draws(posterior: Posterior) -> list[tuple[str, str, Float]]:
-    """Label, unit and draws (ensembles, draws) of each of f, j, s_out that was sampled."""
-    unit = posterior.model.unit
-    hyper = {key: np.asarray(draws, float) for key, draws in posterior.hyper.items()}
-    return [
-        (key, "%", 100.0 * hyper[key]) if key == "f" else (key, unit, hyper[key])
-        for key in _MIXTURE
-        if key in hyper
-    ]
-
-
 @REPORT.figure("coefficients", needs=("posterior",))
 def ranks(r: ReportInput) -> Plot:
     """Ranks of the draws of each ensemble among all, of the slowest parameters and f, j, s_out."""
     posterior = needed(r.posterior)
-    rows = [
-        (broken_name(name), posterior.theta[..., posterior.model.names.index(name)])
-        for name in slowest_parameters(posterior, without=r.held)
-    ]
-    rows += [(label, draws) for label, _, draws in _mixture_draws(posterior)]
-    columns = min(4, len(rows))
-    lines = -(-len(rows) // columns)
+    names = list(slowest_parameters(posterior, without=r.held))
+    names += [name for name in MIXTURE if name in posterior.hyper]
+    columns = min(4, len(names))
+    lines = -(-len(names) // columns)
     fig = new_figure(WIDTH, 0.5 + 1.5 * lines)
     axes = fig.subplots(lines, columns, sharex=True, sharey=True, squeeze=False).ravel()
-    for ax in axes[len(rows) :]:
+    for ax in axes[len(names) :]:
         ax.remove()
-    ensembles, draws = rows[0][1].shape
-    ess = dict(zip(posterior.convergence.names, posterior.convergence.ess_bulk, strict=True))
-    worst = min((v for v in ess.values() if np.isfinite(v)), default=float(ensembles * draws))
-    # a share of the draws of an ensemble that is 1 / bins, known from its effective draws
-    band = 2.0 * np.sqrt((1.0 - 1.0 / ensembles) * (RANK_BINS - 1) * ensembles / max(worst, 1.0))
-    edges, farthest = np.linspace(0.0, 1.0, RANK_BINS + 1), band
-    for ax, (label, values) in zip(axes, rows, strict=False):
-        ax.axhspan(1 - band, 1 + band, color=OUTLINE, alpha=0.25, lw=0)
-        for k, counts in enumerate(rank_counts(values, RANK_BINS)):
-            share = counts * RANK_BINS / draws
-            farthest = max(farthest, float(np.abs(share - 1).max()))
-            color = CYCLE[k % len(CYCLE)]
-            ax.stairs(share, edges, color=color, lw=1.1, baseline=None, label=f"ensemble {k + 1}")
-        ax.set_title(label.replace("\n", " "))
-    for ax in axes[: len(rows)]:
+    axes = axes[: len(names)]
+    band = rank_band(posterior)
+    farthest = max(
+        draw_ranks(ax, posterior, name, band) for ax, name in zip(axes, names, strict=True)
+    )
+    for ax in axes:
         spec = ax.get_subplotspec()
         if spec.colspan.start == 0:
             ax.set_ylabel("draws / expected\n[no unit]")
-        if spec.rowspan.start == (len(rows) - 1 - spec.colspan.start) // columns:
+        if spec.rowspan.start == (len(names) - 1 - spec.colspan.start) // columns:
             ax.tick_params(labelbottom=True)
             ax.set_xlabel("rank [fraction]")
     axes[0].set_xlim(0, 1)
@@ -258,20 +206,3 @@ def ranks(r: ReportInput) -> Plot:
         f"{_INDEPENDENCE}",
         "Histograms of the ranks of the draws, by ensemble, which are flat where chains agree.",
     )
-
-
-def rank_counts(draws: Float, bins: int) -> Int:
-    """Numbers (ensembles, bins) of draws (ensembles, draws) in equal bins of their ranks."""
-    order = np.argsort(draws, axis=None, kind="stable")
-    which = np.empty(draws.size, np.int64)
-    which[order] = np.arange(draws.size) * bins // draws.size
-    return np.array([np.bincount(w, minlength=bins) for w in which.reshape(draws.shape)])
-
-
-def slowest_parameters(posterior: Posterior, *, without: Collection[str] = ()) -> tuple[str, ...]:
-    """Parameters of theta with the fewest effective draws, but for those in `without`."""
-    names = posterior.model.names
-    known = dict(zip(posterior.convergence.names, posterior.convergence.ess_bulk, strict=True))
-    ess = np.array([known.get(name, np.inf) for name in names], float)
-    order = np.argsort(np.where(np.isfinite(ess), ess, -np.inf), kind="stable")
-    return tuple(names[k] for k in order if names[k] not in without)[:N_SLOWEST]

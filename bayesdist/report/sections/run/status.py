@@ -15,7 +15,7 @@ from bayesdist.assess.maps.uncertainty import per_axis
 from bayesdist.assess.requirements.validity import ValidityPeriod
 from bayesdist.report.contents import REPORT
 from bayesdist.report.context import ReportInput, needed
-from bayesdist.report.sections.run.margins import VERDICT_LEVELS
+from bayesdist.report.plots.errors import VERDICT_LEVELS
 from bayesdist.report.texttable import TextTable, check_cells
 from bayesdist.utils.checks import GROUPS, LEVELS, Check, doubts_of, warnings_of, worst
 from bayesdist.utils.numbers import counted, rounded, with_mas

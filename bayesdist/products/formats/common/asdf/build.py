@@ -11,14 +11,11 @@ from astropy.modeling import Model
 
 from bayesdist.calibration.calibration import Calibration
 from bayesdist.calibration.inverse import detector_grid, fitted_inverse
+from bayesdist.calibration.modeling import forward_transform, inverse_transform
 from bayesdist.calibration.plane import Plane
 from bayesdist.errors import InputError, required
 from bayesdist.products.formats.common.asdf.distortion import closure_of
-from bayesdist.products.formats.common.asdf.transforms import (
-    forward_transform,
-    inverse_transform,
-    tables_of,
-)
+from bayesdist.products.formats.common.asdf.transforms import tables_of
 from bayesdist.products.formats.common.asdf.tree import Detector, PlacedSettings
 from bayesdist.products.formats.common.coefficients import require_regular
 from bayesdist.products.formats.common.document import BuildOptions

@@ -1,0 +1,316 @@
+"""`bayesdist.calibrate`: from matched stars in Python to a finished run in memory."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import fields
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import tomli_w
+
+from bayesdist.app.config import MatchesConfig, parse_config
+from bayesdist.app.config.assess import RequirementBlock
+from bayesdist.app.kinds.fit_data import StarReader
+from bayesdist.app.kinds.kind import MATCHES
+from bayesdist.app.pipeline import diagnose, sample
+from bayesdist.app.rehearsal import rehearse
+from bayesdist.app.results import Results
+from bayesdist.app.run import Run, as_requirements
+from bayesdist.app.run_folder import MATCHES_FILE
+from bayesdist.app.screen import progress_bar
+from bayesdist.app.stages import evaluated
+from bayesdist.app.store.rundir import RunDirectory
+from bayesdist.assess import Requirement, UserTerm
+from bayesdist.assess.terms.given import Catalogue
+from bayesdist.data import Matches, ReadOptions
+from bayesdist.data.reading.options import check_sigma
+from bayesdist.data.reading.table import match_arguments
+from bayesdist.errors import ConfigError, InputError
+from bayesdist.infer import OutlierMixture
+from bayesdist.model import Chip, TimeDependence
+from bayesdist.utils.quantities import value_in, year_of
+
+__all__ = ["calibrate"]
+
+WHERE = "calibrate"  # stands for the name of the configuration in messages
+
+Settings = dict[str, Any]
+
+
+def calibrate(
+    matches: Any,
+    *,
+    order: int,
+    size: tuple[float, float] | None = None,
+    chips: Sequence[Chip] = (),
+    reference_pixel: tuple[float, float] | None = None,
+    scale_mas: Any = None,
+    frames: str = "none",
+    time: TimeDependence | None = None,
+    sigma: Any = None,
+    outliers: OutlierMixture | str = "gaussian",
+    catalogue: Catalogue | None = None,
+    terms: Sequence[UserTerm] = (),
+    requirements: Requirement | Sequence[Requirement] = (),
+    epoch: Any = None,
+    exposure: str = "mean",
+    held_out: float = 0.0,
+    seed: int = 1,
+    name: str = "",
+    settings: Mapping[str, Mapping[str, Any]] | None = None,
+    progress: bool = False,
+) -> Run:
+    """Fit, sample, diagnose and evaluate the distortion that matched stars show.
+
+    The same stars, settings and seed give the same numbers as ``bayesdist run``, bit for bit.
+
+    Parameters
+    ----------
+    matches : Matches, table or path
+        Matched stars, a table that `Matches.from_table` takes, or files that `read_matches` reads.
+    order : int
+        Total order of the polynomials, 1 to 12.
+    size : tuple of float, optional
+        Columns and rows of a detector with one chip.
+    chips : sequence of Chip, optional
+        Chips of a detector with several, the reference chip first, in place of `size`.
+    reference_pixel : tuple of float, optional
+        Zero point of the polynomials, FITS 1-based pixels; the centre of the chip by default.
+    scale_mas : float or Quantity, optional
+        Size of a pixel in mas, to convert requirements and to print mas beside pixels.
+    frames : {'none', 'shift', 'shift_rotation', 'shift_rotation_scale', 'affine'}
+        Transformation that is fitted to each exposure.
+    time : TimeDependence, optional
+        Terms of the polynomials that drift linearly with time.
+    sigma : {'columns', 'by_magnitude'}, float or Quantity, optional
+        Source of the errors of the matches: their own, an estimate from the residuals by magnitude,
+        or one number in the unit of u and v.  By default their own if they have any, else the
+        estimate by magnitude.
+    outliers : OutlierMixture or {'gaussian', 'uniform', 'none'}
+        Distribution of false matches.
+    catalogue : Catalogue, optional
+        Systematic position error of the reference catalogue.  Without it verdicts are undecided,
+        because no residual shows this error.
+    terms : sequence of UserTerm
+        Other errors that the data cannot show.
+    requirements : Requirement or sequence of Requirement
+        Limits on the position error.
+    epoch : float or Time, optional
+        Date of the evaluation, in decimal years; needed only if the model depends on time.
+    exposure : {'mean', 'single'}
+        Evaluate errors of the mean calibration, or of a single exposure.
+    held_out : float
+        Fraction of the stars that are set aside to test the result.
+    seed : int
+        Seed of all random numbers.
+    name : str
+        Name of the detector.
+    settings : mapping of str to mapping, optional
+        Other sections and keys of the configuration, as in a TOML file, for example
+        ``{"sampler": {"max_steps": 40000}}``.
+    progress : bool
+        Show a progress bar while sampling, if stderr is a terminal.
+
+    Returns
+    -------
+    Run
+
+    Raises
+    ------
+    InputError
+        If the stars or settings cannot be used: what is wrong, where, and what to do.
+
+    Examples
+    --------
+    >>> chip = bd.Chip(1, "camera", (2048, 2048), (1024.5, 1024.5))
+    >>> model = bd.DistortionModel(1, (chip,), "pix")
+    >>> truth = [0, 1000, 0, 0, 0, 1000]
+    >>> rng = np.random.default_rng(1)
+    >>> stars, _ = bd.simulate_matches(model, truth, 500, sigma=0.01, rng=rng)
+    >>> gaia = bd.Catalogue("Gaia DR3", sigma=0.0005, unit="pix", source="a made-up example")
+    >>> run = bd.calibrate(stars, order=1, size=(2048, 2048), catalogue=gaia)
+    >>> run.converged
+    True
+    >>> run.check(bd.Requirement("whole field", "p95", 0.1))[0].verdict
+    'met'
+    """
+    stars, data = None, {"matches": MATCHES_FILE, "sigma": sigma}
+    if is_path(matches):
+        data["matches"] = _absolute(matches)
+    else:
+        stars, data["sigma"] = _stars(matches, sigma)
+    configured: Settings = {
+        "data": data,
+        "detector": {"name": name, "size": size, "scale_mas": _in(scale_mas, "mas", "scale_mas")},
+        "chip": [
+            {
+                "number": chip.number,
+                "name": chip.name or f"chip {chip.number}",
+                "size": chip.size,
+                "reference_pixel": chip.reference_pixel,
+                "reference": chip is chips[0],
+            }
+            for chip in chips
+        ],
+        "model": {
+            "order": order,
+            "reference_pixel": reference_pixel,
+            "frames": frames,
+            "tdd": None if time is None else _drift(time),
+        },
+        "outliers": _outliers(outliers),
+        "sampler": {"seed": seed},
+        "assess": {"epoch": None if epoch is None else year_of(epoch), "exposure": exposure},
+        "holdout": {"fraction": held_out} if held_out else None,
+        "budget": _budget(catalogue, terms),
+        "requirement": [_requirement_block(one) for one in as_requirements(requirements)],
+    }
+    text = _toml(_merged(configured, settings or {}))
+    config = parse_config(text, WHERE)
+    if not isinstance(config, MatchesConfig):
+        raise ConfigError(
+            "settings name a campaign or a self-calibration, which begin with star lists",
+            where=WHERE,
+            do="write a configuration file, and give it to bayesdist.run",
+        )
+    if stars is None:
+        stars = MATCHES.read(config, Path.cwd())
+    results = Results(
+        RunDirectory.unsaved(config, text),
+        StarReader(config.resources()),
+        made={"inputs": stars},
+    )
+    return Run(_calibrated(results, progress))
+
+
+def _calibrated(results: Results, progress: bool) -> Results:
+    """Results with fit, posterior, diagnostics and evaluation."""
+    config = results.config
+    results = rehearse(results)
+    if progress:
+        with progress_bar("sample") as update:
+            posterior = sample(results.data, config, progress=update)
+    else:
+        posterior = sample(results.data, config)
+    results = results.having(posterior=posterior)
+    diagnostics = diagnose(results.posterior, results.data, config, results.base)
+    results = results.having(stored=diagnostics)
+    return results.having(evaluation=evaluated(results))
+
+
+def is_path(matches: Any) -> bool:
+    """True if stars are given by the names of files."""
+    if isinstance(matches, str | os.PathLike):
+        return True
+    return (
+        isinstance(matches, list | tuple)
+        and len(matches) > 0
+        and all(isinstance(part, str | os.PathLike) for part in matches)
+    )
+
+
+def _stars(matches: Any, sigma: Any) -> tuple[Matches, str | float]:
+    """Matches with the errors that are asked for, and the source of these errors."""
+    if not isinstance(matches, Matches):
+        matches = Matches(**match_arguments(matches, ReadOptions()))
+    if sigma is None:
+        sigma = "by_magnitude" if matches.has_mag and not matches.has_sigma else "columns"
+    elif not isinstance(sigma, str):
+        sigma = value_in(sigma, matches.unit, "sigma")
+    check_sigma(sigma)
+    stars = matches.as_read(sigma)
+    if sigma == "by_magnitude" and stars.has_sigma:
+        stars = stars.with_columns(sigma_u=None, sigma_v=None)
+    return stars, sigma
+
+
+def _absolute(paths: Any) -> str | list[str]:
+    """Names of files that do not depend on the current folder."""
+    if isinstance(paths, str | os.PathLike):
+        return str(Path(paths).absolute())
+    return [str(Path(path).absolute()) for path in paths]
+
+
+def _in(value: Any, unit: str, what: str) -> float | None:
+    return None if value is None else value_in(value, unit, what)
+
+
+def _drift(time: TimeDependence) -> Settings:
+    return {"epoch0": list(time.epoch0), "terms": list(time.terms), "breaks": list(time.breaks)}
+
+
+def _outliers(outliers: OutlierMixture | str) -> Settings:
+    """Section [outliers] of a mixture."""
+    if isinstance(outliers, str):
+        return {} if outliers == "gaussian" else {"model": outliers}
+    section = {field.name: getattr(outliers, field.name) for field in fields(outliers)}
+    jitter = section["jitter"]
+    return section | {"jitter": "fit" if jitter is None else jitter}
+
+
+def _budget(catalogue: Catalogue | None, terms: Sequence[UserTerm]) -> list[Settings]:
+    """[[budget]] rows of the errors that the user states."""
+    rows = [] if catalogue is None else [catalogue.budget_row()]
+    for term in terms:
+        if not isinstance(term, UserTerm):
+            raise InputError(
+                f"a term is a {type(term).__name__}",
+                where="terms",
+                do="give bayesdist.UserTerm, or use bayesdist.error_budget for terms of your own",
+            )
+        names = "name kind sigma_u sigma_v unit source included_in_scatter".split()
+        rows.append({key: getattr(term, key) for key in names})
+    return rows
+
+
+def _requirement_block(requirement: Requirement) -> Settings:
+    return {key: getattr(requirement, key) for key in RequirementBlock.model_fields}
+
+
+def _merged(configured: Settings, settings: Mapping[str, Any]) -> Settings:
+    """Configuration with the user's settings in it, without what is not given."""
+    out = _plain(configured)
+    for key, section in _plain(settings).items():
+        given = out.get(key) or {}
+        if not isinstance(section, Mapping):
+            if given:
+                raise _given_twice(key)
+            out[key] = section
+            continue
+        for name, value in section.items():
+            if given.get(name, value) != value:
+                raise _given_twice(f"{key}.{name}")
+        out[key] = {**given, **section}
+    return {key: value for key, value in out.items() if value not in ({}, [])}
+
+
+def _toml(settings: Settings) -> str:
+    """Settings as the text of a TOML file."""
+    try:
+        return tomli_w.dumps(settings)
+    except (TypeError, ValueError) as error:
+        raise ConfigError(
+            f"a value cannot be written in TOML ({error})",
+            where=WHERE,
+            do="give numbers, texts, lists and mappings",
+        ) from error
+
+
+def _given_twice(key: str) -> ConfigError:
+    return ConfigError(
+        "is given by an argument and in settings", where=f"{WHERE}: {key}", do="give it once"
+    )
+
+
+def _plain(tree: Any) -> Any:
+    """Tree of values that TOML can hold, without None."""
+    if isinstance(tree, Mapping):
+        return {key: _plain(value) for key, value in tree.items() if value is not None}
+    if isinstance(tree, list | tuple):
+        return [_plain(value) for value in tree]
+    if isinstance(tree, np.ndarray | np.generic):
+        return tree.tolist()
+    return str(tree) if isinstance(tree, Path) else tree

@@ -1,0 +1,254 @@
+"""The whole job: a configuration in, a finished run directory out."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from bayesdist.app.config import load_config
+from bayesdist.app.kinds.fitted import Fitted
+from bayesdist.app.kinds.kind import kind_of
+from bayesdist.app.pipeline import (
+    diagnose,
+    error_model,
+    evaluate,
+    export,
+    fit,
+    match,
+    report,
+    sample,
+)
+from bayesdist.app.rehearsal import rehearse
+from bayesdist.app.results import Results, open_results
+from bayesdist.app.saving import (
+    save_diagnosed,
+    save_evaluation,
+    save_figures,
+    save_fit,
+    save_matches,
+    save_products,
+    save_sampled,
+)
+from bayesdist.app.screen import log_file, progress_bar
+from bayesdist.app.store.made_from import NEEDS, STAGES
+from bayesdist.app.store.rundir import RunDirectory
+from bayesdist.assess.evaluation import Evaluation
+from bayesdist.errors import InputError, NotConvergedError
+from bayesdist.infer import Posterior
+from bayesdist.infer.posterior.checks import convergence_check
+from bayesdist.utils.memory import release_memory
+
+__all__ = ["continue_stage", "make_stages", "run"]
+
+ASSESS = ("diagnose", "evaluate")
+
+
+def run(
+    config: str | Path,
+    output: str | Path,
+    *,
+    resume: bool = False,
+    force: bool = False,
+    strict: bool = False,
+    seed: int | None = None,
+    command: str = "",
+) -> Path:
+    """Match, fit, sample, diagnose, evaluate, export and report, as a configuration says.
+
+    Parameters
+    ----------
+    config : path
+        TOML file; paths in it are relative to it.
+    output : path
+        Run directory.
+    resume : bool
+        Resume the run that is there: stages that stand are skipped, checkpoints are used.
+    force : bool
+        Replace the run that is there.
+    strict : bool
+        Raise when the sampler has not converged (after everything has been written).
+    seed : int, optional
+        In place of the configured one.
+    command : str
+        For the record.
+
+    Returns
+    -------
+    Path
+        The run directory.
+
+    Raises
+    ------
+    BayesdistError
+
+    Examples
+    --------
+    >>> directory = bd.run("config.toml", "run")  # doctest: +SKIP
+    >>> posterior = bd.load_posterior(directory / "posterior.nc")  # doctest: +SKIP
+    """
+    settings, text = load_config(config)
+    directory = RunDirectory.plan(
+        output,
+        settings,
+        text,
+        Path(config).resolve().parent,
+        resume=resume,
+        force=force,
+        seed=seed,
+        command=command,
+    )
+    with initialized(directory) as results:
+        names = list(STAGES)
+        results = make_stages(results, names[names.index(results.kind.begins_with) :])
+        _require_converged(results, strict)
+    return directory.path
+
+
+def make_stages(
+    results: Results,
+    stages: Collection[str],
+    *,
+    force: bool = False,
+    pdf: bool = False,
+    ready: Mapping[str, Any] | None = None,
+) -> Results:
+    """Results with the artefacts of some stages: each that does not stand is made and saved.
+
+    What the other stages made is loaded where it is needed.
+
+    Parameters
+    ----------
+    results : Results
+    stages : collection of str
+    force : bool
+        Make them also where they stand.
+    pdf : bool
+        Draw figures as PDF, too.
+    ready : mapping of str to object, optional
+        Artefacts that were computed before and are only to be saved, by name.
+    """
+    r, run, config, base = results, results.run, results.config, results.base
+    source, ready = str(run.path), ready or {}
+
+    def stage(
+        name: str, artefact: str, make: Callable[[], Any], save: Callable[[Results], None]
+    ) -> None:
+        """Make and save an artefact, where its stage is among them."""
+        nonlocal r
+
+        def made() -> Results:
+            value = ready[artefact] if artefact in ready else make()
+            results_of_stage = r.having(**{artefact: value})
+            save(results_of_stage)
+            # matches are read back: their rows may name the files that they lie in from now on
+            return results_of_stage if name != "match" else r.having(inputs=r.inputs)
+
+        if name in stages:
+            r = run.make(name, made, force=force).value or r
+            release_memory()
+
+    def fitted() -> Fitted:
+        """The fit, unless the rehearsal has made it."""
+        return r.made.get("fitted") or fit(r.matched, config, base, r.reader).fitted
+
+    def exported() -> list[dict[str, Any]]:
+        evaluation, posterior = r.stored_evaluation, r.posterior
+        return export(
+            evaluation, posterior, r.stored, r.data, config, base, run.path, source=source
+        )
+
+    stage("match", "matched", lambda: match(r.inputs, config), save_matches)
+    stage("fit", "fitted", fitted, save_fit)
+    stage("sample", "posterior", lambda: _sampled(r), save_sampled)
+    stage("diagnose", "stored", lambda: diagnose(r.posterior, r.data, config, base), save_diagnosed)
+    stage("evaluate", "evaluation", lambda: evaluated(r), save_evaluation)
+    stage("export", "products", exported, save_products)
+    stage("report", "figures", lambda: report(r, pdf=pdf), save_figures)
+    return r
+
+
+def evaluated(results: Results) -> Evaluation:
+    """Maps, budget, margins and validity periods of a run that has been sampled and diagnosed."""
+    posterior, diagnostics, data = results.posterior, results.diagnostics, results.data
+    return evaluate(
+        error_model(posterior, diagnostics, data, results.config),
+        posterior,
+        diagnostics,
+        data,
+        results.config,
+        results.base,
+        source=results.source_name,
+        series=results.series,
+    )
+
+
+def _sampled(r: Results) -> Posterior:
+    """The posterior, with a progress bar."""
+    with progress_bar("sample") as progress:
+        return sample(r.data, r.config, folder=r.run.path, progress=progress)
+
+
+def continue_stage(
+    path: str | Path, stage: str, *, strict: bool = False, pdf: bool = False
+) -> RunDirectory:
+    """One stage of a run; 'assess' stands for 'diagnose' and 'evaluate'.
+
+    Parameters
+    ----------
+    path : path
+        Run directory.
+    stage : str
+    strict : bool
+        Of 'sample': as of `run`.
+    pdf : bool
+        Of 'report': whether figures are drawn as PDF, too.
+
+    Raises
+    ------
+    BayesdistError
+    """
+    directory = RunDirectory.open(path)
+    begins_with = kind_of(directory.config).begins_with
+    if stage == "match" != begins_with:
+        raise InputError(
+            "has no star lists to match", where=str(path), do="begin with the stage 'fit'"
+        )
+    stages = ASSESS if stage == "assess" else (stage,)
+    needs = (begins_with,) if stage == "fit" != begins_with else NEEDS[stages[0]]
+    directory.require(stage, needs)
+    with initialized(directory) as results:
+        results = make_stages(results, stages, force=True, pdf=pdf)
+        if stage == "sample":
+            _require_converged(results, strict)
+    return directory
+
+
+@contextmanager
+def initialized(directory: RunDirectory) -> Iterator[Results]:
+    """Results of a run whose folder is there, once it is known that it can be carried out."""
+    with open_results(directory) as results:
+        begins = directory.is_planned
+        if begins:
+            results = rehearse(results)
+        with directory.locked():
+            directory.begin()
+            if begins:
+                results = results.adopting_inputs()
+            with log_file(directory / "bayesdist.log"):
+                yield results
+
+
+def _require_converged(results: Results, strict: bool) -> None:
+    """Raise where a sampler has not converged, if that is asked for."""
+    posterior = results.posterior
+    if strict and convergence_check(posterior.convergence).level == "fail":
+        exact = posterior.sampler.exact
+        raise NotConvergedError(
+            f"the sampler has not converged ({'; '.join(posterior.convergence.reasons)})",
+            where=str(results.run.path),
+            do="raise sampler.max_steps and resume, or simplify the model"
+            if exact
+            else "set sampler.second_stage = 'always' and run with --force",
+        )

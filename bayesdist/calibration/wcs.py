@@ -1,0 +1,569 @@
+"""World coordinate systems of calibrations, as objects of the shared astropy interface (APE 14)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from astropy import units
+from astropy.coordinates import ICRS, SkyCoord
+from astropy.wcs.wcsapi import BaseLowLevelWCS
+from astropy.wcs.wcsapi.high_level_api import HighLevelWCSMixin
+from numpy.typing import ArrayLike
+
+from bayesdist.calibration import hooks
+from bayesdist.calibration.calibration import Calibration, GaussianSolution
+from bayesdist.calibration.chip_map import ChipMap, chip_of
+from bayesdist.calibration.modeling import plane_model, sky_model
+from bayesdist.calibration.plane import Plane, SkyPlacement
+from bayesdist.calibration.sky_positions import placement_of, plane_covariances, sky_positions
+from bayesdist.errors import BayesdistError, InputError
+from bayesdist.infer.solution.solution import LinearMap
+from bayesdist.infer.solution.transforms import at_exposure
+from bayesdist.mission import load_object
+from bayesdist.utils.arrays import Bool, Float
+from bayesdist.utils.numbers import number
+from bayesdist.utils.quantities import (
+    Direction,
+    Epoch,
+    Number,
+    Random,
+    direction_in,
+    generator_of,
+    value_in,
+    year_of,
+)
+
+if TYPE_CHECKING:
+    from astropy.modeling import Model
+    from astropy.wcs import WCS
+    from gwcs import WCS as GWCS
+
+__all__ = ["CalibrationWCS"]
+
+SIP_ORDER = 9  # highest order of a SIP polynomial
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class CalibrationWCS(BaseLowLevelWCS, HighLevelWCSMixin):
+    """World coordinate system of one chip at one date, with its errors.
+
+    `Calibration.wcs` makes it.  It has both interfaces of APE 14: methods that take and return
+    numbers, such as `pixel_to_world_values`, and methods that take and return objects, such as
+    `pixel_to_world`.  Any package that accepts such a WCS accepts it, among them photutils,
+    reproject, regions, ndcube and the axes of astropy for matplotlib.
+
+    Pixels are 0-based: the centre of the first pixel is (0, 0).  World coordinates are right
+    ascension and declination (ICRS) in degrees, or u and v if the plane of the calibration has no
+    position on the sky.  Positions have any shape and are broadcast.  Pixels are found by Newton's
+    method on the same map, look-up tables included; they are NaN if there is no solution.
+
+    Parameters
+    ----------
+    calibration : Calibration
+        Calibration of a single chip that does not depend on time.
+    placement : SkyPlacement or None
+        Tangent point on the sky and directions of u and v; None for a WCS of u and v.
+
+    Examples
+    --------
+    >>> rng = np.random.default_rng(1)
+    >>> chip = bd.Chip(1, "camera", (1000, 1000), (500.5, 500.5))
+    >>> model = bd.DistortionModel(1, (chip,), "arcsec")
+    >>> truth = [0, -50, 0, 0, 0, 50]
+    >>> stars, _ = bd.simulate_matches(model, truth, 500, sigma=0.01, fraction=0.0, rng=rng)
+    >>> calibration = bd.Calibration("camera", bd.fit_linear(stars, model))
+    >>> wcs = calibration.wcs(point=(150.0, 2.2))
+    >>> wcs.pixel_to_world(499.5, 499.5).to_string(precision=4)
+    '150 2.2'
+    >>> x, y = wcs.world_to_pixel_values(150.0, 2.2)
+    >>> bool(np.hypot(x - 499.5, y - 499.5) < 0.05)
+    True
+    >>> cov = wcs.covariance(499.5, 499.5)  # of the mean of 500 stars
+    >>> bool(abs(cov[0, 0].to_value("mas2") ** 0.5 - 10 / 500**0.5) < 0.01)
+    True
+    """
+
+    calibration: Calibration
+    placement: SkyPlacement | None = None
+
+    @cached_property
+    def chip_map(self) -> ChipMap:
+        """Map from FITS 1-based pixels to the plane (u, v), look-up tables included."""
+        [chip_map] = self.calibration.with_tables(self.calibration.at(origin="stated")).values()
+        return chip_map
+
+    @property
+    def chip(self) -> int:
+        """Number of the chip."""
+        return self.calibration.numbers[0]
+
+    # -- values -----------------------------------------------------------------------------------
+
+    def pixel_to_world_values(self, *pixel_arrays: ArrayLike) -> tuple[Float, Float]:
+        """World coordinates of pixels.
+
+        Parameters
+        ----------
+        *pixel_arrays : array_like
+            0-based x and y of any shape.
+
+        Returns
+        -------
+        tuple of ndarray
+            Right ascension and declination in degrees, or u and v in the unit of the calibration;
+            numbers if x and y are numbers.
+        """
+        x, y, shape = _flat(*pixel_arrays)
+        plane = self.chip_map.at(x + 1.0, y + 1.0)
+        first, second = plane if self.placement is None else self.placement.sky(plane)
+        return first.reshape(shape)[()], second.reshape(shape)[()]
+
+    def world_to_pixel_values(self, *world_arrays: ArrayLike) -> tuple[Float, Float]:
+        """Pixels of world coordinates.
+
+        Parameters
+        ----------
+        *world_arrays : array_like
+            Right ascension and declination in degrees, or u and v in the unit of the calibration,
+            of any shape.
+
+        Returns
+        -------
+        tuple of ndarray
+            0-based x and y; NaN if no pixel of the chip or around it has this position.
+        """
+        first, second, shape = _flat(*world_arrays)
+        plane = np.stack([first, second])
+        if self.placement is not None:
+            plane = self.placement.plane(first, second)
+        pixels, slope = self.chip_map.pixels(plane)
+        pixels[:, ~self._same_side(slope)] = np.nan
+        x, y = pixels - 1.0
+        return x.reshape(shape)[()], y.reshape(shape)[()]
+
+    def _same_side(self, slope: Float) -> Bool:
+        """Boolean mask (N,) of slopes (N, 2, 2) that are not beyond a fold of the map."""
+        return np.linalg.det(slope) * np.linalg.det(self.chip_map.linear) > 0
+
+    # -- description of the axes ------------------------------------------------------------------
+
+    @property
+    def pixel_n_dim(self) -> int:
+        """Number of pixel axes."""
+        return 2
+
+    @property
+    def world_n_dim(self) -> int:
+        """Number of world axes."""
+        return 2
+
+    @property
+    def pixel_axis_names(self) -> tuple[str, str]:
+        """Names of the pixel axes."""
+        return "x", "y"
+
+    @property
+    def world_axis_names(self) -> tuple[str, str]:
+        """Names of the world axes."""
+        return ("u", "v") if self.placement is None else ("ra", "dec")
+
+    @property
+    def world_axis_physical_types(self) -> tuple[str, str]:
+        """Physical types of the world axes: UCDs on the sky, otherwise custom types."""
+        if self.placement is None:
+            return "custom:pos.detector.u", "custom:pos.detector.v"
+        return "pos.eq.ra", "pos.eq.dec"
+
+    @property
+    def world_axis_units(self) -> tuple[str, str]:
+        """Units of the world axes."""
+        unit = self.calibration.unit if self.placement is None else "deg"
+        return unit, unit
+
+    @property
+    def axis_correlation_matrix(self) -> Bool:
+        """Matrix that is True where a world axis depends on a pixel axis: everywhere."""
+        return np.ones((2, 2), bool)
+
+    @property
+    def world_axis_object_components(self) -> list[tuple[str, int, str]]:
+        """Object, argument and attribute of each world axis."""
+        if self.placement is None:
+            return [("u", 0, "value"), ("v", 0, "value")]
+        return [
+            ("celestial", 0, "spherical.lon.degree"),
+            ("celestial", 1, "spherical.lat.degree"),
+        ]
+
+    @property
+    def world_axis_object_classes(self) -> dict[str, tuple[type, tuple[()], dict[str, Any]]]:
+        """Classes of the world objects: a SkyCoord (ICRS), or Quantities u and v."""
+        if self.placement is None:
+            unit = units.Unit(self.calibration.unit)
+            return {axis: (units.Quantity, (), {"unit": unit}) for axis in ("u", "v")}
+        return {"celestial": (SkyCoord, (), {"frame": ICRS(), "unit": units.deg})}
+
+    @property
+    def pixel_shape(self) -> tuple[int, int]:
+        """Columns and rows of the chip."""
+        nx, ny = self.chip_map.basis.size
+        return round(nx), round(ny)
+
+    @property
+    def array_shape(self) -> tuple[int, int]:
+        """Rows and columns of the chip, the shape of its image as an array."""
+        nx, ny = self.pixel_shape
+        return ny, nx
+
+    @property
+    def pixel_bounds(self) -> tuple[tuple[float, float], tuple[float, float]]:
+        """Edges of the chip in x and in y."""
+        nx, ny = self.chip_map.basis.size
+        return (-0.5, nx - 0.5), (-0.5, ny - 0.5)
+
+    @property
+    def bounding_box(self) -> tuple[tuple[float, float], tuple[float, float]]:
+        """Edges of the chip in x and in y, as `pixel_bounds`; pixels outside are mapped too."""
+        return self.pixel_bounds
+
+    # -- errors -----------------------------------------------------------------------------------
+
+    def covariance(
+        self, x: ArrayLike, y: ArrayLike, *, joint: bool = False, further: bool = True
+    ) -> units.Quantity:
+        """Covariance of the positions of pixels.
+
+        It contains the errors of the coefficients and the `further` errors of the calibration, the
+        same as `bayesdist apply --sky`.  Errors of centroids are not contained.
+
+        Parameters
+        ----------
+        x, y : array_like
+            0-based pixels of any shape.
+        joint : bool
+            Give the covariance between all positions too.
+        further : bool
+            False to leave out the further errors of the calibration: the covariance is then that of
+            the draws of `draw`.
+
+        Returns
+        -------
+        astropy.units.Quantity
+            In mas^2 along east and north, or along u and v in the square of their unit.  The shape
+            is that of the positions followed by (2, 2); with `joint` it is (2 N, 2 N) for N
+            positions, with the two axes of each position next to each other.
+
+        Raises
+        ------
+        InputError
+            If the calibration states no errors.
+        """
+        px, py, shape = _flat(x, y)
+        calibration = self.calibration if further else replace(self.calibration, further=())
+        if self.placement is None:
+            single, whole = plane_covariances(
+                calibration,
+                {self.chip: self.chip_map},
+                px + 1.0,
+                py + 1.0,
+                np.full(px.shape, self.chip),
+                joint=joint,
+            )
+            unit = units.Unit(self.calibration.unit) ** 2
+        else:
+            at = sky_positions(
+                calibration, px + 1.0, py + 1.0, self.chip, placement=self.placement, joint=joint
+            )
+            single, whole, unit = at.cov, at.joint, units.mas**2
+        if single is None:
+            raise InputError(
+                "states no errors of its coefficients",
+                where=self.calibration.name,
+                do="use a run, or a file that holds the covariance",
+            )
+        if whole is not None:
+            return units.Quantity(whole.reshape(2 * px.size, 2 * px.size), unit)
+        return units.Quantity(single.reshape(*shape, 2, 2), unit)
+
+    def draw(self, n: int, rng: Random) -> list[CalibrationWCS]:
+        """Random draws from the posterior of the WCS.
+
+        Each is a possible WCS of the same chip, without errors.  The coefficients vary as in the
+        posterior; the further errors of the calibration are not drawn.
+
+        Parameters
+        ----------
+        n : int
+            Number of draws.
+        rng : int or numpy.random.Generator
+            Seed or random generator.
+
+        Returns
+        -------
+        list of CalibrationWCS
+
+        Raises
+        ------
+        InputError
+            If the calibration states no errors of its coefficients.
+        """
+        if self.calibration.errors == "none":
+            raise InputError(
+                "states no errors of its coefficients, so there is nothing to draw",
+                where=self.calibration.name,
+                do="use a run, or a file that holds the covariance",
+            )
+        solution = self.calibration.solution
+        exact = np.zeros((solution.model.n_params,) * 2)
+        return [
+            replace(
+                self,
+                calibration=replace(
+                    self.calibration,
+                    name=f"{self.calibration.name}, draw {k}",
+                    solution=GaussianSolution(solution.model, theta, exact),
+                    errors="none",
+                    further=(),
+                ),
+            )
+            for k, theta in enumerate(solution.draws(n, generator_of(rng)), start=1)
+        ]
+
+    # -- other objects ----------------------------------------------------------------------------
+
+    def to_model(self) -> Model:
+        """Compound model of astropy.modeling from 0-based pixels to the world, with its inverse.
+
+        Returns
+        -------
+        astropy.modeling.Model
+            Two inputs, x and y; two outputs, right ascension and declination in degrees, or u and
+            v.  `inverse` iterates on the map, as `world_to_pixel_values` does.
+        """
+        if self.placement is None:
+            return plane_model(self.chip_map)
+        return sky_model(self.chip_map, self.placement)
+
+    def to_gwcs(self) -> GWCS:
+        """WCS of the package gwcs, with the same map and its inverse.
+
+        Returns
+        -------
+        gwcs.WCS
+            From a frame ``detector`` in pixels to a frame ``world``: ICRS, or u and v.  Its
+            bounding box is the chip.
+
+        Raises
+        ------
+        InputError
+            If gwcs is not installed.
+        """
+        try:
+            import gwcs
+            from gwcs import coordinate_frames as frames
+        except ImportError:
+            raise InputError(
+                "gwcs is not installed", where="to_gwcs", do="install gwcs 1.0 or newer"
+            ) from None
+        pixel = (units.pix, units.pix)
+        detector = frames.Frame2D(name="detector", axes_names=self.pixel_axis_names, unit=pixel)
+        if self.placement is None:
+            unit = units.Unit(self.calibration.unit)
+            world = frames.Frame2D(
+                name="world",
+                axes_names=self.world_axis_names,
+                unit=(unit, unit),
+                axis_physical_types=self.world_axis_physical_types,
+            )
+        else:
+            world = frames.CelestialFrame(
+                name="world", reference_frame=ICRS(), unit=(units.deg, units.deg)
+            )
+        out = gwcs.WCS([(detector, self.to_model()), (world, None)])
+        out.bounding_box = self.bounding_box
+        out.pixel_shape = self.pixel_shape
+        return out
+
+    def to_fits_sip(self, *, max_residual: float = 0.0) -> WCS:
+        """WCS of astropy.wcs with SIP polynomials.
+
+        It is exact for a polynomial up to order 9 without look-up tables.  Otherwise a polynomial
+        of order 9 is fitted over the chip if that is allowed by `max_residual`.
+
+        Parameters
+        ----------
+        max_residual : float
+            Largest distance in pixels that the fitted polynomial may have from the map.
+
+        Returns
+        -------
+        astropy.wcs.WCS
+            `to_header(relax=True)` writes it as a FITS header.
+
+        Raises
+        ------
+        InputError
+            If the plane has no position on the sky, or the fitted polynomial is farther from the
+            map than `max_residual`; the message states its largest and rms distance.
+        """
+        placement = self.placement
+        if placement is None:
+            raise InputError(
+                "has no position on the sky, and a SIP header has to state one",
+                where=self.calibration.name,
+                do="give wcs the point, the sky position of u, v = 0",
+            )
+        chip_map, worst, rms = self.chip_map.polynomial(
+            min(self.chip_map.basis.order, SIP_ORDER)
+            if not (self.chip_map.before or self.chip_map.after)
+            else SIP_ORDER
+        )
+        if worst > max_residual:
+            raise InputError(
+                f"look-up tables or terms above order {SIP_ORDER} cannot be written in SIP: a "
+                f"polynomial of order {chip_map.basis.order} differs by up to {worst:.2g} pixels "
+                f"(rms {rms:.2g})",
+                where=self.calibration.name,
+                do=f"give max_residual={_rounded_up(worst):g} to accept that, or use to_gwcs",
+            )
+        return load_object(hooks.SIP)(self._on_tangent_plane(chip_map), placement.point)
+
+    def _on_tangent_plane(self, chip_map: ChipMap) -> Calibration:
+        """Calibration of the chip in arcsec to the east and north of the tangent point."""
+        placement = self.placement
+        assert placement is not None
+        K = chip_map.basis.n_terms
+        model = replace(self.calibration.model, order=chip_map.basis.order, unit="arcsec")
+        matrix = np.asarray(np.kron(placement.matrix, np.eye(K)), float)
+        cov = np.zeros((2 * K, 2 * K)) if chip_map.cov is None else chip_map.cov
+        source = GaussianSolution(model, chip_map.coefficients.ravel(), cov)
+        return Calibration(
+            self.calibration.name,
+            source.transformed(model, LinearMap(matrix), matrix),
+            Plane("sky", point=placement.point),
+            errors=self.calibration.errors,
+            notes=self.calibration.notes,
+        )
+
+    # -- in words ---------------------------------------------------------------------------------
+
+    def __repr__(self) -> str:
+        nx, ny = self.pixel_shape
+        lines = [
+            f"<CalibrationWCS of {self.calibration.name!r}, chip {self.chip}, {nx} x {ny} pixels"
+        ]
+        x, y = (nx - 1) / 2, (ny - 1) / 2
+        try:
+            lines += self._centre_lines(x, y)
+        except BayesdistError as error:
+            lines.append(f"  {error.cause}")
+        lines.append(f"  {'1 sigma':<9} {self._sigma_words(x, y)}")
+        return "\n".join(lines) + ">"
+
+    def _centre_lines(self, x: float, y: float) -> list[str]:
+        """Lines on the position of the centre, the pixel scale and the parity."""
+        world = self.pixel_to_world_values(x, y)
+        slope = self.chip_map.slope(x + 1.0, y + 1.0)[0]
+        if self.placement is None:
+            unit, across = self.calibration.unit, np.hypot(*slope)
+            return [
+                f"  centre    u {world[0]:.6g}, v {world[1]:.6g} {unit}; not on the sky: give wcs "
+                "the point",
+                f"  pixel     {across[0]:.6g} x {across[1]:.6g} {unit}, "
+                + ("u, v as x, y" if np.linalg.det(slope) > 0 else "u, v mirrored against x, y"),
+            ]
+        [step] = self.placement.steps(*(np.array([w]) for w in world)) @ slope / 1e3
+        across = np.hypot(*step)
+        angle = np.degrees(np.arctan2(step[0, 1], step[1, 1]))
+        sky = np.linalg.det(step) < 0
+        return [
+            f"  centre    RA {world[0]:.7f}, Dec {world[1]:+.7f} deg (ICRS)",
+            f"  pixel     {across[0]:.6g} x {across[1]:.6g} arcsec, +y at position angle "
+            f"{angle:.4g} deg, {'parity as on the sky' if sky else 'a mirror image of the sky'}",
+        ]
+
+    def _sigma_words(self, x: float, y: float) -> str:
+        """Standard deviations along an axis at the centre and in the worst corner."""
+        corners = ([x, 0.0, 2 * x, 0.0, 2 * x], [y, 0.0, 0.0, 2 * y, 2 * y])
+        try:
+            cov = self.covariance(*corners)
+        except InputError:
+            return "not known"
+        sigma = np.sqrt(np.trace(cov.value, axis1=1, axis2=2) / 2)
+        unit = self.calibration.unit if self.placement is None else "mas"
+        centre, corner = number(sigma[0], 2), number(sigma[1:].max(), 2)
+        return f"{centre} {unit} at the centre, {corner} {unit} in the worst corner, along an axis"
+
+
+def wcs_of_chip(
+    calibration: Calibration,
+    chip: int | None,
+    *,
+    epoch: Epoch | None,
+    point: Direction | None,
+    position_angle: Number | None,
+    mirrored: bool,
+    pixel_scale: Number | None,
+) -> CalibrationWCS:
+    """WCS of a chip; arguments as for `Calibration.wcs`."""
+    numbers = calibration.numbers
+    if chip is None and len(numbers) > 1:
+        raise InputError(
+            "has several chips and no chip is given",
+            where=calibration.name,
+            do=f"choose one of {', '.join(map(str, numbers))}",
+        )
+    date = None if epoch is None else year_of(epoch)
+    number = numbers[0] if chip is None else chip
+    chip_of(calibration.at(date), number, calibration.name)
+    placement = None
+    if calibration.plane.point is not None or point is not None:
+        placement = placement_of(
+            calibration,
+            None if point is None else direction_in(point, "point", where="wcs"),
+            position_angle=None
+            if position_angle is None
+            else value_in(position_angle, "deg", "position_angle", where="wcs"),
+            mirrored=mirrored,
+            pixel_scale=None
+            if pixel_scale is None
+            else value_in(pixel_scale, "arcsec", "pixel_scale", where="wcs"),
+        )
+    elif position_angle is not None or mirrored or pixel_scale is not None:
+        raise InputError(
+            "has no position on the sky, to which the directions and the scale of u and v refer",
+            where=calibration.name,
+            do="give the point, the sky position of u, v = 0, too",
+        )
+    return CalibrationWCS(_at_date(calibration, number, date), placement)
+
+
+def _at_date(calibration: Calibration, number: int, epoch: float | None) -> Calibration:
+    """Calibration of one chip at a date, with the draws of its solution."""
+    date = calibration.reference_date if epoch is None else epoch
+    return replace(
+        calibration,
+        solution=at_exposure(calibration.solution, epoch=date, chips=(number,)),
+        before=tuple(t for t in calibration.before if t.chip == number),
+        after=tuple(t for t in calibration.after if t.chip == number),
+        inverses={k: v for k, v in calibration.inverses.items() if k == number},
+        reference_date=None,
+        undated="",
+        no_date="",
+        with_plane=None,
+    )
+
+
+def _rounded_up(value: float) -> float:
+    """Value rounded up to two digits."""
+    step = 10.0 ** (np.floor(np.log10(value)) - 1)
+    return float(np.ceil(value / step) * step)
+
+
+def _flat(*arrays: ArrayLike) -> tuple[Float, Float, tuple[int, ...]]:
+    """Two arrays (N,), broadcast, and the shape that they had."""
+    first, second = np.broadcast_arrays(*(np.asarray(one, float) for one in arrays))
+    return first.ravel(), second.ravel(), first.shape

@@ -1,0 +1,63 @@
+"""Axes, units and titles of the plots."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import matplotlib
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.cm import ScalarMappable
+
+from bayesdist.errors import InputError
+from bayesdist.utils.numbers import Scale, display_scale
+
+
+def axes_of(ax: Axes | None, *, height: float = 0.0) -> Axes:
+    """Axes to draw into: `ax`, or those of a new pyplot figure if it is None.
+
+    The new figure has the size of the user's style and is at least `height` inches high.
+    """
+    if ax is None:
+        from matplotlib import pyplot  # pyplot chooses a backend: only if a figure is asked for
+
+        size = matplotlib.rcParams["figure.figsize"]
+        # compressed: labels fit, and maps, whose pixels are square, have no room around them
+        _, made = pyplot.subplots(figsize=(size[0], max(size[1], height)), layout="compressed")
+        return made
+    if not isinstance(ax, Axes):
+        shape = f" of shape {np.shape(ax)}" if np.ndim(ax) else ""
+        raise InputError(
+            f"ax is a {type(ax).__name__}{shape}",
+            where="plot",
+            do="give one matplotlib Axes, such as an element of that array",
+        )
+    return ax
+
+
+def scale_of(unit: str, largest: float, scale_mas: float | None) -> Scale:
+    """Unit in which values of at most `largest` are shown, and the factor that leads to it.
+
+    Pixels become milliarcseconds if `scale_mas`, the size of a pixel, is given.
+    """
+    if scale_mas is None or unit != "pix":
+        return display_scale(unit, largest)
+    scale = display_scale("mas", largest * scale_mas)
+    return Scale(scale.factor * scale_mas, scale.unit)
+
+
+def add_colorbar(ax: Axes, drawn: ScalarMappable, label: str, **look: Any) -> None:
+    """Draw a colour bar beside `ax` that is as high as `ax`, whatever the layout of the figure."""
+    ax.figure.colorbar(drawn, cax=ax.inset_axes((1.03, 0.0, 0.05, 1.0)), label=label, **look)
+
+
+def set_title(
+    ax: Axes, title: str | None, default: str, name: str = "", *, pad: float | None = None
+) -> None:
+    """Set the title of a plot: the default one if `title` is None, and none if it is empty.
+
+    The default one begins with the name of the chip if there is one.
+    """
+    text = (f"{name}: {default}" if name else default) if title is None else title
+    if text:
+        ax.set_title(text, pad=pad)

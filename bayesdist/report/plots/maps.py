@@ -1,0 +1,193 @@
+"""Plots over the detector: uncertainty of the position, and distortion."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+from matplotlib.axes import Axes
+from numpy.typing import ArrayLike
+
+from bayesdist.errors import require_known
+from bayesdist.report.figures.arrows import (
+    Arrows,
+    crosses_magnification,
+    draw_arrows,
+    draw_crosses,
+    draw_key,
+    magnification_of,
+)
+from bayesdist.report.figures.fields import Grid, contour_levels, draw_grid
+from bayesdist.report.figures.panels import chip_axes
+from bayesdist.report.figures.style import COLORBAR, nice_below
+from bayesdist.report.plots.axes import add_colorbar, axes_of, scale_of, set_title
+from bayesdist.utils.numbers import number, size_of
+
+if TYPE_CHECKING:
+    from bayesdist.assess import UncertaintyMap, VectorMap
+
+KINDS = ("contours", "crosses")
+KEY_PAD = 20.0  # points between a panel and its title, so that the key fits below the title
+BORDER = 0.02  # of the longer side of a chip, around its outline
+
+
+def plot_map(
+    uncertainty_map: UncertaintyMap,
+    ax: Axes | None = None,
+    *,
+    kind: str = "contours",
+    scale_mas: float | None = None,
+    levels: ArrayLike | None = None,
+    magnification: float | None = None,
+    colorbar: bool | Sequence[Axes] = True,
+    name: str = "",
+    title: str | None = None,
+) -> Axes:
+    """Plot the uncertainty of the position over a chip.
+
+    Parameters
+    ----------
+    uncertainty_map : UncertaintyMap
+    ax : matplotlib.axes.Axes, optional
+        A new figure is made without it.
+    kind : str
+        'contours': filled contours of the uncertainty per axis, the rms of sigma_u and sigma_v,
+        with a ring where it is largest. 'crosses': four vectors from each point of the grid, to all
+        combinations of (+-sigma_u, +-sigma_v), enlarged as the key above the axes states.
+    scale_mas : float, optional
+        Size of a pixel in mas; if given, errors in pixels are shown in mas.
+    levels : array_like, optional
+        Levels of the contours in the unit of the map, such as those of another plot; round numbers
+        by default.
+    magnification : float, optional
+        Length of the crosses in pixels of the axes for an error of 1; a round number by default.
+    colorbar : bool or sequence of matplotlib.axes.Axes
+        True for a colour bar of the contours beside `ax`; or all axes that share this colour bar.
+    name : str
+        Name of the chip, which begins the default title.
+    title : str, optional
+        By default the solution and its range of errors; an empty title for none.
+
+    Returns
+    -------
+    matplotlib.axes.Axes
+
+    Raises
+    ------
+    InputError
+        For an unknown kind, or if `ax` is not one Axes.
+
+    Examples
+    --------
+    >>> matches, truth = bd.simulate_wise(500, rng=np.random.default_rng(1))
+    >>> model = bd.build_model(matches, order=2, size=(1016, 1016))
+    >>> errors = bd.uncertainty_map(bd.fit_linear(matches, model))
+    >>> ax = plot_map(errors, Figure().subplots())
+    >>> ax.get_xlabel()
+    'x [pix]'
+    """
+    require_known(kind, KINDS, "kind of map", where="kind")
+    ax, m = axes_of(ax), uncertainty_map
+    size = float(m.x[-1]), float(m.y[-1])
+    if kind == "crosses":
+        M = crosses_magnification([m]) if magnification is None else magnification
+        chip_axes(ax, size, margin=M * max(m.sigma_u_max, m.sigma_v_max) + BORDER * max(size))
+        draw_crosses(ax, m, magnification=M)
+        key = _key_length(m.radius_max, m.unit, scale_mas)
+        draw_key(ax, key, magnification=M, unit=m.unit, scale_mas=scale_mas)
+        largest = float(m.per_axis.max())
+        scale = scale_of(m.unit, largest, scale_mas)
+        default = f"{m.kind}, largest {scale.text(largest)} per axis"
+        set_title(ax, title, default, name, pad=KEY_PAD)
+        return ax
+    chip_axes(ax, size)
+    scale = scale_of(m.unit, float(m.per_axis.max()), scale_mas)
+    grid = Grid(m.x, m.y, m.per_axis * scale.factor, m.position_of_max)
+    shown = contour_levels(grid.values) if levels is None else np.asarray(levels) * scale.factor
+    drawn = draw_grid(ax, grid, levels=shown)
+    label = f"per axis (1 σ) [{scale.unit}]"
+    if colorbar is True:
+        add_colorbar(ax, drawn, label)
+    elif colorbar is not False:
+        ax.figure.colorbar(drawn, ax=list(colorbar), label=label, **COLORBAR)
+    low, high = number(grid.values.min()), number(grid.values.max())
+    set_title(ax, title, f"{m.kind}: {low} to {high}", name)
+    return ax
+
+
+def plot_distortion(
+    vector_map: VectorMap,
+    ax: Axes | None = None,
+    *,
+    scale_mas: float | None = None,
+    magnification: float | None = None,
+    key: float | None = None,
+    name: str = "",
+    title: str | None = None,
+) -> Axes:
+    """Plot the distortion of a chip as vectors, with a ring around the origin of the longest.
+
+    Vectors are along x and y of the detector and in its pixels. They run from a position to where
+    the distortion moves it, enlarged as the key above the axes states.
+
+    Parameters
+    ----------
+    vector_map : VectorMap
+        Of `distortion_vectors`.
+    ax : matplotlib.axes.Axes, optional
+        A new figure is made without it.
+    scale_mas : float, optional
+        Size of a pixel in mas; if given, lengths are stated in mas.
+    magnification : float, optional
+        By which vectors are enlarged; a round number by default.
+    key : float, optional
+        Length of the vector above the axes, in pixels; a round number by default.
+    name : str
+        Name of the chip, which begins the default title.
+    title : str, optional
+        By default the largest length; an empty title for none.
+
+    Returns
+    -------
+    matplotlib.axes.Axes
+
+    Examples
+    --------
+    >>> matches, truth = bd.simulate_wise(500, rng=np.random.default_rng(1))
+    >>> model = bd.build_model(matches, order=2, size=(1016, 1016))
+    >>> vectors = distortion_vectors(bd.fit_linear(matches, model), grid=(9, 9))
+    >>> ax = plot_distortion(vectors, Figure().subplots())
+    >>> ax.get_aspect()
+    1.0
+    """
+    ax, size = axes_of(ax), (float(vector_map.x[-1]), float(vector_map.y[-1]))
+    arrows = Arrows.of_map(vector_map)
+    M = distortion_magnification([vector_map]) if magnification is None else magnification
+    chip_axes(ax, size, margin=arrows.reach(M, size) + BORDER * max(size))
+    draw_arrows(ax, arrows, magnification=M)
+    largest = _largest(vector_map)
+    length = _key_length(largest / 1.5, "pix", scale_mas) if key is None else key
+    draw_key(ax, length, magnification=M, scale_mas=scale_mas)
+    shown = size_of(largest, digits=4) if scale_mas is None else size_of(largest * scale_mas, "mas")
+    set_title(ax, title, f"largest {shown}", name, pad=KEY_PAD)
+    return ax
+
+
+def distortion_magnification(vectors: Sequence[VectorMap]) -> float:
+    """Round factor that draws the longest vector of some maps as 1.5 grid steps, or less.
+
+    At that length vectors do not hide their neighbours, which have nearly the same direction.
+    """
+    return min(magnification_of(1.5 * Arrows.of_map(v).step, _largest(v)) for v in vectors)
+
+
+def _largest(vectors: VectorMap) -> float:
+    """Largest length in pixels of the detector."""
+    return float(np.hypot(*vectors.on_detector).max())
+
+
+def _key_length(below: float, unit: str, scale_mas: float | None) -> float:
+    """Length of a key in `unit`, not above a limit, that is a round number where it is stated."""
+    factor = scale_mas if scale_mas is not None and unit == "pix" else 1.0
+    return nice_below(below * factor) / factor

@@ -1,0 +1,103 @@
+"""Truths carried through the functions of the Python interface, one by one."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from astropy.table import Table
+
+import bayesdist as bd
+from bayesdist.assess import Catalogue
+from bayesdist.assess.statistics import field_statistic
+from bayesdist.diagnose.diagnostics import Diagnostics, diagnose
+from bayesdist.model.grid import grid_pixels, mesh
+
+from .fields import SIDE
+from .measure import DRAWS, GRID
+from .truth import Truth
+
+
+@dataclass(frozen=True)
+class Steps:
+    """What the single functions made of one truth."""
+
+    truth: Truth
+    seed: int
+    matches: bd.Matches
+    fit: bd.LinearFit
+    posterior: bd.Posterior
+    diagnostics: Diagnostics
+    # of budget and verdicts: terms and where errors are assessed
+    options: dict[str, Any] = field(default_factory=dict)
+
+    def margins(self, requirements: Sequence[bd.Requirement], **options: Any) -> tuple[Any, ...]:
+        given = {"diagnostics": self.diagnostics, "rng": self.seed} | self.options | options
+        return bd.check_requirements(self.posterior, requirements, **given)
+
+    def budget(self, **options: Any) -> bd.ErrorBudget:
+        given = {"diagnostics": self.diagnostics, "rng": self.seed} | self.options | options
+        return bd.error_budget(self.posterior, **given)
+
+    def actual_error(self) -> np.ndarray:
+        """Predicted less true positions (ny * nx, 2), the best shift and rotation taken off.
+
+        A statement on positions can be read as one of relative positions, and this is its kindest
+        reading: no frame of the observer makes the error smaller.
+        """
+        model, mean = self.posterior.model, np.asarray(self.posterior.mean)
+        x, y = mesh(*grid_pixels(model.chips[0].size, GRID))
+        epoch = self.truth.epoch
+        when = {"epoch": None if epoch is None else np.full(x.size, epoch)}
+        true = self.truth.true_map(x, y, epoch)
+        if model.frames == "none":
+            error = np.asarray(model.predict(mean, x, y, **when)) - true
+        else:
+            code = int(np.random.default_rng([7, self.seed]).integers(1, len(model.exposures)))
+            seen = model.predict(mean, x, y, exposure=np.full(x.size, code), **when)
+            error = self.truth.frames[model.exposures[code]].undone(np.asarray(seen)) - true
+        one, zero = np.ones(x.size), np.zeros(x.size)
+        u, v = true.T
+        design = np.concatenate(
+            [np.column_stack([one, zero, -v]), np.column_stack([zero, one, u])]
+        )  # shift along u and v, and a small rotation
+        along = error.T.ravel()
+        left = along - design @ np.linalg.lstsq(design, along, rcond=None)[0]
+        return left.reshape(2, -1).T
+
+    def true_p95(self) -> float:
+        return float(field_statistic("p95", self.actual_error()))
+
+
+def carried(truth: Truth, folder: Path, seed: int) -> Steps:
+    """Stars of a truth fitted, sampled and diagnosed by the functions of the Python interface."""
+    config, path = truth.config, folder / "stars.parquet"
+    Table(truth.stars).write(path, overwrite=True)
+    matches = bd.read_matches(path, unit="pix")
+    drift = config["model"].get("tdd")
+    model = bd.build_model(
+        matches,
+        order=config["model"]["order"],
+        size=(float(SIDE), float(SIDE)),
+        name="A",
+        frames=config["model"].get("frames", "none"),
+        time=None
+        if drift is None
+        else bd.TimeDependence(tuple(map(tuple, drift["terms"])), (drift["epoch0"],)),
+    )
+    fit = bd.fit_linear(matches, model)
+    outliers = bd.OutlierMixture(**config.get("outliers", {}))
+    posterior = bd.sample(fit, matches, outliers=outliers, seed=seed)
+    options: dict[str, Any] = {"grid": GRID, "n_draws": DRAWS, "epoch": truth.epoch}
+    options["exposure"] = config.get("assess", {}).get("exposure", "mean")
+    rows = config.get("budget", [])
+    if rows:
+        (row,) = rows
+        sizes = row["sigma_u"], row["sigma_v"]
+        options["catalogue"] = Catalogue(row["name"], sizes, row["unit"], row.get("source", ""))
+    return Steps(
+        truth, seed, matches, fit, posterior, diagnose(posterior, matches, rng=seed), options
+    )

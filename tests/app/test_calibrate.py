@@ -1,0 +1,207 @@
+"""A run in Python: the numbers of the command line, in memory and in a folder."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import astropy.units as u
+import numpy as np
+import pytest
+from astropy.table import QTable
+from astropy.time import Time
+
+import bayesdist as bd
+
+from .conftest import BUDGET, REQUIREMENTS
+from .support import CENTRE, SIZE, as_table, good, simulated, summary_of, write_job
+
+SETTINGS = {
+    "sampler": {"target_ess": 100, "target_rhat": 1.05},
+    "assess": {"grid": (9, 7), "draws": 400},
+}
+
+
+def calibrated(stars, **options):
+    """A small run in memory, of the settings of `config_text`."""
+    settings = SETTINGS | options.pop("settings", {})
+    given = {"order": 2, "size": SIZE, "reference_pixel": CENTRE, "name": "A"}
+    return bd.calibrate(stars, settings=settings, **(given | options))
+
+
+@pytest.fixture(scope="module")
+def run(finished):
+    return calibrated(
+        bd.read_matches(finished.config.parent / "stars.ecsv"),
+        scale_mas=50.0 * u.mas,
+        requirements=[bd.Requirement(**one) for one in REQUIREMENTS],
+        terms=[bd.UserTerm(**one) for one in BUDGET],
+        settings={"products": {"sip": {"inverse_order": 4}}},
+    )
+
+
+@pytest.fixture(scope="module")
+def saved(run, tmp_path_factory):
+    return run.save(tmp_path_factory.mktemp("python") / "run")
+
+
+def assert_same(one: bd.Run, other: bd.Run):
+    """Two runs are equal to the last bit, from the fit to the margins."""
+    np.testing.assert_array_equal(one.fit.mean, other.fit.mean)
+    np.testing.assert_array_equal(one.posterior.theta, other.posterior.theta)
+    np.testing.assert_array_equal(one.solution.theta, other.solution.theta)
+    assert one.budget().rows() == other.budget().rows()
+    assert one.budget(at=(10, 10), to=(900, 700)).rows() == (
+        other.budget(at=(10, 10), to=(900, 700)).rows()
+    )
+    assert one.evaluation.checks == other.evaluation.checks
+    assert one.warnings == other.warnings
+    np.testing.assert_array_equal(one.map().radius, other.map().radius)
+    for margin, known in zip(one.margins, other.margins, strict=True):
+        assert (margin.verdict, margin.reason) == (known.verdict, known.reason)
+        np.testing.assert_array_equal(margin.draws, known.draws)
+    assert one.diagnostics.score_tests == other.diagnostics.score_tests
+
+
+def test_python_and_the_command_line_agree_to_the_bit(run, finished):
+    with bd.open_run(finished.path) as other:
+        assert len(other.margins) == 3
+        assert_same(run, other)
+
+
+def test_a_saved_run_is_the_run(run, saved):
+    with bd.open_run(saved) as other:
+        assert_same(run, other)
+        assert other.folder == saved and run.folder is None
+        assert other.matches.n_rows == run.matches.n_rows
+
+
+def test_commands_read_a_saved_run(saved, tmp_path):
+    summary = summary_of(saved)
+    assert [one["verdict"] for one in summary["margins"]]
+    assert (saved / "sip.hdr").exists()
+    assert "total" in good("budget", saved, "--at", 10, 10).out
+    good("stage", "report", saved)
+    assert (saved / "report.html").exists()
+    # nothing has to be made again
+    before = (saved / "posterior.nc").stat().st_mtime_ns
+    good("run", saved / "config.toml", "-o", saved, "--resume")
+    assert (saved / "posterior.nc").stat().st_mtime_ns == before
+
+
+def test_a_saved_run_can_be_copied_and_moved(saved, run, tmp_path):
+    with bd.open_run(saved) as other:
+        copy = other.save(tmp_path / "copy")
+    moved = copy.rename(tmp_path / "moved")
+    with bd.open_run(moved) as other:
+        np.testing.assert_array_equal(other.posterior.theta, run.posterior.theta)
+
+
+def test_a_folder_in_use_is_refused_and_left(run, saved, tmp_path):
+    (tmp_path / "notes.txt").write_text("mine")
+    with pytest.raises(bd.InputError, match="holds other files"):
+        run.save(tmp_path)
+    assert [path.name for path in tmp_path.iterdir()] == ["notes.txt"]
+    with pytest.raises(bd.InputError, match="overwrite=True"):
+        run.save(saved)
+    with bd.open_run(saved) as other, pytest.raises(bd.InputError, match="is in this folder"):
+        other.save(saved)
+
+
+def test_a_run_can_replace_another(run, tmp_path):
+    folder = calibrated(simulated(300, seed=3)[0]).save(tmp_path / "run")
+    run.save(folder, overwrite=True)
+    with bd.open_run(folder) as other:
+        assert_same(run, other)
+
+
+def test_stars_by_magnitude_are_found_without_being_asked():
+    stars, _ = simulated(800, mag=np.linspace(12.0, 18.0, 800))
+    bare = stars.with_columns(sigma_u=None, sigma_v=None)
+    run = calibrated(bare)
+    assert run.config.data.sigma == "by_magnitude"
+    np.testing.assert_array_equal(
+        calibrated(stars, sigma="by_magnitude").posterior.theta, run.posterior.theta
+    )
+
+
+def test_a_path_is_read_as_by_the_command_line(finished):
+    run = calibrated(finished.config.parent / "stars.ecsv", scale_mas=50.0)
+    with bd.open_run(finished.path) as other:
+        np.testing.assert_array_equal(run.posterior.theta, other.posterior.theta)
+
+
+def test_a_run_of_files_is_saved_with_their_names(finished, tmp_path):
+    run = calibrated(finished.config.parent / "stars.ecsv")
+    with bd.open_run(run.save(tmp_path / "run")) as other:
+        np.testing.assert_array_equal(run.posterior.theta, other.posterior.theta)
+        assert not (tmp_path / "run" / "matches.h5").exists()
+
+
+def test_tables_of_others_are_taken(finished):
+    table = QTable.read(finished.config.parent / "stars.ecsv")
+    run = calibrated(table, scale_mas=50.0)
+    with bd.open_run(finished.path) as other:
+        np.testing.assert_array_equal(run.posterior.theta, other.posterior.theta)
+
+
+def test_dates_are_times_or_years():
+    stars = simulated(600)[0].with_columns(epoch=np.linspace(2010.0, 2014.0, 600))
+    time = bd.TimeDependence((("u", 1, 0),), (2012.0,))
+    run = calibrated(stars, time=time, epoch=Time(2013.0, format="decimalyear"))
+    assert run.map().epoch == pytest.approx(2013.0)
+    late, early = run.map(epoch=2019.0), run.map(epoch=2012.0)
+    assert late.radius_max > early.radius_max
+    assert run.budget(epoch=2019.0).rows()[-1]["radial"] > run.budget().rows()[-1]["radial"]
+
+
+WRONG = {
+    "order": ({"order": 13}, "model.order"),
+    "size": ({"size": None}, "size"),
+    "frames": ({"frames": "rotation"}, "model.frames"),
+    "unknown key": ({"settings": {"sampler": {"max_step": 5}}}, "max_steps"),
+    "given twice": ({"settings": {"model": {"order": 3}}}, "give it once"),
+    "unit": ({"scale_mas": 50 * u.s}, "scale_mas"),
+    "requirement": ({"requirements": ["p95"]}, "bayesdist.Requirement"),
+    "term": ({"terms": [0.1]}, "bayesdist.UserTerm"),
+    "seed": ({"seed": -1}, "sampler.seed"),
+    "no TOML": ({"settings": {"sampler": {"max_steps": object()}}}, "TOML"),
+    "not finite": ({"size": (np.nan, 800)}, "detector.size"),
+    "another kind": ({"settings": {"campaign": {"catalogue": "x"}}}, "give one"),
+}
+
+
+@pytest.mark.parametrize("name", WRONG)
+def test_wrong_settings_are_named(name):
+    options, words = WRONG[name]
+    with pytest.raises(bd.InputError, match=words) as caught:
+        calibrated(simulated()[0], **options)
+    assert caught.value.do and "\n" not in str(caught.value)
+
+
+def test_wrong_questions_are_named(run):
+    with pytest.raises(bd.InputError, match="chip"):
+        run.map(chip=7)
+    with pytest.raises(bd.InputError, match="one position"):
+        run.budget(to=(1, 2))
+    with pytest.raises(bd.InputError, match="give \\(x, y\\)"):
+        run.budget(at="corner")
+    with pytest.raises(bd.InputError, match="not on chip"):
+        run.budget(at=(2000, 1))
+    with pytest.raises(bd.InputError, match="epoch"):
+        run.map(epoch=16.5)
+    with pytest.raises(bd.InputError, match="is no run"):
+        bd.open_run(Path(__file__).parent)
+
+
+def test_a_run_that_is_not_sampled_is_refused(tmp_path):
+    config = write_job(tmp_path / "input", as_table(simulated()[0]))
+    good("stage", "fit", _begun(tmp_path / "run", config))
+    with pytest.raises(bd.InputError, match="sample"):
+        bd.open_run(tmp_path / "run")
+
+
+def _begun(folder: Path, config: Path) -> Path:
+    folder.mkdir()
+    text = config.read_text().replace("stars.ecsv", str(config.parent / "stars.ecsv"))
+    (folder / "config.toml").write_text(text)
+    return folder

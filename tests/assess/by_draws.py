@@ -1,0 +1,33 @@
+"""Margins by the draws of the stated errors alone, as if the residuals had been examined."""
+
+from __future__ import annotations
+
+from bayesdist.assess.model import error_model
+from bayesdist.assess.requirements.margins import judge
+from bayesdist.assess.units import pixel_scale_of
+from bayesdist.infer.posterior.checks import convergence_check
+
+
+def margins_by_draws(
+    solution,
+    requirements,
+    *,
+    terms=(),
+    aligned=False,
+    n_draws=2000,
+    rng,
+    chip=None,
+    pixel_scale=None,
+    checks=(),
+    **places,
+):
+    """Margins of requirements: what draws decide, if nothing is known to be wrong with them.
+
+    `places`: grid and epoch as of `judge`.
+    """
+    scale = pixel_scale_of(solution, chip, pixel_scale)
+    errors = error_model(solution, terms=terms, aligned=aligned, pixel_scale=scale)
+    if solution.convergence is not None:
+        checks = (convergence_check(solution.convergence), *checks)
+    drawn = errors.drawn(n_draws, rng)
+    return judge(drawn, requirements, chip=chip, pixel_scale=scale, checks=checks, **places)
