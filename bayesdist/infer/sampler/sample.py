@@ -133,7 +133,7 @@ def sample(
     started = time.monotonic()
     with opened(fit.model, matches, compute) as shards:
         radius = matches.match_radius if isinstance(matches, Matches) else None
-        mixture = outliers or OutlierMixture(match_radius=radius)
+        mixture = (outliers or OutlierMixture(match_radius=radius)).in_unit(fit.model.unit)
         priors = priors or GaussianPriors.none(fit.model)
         target = Target(shards, mixture, priors)
         folder = None if folder is None else Path(folder)
