@@ -99,6 +99,14 @@ def test_the_page_on_positions_runs(tmp_path, monkeypatch):
     assert namespace["cov"].shape == (6, 6)
 
 
+def test_the_page_on_tables_runs(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    namespace = run_page(DOCS / "your_table.md")
+    on_sky = namespace["on_sky"]
+    assert any("moved to 2024.50" in note for note in on_sky.notes)
+    assert np.array_equal(namespace["found"].star, np.arange(400))
+
+
 @pytest.mark.parametrize("page", ["jwst.md", "roman.md"])
 def test_the_pages_of_the_pipelines_run(page, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
@@ -130,7 +138,7 @@ def test_every_block_that_could_run_is_run():
     run = {p.name for p in DOCS.glob("*.md") if {"console", "python"} & {b for b, _ in blocks(p)}}
     tutorials = {p.name for p in DOCS.glob("tutorial_*.md")}
     others = {"posterior_file.md", "new_instrument.md", "ground_based.md", "jwst.md", "roman.md"}
-    others |= {"positions.md"}
+    others |= {"positions.md", "your_table.md"}
     assert run == tutorials | others
 
 
