@@ -307,7 +307,8 @@ class Calibration:
             place of the calibration's.
         position_angle : float or Quantity, optional
             Position angle of the v axis at `point`, in degrees from north to east, 0 by default.
-            For a calibration in the plane of an aperture it is that of V3, and has to be given.
+            For a calibration in the plane of an aperture it has to be given, and is that of V3 if
+            the directions of u and v in V2, V3 are known.
         mirrored : bool
             True if u is 90 degrees west of v; by default it is 90 degrees east of it.
         pixel_scale : float or Quantity, optional

@@ -140,8 +140,8 @@ def placement_of(
 
     `point` (degrees) is the sky position of (u, v) = (0, 0), in place of that of the plane.
     `position_angle` (degrees, from north to east) is that of the v axis, 0 by default, or of V3 for
-    a plane in an aperture; u is then 90 degrees east of v, or west if `mirrored`.  `pixel_scale`
-    are arcseconds per pixel, for u and v in pixels.
+    a plane in an aperture with known axes; u is 90 degrees east of v, or west if `mirrored`.
+    `pixel_scale` is the size of a pixel in arcsec, for u and v in pixels.
     InputError for a plane in an aperture without position angle, a plane without point, and u and v
     in pixels of unknown size.
     """
@@ -176,8 +176,10 @@ def placement_of(
         matrix = np.array([[c, s], [-s, c]])
         if mirrored:
             matrix = matrix @ np.diag([-1.0, 1.0])
-        if plane.kind == "aperture" and plane.to_v2v3 is not None:
-            matrix = matrix @ plane.to_v2v3
+        if plane.kind == "aperture" and plane.to_v2v3 is not None and plane.v2v3 is not None:
+            # V2 and V3 are spherical: a step in V2 is an arc shorter by cos V3
+            cosine = np.cos(np.radians(plane.v2v3[1] / 3600.0))
+            matrix = matrix @ np.diag([cosine, 1.0]) @ plane.to_v2v3
     elif mirrored:
         matrix = np.diag([-1.0, 1.0])
     return SkyPlacement(place, unit * matrix)
