@@ -101,6 +101,14 @@ def test_the_page_on_positions_runs(tmp_path, monkeypatch):
     assert namespace["cov"].shape == (6, 6)
 
 
+def test_the_page_on_tables_runs(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    namespace = run_page(DOCS / "your_table.md")
+    on_sky = namespace["on_sky"]
+    assert any("moved to 2024.50" in note for note in on_sky.notes)
+    assert np.array_equal(namespace["found"].star, np.arange(400))
+
+
 def test_the_page_on_plots_runs(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     namespace = run_page(DOCS / "plots.md")
@@ -148,7 +156,7 @@ def test_every_block_that_could_run_is_run():
     run = {p.name for p in DOCS.glob("*.md") if {"console", "python"} & {b for b, _ in blocks(p)}}
     tutorials = {p.name for p in DOCS.glob("tutorial_*.md")}
     others = {"posterior_file.md", "new_instrument.md", "ground_based.md", "jwst.md", "roman.md"}
-    others |= {"plots.md", "positions.md", "wcs.md"}
+    others |= {"plots.md", "positions.md", "wcs.md", "your_table.md"}
     assert run == tutorials | others
 
 
