@@ -99,6 +99,15 @@ def test_the_page_on_positions_runs(tmp_path, monkeypatch):
     assert namespace["cov"].shape == (6, 6)
 
 
+def test_the_page_on_plots_runs(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    namespace = run_page(DOCS / "plots.md")
+    assert Path("plots_maps.png").is_file() and namespace["panels"].shape == (3, 3)
+    listed = re.findall(r"^  \.(\w+)\(\)", repr(namespace["run"].plot), re.MULTILINE)
+    shown = set(re.findall(r"run\.plot\.(\w+)\(", (DOCS / "plots.md").read_text("utf-8")))
+    assert set(listed) <= shown
+
+
 def test_the_page_on_wcs_runs(tmp_path, monkeypatch):
     for program in ("gwcs", "photutils", "regions", "reproject"):
         pytest.importorskip(program)
@@ -137,7 +146,7 @@ def test_every_block_that_could_run_is_run():
     run = {p.name for p in DOCS.glob("*.md") if {"console", "python"} & {b for b, _ in blocks(p)}}
     tutorials = {p.name for p in DOCS.glob("tutorial_*.md")}
     others = {"posterior_file.md", "new_instrument.md", "ground_based.md", "jwst.md", "roman.md"}
-    others |= {"positions.md", "wcs.md"}
+    others |= {"plots.md", "positions.md", "wcs.md"}
     assert run == tutorials | others
 
 

@@ -230,7 +230,7 @@ def diagnose(
     with opened(posterior.model, matches, compute) as shards:
         fit = fit or fit_linear(shards, posterior.model, priors=priors)
         table = matches.sample(SAMPLE)
-        found = diagnose_fit(
+        by_residuals = diagnose_fit(
             fit,
             posterior,
             matches,
@@ -244,7 +244,7 @@ def diagnose(
             matched_before=True,
         )
         return diagnose_posterior(
-            found,
+            by_residuals,
             fit,
             posterior,
             matches,
