@@ -74,15 +74,15 @@ class CalibrationWCS(BaseLowLevelWCS, HighLevelWCSMixin):
     >>> model = bd.DistortionModel(1, (chip,), "arcsec")
     >>> truth = [0, -50, 0, 0, 0, 50]
     >>> stars, _ = bd.simulate_matches(model, truth, 500, sigma=0.01, fraction=0.0, rng=rng)
-    >>> calibration = bd.Calibration("camera", bd.fit_linear(stars, model))
-    >>> wcs = calibration.wcs(point=(150.0, 2.2))
+    >>> run = bd.calibrate(stars, order=1, size=(1000, 1000))
+    >>> wcs = run.wcs(point=(150.0, 2.2))
     >>> wcs.pixel_to_world(499.5, 499.5).to_string(precision=4)
-    '150 2.2'
+    '150.0000 2.2000'
     >>> x, y = wcs.world_to_pixel_values(150.0, 2.2)
     >>> bool(np.hypot(x - 499.5, y - 499.5) < 0.05)
     True
-    >>> cov = wcs.covariance(499.5, 499.5)  # of the mean of 500 stars
-    >>> bool(abs(cov[0, 0].to_value("mas2") ** 0.5 - 10 / 500**0.5) < 0.01)
+    >>> cov = wcs.covariance(499.5, 499.5, further=False)  # of the mean of 500 stars
+    >>> bool(abs(cov[0, 0].to_value("mas2") ** 0.5 - 10 / 500**0.5) < 0.1)
     True
     """
 
@@ -333,7 +333,7 @@ class CalibrationWCS(BaseLowLevelWCS, HighLevelWCSMixin):
             )
             drawn = replace(self, calibration=calibration)
             # the cached map: thousands of draws need not work it out again
-            vars(drawn)["chip_map"] = replace(
+            drawn.__dict__["chip_map"] = replace(
                 self.chip_map, name=name, coefficients=theta.reshape(2, -1), cov=None
             )
             out.append(drawn)
@@ -350,12 +350,21 @@ class CalibrationWCS(BaseLowLevelWCS, HighLevelWCSMixin):
             Two inputs, x and y; two outputs, right ascension and declination in degrees, or u and
             v.  `inverse` iterates on the map, as `world_to_pixel_values` does.
         """
-        if self.placement is None:
-            return plane_model(self.chip_map)
-        return sky_model(self.chip_map, self.placement)
+        return self._model(None)
 
-    def to_gwcs(self) -> GWCS:
+    def _model(self, inverse_order: int | None) -> Model:
+        plane = plane_model(self.chip_map, inverse_order)
+        return plane if self.placement is None else sky_model(plane, self.placement)
+
+    def to_gwcs(self, *, inverse_order: int | None = None) -> GWCS:
         """WCS of the package gwcs, with the same map and its inverse.
+
+        Parameters
+        ----------
+        inverse_order : int, optional
+            Order of a polynomial that is fitted over the chip for the inverse, which ASDF files can
+            hold.  By default the inverse iterates on the map, and the WCS cannot be written to a
+            file.
 
         Returns
         -------
@@ -368,7 +377,8 @@ class CalibrationWCS(BaseLowLevelWCS, HighLevelWCSMixin):
         Raises
         ------
         InputError
-            If gwcs is not installed.
+            If gwcs is not installed, or look-up tables behind the polynomial leave no inverse that
+            a file can hold.
         """
         try:
             import gwcs
@@ -391,7 +401,7 @@ class CalibrationWCS(BaseLowLevelWCS, HighLevelWCSMixin):
             world = frames.CelestialFrame(
                 name="world", reference_frame=ICRS(), unit=(units.deg, units.deg)
             )
-        out = gwcs.WCS([(detector, self.to_model()), (world, None)])
+        out = gwcs.WCS([(detector, self._model(inverse_order)), (world, None)])
         out.pixel_shape = self.pixel_shape
         return out
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import doctest
 import pickle
 from dataclasses import replace
 
@@ -21,9 +22,11 @@ from astropy.wcs.wcsapi.low_level_api import validate_physical_types
 from numpy.polynomial import polynomial
 from numpy.testing import assert_allclose, assert_array_equal
 
+import bayesdist as bd
 from bayesdist.calibration.calibration import Calibration, calibration_of_maps
 from bayesdist.calibration.chip_map import ChipMap
 from bayesdist.calibration.plane import Plane
+from bayesdist.calibration.wcs import CalibrationWCS
 from bayesdist.errors import InputError
 from bayesdist.model import PolynomialBasis
 
@@ -230,6 +233,15 @@ def test_it_is_pickled_and_copied(kind):
         drawn, same = (one.draw(1, 3)[0].pixel_to_world_values(x, y) for one in (other, wcs))
         assert_array_equal(drawn, same)
         assert repr(other) == repr(wcs)
+
+
+def test_the_example_of_its_docstring_runs():
+    [example] = doctest.DocTestFinder(recurse=False).find(
+        CalibrationWCS, "CalibrationWCS", globs={"bd": bd, "np": np}
+    )
+    written = []
+    assert example.examples
+    assert not doctest.DocTestRunner(verbose=False).run(example, out=written.append).failed, written
 
 
 def test_it_describes_itself():

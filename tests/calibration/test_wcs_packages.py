@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import astropy.units as u
 import numpy as np
 import pytest
@@ -44,6 +46,23 @@ def test_gwcs_has_the_same_pixels_and_sky(point, tables):
     assert other.array_shape == wcs.array_shape
     other.bounding_box = wcs.bounding_box
     assert np.isnan(other.pixel_to_world_values(-300.0, 4.0)).all()
+
+
+def test_gwcs_with_a_fitted_inverse_is_written_and_read(tmp_path):
+    asdf = pytest.importorskip("asdf")
+    pytest.importorskip("gwcs")
+    calibration = replace(camera(tables=True), after=())
+    wcs = calibration.wcs()
+    asdf.AsdfFile({"wcs": wcs.to_gwcs(inverse_order=7)}).write_to(tmp_path / "wcs.asdf")
+    x, y = pixels(500, beyond=0.0)
+    with asdf.open(tmp_path / "wcs.asdf") as file:
+        other = file["wcs"]
+        ra, dec = other.pixel_to_world_values(x, y)
+        back = np.stack(other.world_to_pixel_values(ra, dec))
+    assert apart(wcs.pixel_to_world_values(x, y), (ra, dec)) < LIMIT * PIXEL
+    assert_allclose(back, [x, y], rtol=0, atol=1e-4)
+    with pytest.raises(InputError, match="behind its polynomial"):
+        camera(tables=True).wcs().to_gwcs(inverse_order=7)
 
 
 def test_gwcs_of_a_plane():
