@@ -1,7 +1,13 @@
-# Six targets do everything on a bare machine with Python 3.11 or newer:
+# Everything runs on a bare machine with Python 3.11 or newer:
 #   make demo    the environment, then `bayesdist demo`
 #   make test    the environment with the test extra, checks of the code and the tests: some ten
 #                minutes on two cores
+#   make types   mypy, in an environment of its own whose versions are exact (.ci/types.txt): what a
+#                new release of numpy or mypy thinks of the code fails nobody's `make test`
+#   make ci      `make test` and `make types` at once, as .ci/run does
+#   make test-matrix  `make demo` and `make test` in clones, for each Python from 3.11 on that is
+#                found, with the newest dependencies and, on 3.11, the oldest: an hour
+#   make coverage  the tests, and which lines they reach: build/coverage/index.html
 #   make test-full  the same, with the statistical suites in full: some hours on two cores
 #   make bench   the same environment, then the benchmarks: build/bench/bench.json, and
 #                docs/benchmarks.md with what other pages state of it (docs/measured.toml);
@@ -12,24 +18,31 @@
 #                warning is an error
 PYTHON ?= python3
 VENV   ?= .venv
+TYPES  ?= .venv-types
 BIN     = $(VENV)/bin
 
 # else each process that tests and commands start compiles all modules again: seconds, dozens of times
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: demo test types imports suite test-full docs bench bench-check lint clean
+.PHONY: demo test ci style types imports suite test-full test-matrix coverage docs bench bench-check \
+        lint clean
 
 demo: $(VENV)/.installed
 	$(BIN)/bayesdist demo -o demo-run --force
 
-test: $(VENV)/.installed-test
-	$(BIN)/ruff check .
-	$(BIN)/ruff format --check .
-	$(MAKE) --no-print-directory -j3 types imports suite
+test: style
+	$(MAKE) --no-print-directory -j2 imports suite
 
 # all at once: mypy takes a minute of one core at first, and the tests wait for each other at times
-types: $(VENV)/.installed-test
-	$(BIN)/mypy
+ci: style
+	$(MAKE) --no-print-directory -j3 types imports suite
+
+style: $(VENV)/.installed-test
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+
+types: $(TYPES)/.installed
+	$(TYPES)/bin/mypy
 
 imports: $(VENV)/.installed-test
 	$(BIN)/lint-imports
@@ -39,6 +52,15 @@ suite: $(VENV)/.installed-test
 
 test-full: $(VENV)/.installed-test
 	BAYESDIST_FULL=1 $(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder
+
+# with arguments: make test-matrix ONLY="3.13-newest 3.11-oldest"
+test-matrix:
+	$(PYTHON) -m tests.matrix $(ONLY)
+
+# loops that numba compiles are not seen, and processes that tests start are
+coverage: $(VENV)/.installed-test
+	$(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder \
+	  --cov --cov-report=term:skip-covered --cov-report=html:build/coverage
 
 docs: $(VENV)/.installed-docs
 	$(BIN)/sphinx-build -q -W --keep-going -n -d build/doctrees docs build/docs
@@ -67,9 +89,15 @@ $(VENV)/.installed-test: pyproject.toml | $(BIN)/python
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[test]'
 	@touch $@ $(VENV)/.installed
 
+$(TYPES)/.installed: .ci/types.txt | $(BIN)/python
+	$(BIN)/python -m venv $(TYPES)
+	$(TYPES)/bin/python -m pip install --quiet --disable-pip-version-check --only-binary :all: \
+	  --requirement .ci/types.txt
+	@touch $@
+
 $(VENV)/.installed-docs: pyproject.toml | $(BIN)/python
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[docs]'
 	@touch $@ $(VENV)/.installed
 
 clean:
-	rm -rf $(VENV) demo-run build dist
+	rm -rf $(VENV) $(TYPES) demo-run build dist

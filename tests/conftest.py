@@ -7,15 +7,15 @@ import os
 from collections.abc import Iterator
 from pathlib import Path
 
-import numba
 import numpy as np
 import pytest
 
+from bayesdist.infer import kernel
 from tests import ALONE
 from tests.reduced import FULL
 
 if not ALONE:
-    numba.set_num_threads(1)
+    kernel.set_threads(1)
 
 
 @pytest.fixture(scope="session")

@@ -9,8 +9,9 @@ from itertools import starmap
 from multiprocessing import get_context
 from typing import Any
 
-import numba
 from threadpoolctl import threadpool_limits
+
+from bayesdist.infer import kernel
 
 
 def over(function: Callable[..., Any], jobs: Iterable[tuple[Any, ...]], *, lot: int = 1) -> list:
@@ -28,15 +29,15 @@ def over(function: Callable[..., Any], jobs: Iterable[tuple[Any, ...]], *, lot: 
 
 
 def _here(function: Callable[..., Any], jobs: list[tuple[Any, ...]]) -> list:
-    threads = numba.get_num_threads()
-    numba.set_num_threads(1)
+    threads = kernel.get_threads()
+    kernel.set_threads(1)
     try:
         with threadpool_limits(1):
             return list(starmap(function, jobs))
     finally:
-        numba.set_num_threads(threads)
+        kernel.set_threads(threads)
 
 
 def _one_thread() -> None:
-    numba.set_num_threads(1)
+    kernel.set_threads(1)
     threadpool_limits(1)

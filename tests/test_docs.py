@@ -21,10 +21,12 @@ import pytest
 from pydantic import BaseModel
 
 import bayesdist as bd
+from bayesdist import formats
 from bayesdist.app.cli import bayesdist as root
 from bayesdist.app.config import KINDS
 from bayesdist.app.config.data import data_sections
 from bayesdist.mission import load_object
+from bayesdist.missions import wise
 
 from .docs_blocks import DOCS, blocks, run_page
 from .sketches import sketched
@@ -99,6 +101,30 @@ def test_the_page_on_positions_runs(tmp_path, monkeypatch):
     assert namespace["cov"].shape == (6, 6)
 
 
+def test_the_page_on_tables_runs(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    namespace = run_page(DOCS / "your_table.md")
+    on_sky = namespace["on_sky"]
+    assert any("moved to 2024.50" in note for note in on_sky.notes)
+    assert np.array_equal(namespace["found"].star, np.arange(400))
+
+
+def test_the_page_on_plots_runs(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    namespace = run_page(DOCS / "plots.md")
+    assert Path("plots_maps.png").is_file() and namespace["panels"].shape == (3, 3)
+    listed = re.findall(r"^  \.(\w+)\(\)", repr(namespace["run"].plot), re.MULTILINE)
+    shown = set(re.findall(r"run\.plot\.(\w+)\(", (DOCS / "plots.md").read_text("utf-8")))
+    assert set(listed) <= shown
+
+
+def test_the_page_on_wcs_runs(tmp_path, monkeypatch):
+    for program in ("gwcs", "photutils", "regions", "reproject"):
+        pytest.importorskip(program)
+    monkeypatch.chdir(tmp_path)
+    assert run_page(DOCS / "wcs.md")["wcs"].pixel_shape == (1000, 800)
+
+
 @pytest.mark.parametrize("page", ["jwst.md", "roman.md"])
 def test_the_pages_of_the_pipelines_run(page, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
@@ -130,7 +156,7 @@ def test_every_block_that_could_run_is_run():
     run = {p.name for p in DOCS.glob("*.md") if {"console", "python"} & {b for b, _ in blocks(p)}}
     tutorials = {p.name for p in DOCS.glob("tutorial_*.md")}
     others = {"posterior_file.md", "new_instrument.md", "ground_based.md", "jwst.md", "roman.md"}
-    others |= {"positions.md"}
+    others |= {"plots.md", "positions.md", "wcs.md", "your_table.md"}
     assert run == tutorials | others
 
 
@@ -323,14 +349,15 @@ def test_names_and_files_of_the_code_are_there(page):
 def test_the_reference_names_all_that_is_public():
     api = (DOCS / "api.md").read_text(encoding="utf-8")
     listed = {n.rpartition(".")[2] for n in re.findall(r"^   ~(bayesdist[\w.]+)$", api, re.M)}
-    assert listed == set(bd.__all__) - {"__version__"}
+    public = {*bd.__all__, *formats.__all__, *wise.__all__}
+    assert listed == public - {"__version__", "MISSION"}
     modules = re.findall(r"^   (bayesdist[\w.]+)$", api, re.MULTILINE)
     assert {p.stem for p in (DOCS / "api").glob("*.md")} == set(modules)
     for name in modules:
         module = import_module(name)
-        for public in getattr(module, "__all__", ()):
-            member = getattr(module, public)
-            assert not callable(member) or member.__doc__, f"{name}.{public}"
+        for offered in getattr(module, "__all__", ()):
+            member = getattr(module, offered)
+            assert not callable(member) or member.__doc__, f"{name}.{offered}"
 
 
 @pytest.mark.slow

@@ -176,10 +176,12 @@ class ChipMap:
         for table in self.before:
             inner = _slope(table, *pixels) @ inner
             pixels = pixels + _shift(table, *pixels)
-        phi = self.basis.evaluate(*pixels)
         by_x, by_y = self.basis.derivatives
-        slope = np.stack([phi @ (by @ self.coefficients.T) for by in (by_x, by_y)], axis=-1)
-        value = (phi @ self.coefficients.T).T
+        C = self.coefficients.T
+        # in one pass over the basis functions, which are far more numbers than the results
+        all_six = self.basis.evaluate(*pixels) @ np.hstack([C, by_x @ C, by_y @ C])
+        value = all_six[:, :2].T
+        slope = np.stack([all_six[:, 2:4], all_six[:, 4:]], axis=-1)
         for table in self.after:
             value = value + _shift(table, *pixels)
             slope = slope + _slope(table, *pixels) - np.eye(2)

@@ -9,14 +9,16 @@ rotated to V2, V3 and shifted to the position of the aperture; on the sky it is 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 from astropy.modeling import Model, models
 
 from bayesdist.calibration.chip_map import ChipMap, Monomials
-from bayesdist.calibration.inverse import ExplicitInverse, Terms
+from bayesdist.calibration.inverse import ExplicitInverse, Terms, fitted_inverse
 from bayesdist.calibration.plane import SkyPlacement
+from bayesdist.errors import InputError
 from bayesdist.model import LookupTable
 from bayesdist.utils.arrays import Float
 
@@ -25,8 +27,14 @@ _LEFT, _MOST_STEPS = 1e-10, 12
 _SPLIT = models.Mapping((0, 1, 0, 1))
 
 
-def plane_model(chip: ChipMap) -> Model:
-    """Model from 0-based pixels to the plane (u, v) of a chip, with an inverse by iteration."""
+def plane_model(chip: ChipMap, inverse_order: int | None = None) -> Model:
+    """Model from 0-based pixels to the plane (u, v) of a chip, with its inverse.
+
+    The inverse iterates by default; with `inverse_order` it is a polynomial that is fitted over the
+    chip, and every part of the model is one that ASDF can write.
+    InputError for such a polynomial beside look-up tables behind the polynomial of the chip, and as
+    for `fitted_inverse`.
+    """
     x, y = chip.basis.reference_pixel
     poly = chip.monomials()
     offset = _pair(models.Shift, 1.0 - x, 1.0 - y)
@@ -36,16 +44,26 @@ def plane_model(chip: ChipMap) -> Model:
         du, dv = _shifts(table)
         u, v = u + du, v + dv
     model = _chain([*(_corrected(table) for table in chip.before), _SPLIT, u & v])
-    model.inverse = PlaneToPixel(chip)
+    if inverse_order is None:
+        model.inverse = PlaneToPixel(chip)
+        return model
+    if chip.after:
+        raise InputError(
+            "has look-up tables behind its polynomial, which no fitted inverse takes back",
+            where=chip.name,
+            do="leave inverse_order out",
+        )
+    back = fitted_inverse(replace(chip, before=()), inverse_order)
+    model.inverse = inverse_transform(back, np.eye(2), (0.0, 0.0), chip.before)
     return model
 
 
-def sky_model(chip: ChipMap, placement: SkyPlacement) -> Model:
-    """Model from 0-based pixels to right ascension and declination in degrees, with its inverse."""
+def sky_model(plane: Model, placement: SkyPlacement) -> Model:
+    """Model to right ascension and declination in degrees behind one from pixels to the plane."""
     ra, dec = placement.point
     return _chain(
         [
-            plane_model(chip),
+            plane,
             models.AffineTransformation2D(placement.matrix / 3600.0, [0.0, 0.0]),
             models.Pix2Sky_TAN(),
             models.RotateNative2Celestial(ra, dec, 180.0),

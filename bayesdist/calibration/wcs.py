@@ -74,15 +74,15 @@ class CalibrationWCS(BaseLowLevelWCS, HighLevelWCSMixin):
     >>> model = bd.DistortionModel(1, (chip,), "arcsec")
     >>> truth = [0, -50, 0, 0, 0, 50]
     >>> stars, _ = bd.simulate_matches(model, truth, 500, sigma=0.01, fraction=0.0, rng=rng)
-    >>> calibration = bd.Calibration("camera", bd.fit_linear(stars, model))
-    >>> wcs = calibration.wcs(point=(150.0, 2.2))
+    >>> run = bd.calibrate(stars, order=1, size=(1000, 1000))
+    >>> wcs = run.wcs(point=(150.0, 2.2))
     >>> wcs.pixel_to_world(499.5, 499.5).to_string(precision=4)
-    '150 2.2'
+    '150.0000 2.2000'
     >>> x, y = wcs.world_to_pixel_values(150.0, 2.2)
     >>> bool(np.hypot(x - 499.5, y - 499.5) < 0.05)
     True
-    >>> cov = wcs.covariance(499.5, 499.5)  # of the mean of 500 stars
-    >>> bool(abs(cov[0, 0].to_value("mas2") ** 0.5 - 10 / 500**0.5) < 0.01)
+    >>> cov = wcs.covariance(499.5, 499.5, further=False)  # of the mean of 500 stars
+    >>> bool(abs(cov[0, 0].to_value("mas2") ** 0.5 - 10 / 500**0.5) < 0.1)
     True
     """
 
@@ -146,7 +146,8 @@ class CalibrationWCS(BaseLowLevelWCS, HighLevelWCSMixin):
 
     def _same_side(self, slope: Float) -> Bool:
         """Boolean mask (N,) of slopes (N, 2, 2) that are not beyond a fold of the map."""
-        return np.linalg.det(slope) * np.linalg.det(self.chip_map.linear) > 0
+        det = slope[:, 0, 0] * slope[:, 1, 1] - slope[:, 0, 1] * slope[:, 1, 0]
+        return det * np.linalg.det(self.chip_map.linear) > 0
 
     # -- description of the axes ------------------------------------------------------------------
 
@@ -308,8 +309,10 @@ class CalibrationWCS(BaseLowLevelWCS, HighLevelWCSMixin):
         Raises
         ------
         InputError
-            If the calibration states no errors of its coefficients.
+            If the calibration states no errors of its coefficients, or `n` is negative.
         """
+        if n < 0:
+            raise InputError(f"the number of draws is {n}", where="draw", do="give 0 or more")
         if self.calibration.errors == "none":
             raise InputError(
                 "states no errors of its coefficients, so there is nothing to draw",
@@ -318,19 +321,23 @@ class CalibrationWCS(BaseLowLevelWCS, HighLevelWCSMixin):
             )
         solution = self.calibration.solution
         exact = np.zeros((solution.model.n_params,) * 2)
-        return [
-            replace(
-                self,
-                calibration=replace(
-                    self.calibration,
-                    name=f"{self.calibration.name}, draw {k}",
-                    solution=GaussianSolution(solution.model, theta, exact),
-                    errors="none",
-                    further=(),
-                ),
+        out = []
+        for k, theta in enumerate(solution.draws(n, generator_of(rng)), start=1):
+            name = f"{self.calibration.name}, draw {k}"
+            calibration = replace(
+                self.calibration,
+                name=name,
+                solution=GaussianSolution(solution.model, theta, exact),
+                errors="none",
+                further=(),
             )
-            for k, theta in enumerate(solution.draws(n, generator_of(rng)), start=1)
-        ]
+            drawn = replace(self, calibration=calibration)
+            # the cached map: thousands of draws need not work it out again
+            drawn.__dict__["chip_map"] = replace(
+                self.chip_map, name=name, coefficients=theta.reshape(2, -1), cov=None
+            )
+            out.append(drawn)
+        return out
 
     # -- other objects ----------------------------------------------------------------------------
 
@@ -343,23 +350,35 @@ class CalibrationWCS(BaseLowLevelWCS, HighLevelWCSMixin):
             Two inputs, x and y; two outputs, right ascension and declination in degrees, or u and
             v.  `inverse` iterates on the map, as `world_to_pixel_values` does.
         """
-        if self.placement is None:
-            return plane_model(self.chip_map)
-        return sky_model(self.chip_map, self.placement)
+        return self._model(None)
 
-    def to_gwcs(self) -> GWCS:
+    def _model(self, inverse_order: int | None) -> Model:
+        plane = plane_model(self.chip_map, inverse_order)
+        return plane if self.placement is None else sky_model(plane, self.placement)
+
+    def to_gwcs(self, *, inverse_order: int | None = None) -> GWCS:
         """WCS of the package gwcs, with the same map and its inverse.
+
+        Parameters
+        ----------
+        inverse_order : int, optional
+            Order of a polynomial that is fitted over the chip for the inverse, which ASDF files can
+            hold.  By default the inverse iterates on the map, and the WCS cannot be written to a
+            file.
 
         Returns
         -------
         gwcs.WCS
-            From a frame ``detector`` in pixels to a frame ``world``: ICRS, or u and v.  Its
-            bounding box is the chip.
+            From a frame ``detector`` in pixels to a frame ``world``: ICRS, or u and v.  It has no
+            bounding box.  With one, as in ``w.bounding_box = wcs.bounding_box``, gwcs refuses
+            positions outside the range of the four corners, some pixels at curved edges and all
+            around a celestial pole among them.
 
         Raises
         ------
         InputError
-            If gwcs is not installed.
+            If gwcs is not installed, or look-up tables behind the polynomial leave no inverse that
+            a file can hold.
         """
         try:
             import gwcs
@@ -382,8 +401,7 @@ class CalibrationWCS(BaseLowLevelWCS, HighLevelWCSMixin):
             world = frames.CelestialFrame(
                 name="world", reference_frame=ICRS(), unit=(units.deg, units.deg)
             )
-        out = gwcs.WCS([(detector, self.to_model()), (world, None)])
-        out.bounding_box = self.bounding_box
+        out = gwcs.WCS([(detector, self._model(inverse_order)), (world, None)])
         out.pixel_shape = self.pixel_shape
         return out
 
@@ -452,9 +470,8 @@ class CalibrationWCS(BaseLowLevelWCS, HighLevelWCSMixin):
 
     def __repr__(self) -> str:
         nx, ny = self.pixel_shape
-        lines = [
-            f"<CalibrationWCS of {self.calibration.name!r}, chip {self.chip}, {nx} x {ny} pixels"
-        ]
+        name = self.calibration.name.rpartition("/")[2]
+        lines = [f"<CalibrationWCS of {name!r}, chip {self.chip}, {nx} x {ny} pixels"]
         x, y = (nx - 1) / 2, (ny - 1) / 2
         try:
             lines += self._centre_lines(x, y)
@@ -521,16 +538,18 @@ def wcs_of_chip(
     chip_of(calibration.at(date), number, calibration.name)
     placement = None
     if calibration.plane.point is not None or point is not None:
+        angle = scale = None
+        if position_angle is not None:
+            angle = value_in(position_angle, "deg", "position_angle", where="wcs")
+        if pixel_scale is not None:
+            scale = value_in(pixel_scale, "arcsec", "pixel_scale", where="wcs")
+        _check_placement(calibration, angle, scale)
         placement = placement_of(
             calibration,
             None if point is None else direction_in(point, "point", where="wcs"),
-            position_angle=None
-            if position_angle is None
-            else value_in(position_angle, "deg", "position_angle", where="wcs"),
+            position_angle=angle,
             mirrored=mirrored,
-            pixel_scale=None
-            if pixel_scale is None
-            else value_in(pixel_scale, "arcsec", "pixel_scale", where="wcs"),
+            pixel_scale=scale,
         )
     elif position_angle is not None or mirrored or pixel_scale is not None:
         raise InputError(
@@ -539,6 +558,28 @@ def wcs_of_chip(
             do="give the point, the sky position of u, v = 0, too",
         )
     return CalibrationWCS(_at_date(calibration, number, date), placement)
+
+
+def _check_placement(
+    calibration: Calibration, position_angle: float | None, pixel_scale: float | None
+) -> None:
+    """Refuse a plane without the direction or the scale that it needs on the sky."""
+    if calibration.plane.kind == "aperture" and position_angle is None:
+        raise InputError(
+            "lies in the plane of an aperture, whose orientation on the sky is not known",
+            where=calibration.name,
+            do="give position_angle, that of V3 (or of v, if V3 is not known) at the point",
+        )
+    if calibration.unit == "pix" and not (
+        pixel_scale is not None and np.isfinite(pixel_scale) and pixel_scale > 0
+    ):
+        raise InputError(
+            "has u and v in pixels of unknown size"
+            if pixel_scale is None
+            else f"has u and v in pixels, and pixel_scale is {pixel_scale:g}",
+            where=calibration.name,
+            do="give pixel_scale in arcsec, a positive number",
+        )
 
 
 def _at_date(calibration: Calibration, number: int, epoch: float | None) -> Calibration:

@@ -20,6 +20,8 @@ if TYPE_CHECKING:
     from bayesdist.infer import LinearFit, Posterior
     from bayesdist.infer.solution.solution import Solution
 
+__all__ = ["RunPlots"]
+
 RESIDUAL_KINDS = ("position", "histogram", "magnitude", "x", "y", "colour", "epoch")
 MAPS = ("posterior", "formal", "relative")
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
 
@@ -89,3 +90,38 @@ print([m for m in {heavy!r} if m in sys.modules])
 """
     run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert run.stdout.strip() == "[]"
+
+
+@pytest.mark.parametrize(
+    ("words", "proposed"),
+    [
+        ("bayesdist re", {"plain,report", "plain,requirements", "plain,release"}),
+        ("bayesdist run --re", {"plain,--resume"}),
+        ("bayesdist simulate ", {"plain,camera", "plain,acs", "plain,wise"}),
+        ("bayesdist stage sa", {"plain,sample"}),
+        ("bayesdist run cam", {"file,cam"}),
+        ("bayesdist run c.toml -o ", {"file,"}),
+    ],
+)
+def test_a_shell_completes_commands_options_and_files(words, proposed):
+    variables = {"COMP_WORDS": words, "COMP_CWORD": str(words.count(" "))}
+    run = subprocess.run(
+        [sys.executable, "-m", "bayesdist"],
+        env=os.environ | variables | {"_BAYESDIST_COMPLETE": "bash_complete"},
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    assert set(run.stdout.splitlines()) == proposed
+
+
+@pytest.mark.parametrize("shell", ["bash", "zsh", "fish"])
+def test_the_script_for_a_shell(shell):
+    run = subprocess.run(
+        [sys.executable, "-m", "bayesdist"],
+        env=os.environ | {"_BAYESDIST_COMPLETE": f"{shell}_source"},
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    assert f"_BAYESDIST_COMPLETE={shell}_complete" in run.stdout

@@ -155,12 +155,12 @@ class Threads:
         self.n = min(n, numba.config.NUMBA_NUM_THREADS)
 
     def __enter__(self) -> int:
-        self.before = numba.get_num_threads()
-        numba.set_num_threads(self.n)
+        self.before = kernel.get_threads()
+        kernel.set_threads(self.n)
         return self.n
 
     def __exit__(self, *_: object) -> None:
-        numba.set_num_threads(self.before)
+        kernel.set_threads(self.before)
 
 
 def draws_of(posterior: bd.Posterior) -> Float:

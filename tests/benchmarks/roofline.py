@@ -8,7 +8,7 @@ import numba as nb
 import numpy as np
 
 from bayesdist.infer.kernel.blocks import BLOCK, scratch
-from bayesdist.infer.kernel.vectors import use_whole_vectors
+from bayesdist.infer.kernel.vectors import whole_vectors
 from tests.benchmarks.timing import best
 
 __all__ = ["Roofline", "measure"]
@@ -23,11 +23,10 @@ STREAM = 16_000_000  # doubles of one array: beyond any last-level cache
 MIXTURE_OPS = 45
 BYTES_PER_STAR = 6 * 8  # X, Y, u, v, var_u, var_v
 
-use_whole_vectors()  # as the passes do
-
 
 @nb.njit(fastmath={"contract", "nsz", "arcp"})
 def _multiply_adds(x, out, c, times):
+    whole_vectors()  # as the passes do
     c0, c1, c2, c3 = c
     for _ in range(times):
         for s in range(len(x)):
@@ -54,6 +53,7 @@ def _multiply_adds(x, out, c, times):
 
 @nb.njit(parallel=True)
 def _triad(a, b, c, factor):
+    whole_vectors()
     for i in nb.prange(len(a)):
         a[i] = b[i] + factor * c[i]
 

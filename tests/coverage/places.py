@@ -7,7 +7,6 @@ from contextlib import closing, contextmanager
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-import numba
 import numpy as np
 from scipy.stats import norm
 
@@ -21,6 +20,7 @@ from bayesdist.assess.terms.forms import PolynomialField
 from bayesdist.assess.terms.given import CENTROID
 from bayesdist.assess.terms.solution import COEFFICIENTS, TIME_DEPENDENCE
 from bayesdist.diagnose.correlated import Discrepancy
+from bayesdist.infer import kernel
 from bayesdist.model import DistortionModel
 
 from .campaigns import (
@@ -48,10 +48,10 @@ PLACE_TOTAL = "total of a place"  # without a star there
 
 @contextmanager
 def one_thread() -> Iterator[None]:
-    before = numba.get_num_threads()
-    numba.set_num_threads(1)
+    before = kernel.get_threads()
+    kernel.set_threads(1)
     yield
-    numba.set_num_threads(before)
+    kernel.set_threads(before)
 
 
 def model_errors(

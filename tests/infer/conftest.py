@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-import numba
 import pytest
+
+from bayesdist.infer import kernel
 
 # files whose tasks go to workers
 ON_WORKERS = ("tests.infer.stars.test_cluster", "tests.infer.selfcal.test_cluster")
@@ -14,10 +15,10 @@ ON_WORKERS = ("tests.infer.stars.test_cluster", "tests.infer.selfcal.test_cluste
 @pytest.fixture(scope="module")
 def one_thread() -> Iterator[None]:
     """Small data on a busy machine: waiting for a second thread costs more than it gives."""
-    before = numba.get_num_threads()
-    numba.set_num_threads(1)
+    before = kernel.get_threads()
+    kernel.set_threads(1)
     yield
-    numba.set_num_threads(before)
+    kernel.set_threads(before)
 
 
 @pytest.fixture(scope="module")

@@ -20,19 +20,26 @@ from bayesdist.app.commands.options import (
 
 
 @command(calls=f"{ON_FILES}.inspect:inspect")
-@click.argument("path", metavar="FILE")
+@click.argument("path", metavar="FILE", type=click.Path())
 def inspect() -> None:
     """Describe a product, a posterior or a run, and report its faults."""
 
 
 @command()
-@click.argument("file", metavar="FILE")
-@click.argument("table", metavar="TABLE")
+@click.argument("file", metavar="FILE", type=click.Path())
+@click.argument("table", metavar="TABLE", type=click.Path())
 @filter_name
 @epoch
 @pixel_scale
 @image_size
-@click.option("-o", "--output", required=True, metavar="OUT", help="An .ecsv, .csv or .fits file.")
+@click.option(
+    "-o",
+    "--output",
+    type=click.Path(),
+    required=True,
+    metavar="OUT",
+    help="An .ecsv, .csv or .fits file.",
+)
 @click.option("--inverse", is_flag=True, help="Transform back to pixels.")
 @click.option(
     "--method",
@@ -66,7 +73,9 @@ def inspect() -> None:
     default="1",
     help="With --sky: coordinate of the first pixel's centre.",
 )
-@click.option("--image", metavar="FLT", help="A calibrated image whose pixels these are.")
+@click.option(
+    "--image", type=click.Path(), metavar="FLT", help="A calibrated image whose pixels these are."
+)
 @click.option("--ltv", nargs=2, type=float, metavar="LTV1 LTV2", help="LTV keywords of a subarray.")
 @click.option("--corner", nargs=2, type=float, metavar="X Y", help="First pixel of a subarray.")
 @force
@@ -98,9 +107,11 @@ def apply(file: str, table: str, output: str, **options: Any) -> None:
 
 
 @command(calls=f"{ON_FILES}.convert:convert")
-@click.argument("path", metavar="FILE")
+@click.argument("path", metavar="FILE", type=click.Path())
 @click.option("--to", required=True, metavar="FORMAT", help="Format to write, a key of [products].")
-@click.option("-o", "--output", metavar="OUT", help="Folder, or file where one is made.")
+@click.option(
+    "-o", "--output", type=click.Path(), metavar="OUT", help="Folder, or file where one is made."
+)
 @click.option(
     "--option",
     "options",
@@ -125,9 +136,15 @@ def convert() -> None:
 
 
 @command(calls=f"{ON_RUNS}.compare:compare_files", recorded=True)
-@click.argument("a", metavar="A")
-@click.argument("b", metavar="B")
-@click.option("-o", "--output", metavar="DIR", help="Folder to create for tables and figure.")
+@click.argument("a", metavar="A", type=click.Path())
+@click.argument("b", metavar="B", type=click.Path())
+@click.option(
+    "-o",
+    "--output",
+    type=click.Path(),
+    metavar="DIR",
+    help="Folder to create for tables and figure.",
+)
 @click.option(
     "--chip", type=int, metavar="N", show_default="all common chips", help="Chip that is compared."
 )
@@ -153,9 +170,15 @@ def compare() -> None:
 
 
 @command(calls=f"{ON_RUNS}.monitor:monitor", recorded=True)
-@click.argument("run", metavar="RUN")
-@click.argument("new", metavar="NEW")
-@click.option("-o", "--output", metavar="DIR", help="Folder to create for tables and figure.")
+@click.argument("run", metavar="RUN", type=click.Path())
+@click.argument("new", metavar="NEW", type=click.Path())
+@click.option(
+    "-o",
+    "--output",
+    type=click.Path(),
+    metavar="DIR",
+    help="Folder to create for tables and figure.",
+)
 def monitor() -> None:
     """Test whether a released calibration still describes new matches.
 
@@ -164,7 +187,7 @@ def monitor() -> None:
 
 
 @command(calls=f"{ON_RUNS}.release:release_runs", recorded=True)
-@click.argument("runs", nargs=-1, required=True, metavar="RUN...")
+@click.argument("runs", nargs=-1, required=True, metavar="RUN...", type=click.Path())
 @new_folder
 @click.option(
     "--allow-unconverged", is_flag=True, help="Release runs that have not converged, too."

@@ -105,7 +105,9 @@ def command(
 
 ON_FILES, ON_RUNS = "bayesdist.app.commands.on_files", "bayesdist.app.commands.on_runs"
 column_names = _ColumnNames()
-new_folder = click.option("-o", "--output", required=True, metavar="DIR", help="Folder to create.")
+new_folder = click.option(
+    "-o", "--output", type=click.Path(), required=True, metavar="DIR", help="Folder to create."
+)
 force = click.option("--force", is_flag=True, help="Replace an existing output.")
 seed = click.option(
     "--seed", type=click.IntRange(min=0), default=1, metavar="N", help="Seed of the random numbers."

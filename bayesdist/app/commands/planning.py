@@ -8,7 +8,7 @@ from bayesdist.app.commands.options import ON_RUNS, CommaList, command, force
 
 
 @command(calls=f"{ON_RUNS}.plan:plan")
-@click.argument("run", metavar="RUN")
+@click.argument("run", metavar="RUN", type=click.Path())
 @click.option(
     "--requirement", "name", metavar="NAME", show_default="all", help="Name of one requirement."
 )
@@ -26,16 +26,20 @@ def plan() -> None:
 @command(
     calls="bayesdist.app.commands.patterns.command:plan_patterns", recorded=True, name="plan-dither"
 )
-@click.argument("path", metavar="PATTERNS.toml")
+@click.argument("path", metavar="PATTERNS.toml", type=click.Path())
 @click.option(
-    "-o", "--output", metavar="DIR", help="Folder to create for table, record and figure."
+    "-o",
+    "--output",
+    type=click.Path(),
+    metavar="DIR",
+    help="Folder to create for table, record and figure.",
 )
 def plan_dither() -> None:
     """Compare dither patterns for a self-calibration, without data."""
 
 
 @command(calls=f"{ON_RUNS}.order:order", name="select-order")
-@click.argument("path", metavar="CONFIG.toml")
+@click.argument("path", metavar="CONFIG.toml", type=click.Path())
 @click.option(
     "--orders",
     nargs=2,
@@ -51,8 +55,12 @@ def plan_dither() -> None:
     show_default="the only one",
     help="Chip that is compared.",
 )
-@click.option("-o", "--output", metavar="orders.ecsv", help="Write the table to a file.")
-@click.option("--figure", metavar="orders.png", help="Draw the comparison into a file.")
+@click.option(
+    "-o", "--output", type=click.Path(), metavar="orders.ecsv", help="Write the table to a file."
+)
+@click.option(
+    "--figure", type=click.Path(), metavar="orders.png", help="Draw the comparison into a file."
+)
 @force
 def select_order() -> None:
     """Select the polynomial order."""

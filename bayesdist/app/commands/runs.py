@@ -14,8 +14,10 @@ MISSED = 4  # exit code of requirements that are not all met
 
 
 @command()
-@click.argument("config", metavar="CONFIG.toml")
-@click.option("--matches", metavar="FILE", help="Table of matched stars; needed.")
+@click.argument("config", metavar="CONFIG.toml", type=click.Path())
+@click.option(
+    "--matches", type=click.Path(), metavar="FILE", help="Table of matched stars; needed."
+)
 @click.option(
     "--columns",
     type=column_names,
@@ -47,14 +49,16 @@ def init(config: str, matches: str | None, **options: Any) -> None:
 
 
 @command(calls=f"{ON_RUNS}.check:check")
-@click.argument("path", metavar="CONFIG.toml")
+@click.argument("path", metavar="CONFIG.toml", type=click.Path())
 def check() -> None:
     """Check units, rank, degeneracies and cost of a configuration, without sampling."""
 
 
 @command()
-@click.argument("config", metavar="CONFIG.toml")
-@click.option("-o", "--output", required=True, metavar="RUN", help="Folder of the run.")
+@click.argument("config", metavar="CONFIG.toml", type=click.Path())
+@click.option(
+    "-o", "--output", type=click.Path(), required=True, metavar="RUN", help="Folder of the run."
+)
 @click.option("--resume", is_flag=True, help="Resume an interrupted run.")
 @click.option("--force", is_flag=True, help="Replace an existing run.")
 @click.option("--strict", is_flag=True, help="Exit with 3 unless converged.")
@@ -80,7 +84,7 @@ def run(line: str, config: str, output: str, **options: Any) -> None:
 
 @command()
 @click.argument("name", metavar=f"[{'|'.join(STAGES)}]", type=click.Choice(STAGES))
-@click.argument("run", metavar="RUN")
+@click.argument("run", metavar="RUN", type=click.Path())
 @click.option("--strict", is_flag=True, help="For sample: exit with 3 unless converged.")
 @click.option("--pdf", is_flag=True, help="For report: draw the figures as PDF, too.")
 def stage(name: str, run: str, strict: bool, pdf: bool) -> None:
@@ -100,9 +104,13 @@ def stage(name: str, run: str, strict: bool, pdf: bool) -> None:
 
 
 @command()
-@click.argument("run", metavar="RUN")
+@click.argument("run", metavar="RUN", type=click.Path())
 @click.option(
-    "--requirements", required=True, metavar="REQ.toml", help="File of [[requirement]] blocks."
+    "--requirements",
+    type=click.Path(),
+    required=True,
+    metavar="REQ.toml",
+    help="File of [[requirement]] blocks.",
 )
 def requirements(run: str, requirements: str) -> int:
     """Judge a run by requirements; exit with 4 unless all are met."""
@@ -114,7 +122,7 @@ def requirements(run: str, requirements: str) -> int:
 
 
 @command(calls=f"{ON_RUNS}.budget:budget_at")
-@click.argument("run", metavar="RUN")
+@click.argument("run", metavar="RUN", type=click.Path())
 @click.option("--at", required=True, nargs=2, type=float, metavar="X Y", help="FITS 1-based pixel.")
 @click.option(
     "--to",
@@ -136,9 +144,13 @@ def budget() -> None:
 
 
 @command()
-@click.argument("runs", metavar="RUN...", nargs=-1, required=True)
+@click.argument("runs", metavar="RUN...", nargs=-1, required=True, type=click.Path())
 @click.option(
-    "-o", "--output", metavar="FILE", help="The page of several runs.  [default: reports.html]"
+    "-o",
+    "--output",
+    type=click.Path(),
+    metavar="FILE",
+    help="The page of several runs.  [default: reports.html]",
 )
 def report(runs: tuple[str, ...], output: str | None) -> None:
     """Write one page for many runs, with status, worst margin and validity of each.

@@ -14,7 +14,12 @@ from bayesdist.files.atomic import atomic_path
 
 @command()
 @click.option(
-    "-o", "--output", default="camera_gaia.csv", metavar="FILE.csv", help="File to write."
+    "-o",
+    "--output",
+    type=click.Path(),
+    default="camera_gaia.csv",
+    metavar="FILE.csv",
+    help="File to write.",
 )
 @click.option(
     "--stars", type=click.IntRange(min=1), default=4000, metavar="N", help="Number of stars."

@@ -293,7 +293,7 @@ class Catalogue:
                 do="give sigma_mas, or sigma with its unit; 0 with its source where it has none",
             )
         given: Any = sigma if sigma_mas is None else sigma_mas
-        several = isinstance(given, tuple | list) or getattr(given, "ndim", 0)
+        several = isinstance(given, tuple | list) or getattr(given, "ndim", 0) > 0
         pair = tuple(given) if several else (given, given)
         if len(pair) != 2:
             raise InputError(

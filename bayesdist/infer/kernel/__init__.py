@@ -6,11 +6,9 @@ not depend on the number of threads.
 """
 
 from bayesdist.infer.kernel.cache import kept_by_content
-from bayesdist.infer.kernel.vectors import use_whole_vectors
 
-use_whole_vectors()
 with kept_by_content():
-    from bayesdist.infer.kernel.blocks import BLOCK, pieces_of, set_threads
+    from bayesdist.infer.kernel.blocks import BLOCK, get_threads, pieces_of, set_threads
     from bayesdist.infer.kernel.likelihood import log_likelihood
     from bayesdist.infer.kernel.mixture import GAUSSIAN, NO_OUTLIERS, UNIFORM, Constants
     from bayesdist.infer.kernel.moments import (
@@ -64,6 +62,7 @@ __all__ = [
     "draw_deviations",
     "eliminate_stars",
     "gaussians",
+    "get_threads",
     "least_squares_moments",
     "linearised",
     "log_likelihood",

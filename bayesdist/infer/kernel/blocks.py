@@ -1,6 +1,7 @@
 """Chunks into which the stars are cut, and the threads that share them.
 
 Threads are Python's.  numba's own compile each pass several times over, and do not survive a fork.
+Even to ask numba for their number starts them, and fixes how the process starts others.
 """
 
 from __future__ import annotations
@@ -10,6 +11,7 @@ import os
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
+from contextvars import ContextVar
 from functools import cache
 from itertools import pairwise
 from typing import Any
@@ -18,6 +20,7 @@ import numba as nb
 import numpy as np
 
 from bayesdist.infer.kernel.lanes import FAST, INNER, copy
+from bayesdist.infer.kernel.vectors import whole_vectors
 from bayesdist.utils.arrays import Float, Int
 
 # how a pass is compiled: without a check for division by zero, which would exclude vectors
@@ -31,6 +34,7 @@ PASS: dict[str, Any] = {
 
 BLOCK = 256  # stars whose scratch arrays stay in the first-level cache
 THREADS_PAY = 200_000  # evaluations of a star below which one thread is faster
+_threads: ContextVar[int] = ContextVar("threads", default=nb.config.NUMBA_NUM_THREADS)
 PARTS = 4  # of the work, for each thread: some are done sooner than others
 
 
@@ -67,6 +71,7 @@ def star_room() -> tuple[Float, Float]:
 @nb.njit(**INNER)
 def put_ones(rows, n):
     """Write ones to rows of `scratch` behind the first n stars."""
+    whole_vectors()
     for k in range(len(rows)):
         for s in range(n, BLOCK):
             rows[k, s] = 1.0
@@ -75,6 +80,7 @@ def put_ones(rows, n):
 @nb.njit(**INNER)
 def lay_out(columns, first, end, rows):
     """Copy X, Y, u, v, var_u, var_v of some stars to rows of `scratch`, and ones behind them."""
+    whole_vectors()
     n = end - first
     copy(columns[0], first, n, rows, 0)
     copy(columns[1], first, n, rows, 1)
@@ -95,12 +101,12 @@ def share_out(
 
     Each part has its own `room`, arrays to write to, which come before the other arguments.
     """
-    threads = min(nb.get_num_threads(), n)
+    threads = min(get_threads(), n)
     if threads < 2:
         loop(0, n, *room(), *arguments)
         return
     edges = [n * part // (PARTS * threads) for part in range(PARTS * threads + 1)]
-    pool = _pool(nb.get_num_threads())
+    pool = _pool(get_threads())
     parts = [pool.submit(loop, a, e, *room(), *arguments) for a, e in pairwise(edges)]
     for done in parts:
         done.result()
@@ -118,7 +124,7 @@ if hasattr(os, "register_at_fork"):  # not on Windows
 
 def in_turn(function: Callable[..., Any], *arguments: Iterable[Any]) -> Iterator[Any]:
     """Results of a function that is called as by `map`, on all threads at a time."""
-    threads = nb.get_num_threads()
+    threads = get_threads()
     if threads < 2:
         yield from map(function, *arguments)
         return
@@ -134,14 +140,18 @@ def at_once(function: Callable[..., Any], *arguments: Iterable[Any]) -> list[Any
 @contextmanager
 def threads_for(evaluations: float) -> Iterator[None]:
     """Context with one thread where more would wait for each other longer than they work."""
-    threads = nb.get_num_threads()
-    nb.set_num_threads(threads if evaluations > THREADS_PAY else 1)
+    token = _threads.set(get_threads() if evaluations > THREADS_PAY else 1)
     try:
         yield
     finally:
-        nb.set_num_threads(threads)
+        _threads.reset(token)
+
+
+def get_threads() -> int:
+    """Number of threads that a pass may use: at first NUMBA_NUM_THREADS, or the processors."""
+    return _threads.get()
 
 
 def set_threads(n: int) -> None:
-    """Use at most `n` threads in this process from now on."""
-    nb.set_num_threads(max(1, min(n, nb.config.NUMBA_NUM_THREADS, os.cpu_count() or 1)))
+    """Use at most `n` threads from now on, in passes that the calling thread starts."""
+    _threads.set(max(1, min(n, nb.config.NUMBA_NUM_THREADS, os.cpu_count() or 1)))

@@ -25,6 +25,7 @@ import numpy as np
 
 from bayesdist.infer.kernel.lanes import FAST
 from bayesdist.infer.kernel.numeric import exp_negative
+from bayesdist.infer.kernel.vectors import whole_vectors
 from bayesdist.utils.arrays import Float, Int
 
 SURE = 8.6**2  # squared errors from the edge within which the probability is 1 to the last digit
@@ -56,6 +57,7 @@ NODES = _table()
 @nb.njit(cache=True, forceinline=True, fastmath=FAST)
 def inside(du, dv, A, B, R):
     """True if all but less than the last digit of the Gaussian lies in the circle."""
+    whole_vectors()
     d2 = du * du + dv * dv
     room = R - math.sqrt(d2)
     return room > 0.0 and room * room > SURE * max(A, B)
@@ -64,6 +66,7 @@ def inside(du, dv, A, B, R):
 @nb.njit(cache=True, forceinline=True, fastmath=FAST)
 def nodes_for(du, dv, A, B, R, counts):
     """Index of the smallest set of nodes that resolves the integrand."""
+    whole_vectors()
     bend = R * math.sqrt(du * du / (A * A) + dv * dv / (B * B)) + R * R * abs(1.0 / A - 1.0 / B)
     wanted = 9.0 + 7.2 * math.sqrt(bend)
     if du * du + dv * dv > R * R:
@@ -77,6 +80,7 @@ def nodes_for(du, dv, A, B, R, counts):
 @nb.njit(cache=True, forceinline=True, fastmath=FAST)
 def _total(values, n):
     """Sum of the first n values, n a multiple of four."""
+    whole_vectors()
     total = 0.0
     for s in range(0, n, 4):
         total += (values[s] + values[s + 1]) + (values[s + 2] + values[s + 3])
@@ -86,6 +90,7 @@ def _total(values, n):
 @nb.njit(cache=True, forceinline=True, fastmath=FAST)
 def _flux(e, away):
     """Contribution of a node to the sum: E(e) times the way out."""
+    whole_vectors()
     series = 1.0 - e * (1.0 / 2 - e * (1.0 / 6 - e * (1.0 / 24 - e * (1.0 / 120 - e / 720))))
     safe = max(e, EDGE)
     return away * (series if e < EDGE else (1.0 - exp_negative(-safe)) / safe)
@@ -97,6 +102,7 @@ def _log_from_within(du, dv, A, B, R, n, first, cosine, sine, work):
 
     No term is negative.
     """
+    whole_vectors()
     half_a, half_b = 0.5 / A, 0.5 / B
     for k in range(n):
         c, s = cosine[first + k], sine[first + k]
@@ -108,6 +114,7 @@ def _log_from_within(du, dv, A, B, R, n, first, cosine, sine, work):
 @nb.njit(cache=True, forceinline=True, fastmath=FAST)
 def _exponents(du, dv, A, B, R, n, first, cosine, sine, q):
     """Write q at the nodes to `q`; the least of them."""
+    whole_vectors()
     half_a, half_b = 0.5 / A, 0.5 / B
     least = math.inf
     for k in range(n):
@@ -121,6 +128,7 @@ def _exponents(du, dv, A, B, R, n, first, cosine, sine, q):
 @nb.njit(cache=True, forceinline=True, fastmath=FAST)
 def _log_from_outside(du, dv, A, B, R, n, first, cosine, sine, q, least, work):
     """Logarithm of the probability where the centre is not in the circle, from q at the nodes."""
+    whole_vectors()
     scale = R / (2.0 * n * math.sqrt(A * B))
     for k in range(n):
         work[k] = _flux(q[k], R + du * cosine[first + k] + dv * sine[first + k])
@@ -141,6 +149,7 @@ def log_circle(du, dv, A, B, R, nodes, q, work):
 
     q and work have room for `MOST` numbers.
     """
+    whole_vectors()
     if inside(du, dv, A, B, R):
         return 0.0
     A, B = max(A, STEEP * R * R), max(B, STEEP * R * R)
@@ -160,6 +169,7 @@ def slopes(du, dv, A, B, R, nodes, q, work, out):
     The logarithm; its derivatives by u, v; uu, uv, vv; by a variance that is added on both axes; by
     that and u, by that and v; and twice by that.
     """
+    whole_vectors()
     for m in range(10):
         out[m] = 0.0
     if inside(du, dv, A, B, R):

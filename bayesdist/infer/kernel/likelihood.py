@@ -30,6 +30,7 @@ from bayesdist.infer.kernel.lanes import (
 from bayesdist.infer.kernel.mixture import Constants, log_of_product, packed
 from bayesdist.infer.kernel.numeric import exp_negative, inverse_root
 from bayesdist.infer.kernel.polynomial import evaluate
+from bayesdist.infer.kernel.vectors import whole_vectors
 from bayesdist.utils.arrays import Float, Int
 
 SCRATCH = 16_000_000  # bytes of partial sums in memory at a time
@@ -39,6 +40,7 @@ SCRATCH = 16_000_000  # bytes of partial sums in memory at a time
 def _partial_sums(
     first, end, stars, model, density, blocks, columns, coef, order, rows, unit2, sums
 ):
+    whole_vectors()
     for b in range(first, end):
         g, a, e = blocks[b]
         n = e - a

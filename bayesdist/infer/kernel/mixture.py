@@ -15,6 +15,7 @@ import numpy as np
 from bayesdist.infer.kernel.blocks import BLOCK
 from bayesdist.infer.kernel.lanes import INNER, WIDTH, choose, load, product, spread, total
 from bayesdist.infer.kernel.numeric import bits_of, from_bits
+from bayesdist.infer.kernel.vectors import whole_vectors
 from bayesdist.utils.arrays import Float
 
 NO_OUTLIERS, GAUSSIAN, UNIFORM = 0, 1, 2
@@ -63,6 +64,7 @@ def packed(constants: Constants) -> Float:
 @nb.njit(**INNER)
 def log_of_product(density):
     """Sum of the logarithms of a block (1, BLOCK); one logarithm in all."""
+    whole_vectors()
     mantissa = load(density, 0, 0)
     exponent, mantissa, safe = spread(0, mantissa), spread(1.0, mantissa), spread(0.0, mantissa)
     for a in range(0, BLOCK, 8 * WIDTH):

@@ -43,6 +43,7 @@ from bayesdist.infer.kernel.lanes import (
 from bayesdist.infer.kernel.mixture import Constants, log_of_product, packed
 from bayesdist.infer.kernel.numeric import exp_negative, inverse_root
 from bayesdist.infer.kernel.polynomial import evaluate, legendre
+from bayesdist.infer.kernel.vectors import whole_vectors
 from bayesdist.utils.arrays import Float, Int
 
 PIECE = 4096
@@ -115,6 +116,7 @@ def room_for(order: int, columns: int) -> tuple[Float, ...]:
 @nb.njit(**INNER)
 def add_columns(columns, n, P, Q, lanes):
     """Add the moments of some stars to lanes."""
+    whole_vectors()
     for g in range(len(lanes)):
         top = len(P) if g == 0 else (len(P) + 1) >> 1
         for i in range(top):
@@ -140,6 +142,7 @@ def add_columns(columns, n, P, Q, lanes):
 @nb.njit(**INNER)
 def write_columns(lanes, out):
     """Write moments to out (columns, M), by total order, and zeros to the lanes."""
+    whole_vectors()
     T = lanes.shape[1]
     for g in range(len(lanes)):
         top = T if g == 0 else (T + 1) >> 1
@@ -157,6 +160,7 @@ def _least_squares(
     start, stop, stars, about, test, weighted, P, Q, lanes,
     pieces, columns, coef_about, coef_test, order, rules, sums, scalars,
 ):  # fmt: skip
+    whole_vectors()
     chi2_limit, r2_limit, corner, power = rules[0], rules[1], rules[2], int(rules[3])
     zero = spread(0.0, load(about, 0, 0))
     for b in range(start, stop):
@@ -209,6 +213,7 @@ def _mixture(
     start, stop, stars, model, density, weighted, P, Q, lanes,
     pieces, columns, coef, order, row, unit2, em, sums, scalars,
 ):  # fmt: skip
+    whole_vectors()
     wavering, log_unit = 0.0 if em else 1.0, math.log(2 * math.pi * unit2)
     j2, core, outlier, half, never = row[0], row[1], row[2], row[3], row[4]
     f, w = row[5], row[6]

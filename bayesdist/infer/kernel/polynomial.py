@@ -5,6 +5,7 @@ from __future__ import annotations
 import numba as nb
 
 from bayesdist.infer.kernel.lanes import FAST, INNER, WIDE, load_wide, put, spread
+from bayesdist.infer.kernel.vectors import whole_vectors
 
 
 @nb.njit(**INNER, fastmath=FAST)
@@ -13,6 +14,7 @@ def evaluate(coef, order, stars, n, out):
 
     `coef` (2, K) are sorted as `polynomial_terms`; X and Y are the first rows of `stars`.
     """
+    whole_vectors()
     cu, cv = coef[0], coef[1]
     for s in range(0, n, WIDE):
         x, y = load_wide(stars, 0, s), load_wide(stars, 1, s)
@@ -31,6 +33,7 @@ def evaluate(coef, order, stars, n, out):
 @nb.njit(**INNER, fastmath=FAST)
 def legendre(stars, n, top, P, Q):
     """P[k, s] = P_k(X[s]) for k <= top, and Q of Y; X and Y are the first rows of `stars`."""
+    whole_vectors()
     for s in range(0, n, WIDE):
         x, y = load_wide(stars, 0, s), load_wide(stars, 1, s)
         a = b = spread(1.0, x)

@@ -11,12 +11,14 @@ import numpy as np
 
 from bayesdist.infer.kernel.blocks import PASS, share_out
 from bayesdist.infer.kernel.lanes import FAST
+from bayesdist.infer.kernel.vectors import whole_vectors
 from bayesdist.utils.arrays import Float, Int
 
 
 @nb.njit(cache=True, forceinline=True, fastmath=FAST)
 def legendre(x, y, order, px, py, phi):
     """All basis functions of one position, by total order, then by descending power of x."""
+    whole_vectors()
     px[0] = py[0] = 1.0
     if order > 0:
         px[1], py[1] = x, y
@@ -34,6 +36,7 @@ def legendre(x, y, order, px, py, phi):
 @nb.njit(cache=True, forceinline=True, fastmath=FAST)
 def powers(coef, order, x, y):
     """Sums u, v of c_ij x^i y^j by Horner's rule from coefficients (2, K), sorted as the basis."""
+    whole_vectors()
     u = v = 0.0
     for i in range(order, -1, -1):
         at = order * (order + 1) // 2 + order - i
@@ -48,6 +51,7 @@ def powers(coef, order, x, y):
 @nb.njit(cache=True, forceinline=True, fastmath=FAST)
 def powers_and_slopes(coef, order, x, y):
     """Sums u, v as of `powers`, and their derivatives u_x, u_y, v_x, v_y."""
+    whole_vectors()
     u = ux = uy = v = vx = vy = 0.0
     for i in range(order, -1, -1):
         at = order * (order + 1) // 2 + order - i
@@ -63,6 +67,7 @@ def powers_and_slopes(coef, order, x, y):
 
 @nb.njit(**PASS)
 def _positions(first, end, group, X, Y, coef, order, out):
+    whole_vectors()
     for i in range(first, end):
         out[i, 0], out[i, 1] = powers(coef[group[i]], order, X[i], Y[i])
 
@@ -76,6 +81,7 @@ def positions(group: Int, X: Float, Y: Float, coef: Float, order: int) -> Float:
 
 @nb.njit(**PASS)
 def _slopes(first, end, group, X, Y, coef, order, out):
+    whole_vectors()
     for i in range(first, end):
         _, _, ux, uy, vx, vy = powers_and_slopes(coef[group[i]], order, X[i], Y[i])
         out[i, 0, 0], out[i, 0, 1], out[i, 1, 0], out[i, 1, 1] = ux, uy, vx, vy
@@ -90,6 +96,7 @@ def slopes(group: Int, X: Float, Y: Float, coef: Float, order: int) -> Float:
 
 @nb.njit(**PASS)
 def _linearised(first, end, group, seen_X, seen_Y, X, Y, places, coef, half, order, out):
+    whole_vectors()
     new_X, new_Y, offset, W = out
     for i in range(first, end):
         g, x, y = group[i], X[i], Y[i]

@@ -15,6 +15,7 @@ from bayesdist.infer.kernel.blocks import PASS
 from bayesdist.infer.kernel.lanes import FAST
 from bayesdist.infer.kernel.numeric import exp_negative
 from bayesdist.infer.kernel.star_modes import cholesky
+from bayesdist.infer.kernel.vectors import whole_vectors
 from bayesdist.utils.arrays import Float
 
 SUMS = PASS | {"fastmath": FAST | {"reassoc"}}
@@ -23,6 +24,7 @@ SUMS = PASS | {"fastmath": FAST | {"reassoc"}}
 @nb.njit(cache=True)
 def _factor(formal, sigma, L):
     """Lower Cholesky factors (k, k, E) of formal + sigma, with inverse diagonals."""
+    whole_vectors()
     k, _, n = formal.shape
     for j in range(k):
         for i in range(j, k):
@@ -44,6 +46,7 @@ def _factor(formal, sigma, L):
 
 @nb.njit(**PASS)
 def _precisions(formal, sigma, precision):
+    whole_vectors()
     k, _, n = formal.shape
     L, W = np.empty((k, k, n)), np.empty((k, k, n))
     for c in range(len(sigma)):
@@ -81,6 +84,7 @@ def precisions(formal: Float, sigma: Float) -> Float:
 
 @nb.njit(**PASS)
 def _densities(formal, sigma, residual, fraction, kappa2, density, distance, odd):
+    whole_vectors()
     k, _, n = formal.shape
     L, white, root = np.empty((k, k, n)), np.empty((k, n)), np.empty(n)
     for c in range(len(sigma)):
@@ -132,6 +136,7 @@ def densities(
 
 @nb.njit(**PASS)
 def _deviations(sigma, root, precision, residual, noise, deviation):
+    whole_vectors()
     n_chains, k, n = residual.shape
     missed = np.empty((k, n))
     for c in range(n_chains):
@@ -179,6 +184,7 @@ def _gaussian(matrix, x, noise):
 
     The integral is up to a constant, and NaN where the matrix is not positive.
     """
+    whole_vectors()
     k, value = len(x), 0.0
     if not cholesky(matrix, k):
         return math.nan
@@ -198,6 +204,7 @@ def _gaussian(matrix, x, noise):
 
 @nb.njit(**PASS)
 def _gaussians(matrix, x, noise, value):
+    whole_vectors()
     for c in range(len(x)):
         value[c] = _gaussian(matrix[c], x[c], noise[c])
 
@@ -216,6 +223,7 @@ def gaussians(matrix: Float, right: Float, noise: Float) -> tuple[Float, Float]:
 @nb.njit(**SUMS)
 def _pull(weight, r, u, out):
     """Row of the formal precision, `weight` (k, E), times residuals less deviations."""
+    whole_vectors()
     k, n = r.shape
     for e in range(n):
         out[e] = 0.0
@@ -232,6 +240,7 @@ def _share(i, u, r, inverse, P, D, seen, noise, matrix, pull, part):
     With D given the log density is quadratic in the parts: u becomes Lambda u, and the precision P
     of the covariance Lambda^-T P Lambda^-1, whose diagonal its prior weights with D^2.
     """
+    whole_vectors()
     k, n = u.shape
     x, row, own, a = np.empty(k), P[i].copy(), u[i], inverse[i, i]
     _pull(inverse[i], r, u, pull)
@@ -267,6 +276,7 @@ def _stretch(i, u, r, inverse, P, D, seen, dof, normal, luck, pull, part):
     s is proposed as the residuals ask for; its prior density, with those of the covariance and of
     the group of stretches, is s^-(dof + k) exp(-tail / s^2).
     """
+    whole_vectors()
     k, n = u.shape
     row, own, a = P[i].copy(), u[i], inverse[i, i]
     _pull(inverse[i], r, u, pull)
@@ -296,6 +306,7 @@ def _stretch(i, u, r, inverse, P, D, seen, dof, normal, luck, pull, part):
 @nb.njit(**SUMS)
 def _rescale(u, r, inverse, D, seen, variance, noise, matrix, pull, part):
     """Draw the scales D, of which the deviations are multiples, from their Gaussian density."""
+    whole_vectors()
     k, n = u.shape
     x = np.empty(k)
     for j in range(k):
@@ -329,6 +340,7 @@ def _rescale(u, r, inverse, D, seen, variance, noise, matrix, pull, part):
 
 @nb.njit(**PASS)
 def _shear(deviation, residual, inverse, precision, scale, prior, included, noise, luck):
+    whole_vectors()
     n_chains, k, n = deviation.shape
     variance, dof = prior
     matrix, pull, part = np.empty((k, k)), np.empty(n), np.empty(n)

@@ -34,6 +34,7 @@ from bayesdist.infer.kernel.star_modes import (
     own_rows,
     to_mode,
 )
+from bayesdist.infer.kernel.vectors import whole_vectors
 from bayesdist.utils.arrays import Float
 
 Flags = NDArray[np.int8]
@@ -56,6 +57,7 @@ C00, C10, C11, G0, G1, SQUARE = range(6)
 @nb.njit(cache=True, forceinline=True)
 def _place(coef, start, phi, offset_u, offset_v):
     """offset + sum of phi_k coef_k in lanes, of coefficients in 2 K rows (WIDTH,) from one on."""
+    whole_vectors()
     K = len(phi)
     u, v = load(coef, start, 0) * phi[0] + offset_u, load(coef, start + K, 0) * phi[0] + offset_v
     for k in range(1, K):
@@ -67,6 +69,7 @@ def _place(coef, start, phi, offset_u, offset_v):
 @nb.njit(cache=True, forceinline=True)
 def _times(mantissa, exponent, factor):
     """Product with one more factor; mantissas from one to two, and exponents."""
+    whole_vectors()
     bits = bits_of(mantissa * larger(factor, LEAST))
     # an integer below 2^52 in the low bits of 2^52
     exponent = exponent + (from_bits((bits >> 52) | 0x4330000000000000) - (2.0**52 + 1023.0))
@@ -82,6 +85,7 @@ def _newton(n, a, W, var, at, d, constants, centre, precision, p, least, found):
     positive, or the step long; the product of the densities of the detections; the determinant of
     the curvature.
     """
+    whole_vectors()
     jitter, far_odds = load(constants, 0, d), load(constants, 1, d)
     pu, pv = load(p, 0, 0), load(p, 1, 0)
     zero = spread(0.0, pu)
@@ -136,6 +140,7 @@ def _members(n, a, W, var, at, d, constants, state, centre, precision, p, member
     densities of members where they are largest, each times 2 pi.  Those of each doubtful one are
     written to `doubtful` (7 k rows or more, WIDTH), its density last.
     """
+    whole_vectors()
     jitter = load(constants, 0, d)
     pu, pv = load(p, 0, 0), load(p, 1, 0)
     du, dv = centre[0] - pu, centre[1] - pv
@@ -185,6 +190,7 @@ def _over_choices(members, doubtful, k, l, log_norm, log_out, least):
     Apart from a factor of 2 pi it equals the expansion about a mode: density less `log_root`.
     Without members and prior the star is somewhere in the match circle.
     """
+    whole_vectors()
     top, total, floor = -math.inf, 0.0, 2.0 * math.log(least)
     sure = math.log(members[6, l]) + LN2 * members[7, l]
     for choice in range(1 << k):
@@ -221,6 +227,7 @@ def _at_modes(n, a, W, var, at, d, constants, centre, precision, place, least, f
 
     The search for the mode begins at `place`, which is moved.  NaN where it does not go straight.
     """
+    whole_vectors()
     value[:] = math.nan
     for _ in range(STEPS):
         _newton(n, a, W, var, at, d, constants, centre, precision, place, least, found)
@@ -244,6 +251,7 @@ def _log_marginals(
     start, stop, starts, group, X, Y, offset, W, var, time, factor, centre, precision, stars,
     middles, response, state, coef, G, order, constants, least, sums,
 ):  # fmt: skip
+    whole_vectors()
     q, K, n_draws = stars.shape[1], (order + 1) * (order + 2) // 2, sums.shape[1]
     step = -(-len(stars) // PIECES)
     for piece in range(start, stop):

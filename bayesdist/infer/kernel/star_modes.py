@@ -24,6 +24,7 @@ import numpy as np
 
 from bayesdist.infer.kernel.lanes import FAST, WIDTH
 from bayesdist.infer.kernel.numeric import exp_negative
+from bayesdist.infer.kernel.vectors import whole_vectors
 
 MOST_STAR = 5  # parameters of a star
 MOST_STEPS = 60
@@ -43,6 +44,7 @@ def own_rows(W, var, a, e):
 
     (ROWS, n): n fills whole vectors, since what is left over would take as long as a vector each.
     """
+    whole_vectors()
     own = np.zeros((ROWS, -(-(e - a) // WIDTH) * WIDTH))
     own[VAR] = 1.0
     for i in range(a, e):
@@ -54,6 +56,7 @@ def own_rows(W, var, a, e):
 @nb.njit(cache=True, forceinline=True)
 def cholesky(A, q):
     """Lower Cholesky factor in place; False where the matrix is not positive."""
+    whole_vectors()
     for i in range(q):
         for j in range(i + 1):
             total = A[i, j]
@@ -71,6 +74,7 @@ def cholesky(A, q):
 @nb.njit(cache=True, forceinline=True)
 def _solve(L, b, q):
     """Solve L L^T x = b in place and return the squared length of L^-1 b."""
+    whole_vectors()
     decrement = 0.0
     for i in range(q):
         for k in range(i):
@@ -87,6 +91,7 @@ def _solve(L, b, q):
 @nb.njit(cache=True, forceinline=True)
 def design(S, q, i, time, factor):
     """Derivative (2, q) of a star's position by its parameters at the date of detection i."""
+    whole_vectors()
     S[0, 0] = S[1, 1] = 1.0
     S[0, 1] = S[1, 0] = 0.0
     if q >= 4:
@@ -99,6 +104,7 @@ def design(S, q, i, time, factor):
 @nb.njit(cache=True, forceinline=True)
 def residual(i, own, S, p, q):
     """W times the residual, and its square in square pixels."""
+    whole_vectors()
     ru, rv = own[PLACE_U, i], own[PLACE_V, i]
     for k in range(q):
         ru -= S[0, k] * p[k]
@@ -110,12 +116,14 @@ def residual(i, own, S, p, q):
 @nb.njit(cache=True, forceinline=True)
 def far_odds(log_core, log_out):
     """Density of false detections over that of true ones, without the factor s^2 / e."""
+    whole_vectors()
     return 2.0 * math.pi * math.exp(log_out - log_core)
 
 
 @nb.njit(cache=True, forceinline=True)
 def membership(odds, square, s2):
     """Probability that a detection belongs to its star; `odds` as of `far_odds`."""
+    whole_vectors()
     near = exp_negative(-0.5 * square / s2)
     return near / (near + odds * s2)
 
@@ -123,6 +131,7 @@ def membership(odds, square, s2):
 @nb.njit(cache=True, forceinline=True)
 def add_curvature(A, S, q, h0, h1, h2):
     """Add S^T H S, lower half."""
+    whole_vectors()
     for k in range(q):
         a = h0 * S[0, k] + h1 * S[1, k]
         b = h1 * S[0, k] + h2 * S[1, k]
@@ -133,6 +142,7 @@ def add_curvature(A, S, q, h0, h1, h2):
 @nb.njit(cache=True, forceinline=True)
 def hessian(i, own, wu, wv, s2, w, observed):
     """Curvature (3 numbers) of a detection by position: of the mixture, or with its EM weight."""
+    whole_vectors()
     core = w / s2
     tie = w * (1.0 - w) / (s2 * s2) if observed else 0.0
     return (
@@ -145,6 +155,7 @@ def hessian(i, own, wu, wv, s2, w, observed):
 @nb.njit(cache=True, forceinline=True)
 def _start(centre, precision, p, A, b):
     """Prior of a star: curvature, gradient, log density."""
+    whole_vectors()
     value = 0.0
     for k in range(len(p)):
         b[k] = 0.0
@@ -158,6 +169,7 @@ def _start(centre, precision, p, A, b):
 @nb.njit(cache=True, forceinline=True, fastmath=FAST | {"reassoc"})
 def _sums(own, j2, odds, pu, pv, share):
     """Curvature and gradient of a star without motion at (pu, pv); `share` as of `_expanded`."""
+    whole_vectors()
     a00 = a10 = a11 = b0 = b1 = 0.0
     for i in range(own.shape[1]):
         s2, uu, uv, vv = own[VAR, i] + j2, own[UU, i], own[UV, i], own[VV, i]
@@ -181,6 +193,7 @@ def _sums(own, j2, odds, pu, pv, share):
 @nb.njit(cache=True)
 def _expanded(own, n, j2, odds, time, factor, centre, precision, p, S, A, b, observed):
     """Log density of one star with its prior, gradient b and lower half of the curvature A."""
+    whole_vectors()
     q, value = len(p), _start(centre, precision, p, A, b)
     for i in range(n):
         s2 = own[VAR, i] + j2
@@ -200,6 +213,7 @@ def _expanded(own, n, j2, odds, time, factor, centre, precision, p, S, A, b, obs
 @nb.njit(cache=True)
 def _log_density(own, n, j2, log_core):
     """Log density of the detections of a star, from the terms of its last expansion."""
+    whole_vectors()
     value, product = 0.0, 1.0
     scale = own[VAR, 0] + j2  # keeps products near one
     for i in range(n):
@@ -213,6 +227,7 @@ def _log_density(own, n, j2, log_core):
 @nb.njit(cache=True, forceinline=True)
 def _expanded_at_rest(own, j2, odds, c0, c1, p00, p10, p11, pu, pv, observed):
     """As `_expanded`, at (pu, pv): value, gradient and factor, whose first number is 0 if none."""
+    whole_vectors()
     a00, a10, a11, b0, b1 = _sums(own, j2, odds, pu, pv, 1.0 if observed else 0.0)
     du, dv = c0 - pu, c1 - pv
     g0, g1 = p00 * du + p10 * dv, p10 * du + p11 * dv
@@ -230,6 +245,7 @@ def _to_mode_at_rest(own, n, j2, odds, log_core, c0, c1, p00, p10, p11, pu, pv, 
     c0, c1 are the centre of its prior, p00, p10, p11 the precision, pu, pv the start.  Returns the
     log density, whether the curvature is the mixture's, the mode, and the factor of the curvature.
     """
+    whole_vectors()
     observed, failed = True, False
     for _ in range(MOST_STEPS):
         value, b0, b1, l00, l10, l11 = _expanded_at_rest(
@@ -283,6 +299,7 @@ def to_mode(
     Returns the log density, and whether the curvature is the mixture's, or with EM weights: as
     requested by `seen`, or where necessary.
     """
+    whole_vectors()
     q, observed, failed, value, left = len(p), True, False, 0.0, 1.0
     odds = far_odds(log_core, log_out)
     if q == 2:  # most stars have no motion
@@ -328,6 +345,7 @@ def log_root(A, q, least):
     Without members a star's position would be unlimited; it is not, for its detections lie in one
     circle.
     """
+    whole_vectors()
     total = 0.0
     for k in range(q):
         total += math.log(max(A[k, k], least) if k < 2 else A[k, k])

@@ -11,11 +11,13 @@ from bayesdist.infer.kernel.blocks import PASS, lay_out, share_out, star_room, t
 from bayesdist.infer.kernel.mixture import Constants, packed
 from bayesdist.infer.kernel.numeric import exp_negative
 from bayesdist.infer.kernel.polynomial import evaluate
+from bayesdist.infer.kernel.vectors import whole_vectors
 from bayesdist.utils.arrays import Float, Int
 
 
 @nb.njit(**PASS)
 def _residuals(first, end, stars, model, blocks, columns, coef, order, out):
+    whole_vectors()
     for b in range(first, end):
         g, a, e = blocks[b]
         lay_out(columns, a, e, stars)
@@ -48,6 +50,7 @@ def residuals(blocks: Int, columns: tuple[Float, ...], coef: Float, order: int) 
 
 @nb.njit(**PASS)
 def _memberships(first, end, stars, model, blocks, columns, coef, order, rows, unit2, out):
+    whole_vectors()
     each = len(rows) // len(out)
     share, constant = 1.0 / each, math.log(2 * math.pi * unit2)
     for b in range(first, end):

@@ -31,6 +31,7 @@ from bayesdist.infer.kernel.star_modes import (
     residual,
     to_mode,
 )
+from bayesdist.infer.kernel.vectors import whole_vectors
 from bayesdist.utils.arrays import Float, Int
 
 
@@ -39,6 +40,7 @@ def _weighted_stars(
     first, end, starts, z, W, var, j2, log_core, log_out, time, factor, centre, precision, least,
     stars, member,
 ):  # fmt: skip
+    whole_vectors()
     q, odds = stars.shape[1], far_odds(log_core, log_out)
     S, A, b = np.zeros((2, MOST_STAR)), np.zeros((MOST_STAR, MOST_STAR)), np.zeros(MOST_STAR)
     for s in range(first, end):
@@ -74,6 +76,7 @@ def weighted_stars(
 @nb.njit(cache=True, forceinline=True)
 def _dot(coef, at, phi, row, n):
     """Sum of the first n products of two rows; n fills whole vectors."""
+    whole_vectors()
     lanes = load(coef, at, 0) * load(phi, row, 0)
     for k in range(WIDTH, n, WIDTH):
         lanes += load(coef, at, k) * load(phi, row, k)
@@ -83,6 +86,7 @@ def _dot(coef, at, phi, row, n):
 @nb.njit(cache=True, forceinline=True)
 def _add(out, at, phi, row, n, factor):
     """Add so many times the first n numbers of a row to one of `out`; n fills whole vectors."""
+    whole_vectors()
     for k in range(0, n, WIDTH):
         put(out, at, k, load(out, at, k) + load(phi, row, k) * factor)
 
@@ -93,6 +97,7 @@ def _eliminate_stars(
     chip, n_chips, linear, extra, columns, order, j2, log_core, log_out, least, seen, weights,
     pulls, scalars, rows, factors,
 ):  # fmt: skip
+    whole_vectors()
     q, m, odds = stars.shape[1], columns.shape[1], far_odds(log_core, log_out)
     K, low, top = (order + 1) * (order + 2) // 2, coef.shape[1], weights.shape[1]
     n_params = rows.shape[1]

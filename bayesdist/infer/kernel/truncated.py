@@ -42,6 +42,7 @@ from bayesdist.infer.kernel.moments import (
 )
 from bayesdist.infer.kernel.numeric import exp_negative
 from bayesdist.infer.kernel.polynomial import evaluate, legendre
+from bayesdist.infer.kernel.vectors import whole_vectors
 from bayesdist.utils.arrays import Float, Int
 
 SCRATCH = 16_000_000  # bytes of partial sums in memory at a time
@@ -56,6 +57,7 @@ N_TERMS = COLUMNS + N_MIXTURE  # columns and scalars of one star
 @nb.njit(cache=True, forceinline=True, fastmath=FAST)
 def _residual(stars, i, model, s, j2):
     """Residual of a star, its distance from the nominal position, and its variances."""
+    whole_vectors()
     ru, rv = stars[2][i] - model[0, s], stars[3][i] - model[1, s]
     return ru, rv, ru + stars[6][i], rv + stars[7][i], stars[4][i] + j2, stars[5][i] + j2
 
@@ -63,6 +65,7 @@ def _residual(stars, i, model, s, j2):
 @nb.njit(cache=True, forceinline=True, fastmath=FAST)
 def _parts(star, row, circle, q, work):
     """Densities of both parts, in the unit of `mixture`, and half the chi-square taken out."""
+    whole_vectors()
     ru, rv, du, dv, au, av = star
     gaussian, radius, nodes = circle[0], circle[1], circle[2:]
     q_in = 0.5 * (ru * ru / au + rv * rv / av)
@@ -86,6 +89,7 @@ def _evaluated(
     first, end, places, model, blocks, stars, coef, order, rows, unit2, circle, sums, out
 ):
     """Log-likelihood (n, D) of each block; averages by star to out (D / each, 3, N) if any."""
+    whole_vectors()
     n_draws, wanted = len(rows), len(out) > 0
     each = n_draws // len(out) if wanted else 1
     share, constant = 1.0 / each, math.log(2 * math.pi * unit2)
@@ -117,6 +121,7 @@ def _terms(star, row, circle, wavering, q, work, zc, zo, out):
 
     `wavering` is 1, or 0 at fixed memberships.
     """
+    whole_vectors()
     ru, rv, du, dv, au, av = star
     gaussian, radius, nodes = circle[0], circle[1], circle[2:]
     j2, f, w = row[0], row[5], row[6]
@@ -179,6 +184,7 @@ def _moments(
     start, stop, places, model, _, weighted, P, Q, lanes,
     pieces, stars, coef, order, row, unit2, circle, em, sums, scalars,
 ):  # fmt: skip
+    whole_vectors()
     q, work, zc, zo = np.empty(MOST), np.empty(MOST), np.empty(10), np.empty(10)
     one = np.empty(N_TERMS)
     wavering, log_unit = 0.0 if em else 1.0, math.log(2 * math.pi * unit2)
@@ -205,6 +211,7 @@ def _moments(
 
 @nb.njit(**PASS)
 def _scores(first, end, places, model, blocks, stars, coef, order, row, circle, out):
+    whole_vectors()
     for b in range(first, end):
         g, a, e = blocks[b]
         q, work, zc, zo = np.empty(MOST), np.empty(MOST), np.empty(10), np.empty(10)

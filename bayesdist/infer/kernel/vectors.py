@@ -6,16 +6,28 @@ slows the processor down.  The passes are nothing but vectors, and a third faste
 
 from __future__ import annotations
 
-from numba import config
-from numba.core.codegen import get_host_cpu_features
+from typing import Any
+
+from numba import config, types
+from numba.extending import intrinsic
+
+from bayesdist.infer.kernel.lanes import HAS_512
+
+WHOLE = HAS_512 and config.CPU_FEATURES is None  # the user's own choice comes first
 
 
-def use_whole_vectors() -> None:
-    """Compile for the whole width, unless numba's variables for the processor say otherwise.
+@intrinsic
+def whole_vectors(typingctx: Any) -> Any:
+    """Compile the function that calls this for vectors of the whole width.
 
-    Without effect in a process in which numba has already compiled something else.
+    An attribute of one function: numba's configuration, and with it the code of all other
+    functions of the process and the names of their caches, stays as it is.
     """
-    features = get_host_cpu_features()
-    wide = "+avx512f" in features.split(",")
-    if wide and config.CPU_FEATURES is None and config.CPU_NAME is None:
-        config.CPU_FEATURES = f"{features},-prefer-256-bit"
+
+    def build(context: Any, builder: Any, signature: Any, values: Any) -> Any:
+        if WHOLE:
+            # llvmlite writes attributes out as they are, but its `add` refuses those with a value
+            set.add(builder.function.attributes, '"prefer-vector-width"="512"')
+        return context.get_dummy_value()
+
+    return types.none(), build

@@ -182,7 +182,8 @@ class _EffectivePolynomials:
 
     def __call__(self, theta: Float) -> Float:
         parts = [self.model.effective(theta, group) for group in self.groups]
-        return np.concatenate(parts, axis=-3).reshape(*theta.shape[:-1], -1)
+        n_params = len(parts) * 2 * self.model.n_terms
+        return np.concatenate(parts, axis=-3).reshape(*theta.shape[:-1], n_params)
 
 
 def segment(solution: Solution, s: int) -> TransformedSolution:

@@ -19,7 +19,7 @@ from bayesdist.app.commands.options import (
 
 
 @command()
-@click.argument("file", metavar="FILE")
+@click.argument("file", metavar="FILE", type=click.Path())
 @filter_name
 @epoch
 @pixel_scale
@@ -43,13 +43,20 @@ def handbook(line: str, file: str, output: str, **options: Any) -> None:
 
 
 @command()
-@click.argument("file", metavar="FILE")
+@click.argument("file", metavar="FILE", type=click.Path())
 @filter_name
 @epoch
 @pixel_scale
-@click.option("-o", "--output", required=True, metavar="OUT.fits", help="File to write.")
+@click.option(
+    "-o", "--output", type=click.Path(), required=True, metavar="OUT.fits", help="File to write."
+)
 @click.option("--chip", type=int, metavar="N", show_default="all", help="Chip of the primary HDU.")
-@click.option("--image", metavar="FLT", help="A calibrated image that the maps shall match.")
+@click.option(
+    "--image",
+    type=click.Path(),
+    metavar="FLT",
+    help="A calibrated image that the maps shall match.",
+)
 @force
 def pam(file: str, output: str, **options: Any) -> None:
     """Write pixel area maps with their errors.

@@ -30,7 +30,14 @@ _optical_rotation = _number(
 
 
 @command()
-@click.option("-o", "--output", default="bayesdist-demo", metavar="DIR", help="Folder to create.")
+@click.option(
+    "-o",
+    "--output",
+    type=click.Path(),
+    default="bayesdist-demo",
+    metavar="DIR",
+    help="Folder to create.",
+)
 @click.option(
     "--as",
     "format",
@@ -47,7 +54,7 @@ def demo(line: str, output: str, format: str | None, force: bool) -> None:
 
 
 @command()
-@click.argument("runs", nargs=-1, required=True, metavar="RUN...")
+@click.argument("runs", nargs=-1, required=True, metavar="RUN...", type=click.Path())
 @new_folder
 @click.option(
     "--bins", type=int, default=31, metavar="N", help="Number of residual bins on each axis."
@@ -90,8 +97,8 @@ def bands(
 
 
 @command(name="bring-up")
-@click.argument("detections", metavar="DETECTIONS")
-@click.argument("reference", metavar="REFERENCE")
+@click.argument("detections", metavar="DETECTIONS", type=click.Path())
+@click.argument("reference", metavar="REFERENCE", type=click.Path())
 @new_folder
 @click.option("--band", required=True, metavar="W1", help="Band of the detections.")
 @click.option("--order", type=int, default=4, metavar="N", help="Final order of the polynomial.")
@@ -113,10 +120,12 @@ def bring_up(line: str, detections: str, reference: str, output: str, **options:
 
 
 @command()
-@click.argument("file", metavar="FILE")
+@click.argument("file", metavar="FILE", type=click.Path())
 @_number("--angle", metavar="DEG", help="Angle from x towards y, degrees.")
 @click.option("--mirror", is_flag=True, help="Change the sign of x first.")
-@click.option("-o", "--output", required=True, metavar="OUT", help="File to write.")
+@click.option(
+    "-o", "--output", type=click.Path(), required=True, metavar="OUT", help="File to write."
+)
 @force
 def rotate(file: str, output: str, angle: float, mirror: bool, force: bool) -> None:
     """Rotate the pixel frame of a SIP header or of WISE meta-data."""
@@ -141,7 +150,7 @@ def _pairs(function: Callable[..., None]) -> Callable[..., None]:
         ),
         click.option("--band", metavar="W1", help="Band, needed where the files hold several."),
         new_folder,
-        click.argument("files", nargs=-1, required=True, metavar="FILE..."),
+        click.argument("files", nargs=-1, required=True, metavar="FILE...", type=click.Path()),
     ):
         function = decorate(function)
     return function

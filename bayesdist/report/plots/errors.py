@@ -104,9 +104,11 @@ def plot_budget(
 
     Examples
     --------
-    >>> rng = np.random.default_rng(1)
-    >>> matches, truth = bd.simulate_wise(500, rng=rng)
-    >>> fit = bd.fit_linear(matches, bd.build_model(matches, order=2, size=(1016, 1016)))
+    >>> chip = bd.Chip(1, "camera", (2048, 2048), (1024.5, 1024.5))
+    >>> model, rng = bd.DistortionModel(1, (chip,), "pix"), np.random.default_rng(1)
+    >>> truth = [0, 1000, 0, 0, 0, 1000]
+    >>> stars, _ = bd.simulate_matches(model, truth, 500, sigma=0.01, rng=rng)
+    >>> fit = bd.fit_linear(stars, model)
     >>> budget = bd.error_budget(fit, grid=(5, 3), n_draws=100, rng=rng)
     >>> ax = plot_budget(budget, Figure().subplots())
     >>> [label.get_text() for label in ax.get_yticklabels()][-1]
@@ -217,9 +219,11 @@ def plot_margins(margins: Sequence[Margin], ax: Axes | None = None) -> Axes:
 
     Examples
     --------
-    >>> rng = np.random.default_rng(1)
-    >>> matches, truth = bd.simulate_wise(500, rng=rng)
-    >>> fit = bd.fit_linear(matches, bd.build_model(matches, order=2, size=(1016, 1016)))
+    >>> chip = bd.Chip(1, "camera", (2048, 2048), (1024.5, 1024.5))
+    >>> model, rng = bd.DistortionModel(1, (chip,), "pix"), np.random.default_rng(1)
+    >>> truth = [0, 1000, 0, 0, 0, 1000]
+    >>> stars, _ = bd.simulate_matches(model, truth, 500, sigma=0.01, rng=rng)
+    >>> fit = bd.fit_linear(stars, model)
     >>> needs = [bd.Requirement("field-wide", "p95", 1.0), bd.Requirement("corner", "max", 2.0)]
     >>> margins = bd.check_requirements(fit, needs, grid=(5, 3), n_draws=400, rng=rng)
     >>> ax = plot_margins(margins, Figure().subplots())

@@ -80,9 +80,11 @@ def plot_map(
 
     Examples
     --------
-    >>> matches, truth = bd.simulate_wise(500, rng=np.random.default_rng(1))
-    >>> model = bd.build_model(matches, order=2, size=(1016, 1016))
-    >>> errors = bd.uncertainty_map(bd.fit_linear(matches, model))
+    >>> chip = bd.Chip(1, "camera", (2048, 2048), (1024.5, 1024.5))
+    >>> model, rng = bd.DistortionModel(1, (chip,), "pix"), np.random.default_rng(1)
+    >>> truth = [0, 1000, 0, 0, 0, 1000]
+    >>> stars, _ = bd.simulate_matches(model, truth, 500, sigma=0.01, rng=rng)
+    >>> errors = bd.uncertainty_map(bd.fit_linear(stars, model))
     >>> ax = plot_map(errors, Figure().subplots())
     >>> ax.get_xlabel()
     'x [pix]'
@@ -154,9 +156,11 @@ def plot_distortion(
 
     Examples
     --------
-    >>> matches, truth = bd.simulate_wise(500, rng=np.random.default_rng(1))
-    >>> model = bd.build_model(matches, order=2, size=(1016, 1016))
-    >>> vectors = distortion_vectors(bd.fit_linear(matches, model), grid=(9, 9))
+    >>> chip = bd.Chip(1, "camera", (2048, 2048), (1024.5, 1024.5))
+    >>> model, rng = bd.DistortionModel(1, (chip,), "pix"), np.random.default_rng(1)
+    >>> truth = [0, 1000, 0, 0, 0, 1000]
+    >>> stars, _ = bd.simulate_matches(model, truth, 500, sigma=0.01, rng=rng)
+    >>> vectors = distortion_vectors(bd.fit_linear(stars, model), grid=(9, 9))
     >>> ax = plot_distortion(vectors, Figure().subplots())
     >>> ax.get_aspect()
     1.0

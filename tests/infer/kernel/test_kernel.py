@@ -229,17 +229,17 @@ def test_the_number_of_threads_does_not_matter(kind, which, monkeypatch):
     monkeypatch.setattr(blocks, "THREADS_PAY", 0)
     starts, columns, coef, order, constants, *_ = problem(kind, counts=(9000, 4900, 3))
     small, large = (kernel.pieces_of(starts, n) for n in (kernel.BLOCK, kernel.PIECE))
-    before = numba.get_num_threads()
+    before = kernel.get_threads()
     try:
         values = []
         for threads in (1, 2):
-            numba.set_num_threads(threads)
+            kernel.set_threads(threads)
             with blocks.threads_for(1):
-                assert numba.get_num_threads() == threads  # the work is shared out in earnest
+                assert kernel.get_threads() == threads  # the work is shared out in earnest
             values.append(PASSES[which](small, large, columns, coef, order, constants))
-            assert numba.get_num_threads() == threads
+            assert kernel.get_threads() == threads
     finally:
-        numba.set_num_threads(before)
+        kernel.set_threads(before)
     for one, two in zip(*values, strict=True):
         np.testing.assert_array_equal(one, two)
 
@@ -250,7 +250,7 @@ def test_a_fork_has_threads_of_its_own():
     """Those that wait for passes are not there any more in a child: it would wait for ever."""
     if numba.config.NUMBA_NUM_THREADS < 2:
         pytest.skip("one processor")
-    before = numba.get_num_threads()
+    before = kernel.get_threads()
 
     def sums() -> np.ndarray:
         out = np.zeros(2)
@@ -258,7 +258,7 @@ def test_a_fork_has_threads_of_its_own():
         return out
 
     try:
-        numba.set_num_threads(2)
+        kernel.set_threads(2)
         np.testing.assert_array_equal(sums(), [1, 2])
         child = os.fork()
         if child == 0:
@@ -266,7 +266,7 @@ def test_a_fork_has_threads_of_its_own():
             os._exit(0 if np.array_equal(sums(), [1, 2]) else 1)
         assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 0
     finally:
-        numba.set_num_threads(before)
+        kernel.set_threads(before)
 
 
 def _fill(first: int, end: int, out: np.ndarray) -> None:
@@ -276,21 +276,21 @@ def _fill(first: int, end: int, out: np.ndarray) -> None:
 def test_little_work_has_one_thread_and_the_number_comes_back():
     if numba.config.NUMBA_NUM_THREADS < 2:
         pytest.skip("one processor")
-    before = numba.get_num_threads()
+    before = kernel.get_threads()
     try:
-        numba.set_num_threads(2)
+        kernel.set_threads(2)
         with blocks.threads_for(blocks.THREADS_PAY):
-            assert numba.get_num_threads() == 1
-        assert numba.get_num_threads() == 2
+            assert kernel.get_threads() == 1
+        assert kernel.get_threads() == 2
         with pytest.raises(ZeroDivisionError), blocks.threads_for(1):
             1 / 0  # noqa: B018
-        assert numba.get_num_threads() == 2
+        assert kernel.get_threads() == 2
         kernel.set_threads(10_000)
-        assert 1 <= numba.get_num_threads() <= numba.config.NUMBA_NUM_THREADS
+        assert 1 <= kernel.get_threads() <= numba.config.NUMBA_NUM_THREADS
         kernel.set_threads(0)
-        assert numba.get_num_threads() == 1
+        assert kernel.get_threads() == 1
     finally:
-        numba.set_num_threads(before)
+        kernel.set_threads(before)
 
 
 # -- pieces --------------------------------------------------------------------------------------

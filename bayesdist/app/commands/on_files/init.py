@@ -139,7 +139,7 @@ def init(
         parse_config(text, str(path))
         outcome = f"for {n} matches; read it, then 'bayesdist check' it"
     with atomic_path(path) as temporary:
-        temporary.write_text(text, encoding="utf-8")
+        temporary.write_text(text, encoding="utf-8", newline="\n")
     return f"{path}: {outcome}"
 
 
