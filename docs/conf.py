@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import os
+import sysconfig
+
 import bayesdist
 
 project = "bayesdist"
@@ -13,7 +16,7 @@ extensions = [
     "sphinx.ext.autodoc",
     "sphinx.ext.autosummary",
     "numpydoc",
-    "myst_parser",
+    "myst_nb",  # also the parser of all other pages
     "sphinx-mathjax-offline",
 ]
 templates_path = ["_templates"]
@@ -26,6 +29,14 @@ autodoc_typehints = "none"  # the docstrings have types, shapes and units
 autodoc_member_order = "bysource"
 autosummary_generate = False
 numpydoc_show_class_members = False
+
+# notebooks are executed where they can write files, and find the commands of this environment
+nb_execution_mode = "force"
+nb_execution_in_temp = True
+nb_execution_raise_on_error = True
+nb_execution_timeout = 600  # seconds for one cell, on a machine with much else to do
+nb_merge_streams = True
+os.environ["PATH"] = os.pathsep.join([sysconfig.get_path("scripts"), os.environ.get("PATH", "")])
 
 myst_enable_extensions = ["dollarmath", "amsmath"]
 myst_heading_anchors = 3

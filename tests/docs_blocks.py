@@ -44,8 +44,10 @@ def run_notebook(page: Path, changes: Mapping[str, str] | None = None) -> dict[s
     for before, after in (changes or {}).items():
         assert any(before in cell for cell in code), f"{page.name}: has no {before!r}"
         code = [cell.replace(before, after) for cell in code]
-    namespace: dict[str, object] = {}
+    namespace: dict[str, object] = {"_command": _command}
     for number, cell in enumerate(code, start=1):
+        # commands of the shell, as in Jupyter: "!bayesdist ..."
+        cell = re.sub(r"^!(bayesdist .*)$", r"_command('$ \1')", cell, flags=re.MULTILINE)
         with contextlib.redirect_stdout(io.StringIO()):
             exec(compile(cell, f"{page.name}, cell {number}", "exec"), namespace)
     return namespace

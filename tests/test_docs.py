@@ -32,9 +32,12 @@ from .docs_blocks import DOCS, blocks, run_page
 from .sketches import sketched
 
 ROOT = DOCS.parent
-PAGES = sorted([*DOCS.glob("*.md"), *ROOT.glob("[CR]*.md"), ROOT / "examples" / "README.md"])
+NOTEBOOKS = sorted((DOCS / "notebooks").glob("*.md"))
+PAGES = sorted(
+    [*DOCS.glob("*.md"), *NOTEBOOKS, *ROOT.glob("[CR]*.md"), ROOT / "examples" / "README.md"]
+)
 # what make docs needs beyond the test extra's other packages
-SITE = ("sphinx", "myst_parser", "numpydoc", "pydata_sphinx_theme", "sphinx-mathjax-offline")
+SITE = ("sphinx", "myst_nb", "numpydoc", "pydata_sphinx_theme", "sphinx-mathjax-offline")
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -181,7 +184,8 @@ def test_every_page_is_in_the_table_of_contents():
     index = (DOCS / "index.md").read_text(encoding="utf-8")
     listed = {line.strip() for body in re.findall(r"```\{toctree\}(.*?)```", index, re.S)
               for line in body.splitlines()}  # fmt: skip
-    assert {p.stem for p in DOCS.glob("*.md")} - {"index"} <= listed
+    pages = {*DOCS.glob("*.md"), *NOTEBOOKS} - {DOCS / "index.md"}
+    assert {p.relative_to(DOCS).with_suffix("").as_posix() for p in pages} <= listed
 
 
 def _configured(kind: type[BaseModel], section: str = "") -> set[tuple[str, str]]:

@@ -615,6 +615,7 @@ def run(
     resume: bool = False,
     overwrite: bool = False,
     seed: int | None = None,
+    report: bool = True,
 ) -> Run:
     """Make the run of a configuration file, as ``bayesdist run`` does.
 
@@ -630,6 +631,9 @@ def run(
         Replace the run that is in the folder.
     seed : int, optional
         Seed in place of the configured one.
+    report : bool
+        False to leave out the report and its figures, which may take as long as everything else;
+        `Run.report` writes it at any time.
 
     Returns
     -------
@@ -645,7 +649,9 @@ def run(
     >>> run = bd.run("config.toml", "run")  # doctest: +SKIP
     """
     return open_run(
-        run_configuration(Path(config), Path(folder), resume=resume, force=overwrite, seed=seed)
+        run_configuration(
+            Path(config), Path(folder), resume=resume, force=overwrite, seed=seed, report=report
+        )
     )
 
 

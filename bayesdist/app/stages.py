@@ -53,6 +53,7 @@ def run(
     force: bool = False,
     strict: bool = False,
     seed: int | None = None,
+    report: bool = True,
     command: str = "",
 ) -> Path:
     """Match, fit, sample, diagnose, evaluate, export and report, as a configuration says.
@@ -71,6 +72,8 @@ def run(
         Raise when the sampler has not converged (after everything has been written).
     seed : int, optional
         In place of the configured one.
+    report : bool
+        False to leave out the stage 'report'.
     command : str
         For the record.
 
@@ -101,7 +104,8 @@ def run(
     )
     with initialized(directory) as results:
         names = list(STAGES)
-        results = make_stages(results, names[names.index(results.kind.begins_with) :])
+        names = names[names.index(results.kind.begins_with) : None if report else -1]
+        results = make_stages(results, names)
         _require_converged(results, strict)
     return directory.path
 
