@@ -190,10 +190,21 @@ def test_the_summary_has_what_the_design_lists(finished):
         assert set(summary["outliers"][key]) >= {"mean", "sd"}
 
 
+def _without_defaults(schema):
+    """The same JSON Schema without what says nothing new, and some versions of pydantic write."""
+    if isinstance(schema, list):
+        return [_without_defaults(item) for item in schema]
+    if not isinstance(schema, dict):
+        return schema
+    idle = [("additionalProperties", True), ("enum", [schema.get("const")])]
+    return {k: _without_defaults(v) for k, v in schema.items() if (k, v) not in idle}
+
+
 def test_the_summary_is_as_its_schema_has_it(finished):
     """The model is that of the JSON Schema in the package, and the file fits it."""
     there = Path(bayesdist.__file__).parent / "app" / "store" / "schema.json"
-    assert there.read_text(encoding="utf-8") == schema_text()
+    stated, defined = (json.loads(text) for text in (there.read_text("utf-8"), schema_text()))
+    assert _without_defaults(stated) == _without_defaults(defined)
     found = Summary.model_validate(summary_of(finished.path))
     assert (found.kind, found.detector, found.simulated) == ("data", "A", False)
     assert found.began == json.loads((finished.path / "run.json").read_text())["created"]
