@@ -28,7 +28,7 @@ from bayesdist.app.config.data import data_sections
 from bayesdist.mission import load_object
 from bayesdist.missions import wise
 
-from .docs_blocks import DOCS, blocks, run_page
+from .docs_blocks import DOCS, blocks, run_notebook, run_page
 from .sketches import sketched
 
 ROOT = DOCS.parent
@@ -133,6 +133,45 @@ def test_the_pages_of_the_pipelines_run(page, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     run_page(DOCS / page)
     assert list(tmp_path.glob("**/*_distortion.asdf"))
+
+
+def test_the_notebook_on_sip_headers_agrees_with_the_truth(tmp_path, monkeypatch):
+    """Its header errs as much as stated: the rms of error / sigma of 30 joint errors is near 1."""
+    monkeypatch.chdir(tmp_path)
+    namespace = run_notebook(DOCS / "notebooks" / "sextractor_to_sip.md")
+    run = namespace["run"]
+    assert run.converged and run.margins[0].verdict == "met" and run.warnings == ()
+    assert namespace["p95"] < 0.02  # the requirement, by the truth
+    assert 0.3 < np.sqrt((namespace["pulls"] ** 2).mean()) < 1.8
+
+
+def test_the_notebook_on_photutils_agrees_with_the_truth(tmp_path, monkeypatch):
+    """Errors of positions and of an angle are within what their covariance and draws say."""
+    for package in ("photutils", "regions", "reproject"):
+        pytest.importorskip(package, reason="comes with the docs extra")
+    monkeypatch.chdir(tmp_path)
+    namespace = run_notebook(DOCS / "notebooks" / "photutils_to_wcs.md")
+    assert 0.3 < namespace["rms_pull"] < 1.8 and abs(namespace["angle_pull"]) < 4
+    assert namespace["together"] < namespace["single"]
+
+
+def test_the_notebook_on_a_campaign_agrees_with_the_truth(tmp_path, monkeypatch):
+    """The error of the non-linear distortion is as large as that of draws of the posterior."""
+    monkeypatch.chdir(tmp_path)
+    namespace = run_notebook(DOCS / "notebooks" / "campaign.md")
+    assert namespace["run"].margins[0].verdict == "met"
+    assert 0.5 * namespace["low"] < namespace["error"] < 1.5 * namespace["high"]
+
+
+def test_the_notebook_on_releases_tells_a_change_from_none(tmp_path, monkeypatch):
+    """The release misses the requirement by the truth, and the new calibration meets it."""
+    monkeypatch.chdir(tmp_path)
+    namespace = run_notebook(DOCS / "notebooks" / "judging_a_release.md")
+    assert namespace["new_p95"] < 0.02 < namespace["old_p95"]
+    assert namespace["new"].margins[0].verdict == "met"
+    text = namespace["printed"]
+    assert "no longer describes" in text[0] and "still describes" in text[1]
+    assert "differ significantly" in text[2]
 
 
 @pytest.mark.slow
