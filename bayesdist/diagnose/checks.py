@@ -77,9 +77,7 @@ def input_checks(
     if error_scale:
         name = "Scale of the quoted errors"
         yield Check(FIT, name, level="warn", sentence=error_scale, doubt=LARGER)
-    if match_radius is None:
-        match_radius = table.match_radius
-    if matched_before and not in_circle and table.has_nominal and match_radius is None:
+    if matched_before and not in_circle and table.has_nominal:
         yield Check(
             MATCHING,
             "Match radius",
@@ -87,9 +85,7 @@ def input_checks(
             sentence="the matches have nominal positions, and outliers.match_radius is not given: "
             "the likelihood does not know that they were selected",
         )
-    yield from matching_checks(
-        match_radius, reference_sigma, in_circle=in_circle, nominal=table.has_nominal
-    )
+    yield from matching_checks(match_radius, reference_sigma, in_circle=in_circle)
 
 
 def frames_doubt(fit: LinearFit, table: Matches, *, suspicious: bool) -> str:
@@ -105,16 +101,15 @@ def frames_doubt(fit: LinearFit, table: Matches, *, suspicious: bool) -> str:
 
 
 def matching_checks(
-    match_radius: float | None, sigma: float, *, in_circle: bool, nominal: bool = False
+    match_radius: float | None, sigma: float, *, in_circle: bool
 ) -> Iterator[Check]:
     """Check of residuals that the match circle may have cut off, unknown to the likelihood.
 
     `match_radius`: in the unit of u and v. `sigma`: usual error of a star. `in_circle`: True if the
-    likelihood knows of the circles. `nominal`: True if the stars have nominal positions.
+    likelihood knows of the circles.
     """
     if in_circle or match_radius is None or MATCH_RADIUS.met_by(match_radius / sigma):
         return
-    remedy = "set outliers.match_radius" if nominal else "give the columns u_nominal and v_nominal"
     yield Check(
         ASSUMPTIONS,
         "Match radius, in errors of a star",
@@ -122,9 +117,8 @@ def matching_checks(
         MATCH_RADIUS.words,
         "warn",
         f"stars were matched within {match_radius / sigma:.1f} of their errors of nominal "
-        f"positions that {'the likelihood does not use' if nominal else 'are not given'}, which "
-        "cuts the scatter and draws the fit: match again with a wider match radius, or "
-        f"{remedy}",
+        "positions that are not given, which cuts the scatter and draws the fit: match again with "
+        "a wider match radius, or give the columns u_nominal and v_nominal",
         LARGER,
     )
 
