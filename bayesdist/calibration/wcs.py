@@ -139,15 +139,8 @@ class CalibrationWCS(BaseLowLevelWCS, HighLevelWCSMixin):
         plane = np.stack([first, second])
         if self.placement is not None:
             plane = self.placement.plane(first, second)
-        pixels, slope = self.chip_map.pixels(plane)
-        pixels[:, ~self._same_side(slope)] = np.nan
-        x, y = pixels - 1.0
+        x, y = self.chip_map.unfolded_pixels(plane) - 1.0
         return x.reshape(shape)[()], y.reshape(shape)[()]
-
-    def _same_side(self, slope: Float) -> Bool:
-        """Boolean mask (N,) of slopes (N, 2, 2) that are not beyond a fold of the map."""
-        det = slope[:, 0, 0] * slope[:, 1, 1] - slope[:, 0, 1] * slope[:, 1, 0]
-        return det * np.linalg.det(self.chip_map.linear) > 0
 
     # -- description of the axes ------------------------------------------------------------------
 
@@ -606,5 +599,5 @@ def _rounded_up(value: float) -> float:
 
 def _flat(*arrays: ArrayLike) -> tuple[Float, Float, tuple[int, ...]]:
     """Two arrays (N,), broadcast, and the shape that they had."""
-    first, second = np.broadcast_arrays(*(np.asarray(one, float) for one in arrays))
+    first, second = np.broadcast_arrays(*(np.asarray(array, float) for array in arrays))
     return first.ravel(), second.ravel(), first.shape
