@@ -76,8 +76,9 @@ class InputError(BayesdistError):
 
     Examples
     --------
+    >>> from bayesdist.model import PolynomialBasis
     >>> try:
-    ...     bd.PolynomialBasis(0, (1016, 1016), (508.5, 508.5))
+    ...     PolynomialBasis(0, (1016, 1016), (508.5, 508.5))
     ... except bd.InputError as error:
     ...     print(error.exit_code)
     1

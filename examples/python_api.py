@@ -1,19 +1,15 @@
-"""The whole job in a dozen lines of Python, on simulated WISE pairs (writes w2.hdr)."""
-
-import numpy as np
+"""A calibration in Python, on simulated WISE pairs (writes w2.hdr and the folder w2-run)."""
 
 import bayesdist as bd
+from bayesdist.missions.wise import simulate_wise
 
-rng = np.random.default_rng(1)
-matches, truth = bd.simulate_wise(6000, rng=rng)  # or bd.read_matches("stars.ecsv")
-model = bd.build_model(matches, order=4, size=(1016, 1016))
-fit = bd.fit_linear(matches, model)
-posterior = bd.sample(fit, matches, seed=1)
-print("converged:", posterior.convergence.converged, *posterior.convergence.reasons)
-print("largest radius, formal:   ", bd.uncertainty_map(fit).radius_max, model.unit)
-print("largest radius, posterior:", bd.uncertainty_map(posterior).radius_max, model.unit)
-catalogue = bd.UserTerm("reference catalogue", "systematic", 0.005, 0.005)
-print(bd.error_budget(posterior, terms=[catalogue], rng=rng).rows()[-1])
-field_wide = bd.Requirement("field-wide", "p95", 0.03, probability=0.95)
-print(bd.check_requirements(posterior, [field_wide], terms=[catalogue], rng=rng)[0].verdict)
-bd.write_sip(bd.sip_from_solution(posterior, linear="sip", scale_arcsec=2.75), "w2.hdr")
+stars, truth = simulate_wise(6000, rng=1)  # or bd.read_matches("stars.ecsv")
+catalogue = bd.Catalogue("2MASS", sigma=0.005, unit="pix", source="a guess for this example")
+need = bd.Requirement("field-wide", "p95", 0.03, probability=0.95)
+run = bd.calibrate(stars, order=4, size=(1016, 1016), catalogue=catalogue, requirements=need)
+print(run)  # verdict, warnings, error budget; a table in a notebook
+print("largest radius, formal:   ", bd.uncertainty_map(run.fit).radius_max, run.model.unit)
+print("largest radius, posterior:", run.map().radius_max, run.model.unit)
+print(run.budget(at=(10, 10), to=(1000, 1000)))  # of a separation
+run.write("sip", "w2.hdr", linear="sip", scale_mas=2750)
+run.save("w2-run")  # as the command line does; bd.open_run("w2-run") reads it

@@ -22,7 +22,9 @@ HEAVY = (
 )
 
 
-@pytest.mark.parametrize("package", ["", ".data", ".infer", ".assess", ".products"])
+@pytest.mark.parametrize(
+    "package", ["", ".data", ".infer", ".assess", ".products", ".missions.wise"]
+)
 def test_public_names_are_where_they_are_said_to_be(package):
     """The stub, which type checkers read, and what is loaded."""
     face = import_module(f"bayesdist{package}")
@@ -48,3 +50,22 @@ def test_importing_the_package_is_cheap():
         cwd=Path(bayesdist.__file__).parent.parent,
     )
     assert run.stdout.strip() == "[]"
+
+
+def test_importing_a_mission_is_cheap():
+    """The entry point loads it, and its names are loaded when they are used."""
+    code = f"import sys, bayesdist.missions.wise; print([m for m in {HEAVY!r} if m in sys.modules])"
+    run = subprocess.run(
+        [sys.executable, "-c", code],
+        capture_output=True,
+        text=True,
+        check=True,
+        cwd=Path(bayesdist.__file__).parent.parent,
+    )
+    assert run.stdout.strip() == "[]"
+
+
+def test_the_face_has_few_names():
+    """At most 45, without those of single formats and missions."""
+    assert len(bayesdist.__all__) <= 45
+    assert not [n for n in bayesdist.__all__ if n.startswith(("simulate_wise", "read_sip", "Idc"))]

@@ -9,6 +9,9 @@ import pytest
 from astropy.table import Table
 
 import bayesdist as bd
+from bayesdist.formats import read_sip, sip_from_solution, write_sip
+from bayesdist.missions.wise import simulate_wise
+from bayesdist.model import PolynomialBasis
 from bayesdist.simulate.camera import camera, matched_to_gaia
 from tests.app.support import as_table
 
@@ -19,7 +22,7 @@ README = Path(__file__).resolve().parents[1] / "README.md"
 
 def test_the_session_of_the_readme(tmp_path, monkeypatch):
     rng = np.random.default_rng(1)
-    simulated, truth = bd.simulate_wise(1500, rng=rng)
+    simulated, truth = simulate_wise(1500, rng=rng)
     as_table(simulated).write(tmp_path / "stars.ecsv")
     monkeypatch.chdir(tmp_path)
 
@@ -34,7 +37,7 @@ def test_the_session_of_the_readme(tmp_path, monkeypatch):
     budget = bd.error_budget(again, terms=[catalogue], rng=rng)
     goal = bd.Requirement("field-wide", "p95", 0.1)
     (margin,) = bd.check_requirements(again, [goal], terms=[catalogue], rng=rng)
-    bd.write_sip(bd.sip_from_solution(again, linear="sip"), "sip.hdr")
+    write_sip(sip_from_solution(again, linear="sip"), "sip.hdr")
 
     assert posterior.convergence.converged
     off = again.mean - truth.theta
@@ -46,9 +49,9 @@ def test_the_session_of_the_readme(tmp_path, monkeypatch):
     # nothing is decided before the residuals are examined
     assert margin.verdict == "undecided" and 0 < margin.value < 0.1
     assert margin.reason.startswith("the residuals were not examined; give diagnostics=")
-    header = bd.read_sip("sip.hdr")
+    header = read_sip("sip.hdr")
     assert header.order == (4, 4)
-    bd.write_sip(header, "again.hdr")
+    write_sip(header, "again.hdr")
     assert (tmp_path / "again.hdr").read_text() == (tmp_path / "sip.hdr").read_text()
 
 
@@ -56,10 +59,10 @@ def test_the_sip_terms_are_those_that_were_published(tmp_path):
     """From simulated pairs back to Appendix B of the WISE report, within the errors stated."""
     from bayesdist.missions.wise.published import WISE_COEFFICIENTS
 
-    matches, _ = bd.simulate_wise(3000, rng=np.random.default_rng(2))
+    matches, _ = simulate_wise(3000, rng=np.random.default_rng(2))
     fit = bd.fit_linear(matches, bd.build_model(matches, order=4, size=(1016, 1016)))
-    header = bd.sip_from_solution(fit, linear="sip")
-    terms = bd.PolynomialBasis(4, (1016, 1016), (508.5, 508.5)).terms
+    header = sip_from_solution(fit, linear="sip")
+    terms = PolynomialBasis(4, (1016, 1016), (508.5, 508.5)).terms
     for found, sigma, published in (
         (header.a, header.sigma_a, WISE_COEFFICIENTS["W2"][0]),
         (header.b, header.sigma_b, WISE_COEFFICIENTS["W2"][1]),

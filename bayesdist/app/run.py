@@ -30,6 +30,7 @@ from bayesdist.diagnose.diagnostics import Diagnostics
 from bayesdist.errors import InputError
 from bayesdist.infer import LinearFit, Posterior
 from bayesdist.model import DistortionModel
+from bayesdist.products.registry import format_of
 from bayesdist.report.html import (
     RunSummary,
     budget_rows,
@@ -43,6 +44,7 @@ from bayesdist.utils.quantities import year_of
 
 if TYPE_CHECKING:
     from astropy.modeling import Model
+    from astropy.table import QTable
     from xarray import DataTree
 
     from bayesdist.app.config import Config
@@ -136,9 +138,13 @@ class Run:
     @cached_property
     def calibration(self) -> Calibration:
         """Calibration of the detector as it is written to files, with all errors of positions."""
-        product = self.results.product
-        budget = self.evaluation.budget.rows()
-        return replace(product.calibration, further=further_errors(budget))
+        results = self.results
+        return replace(
+            results.product.calibration,
+            pixel_mas=results.config.detector.scale_mas,
+            before=results.fitted.tables.tables,
+            further=further_errors(self.evaluation.budget.rows()),
+        )
 
     @property
     def converged(self) -> bool:
@@ -452,7 +458,57 @@ class Run:
             f"{count} {name}" for count, name in counts if count
         )
 
+    def to_sky(self, table: Any, **options: Any) -> QTable:
+        """Positions on the sky of a table of pixels, with all errors that the run knows.
+
+        Parameters
+        ----------
+        table : table
+            Pixels of stars, with a column chip if the detector has several chips.
+        **options
+            Names of columns, pixel origin, chip, epoch and others, as for `Calibration.to_sky`.
+
+        Returns
+        -------
+        QTable
+            The table with sky positions, their standard deviations and correlation.
+
+        Raises
+        ------
+        InputError
+            If u and v do not lie on the sky, or columns or chips are unknown.
+        """
+        return self.calibration.to_sky(table, **options)
+
     # -- files ------------------------------------------------------------------------------------
+
+    def write(self, format: str, file: str | os.PathLike[str], **settings: Any) -> list[Path]:
+        """Write the calibration in the format of a pipeline.
+
+        Parameters
+        ----------
+        format : str
+            Name of the format, such as 'sip' or 'tpv'; `bayesdist.formats.list_formats` lists them.
+        file : path-like
+            File to write, or a folder for a format with several files.
+        **settings
+            Settings of the format and options, as for `Calibration.write`.  The date is that of
+            the evaluation by default, if the format holds one date and the model depends on time.
+
+        Returns
+        -------
+        list of Path
+            Files that were written.
+
+        Raises
+        ------
+        InputError
+            If the format or a setting is unknown, the file exists, or the format cannot hold the
+            calibration.
+        """
+        if self.model.time is not None and not format_of(format).holds_time:
+            settings = {"epoch": self.results.epoch} | settings
+        return self.calibration.write(format, file, **settings)
 
     def report(self, path: str | os.PathLike[str]) -> Path:
         """Write the report of the run as one HTML file.

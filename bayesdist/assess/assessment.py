@@ -111,11 +111,12 @@ def error_budget(
 
     Examples
     --------
-    >>> matches, truth = bd.simulate_wise(500, rng=np.random.default_rng(1))
+    >>> from bayesdist.missions.wise import simulate_wise
+    >>> matches, truth = simulate_wise(500, rng=np.random.default_rng(1))
     >>> model = bd.build_model(matches, order=2, size=(1016, 1016))
     >>> fit = bd.fit_linear(matches, model)
-    >>> catalogue = bd.UserTerm("2MASS", "systematic", 0.005, 0.005)
-    >>> budget = bd.error_budget(fit, terms=[catalogue], grid=(5, 3), n_draws=100)
+    >>> catalogue = bd.Catalogue("2MASS", 0.005, "pix")
+    >>> budget = bd.error_budget(fit, catalogue=catalogue, grid=(5, 3), n_draws=100)
     >>> [row["name"] for row in budget.rows()]
     ['coefficients', '2MASS', 'total']
     >>> "the residuals were not examined" in budget.notes[0]
@@ -218,13 +219,23 @@ def check_requirements(
 
     Examples
     --------
-    >>> matches, truth = bd.simulate_wise(500, rng=np.random.default_rng(1))
-    >>> model = bd.build_model(matches, order=2, size=(1016, 1016))
-    >>> fit = bd.fit_linear(matches, model)
-    >>> need = bd.Requirement("field-wide", "p95", 1.0)
-    >>> (margin,) = bd.check_requirements(fit, [need], grid=(5, 3), n_draws=400)
+    >>> from bayesdist.missions.wise import simulate_wise
+    >>> matches, truth = simulate_wise(500, rng=np.random.default_rng(1))
+    >>> model = bd.build_model(matches, order=4, size=(1016, 1016))
+    >>> posterior = bd.sample(bd.fit_linear(matches, model), matches)
+    >>> need, gaia = bd.Requirement("field-wide", "p95", 1.0), bd.Catalogue("Gaia", 0.001, "pix")
+    >>> (margin,) = bd.check_requirements(posterior, [need], catalogue=gaia, grid=(5, 3))
     >>> margin.verdict, margin.reason.partition(";")[0]
     ('undecided', 'the residuals were not examined')
+    >>> (margin,) = bd.check_requirements(
+    ...     posterior,
+    ...     [need],
+    ...     diagnostics=bd.diagnose(posterior, matches),
+    ...     catalogue=gaia,
+    ...     grid=(5, 3),
+    ... )
+    >>> margin.verdict
+    'met'
     """
     stated = _stated_terms(catalogue, terms)
     settings = _settings(solution, diagnostics, stated, exposure, grid, epoch, n_draws, pixel_scale)

@@ -30,6 +30,7 @@ from bayesdist.infer.solution.solution import Solution
 from bayesdist.model import LookupTable
 from bayesdist.utils.arrays import Float
 from bayesdist.utils.memory import require_memory
+from bayesdist.utils.quantities import Random, generator_of
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,7 +58,7 @@ class ErrorModel:
         """True if the star lies in a new exposure, which deviates as those at hand scatter."""
         return self.aligned and any(isinstance(term, ExposureVariation) for term in self.terms)
 
-    def drawn(self, n: int, rng: np.random.Generator) -> DrawnErrors:
+    def drawn(self, n: int, rng: Random) -> DrawnErrors:
         """Draws of all errors.
 
         A star is taken to lie in an exposure chosen at random, for each draw, among those whose
@@ -66,7 +67,7 @@ class ErrorModel:
         Parameters
         ----------
         n : int
-        rng : numpy.random.Generator
+        rng : int or numpy.random.Generator
 
         Raises
         ------
@@ -81,6 +82,7 @@ class ErrorModel:
             where="assess.draws",
             do="ask for fewer",
         )
+        rng = generator_of(rng)
         one = self.solution.draw(n, rng)
         solution, fitted = self.solution.solution, self.solution.fitted_exposures
         image = Image()
@@ -130,9 +132,7 @@ class ErrorModel:
                 out.append(table_of(chip.number, chip.size, sigma))
         return tuple(out)
 
-    def at(
-        self, domain: EvaluationDomain, *, n: int = 4000, rng: np.random.Generator
-    ) -> ErrorBudget:
+    def at(self, domain: EvaluationDomain, *, n: int = 4000, rng: Random) -> ErrorBudget:
         """The error budget of positions, or of their differences.
 
         Parameters
@@ -140,7 +140,7 @@ class ErrorModel:
         domain : EvaluationDomain
         n : int
             Draws.
-        rng : numpy.random.Generator
+        rng : int or numpy.random.Generator
         """
         return budget_of(self.drawn(n, rng), domain)
 

@@ -2,13 +2,15 @@
 
 A calibration is a solution without the frames of exposures, whether it was fitted or read from a
 file, with the further data that pipelines need: the plane it maps to, look-up tables, explicit
-inverses, its validity period.  One calibration is of one filter.
+inverses, its reference date.  A calibration belongs to one filter.
 """
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -25,43 +27,158 @@ from bayesdist.infer.solution.transforms import at_exposure, without_frames
 from bayesdist.mission import load_object
 from bayesdist.model import Chip, DistortionModel, LookupTable, TimeDependence, corrected
 from bayesdist.utils.arrays import Float
-from bayesdist.utils.quantities import Direction, Epoch, Number, year_of
+from bayesdist.utils.quantities import Direction, Epoch, Number, direction_in, year_of
 
 if TYPE_CHECKING:
+    import pandas
     from astropy.modeling import Model
+    from astropy.table import QTable, Table
 
     from bayesdist.calibration.wcs import CalibrationWCS
+
+__all__ = ["Calibration"]
 
 ORIGINS = ("stated", "reference", "chip")
 FOLLOWING_ORDER = 9  # of the polynomial that stands for look-up tables where two are compared
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Calibration:
-    """Calibration of all chips of a detector in one plane.
+    """Map from the pixels of all chips of a detector to one plane, with its errors.
 
-    `inverses` are by chip, from positions about its own zero point, at the reference date.
+    `bayesdist.read_calibration` reads it from a run or from a calibration file of any format, and
+    `from_solution` makes it from a fit or a posterior.  A chip maps a pixel (x, y), FITS 1-based,
+    to (u, v): the pixel is first corrected by the look-up tables `before`, then the polynomial of
+    the solution is evaluated, then the look-up tables `after` are added.
+
+    Parameters
+    ----------
+    name : str
+        Name of the file or run, for messages.
+    solution : Solution
+        Polynomials of all chips and their covariance, without frames of exposures.  Its first chip
+        is the reference chip.
+    plane : Plane, optional
+        Plane of (u, v): on the sky, in an aperture, of corrected pixels, or free.
+    instrument, detector, filter : str, optional
+        Names; empty if unknown.
+    errors : {'covariance', 'sigma', 'none'}
+        What is known of the errors of the coefficients: their covariance, standard deviations of
+        monomials alone, or nothing.
+    numbered : bool
+        False for a file without chip numbers.
+    before : tuple of LookupTable, optional
+        Look-up tables in pixels, which are applied before the polynomial.
+    after : tuple of LookupTable, optional
+        Look-up tables in the unit of u and v, which are added after the polynomial.
+    inverses : mapping of int to ExplicitInverse, optional
+        Inverse polynomials of a file, by chip number, at the reference date.
+    scale : float, optional
+        Size of a corrected pixel in the unit of u and v, if stated.
+    scale_from : str, optional
+        Source of `scale`.
+    pixel_mas : float, optional
+        Size of a pixel on the sky in mas, if known for u and v in pixels.
+    reference_date : float, optional
+        Date in decimal years at which a calibration that depends on time is evaluated by default.
+    undated : str, optional
+        Note on positions without a date.
+    no_date : str, optional
+        Reason why the calibration cannot be evaluated at another date; empty if it can.
+    with_plane : ndarray, shape (D, 4), optional
+        Covariance of the D parameters with the four parameters of the orientation of the plane.
+    notes : tuple of str, optional
+        Notes for the reader.
+    further : tuple of FurtherError, optional
+        Errors of positions that the covariance of the solution does not hold.
+
+    Examples
+    --------
+    A camera with 0.2 arcsec to the pixel, fitted to 500 stars and written as a TPV header:
+
+    >>> rng = np.random.default_rng(1)
+    >>> chip = bd.Chip(1, "camera", (1000, 1000), (500.5, 500.5))
+    >>> model = bd.DistortionModel(1, (chip,), "arcsec")
+    >>> stars, _ = bd.simulate_matches(model, [0, -100, 0, 0, 0, 100], 500, sigma=0.01, rng=rng)
+    >>> fit = bd.fit_linear(stars, model)
+    >>> calibration = bd.Calibration.from_solution(fit, name="camera", point=(150.0, 2.2))
+    >>> calibration
+    <Calibration 'camera': chip 1, order 1, u and v in arcsec on the sky at (150, 2.2), covariance>
+    >>> [path.name for path in calibration.write("tpv", "camera.head")]
+    ['camera_parameters.fits', 'camera.head']
+    >>> again = bd.read_calibration("camera.head")
+    >>> np.allclose(again.forward([1.0], [1.0], chip=1), calibration.forward([1.0], [1.0], chip=1))
+    True
     """
 
-    name: str  # of the file or run, for messages
-    solution: Solution  # without frames; its first chip is the reference chip
+    name: str
+    solution: Solution
     plane: Plane = field(default_factory=Plane)
     instrument: str = ""
     detector: str = ""
     filter: str = ""
-    errors: str = "covariance"  # 'covariance', 'sigma' (of monomials alone) or 'none'
-    numbered: bool = True  # False for a file without chip numbers
-    before: tuple[LookupTable, ...] = ()  # in pixels, before the polynomial
-    after: tuple[LookupTable, ...] = ()  # in the plane's unit, after it
+    errors: str = "covariance"
+    numbered: bool = True
+    before: tuple[LookupTable, ...] = ()
+    after: tuple[LookupTable, ...] = ()
     inverses: Mapping[int, ExplicitInverse] = field(default_factory=dict)
-    scale: float | None = None  # stated size of a corrected pixel, in the plane's unit
-    scale_from: str = ""  # source of the scale
-    reference_date: float | None = None  # decimal years: default of `at`
-    undated: str = ""  # note on positions without a date
-    no_date: str = ""  # reason why it cannot be brought to a date; else empty
-    with_plane: Float | None = None  # (D, 4), covariance with the orientation
-    notes: tuple[str, ...] = ()  # notes for the reader
-    further: tuple[FurtherError, ...] = ()  # errors of positions that `solution` does not hold
+    scale: float | None = None
+    scale_from: str = ""
+    pixel_mas: float | None = None
+    reference_date: float | None = None
+    undated: str = ""
+    no_date: str = ""
+    with_plane: Float | None = None
+    notes: tuple[str, ...] = ()
+    further: tuple[FurtherError, ...] = ()
+
+    @classmethod
+    def from_solution(
+        cls,
+        solution: Solution,
+        *,
+        name: str = "solution",
+        point: Direction | None = None,
+        detector: str = "",
+        filter: str = "",
+    ) -> Calibration:
+        """Calibration of a fit or a posterior, without the frames of its exposures.
+
+        Parameters
+        ----------
+        solution : LinearFit or Posterior
+        name : str, optional
+            Name for messages and files.
+        point : SkyCoord or tuple, optional
+            Right ascension and declination (numbers in degrees) of (u, v) = (0, 0), if u increases
+            to the east and v to the north.
+        detector, filter : str, optional
+            Names that files state.
+
+        Returns
+        -------
+        Calibration
+        """
+        plane = None if point is None else Plane("sky", point=direction_in(point, "point"))
+        return calibration_of(solution, name, plane=plane, detector=detector, filter=filter)
+
+    def __repr__(self) -> str:
+        chips = f"chip{'s' if len(self.numbers) > 1 else ''} {', '.join(map(str, self.numbers))}"
+        where = {
+            "sky": " on the sky",
+            "aperture": " of an aperture",
+            "detector": " of the corrected detector",
+        }.get(self.plane.kind, "")
+        if self.plane.point is not None:
+            where += " at ({:.6g}, {:.6g})".format(*self.plane.point)
+        parts = [chips, f"order {self.model.order}", f"u and v in {self.unit}{where}"]
+        if self.before or self.after:
+            parts.append("look-up tables")
+        if self.model.time is not None:
+            parts.append("depends on time")
+        words = {"sigma": "standard deviations", "none": "no errors"}
+        parts.append(words.get(self.errors, self.errors))
+        return f"<Calibration {self.name!r}: {', '.join(parts)}>"
 
     @property
     def model(self) -> DistortionModel:
@@ -233,7 +350,9 @@ class Calibration:
             return None
         if epoch is None and self.reference_date is None:
             raise InputError(
-                "depends on time and no date is given", where=self.name, do="give --epoch"
+                "depends on time and no date is given",
+                where=self.name,
+                do="give the epoch (--epoch on the command line)",
             )
         return self.reference_date if epoch is None else epoch
 
@@ -263,6 +382,139 @@ class Calibration:
             inverses={k: v for k, v in self.inverses.items() if k == number},
         )
 
+    # -- files and tables -------------------------------------------------------------------------
+
+    def write(
+        self,
+        format: str,
+        file: str | os.PathLike[str],
+        *,
+        epoch: Epoch | None = None,
+        scale_mas: Number | None = None,
+        order: int | None = None,
+        overwrite: bool = False,
+        **settings: Any,
+    ) -> list[Path]:
+        """Write the calibration in a format.
+
+        Parameters
+        ----------
+        format : str
+            Name of the format, such as 'sip' or 'tpv'; `bayesdist.formats.list_formats` lists them.
+        file : path
+            File to write, or an existing folder, in which files have the usual names of the
+            format.  A format with a file for each chip needs a folder.
+        epoch : float, str, Time or Quantity, optional
+            Date at which a calibration that depends on time is written; a number is in decimal
+            years.
+        scale_mas : float or Quantity, optional
+            Size of a pixel on the sky in mas.  Needed if u and v are in pixels and the file states
+            angles; by default `pixel_mas`.
+        order : int, optional
+            Order of the polynomial in the file, by default that of the calibration.  Look-up
+            tables that the format cannot hold are fitted by a polynomial of this order.
+        overwrite : bool
+            Whether existing files are replaced.
+        **settings
+            Settings of the format: the keys of its table ``[products.NAME]`` in a configuration.
+
+        Returns
+        -------
+        list of Path
+            Files that were written, those that stand beside the file itself first.
+
+        Raises
+        ------
+        InputError
+            For an unknown format or setting, an existing file, a folder that does not exist, and
+            whatever the format cannot hold, such as look-up tables or the dependence on time.
+        """
+        written: list[Path] = load_object(hooks.WRITE)(
+            self,
+            format,
+            file,
+            epoch=epoch,
+            scale_mas=scale_mas,
+            order=order,
+            overwrite=overwrite,
+            **settings,
+        )
+        return written
+
+    def to_sky(
+        self,
+        table: Table | pandas.DataFrame | Mapping[str, Any],
+        *,
+        columns: Sequence[str] = ("x", "y"),
+        centroids: Sequence[str] | None = None,
+        pixel_origin: float = 1.0,
+        chip: int | None = None,
+        epoch: Epoch | None = None,
+        point: Direction | None = None,
+        covariance: bool = False,
+    ) -> QTable:
+        """Positions on the sky of a table of pixels, with all errors that the calibration carries.
+
+        Parameters
+        ----------
+        table : astropy Table, pandas DataFrame or mapping of arrays
+            Pixels of stars, with a column chip if the detector has several chips.
+        columns : tuple of str
+            Names of the columns with x and y.
+        centroids : tuple of str, optional
+            Names of the columns with the standard deviations of x and y, in pixels.
+        pixel_origin : float
+            Coordinate of the centre of the first pixel: 1 as in FITS, 0 as in photutils.
+        chip : int, optional
+            Chip number of all stars, instead of a column.
+        epoch : float, str, Time or Quantity, optional
+            Date, for a calibration that depends on time; a number is in decimal years.
+        point : SkyCoord or tuple, optional
+            Right ascension and declination (numbers in degrees) of (u, v) = (0, 0), with u to the
+            east and v to the north, instead of the calibration's own.
+        covariance : bool
+            Whether the joint covariance of all stars is returned.
+
+        Returns
+        -------
+        QTable
+            The table with `ra` and `dec`, their standard deviations `sigma_ra` (to the east, with
+            cos(dec)) and `sigma_dec`, and the correlation `corr_ra_dec`.  ``meta["errors"]`` names
+            the errors that are included.  With `covariance`, ``meta["covariance"]`` is the matrix
+            (2 N, 2 N) of all stars in mas^2, east and north in turn.
+
+        Raises
+        ------
+        InputError
+            For a calibration that does not lie on the sky, and unknown columns or chips.
+
+        Examples
+        --------
+        >>> rng = np.random.default_rng(1)
+        >>> chip = bd.Chip(1, "camera", (1000, 1000), (500.5, 500.5))
+        >>> model = bd.DistortionModel(1, (chip,), "arcsec")
+        >>> truth = [0, 50, 0, 0, 0, 50]
+        >>> stars, _ = bd.simulate_matches(model, truth, 500, sigma=0.01, fraction=0.0, rng=rng)
+        >>> calibration = bd.Calibration.from_solution(bd.fit_linear(stars, model))
+        >>> sky = calibration.to_sky({"x": [500.5], "y": [500.5]}, point=(30.0, 0.0))
+        >>> round(float(sky["ra"][0].value), 4)
+        30.0
+        >>> bool(abs(sky["sigma_ra"][0].to_value("mas") - 10 / 500**0.5) < 0.01)  # mean of 500
+        True
+        """
+        positions: QTable = load_object(hooks.TO_SKY)(
+            self,
+            table,
+            columns=columns,
+            centroids=centroids,
+            pixel_origin=pixel_origin,
+            chip=chip,
+            epoch=epoch,
+            point=point,
+            covariance=covariance,
+        )
+        return positions
+
     # -- scale ------------------------------------------------------------------------------------
 
     def pixel(self, epoch: float | None = None) -> tuple[float, str]:
@@ -275,7 +527,7 @@ class Calibration:
         area = abs(float(np.linalg.det(self.chip(epoch=epoch).linear)))
         if not area > 0:
             raise InputError(
-                "the pixel at the zero point has no area", where=self.name, do="give --scale"
+                "the pixel at the zero point has no area", where=self.name, do="give the scale"
             )
         return float(np.sqrt(area)), "the pixel at the zero point"
 

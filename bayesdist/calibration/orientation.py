@@ -269,7 +269,7 @@ def placed_at(
             raise InputError(
                 "a crval is given, and u and v are in pixels of unknown size",
                 where="detector.scale_mas",
-                do="give the pixel scale (of convert: --scale)",
+                do="give the pixel scale (scale_mas in Python, --scale of convert)",
             )
         calibration = in_arcsec(calibration, scale_arcsec)
     plane = Plane("sky", point=(float(crval[0]), float(crval[1])), note=calibration.plane.note)

@@ -22,6 +22,7 @@ from bayesdist.calibration.chip_map import ChipMap
 from bayesdist.calibration.plane import ARCSEC, SkyPlacement
 from bayesdist.errors import InputError
 from bayesdist.utils.arrays import Float, Int
+from bayesdist.utils.quantities import Direction, Epoch, direction_in, values_in, year_of
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,8 +48,8 @@ def sky_positions(
     y: ArrayLike,
     chip: ArrayLike,
     *,
-    epoch: float | None = None,
-    point: tuple[float, float] | None = None,
+    epoch: Epoch | None = None,
+    point: Direction | None = None,
     placement: SkyPlacement | None = None,
     centroids: tuple[ArrayLike, ArrayLike] | None = None,
     joint: bool = False,
@@ -61,7 +62,8 @@ def sky_positions(
     `joint` the covariance of all stars is there.
     InputError for a plane that does not touch the sky and no point, or a unit that is no angle.
     """
-    x, y = np.atleast_1d(np.asarray(x, float)), np.atleast_1d(np.asarray(y, float))
+    x, y = (np.atleast_1d(values_in(a, "pix", name)) for name, a in (("x", x), ("y", y)))
+    epoch = None if epoch is None else year_of(epoch)
     chip = np.broadcast_to(np.asarray(chip, np.int64), x.shape)
     placement = placement or placement_of(calibration, point)
     maps = calibration.with_tables(calibration.at(epoch, origin="stated"))
@@ -106,9 +108,8 @@ def plane_covariances(
     for number, chip_map in maps.items():
         rows = chip == number
         slope[rows] = chip_map.slope(x[rows], y[rows])
-    own = _own(calibration, slope, centroids)
-    shared = np.diag([sum(r.u**2 for r in calibration.further if r.shared),
-                      sum(r.v**2 for r in calibration.further if r.shared)])  # fmt: skip
+    own = own_covariances(calibration, slope, centroids)
+    shared = shared_covariance(calibration)
     single = own + shared
     for number, chip_map in maps.items():
         rows = chip == number
@@ -117,8 +118,10 @@ def plane_covariances(
             single[rows] += from_coefficients
     if not joint:
         return single, None
-    design = _designs(calibration, maps, x, y, chip)
-    whole = np.einsum("nak,kl,mbl->namb", design, _coefficients(calibration, epoch), design)
+    design = designs(calibration, maps, x, y, chip)
+    whole = np.einsum(
+        "nak,kl,mbl->namb", design, coefficient_covariance(calibration, epoch), design
+    )
     whole += shared[None, :, None, :]
     rows = np.arange(x.size)
     whole[rows, :, rows, :] += own
@@ -127,7 +130,7 @@ def plane_covariances(
 
 def placement_of(
     calibration: Calibration,
-    point: tuple[float, float] | None = None,
+    point: Direction | None = None,
     *,
     position_angle: float | None = None,
     mirrored: bool = False,
@@ -149,9 +152,8 @@ def placement_of(
             where=calibration.name,
             do="put it into the image's header by a pipeline, or give a file in TPV or SIP",
         )
-    if point is None:
-        point = plane.point
-    if point is None:
+    place = plane.point if point is None else direction_in(point, "point")
+    if place is None:
         raise InputError(
             "does not say where its plane touches the sky",
             where=calibration.name,
@@ -180,10 +182,16 @@ def placement_of(
             matrix = matrix @ np.diag([cosine, 1.0]) @ plane.to_v2v3
     elif mirrored:
         matrix = np.diag([-1.0, 1.0])
-    return SkyPlacement(point, unit * matrix)
+    return SkyPlacement(place, unit * matrix)
 
 
-def _own(
+def shared_covariance(calibration: Calibration) -> Float:
+    """Covariance (2, 2) on the plane of errors that all stars of an image share."""
+    rows = [row for row in calibration.further if row.shared]
+    return np.diag([float(sum(r.u**2 for r in rows)), float(sum(r.v**2 for r in rows))])
+
+
+def own_covariances(
     calibration: Calibration, slope: Float, centroids: tuple[ArrayLike, ArrayLike] | None
 ) -> Float:
     """Covariances (N, 2, 2) on the plane of errors that each star has by itself."""
@@ -192,19 +200,21 @@ def _own(
     out[:, 0, 0] = sum(row.u**2 for row in alone)
     out[:, 1, 1] = sum(row.v**2 for row in alone)
     if centroids is not None:
-        sigma = np.stack([np.broadcast_to(np.asarray(s, float), len(slope)) for s in centroids])
+        sigma = np.stack(
+            [np.broadcast_to(values_in(s, "pix", "centroids"), len(slope)) for s in centroids]
+        )
         out += np.einsum("nab,bn,ncb->nac", slope, sigma**2, slope)
     return out
 
 
-def _coefficients(calibration: Calibration, epoch: float | None) -> Float:
+def coefficient_covariance(calibration: Calibration, epoch: float | None) -> Float:
     """Covariance of the coefficients of all chips; zero where there is none."""
     found = calibration.joint_covariance(calibration.numbers, epoch, origin="stated")
     n = 2 * calibration.model.n_terms * len(calibration.numbers)
     return np.zeros((n, n)) if found is None else found
 
 
-def _designs(
+def designs(
     calibration: Calibration, maps: Mapping[int, ChipMap], x: Float, y: Float, chip: Int
 ) -> Float:
     """Derivatives (N, 2, n) of positions by the coefficients of all chips."""

@@ -8,11 +8,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from astropy.table import Table
 from numpy.typing import NDArray
 
 from bayesdist.data.reading.columns import is_on_sky, plane_unit, position_unit
-from bayesdist.data.reading.table import with_sky_columns
+from bayesdist.data.reading.table import as_table, with_sky_columns
 from bayesdist.data.sky.earth import parallax_factors
 from bayesdist.data.sky.positions import sky_columns
 from bayesdist.data.sky.tangent import onto_plane
@@ -30,6 +29,7 @@ from bayesdist.data.tables.units import check_unit
 from bayesdist.errors import InputError
 from bayesdist.files.tables import read_table
 from bayesdist.utils.arrays import Float, Int
+from bayesdist.utils.quantities import Direction, Epoch, direction_in, year_of
 
 _PAIRS = (("sigma_u", "sigma_v"), ("pm_u", "pm_v"), ("sigma_pm_u", "sigma_pm_v"))
 _PARALLAX = ("parallax", "sigma_parallax")
@@ -156,7 +156,7 @@ class ReferenceCatalog:
         lengths = columns_of(self, [name for name in _COLUMNS if name != "mag"])
         return replace(self, **{k: factor * values for k, values in lengths.items()}, unit=unit)
 
-    def at(self, epoch: float) -> ReferenceCatalog:
+    def at(self, epoch: Epoch) -> ReferenceCatalog:
         """Catalogue at another epoch.
 
             u(t) = u + pm (t - t0),   sigma(t)^2 = sigma^2 + sigma_pm^2 (t - t0)^2
@@ -167,8 +167,8 @@ class ReferenceCatalog:
 
         Parameters
         ----------
-        epoch : float
-            Decimal years.
+        epoch : float, str, Time, date or Quantity
+            Numbers are decimal years.
 
         Returns
         -------
@@ -179,13 +179,14 @@ class ReferenceCatalog:
         InputError
             When there are proper motions but no epoch to count from.
         """
+        year = year_of(epoch)
         if self.pm_u is None or self.pm_v is None:
-            return replace(self, epoch=float(epoch))
+            return replace(self, epoch=year)
         if self.epoch is None:
             raise InputError(
                 "has proper motions but no epoch", where=self.source, do="give the epoch"
             )
-        dt = float(epoch) - np.asarray(self.epoch, float)
+        dt = year - np.asarray(self.epoch, float)
         sigma_u, sigma_v = self.sigma_u, self.sigma_v
         if sigma_u is not None and self.sigma_pm_u is not None:
             sigma_u = np.hypot(sigma_u, self.sigma_pm_u * dt)
@@ -197,16 +198,16 @@ class ReferenceCatalog:
             v=self.v + self.pm_v * dt,
             sigma_u=sigma_u,
             sigma_v=sigma_v,
-            epoch=float(epoch),
+            epoch=year,
         )
 
-    def as_seen(self, epoch: float) -> ReferenceCatalog:
+    def as_seen(self, epoch: Epoch) -> ReferenceCatalog:
         """Catalogue as seen from the Earth: that of `at`, displaced by the parallaxes.
 
         Parameters
         ----------
-        epoch : float
-            Decimal years.
+        epoch : float, str, Time, date or Quantity
+            Numbers are decimal years.
 
         Returns
         -------
@@ -222,7 +223,7 @@ class ReferenceCatalog:
         if self.parallax is None or self.tangent_point is None:
             return then
         # factors of the middle of the field serve all of it
-        east, north = parallax_factors(epoch, *self.tangent_point)[0]
+        east, north = parallax_factors(year_of(epoch), *self.tangent_point)[0]
         sigmas = {}
         u, v = then.sigma_u, then.sigma_v
         if self.sigma_parallax is not None and u is not None and v is not None:
@@ -281,8 +282,8 @@ def read_catalog(
     columns: Mapping[str, str] | None = None,
     *,
     unit: str | None = None,
-    epoch: float | None = None,
-    tangent_point: tuple[float, float] | None = None,
+    epoch: Epoch | None = None,
+    tangent_point: Direction | None = None,
 ) -> ReferenceCatalog:
     r"""Read a reference catalogue from a table file.
 
@@ -321,19 +322,20 @@ def read_catalog(
 
 
 def catalog_from_table(
-    table: Table,
+    table: Any,
     columns: Mapping[str, str] | None = None,
     *,
     source: str = "catalogue",
     unit: str | None = None,
-    epoch: float | None = None,
-    tangent_point: tuple[float, float] | None = None,
+    epoch: Epoch | None = None,
+    tangent_point: Direction | None = None,
 ) -> ReferenceCatalog:
     """Reference catalogue from a table's columns.
 
     Parameters
     ----------
-    table : astropy Table
+    table : table
+        Any object that `Matches.from_table` takes.
     columns : mapping of str to str, optional
         Column of each quantity: u v ra dec sigma_u sigma_v pm_u pm_v sigma_pm_u sigma_pm_v
         parallax sigma_parallax epoch mag star; an empty name leaves one out.  With ra and dec,
@@ -346,10 +348,10 @@ def catalog_from_table(
         Unit of u and v where the table has none.  Errors and motions without a unit are in that
         of u and v, per year; with ra and dec they must have one, in the file or by their names
         (those of the Gaia archive and of VizieR).
-    epoch : float, optional
-        Decimal year, where the table has no such column.
-    tangent_point : tuple of float, optional
-        RA and Dec in degrees; by default the mean direction of the stars.
+    epoch : float, str, Time, date or Quantity, optional
+        Epoch of the positions, where the table has no such column.
+    tangent_point : SkyCoord, or pair of float or Quantity, optional
+        By default the mean direction of the stars.
 
     Returns
     -------
@@ -361,7 +363,12 @@ def catalog_from_table(
         For missing columns, values that are missing or no numbers, and units missing or
         contradictory.
     """
-    table = with_sky_columns(table)
+    if epoch is not None:
+        epoch = year_of(epoch, where=source)
+    point = None
+    if tangent_point is not None:
+        point = direction_in(tangent_point, "tangent_point", where=source)
+    table = with_sky_columns(as_table(table, source))
     named = {_ALSO.get(key, key): name for key, name in (columns or {}).items()}
     found = find_columns(table.colnames, named, _ALIASES, source=source, pairs=_NAME_PAIRS)
     on_sky = is_on_sky(table.colnames, found, named, source)
@@ -424,7 +431,7 @@ def catalog_from_table(
         )
         out |= onto_plane(
             *sky_columns(quantities),
-            tangent_point,
+            point,
             sigma=sigma,
             motion=motion,
             sigma_motion=sigma_motion,

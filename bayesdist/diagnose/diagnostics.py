@@ -74,9 +74,47 @@ class Diagnostics:
     `diagnose` makes it.  `error_budget` and `check_requirements` take it, so that a verdict counts
     what the residuals show; printed, it says how many tests there were and what was found.
 
+    Parameters
+    ----------
+    sums : StarSums
+        Sums of the residuals of all stars.
+    partitions : mapping
+        Numbers of bins (nx, ny) of each partition, by chip number and name of the partition.
+    misfits : tuple of Misfit
+        Structure that the solution leaves, for each chip or, if chips share stars, for all.
+    coverage : tuple of Coverage
+        Area of each chip that the stars cover.
+    sample : StarSample
+        All stars, or a sample of very many, with their residuals and probabilities.
+    input_checks : tuple of Check
+        Checks of the fit, the frames, the quoted errors and the matching.
+    dates : ndarray, shape (T,)
+        Distinct dates of the stars in decimal years, ascending; empty without dates.
+    majority : str
+        Sentence on a majority of false pairs; empty if there is none.
+    epoch_shift : EpochShift or None
+        Error of the epochs; None without proper motions.
+    centroid : MagnitudeErrors or None
+        Scatter of the residuals by magnitude; None without magnitudes.
+    flagged : ndarray of int, shape (E,), or None
+        Number of stars of each exposure that are more likely false than not; None for one exposure.
+    score_tests : tuple of ScoreTest
+        Results of the tests of the residuals.
+    correlated : Discrepancy or None
+        Correlated errors beyond the model; None if they have not been estimated.
+    catalogue : StarCovariance or None
+        Covariance of the parameters due to errors of the catalogue; None if these are unknown.
+    periods : TimeVariation or None
+        Comparison of the models of several periods; None if it was not asked for.
+    holdout : HoldoutValidation or None
+        Results for stars that were set aside before the fit; None without such stars.
+    overlap : OverlapTest or None
+        Comparison of two exposures far apart in time; None unless the run is a campaign.
+
     Examples
     --------
-    >>> matches, truth = bd.simulate_wise(500, rng=np.random.default_rng(1))
+    >>> from bayesdist.missions.wise import simulate_wise
+    >>> matches, truth = simulate_wise(500, rng=np.random.default_rng(1))
     >>> model = bd.build_model(matches, order=4, size=(1016, 1016))
     >>> posterior = bd.sample(bd.fit_linear(matches, model), matches, target_ess=100)
     >>> diagnostics = bd.diagnose(posterior, matches)
@@ -84,32 +122,22 @@ class Diagnostics:
     True
     """
 
-    sums: StarSums  # of residuals over all stars
-    # bins of each chip, by its number and the name of the partition
+    sums: StarSums
     partitions: Mapping[int, Mapping[str, Bins]]
-    # structure that the solution leaves, of each chip or, where these share stars, of all
     misfits: tuple[Misfit, ...]
-    coverage: tuple[Coverage, ...]  # the area of each chip that its stars cover
-    sample: StarSample  # some stars, or all of them, and what residuals and probabilities of each
-    # of the fit, the frames, the quoted errors and the matching: what only the data can tell
+    coverage: tuple[Coverage, ...]
+    sample: StarSample
     input_checks: tuple[Check, ...]
-    dates: Float  # (T,), distinct dates of the stars, ascending decimal years; empty without dates
-    majority: str = ""  # what it means that most pairs are false; empty where they are not
-    epoch_shift: EpochShift | None = None  # error of the epochs; None without proper motions
-    # scatter of residuals by magnitude, where stars have magnitudes
+    dates: Float
+    majority: str = ""
+    epoch_shift: EpochShift | None = None
     centroid: MagnitudeErrors | None = None
-    # (E,), stars of each exposure that are more likely false than not; None for one exposure
     flagged: Int | None = None
     score_tests: tuple[ScoreTest, ...] = ()
-    # correlated errors; None where they have not been estimated
     correlated: Discrepancy | None = None
-    # covariance of the parameters by errors of the catalogue, where these are known by star
     catalogue: StarCovariance | None = None
-    # models of several periods compared, where that was asked for
     periods: TimeVariation | None = None
-    # results of stars that were set aside before the fit, where there are any
     holdout: HoldoutValidation | None = None
-    # two exposures far apart in time laid on each other, of a campaign
     overlap: OverlapTest | None = None
 
     def __repr__(self) -> str:
@@ -214,7 +242,8 @@ def diagnose(
 
     Examples
     --------
-    >>> matches, truth = bd.simulate_wise(500, rng=np.random.default_rng(1))
+    >>> from bayesdist.missions.wise import simulate_wise
+    >>> matches, truth = simulate_wise(500, rng=np.random.default_rng(1))
     >>> model = bd.build_model(matches, order=2, size=(1016, 1016))
     >>> fit = bd.fit_linear(matches, model)
     >>> posterior = bd.sample(fit, matches, seed=1, target_ess=100)

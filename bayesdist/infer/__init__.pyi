@@ -21,6 +21,7 @@ from .exposures.hierarchy import (
     held_in_reference as held_in_reference,
 )
 from .posterior.files import (
+    posterior_datatree as posterior_datatree,
     load_fit as load_fit,
     load_posterior as load_posterior,
     save_fit as save_fit,

@@ -136,7 +136,8 @@ class PolynomialBasis:
 
     Examples
     --------
-    >>> basis = bd.PolynomialBasis(2, (1016, 1016), (508.5, 508.5))
+    >>> from bayesdist.model import PolynomialBasis
+    >>> basis = PolynomialBasis(2, (1016, 1016), (508.5, 508.5))
     >>> basis.n_terms
     6
     >>> X, Y = basis.scaled([0.5, 508.5], [508.5, 1016.5])  # from edge to edge

@@ -15,6 +15,7 @@ from bayesdist.model.basis import PolynomialBasis
 from bayesdist.model.frames import CHIP_DEVIATIONS, FRAME_KINDS, RIGID, frame_names
 from bayesdist.model.timedep import AXES, TimeDependence
 from bayesdist.utils.arrays import Float, Int
+from bayesdist.utils.quantities import values_in
 
 GAUGES = ("first", "held")
 
@@ -28,9 +29,9 @@ class Chip:
     number : int
         As in the data and in the IDCTAB column DETCHIP.
     name : str
-    size : tuple of float
+    size : tuple of float or Quantity
         Columns, rows.
-    reference_pixel : tuple of float
+    reference_pixel : tuple of float or Quantity
         Zero point of the polynomial, FITS 1-based pixels.
 
     Examples
@@ -44,6 +45,13 @@ class Chip:
     name: str
     size: tuple[float, float]
     reference_pixel: tuple[float, float]
+
+    def __post_init__(self) -> None:
+        for name in ("size", "reference_pixel"):
+            pair = getattr(self, name)
+            if hasattr(pair, "unit") or any(hasattr(one, "unit") for one in pair):
+                pixels = values_in(pair, "pix", name, where=f"chip {self.number}")
+                object.__setattr__(self, name, tuple(pixels.tolist()))
 
     def quadrature(self, nodes: int) -> tuple[Float, Float, Float]:
         """Gauss-Legendre quadrature over the area of the chip.

@@ -53,6 +53,7 @@ from .maps_file import write_pam as write_pam
 from .registry import (
     describe as describe,
     lint as lint,
+    list_formats as list_formats,
     open_document as open_document,
     read_calibration as read_calibration,
 )

@@ -10,8 +10,10 @@ import os
 import pkgutil
 from collections.abc import Sequence
 from dataclasses import replace
+from difflib import get_close_matches
 from functools import cache
 from importlib import import_module
+from typing import TYPE_CHECKING
 
 from bayesdist.calibration.calibration import Calibration
 from bayesdist.errors import InputError, required
@@ -28,6 +30,9 @@ from bayesdist.products.formats.common.document import (
     FormatSettings,
 )
 from bayesdist.products.formats.common.read_back import ReadBack, by_calibrations, of_chips
+
+if TYPE_CHECKING:
+    from astropy.table import Table
 
 
 @cache
@@ -85,12 +90,66 @@ def read_calibration(
 
 
 def describe(path: str | os.PathLike[str]) -> str:
-    """Text on the content of a file, with its findings; errors as for `open_document`."""
+    """Text on the content of a calibration file of any format, with its findings.
+
+    Parameters
+    ----------
+    path : path
+
+    Returns
+    -------
+    str
+        Several lines, as `bayesdist inspect` prints them.
+
+    Raises
+    ------
+    InputError
+        For a file that cannot be read or is of no known format.
+
+    Examples
+    --------
+    >>> from bayesdist.formats import describe
+    >>> rng = np.random.default_rng(1)
+    >>> chip = bd.Chip(1, "camera", (1000, 1000), (500.5, 500.5))
+    >>> model = bd.DistortionModel(1, (chip,), "arcsec")
+    >>> stars, _ = bd.simulate_matches(model, [0, 100, 0, 0, 0, 100], 500, sigma=0.01, rng=rng)
+    >>> calibration = bd.Calibration.from_solution(bd.fit_linear(stars, model))
+    >>> written = calibration.write("parameters", "camera.fits")
+    >>> print(describe("camera.fits").splitlines()[0])
+    camera.fits: parameters of a calibration, by bayesdist
+    """
     return open_document(path).describe()
 
 
 def lint(path: str | os.PathLike[str]) -> tuple[Finding, ...]:
-    """Findings in a file; errors as for `open_document`."""
+    """Faults and peculiarities of a calibration file of any format.
+
+    Parameters
+    ----------
+    path : path
+
+    Returns
+    -------
+    tuple of Finding
+        Each with `level` ('error', 'warning' or 'note'), `where` and `message`.
+
+    Raises
+    ------
+    InputError
+        For a file that cannot be read or is of no known format.
+
+    Examples
+    --------
+    >>> from bayesdist.formats import lint
+    >>> rng = np.random.default_rng(1)
+    >>> chip = bd.Chip(1, "camera", (1000, 1000), (500.5, 500.5))
+    >>> model = bd.DistortionModel(1, (chip,), "arcsec")
+    >>> stars, _ = bd.simulate_matches(model, [0, 100, 0, 0, 0, 100], 500, sigma=0.01, rng=rng)
+    >>> calibration = bd.Calibration.from_solution(bd.fit_linear(stars, model))
+    >>> written = calibration.write("parameters", "camera.fits")
+    >>> lint("camera.fits")
+    ()
+    """
     return open_document(path).lint()
 
 
@@ -104,10 +163,47 @@ def format_of(key: str) -> Format:
     for one in all_formats():
         if one.key == key and one.build is not None:
             return one
+    names = sorted(product_settings())
+    near = get_close_matches(str(key).lower(), names, n=1, cutoff=0.5)
+    meant = f"use {near[0]!r} if that is meant, or " if near else ""
     raise InputError(
         f"there is no format {key!r} that can be built",
-        do=f"choose one of {', '.join(product_settings())}",
+        do=f"{meant}choose one of {', '.join(names)}",
     )
+
+
+def list_formats() -> Table:
+    """Formats of calibration files.
+
+    Returns
+    -------
+    astropy.table.Table
+        One row for each format: `name`, as `bayesdist.Calibration.write` takes it; `title`; and
+        whether files of it can be `read` as a calibration, `written` from one, and hold look-up
+        `tables` and the dependence on `time`.
+
+    Examples
+    --------
+    >>> from bayesdist.formats import list_formats
+    >>> formats = list_formats()
+    >>> formats.add_index("name")
+    >>> bool(formats.loc["sip"]["read"]), bool(formats.loc["sip"]["written"])
+    (True, True)
+    """
+    from astropy.table import Table
+
+    rows = [
+        (
+            entry.key,
+            entry.title.removeprefix("a ").removeprefix("an "),
+            entry.calibration is not None,
+            entry.build is not None,
+            entry.holds_tables,
+            entry.holds_time,
+        )
+        for entry in sorted(all_formats(), key=lambda entry: entry.key)
+    ]
+    return Table(rows=rows, names=("name", "title", "read", "written", "tables", "time"))
 
 
 def build(
@@ -123,7 +219,7 @@ def build(
             f"the order is {calibration.model.order}, and polynomials of {one.title} go "
             f"up to order {one.highest_order}",
             where=f"products.{key}",
-            do=f"convert the run with --order {one.highest_order}, or choose another format",
+            do=f"give order {one.highest_order} (--order of convert), or choose another format",
         )
     if one.holds_tables and not calibration.before:
         calibration = replace(calibration, before=options.tables)

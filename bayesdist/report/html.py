@@ -279,12 +279,12 @@ def _shown(rows: Sequence[Row]) -> tuple[list[Row], int]:
 
 
 def _columns_of_words(rows: Sequence[Row]) -> set[str]:
-    """Headings of the columns in which no cell begins with a number."""
+    """Headings of the columns in which some cell begins neither with a number nor is missing."""
 
     def numeric(cell: str) -> bool:
         return cell == MISSING or cell.lstrip("−-+<>≤≥~ \u202f")[:1].isdigit()
 
-    return {name for name in rows[0] if not any(numeric(row[name]) for row in rows)}
+    return {name for name in rows[0] if not all(numeric(row[name]) for row in rows)}
 
 
 def _more(n: int, noun: str) -> str:

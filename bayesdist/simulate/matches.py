@@ -15,6 +15,7 @@ from bayesdist.data.storage.write import write_partitioned
 from bayesdist.errors import InputError
 from bayesdist.model import DistortionModel
 from bayesdist.utils.arrays import Bool, Float, Int
+from bayesdist.utils.quantities import Number, Random, generator_of, value_in
 
 _AT_ONCE, _STEP = 65_536, 8192
 CHUNK = 1_000_000  # matches in memory at a time
@@ -51,8 +52,8 @@ def simulate_matches(
     theta: ArrayLike,
     n: int,
     *,
-    rng: np.random.Generator,
-    sigma: float | tuple[Float, Float] | Callable[[Float], tuple[Float, Float]] = 0.05,
+    rng: Random,
+    sigma: Number | tuple[Float, Float] | Callable[[Float], tuple[Float, Float]] = 0.05,
     mag: Float | None = None,
     fraction: float = 0.03,
     jitter: float = 0.0,
@@ -69,8 +70,9 @@ def simulate_matches(
         Its true parameters.
     n : int
         Number of matches.
-    rng : numpy.random.Generator
-    sigma : float, pair of ndarray, or callable
+    rng : int or numpy.random.Generator
+        Seed, or source of the random numbers.
+    sigma : float, Quantity, pair of ndarray, or callable
         Quoted errors: one number, one for each star and axis, or a function of the magnitudes.
     mag : ndarray, shape (n,), optional
     fraction, jitter, outlier_scale : float
@@ -92,13 +94,15 @@ def simulate_matches(
 
     Examples
     --------
-    >>> model, theta = bd.wise_solution("W2")
+    >>> from bayesdist.missions.wise import wise_solution
+    >>> model, theta = wise_solution("W2")
     >>> matches, truth = bd.simulate_matches(model, theta, 400, rng=np.random.default_rng(1))
     >>> len(matches), truth.false.shape
     (400, (400,))
     """
     if outliers not in ("gaussian", "uniform"):
         raise InputError(f"unknown kind of outliers {outliers!r}", do="choose gaussian or uniform")
+    rng = generator_of(rng)
     theta = np.asarray(theta, float)
     chip = rng.integers(len(model.chips), size=n)
     exposure = np.arange(n) * len(model.exposures) // n
@@ -115,7 +119,7 @@ def simulate_matches(
     elif isinstance(sigma, tuple):
         sigma_u, sigma_v = sigma
     else:
-        sigma_u, sigma_v = np.full(n, sigma), np.full(n, sigma)
+        sigma_u = sigma_v = np.full(n, value_in(sigma, model.unit, "sigma"))
     quoted = np.column_stack([sigma_u, sigma_v])
     error = rng.standard_normal((n, 2)) * np.hypot(quoted, jitter)
     false = rng.uniform(size=n) < fraction
@@ -166,9 +170,11 @@ def simulate_partitioned(
 
     Examples
     --------
-    >>> model, theta = bd.wise_solution("W2")
+    >>> from bayesdist.missions.wise import wise_solution
+    >>> from bayesdist.simulate import simulate_partitioned
+    >>> model, theta = wise_solution("W2")
     >>> rng = np.random.default_rng(1)
-    >>> truth = bd.simulate_partitioned(
+    >>> truth = simulate_partitioned(
     ...     "many", 400, lambda n: bd.simulate_matches(model, theta, n, rng=rng)
     ... )
     >>> bd.open_matches("many").n_rows

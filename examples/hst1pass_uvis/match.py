@@ -13,11 +13,12 @@ from pathlib import Path
 from astropy.table import Table
 
 import bayesdist as bd
+from bayesdist.formats import read_matchup
 
 
 def main(folder: Path) -> None:
     lists = bd.read_matches(folder / "*.uvwXYMpq", sigma="by_magnitude")
-    master = bd.read_matchup(folder / "MATCHUP_XYMEEE_final")
+    master = read_matchup(folder / "MATCHUP_XYMEEE_final")
     stars = bd.match_table(lists, master)
 
     table = Table()

@@ -170,19 +170,22 @@ def test_bad_requests_get_a_sentence(tmp_path):
     new = ("-o", tmp_path / "x")
     for arguments, message in (
         ((path, "--to", "fit", *new), "there is no format 'fit' that can be built"),
-        ((path, "--to", "tpv", "--option", "colour=red", *new), "the keys of tpv are crval"),
+        (
+            (path, "--to", "tpv", "--option", "colour=red", *new),
+            "setting of tpv 'colour'; choose one of crval",
+        ),
         ((path, "--to", "tpv", "--option", "crval", *new), "is not KEY=VALUE"),
         ((path, "--to", "jwst", *new), "needs useafter, pedigree, author, instrument"),
         ((notes, "--to", "jwst", *new), "notes.txt: is of no kind that is understood"),
         (
             (pixels, "--to", "siaf", "--option", "aperture=A", *new),
-            "give the pixel scale (of convert: --scale)",
+            "give the pixel scale (scale_mas in Python, --scale of convert)",
         ),
-        ((path, "--to", "siaf", *new), "(of convert: --option aperture=NIS_CEN)"),
+        ((path, "--to", "siaf", *new), "(--option aperture=NIS_CEN of convert)"),
         ((path, "--to", "wise_meta", *new), "give a run whose detector.name is the band"),
         ((path, "--to", "tpv", "--order", 11, *new), "choose one from 1 to 7 for TPV headers"),
         ((high, "--to", "tpv", *new), "up to order 7"),
-        ((path, "--to", "tpv", "-o", tmp_path / "one.head"), "2 files are made"),
+        ((pixels, "--to", "tpv", *new), "is in pixels of unknown size, and TPV headers"),
         ((path, "--to", "tpv", "--scale", -1, *new), "give a positive number"),
         ((tmp_path / "none", "--to", "tpv", *new), "there is no such file"),
     ):

@@ -1,4 +1,4 @@
-"""Pixels to the sky with the errors of a calibration: `apply --sky` and `apply_to_sky`."""
+"""Pixels to the sky with the errors of a calibration: `apply --sky` and `Calibration.to_sky`."""
 
 from __future__ import annotations
 
@@ -123,22 +123,22 @@ def test_a_file_and_what_it_was_made_from_say_the_same(calibration, stars, tmp_p
     first = {"tpv": "tpv.head", "cpdis": "cpdis.fits"}[key]
     again = read_calibration(tmp_path / first)
     assert again.further == calibration.further
-    here = bd.apply_to_sky(calibration, stars, centroids=("sx", "sy"))
-    there = bd.apply_to_sky(tmp_path / first, stars, centroids=("sx", "sy"))
+    here = calibration.to_sky(stars, centroids=("sx", "sy"))
+    there = bd.read_calibration(tmp_path / first).to_sky(stars, centroids=("sx", "sy"))
     for name in ("ra", "dec", "sigma_ra", "sigma_dec", "corr_ra_dec"):
         np.testing.assert_allclose(here[name], there[name], rtol=1e-9, err_msg=name)
 
 
 def test_tables_of_all_kinds_are_taken(calibration, stars):
-    expected = bd.apply_to_sky(calibration, stars)
+    expected = calibration.to_sky(stars)
     frame = pd.DataFrame({c: np.asarray(stars[c]) for c in stars.colnames})
     for one in (QTable(stars), frame, {c: np.asarray(stars[c]) for c in stars.colnames}):
-        found = bd.apply_to_sky(calibration, one)
+        found = calibration.to_sky(one)
         assert (found["ra"] == expected["ra"]).all() and found["sigma_ra"].unit == units.mas
     zero = stars.copy()
     zero["x"] -= 1
     zero["y"] -= 1
-    found = bd.apply_to_sky(calibration, zero, pixel_origin=0)
+    found = calibration.to_sky(zero, pixel_origin=0)
     np.testing.assert_allclose(found["ra"].value, expected["ra"].value, rtol=0, atol=1e-12)
 
 
@@ -156,7 +156,7 @@ def test_the_command_writes_what_python_gives(calibration, stars, tmp_path):
         "centroids (of each star by itself)",
     ):
         assert line in done.out
-    expected = bd.apply_to_sky(calibration, stars, centroids=("sx", "sy"), covariance=True)
+    expected = calibration.to_sky(stars, centroids=("sx", "sy"), covariance=True)
     with fits.open(out) as file:
         np.testing.assert_allclose(
             file["COVARIANCE"].data, expected.meta["covariance"], rtol=1e-8, atol=1e-9
@@ -174,10 +174,10 @@ def test_planes_that_are_not_on_the_sky_are_refused(calibration, stars):
         (Plane("aperture", v2v3=(0.0, 0.0)), "V2, V3"),
     ):
         with pytest.raises(InputError, match=message):
-            bd.apply_to_sky(replace(calibration, plane=plane), stars)
+            replace(calibration, plane=plane).to_sky(stars)
     free = replace(calibration, plane=Plane("free"))
-    found = bd.apply_to_sky(free, stars, point=POINT)
-    expected = bd.apply_to_sky(calibration, stars)
+    found = free.to_sky(stars, point=POINT)
+    expected = calibration.to_sky(stars)
     assert (found["dec"] == expected["dec"]).all()
 
 
@@ -203,8 +203,8 @@ def test_a_header_of_a_given_crval_is_applied_where_others_have_it(
     for one in build(to, free, settings, BuildOptions(None, 0.26 if unit == "pix" else None)):
         (tmp_path / one.file_name).write_bytes(one.content)
     mine = stars[stars["chip"] == 1]
-    expected = bd.apply_to_sky(calibration, mine, covariance=True)
-    found = bd.apply_to_sky(tmp_path / name, mine, covariance=True)
+    expected = calibration.to_sky(mine, covariance=True)
+    found = bd.read_calibration(tmp_path / name).to_sky(mine, covariance=True)
     at = SkyCoord(found["ra"], found["dec"])
     assert at.separation(SkyCoord(expected["ra"], expected["dec"])).mas.max() < limit_mas
     np.testing.assert_allclose(found.meta["covariance"], expected.meta["covariance"], rtol=1e-6)

@@ -41,7 +41,7 @@ def test_the_covariance_is_that_of_apply(kind):
     assert_allclose(cov.value, at.cov, rtol=1e-9)
     assert_allclose(wcs.covariance(x, y, joint=True).value, at.joint, rtol=1e-9, atol=1e-9)
     table = Table({"x": x + 1, "y": y + 1, "chip": np.full(x.shape, number)})
-    sky = bd.apply_to_sky(calibration, table, covariance=True)
+    sky = calibration.to_sky(table, covariance=True)
     assert_allclose(cov[:, 0, 0].value, sky["sigma_ra"].to_value("mas") ** 2, rtol=1e-9)
     assert_allclose(cov[:, 1, 1].value, sky["sigma_dec"].to_value("mas") ** 2, rtol=1e-9)
 

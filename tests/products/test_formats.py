@@ -37,6 +37,7 @@ IN_V2V3 = {
 SETTINGS = {
     "ast": {},
     "cpdis": {},
+    "parameters": {},
     "idctab": {"instrument": "WFC3", "detector": "IR"},
     "sip": {},
     "stdgdc": {},
@@ -47,7 +48,7 @@ SETTINGS = {
     "siaf": {"aperture": "MADE_UP"},
 }
 # errors that a file has by itself; what more there is stands in a file beside it
-HOLD_COVARIANCE = ("cpdis", "idctab", "jwst", "roman", "stdgdc")
+HOLD_COVARIANCE = ("cpdis", "idctab", "jwst", "parameters", "roman", "stdgdc")
 ALONE = dict.fromkeys(("ast", "siaf", "tpv"), "none") | dict.fromkeys(HOLD_COVARIANCE, "covariance")
 SCALE = 0.11
 OPTIONS = BuildOptions(scale_arcsec=SCALE)

@@ -14,6 +14,7 @@ from bayesdist.calibration.calibration import Calibration, GaussianSolution, cal
 from bayesdist.calibration.further import FurtherError
 from bayesdist.calibration.plane import Plane
 from bayesdist.errors import InputError
+from bayesdist.missions.wise import simulate_wise
 from bayesdist.products.formats.common.document import BuildOptions, Choice
 from bayesdist.products.registry import (
     build,
@@ -82,7 +83,7 @@ def test_what_programs_would_make_of_a_header_is_warned_of(fit, tmp_path):
 
 def test_constant_and_linear_terms_are_warned_of(tmp_path):
     rng = np.random.default_rng(3)
-    matches, _ = bd.simulate_wise(400, rng=rng)
+    matches, _ = simulate_wise(400, rng=rng)
     fit = bd.fit_linear(matches, bd.build_model(matches, order=3, size=(1016, 1016)))
     [one], _ = made(fit, tmp_path, linear="sip")
     assert any("stwcs and gwcs drop" in w for w in one.warnings)

@@ -75,8 +75,9 @@ class ErrorBudget:
 
     Examples
     --------
+    >>> from bayesdist.missions.wise import simulate_wise
     >>> rng = np.random.default_rng(1)
-    >>> matches, truth = bd.simulate_wise(500, rng=rng)
+    >>> matches, truth = simulate_wise(500, rng=rng)
     >>> model = bd.build_model(matches, order=2, size=(1016, 1016))
     >>> fit = bd.fit_linear(matches, model)
     >>> budget = bd.error_budget(fit, grid=(5, 3), n_draws=100, rng=rng)
@@ -128,6 +129,12 @@ class ErrorBudget:
         chips = ", ".join(map(str, self.domain.chips))
         several = "s" if len(self.domain.chips) > 1 else ""
         words = f"at {self.x.size} positions on chip{several} {chips}"
+        if self.domain.relative == "first":
+            start, *ends = zip(self.domain.x, self.domain.y, strict=True)
+            to = f"({ends[0][0]:g}, {ends[0][1]:g})" if len(ends) == 1 else f"{len(ends)} positions"
+            words = f"of the separation of ({start[0]:g}, {start[1]:g}) from {to} on chip {chips}"
+        elif self.x.size == 1:
+            words = f"at ({self.x[0]:g}, {self.y[0]:g}) on chip {chips}"
         return words if self.epoch is None else f"{words} in {self.epoch:.2f}"
 
     def _cells(self) -> list[tuple[str, ...]]:

@@ -15,6 +15,7 @@ from bayesdist.calibration.chip_map import position_moments
 from bayesdist.infer.solution.solution import Solution
 from bayesdist.model.grid import DEFAULT_GRID, grid_pixels, mesh, position_of_largest
 from bayesdist.utils.arrays import Float
+from bayesdist.utils.quantities import Epoch, year_of
 
 RELATIVE = "relative positions"
 NODES = 33  # ratios of the axes between which radii are interpolated: to 1e-4
@@ -43,8 +44,9 @@ class UncertaintyMap:
 
     Examples
     --------
+    >>> from bayesdist.missions.wise import simulate_wise
     >>> rng = np.random.default_rng(1)
-    >>> matches, truth = bd.simulate_wise(500, rng=rng)
+    >>> matches, truth = simulate_wise(500, rng=rng)
     >>> model = bd.build_model(matches, order=2, size=(1016, 1016))
     >>> fit = bd.fit_linear(matches, model)
     >>> found = bd.uncertainty_map(fit, grid=(5, 3))
@@ -141,7 +143,7 @@ def uncertainty_map(
     solution: Solution,
     *,
     grid: tuple[int, int] = DEFAULT_GRID,
-    epoch: float | None = None,
+    epoch: Epoch | None = None,
     chip: int | None = None,
     exposure: int | str | None = None,
 ) -> UncertaintyMap:
@@ -152,8 +154,8 @@ def uncertainty_map(
     solution : LinearFit or Posterior
     grid : tuple of int
         Points on x and y.
-    epoch : float, optional
-        Decimal years; needed by a model with time dependence.
+    epoch : float, str, Time, date or Quantity, optional
+        Needed by a model with time dependence.
     chip : int, optional
         Chip number; the first chip by default.
     exposure : int or str, optional
@@ -170,15 +172,17 @@ def uncertainty_map(
 
     Examples
     --------
+    >>> from bayesdist.missions.wise import simulate_wise
     >>> rng = np.random.default_rng(1)
-    >>> matches, truth = bd.simulate_wise(500, rng=rng)
+    >>> matches, truth = simulate_wise(500, rng=rng)
     >>> model = bd.build_model(matches, order=2, size=(1016, 1016))
     >>> fit = bd.fit_linear(matches, model)
     >>> found = bd.uncertainty_map(fit, grid=(5, 3))
     >>> found.sigma_u.shape
     (3, 5)
     """
-    place = place_of(solution.model, epoch=epoch, exposure=exposure, chip=chip)
+    year = None if epoch is None else year_of(epoch)
+    place = place_of(solution.model, epoch=year, exposure=exposure, chip=chip)
     x, y = grid_pixels(place.chip.size, grid)
     uu, vv, uv = position_moments(place.covariance(solution), place.basis, *mesh(x, y))
     shape = (y.size, x.size)

@@ -65,8 +65,9 @@ class Margin:
 
     Examples
     --------
+    >>> from bayesdist.missions.wise import simulate_wise
     >>> rng = np.random.default_rng(1)
-    >>> matches, truth = bd.simulate_wise(500, rng=rng)
+    >>> matches, truth = simulate_wise(500, rng=rng)
     >>> model = bd.build_model(matches, order=2, size=(1016, 1016))
     >>> fit = bd.fit_linear(matches, model)
     >>> need = bd.Requirement("field-wide", "p95", 1.0)

@@ -18,7 +18,7 @@ from bayesdist.diagnose.residuals.coverage import Coverage
 from bayesdist.errors import InputError, require_known
 from bayesdist.model.grid import grid_pixels, mesh
 from bayesdist.utils.limits import BEYOND_STARS
-from bayesdist.utils.quantities import unit_name, value_in
+from bayesdist.utils.quantities import unit_name, value_in, year_of
 
 
 @dataclass(frozen=True)
@@ -36,8 +36,8 @@ class Requirement:
         'pix', 'arcsec', 'mas' or 'deg'; of a Quantity it is its own.
     probability : float
         With which the statistic must be at or under the limit, between 0 and 1.
-    epoch : float, optional
-        Decimal years.
+    epoch : float, str, Time, date or Quantity, optional
+        Stored in decimal years.
     chip : int, optional
         Number of the one chip that is judged; all chips together by default.
     region : str or sequence of (x, y)
@@ -47,7 +47,7 @@ class Requirement:
     relative : bool
         Whether the error is that of the difference of two positions in one image, over all pairs of
         positions, in place of that of one position.
-    separation : float, optional
+    separation : float or Quantity, optional
         Pairs on one chip that are not farther apart than so many pixels; for relative errors.
     magnitude : float, optional
         Of the star whose error is meant: its centroid's error counts in.
@@ -84,8 +84,14 @@ class Requirement:
         object.__setattr__(self, "limit", value_in(self.limit, unit, "limit", where=self.where))
         object.__setattr__(self, "unit", unit)
         object.__setattr__(self, "region", check_region(self.region, self.where))
+        if self.separation is not None:
+            apart = value_in(self.separation, "pix", "separation", where=self.where)
+            object.__setattr__(self, "separation", apart)
+        if self.epoch is not None:
+            object.__setattr__(self, "epoch", year_of(self.epoch, where=self.where))
         if self.epochs is not None:
-            object.__setattr__(self, "epochs", tuple(self.epochs))
+            years = tuple(year_of(one, "epochs", where=self.where) for one in self.epochs)
+            object.__setattr__(self, "epochs", years)
         for wrong, cause, do in (
             (
                 not (math.isfinite(self.limit) and self.limit > 0),

@@ -207,10 +207,11 @@ def read_hst1pass(path: str | Path) -> Hst1passList:
 
     Examples
     --------
+    >>> from bayesdist.formats import read_hst1pass
     >>> from pathlib import Path
     >>> head = "# FILEOUT:\n# (1) X -- raw\n# (2) Y -- raw\n# (3) M -- magnitude\n"
     >>> n = Path("j8c0.uvwXYMpq").write_text(head + "100.5 200.25 -9.5\n")
-    >>> one = bd.read_hst1pass("j8c0.uvwXYMpq")
+    >>> one = read_hst1pass("j8c0.uvwXYMpq")
     >>> one.name, one.detections().x.tolist()
     ('j8c0', [100.5])
     """
@@ -301,10 +302,11 @@ def read_matchup(
 
     Examples
     --------
+    >>> from bayesdist.formats import read_matchup
     >>> from pathlib import Path
     >>> head = "# xbar ybar mbar xsig ysig msig\n"
     >>> n = Path("MATCHUP").write_text(head + "1 2 -9.5 0.01 0.02 0.05\n")
-    >>> master = bd.read_matchup("MATCHUP", epoch=2011.8)
+    >>> master = read_matchup("MATCHUP", epoch=2011.8)
     >>> master.sigma_v.tolist()
     [0.02]
     """

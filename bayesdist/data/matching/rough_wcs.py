@@ -329,7 +329,8 @@ def _detections(
         motions=frozenset(),
     )
     rows = np.flatnonzero(stay)
-    origin, notes = options.pixel_origin, ()
+    origin = options.pixel_origin
+    notes: tuple[str, ...] = ()
     if origin is None:
         origin, why = origin_of(found["x"], table.colnames, table.meta)
         notes = (f"the first pixel is taken as {origin}: {why}",) if why else ()
@@ -352,7 +353,7 @@ def _detections(
         )
     if not inside.all():
         rejected = rejected | {OUTSIDE: int((~inside).sum())}
-        quantities = Quantities(quantities.table[inside], found, DETECTIONS, names=table.colnames)
+        quantities = Quantities(table[rows[inside]], found, DETECTIONS, names=table.colnames)
     mag = None
     if "mag" in found:
         mag = quantities["mag"].numbers()

@@ -19,6 +19,7 @@ from bayesdist.data.matching.similarity import (
 )
 from bayesdist.errors import InputError
 from bayesdist.utils.arrays import Int
+from bayesdist.utils.quantities import Number, value_in
 
 _NARROW = 0.25  # mean distances between reference stars: reach of its last pairs
 _FALSE_RATE = 0.02  # chance matches of a detection that the default radius allows
@@ -61,8 +62,8 @@ def match_to_catalog(
     catalog: ReferenceCatalog,
     *,
     mag: ArrayLike | None = None,
-    radius: float | None = None,
-    max_offset: float | None = None,
+    radius: Number | None = None,
+    max_offset: Number | None = None,
     source: str = "detections",
 ) -> Matching:
     """Matches of detections with reference stars, one to one.
@@ -80,10 +81,10 @@ def match_to_catalog(
     mag : array_like, shape (N,), optional
         Magnitudes of the detections, any zero point: with those of the catalogue they let the
         bright stars be tried first.
-    radius : float, optional
-        Final radius; by default the one in which a detection without counterpart finds a neighbour
-        by chance with probability 0.02.
-    max_offset : float, optional
+    radius : float or Quantity, optional
+        Final radius, a plain number in the catalogue's unit; by default the one in which a
+        detection without counterpart finds a neighbour by chance with probability 0.02.
+    max_offset : float or Quantity, optional
         Largest offset of the middle of the detections on either axis; by default any.
     source : str, optional
         File, for errors.
@@ -98,6 +99,10 @@ def match_to_catalog(
         When no rotation and shift brings together more stars than chance does (another field), with
         the best number of coincidences.
     """
+    if radius is not None:
+        radius = value_in(radius, catalog.unit, "radius", where=source)
+    if max_offset is not None:
+        max_offset = value_in(max_offset, catalog.unit, "max_offset", where=source)
     points = np.column_stack([np.asarray(x, float), np.asarray(y, float)])
     reference = np.column_stack([catalog.u, catalog.v])
     if not len(points) or not np.isfinite(points).all():
@@ -156,8 +161,8 @@ def match_table(
     table: Matches,
     catalog: ReferenceCatalog,
     *,
-    radius: float | None = None,
-    max_offset: float | None = None,
+    radius: Number | None = None,
+    max_offset: Number | None = None,
 ) -> Matches:
     """Matches with a catalogue's positions in place of approximate ones, exposure by exposure.
 

@@ -95,8 +95,10 @@ def open_matches(path: PathLike | Sequence[PathLike], **options: Any) -> Matches
 
     Examples
     --------
-    >>> matches, _ = bd.simulate_wise(500, rng=np.random.default_rng(1))
-    >>> paths = bd.write_partitioned([matches], "stars")
+    >>> from bayesdist.data import write_partitioned
+    >>> from bayesdist.missions.wise import simulate_wise
+    >>> matches, _ = simulate_wise(500, rng=np.random.default_rng(1))
+    >>> paths = write_partitioned([matches], "stars")
     >>> stars = bd.open_matches("stars")  # stays on disk
     >>> sum(len(batch) for batch in stars.batches())
     500

@@ -68,8 +68,10 @@ def write_partitioned(
 
     Examples
     --------
-    >>> matches, _ = bd.simulate_wise(500, rng=np.random.default_rng(1))
-    >>> [path.name for path in bd.write_partitioned([matches, matches], "stars")]
+    >>> from bayesdist.data import write_partitioned
+    >>> from bayesdist.missions.wise import simulate_wise
+    >>> matches, _ = simulate_wise(500, rng=np.random.default_rng(1))
+    >>> [path.name for path in write_partitioned([matches, matches], "stars")]
     ['part-00000.parquet', 'part-00001.parquet']
     """
     folder = Path(folder)

@@ -75,8 +75,9 @@ def fit_by_magnitude(
 
     Examples
     --------
+    >>> from bayesdist.missions.wise import simulate_wise
     >>> rng = np.random.default_rng(1)
-    >>> matches, truth = bd.simulate_wise(500, rng=rng)
+    >>> matches, truth = simulate_wise(500, rng=rng)
     >>> model = bd.build_model(matches, order=4, size=(1016, 1016))
     >>> fit, matches, errors = bd.fit_by_magnitude(matches, model)
     >>> bool((matches.sigma_u > 0).all())

@@ -12,9 +12,8 @@ import io
 import json
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import h5netcdf
 import h5py
@@ -29,14 +28,16 @@ from bayesdist.files.faults import restoring
 from bayesdist.files.hdf5 import netcdf_groups
 from bayesdist.infer.convergence import DIAGNOSTICS, Convergence, Limits
 from bayesdist.infer.posterior import Certificate, Posterior, SamplerInfo
+from bayesdist.infer.posterior.groups import Group, datatree_of
 from bayesdist.infer.posterior.memberships import memberships, star_log_likelihood
 from bayesdist.infer.solution.linear import LinearFit
 from bayesdist.infer.stars.likelihood import Clip
 from bayesdist.infer.stars.mixture import OutlierMixture
 from bayesdist.model import DistortionModel
 
-SCHEMA = 2
-POSTERIOR_NUMBERS = ("n_stars", "n_flagged", "n_false", "reference_sigma")
+if TYPE_CHECKING:
+    import xarray
+
 MOST_STARS = 1_000_000  # with more stars their data are not repeated in the file
 LARGEST = 16_000_000  # bytes of log-likelihood that are stored star by star and draw by draw
 LEAST_RHAT = 0.5  # chains of four draws have 0.87 at least
@@ -69,8 +70,9 @@ def save_posterior(
 
     Examples
     --------
+    >>> from bayesdist.missions.wise import simulate_wise
     >>> rng = np.random.default_rng(1)
-    >>> matches, truth = bd.simulate_wise(500, rng=rng)
+    >>> matches, truth = simulate_wise(500, rng=rng)
     >>> model = bd.build_model(matches, order=2, size=(1016, 1016))
     >>> fit = bd.fit_linear(matches, model)
     >>> posterior = bd.sample(fit, matches, seed=1, target_ess=100)
@@ -78,61 +80,51 @@ def save_posterior(
     >>> np.array_equal(bd.load_posterior("posterior.nc").theta, posterior.theta)
     True
     """
-    c = posterior.convergence
-    names, units = posterior.model.names, posterior.model.units
-    groups = {
-        "": _Group(
-            attrs={
-                "schema": SCHEMA,
-                "creator": "bayesdist",
-                "model": json.dumps(posterior.model.to_dict()),
-                "mixture": json.dumps(asdict(posterior.mixture)),
-                "provenance": json.dumps(dict(provenance or {}), default=str),
-                "certificate": json.dumps(posterior.certificate and asdict(posterior.certificate)),
-                "n_parameters": len(names),
-                "own_places": int(posterior.own_places),
-                **{name: getattr(posterior, name) for name in POSTERIOR_NUMBERS},
-            }
-        ),
-        "posterior": _Group(
-            {
-                "theta": (("chain", "draw", "parameter"), posterior.theta),
-                **{k: (("chain", "draw"), v) for k, v in posterior.hyper.items()},
-                "parameter": (("parameter",), names),
-            },
-            coordinates={"unit": ("parameter", units)},
-        ),
-        "sample_stats": _Group(
-            {"lp": (("chain", "draw"), posterior.log_prob)},
-            attrs=asdict(posterior.sampler) | {"exact": int(posterior.sampler.exact)},
-        ),
-        "diagnostics": _Group(
-            {
-                **{name: (("sampled",), getattr(c, name)) for name in DIAGNOSTICS},
-                "sampled": (("sampled",), c.names),
-            },
-            attrs={
-                "pareto_k": c.pareto_k,
-                "importance_efficiency": c.importance_efficiency,
-                "converged": int(c.converged),
-                "reasons": json.dumps(c.reasons),
-                "limit_ess": c.limits.ess,
-                "limit_rhat": c.limits.rhat,
-            },
-        ),
-    }
+    _write(_groups(posterior, matches, provenance), path)
+
+
+def posterior_datatree(
+    posterior: Posterior,
+    matches: Matches | None = None,
+    *,
+    provenance: Mapping[str, object] | None = None,
+) -> xarray.DataTree:
+    """Data tree with the groups of posterior.nc.
+
+    Parameters
+    ----------
+    posterior, matches, provenance
+        As for `save_posterior`.
+
+    Returns
+    -------
+    xarray.DataTree
+
+    Raises
+    ------
+    InputError
+        If xarray is not installed.
+    """
+    return datatree_of(_groups(posterior, matches, provenance))
+
+
+def _groups(
+    posterior: Posterior, matches: Matches | None, provenance: Mapping[str, object] | None
+) -> dict[str, Group]:
+    """Groups of posterior.nc by name, the top group under ''."""
+    groups = posterior.groups(provenance)
     if matches is not None and len(matches) <= MOST_STARS:
-        groups["observed_data"] = _Group({"u": (("star",), matches.u), "v": (("star",), matches.v)})
+        groups["observed_data"] = Group({"u": (("star",), matches.u), "v": (("star",), matches.v)})
         groups["constant_data"] = _constants(posterior, matches)
         # of one draw only where the stars' positions are unknowns too
         few = posterior.log_prob.size * len(matches) * 8 <= LARGEST
         if few and not posterior.own_places:
             values = star_log_likelihood(posterior, matches)
-            groups["log_likelihood"] = _Group({"uv": (("chain", "draw", "star"), values)})
-    _write(groups, path)
+            groups["log_likelihood"] = Group({"uv": (("chain", "draw", "star"), values)})
+    return groups
 
 
-def _constants(posterior: Posterior, matches: Matches) -> _Group:
+def _constants(posterior: Posterior, matches: Matches) -> Group:
     """Columns of the matches that the posterior was made from."""
     columns = {
         "x": matches.x,
@@ -147,7 +139,7 @@ def _constants(posterior: Posterior, matches: Matches) -> _Group:
     for name in ("epoch", "mag", "colour"):
         if getattr(matches, name) is not None:
             columns[name] = getattr(matches, name)
-    return _Group(
+    return Group(
         {name: (("star",), values) for name, values in columns.items()},
         attrs={"unit": matches.unit, "exposure_names": json.dumps(matches.exposure_names)},
     )
@@ -172,8 +164,9 @@ def load_posterior(path: str | Path) -> Posterior:
 
     Examples
     --------
+    >>> from bayesdist.missions.wise import simulate_wise
     >>> rng = np.random.default_rng(1)
-    >>> matches, truth = bd.simulate_wise(500, rng=rng)
+    >>> matches, truth = simulate_wise(500, rng=rng)
     >>> model = bd.build_model(matches, order=2, size=(1016, 1016))
     >>> fit = bd.fit_linear(matches, model)
     >>> posterior = bd.sample(fit, matches, seed=1, target_ess=100)
@@ -257,7 +250,7 @@ def _plain(value: object) -> object:
 def save_fit(fit: LinearFit, path: str | Path) -> None:
     """Write a linear fit to a netCDF file, which is replaced atomically."""
     names = fit.model.names
-    data = _Group(
+    data = Group(
         {
             "mean": (("parameter",), fit.mean),
             "cov": (("parameter", "parameter_2"), fit.cov),
@@ -307,19 +300,7 @@ def load_fit(path: str | Path) -> LinearFit:
         )
 
 
-@dataclass(frozen=True, eq=False)
-class _Group:
-    """A group of a netCDF file: variables with the names of their dimensions, and attributes.
-
-    `coordinates` belong to the variables that have their dimension, and are none themselves.
-    """
-
-    variables: Mapping[str, tuple[tuple[str, ...], Any]] = field(default_factory=dict)
-    attrs: Mapping[str, Any] = field(default_factory=dict)
-    coordinates: Mapping[str, tuple[str, Any]] = field(default_factory=dict)
-
-
-def _write(groups: Mapping[str, _Group], path: str | Path) -> None:
+def _write(groups: Mapping[str, Group], path: str | Path) -> None:
     """Write the groups of a file, '' at its top, replaced atomically.
 
     The file is built in memory: on a full disk HDF5 itself would crash when it is closed.
@@ -332,20 +313,16 @@ def _write(groups: Mapping[str, _Group], path: str | Path) -> None:
         temporary.write_bytes(buffer.getvalue())
 
 
-def _fill(target: h5netcdf.Group, group: _Group) -> None:
+def _fill(target: h5netcdf.Group, group: Group) -> None:
     """Write one group of a file."""
     target.attrs.update(group.attrs)
-    coordinates = {name: ((along,), values) for name, (along, values) in group.coordinates.items()}
-    for name, (along, content) in {**group.variables, **coordinates}.items():
+    for name, (along, content) in group.variables.items():
         values = np.asarray(content)
         if values.dtype.kind == "U":
             values = values.astype(h5py.string_dtype())
         for one, size in zip(along, values.shape, strict=True):
             target.dimensions.setdefault(one, size)
-        variable = target.create_variable(name, along, values.dtype, values)
-        of = [one for one, (where, _) in group.coordinates.items() if where in along]
-        if of and name not in (*of, *along):
-            variable.attrs["coordinates"] = " ".join(of)
+        target.create_variable(name, along, values.dtype, values)
 
 
 @contextmanager

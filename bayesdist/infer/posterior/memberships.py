@@ -78,8 +78,9 @@ def memberships(posterior: Posterior, matches: Matches) -> Memberships:
 
     Examples
     --------
+    >>> from bayesdist.missions.wise import simulate_wise
     >>> rng = np.random.default_rng(1)
-    >>> matches, truth = bd.simulate_wise(500, rng=rng)
+    >>> matches, truth = simulate_wise(500, rng=rng)
     >>> model = bd.build_model(matches, order=2, size=(1016, 1016))
     >>> fit = bd.fit_linear(matches, model)
     >>> posterior = bd.sample(fit, matches, seed=1, target_ess=100)

@@ -2,17 +2,28 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+import json
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from bayesdist.infer.convergence import Convergence
+from bayesdist.infer.convergence import DIAGNOSTICS, Convergence
+from bayesdist.infer.posterior.groups import Group, datatree_of
 from bayesdist.infer.solution.solution import Solution
 from bayesdist.infer.stars.likelihood import MixtureAt
 from bayesdist.infer.stars.mixture import Hyper, OutlierMixture
 from bayesdist.model import DistortionModel
 from bayesdist.utils.arrays import Float, Int
+from bayesdist.utils.quantities import Random, generator_of
+
+if TYPE_CHECKING:
+    import xarray
+
+SCHEMA = 2  # of posterior.nc
+POSTERIOR_NUMBERS = ("n_stars", "n_flagged", "n_false", "reference_sigma")
 
 
 @dataclass(frozen=True)
@@ -126,8 +137,9 @@ class Posterior(Solution):
 
     Examples
     --------
+    >>> from bayesdist.missions.wise import simulate_wise
     >>> rng = np.random.default_rng(1)
-    >>> matches, truth = bd.simulate_wise(500, rng=rng)
+    >>> matches, truth = simulate_wise(500, rng=rng)
     >>> model = bd.build_model(matches, order=2, size=(1016, 1016))
     >>> fit = bd.fit_linear(matches, model)
     >>> posterior = bd.sample(fit, matches, seed=1, target_ess=100)
@@ -200,23 +212,101 @@ class Posterior(Solution):
         tail = (1 - probability) / 2
         return np.quantile(self.flat, [tail, 1 - tail], axis=0).T
 
-    def draws(self, n: int, rng: np.random.Generator) -> Float:
+    def draws(self, n: int, rng: Random) -> Float:
         """Random draws (n, D) of theta, without replacement as long as there are enough.
 
         Parameters
         ----------
         n : int
             How many.
-        rng : numpy.random.Generator
-            Source of the random numbers.
+        rng : int or numpy.random.Generator
+            Seed, or source of the random numbers.
         """
         theta, rows = self.drawn_rows(n, rng)
         return theta[rows]
 
-    def drawn_rows(self, n: int, rng: np.random.Generator) -> tuple[Float, Int]:
+    def drawn_rows(self, n: int, rng: Random) -> tuple[Float, Int]:
         """All draws of theta (m, D), and the rows (n,) among them that `draws` gives."""
         total = len(self.flat)
-        return self.flat, rng.choice(total, size=n, replace=n > total)
+        return self.flat, generator_of(rng).choice(total, size=n, replace=n > total)
+
+    def groups(self, provenance: Mapping[str, object] | None = None) -> dict[str, Group]:
+        """Groups of variables by name, as posterior.nc has them; the top group is ''.
+
+        Parameters
+        ----------
+        provenance : mapping, optional
+            JSON-able facts about the run.
+        """
+        c = self.convergence
+        names, units = self.model.names, self.model.units
+        return {
+            "": Group(
+                attrs={
+                    "schema": SCHEMA,
+                    "creator": "bayesdist",
+                    "model": json.dumps(self.model.to_dict()),
+                    "mixture": json.dumps(asdict(self.mixture)),
+                    "provenance": json.dumps(dict(provenance or {}), default=str),
+                    "certificate": json.dumps(self.certificate and asdict(self.certificate)),
+                    "n_parameters": len(names),
+                    "own_places": int(self.own_places),
+                    **{name: getattr(self, name) for name in POSTERIOR_NUMBERS},
+                }
+            ),
+            "posterior": Group(
+                {
+                    "theta": (("chain", "draw", "parameter"), self.theta),
+                    **{k: (("chain", "draw"), v) for k, v in self.hyper.items()},
+                    "parameter": (("parameter",), names),
+                },
+                # no coordinate: ArviZ 1.x cannot summarise variables that do not share it
+                attrs={"units": json.dumps(units)},
+            ),
+            "sample_stats": Group(
+                {"lp": (("chain", "draw"), self.log_prob)},
+                attrs=asdict(self.sampler) | {"exact": int(self.sampler.exact)},
+            ),
+            "diagnostics": Group(
+                {
+                    **{name: (("sampled",), getattr(c, name)) for name in DIAGNOSTICS},
+                    "sampled": (("sampled",), c.names),
+                },
+                attrs={
+                    "pareto_k": c.pareto_k,
+                    "importance_efficiency": c.importance_efficiency,
+                    "converged": int(c.converged),
+                    "reasons": json.dumps(c.reasons),
+                    "limit_ess": c.limits.ess,
+                    "limit_rhat": c.limits.rhat,
+                },
+            ),
+        }
+
+    def to_datatree(self) -> xarray.DataTree:
+        """Data tree for ArviZ and xarray.
+
+        Returns
+        -------
+        xarray.DataTree
+            Groups posterior (`theta` by chain, draw and parameter, whose names are a coordinate
+            and whose units are the attribute `units`; f, j, s_out), sample_stats (`lp`, the log
+            density) and diagnostics.
+
+        Raises
+        ------
+        InputError
+            If xarray is not installed.
+
+        Examples
+        --------
+        >>> matches, truth = bd.simulate_wise(500, rng=np.random.default_rng(1))
+        >>> fit = bd.fit_linear(matches, bd.build_model(matches, order=2, size=(1016, 1016)))
+        >>> tree = bd.sample(fit, matches, seed=1, target_ess=100).to_datatree()
+        >>> tree["posterior"]["theta"].dims
+        ('chain', 'draw', 'parameter')
+        """
+        return datatree_of(self.groups())
 
     @property
     def sampled_points(self) -> tuple[Float, Float]:

@@ -66,7 +66,7 @@ def sample(
     matches : Matches or Shards
         All stars: none is clipped.
     outliers : OutlierMixture, optional
-        Gaussian outliers by default.
+        Gaussian outliers by default, within the match radius of the matches if they have one.
     priors : GaussianPriors, optional
     seed : int
         All random numbers follow from it.
@@ -107,8 +107,9 @@ def sample(
 
     Examples
     --------
+    >>> from bayesdist.missions.wise import simulate_wise
     >>> rng = np.random.default_rng(1)
-    >>> matches, truth = bd.simulate_wise(500, rng=rng)
+    >>> matches, truth = simulate_wise(500, rng=rng)
     >>> model = bd.build_model(matches, order=2, size=(1016, 1016))
     >>> fit = bd.fit_linear(matches, model)
     >>> posterior = bd.sample(fit, matches, seed=1, target_ess=100)
@@ -132,7 +133,9 @@ def sample(
         raise InputError("steps must be positive", where="sampler")
     started = time.monotonic()
     with opened(fit.model, matches, compute) as shards:
-        mixture, priors = outliers or OutlierMixture(), priors or GaussianPriors.none(fit.model)
+        radius = matches.match_radius if isinstance(matches, Matches) else None
+        mixture = (outliers or OutlierMixture(match_radius=radius)).in_unit(fit.model.unit)
+        priors = priors or GaussianPriors.none(fit.model)
         target = Target(shards, mixture, priors)
         folder = None if folder is None else Path(folder)
         known = _fingerprint(target, seed, ensembles, walkers, checkpoint_every, method)

@@ -30,6 +30,7 @@ from bayesdist.infer.stars.shards import Compute, Shards
 from bayesdist.infer.stars.stars import Stars, in_table_order, prepare
 from bayesdist.model import Chip, DistortionModel, TimeDependence
 from bayesdist.utils.arrays import Bool, Float
+from bayesdist.utils.quantities import value_in, values_in
 
 MEDIAN_STARS = 1_000_000  # largest number of stars whose median is taken
 MEDIAN_CHI2_2 = 2 * np.log(2)  # median of chi-square with two degrees of freedom
@@ -44,7 +45,7 @@ class Rejection:
     clip_chi2 : float
         Stars with a first-pass chi-square (both axes) above this are left out of the second pass.
         Where the errors are too small as a whole, the limit is scaled by the median chi-square.
-    clip_abs : float or None
+    clip_abs : float, Quantity or None
         Stars with a first-pass residual above this many pixels are left out too.
     radial_weight : float
         Factor on the inverse variance in the corners, rising as the square of the radius.
@@ -59,6 +60,11 @@ class Rejection:
     clip_chi2: float = 25.0
     clip_abs: float | None = 2.0
     radial_weight: float = 1.0
+
+    def __post_init__(self) -> None:
+        if self.clip_abs is not None:
+            limit = value_in(self.clip_abs, "pix", "clip_abs", where="fit.clip_abs")
+            object.__setattr__(self, "clip_abs", limit)
 
 
 DEFAULT_REJECTION = Rejection()
@@ -94,8 +100,9 @@ class LinearFit(Solution):
 
     Examples
     --------
+    >>> from bayesdist.missions.wise import simulate_wise
     >>> rng = np.random.default_rng(1)
-    >>> matches, truth = bd.simulate_wise(500, rng=rng)
+    >>> matches, truth = simulate_wise(500, rng=rng)
     >>> model = bd.build_model(matches, order=2, size=(1016, 1016))
     >>> fit = bd.fit_linear(matches, model)
     >>> np.allclose(fit.sigma, np.sqrt(np.diag(fit.cov)))
@@ -190,7 +197,7 @@ def build_model(
     matches : Matches
     order : int
         Polynomial order, 1 to 12.
-    size : tuple of float, optional
+    size : tuple of float or Quantity, optional
         Columns and rows of a single chip; give this or `chips`.
     reference_pixel : tuple of float, optional
         Zero point; the detector's centre by default.
@@ -212,8 +219,9 @@ def build_model(
 
     Examples
     --------
+    >>> from bayesdist.missions.wise import simulate_wise
     >>> rng = np.random.default_rng(1)
-    >>> matches, truth = bd.simulate_wise(500, rng=rng)
+    >>> matches, truth = simulate_wise(500, rng=rng)
     >>> bd.build_model(matches, order=2, size=(1016, 1016)).n_params
     12
     """
@@ -222,7 +230,8 @@ def build_model(
             raise InputError(
                 "the detector's size is not given", where="detector.size", do="give it"
             )
-        centre = ((size[0] + 1) / 2, (size[1] + 1) / 2)
+        nx, ny = values_in(size, "pix", "size", where="detector.size").tolist()
+        centre = ((nx + 1) / 2, (ny + 1) / 2)
         number = int(matches.chip_numbers[0])
         chips = (Chip(number, name or f"chip {number}", size, reference_pixel or centre),)
     if len(chips) == 1 and len(matches.chip_numbers) > 1:
@@ -283,8 +292,9 @@ def fit_linear(
 
     Examples
     --------
+    >>> from bayesdist.missions.wise import simulate_wise
     >>> rng = np.random.default_rng(1)
-    >>> matches, truth = bd.simulate_wise(500, rng=rng)
+    >>> matches, truth = simulate_wise(500, rng=rng)
     >>> model = bd.build_model(matches, order=2, size=(1016, 1016))
     >>> fit = bd.fit_linear(matches, model)
     >>> fit.mean.shape, fit.cov.shape
@@ -380,8 +390,9 @@ def residuals(solution: Solution, matches: Matches) -> Float:
 
     Examples
     --------
+    >>> from bayesdist.missions.wise import simulate_wise
     >>> rng = np.random.default_rng(1)
-    >>> matches, truth = bd.simulate_wise(500, rng=rng)
+    >>> matches, truth = simulate_wise(500, rng=rng)
     >>> model = bd.build_model(matches, order=2, size=(1016, 1016))
     >>> fit = bd.fit_linear(matches, model)
     >>> bd.residuals(fit, matches).shape

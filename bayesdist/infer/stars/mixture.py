@@ -24,7 +24,8 @@ when there are no outliers.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -34,6 +35,7 @@ from bayesdist.errors import InputError, required
 from bayesdist.infer import kernel
 from bayesdist.infer.kernel import Constants
 from bayesdist.utils.arrays import Float
+from bayesdist.utils.quantities import value_in
 
 HYPER_NAMES = {"j": "log j", "f": "logit f", "s_out": "log s_out"}
 KINDS = {"none": kernel.NO_OUTLIERS, "gaussian": kernel.GAUSSIAN, "uniform": kernel.UNIFORM}
@@ -55,16 +57,16 @@ class OutlierMixture:
     ----------
     model : str
         'gaussian', 'uniform' or 'none'.
-    match_radius : float, optional
+    match_radius : float or Quantity, optional
         Radius of the match circle in the unit of u, v; needed by 'uniform'.  With matches that have
         nominal positions, the likelihood is that of stars selected within it.
-    jitter : float or None
+    jitter : float, Quantity or None
         Extra error j in the unit of u, v; None samples it.
     fraction_prior : tuple of float
         Parameters (a, b) of the Beta prior of f.
-    jitter_scale : float, optional
+    jitter_scale : float or Quantity, optional
         Scale of the prior of j in the unit of u, v; by default the median quoted error.
-    outlier_scale : float, optional
+    outlier_scale : float or Quantity, optional
         Most probable w of 'gaussian' outliers beforehand, in the unit of u, v: their scale s_out
         beyond that of the core; by default five times the core's.
 
@@ -95,14 +97,14 @@ class OutlierMixture:
                 where="outliers.model",
                 do="choose gaussian, uniform or none",
             )
-        radius = self.match_radius
+        radius = _number(self.match_radius)
         if self.model == "uniform" and not (radius and 0 < radius < np.inf):
             raise InputError(
                 "uniform outliers need the radius of the match circle",
                 where="outliers.match_radius",
                 do="give it in the unit of u, v",
             )
-        if self.jitter is not None and not 0 <= self.jitter < np.inf:
+        if self.jitter is not None and not 0 <= _number(self.jitter) < np.inf:
             raise InputError(
                 f"jitter is {self.jitter}", where="outliers.jitter", do="give 0 or more"
             )
@@ -120,7 +122,7 @@ class OutlierMixture:
             )
         sampled = {"jitter_scale": "j", "outlier_scale": "s_out"}
         for key, name in sampled.items():
-            value = getattr(self, key)
+            value = _number(getattr(self, key))
             if value is None:
                 continue
             if not 0 < value < np.inf:
@@ -144,6 +146,26 @@ class OutlierMixture:
             out += ("s_out",)
         return out
 
+    def in_unit(self, unit: str) -> OutlierMixture:
+        """Mixture whose lengths are plain numbers.
+
+        Parameters
+        ----------
+        unit : str
+            Unit of u and v, to which Quantities are converted.
+
+        Raises
+        ------
+        InputError
+            If a Quantity cannot be converted.
+        """
+        lengths: dict[str, Any] = {
+            name: value_in(length, unit, name, where=f"outliers.{name}")
+            for name in ("match_radius", "jitter", "jitter_scale", "outlier_scale")
+            if hasattr(length := getattr(self, name), "to_value")
+        }
+        return replace(self, **lengths) if lengths else self
+
     def bind(self, scale: float) -> Hyper:
         """Mixture with its priors scaled to the data.
 
@@ -153,6 +175,11 @@ class OutlierMixture:
             Median quoted error.
         """
         return Hyper(self, scale)
+
+
+def _number(length: Any) -> Any:
+    """Number of a Quantity, whose unit is compared with that of u and v later."""
+    return getattr(length, "value", length)
 
 
 @dataclass(frozen=True)

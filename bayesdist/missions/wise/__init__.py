@@ -1,22 +1,5 @@
 """WISE: simulated pairs, the tables and figures of its distortion report, and its files."""
 
-from bayesdist.mission import Mission
+import lazy_loader
 
-__all__ = ["MISSION"]
-
-_COMMANDS = "bayesdist.missions.wise.commands"
-_PAIRS = "bayesdist.missions.wise.pairs"
-
-MISSION = Mission(
-    title="WISE: comparison of bands, RvB pairs, and files.",
-    commands={
-        "bands": f"{_COMMANDS}:bands",
-        "bring-up": f"{_COMMANDS}:bring_up",
-        "rotate": f"{_COMMANDS}:rotate",
-        "rvb": f"{_COMMANDS}:rvb",
-    },
-    simulate={"wise": f"{_COMMANDS}:simulate"},
-    data_sections={"rvb": f"{_PAIRS}.section:RvbData"},
-    match_sources={"rvb": f"{_PAIRS}.run_input:SOURCE"},
-    beside_core={"demo": f"{_COMMANDS}:demo"},
-)
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

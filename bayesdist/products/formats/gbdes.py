@@ -79,7 +79,9 @@ class GbdesParameters:
         bands = list(dict.fromkeys(match[1] for match in found.values()))
         if band is None and len(bands) > 1:
             raise InputError(
-                f"holds the bands {', '.join(bands)}", where=self.name, do="name one by --filter"
+                f"holds the bands {', '.join(bands)}",
+                where=self.name,
+                do="name one (filter in Python, --filter on the command line)",
             )
         chosen = bands[0] if band is None and bands else band
         if chosen not in bands:
@@ -166,7 +168,9 @@ def _calibration(found: GbdesParameters, name: str, choice: Choice) -> Calibrati
     """Calibration of the detectors' maps, with their joint covariance, in degrees."""
     if choice.size is None:
         raise MissingSizeError(
-            "does not say how large the detectors are", where=name, do="give it by --size NX NY"
+            "does not say how large the detectors are",
+            where=name,
+            do="give it (size=(NX, NY) in Python, --size NX NY on the command line)",
         )
     wrong = [f for f in _lint(found) if f.level == "error"]
     if wrong:

@@ -1,10 +1,28 @@
-"""Tables of parameters that stand beside text files, as a format."""
+"""Tables of parameters with their covariance, alone or beside text files, as a format."""
 
 from __future__ import annotations
 
+from bayesdist.calibration.calibration import Calibration
+from bayesdist.errors import InputError
 from bayesdist.products.formats.common.content import Content, Hdu
-from bayesdist.products.formats.common.document import Format, finding_lines
-from bayesdist.products.formats.common.parameters import stored_calibration, stored_in
+from bayesdist.products.formats.common.document import (
+    BuildOptions,
+    Built,
+    Format,
+    FormatSettings,
+    finding_lines,
+)
+from bayesdist.products.formats.common.parameters import (
+    parameters_content,
+    stored_calibration,
+    stored_in,
+)
+
+KIND = "table of parameters"
+
+
+class Settings(FormatSettings):
+    """Configuration of a table of parameters."""
 
 
 def _parse(content: Content) -> tuple[str, Hdu] | None:
@@ -30,6 +48,18 @@ def _describe(table: tuple[str, Hdu]) -> list[str]:
     ]
 
 
+def build(calibration: Calibration, _: Settings, options: BuildOptions) -> tuple[Built, ...]:
+    """One FITS file with all chips at one date; InputError for look-up tables, which it lacks."""
+    if calibration.before or calibration.after:
+        raise InputError(
+            "a table of parameters has no look-up tables",
+            where="products.parameters",
+            do="give the order of a polynomial in their place",
+        )
+    content = parameters_content(calibration, options.epoch)
+    return (Built(options.named("parameters.fits"), KIND, content, calibration),)
+
+
 FORMAT = Format(
     "parameters",
     "a table of parameters by bayesdist",
@@ -37,4 +67,6 @@ FORMAT = Format(
     _parse,
     _describe,
     calibration=lambda table, name, _: stored_calibration(table[1], name),
+    settings=Settings,
+    build=build,
 )

@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
+from astropy.io import fits
 from astropy.table import Table
 
+import bayesdist as bd
 from bayesdist.app.kinds.fitted import read_tables
 from bayesdist.data import read_exposures, read_matches
 from bayesdist.infer import load_posterior
@@ -254,3 +258,30 @@ def test_data_and_campaign_together_are_refused(folder, tmp_path):
     assert result.code == 1
     one_sentence(result.err, "campaign", "data")
     assert snapshot(tmp_path).keys() == {"config.toml"}
+
+
+def test_the_calibration_of_a_run_has_its_tables(run, tmp_path):
+    """Written as look-up tables, or into a polynomial on request, and never left out silently."""
+    own = read_tables(run / "tables.h5", do="").tables
+    found = bd.read_calibration(run)
+    assert len(found.before) == len(own)
+    x, y = np.random.default_rng(3).uniform(1, 2000, (2, 200))
+    for chip in found.numbers:
+        px, py = corrected(own, x, y, chip=chip, filter="F606W")
+        epoch = None if found.model.time is None else 2004.0
+        bare = replace(found, before=())
+        np.testing.assert_allclose(
+            found.forward(x, y, chip=chip, epoch=epoch),
+            bare.forward(px, py, chip=chip, epoch=epoch), rtol=1e-12,
+        )  # fmt: skip
+    with pytest.raises(bd.InputError, match="has look-up tables, and TPV headers cannot hold them"):
+        found.write("tpv", tmp_path, epoch=2004.0)
+    [path] = found.write("cpdis", tmp_path / "acs.fits", epoch=2004.0)
+    again = bd.read_calibration(path)
+    for chip in found.numbers:
+        far = found.forward(x, y, chip=chip, epoch=2004.0) - again.forward(x, y, chip=chip)
+        pixel = np.sqrt(abs(np.linalg.det(found.chip(chip, 2004.0).linear)))
+        # nodes of tables lie between those of the file, which states what that leaves
+        with fits.open(path) as file:
+            limit = max(float(hdu.header.get("BDWORST", 0.0)) for hdu in file)
+        assert np.hypot(*far.T).max() < 1.01 * limit * pixel + 1e-9

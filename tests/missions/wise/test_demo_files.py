@@ -20,8 +20,9 @@ NAMES = {
 @pytest.fixture(scope="module")
 def fit():
     import bayesdist as bd
+    from bayesdist.missions.wise import simulate_wise
 
-    matches, _ = bd.simulate_wise(800, rng=np.random.default_rng(1))
+    matches, _ = simulate_wise(800, rng=np.random.default_rng(1))
     return bd.fit_linear(matches, bd.build_model(matches, order=4, size=(1016, 1016)))
 
 

@@ -12,10 +12,8 @@ from bayesdist.app.commands.on_files.position_table import (
     OUT,
     add_positions,
     check_output,
-    chip_numbers,
     closing_lines,
     head_line,
-    position_column,
     read_positions,
     write_positions,
 )
@@ -29,6 +27,7 @@ from bayesdist.calibration.apply import (
 )
 from bayesdist.calibration.calibration import Calibration
 from bayesdist.calibration.inverse import fitted_inverse
+from bayesdist.calibration.sky_table import chip_numbers, position_column
 from bayesdist.errors import InputError
 from bayesdist.utils.arrays import Bool, Float, Int
 

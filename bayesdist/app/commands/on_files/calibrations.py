@@ -1,13 +1,15 @@
-"""The calibration that a file or a run holds, as commands take it."""
+"""The calibration of a file or a run: `bayesdist.read_calibration`, and as commands take it."""
 
 from __future__ import annotations
 
+import os
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 from pydantic import TypeAdapter
 
+from bayesdist.app.kinds.fitted import FIT_AGAIN, TABLES, read_tables
 from bayesdist.app.products.made_files import further_errors
 from bayesdist.app.results import open_results
 from bayesdist.app.store.rundir import RunDirectory
@@ -19,14 +21,61 @@ from bayesdist.errors import InputError
 from bayesdist.files.documents import read_json_as
 from bayesdist.infer import LinearFit, load_fit, load_posterior
 from bayesdist.infer.solution.solution import Solution
+from bayesdist.products import registry
 from bayesdist.products.formats.common.content import read_hdus
-from bayesdist.products.registry import read_calibration
+
+__all__ = ["read_calibration"]
 
 _SUMMARY = TypeAdapter(Summary)
 
 
+def read_calibration(
+    file: str | os.PathLike[str],
+    *,
+    filter: str | None = None,
+    size: tuple[float, float] | None = None,
+) -> Calibration:
+    """Calibration of a file of any format, or of a run.
+
+    Parameters
+    ----------
+    file : path
+        A calibration file (its format is recognized by its content), the folder of a run, or the
+        ``posterior.nc`` or ``fit.nc`` in it.
+    filter : str, optional
+        Filter of an IDCTAB, with the names of both wheels joined by a comma, or the band of WISE
+        meta-data.  Needed if the file has several.
+    size : tuple of float, optional
+        Number of columns and rows.  Needed for a header that does not state them.
+
+    Returns
+    -------
+    Calibration
+        With the errors that the file states.  A calibration of a run has all errors of the
+        parameters that the run found, and lies on the sky if the positions of its stars did.
+
+    Raises
+    ------
+    InputError
+        For a file that cannot be read, is of no known format or holds no calibration, and for a
+        filter or size that is missing.
+
+    Examples
+    --------
+    >>> rng = np.random.default_rng(1)
+    >>> chip = bd.Chip(1, "camera", (1000, 1000), (500.5, 500.5))
+    >>> model = bd.DistortionModel(1, (chip,), "arcsec")
+    >>> stars, _ = bd.simulate_matches(model, [0, 100, 0, 0, 0, 100], 500, sigma=0.01, rng=rng)
+    >>> fit = bd.fit_linear(stars, model)
+    >>> written = bd.Calibration.from_solution(fit).write("parameters", "camera.fits")
+    >>> bd.read_calibration("camera.fits")
+    <Calibration 'camera.fits': chip 1, order 1, u and v in arcsec, covariance>
+    """
+    return on_the_sky(Path(file), calibration_at(file, filter=filter, size=size))
+
+
 def calibration_at(
-    path: str | Path,
+    path: str | os.PathLike[str],
     *,
     filter: str | None = None,
     scale: float | None = None,
@@ -44,22 +93,36 @@ def calibration_at(
         raise InputError("there is no such file", where=str(path), do="check the name")
     solution = solution_at(path)
     if solution is None:
-        found = read_calibration(path, filter=filter, size=size)
+        found = registry.read_calibration(path, filter=filter, size=size)
     else:
-        detector, scale_of, summary = "", None, _summary_of(path)
-        if (run := run_of(path)) is not None:
-            detector = run.config.detector.name
-            unit, pixel = solution.model.unit, pixel_of_run(path)
-            if unit != "pix" and pixel is not None:
-                scale_of = pixel / ARCSEC[unit], "detector.scale_mas"
-        found = calibration_of(solution, str(path), detector=detector, scale=scale_of)
-        budget = [] if summary is None else summary.budget or []
-        found = replace(found, further=further_errors([row.model_dump() for row in budget]))
+        found = _calibration_of_run(solution, path)
     if scale is None:
         return found
     if not (np.isfinite(scale) and scale > 0):
         raise InputError(f"the scale is {scale}", where="--scale", do="give a positive number")
     return replace(found, scale=float(scale), scale_from="--scale")
+
+
+def _calibration_of_run(solution: Solution, path: Path) -> Calibration:
+    """Calibration of a solution, with what its run knows: a folder, or a file in it."""
+    run, summary = run_of(path), _summary_of(path)
+    if run is None:
+        return calibration_of(solution, str(path))
+    unit, mas = solution.model.unit, run.config.detector.scale_mas
+    scale = None
+    if unit != "pix" and mas is not None:
+        scale = mas / (1000 * ARCSEC[unit]), "detector.scale_mas"
+    tables = read_tables(run / TABLES, do=FIT_AGAIN).tables
+    found = calibration_of(
+        solution,
+        str(path),
+        detector=run.config.detector.name,
+        filter=next((table.filter for table in tables if table.filter), ""),
+        scale=scale,
+    )
+    budget = [] if summary is None else summary.budget or []
+    further = further_errors([row.model_dump() for row in budget])
+    return replace(found, pixel_mas=mas, before=tables, further=further)
 
 
 def solution_at(path: Path) -> Solution | None:
@@ -126,13 +189,6 @@ def _summary_of(path: Path) -> Summary | None:
     if run is None or not (run / "summary.json").exists():
         return None
     return read_json_as(_SUMMARY, run / "summary.json", do="resume the run, which writes it again")
-
-
-def pixel_of_run(path: Path) -> float | None:
-    """Arcseconds in a pixel as a run was configured; None where nothing says it."""
-    run = run_of(path)
-    mas = None if run is None else run.config.detector.scale_mas
-    return None if mas is None else 1e-3 * mas
 
 
 def notes_of(found: Calibration, epoch: float | None) -> tuple[str, ...]:

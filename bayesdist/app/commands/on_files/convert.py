@@ -3,37 +3,37 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 from datetime import date, time
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from pydantic import ValidationError
 
-from bayesdist.app.commands.on_files.calibrations import (
-    calibration_at,
-    on_the_sky,
-    pixel_of_run,
-)
+from bayesdist.app.commands.on_files.calibrations import calibration_at, on_the_sky
 from bayesdist.app.screen import number as digits
 from bayesdist.app.store.output import refuse_existing
-from bayesdist.calibration.calibration import Calibration, calibration_of_maps
+from bayesdist.calibration.calibration import Calibration
 from bayesdist.calibration.inverse import detector_grid
 from bayesdist.calibration.plane import ARCSEC
 from bayesdist.data.sky.tangent import sky_of_plane
 from bayesdist.errors import InputError, required
-from bayesdist.files.atomic import atomic_path
+from bayesdist.files.atomic import made_folder
 from bayesdist.files.documents import toml_of
 from bayesdist.products.formats.common.document import (
     PARAMETERS,
     BuildOptions,
-    Built,
     Choice,
-    Format,
     FormatSettings,
 )
-from bayesdist.products.registry import build, format_of, open_document, product_settings
+from bayesdist.products.registry import format_of, open_document
+from bayesdist.products.writing import (
+    built_for,
+    places_of,
+    refuse_unknown_scale,
+    representable,
+    settings_of,
+    write_built,
+)
 from bayesdist.utils.arrays import Float
 
 _GRID = 65  # points of each axis over which the loss is measured
@@ -67,18 +67,23 @@ def convert(
     """
     target = format_of(to)
     found = on_the_sky(Path(path), calibration_at(path, filter=filter, size=size))
-    settings = _settings(to, product_settings()[to], options)
+    settings = _settings(to, options)
     source = found if chip is None else found.only(chip, epoch)
     at = None
     if source.model.time is not None:
         at = source.reference_date if epoch is None else epoch
-    made, notes = _representable(source, target, order, at)
-    if scale is None:
-        scale = pixel_of_run(Path(path))
+    made, notes = representable(source, target, order, at)
+    if scale is None and source.pixel_mas is not None:
+        scale = source.pixel_mas / 1000
     if scale is not None and not (np.isfinite(scale) and scale > 0):
         raise InputError(f"the scale is {scale}", where="--scale", do="give a positive number")
-    built = build(to, made, settings, BuildOptions(at, scale))
-    places = _written(built, output, force)
+    refuse_unknown_scale(made, target, settings, scale)
+    place = _target(output)
+    built = built_for(to, made, settings, BuildOptions(at, scale), place)
+    places = places_of(built, place)
+    for path_of_file in places:
+        refuse_existing(path_of_file, force)
+    write_built(built, places)
     held = [p for p, one in zip(places, built, strict=True) if one.kind != PARAMETERS]
     lines = [f"{', '.join(str(p) for p in places)}: by {source.name}"]
     back = _read_back(held, filter, made.model.chips[0].size)
@@ -91,7 +96,8 @@ def convert(
     return "\n".join(lines)
 
 
-def _settings(to: str, kind: type[FormatSettings], options: Sequence[str]) -> FormatSettings:
+def _settings(to: str, options: Sequence[str]) -> FormatSettings:
+    """Settings of a format from KEY=VALUE, values as in TOML."""
     values: dict[str, Any] = {}
     for text in options:
         key, mark, value = text.partition("=")
@@ -103,86 +109,17 @@ def _settings(to: str, kind: type[FormatSettings], options: Sequence[str]) -> Fo
             found = value.strip()
         # settings have dates as text
         values[key.strip()] = value.strip() if isinstance(found, (date, time)) else found
-    try:
-        return kind(**values)
-    except ValidationError as error:
-        found = error.errors()
-        names = [".".join(str(part) for part in one["loc"]) or to for one in found]
-        missing = [n for n, one in zip(names, found, strict=True) if one["type"] == "missing"]
-        what, where = found[0]["msg"].lower(), f"products.{to}.{names[0]}"
-        if missing:
-            what, where = f"needs {', '.join(missing)}", f"products.{to}"
-        keys = ", ".join(kind.model_fields) or "none"
-        raise InputError(
-            what, where=where,
-            do=f"give --option KEY=VALUE; the keys of {to} are {keys}",
-        ) from None  # fmt: skip
-
-
-def _representable(
-    source: Calibration, to: Format, order: int | None, epoch: float | None
-) -> tuple[Calibration, list[str]]:
-    """Calibration that the format can hold as polynomials go, and what was done for it."""
-    tables = bool(source.before or source.after)
-    if order is None and (not tables or to.holds_tables):
-        return source, []
-    wanted = to.highest_order if order is None else order
-    if not 1 <= wanted <= to.highest_order:
-        raise InputError(
-            f"the order is {wanted}",
-            where="--order",
-            do=f"choose one from 1 to {to.highest_order} for {to.title}",
-        )
-    kept = source.with_tables(source.at(epoch, origin="stated"))
-    maps, worst, rms = {}, 0.0, 0.0
-    for number, one in kept.items():
-        maps[number], most, mean = one.polynomial(wanted)
-        worst, rms = max(worst, most), max(rms, mean)
-    K = 2 * next(iter(maps.values())).basis.n_terms
-    cov = _joint(source, epoch, K)
-    made = calibration_of_maps(maps, source.name, cov=cov, errors=source.errors)
-    done = "its look-up tables go" if tables else f"its order {source.model.order} goes"
-    note = f"{done} into a polynomial of order {wanted}: {digits(worst, 3)} pix off at worst"
-    note += f", {digits(rms, 3)} rms"
-    return replace(
-        source, solution=made.solution, before=(), after=(), inverses={}, reference_date=None,
-        undated="",
-    ), [note]  # fmt: skip
-
-
-def _joint(source: Calibration, epoch: float | None, size: int) -> Float | None:
-    """Covariance of all chips, for polynomials of `size` coefficients a chip."""
-    whole = source.joint_covariance(source.numbers, epoch, origin="stated")
-    if whole is None:
-        return None
-    n, K = len(source.numbers), source.model.n_terms
-    out = np.zeros((n, 2, size // 2, n, 2, size // 2))
-    same = min(K, size // 2)
-    parts = whole.reshape(n, 2, K, n, 2, K)
-    out[:, :, :same, :, :, :same] = parts[:, :, :same, :, :, :same]
-    return out.reshape(n * size, n * size)
+    return settings_of(to, values)
 
 
 # -- files ----------------------------------------------------------------------------------------
 
 
-def _written(built: Sequence[Built], output: str | Path | None, force: bool) -> list[Path]:
-    """Places of the files: in a folder, or the one file under the name that is given."""
+def _target(output: str | Path | None) -> Path:
+    """Folder, which is made if it does not exist, or file to write."""
     target = Path("." if output is None else output)
-    single = len(built) == 1 and output is not None and not target.is_dir() and target.suffix
-    places = [target] if single else [target / one.file_name for one in built]
-    if not single and target.suffix and not target.is_dir():
-        names = ", ".join(one.file_name for one in built)
-        raise InputError(
-            f"{len(built)} files are made ({names})", where=str(target), do="name a folder"
-        )
-    for place in places:
-        refuse_existing(place, force)
-    for place, one in zip(places, built, strict=True):
-        place.parent.mkdir(parents=True, exist_ok=True)
-        with atomic_path(place) as temporary:
-            temporary.write_bytes(one.content)
-    return places
+    made_folder(target.parent if target.suffix and not target.is_dir() else target)
+    return target
 
 
 def _read_back(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -15,13 +14,11 @@ from bayesdist.app.screen import number
 from bayesdist.app.store.output import refuse_existing
 from bayesdist.calibration.apply import Positions
 from bayesdist.calibration.calibration import Calibration
+from bayesdist.calibration.sky_table import refuse_columns
 from bayesdist.errors import InputError
 from bayesdist.files.atomic import atomic_path
 from bayesdist.files.tables import read_table
-from bayesdist.utils.arrays import Float, Int
-
-log = logging.getLogger("bayesdist")
-
+from bayesdist.utils.arrays import Float
 
 OUT = ("x_out", "y_out")
 _FORMATS = {".ecsv": "ascii.ecsv", ".csv": "ascii.csv", ".fits": "fits"}
@@ -46,57 +43,6 @@ def read_positions(path: Path) -> Table:
     return table
 
 
-def position_column(table: Table, name: str, where: str) -> Float:
-    """Numbers (N,) of a column; NaN for missing ones."""
-    if name not in table.colnames:
-        raise InputError(
-            f"there is no column {name!r}",
-            where=where,
-            do=f"name those of the positions by --columns, of {', '.join(table.colnames[:8])}",
-        )
-    column = table[name]
-    if column.dtype.kind not in "iuf" or column.ndim != 1:
-        raise InputError("holds no numbers", where=f"{where}, column {name!r}", do="check it")
-    values: Float = np.ma.filled(np.ma.asarray(column).astype(float), np.nan)
-    lost = ~np.isfinite(values)
-    if lost.any():
-        n = np.count_nonzero(lost)
-        log.warning("%s: WARNING: column %r has no finite value in %d rows", where, name, n)
-    return np.where(lost, np.nan, values)
-
-
-def chip_numbers(
-    table: Table, chip: int | None, known: Sequence[int], name: str, where: str
-) -> Int:
-    """Chip (N,) of each row, by an option or a column.
-
-    `known` are the chips of the calibration; `name` and `where` are what to call it and the table.
-    """
-    listed = ", ".join(map(str, known))
-    if chip is not None:
-        if chip not in known:
-            raise InputError(f"there is no chip {chip}", where=name, do=f"choose one of {listed}")
-        return np.full(len(table), chip)
-    if len(known) == 1:
-        return np.full(len(table), known[0])
-    if "chip" not in table.colnames:
-        raise InputError(
-            f"there is no column 'chip', and {name} has chips {listed}",
-            where=where,
-            do="add the column, or give --chip",
-        )
-    numbers = position_column(table, "chip", where)
-    strange = np.flatnonzero(~np.isin(numbers, known))
-    if strange.size:
-        k = int(strange[0])
-        raise InputError(
-            f"there is no chip {numbers[k]:g}",
-            where=f"{where}, row {k + 1}, column 'chip'",
-            do=f"{name} has {listed}",
-        )
-    return numbers.astype(np.int64)
-
-
 def add_positions(table: Table, at: Positions, names: tuple[str, str], where: str) -> None:
     """Add positions and their errors, and back on the detector the chip, as columns."""
     x, y = names
@@ -111,17 +57,6 @@ def add_positions(table: Table, at: Positions, names: tuple[str, str], where: st
         table[name] = values
         if name.startswith(("sigma", *names)):
             table[name].unit = "pix"
-
-
-def refuse_columns(table: Table, new: Sequence[str], where: str) -> None:
-    """Refuse names of new columns that a table has already."""
-    taken = [name for name in new if name in table.colnames]
-    if taken:
-        raise InputError(
-            f"has a column {taken[0]!r} already, which would be overwritten",
-            where=where,
-            do="rename or drop it",
-        )
 
 
 def write_positions(table: Table, output: Path) -> None:

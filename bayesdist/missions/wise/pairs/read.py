@@ -158,9 +158,10 @@ def read_rvb(
 
     Examples
     --------
+    >>> from bayesdist.missions.wise import read_rvb
     >>> from pathlib import Path
     >>> n = Path("pairs.csv").write_text("x,y,u,v\n10,20,10.1,20.2\n900,800,899,799\n")
-    >>> pairs = bd.read_rvb("pairs.csv", band="W2", sigma=0.05)
+    >>> pairs = read_rvb("pairs.csv", band="W2", sigma=0.05)
     >>> len(pairs.matches)
     2
     """

@@ -13,6 +13,7 @@ from bayesdist.missions.wise.published import SAMPLE_SIZES, WISE_ARRAYS, WISE_CO
 from bayesdist.model import Chip, DistortionModel
 from bayesdist.simulate.matches import Truth, simulate_matches, simulate_partitioned
 from bayesdist.utils.arrays import Float
+from bayesdist.utils.quantities import Random, generator_of
 
 FAINT, BRIGHT = 14.5, 7.0
 
@@ -38,7 +39,8 @@ def wise_solution(band: str = "W2") -> tuple[DistortionModel, Float]:
 
     Examples
     --------
-    >>> model, theta = bd.wise_solution("W4")
+    >>> from bayesdist.missions.wise import wise_solution
+    >>> model, theta = wise_solution("W4")
     >>> model.order, theta.shape
     (4, (30,))
     """
@@ -68,7 +70,7 @@ def simulate_wise(
     n: int = 6000,
     *,
     band: str = "W2",
-    rng: np.random.Generator,
+    rng: Random,
     fraction: float = 0.03,
     jitter: float = 0.03,
     outlier_scale: float = 1.0,
@@ -82,7 +84,8 @@ def simulate_wise(
     ----------
     n : int
     band : str
-    rng : numpy.random.Generator
+    rng : int or numpy.random.Generator
+        Seed, or source of the random numbers.
     fraction : float
         Fraction of false matches.
     jitter : float
@@ -103,10 +106,12 @@ def simulate_wise(
 
     Examples
     --------
-    >>> matches, truth = bd.simulate_wise(400, band="W2", rng=np.random.default_rng(1))
+    >>> from bayesdist.missions.wise import simulate_wise
+    >>> matches, truth = simulate_wise(400, band="W2", rng=np.random.default_rng(1))
     >>> len(matches), matches.unit
     (400, 'pix')
     """
+    rng = generator_of(rng)
     model, theta = wise_solution(band)
     # star counts rise as 10^(0.3 m)
     p = rng.uniform(size=n)
@@ -130,7 +135,7 @@ def simulate_wise_partitioned(
     n: int = SAMPLE_SIZES["W2"],
     *,
     band: str = "W2",
-    rng: np.random.Generator,
+    rng: Random,
     fraction: float = 0.03,
     jitter: float = 0.03,
     outlier_scale: float = 1.0,
@@ -159,14 +164,15 @@ def simulate_wise_partitioned(
 
     Examples
     --------
-    >>> truth = bd.simulate_wise_partitioned("pairs", 400, rng=np.random.default_rng(1))
+    >>> from bayesdist.missions.wise import simulate_wise_partitioned
+    >>> truth = simulate_wise_partitioned("pairs", 400, rng=np.random.default_rng(1))
     >>> bd.open_matches("pairs").n_rows
     400
     """
     simulate = partial(
         simulate_wise,
         band=band,
-        rng=rng,
+        rng=generator_of(rng),
         fraction=fraction,
         jitter=jitter,
         outlier_scale=outlier_scale,

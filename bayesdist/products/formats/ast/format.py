@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from math import comb
+from pathlib import Path
 
 import numpy as np
 from pydantic import PositiveFloat, PositiveInt
@@ -38,18 +39,20 @@ def build(calibration: Calibration, settings: Settings, options: BuildOptions) -
     """For each chip a mapping, and the file with its covariance."""
     if calibration.before or calibration.after:
         raise InputError(
-            "a PolyMap has no look-up tables", where="products.ast", do="convert it, which says "
-            "what is lost",
-        )  # fmt: skip
+            "a PolyMap has no look-up tables",
+            where="products.ast",
+            do="give the order of a polynomial in their place",
+        )
     out = []
     for number in calibration.numbers:
-        several = f"_{number}" if len(calibration.numbers) > 1 else ""
+        several = len(calibration.numbers) > 1
+        name = options.named(f"ast_{number}.txt" if several else "ast.txt", several=several)
         one = calibration.only(number, options.epoch)
-        side = f"ast{several}_parameters.fits"
+        side = f"{Path(name).stem}_parameters.fits"
         text = _text(one, settings, options.scale_arcsec, side)
         out += [
             Built(side, PARAMETERS, parameters_content(one), one, number),
-            Built(f"ast{several}.txt", "AST", text.encode("ascii", "replace"), one, number),
+            Built(name, "AST", text.encode("ascii", "replace"), one, number),
         ]
     return tuple(out)
 
@@ -220,5 +223,6 @@ def _describe(file: AstFile) -> list[str]:
 
 
 FORMAT = Format(
-    "ast", "an AST mapping", 34, ast_of, _describe, lint_ast, ast_calibration, Settings, build
-)
+    "ast", "an AST mapping", 34, ast_of, _describe, lint_ast, ast_calibration, Settings, build,
+    needs_scale=lambda settings: True,
+)  # fmt: skip

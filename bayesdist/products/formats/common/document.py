@@ -91,7 +91,9 @@ def required_size(
     found = given if stated is None else stated
     if found is None:
         raise MissingSizeError(
-            f"does not say how large the {what} is", where=name, do="give it by --size NX NY"
+            f"does not say how large the {what} is",
+            where=name,
+            do="give it (size=(NX, NY) in Python, --size NX NY on the command line)",
         )
     return float(found[0]), float(found[1])
 
@@ -129,6 +131,11 @@ class BuildOptions:
     scale_arcsec: float | None = None  # arcseconds per pixel, where configured
     # by which pixels are corrected before the polynomials, of the detector and of the filter
     tables: tuple[LookupTable, ...] = ()
+    file_name: str = ""  # of the file; empty for the usual name of the format
+
+    def named(self, usual: str, *, several: bool = False) -> str:
+        """Name of a file: the requested one, or the usual one if several files are made."""
+        return usual if several else self.file_name or usual
 
 
 @dataclass(frozen=True, eq=False)
@@ -175,7 +182,11 @@ class Format:
     highest_order : int
         Of the polynomials that can be built.
     holds_tables : bool
-        True where what is built has the look-up tables of the calibration.
+        True if files that are built have the look-up tables of the calibration.
+    holds_time : bool
+        True if files that are built have the dependence of the calibration on time.
+    needs_scale : callable
+        From the settings to True if a file states angles, for which u and v in pixels need a scale.
     """
 
     key: str
@@ -192,6 +203,8 @@ class Format:
     )
     highest_order: int = MAX_ORDER
     holds_tables: bool = False
+    holds_time: bool = False
+    needs_scale: Callable[[Any], bool] = lambda settings: False
 
 
 @dataclass(frozen=True, eq=False)

@@ -110,7 +110,7 @@ def at_date(
         raise InputError(
             "u and v are in pixels, and the file is in arcseconds",
             where="detector.scale_mas",
-            do="give the pixel scale (of convert: --scale)",
+            do="give the pixel scale (scale_mas in Python, --scale of convert)",
         )
     date = epoch if calibration.model.time is not None else None
     factor = arcsec_per(unit, scale_arcsec)

@@ -129,10 +129,12 @@ def idctab_from_solution(
 
     Examples
     --------
-    >>> matches, _ = bd.simulate_wise(500, rng=np.random.default_rng(1))
+    >>> from bayesdist.formats import idctab_from_solution
+    >>> from bayesdist.missions.wise import simulate_wise
+    >>> matches, _ = simulate_wise(500, rng=np.random.default_rng(1))
     >>> fit = bd.fit_linear(matches, bd.build_model(matches, order=2, size=(1016, 1016)))
     >>> camera = {"instrument": "WFC3", "detector": "IR", "scale_arcsec": 0.13}
-    >>> tab = bd.idctab_from_solution(fit, **camera, filters=["F160W"])
+    >>> tab = idctab_from_solution(fit, **camera, filters=["F160W"])
     >>> [int(row["DETCHIP"]) for row in tab.rows]
     [1]
     """
@@ -250,7 +252,7 @@ def _arcsec(unit: str, scale_arcsec: float | None) -> float:
         raise InputError(
             "u and v are in pixels, and an IDCTAB is in arcseconds",
             where="detector.scale_mas",
-            do="give the pixel scale (of convert: --scale)",
+            do="give the pixel scale (scale_mas in Python, --scale of convert)",
         )
     return scale_arcsec
 

@@ -162,4 +162,5 @@ FORMAT = Format(
     Settings,
     _build,
     highest_order=HIGHEST,
+    holds_time=True,
 )

@@ -64,10 +64,12 @@ class IdcTab:
 
     Examples
     --------
-    >>> matches, _ = bd.simulate_wise(500, rng=np.random.default_rng(1))
+    >>> from bayesdist.formats import idctab_from_solution
+    >>> from bayesdist.missions.wise import simulate_wise
+    >>> matches, _ = simulate_wise(500, rng=np.random.default_rng(1))
     >>> fit = bd.fit_linear(matches, bd.build_model(matches, order=2, size=(1016, 1016)))
     >>> camera = {"instrument": "WFC3", "detector": "IR", "scale_arcsec": 0.13}
-    >>> tab = bd.idctab_from_solution(fit, **camera, filters=["F160W"])
+    >>> tab = idctab_from_solution(fit, **camera, filters=["F160W"])
     >>> len(tab.rows)  # without an inverse
     1
     """
@@ -412,12 +414,14 @@ def read_idctab(path: str | os.PathLike[str]) -> IdcTab:
 
     Examples
     --------
-    >>> matches, _ = bd.simulate_wise(500, rng=np.random.default_rng(1))
+    >>> from bayesdist.formats import idctab_from_solution, read_idctab, write_idctab
+    >>> from bayesdist.missions.wise import simulate_wise
+    >>> matches, _ = simulate_wise(500, rng=np.random.default_rng(1))
     >>> fit = bd.fit_linear(matches, bd.build_model(matches, order=2, size=(1016, 1016)))
     >>> camera = {"instrument": "WFC3", "detector": "IR", "scale_arcsec": 0.13}
-    >>> tab = bd.idctab_from_solution(fit, **camera, filters=["F160W"])
-    >>> bd.write_idctab(tab, "test_idc.fits")
-    >>> bool((bd.read_idctab("test_idc.fits").rows == tab.rows).all())
+    >>> tab = idctab_from_solution(fit, **camera, filters=["F160W"])
+    >>> write_idctab(tab, "test_idc.fits")
+    >>> bool((read_idctab("test_idc.fits").rows == tab.rows).all())
     True
     """
     return IdcTab(read_hdus(path), str(path))
@@ -439,12 +443,14 @@ def write_idctab(tab: IdcTab, path: str | os.PathLike[str]) -> None:
 
     Examples
     --------
-    >>> matches, _ = bd.simulate_wise(500, rng=np.random.default_rng(1))
+    >>> from bayesdist.formats import idctab_from_solution, read_idctab, write_idctab
+    >>> from bayesdist.missions.wise import simulate_wise
+    >>> matches, _ = simulate_wise(500, rng=np.random.default_rng(1))
     >>> fit = bd.fit_linear(matches, bd.build_model(matches, order=2, size=(1016, 1016)))
     >>> camera = {"instrument": "WFC3", "detector": "IR", "scale_arcsec": 0.13}
-    >>> tab = bd.idctab_from_solution(fit, **camera, filters=["F160W"])
-    >>> bd.write_idctab(tab, "test_idc.fits")
-    >>> bool((bd.read_idctab("test_idc.fits").rows == tab.rows).all())
+    >>> tab = idctab_from_solution(fit, **camera, filters=["F160W"])
+    >>> write_idctab(tab, "test_idc.fits")
+    >>> bool((read_idctab("test_idc.fits").rows == tab.rows).all())
     True
     """
     write_hdus(tab.hdus, path)

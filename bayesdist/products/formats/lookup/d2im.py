@@ -66,9 +66,10 @@ def write_d2im(
 
     Examples
     --------
+    >>> from bayesdist.formats import read_d2im, write_d2im
     >>> tables = [bd.LookupTable(chip, np.full((2, 32, 64), 0.1)) for chip in (1, 2)]
-    >>> file = bd.write_d2im(tables, "test_d2i.fits")
-    >>> sorted(table.chip for table in bd.read_d2im("test_d2i.fits"))
+    >>> file = write_d2im(tables, "test_d2i.fits")
+    >>> sorted(table.chip for table in read_d2im("test_d2i.fits"))
     [1, 2]
     """
     where = "D2IMFILE"
@@ -118,9 +119,10 @@ def read_d2im(
 
     Examples
     --------
+    >>> from bayesdist.formats import read_d2im, write_d2im
     >>> tables = [bd.LookupTable(chip, np.full((2, 32, 64), 0.1)) for chip in (1, 2)]
-    >>> file = bd.write_d2im(tables, "test_d2i.fits")
-    >>> sorted(table.chip for table in bd.read_d2im("test_d2i.fits"))
+    >>> file = write_d2im(tables, "test_d2i.fits")
+    >>> sorted(table.chip for table in read_d2im("test_d2i.fits"))
     [1, 2]
     """
     file = read_lookup_file(path)

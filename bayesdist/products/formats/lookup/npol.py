@@ -90,13 +90,15 @@ def write_npol(
 
     Examples
     --------
-    >>> matches, _ = bd.simulate_wise(500, rng=np.random.default_rng(1))
+    >>> from bayesdist.formats import idctab_from_solution, read_npol, write_npol
+    >>> from bayesdist.missions.wise import simulate_wise
+    >>> matches, _ = simulate_wise(500, rng=np.random.default_rng(1))
     >>> fit = bd.fit_linear(matches, bd.build_model(matches, order=2, size=(1016, 1016)))
     >>> camera = {"instrument": "WFC3", "detector": "IR", "scale_arcsec": 0.13}
-    >>> tab = bd.idctab_from_solution(fit, **camera, filters=["F160W"])
+    >>> tab = idctab_from_solution(fit, **camera, filters=["F160W"])
     >>> table = bd.LookupTable(1, np.full((2, 32, 64), 0.1), filter="F160W")
-    >>> file = bd.write_npol([table], "test_npl.fits", idctab=tab, filters=("F160W",))
-    >>> (back,) = bd.read_npol("test_npl.fits", tab)
+    >>> file = write_npol([table], "test_npl.fits", idctab=tab, filters=("F160W",))
+    >>> (back,) = read_npol("test_npl.fits", tab)
     >>> np.allclose(back.values, 0.1)
     True
     """
@@ -179,13 +181,15 @@ def read_npol(
 
     Examples
     --------
-    >>> matches, _ = bd.simulate_wise(500, rng=np.random.default_rng(1))
+    >>> from bayesdist.formats import idctab_from_solution, read_npol, write_npol
+    >>> from bayesdist.missions.wise import simulate_wise
+    >>> matches, _ = simulate_wise(500, rng=np.random.default_rng(1))
     >>> fit = bd.fit_linear(matches, bd.build_model(matches, order=2, size=(1016, 1016)))
     >>> camera = {"instrument": "WFC3", "detector": "IR", "scale_arcsec": 0.13}
-    >>> tab = bd.idctab_from_solution(fit, **camera, filters=["F160W"])
+    >>> tab = idctab_from_solution(fit, **camera, filters=["F160W"])
     >>> table = bd.LookupTable(1, np.full((2, 32, 64), 0.1), filter="F160W")
-    >>> file = bd.write_npol([table], "test_npl.fits", idctab=tab, filters=("F160W",))
-    >>> (back,) = bd.read_npol("test_npl.fits", tab)
+    >>> file = write_npol([table], "test_npl.fits", idctab=tab, filters=("F160W",))
+    >>> (back,) = read_npol("test_npl.fits", tab)
     >>> np.allclose(back.values, 0.1)
     True
     """

@@ -69,16 +69,22 @@ def build(calibration: Calibration, settings: Settings, options: BuildOptions) -
             raise InputError(
                 "the aperture has no name",
                 where=WHERE,
-                do="give aperture, as in 'NIS_CEN' (of convert: --option aperture=NIS_CEN)",
+                do="give aperture, as in 'NIS_CEN' (--option aperture=NIS_CEN of convert)",
             )
-        out += _files(calibration, chip.number, aperture, settings.order, options)
+        name = options.named(f"siaf_distortion_{aperture}.txt".lower(), several=several)
+        out += _files(calibration, chip.number, aperture, settings.order, options, name)
     return tuple(out)
 
 
 def _files(
-    calibration: Calibration, chip: int, aperture: str, order: int | None, options: BuildOptions
+    calibration: Calibration,
+    chip: int,
+    aperture: str,
+    order: int | None,
+    options: BuildOptions,
+    name: str,
 ) -> tuple[Built, Built]:
-    """Side file and table of one chip, at one date.
+    """Side file and table of one chip, at one date; `name` is that of the table.
 
     (u, v) are taken as Ideal coordinates of the aperture.  Look-up tables are left out.  `order` is
     that of the rows and with it of the inverse, by default that of the polynomial; errors as for
@@ -92,7 +98,6 @@ def _files(
     rows_order = max(order or 0, known.basis.order)
     columns = [*_forward(poly), *_inverse(known, rows_order)]
     date = options.epoch if calibration.model.time is not None else None
-    name = f"siaf_distortion_{aperture}.txt".lower()
     side = side_name(name)
     size, reference = known.basis.size, known.basis.reference_pixel
     tables = any(table.chip == chip for table in calibration.before)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 
@@ -13,7 +14,7 @@ from bayesdist.calibration.plane import ARCSEC, Plane
 from bayesdist.data.sky.tangent import sky_of_plane, tangent_plane
 from bayesdist.model import polynomial_terms
 from bayesdist.products.formats.common.cards import text_card
-from bayesdist.products.formats.common.document import PARAMETERS, Built, MissingSizeError
+from bayesdist.products.formats.common.document import PARAMETERS, Built, required_size
 from bayesdist.products.formats.common.parameters import (
     parameters_content,
     refuse_other,
@@ -35,13 +36,7 @@ def sip_calibration(
     `size` is columns and rows, for a header without them (else MissingSizeError); with `pixels`,
     for a file without CD, (u, v) are corrected pixels, else arcseconds; `notes` go to the reader.
     """
-    found = size if sip.size is None else (float(sip.size[0]), float(sip.size[1]))
-    if found is None:
-        raise MissingSizeError(
-            "does not say how large the image is",
-            where=name,
-            do="add NAXIS1 and NAXIS2 (or IMAGEW and IMAGEH), or compare it with a file that says",
-        )
+    found = required_size(sip.size, size, name)
     order = max(sip.order) if min(sip.order) >= SIP_ORDERS[0] else 1
     linear = np.eye(2) if pixels else sip.cd * (1.0 if sip.linear_axes else 3600.0)
 
@@ -98,7 +93,7 @@ def side_file(calibration: Calibration, chip: int, epoch: float | None, header: 
     """File with the parameters of one chip at a date, to stand beside a header."""
     date = epoch if calibration.model.time is not None else None
     one = calibration.only(chip, date)
-    name = f"{header.removesuffix('.hdr')}_parameters.fits"
+    name = f"{Path(header).stem}_parameters.fits"
     return Built(name, PARAMETERS, parameters_content(one), one, chip)
 
 

@@ -86,7 +86,8 @@ def _build(
             notes=calibration.remarks,
             **settings.model_dump(exclude={"parameters"}),
         )
-        name = f"sip_{number}.hdr" if len(calibration.numbers) > 1 else "sip.hdr"
+        several = len(calibration.numbers) > 1
+        name = options.named(f"sip_{number}.hdr" if several else "sip.hdr", several=several)
         if settings.parameters:
             beside = side_file(calibration, number, options.epoch, name)
             sip = with_side_file(sip, beside.file_name)
@@ -136,4 +137,5 @@ FORMAT = Format(
     _build,
     sip_read_back,
     highest_order=SIP_ORDERS[1],
+    needs_scale=lambda settings: settings.axes == "sky",
 )

@@ -68,9 +68,11 @@ class SipHeader:
 
     Examples
     --------
-    >>> matches, _ = bd.simulate_wise(500, rng=np.random.default_rng(1))
+    >>> from bayesdist.formats import sip_from_solution
+    >>> from bayesdist.missions.wise import simulate_wise
+    >>> matches, _ = simulate_wise(500, rng=np.random.default_rng(1))
     >>> fit = bd.fit_linear(matches, bd.build_model(matches, order=2, size=(1016, 1016)))
-    >>> sip = bd.sip_from_solution(fit, scale_arcsec=2.757)
+    >>> sip = sip_from_solution(fit, scale_arcsec=2.757)
     >>> sorted(sip.a)
     [(0, 2), (1, 1), (2, 0)]
     """

@@ -53,10 +53,12 @@ def write_sip(sip: SipHeader, path: str | os.PathLike[str]) -> None:
 
     Examples
     --------
-    >>> matches, _ = bd.simulate_wise(500, rng=np.random.default_rng(1))
+    >>> from bayesdist.formats import read_sip, sip_from_solution, write_sip
+    >>> from bayesdist.missions.wise import simulate_wise
+    >>> matches, _ = simulate_wise(500, rng=np.random.default_rng(1))
     >>> fit = bd.fit_linear(matches, bd.build_model(matches, order=2, size=(1016, 1016)))
-    >>> bd.write_sip(bd.sip_from_solution(fit, scale_arcsec=2.757), "sip.hdr")
-    >>> bd.read_sip("sip.hdr").ctype
+    >>> write_sip(sip_from_solution(fit, scale_arcsec=2.757), "sip.hdr")
+    >>> read_sip("sip.hdr").ctype
     ('RA---TAN-SIP', 'DEC--TAN-SIP')
     """
     with atomic_path(path) as temporary:

@@ -58,7 +58,7 @@ def build(calibration: Calibration, settings: Settings, options: BuildOptions) -
             f"an STDGDC file is of one detector, and this one has the chips "
             f"{', '.join(map(str, calibration.numbers))}",
             where="products.stdgdc",
-            do="convert them one by one with --chip",
+            do="write them one by one (Calibration.only in Python, --chip of convert)",
         )
     number = calibration.numbers[0]
     one = calibration.with_tables(calibration.at(options.epoch, origin="stated"))[number]

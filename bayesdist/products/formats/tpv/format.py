@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 
@@ -44,7 +45,7 @@ from bayesdist.products.formats.tpv.head import (
 )
 from bayesdist.products.formats.tpv.lint import lint_tpv
 
-NAME, SIDE = "tpv.head", "tpv_parameters.fits"
+NAME = "tpv.head"
 _GRID = 33  # points of each axis over which CRDER is the rms error
 
 
@@ -68,21 +69,25 @@ def build(calibration: Calibration, settings: Settings, options: BuildOptions) -
         raise InputError(
             f"TPV holds polynomials up to order {HIGHEST}, and this one has order {model.order}",
             where=where,
-            do="fit a lower order, or convert with --order 7, which says what is lost",
+            do="fit a lower order, or write it with order 7 (--order 7 of convert)",
         )
     if calibration.before or calibration.after:
         raise InputError(
-            "TPV has no look-up tables", where=where, do="convert it, which says what is lost"
+            "TPV has no look-up tables",
+            where=where,
+            do="give the order of a polynomial in their place",
         )
     arcsec = arcsec_per(model.unit, options.scale_arcsec)
     maps = calibration.at(options.epoch, origin="stated")
     heads = tuple(_head(one, number, arcsec, calibration) for number, one in maps.items())
-    named = text_card(SIDE_FILE, SIDE, "file with the covariance")
+    name = options.named(NAME)
+    side = f"{Path(name).stem}_parameters.fits"
+    named = text_card(SIDE_FILE, side, "file with the covariance")
     cards = [str(card) for head in heads for card in (*head.header.cards, named, "END")]
     text = "\n".join(card.rstrip() for card in cards) + "\n"
     return (
-        Built(SIDE, PARAMETERS, parameters_content(calibration, options.epoch), calibration),
-        Built(NAME, "TPV", text.encode("ascii"), heads),
+        Built(side, PARAMETERS, parameters_content(calibration, options.epoch), calibration),
+        Built(name, "TPV", text.encode("ascii"), heads),
     )
 
 
@@ -153,5 +158,5 @@ def _describe(file: TpvFile) -> list[str]:
 
 FORMAT = Format(
     "tpv", "TPV headers", 31, tpv_of, _describe, lint_tpv, tpv_calibration, Settings, build,
-    highest_order=HIGHEST,
+    highest_order=HIGHEST, needs_scale=lambda settings: True,
 )  # fmt: skip

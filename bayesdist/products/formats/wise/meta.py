@@ -168,7 +168,7 @@ def wise_calibration(bands: Sequence[WiseBand], name: str, band: str | None = No
         raise InputError(
             f"holds the bands {', '.join(known)}",
             where=name,
-            do="name one by --filter, or one for each file as in --filter W1:W2",
+            do="name one by filter (--filter W1, or W1:W2 for two files, on the command line)",
         )
     one = known[chosen] if band is not None else next(iter(known.values()))
     notes = ("without the SKEW of its CD matrix",) if one.skew else ()

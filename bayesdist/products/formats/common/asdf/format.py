@@ -111,7 +111,8 @@ class Observatory(Generic[Settings]):
             refuse_larger(one, detector, self.detector(meta["instrument"]), where)
             instrument = meta["instrument"]["name"]
             one.record["provenance"] |= {"instrument": instrument, "detector": detector}
-            file = f"{self.key}_{instrument}_{detector}_distortion.asdf".lower()
+            usual = f"{self.key}_{instrument}_{detector}_distortion.asdf".lower()
+            file = options.named(usual, several=several)
             tree = self.tree(meta, one.model, one.record, file)
             content = packed(tree, file, one.table_arrays)
             kind, found = f"{self.name} distortion", {"closure_pix": one.closure}

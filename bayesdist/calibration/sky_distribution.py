@@ -1,0 +1,140 @@
+"""Sky positions as distributions: draws of all errors that a calibration knows."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from bayesdist.calibration.calibration import Calibration
+from bayesdist.calibration.plane import SkyPlacement
+from bayesdist.calibration.sky_positions import (
+    coefficient_covariance,
+    designs,
+    own_covariances,
+    placement_of,
+    shared_covariance,
+)
+from bayesdist.data.sky.tangent import plane_axes
+from bayesdist.errors import InputError
+from bayesdist.utils.arrays import Float
+from bayesdist.utils.quantities import Direction, Epoch, Random, generator_of, values_in, year_of
+
+if TYPE_CHECKING:
+    from astropy.coordinates import SkyCoord
+
+
+def sky_distribution(
+    calibration: Calibration,
+    x: ArrayLike,
+    y: ArrayLike,
+    *,
+    n_draws: int = 1000,
+    rng: Random,
+    chip: ArrayLike | None = None,
+    epoch: Epoch | None = None,
+    point: Direction | None = None,
+    placement: SkyPlacement | None = None,
+    centroids: tuple[ArrayLike, ArrayLike] | None = None,
+) -> SkyCoord:
+    """Random draws of positions on the sky, as a SkyCoord of distributions.
+
+    Parameters
+    ----------
+    calibration : Calibration
+    x, y : array_like, shape (N,)
+        FITS 1-based pixels.
+    n_draws : int
+    rng : int or numpy.random.Generator
+        Seed, or source of the random numbers.
+    chip : array_like, optional
+        Chip number of each position, or of all; it may be left out for a single chip.
+    epoch : float, str, Time, date or Quantity, optional
+        Needed by a calibration that depends on time.
+    point : SkyCoord, or pair of float or Quantity, optional
+        Sky position of (u, v) = (0, 0), u to the east and v to the north, in place of the
+        calibration's own.
+    placement : SkyPlacement, optional
+        Place and directions of u and v on the sky, in place of `point`.
+    centroids : pair of array_like, optional
+        Standard deviations of x and y in pixels.
+
+    Returns
+    -------
+    SkyCoord, shape (N,)
+        ICRS, with `astropy.uncertainty.Distribution` of `n_draws` values as ra and dec.  A draw has
+        the same errors of the calibration for all stars, so that the covariance between positions
+        is that of ``sky_positions(..., joint=True)`` within its Monte-Carlo error.
+
+    Raises
+    ------
+    InputError
+        For fewer than two draws, a calibration without errors, a plane that does not touch the sky
+        and no point, or a unit that is no angle.
+
+    Notes
+    -----
+    ``sky.ra.pdf_std()``, transformations to other frames, offsets and the separation from a plain
+    SkyCoord work on distributions.  Indexing with a single number and the separation of two such
+    objects do not in astropy 8; for these ``SkyCoord(sky.ra.distribution, sky.dec.distribution)``
+    is a plain SkyCoord of shape (N, n_draws).
+    """
+    from astropy import units as apu
+    from astropy.coordinates import SkyCoord
+    from astropy.uncertainty import Distribution
+
+    if n_draws < 2:
+        raise InputError(f"n_draws is {n_draws}", do="ask for two draws or more")
+    if calibration.errors == "none" and not calibration.further and centroids is None:
+        raise InputError(
+            "has no errors to draw from",
+            where=calibration.name,
+            do="give a calibration with a covariance, or the errors of the centroids",
+        )
+    if chip is None and len(calibration.numbers) > 1:
+        raise InputError(
+            "has several chips, and none is named",
+            where=calibration.name,
+            do=f"give chip, one of {', '.join(map(str, calibration.numbers))}",
+        )
+    generator = generator_of(rng)
+    epoch = None if epoch is None else year_of(epoch)
+    px, py = (np.atleast_1d(values_in(a, "pix", name)) for name, a in (("x", x), ("y", y)))
+    numbers = np.broadcast_to(
+        np.asarray(calibration.numbers[0] if chip is None else chip, np.int64), px.shape
+    )
+    placement = placement or placement_of(calibration, point)
+    maps = calibration.with_tables(calibration.at(epoch, origin="stated"))
+    plane, slope = np.full((2, px.size), np.nan), np.full((px.size, 2, 2), np.nan)
+    for number, chip_map in maps.items():
+        rows = numbers == number
+        plane[:, rows] = chip_map.at(px[rows], py[rows])
+        slope[rows] = chip_map.slope(px[rows], py[rows])
+    ra, dec = placement.sky(plane)
+    root = _root(coefficient_covariance(calibration, epoch))
+    design = designs(calibration, maps, px, py, numbers)
+    errors = design @ (root @ generator.standard_normal((len(root), n_draws)))  # (N, 2, n_draws)
+    errors += _root(shared_covariance(calibration)) @ generator.standard_normal((2, n_draws))
+    own = _root(own_covariances(calibration, slope, centroids))
+    errors += own @ generator.standard_normal((px.size, 2, n_draws))
+    steps = placement.steps(ra, dec)  # mas to the east and to the north
+    drawn_ra, drawn_dec = _moved(ra, dec, np.radians((steps @ errors) / 3.6e6))
+    return SkyCoord(Distribution(drawn_ra * apu.deg), Distribution(drawn_dec * apu.deg))
+
+
+def _moved(ra: Float, dec: Float, offset: Float) -> tuple[Float, Float]:
+    """Directions (N, n), degrees, at small offsets (N, 2, n) to the east and north, radians."""
+    axes = np.stack([plane_axes(one) for one in zip(ra.tolist(), dec.tolist(), strict=True)])
+    vectors = axes[:, 2, :, None] + np.einsum("nad,nax->nxd", offset, axes[:, :2])
+    x, y, z = np.moveaxis(vectors, 1, 0)
+    moved = np.degrees(np.arctan2(y, x))
+    # on one side of the meridian for each star, so that mean and scatter make sense
+    moved = ra[:, None] + (moved - ra[:, None] + 180.0) % 360.0 - 180.0
+    return moved, np.degrees(np.arctan2(z, np.hypot(x, y)))
+
+
+def _root(cov: Float) -> Float:
+    """Matrices R with R R^T equal to covariances (..., n, n), which may be singular."""
+    values, vectors = np.linalg.eigh(cov)
+    return np.asarray(vectors * np.sqrt(np.maximum(values, 0.0))[..., None, :])

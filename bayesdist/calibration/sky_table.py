@@ -1,0 +1,165 @@
+"""Tables of pixels, and the positions on the sky that a calibration gives them."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from astropy import units
+from astropy.table import QTable, Table
+
+from bayesdist.calibration.apply import on_chip
+from bayesdist.calibration.calibration import Calibration
+from bayesdist.calibration.sky_positions import sky_positions
+from bayesdist.errors import InputError
+from bayesdist.utils.arrays import Float, Int
+from bayesdist.utils.quantities import Direction, Epoch, direction_in, year_of
+
+if TYPE_CHECKING:
+    import pandas
+
+log = logging.getLogger("bayesdist")
+
+COLUMNS = ("ra", "dec", "sigma_ra", "sigma_dec", "corr_ra_dec")
+COVARIANCE = "covariance"  # key of the joint covariance in the meta-data of a table
+
+
+def table_on_sky(
+    calibration: Calibration,
+    table: Table | pandas.DataFrame | Mapping[str, Any],
+    *,
+    columns: Sequence[str] = ("x", "y"),
+    centroids: Sequence[str] | None = None,
+    pixel_origin: float = 1.0,
+    chip: int | None = None,
+    epoch: Epoch | None = None,
+    point: Direction | None = None,
+    covariance: bool = False,
+    name: str = "table",
+) -> QTable:
+    """Positions on the sky of a table of pixels; arguments as for `Calibration.to_sky`.
+
+    `name` is that of the table in messages.
+    """
+    is_frame = hasattr(table, "to_parquet")  # a pandas DataFrame
+    rows = QTable(Table.from_pandas(table) if is_frame else table)
+    plain = Table(rows)
+    x, y = (position_column(plain, c, name) + (1.0 - pixel_origin) for c in columns)
+    sigma = None
+    if centroids is not None:
+        sigma_x, sigma_y = (position_column(plain, c, name) for c in centroids)
+        sigma = sigma_x, sigma_y
+    numbers = chip_numbers(plain, chip, list(calibration.numbers), calibration.name, name)
+    year = None if epoch is None else year_of(epoch)
+    at = sky_positions(
+        calibration,
+        x,
+        y,
+        numbers,
+        epoch=year,
+        point=None if point is None else direction_in(point, "point"),
+        centroids=sigma,
+        joint=covariance,
+    )
+    new = COLUMNS if at.sigma is not None else COLUMNS[:2]
+    refuse_columns(rows, new, name)
+    rows["ra"], rows["dec"] = at.ra * units.deg, at.dec * units.deg
+    if at.cov is not None and at.sigma is not None:
+        east, north = at.sigma
+        rows["sigma_ra"], rows["sigma_dec"] = east * units.mas, north * units.mas
+        product = east * north
+        rows["corr_ra_dec"] = np.divide(
+            at.cov[:, 0, 1], product, out=np.zeros_like(product), where=product > 0
+        )
+    outside = sum(
+        int((~on_chip(m, x[numbers == n], y[numbers == n]) & np.isfinite(x[numbers == n])).sum())
+        for n, m in calibration.at(year).items()
+    )
+    rows.meta = {
+        "calibration": calibration.name,
+        "errors": [error for error, _ in errors_in(calibration, centroids)],
+        "outside": outside,
+    }
+    if at.joint is not None:
+        rows.meta[COVARIANCE] = at.joint
+    return rows
+
+
+def errors_in(calibration: Calibration, centroids: Sequence[str] | None) -> list[tuple[str, str]]:
+    """Errors of positions on the sky, and in which way stars have them in common."""
+    out = []
+    if calibration.errors == "covariance":
+        out.append(("coefficients, with their covariance", "correlated between stars"))
+    elif calibration.errors == "sigma":
+        out.append(("coefficients, without their correlations", "correlated between stars"))
+    for row in calibration.further:
+        shared = "the same for all stars" if row.shared else "of each star by itself"
+        out.append((row.name, shared))
+    if centroids is not None:
+        out.append(("centroids", "of each star by itself"))
+    return out
+
+
+def position_column(table: Table, name: str, where: str) -> Float:
+    """Numbers (N,) of a column; NaN for missing ones."""
+    if name not in table.colnames:
+        raise InputError(
+            f"there is no column {name!r}",
+            where=where,
+            do="name those of the positions (columns in Python, --columns on the command line), of "
+            f"{', '.join(table.colnames[:8])}",
+        )
+    column = table[name]
+    if column.dtype.kind not in "iuf" or column.ndim != 1:
+        raise InputError("holds no numbers", where=f"{where}, column {name!r}", do="check it")
+    values: Float = np.ma.filled(np.ma.asarray(column).astype(float), np.nan)
+    lost = ~np.isfinite(values)
+    if lost.any():
+        n = np.count_nonzero(lost)
+        log.warning("%s: WARNING: column %r has no finite value in %d rows", where, name, n)
+    return np.where(lost, np.nan, values)
+
+
+def chip_numbers(
+    table: Table, chip: int | None, known: Sequence[int], name: str, where: str
+) -> Int:
+    """Chip (N,) of each row, by an option or a column.
+
+    `known` are the chips of the calibration; `name` and `where` are what to call it and the table.
+    """
+    listed = ", ".join(map(str, known))
+    if chip is not None:
+        if chip not in known:
+            raise InputError(f"there is no chip {chip}", where=name, do=f"choose one of {listed}")
+        return np.full(len(table), chip)
+    if len(known) == 1:
+        return np.full(len(table), known[0])
+    if "chip" not in table.colnames:
+        raise InputError(
+            f"there is no column 'chip', and {name} has chips {listed}",
+            where=where,
+            do="add the column, or give the chip (--chip on the command line)",
+        )
+    numbers = position_column(table, "chip", where)
+    strange = np.flatnonzero(~np.isin(numbers, known))
+    if strange.size:
+        k = int(strange[0])
+        raise InputError(
+            f"there is no chip {numbers[k]:g}",
+            where=f"{where}, row {k + 1}, column 'chip'",
+            do=f"{name} has {listed}",
+        )
+    return numbers.astype(np.int64)
+
+
+def refuse_columns(table: Table, new: Sequence[str], where: str) -> None:
+    """Refuse names of new columns that a table has already."""
+    taken = [name for name in new if name in table.colnames]
+    if taken:
+        raise InputError(
+            f"has a column {taken[0]!r} already, which would be overwritten",
+            where=where,
+            do="rename or drop it",
+        )

@@ -1,0 +1,20 @@
+"""What WISE adds to the package, as its entry point names it."""
+
+from bayesdist.mission import Mission
+
+_COMMANDS = "bayesdist.missions.wise.commands"
+_PAIRS = "bayesdist.missions.wise.pairs"
+
+MISSION = Mission(
+    title="WISE: comparison of bands, RvB pairs, and files.",
+    commands={
+        "bands": f"{_COMMANDS}:bands",
+        "bring-up": f"{_COMMANDS}:bring_up",
+        "rotate": f"{_COMMANDS}:rotate",
+        "rvb": f"{_COMMANDS}:rvb",
+    },
+    simulate={"wise": f"{_COMMANDS}:simulate"},
+    data_sections={"rvb": f"{_PAIRS}.section:RvbData"},
+    match_sources={"rvb": f"{_PAIRS}.run_input:SOURCE"},
+    beside_core={"demo": f"{_COMMANDS}:demo"},
+)
