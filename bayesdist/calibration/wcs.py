@@ -74,14 +74,14 @@ class CalibrationWCS(BaseLowLevelWCS, HighLevelWCSMixin):
     >>> model = bd.DistortionModel(1, (chip,), "arcsec")
     >>> truth = [0, -50, 0, 0, 0, 50]
     >>> stars, _ = bd.simulate_matches(model, truth, 500, sigma=0.01, fraction=0.0, rng=rng)
-    >>> run = bd.calibrate(stars, order=1, size=(1000, 1000))
-    >>> wcs = run.wcs(point=(150.0, 2.2))
+    >>> fit = bd.fit_linear(stars, model)
+    >>> wcs = bd.Calibration.from_solution(fit, name="camera", point=(150.0, 2.2)).wcs()
     >>> wcs.pixel_to_world(499.5, 499.5).to_string(precision=4)
     '150.0000 2.2000'
     >>> x, y = wcs.world_to_pixel_values(150.0, 2.2)
     >>> bool(np.hypot(x - 499.5, y - 499.5) < 0.05)
     True
-    >>> cov = wcs.covariance(499.5, 499.5, further=False)  # of the mean of 500 stars
+    >>> cov = wcs.covariance(499.5, 499.5)  # of the mean of 500 stars
     >>> bool(abs(cov[0, 0].to_value("mas2") ** 0.5 - 10 / 500**0.5) < 0.1)
     True
     """
@@ -536,6 +536,8 @@ def wcs_of_chip(
             angle = value_in(position_angle, "deg", "position_angle", where="wcs")
         if pixel_scale is not None:
             scale = value_in(pixel_scale, "arcsec", "pixel_scale", where="wcs")
+        elif calibration.pixel_mas is not None:
+            scale = calibration.pixel_mas / 1000
         _check_placement(calibration, angle, scale)
         placement = placement_of(
             calibration,

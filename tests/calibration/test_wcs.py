@@ -266,6 +266,14 @@ def test_a_point_puts_a_plane_on_the_sky():
         assert_array_equal(calibration.wcs(point=point).pixel_to_world_values(x, y), of_plane)
 
 
+def test_a_stated_pixel_is_the_scale_of_pixels():
+    calibration = camera(unit="pix", plane=Plane("detector"))
+    x, y = pixels(50)
+    given = calibration.wcs(point=POINT, pixel_scale=PIXEL).pixel_to_world_values(x, y)
+    stated = replace(calibration, pixel_mas=1000 * PIXEL).wcs(point=POINT)
+    assert_array_equal(stated.pixel_to_world_values(x, y), given)
+
+
 @pytest.mark.parametrize("mirrored", [False, True])
 @pytest.mark.parametrize("angle", [0.0, 30.0, 200.0])
 def test_the_position_angle_is_that_of_v(angle, mirrored):
