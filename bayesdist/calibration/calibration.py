@@ -564,7 +564,8 @@ class Calibration:
         mirrored : bool
             True if u is 90 degrees west of v; by default it is 90 degrees east of it.
         pixel_scale : float or Quantity, optional
-            Size of a pixel in arcsec; needed on the sky if u and v are in pixels.
+            Size of a pixel in arcsec, `pixel_mas` by default; needed on the sky if u and v are in
+            pixels.
 
         Returns
         -------
