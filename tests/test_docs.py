@@ -90,6 +90,7 @@ def test_the_tutorial_in_python_runs(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     namespace = run_page(DOCS / "tutorial_python.md")
     assert namespace["margin"].verdict == "met" and Path("w2.hdr").is_file()
+    assert Path("w2-run/summary.json").is_file() and Path("w2.html").is_file()
 
 
 def test_the_page_on_ground_based_cameras_runs(tmp_path, monkeypatch):
@@ -110,6 +111,11 @@ def test_the_page_on_tables_runs(tmp_path, monkeypatch):
     on_sky = namespace["on_sky"]
     assert any("moved to 2024.50" in note for note in on_sky.notes)
     assert np.array_equal(namespace["found"].star, np.arange(400))
+
+
+def test_the_page_on_files_runs(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert run_page(DOCS / "files.md", languages={"python"})["calibration"].numbers == (1,)
 
 
 def test_the_page_on_plots_runs(tmp_path, monkeypatch):
@@ -198,7 +204,7 @@ def test_every_block_that_could_run_is_run():
     run = {p.name for p in DOCS.glob("*.md") if {"console", "python"} & {b for b, _ in blocks(p)}}
     tutorials = {p.name for p in DOCS.glob("tutorial_*.md")}
     others = {"posterior_file.md", "new_instrument.md", "ground_based.md", "jwst.md", "roman.md"}
-    others |= {"plots.md", "positions.md", "wcs.md", "your_table.md"}
+    others |= {"files.md", "plots.md", "positions.md", "wcs.md", "your_table.md"}
     assert run == tutorials | others
 
 

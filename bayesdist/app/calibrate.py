@@ -90,7 +90,8 @@ def calibrate(
         or one number in the unit of u and v.  By default their own if they have any, else the
         estimate by magnitude.
     outliers : OutlierMixture or {'gaussian', 'uniform', 'none'}
-        Distribution of false matches.
+        Distribution of false matches.  The match radius is that of `matches` if they were made by
+        `match`.
     catalogue : Catalogue, optional
         Systematic position error of the reference catalogue.  Without it verdicts are undecided,
         because no residual shows this error.
@@ -161,7 +162,7 @@ def calibrate(
             "frames": frames,
             "tdd": None if time is None else _drift(time),
         },
-        "outliers": _outliers(outliers),
+        "outliers": _outliers(outliers, stars),
         "sampler": {"seed": seed},
         "assess": {"epoch": None if epoch is None else year_of(epoch), "exposure": exposure},
         "holdout": {"fraction": held_out} if held_out else None,
@@ -222,8 +223,11 @@ def _stars(matches: Any, sigma: Any) -> tuple[Matches, str | float]:
         sigma = value_in(sigma, matches.unit, "sigma")
     check_sigma(sigma)
     stars = matches.as_read(sigma)
-    if sigma == "by_magnitude" and stars.has_sigma:
-        stars = stars.with_columns(sigma_u=None, sigma_v=None)
+    if sigma == "by_magnitude" and stars.in_memory:
+        # the circle cuts the residuals from which these errors come: the likelihood must not count
+        # it again, and a check compares its radius with the errors
+        no_errors = dict.fromkeys(("sigma_u", "sigma_v", "u_nominal", "v_nominal"))
+        stars = stars.with_columns(**no_errors)
     return stars, sigma
 
 
@@ -242,10 +246,11 @@ def _drift(time: TimeDependence) -> Settings:
     return {"epoch0": list(time.epoch0), "terms": list(time.terms), "breaks": list(time.breaks)}
 
 
-def _outliers(outliers: OutlierMixture | str) -> Settings:
-    """Section [outliers] of a mixture."""
+def _outliers(outliers: OutlierMixture | str, stars: Matches | None) -> Settings:
+    """Section [outliers] of a mixture; the match radius is that of the stars if they state one."""
     if isinstance(outliers, str):
-        return {} if outliers == "gaussian" else {"model": outliers}
+        radius = None if stars is None else stars.match_radius
+        return {"match_radius": radius} | ({} if outliers == "gaussian" else {"model": outliers})
     section = {field.name: getattr(outliers, field.name) for field in fields(outliers)}
     jitter = section["jitter"]
     return section | {"jitter": "fit" if jitter is None else jitter}

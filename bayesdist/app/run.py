@@ -356,7 +356,14 @@ class Run:
             filter=plain.filter,
             scale=None if plain.scale is None else (plain.scale, plain.scale_from),
         )
-        return replace(of_exposure, further=plain.further).wcs(chip, **sky)
+        of_exposure = replace(
+            of_exposure,
+            further=plain.further,
+            before=plain.before,
+            after=plain.after,
+            pixel_mas=plain.pixel_mas,
+        )
+        return of_exposure.wcs(chip, **sky)
 
     def _date(self, exposure: str | None, epoch: Any) -> float | None:
         """Decimal year of a calibration; None if the model does not depend on time."""

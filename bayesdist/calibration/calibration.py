@@ -30,9 +30,8 @@ from bayesdist.utils.arrays import Float
 from bayesdist.utils.quantities import Direction, Epoch, Number, direction_in, year_of
 
 if TYPE_CHECKING:
-    import pandas
     from astropy.modeling import Model
-    from astropy.table import QTable, Table
+    from astropy.table import QTable
 
     from bayesdist.calibration.wcs import CalibrationWCS
 
@@ -443,7 +442,7 @@ class Calibration:
 
     def to_sky(
         self,
-        table: Table | pandas.DataFrame | Mapping[str, Any],
+        table: Any,
         *,
         columns: Sequence[str] = ("x", "y"),
         centroids: Sequence[str] | None = None,
@@ -457,8 +456,9 @@ class Calibration:
 
         Parameters
         ----------
-        table : astropy Table, pandas DataFrame or mapping of arrays
-            Pixels of stars, with a column chip if the detector has several chips.
+        table : table
+            Pixels of stars, in whatever `Matches.from_table` takes, with a column chip if the
+            detector has several chips.
         columns : tuple of str
             Names of the columns with x and y.
         centroids : tuple of str, optional
@@ -564,7 +564,8 @@ class Calibration:
         mirrored : bool
             True if u is 90 degrees west of v; by default it is 90 degrees east of it.
         pixel_scale : float or Quantity, optional
-            Size of a pixel in arcsec; needed on the sky if u and v are in pixels.
+            Size of a pixel in arcsec, `pixel_mas` by default; needed on the sky if u and v are in
+            pixels.
 
         Returns
         -------

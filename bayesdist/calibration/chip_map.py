@@ -146,6 +146,13 @@ class ChipMap:
             found[:, rows], slope[rows] = self._newton(w[:, rows], linear)
         return found, slope
 
+    def unfolded_pixels(self, w: Float) -> Float:
+        """Pixels (2, N) at positions (2, N), as `pixels`; NaN beyond a fold of the map."""
+        found, slope = self.pixels(w)
+        det = slope[:, 0, 0] * slope[:, 1, 1] - slope[:, 0, 1] * slope[:, 1, 0]
+        found[:, ~(det * np.linalg.det(self.linear) > 0)] = np.nan
+        return found
+
     def _newton(self, w: Float, linear: Float) -> tuple[Float, Float]:
         zero = np.array(self.basis.reference_pixel)[:, None]
         pixels = zero + np.linalg.solve(linear, w - self._values_and_slopes(zero)[0])

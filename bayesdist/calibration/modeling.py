@@ -59,7 +59,10 @@ def plane_model(chip: ChipMap, inverse_order: int | None = None) -> Model:
 
 
 def sky_model(plane: Model, placement: SkyPlacement) -> Model:
-    """Model to right ascension and declination in degrees behind one from pixels to the plane."""
+    """Model from 0-based pixels to right ascension and declination in degrees.
+
+    `plane` is the model from pixels to the plane, to which the projection is added.
+    """
     ra, dec = placement.point
     return _chain(
         [
@@ -89,9 +92,9 @@ class PlaneToPixel(Model):
         self.chip = chip
 
     def evaluate(self, u: Float, v: Float) -> tuple[Float, Float]:
-        """Pixels of positions of any shape; NaN where there is none."""
+        """Pixels of positions of any shape; NaN if no pixel has a position."""
         u, v = np.broadcast_arrays(np.asarray(u, float), np.asarray(v, float))
-        x, y = self.chip.pixels(np.stack([u.ravel(), v.ravel()]))[0] - 1.0
+        x, y = self.chip.unfolded_pixels(np.stack([u.ravel(), v.ravel()])) - 1.0
         return x.reshape(u.shape), y.reshape(u.shape)
 
     # astropy would read the annotations of `evaluate` as units

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from astropy import units
@@ -13,12 +13,10 @@ from astropy.table import QTable, Table
 from bayesdist.calibration.apply import on_chip
 from bayesdist.calibration.calibration import Calibration
 from bayesdist.calibration.sky_positions import sky_positions
+from bayesdist.data.reading.table import as_table
 from bayesdist.errors import InputError
 from bayesdist.utils.arrays import Float, Int
 from bayesdist.utils.quantities import Direction, Epoch, direction_in, year_of
-
-if TYPE_CHECKING:
-    import pandas
 
 log = logging.getLogger("bayesdist")
 
@@ -28,7 +26,7 @@ COVARIANCE = "covariance"  # key of the joint covariance in the meta-data of a t
 
 def table_on_sky(
     calibration: Calibration,
-    table: Table | pandas.DataFrame | Mapping[str, Any],
+    table: Any,
     *,
     columns: Sequence[str] = ("x", "y"),
     centroids: Sequence[str] | None = None,
@@ -43,8 +41,7 @@ def table_on_sky(
 
     `name` is that of the table in messages.
     """
-    is_frame = hasattr(table, "to_parquet")  # a pandas DataFrame
-    rows = QTable(Table.from_pandas(table) if is_frame else table)
+    rows = QTable(as_table(table, name))
     plain = Table(rows)
     x, y = (position_column(plain, c, name) + (1.0 - pixel_origin) for c in columns)
     sigma = None

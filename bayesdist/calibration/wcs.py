@@ -74,14 +74,14 @@ class CalibrationWCS(BaseLowLevelWCS, HighLevelWCSMixin):
     >>> model = bd.DistortionModel(1, (chip,), "arcsec")
     >>> truth = [0, -50, 0, 0, 0, 50]
     >>> stars, _ = bd.simulate_matches(model, truth, 500, sigma=0.01, fraction=0.0, rng=rng)
-    >>> run = bd.calibrate(stars, order=1, size=(1000, 1000))
-    >>> wcs = run.wcs(point=(150.0, 2.2))
+    >>> fit = bd.fit_linear(stars, model)
+    >>> wcs = bd.Calibration.from_solution(fit, name="camera", point=(150.0, 2.2)).wcs()
     >>> wcs.pixel_to_world(499.5, 499.5).to_string(precision=4)
     '150.0000 2.2000'
     >>> x, y = wcs.world_to_pixel_values(150.0, 2.2)
     >>> bool(np.hypot(x - 499.5, y - 499.5) < 0.05)
     True
-    >>> cov = wcs.covariance(499.5, 499.5, further=False)  # of the mean of 500 stars
+    >>> cov = wcs.covariance(499.5, 499.5)  # of the mean of 500 stars
     >>> bool(abs(cov[0, 0].to_value("mas2") ** 0.5 - 10 / 500**0.5) < 0.1)
     True
     """
@@ -139,15 +139,8 @@ class CalibrationWCS(BaseLowLevelWCS, HighLevelWCSMixin):
         plane = np.stack([first, second])
         if self.placement is not None:
             plane = self.placement.plane(first, second)
-        pixels, slope = self.chip_map.pixels(plane)
-        pixels[:, ~self._same_side(slope)] = np.nan
-        x, y = pixels - 1.0
+        x, y = self.chip_map.unfolded_pixels(plane) - 1.0
         return x.reshape(shape)[()], y.reshape(shape)[()]
-
-    def _same_side(self, slope: Float) -> Bool:
-        """Boolean mask (N,) of slopes (N, 2, 2) that are not beyond a fold of the map."""
-        det = slope[:, 0, 0] * slope[:, 1, 1] - slope[:, 0, 1] * slope[:, 1, 0]
-        return det * np.linalg.det(self.chip_map.linear) > 0
 
     # -- description of the axes ------------------------------------------------------------------
 
@@ -543,6 +536,8 @@ def wcs_of_chip(
             angle = value_in(position_angle, "deg", "position_angle", where="wcs")
         if pixel_scale is not None:
             scale = value_in(pixel_scale, "arcsec", "pixel_scale", where="wcs")
+        elif calibration.pixel_mas is not None:
+            scale = calibration.pixel_mas / 1000
         _check_placement(calibration, angle, scale)
         placement = placement_of(
             calibration,
@@ -606,5 +601,5 @@ def _rounded_up(value: float) -> float:
 
 def _flat(*arrays: ArrayLike) -> tuple[Float, Float, tuple[int, ...]]:
     """Two arrays (N,), broadcast, and the shape that they had."""
-    first, second = np.broadcast_arrays(*(np.asarray(one, float) for one in arrays))
+    first, second = np.broadcast_arrays(*(np.asarray(array, float) for array in arrays))
     return first.ravel(), second.ravel(), first.shape

@@ -153,6 +153,7 @@ def test_beyond_a_fold_is_no_pixel_and_never_a_wrong_one():
     seen = np.isfinite(x)
     again = wcs.pixel_to_world_values(x[seen], y[seen])
     assert seen.any() and (x[seen] < 1199.5).all()
+    assert_array_equal(wcs.to_model().inverse(u_, v_), (x, y))
     assert_allclose(np.stack(again), np.stack([u_[seen], v_[seen]]), rtol=0, atol=1e-8)
 
 
@@ -263,6 +264,14 @@ def test_a_point_puts_a_plane_on_the_sky():
     of_plane = camera().wcs().pixel_to_world_values(x, y)
     for point in (POINT, SkyCoord(*POINT, unit="deg"), tuple(POINT * u.deg)):
         assert_array_equal(calibration.wcs(point=point).pixel_to_world_values(x, y), of_plane)
+
+
+def test_a_stated_pixel_is_the_scale_of_pixels():
+    calibration = camera(unit="pix", plane=Plane("detector"))
+    x, y = pixels(50)
+    given = calibration.wcs(point=POINT, pixel_scale=PIXEL).pixel_to_world_values(x, y)
+    stated = replace(calibration, pixel_mas=1000 * PIXEL).wcs(point=POINT)
+    assert_array_equal(stated.pixel_to_world_values(x, y), given)
 
 
 @pytest.mark.parametrize("mirrored", [False, True])
