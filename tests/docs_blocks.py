@@ -21,7 +21,9 @@ __all__ = ["DOCS", "blocks", "cells", "run_notebook", "run_page"]
 
 DOCS = Path(__file__).resolve().parents[1] / "docs"
 _FENCE = re.compile(r"^```(\w+)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
-_CELL = re.compile(r"^```\{code-cell\} ipython3\n((?:^:.*\n)*)(.*?)^```$", re.MULTILINE | re.DOTALL)
+_CELL = re.compile(
+    r"^```\{code-cell\} ipython3\n((?:^:[^\n]*\n)*)(.*?)^```$", re.MULTILINE | re.DOTALL
+)
 _EXIT = re.compile(r"\s+# exits with (\d)$")
 
 
