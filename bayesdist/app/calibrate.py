@@ -36,6 +36,8 @@ from bayesdist.utils.quantities import value_in, year_of
 __all__ = ["calibrate"]
 
 WHERE = "calibrate"  # stands for the name of the configuration in messages
+# keys of [data] by which a table is read
+READING = "columns unit pixel_origin tangent_point epoch catalogue_epoch not_finite".split()
 
 Settings = dict[str, Any]
 
@@ -100,7 +102,8 @@ def calibrate(
     requirements : Requirement or sequence of Requirement
         Limits on the position error.
     epoch : float or Time, optional
-        Date of the evaluation, in decimal years; needed only if the model depends on time.
+        Date of the evaluation, in decimal years; needed only if the model depends on time.  The
+        date of the exposures, to which proper motions are applied, is ``data.epoch`` in `settings`.
     exposure : {'mean', 'single'}
         Evaluate errors of the mean calibration, or of a single exposure.
     held_out : float
@@ -111,7 +114,7 @@ def calibrate(
         Name of the detector.
     settings : mapping of str to mapping, optional
         Other sections and keys of the configuration, as in a TOML file, for example
-        ``{"sampler": {"max_steps": 40000}}``.
+        ``{"sampler": {"max_steps": 40000}, "data": {"epoch": 2024.3}}``.
     progress : bool
         Show a progress bar while sampling, if stderr is a terminal.
 
@@ -138,11 +141,14 @@ def calibrate(
     >>> run.check(bd.Requirement("whole field", "p95", 0.1))[0].verdict
     'met'
     """
+    settings = dict(settings or {})
     stars, data = None, {"matches": MATCHES_FILE, "sigma": sigma}
     if is_path(matches):
         data["matches"] = _absolute(matches)
     else:
-        stars, data["sigma"] = _stars(matches, sigma)
+        options = dict(settings.pop("data", {}))
+        data["simulated"] = options.pop("simulated", None)
+        stars, data["sigma"] = _stars(matches, sigma, options)
     configured: Settings = {
         "data": data,
         "detector": {"name": name, "size": size, "scale_mas": _in(scale_mas, "mas", "scale_mas")},
@@ -169,7 +175,7 @@ def calibrate(
         "budget": _budget(catalogue, terms),
         "requirement": [_requirement_block(one) for one in as_requirements(requirements)],
     }
-    text = _toml(_merged(configured, settings or {}))
+    text = _toml(_merged(configured, settings))
     config = parse_config(text, WHERE)
     if not isinstance(config, MatchesConfig):
         raise ConfigError(
@@ -213,10 +219,26 @@ def is_path(matches: Any) -> bool:
     )
 
 
-def _stars(matches: Any, sigma: Any) -> tuple[Matches, str | float]:
-    """Matches with the errors that are asked for, and the source of these errors."""
+def _stars(matches: Any, sigma: Any, options: Mapping[str, Any]) -> tuple[Matches, str | float]:
+    """Matches with the errors that are asked for, and the source of these errors.
+
+    `options` are keys of the section [data], by which a table is read.
+    """
     if not isinstance(matches, Matches):
-        matches = Matches(**match_arguments(matches, ReadOptions()))
+        unknown = [key for key in options if key not in READING]
+        if unknown:
+            raise ConfigError(
+                f"data.{unknown[0]} is no option of reading a table",
+                where=WHERE,
+                do=f"give one of {', '.join(READING)}",
+            )
+        matches = Matches(**match_arguments(matches, ReadOptions(**options)))
+    elif options:
+        raise ConfigError(
+            f"data.{next(iter(options))} is an option of reading, and the matches have been read",
+            where=WHERE,
+            do="give it to bayesdist.read_matches or Matches.from_table",
+        )
     if sigma is None:
         sigma = "by_magnitude" if matches.has_mag and not matches.has_sigma else "columns"
     elif not isinstance(sigma, str):

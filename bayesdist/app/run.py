@@ -445,8 +445,9 @@ class Run:
 
     @property
     def _level(self) -> str:
-        """Level of the verdict: that of the worst margin, or of the checks without margins."""
-        return self.evaluation.verdict[0] if self.converged else "fail"
+        """Level of the verdict; that of a note if nothing was asked and nothing is wrong."""
+        level = self.evaluation.verdict[0] if self.converged else "fail"
+        return "note" if level == "pass" and not self.margins else level
 
     @property
     def _headline(self) -> str:

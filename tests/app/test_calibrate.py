@@ -144,6 +144,22 @@ def test_tables_of_others_are_taken(finished):
         np.testing.assert_array_equal(run.posterior.theta, other.posterior.theta)
 
 
+def test_a_table_is_read_by_the_options_of_settings():
+    """Motions of 1 arcsec in ten years move stars by as much."""
+    rng = np.random.default_rng(1)
+    x, y = rng.uniform(1.0, 1000.0, (2, 300))
+    table = QTable({"x": x, "y": y, "ra": 30.0 + x / 18000.0, "dec": y / 18000.0})
+    table["pmra"], table["pmdec"] = np.full(300, 100.0) * u.mas / u.yr, np.zeros(300) * u.mas / u.yr
+    table["ra_error"] = table["dec_error"] = np.full(300, 20.0) * u.mas
+    table["ref_epoch"] = np.full(300, 2016.0)
+    settings = {"data": {"epoch": 2026.0, "tangent_point": (30.0, 0.0)}}
+    moved = calibrated(table, order=1, settings=settings)
+    settings["data"]["epoch"] = 2016.0
+    still = calibrated(table, order=1, settings=settings)
+    shift = moved.matches.u - still.matches.u
+    np.testing.assert_allclose(shift, 1.0, atol=1e-4)
+
+
 def test_dates_are_times_or_years():
     stars = simulated(600)[0].with_columns(epoch=np.linspace(2010.0, 2014.0, 600))
     time = bd.TimeDependence((("u", 1, 0),), (2012.0,))
@@ -166,6 +182,7 @@ WRONG = {
     "seed": ({"seed": -1}, "sampler.seed"),
     "no TOML": ({"settings": {"sampler": {"max_steps": object()}}}, "TOML"),
     "not finite": ({"size": (np.nan, 800)}, "detector.size"),
+    "options of reading": ({"settings": {"data": {"epoch": 2020.0}}}, "have been read"),
     "another kind": ({"settings": {"campaign": {"catalogue": "x"}}}, "give one"),
 }
 
