@@ -24,7 +24,7 @@ from bayesdist.app.screen import progress_bar
 from bayesdist.app.stages import evaluated
 from bayesdist.app.store.rundir import RunDirectory
 from bayesdist.assess import Requirement, UserTerm
-from bayesdist.assess.terms.given import Catalogue
+from bayesdist.assess.terms.given import Catalogue, require_catalogue
 from bayesdist.data import Matches, ReadOptions
 from bayesdist.data.reading.options import check_sigma
 from bayesdist.data.reading.table import match_arguments
@@ -38,6 +38,14 @@ __all__ = ["calibrate"]
 WHERE = "calibrate"  # stands for the name of the configuration in messages
 # keys of [data] by which a table is read
 READING = "columns unit pixel_origin tangent_point epoch catalogue_epoch not_finite".split()
+
+# arguments that settings may replace while they have their defaults
+DEFAULTS = {
+    "assess.exposure": "mean",
+    "detector.name": "",
+    "model.frames": "none",
+    "sampler.seed": 1,
+}
 
 Settings = dict[str, Any]
 
@@ -141,7 +149,7 @@ def calibrate(
     >>> run.check(bd.Requirement("whole field", "p95", 0.1))[0].verdict
     'met'
     """
-    settings = dict(settings or {})
+    settings = _checked(settings or {})
     stars, data = None, {"matches": MATCHES_FILE, "sigma": sigma}
     if is_path(matches):
         data["matches"] = _absolute(matches)
@@ -160,7 +168,7 @@ def calibrate(
                 "reference_pixel": chip.reference_pixel,
                 "reference": chip is chips[0],
             }
-            for chip in chips
+            for chip in _chips(chips)
         ],
         "model": {
             "order": order,
@@ -186,11 +194,26 @@ def calibrate(
     if stars is None:
         stars = MATCHES.read(config, Path.cwd())
     results = Results(
-        RunDirectory.unsaved(config, text),
+        RunDirectory.unsaved(config, text, files=is_path(matches)),
         StarReader(config.resources()),
         made={"inputs": stars},
     )
     return Run(_calibrated(results, progress))
+
+
+def _checked(settings: Mapping[str, Any]) -> dict[str, Any]:
+    """Settings by section, with the file of an earlier calibration as an absolute path."""
+    if not isinstance(settings, Mapping):
+        raise ConfigError(
+            f"settings are {settings!r}",
+            where=WHERE,
+            do='give sections with their keys, as in {"sampler": {"max_steps": 40000}}',
+        )
+    checked = dict(settings)
+    earlier = checked.get("prior_calibration")
+    if isinstance(earlier, Mapping) and isinstance(earlier.get("source"), str | os.PathLike):
+        checked["prior_calibration"] = {**earlier, "source": _absolute(earlier["source"])}
+    return checked
 
 
 def _calibrated(results: Results, progress: bool) -> Results:
@@ -268,8 +291,23 @@ def _drift(time: TimeDependence) -> Settings:
     return {"epoch0": list(time.epoch0), "terms": list(time.terms), "breaks": list(time.breaks)}
 
 
+def _chips(chips: Sequence[Chip]) -> Sequence[Chip]:
+    """Chips, each checked to be one."""
+    if not isinstance(chips, Sequence) or not all(isinstance(chip, Chip) for chip in chips):
+        raise InputError(
+            f"chips is {chips!r}", where=WHERE, do="give a list of bayesdist.Chip, or size"
+        )
+    return chips
+
+
 def _outliers(outliers: OutlierMixture | str, stars: Matches | None) -> Settings:
     """Section [outliers] of a mixture; the match radius is that of the stars if they state one."""
+    if not isinstance(outliers, str | OutlierMixture):
+        raise InputError(
+            f"outliers is {outliers!r}",
+            where=WHERE,
+            do="give 'gaussian', 'uniform', 'none' or bayesdist.OutlierMixture(...)",
+        )
     if isinstance(outliers, str):
         radius = None if stars is None else stars.match_radius
         return {"match_radius": radius} | ({} if outliers == "gaussian" else {"model": outliers})
@@ -280,6 +318,7 @@ def _outliers(outliers: OutlierMixture | str, stars: Matches | None) -> Settings
 
 def _budget(catalogue: Catalogue | None, terms: Sequence[UserTerm]) -> list[Settings]:
     """[[budget]] rows of the errors that the user states."""
+    require_catalogue(catalogue)
     rows = [] if catalogue is None else [catalogue.budget_row()]
     for term in terms:
         if not isinstance(term, UserTerm):
@@ -308,7 +347,8 @@ def _merged(configured: Settings, settings: Mapping[str, Any]) -> Settings:
             out[key] = section
             continue
         for name, value in section.items():
-            if given.get(name, value) != value:
+            known = given.get(name, value)
+            if known != value and known != DEFAULTS.get(f"{key}.{name}"):
                 raise _given_twice(f"{key}.{name}")
         out[key] = {**given, **section}
     return {key: value for key, value in out.items() if value not in ({}, [])}

@@ -25,6 +25,7 @@ from bayesdist.assess.budget.budget import budget_of, place_budget
 from bayesdist.assess.drawn import DrawnErrors
 from bayesdist.assess.evaluation import Evaluation, position_map
 from bayesdist.calibration.calibration import Calibration, calibration_of_exposure
+from bayesdist.calibration.sky_distribution import sky_distribution
 from bayesdist.data import Matches
 from bayesdist.diagnose.diagnostics import Diagnostics
 from bayesdist.errors import InputError
@@ -40,9 +41,10 @@ from bayesdist.report.html import (
 )
 from bayesdist.utils.checks import warnings_of
 from bayesdist.utils.numbers import with_mas
-from bayesdist.utils.quantities import year_of
+from bayesdist.utils.quantities import Random, year_of
 
 if TYPE_CHECKING:
+    from astropy.coordinates import SkyCoord
     from astropy.modeling import Model
     from astropy.table import QTable
     from xarray import DataTree
@@ -466,27 +468,54 @@ class Run:
             f"{count} {name}" for count, name in counts if count
         )
 
-    def to_sky(self, table: Any, **options: Any) -> QTable:
+    def to_sky(
+        self, table: Any, *, draws: int | None = None, rng: Random = 1, **options: Any
+    ) -> QTable | SkyCoord:
         """Positions on the sky of a table of pixels, with all errors that the run knows.
 
         Parameters
         ----------
         table : table
             Pixels of stars, with a column chip if the detector has several chips.
+        draws : int, optional
+            Number of random draws, for a SkyCoord of distributions in place of a table.
+        rng : int or numpy.random.Generator
+            Random numbers of the draws.
         **options
             Names of columns, pixel origin, chip, epoch and others, as for `Calibration.to_sky`.
 
         Returns
         -------
-        QTable
-            The table with sky positions, their standard deviations and correlation.
+        QTable or SkyCoord
+            The table with sky positions, their standard deviations and correlation.  With `draws`
+            the positions alone, as `astropy.uncertainty.Distribution`, correlated between stars.
 
         Raises
         ------
         InputError
             If u and v do not lie on the sky, or columns or chips are unknown.
         """
-        return self.calibration.to_sky(table, **options)
+        if self.model.time is not None:
+            options = {"epoch": self.results.epoch} | options
+        positions = self.calibration.to_sky(table, **options)
+        if draws is None:
+            return positions
+        names = options.get("columns", ("x", "y"))
+        to_fits = 1.0 - options.get("pixel_origin", 1.0)
+        x, y = (np.asarray(positions[name], float) + to_fits for name in names)
+        chip = options.get("chip")
+        if chip is None and "chip" in positions.colnames:
+            chip = np.asarray(positions["chip"])
+        return sky_distribution(
+            self.calibration,
+            x,
+            y,
+            n_draws=draws,
+            rng=rng,
+            chip=chip,
+            epoch=options.get("epoch"),
+            point=options.get("point"),
+        )
 
     # -- files ------------------------------------------------------------------------------------
 
@@ -543,14 +572,13 @@ class Run:
         folder = Path(tempfile.mkdtemp(prefix="bayesdist-"))
         webbrowser.open(self.report(folder / "report.html").as_uri())
 
-    def save(self, folder: str | os.PathLike[str], *, overwrite: bool = False) -> Path:
+    def save(self, folder: str | os.PathLike[str]) -> Path:
         """Write the run to a folder, which `open_run` and all commands read.
 
         Parameters
         ----------
         folder : path-like
-        overwrite : bool
-            Replace a run that is in the folder.
+            New or empty folder; it appears whole or not at all.
 
         Returns
         -------
@@ -560,13 +588,13 @@ class Run:
         Raises
         ------
         InputError
-            If the folder holds other files, or another run that is not to be replaced.
+            If the folder is not empty, or files that the run was made from have changed.
         """
         folder = Path(folder)
         if self.results.run.in_memory:
-            save_run(self.results, folder, overwrite=overwrite)
+            save_run(self.results, folder)
         else:
-            copy_run(self.results.run, folder, overwrite=overwrite)
+            copy_run(self.results.run, folder)
         return folder
 
     def close(self) -> None:
@@ -607,11 +635,14 @@ def open_run(folder: str | os.PathLike[str]) -> Run:
     >>> bd.open_run("camera-run").model.order
     1
     """
-    directory = RunDirectory.open(Path(folder))
-    if directory.is_planned:
+    directory = RunDirectory(Path(folder))
+    if not directory.is_initialized:
         raise InputError(
-            "the run has not begun", where=str(folder), do="make it with bayesdist.run"
+            "is no run: it has no run.json",
+            where=str(folder),
+            do="restore it, or make the run again with bayesdist.run",
         )
+    directory = RunDirectory.open(Path(folder))
     directory.require("open_run", ("fit", "sample", "diagnose"))
     return Run(results_of(directory))
 
@@ -656,6 +687,12 @@ def run(
     --------
     >>> run = bd.run("config.toml", "run")  # doctest: +SKIP
     """
+    if (Path(folder) / "run.json").exists() and not (resume or overwrite):
+        raise InputError(
+            "the folder holds another run",
+            where=str(folder),
+            do="give resume=True or overwrite=True, or choose another folder",
+        )
     return open_run(
         run_configuration(
             Path(config), Path(folder), resume=resume, force=overwrite, seed=seed, report=report
@@ -671,7 +708,9 @@ def as_requirements(requirements: Requirement | Sequence[Requirement]) -> list[R
     InputError
         If one of them is something else.
     """
-    several = [requirements] if isinstance(requirements, Requirement) else list(requirements)
+    several: list[Any] = [requirements]
+    if isinstance(requirements, list | tuple):
+        several = list(requirements)
     for requirement in several:
         if not isinstance(requirement, Requirement):
             raise InputError(

@@ -117,6 +117,7 @@ def make_stages(
     force: bool = False,
     pdf: bool = False,
     ready: Mapping[str, Any] | None = None,
+    source: str = "",
 ) -> Results:
     """Results with the artefacts of some stages: each that does not stand is made and saved.
 
@@ -132,9 +133,11 @@ def make_stages(
         Draw figures as PDF, too.
     ready : mapping of str to object, optional
         Artefacts that were computed before and are only to be saved, by name.
+    source : str
+        Name of the run in files of its solution; by default that of its folder.
     """
     r, run, config, base = results, results.run, results.config, results.base
-    source, ready = str(run.path), ready or {}
+    source, ready = source or str(run.path), ready or {}
 
     def stage(
         name: str, artefact: str, make: Callable[[], Any], save: Callable[[Results], None]

@@ -29,6 +29,7 @@ from bayesdist.assess.terms.given import (
     UserTerm,
     names_catalogue,
     names_motions,
+    require_catalogue,
     stated_names,
 )
 from bayesdist.assess.units import convert, pixel_scale_of
@@ -280,14 +281,9 @@ def check_requirements(
 
 def _stated_terms(catalogue: Catalogue | None, terms: Sequence[ErrorTerm]) -> tuple[ErrorTerm, ...]:
     """The user's terms in the order of a run: those that are the same everywhere come last."""
+    require_catalogue(catalogue)
     if catalogue is None:
         return tuple(terms)
-    if not isinstance(catalogue, Catalogue):
-        raise InputError(
-            f"the catalogue is a {type(catalogue).__name__}",
-            where="catalogue",
-            do="give bd.Catalogue(name, sigma_mas=...)",
-        )
     return (catalogue.term(), *terms)
 
 

@@ -282,7 +282,7 @@ class CalibrationWCS(BaseLowLevelWCS, HighLevelWCSMixin):
             return units.Quantity(whole.reshape(2 * px.size, 2 * px.size), unit)
         return units.Quantity(single.reshape(*shape, 2, 2), unit)
 
-    def draw(self, n: int, rng: Random) -> list[CalibrationWCS]:
+    def draw(self, n: int, rng: Random = 1) -> list[CalibrationWCS]:
         """Random draws from the posterior of the WCS.
 
         Each is a possible WCS of the same chip, without errors.  The coefficients vary as in the
@@ -601,5 +601,10 @@ def _rounded_up(value: float) -> float:
 
 def _flat(*arrays: ArrayLike) -> tuple[Float, Float, tuple[int, ...]]:
     """Two arrays (N,), broadcast, and the shape that they had."""
-    first, second = np.broadcast_arrays(*(np.asarray(array, float) for array in arrays))
+    try:
+        first, second = np.broadcast_arrays(*(np.asarray(array, float) for array in arrays))
+    except (TypeError, ValueError) as error:
+        raise InputError(
+            f"x and y are no positions ({error})", do="give numbers, or arrays of one shape"
+        ) from error
     return first.ravel(), second.ravel(), first.shape

@@ -56,6 +56,11 @@ class RunPlots:
     magnitude_errors: MagnitudeErrors | None = None
     rows: str = "stars"
 
+    def __dir__(self) -> list[str]:
+        """Names of the plots alone, for completion in notebooks."""
+        fields = set(self.__dataclass_fields__)
+        return [n for n in object.__dir__(self) if n not in fields and not n.startswith("_")]
+
     def map(
         self,
         ax: Axes | None = None,

@@ -23,7 +23,8 @@ SETTINGS = {
 
 def calibrated(stars, **options):
     """A small run in memory, of the settings of `config_text`."""
-    settings = SETTINGS | options.pop("settings", {})
+    settings = options.pop("settings", {})
+    settings = SETTINGS | settings if isinstance(settings, dict) else settings
     given = {"order": 2, "size": SIZE, "reference_pixel": CENTRE, "name": "A"}
     return bd.calibrate(stars, settings=settings, **(given | options))
 
@@ -101,17 +102,43 @@ def test_a_folder_in_use_is_refused_and_left(run, saved, tmp_path):
     with pytest.raises(bd.InputError, match="holds other files"):
         run.save(tmp_path)
     assert [path.name for path in tmp_path.iterdir()] == ["notes.txt"]
-    with pytest.raises(bd.InputError, match="overwrite=True"):
+    for folder in (saved, tmp_path):
+        with bd.open_run(saved) as other, pytest.raises(bd.InputError, match="holds other files"):
+            other.save(folder)
+    with pytest.raises(bd.InputError, match="holds other files"):
         run.save(saved)
-    with bd.open_run(saved) as other, pytest.raises(bd.InputError, match="is in this folder"):
-        other.save(saved)
+    with bd.open_run(saved) as other:
+        np.testing.assert_array_equal(other.posterior.theta, run.posterior.theta)
 
 
-def test_a_run_can_replace_another(run, tmp_path):
-    folder = calibrated(simulated(300, seed=3)[0]).save(tmp_path / "run")
-    run.save(folder, overwrite=True)
-    with bd.open_run(folder) as other:
-        assert_same(run, other)
+def test_a_run_that_cannot_be_saved_leaves_nothing(run, tmp_path, monkeypatch):
+    def full(*_):
+        raise bd.InputError("cannot be written", do="make room")
+
+    monkeypatch.setattr("bayesdist.app.stages.save_sampled", full)
+    with pytest.raises(bd.InputError, match="make room"):
+        run.save(tmp_path / "run")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_files_that_changed_since_are_not_those_of_the_run(finished, tmp_path):
+    text = (finished.config.parent / "stars.ecsv").read_text()
+    (tmp_path / "stars.ecsv").write_text(text)
+    run = calibrated(tmp_path / "stars.ecsv")
+    (tmp_path / "stars.ecsv").write_text("\n".join(text.splitlines()[:-5]) + "\n")
+    with pytest.raises(bd.InputError, match="changed"):
+        run.save(tmp_path / "run")
+    assert not (tmp_path / "run").exists()
+
+
+def test_an_earlier_calibration_may_be_named_relatively(finished, tmp_path, monkeypatch):
+    """The earlier run halves the errors of the same stars, and is found when the run is opened."""
+    monkeypatch.chdir(finished.path.parent)
+    stars = simulated(seed=5)[0]
+    run = calibrated(stars, settings={"prior_calibration": {"source": "run"}})
+    assert run.map().radius_max < calibrated(stars).map().radius_max
+    with bd.open_run(run.save(tmp_path / "run")) as other:
+        np.testing.assert_array_equal(run.posterior.theta, other.posterior.theta)
 
 
 def test_stars_by_magnitude_are_found_without_being_asked():
@@ -180,6 +207,10 @@ WRONG = {
     "requirement": ({"requirements": ["p95"]}, "bayesdist.Requirement"),
     "term": ({"terms": [0.1]}, "bayesdist.UserTerm"),
     "seed": ({"seed": -1}, "sampler.seed"),
+    "catalogue": ({"catalogue": "Gaia DR3"}, "bd.Catalogue"),
+    "outliers": ({"outliers": None}, "bayesdist.OutlierMixture"),
+    "chips": ({"chips": 5}, "bayesdist.Chip"),
+    "no settings": ({"settings": "x"}, "sections"),
     "no TOML": ({"settings": {"sampler": {"max_steps": object()}}}, "TOML"),
     "not finite": ({"size": (np.nan, 800)}, "detector.size"),
     "options of reading": ({"settings": {"data": {"epoch": 2020.0}}}, "have been read"),

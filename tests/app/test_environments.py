@@ -261,7 +261,8 @@ def test_without_a_place_for_compiled_code_it_is_compiled_anew(tmp_path):
     package = REPOSITORY / "bayesdist"
     sealed = ReadOnly(package)
     (tmp_path / "file").touch()
-    imported = ("-c", "import bayesdist.infer.kernel, numba; print(numba.config.CACHE_DIR)")
+    code = "import bayesdist.infer.kernel, numba; print(numba.config.CACHE_DIR)"
+    imported = ("-c", f"import logging; logging.basicConfig(); {code}")
     nowhere = {"HOME": str(tmp_path / "file" / "home"), "NUMBA_CACHE_DIR": None}
     nowhere |= {"XDG_CACHE_HOME": None, "TMPDIR": str(tmp_path)}
     done = started(python=imported, before=sealed.before, environment=nowhere)

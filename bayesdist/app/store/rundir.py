@@ -101,7 +101,7 @@ class RunDirectory(ArtefactStore):
         return run
 
     @classmethod
-    def unsaved(cls, config: Config, text: str) -> RunDirectory:
+    def unsaved(cls, config: Config, text: str, *, files: bool) -> RunDirectory:
         """Run in memory that has no folder yet; files are relative to the current folder.
 
         Parameters
@@ -109,9 +109,11 @@ class RunDirectory(ArtefactStore):
         config : Config
         text : str
             The configuration as TOML.
+        files : bool
+            True if the stars are read from files, of which the record gets the hashes.
         """
-        run = cls(UNSAVED)
-        run._plan(config, text, Path.cwd(), {}, "")
+        run, base = cls(UNSAVED), Path.cwd()
+        run._plan(config, text, base, hashes_of(config, base) if files else {}, "")
         return run
 
     def _plan(

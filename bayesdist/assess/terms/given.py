@@ -222,6 +222,16 @@ class UserTerm:
         return SmoothTerm(self, model, grid or DEFAULT_GRID), replace(self, kind="random")
 
 
+def require_catalogue(catalogue: object) -> None:
+    """Raise InputError if an argument is neither a Catalogue nor None."""
+    if not isinstance(catalogue, Catalogue | None):
+        raise InputError(
+            f"the catalogue is {catalogue!r}",
+            where="catalogue",
+            do="give its error too, as in bd.Catalogue('Gaia DR3', sigma_mas=0.3)",
+        )
+
+
 @dataclass(frozen=True, init=False)
 class Catalogue:
     """The systematic error of the positions of the reference catalogue, as the user states it.

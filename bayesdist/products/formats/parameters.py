@@ -54,7 +54,7 @@ def build(calibration: Calibration, _: Settings, options: BuildOptions) -> tuple
         raise InputError(
             "a table of parameters has no look-up tables",
             where="products.parameters",
-            do="give the order of a polynomial in their place",
+            do="give the order of a polynomial that replaces them",
         )
     content = parameters_content(calibration, options.epoch)
     return (Built(options.named("parameters.fits"), KIND, content, calibration),)

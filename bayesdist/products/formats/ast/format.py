@@ -41,7 +41,7 @@ def build(calibration: Calibration, settings: Settings, options: BuildOptions) -
         raise InputError(
             "a PolyMap has no look-up tables",
             where="products.ast",
-            do="give the order of a polynomial in their place",
+            do="give the order of a polynomial that replaces them",
         )
     out = []
     for number in calibration.numbers:

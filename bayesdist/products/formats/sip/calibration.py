@@ -22,6 +22,11 @@ from bayesdist.products.formats.common.parameters import (
 from bayesdist.products.formats.sip.header import SIP_ORDERS, SipHeader
 from bayesdist.utils.arrays import Float
 
+NO_LINEAR_ERRORS = (
+    "its errors are those of the non-linear terms alone: a SIP header cannot hold those of "
+    "offset, scale and rotation; write it with parameters = true"
+)
+
 
 def sip_calibration(
     sip: SipHeader,
@@ -55,6 +60,8 @@ def sip_calibration(
         unit="pix" if pixels or sip.linear_axes else "arcsec",
         monomial_cov=_variances(sip, linear, order),
     )
+    if one.cov is not None:
+        notes = (*notes, NO_LINEAR_ERRORS)
     plane = Plane("detector") if pixels else Plane("sky", point=sip.crval)
     if sip.linear_axes:
         plane = Plane()

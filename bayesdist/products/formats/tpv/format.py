@@ -75,7 +75,7 @@ def build(calibration: Calibration, settings: Settings, options: BuildOptions) -
         raise InputError(
             "TPV has no look-up tables",
             where=where,
-            do="give the order of a polynomial in their place",
+            do="give the order of a polynomial that replaces them",
         )
     arcsec = arcsec_per(model.unit, options.scale_arcsec)
     maps = calibration.at(options.epoch, origin="stated")
