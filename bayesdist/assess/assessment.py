@@ -36,6 +36,7 @@ from bayesdist.assess.units import convert, pixel_scale_of
 from bayesdist.diagnose.diagnostics import Diagnostics
 from bayesdist.errors import InputError, require_known
 from bayesdist.infer import Posterior, Solution
+from bayesdist.infer.equations.scaled import one_thread
 from bayesdist.infer.posterior.checks import convergence_check
 from bayesdist.model.grid import DEFAULT_GRID
 from bayesdist.utils.checks import Check, in_order
@@ -49,6 +50,7 @@ MISSING_TERMS = (
 )
 
 
+@one_thread
 def error_budget(
     solution: Solution,
     *,
@@ -136,6 +138,7 @@ def error_budget(
     return replace(budget, notes=tuple(notes))
 
 
+@one_thread
 def check_requirements(
     solution: Solution,
     requirements: Sequence[Requirement],
@@ -376,7 +379,10 @@ def _posterior_of(solution: Solution, diagnostics: Diagnostics) -> Posterior:
         )
     correlated = diagnostics.correlated
     same = correlated is not None and correlated.model == solution.model
-    if not same or diagnostics.sample.n_total != solution.n_stars:
+    sample = diagnostics.sample
+    digests = solution.matches_digest, "" if sample.partial else sample.table.digest()
+    other_stars = all(digests) and digests[0] != digests[1]
+    if not same or sample.n_total != solution.n_stars or other_stars:
         raise InputError(
             "they are those of another solution",
             where=where,

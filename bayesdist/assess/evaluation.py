@@ -208,6 +208,7 @@ def evaluate(
     )
 
 
+@one_thread
 def position_map(
     errors: ErrorModel, solution: Posterior, settings: EvaluationSettings, chip: Chip
 ) -> UncertaintyMap:
@@ -229,6 +230,7 @@ def position_map(
     return with_local(shared, errors.structure_sigma(_domain(solution, chip, settings)))
 
 
+@one_thread
 def drawn_errors(
     errors: ErrorModel,
     diagnostics: Diagnostics,
@@ -255,6 +257,7 @@ def with_measured_centroids(
     return errors.with_terms(Centroids(centroids))
 
 
+@one_thread
 def judged(
     errors: ErrorModel,
     diagnostics: Diagnostics,

@@ -25,7 +25,7 @@ from bayesdist.diagnose.diagnostics import Diagnostics
 from bayesdist.errors import InputError, required
 from bayesdist.infer import LinearFit, Posterior
 from bayesdist.infer.catalogue.star_errors import StarCovariance
-from bayesdist.infer.equations.scaled import recolouring, scaled_cholesky
+from bayesdist.infer.equations.scaled import one_thread, recolouring, scaled_cholesky
 from bayesdist.infer.solution.solution import Solution
 from bayesdist.model import LookupTable
 from bayesdist.utils.arrays import Float
@@ -58,6 +58,7 @@ class ErrorModel:
         """True if the star lies in a new exposure, which deviates as those at hand scatter."""
         return self.aligned and any(isinstance(term, ExposureVariation) for term in self.terms)
 
+    @one_thread
     def drawn(self, n: int, rng: Random) -> DrawnErrors:
         """Draws of all errors.
 
@@ -185,6 +186,7 @@ def error_model(
     return ErrorModel(errors, tuple(others), aligned)
 
 
+@one_thread
 def diagnosed_error_model(
     posterior: Posterior,
     diagnostics: Diagnostics,
@@ -238,6 +240,7 @@ def with_shared_stars(posterior: Posterior, fit: LinearFit, stars: StarCovarianc
     return posterior.mapped(recolouring(before, before + stars.extra))
 
 
+@one_thread
 def with_diagnosed_errors(
     posterior: Posterior,
     diagnostics: Diagnostics | None,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import MISSING, dataclass, field, fields, replace
 from functools import partial
@@ -12,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from bayesdist.data.batches import batch_edges, every_kth
-from bayesdist.data.columns.checked import COLUMNS, SIGMAS, MatchColumns, refuse_repeated
+from bayesdist.data.columns.checked import COLUMNS, POSITIONS, SIGMAS, MatchColumns, refuse_repeated
 from bayesdist.data.columns.joining import joined_arguments, joined_columns
 from bayesdist.data.columns.labels import Labels, merged_counts
 from bayesdist.data.columns.output import arrow_stream, html_of, table_of
@@ -397,6 +398,20 @@ class Matches(MatchColumns):
     def in_memory(self) -> bool:
         """True where the columns are in memory."""
         return self._readers is None
+
+    def digest(self) -> str:
+        """SHA-256 of the positions, which tells these stars from others; empty for stars on disk.
+
+        Returns
+        -------
+        str
+        """
+        if not self.in_memory:
+            return ""
+        digest = hashlib.sha256()
+        for name in POSITIONS:
+            digest.update(np.ascontiguousarray(self.column(name)).data)
+        return digest.hexdigest()
 
     def has(self, column: str) -> bool:
         """Truth of a column being there.

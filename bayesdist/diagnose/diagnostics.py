@@ -313,6 +313,13 @@ def _refuse_other_posterior(posterior: Posterior, matches: Matches, fit: LinearF
             where="diagnose",
             do="give the matches that were given to bd.sample",
         )
+    digests = posterior.matches_digest, matches.digest()
+    if all(digests) and digests[0] != digests[1]:
+        raise InputError(
+            "the posterior was made from other stars",
+            where="diagnose",
+            do="give the matches that were given to bd.sample",
+        )
     if fit is not None and fit.model != posterior.model:
         raise InputError(
             "the fit and the posterior have different models",

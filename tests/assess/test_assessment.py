@@ -127,7 +127,10 @@ def test_a_seed_is_that_of_a_run_and_a_generator_is_itself(shifting):
         ({"rng": -1}, "rng is -1"),
         ({"rng": "a"}, "rng is 'a'"),
         ({"exposure": "sngle"}, "unknown exposure 'sngle'; use 'single'"),
-        ({"catalogue": "Gaia"}, "catalogue: the catalogue is a str; give bd.Catalogue"),
+        (
+            {"catalogue": "Gaia"},
+            "catalogue: the catalogue is 'Gaia'; give its error too",
+        ),
         ({"diagnostics": "none"}, "diagnostics: they are a str; give what bd.diagnose"),
         ({"chip": 9}, "9"),
         ({"n_draws": 1}, "the number of draws is 1"),
@@ -156,6 +159,20 @@ def test_diagnostics_belong_to_their_posterior(steps, shifting):
     )
     with pytest.raises(InputError) as error:
         error_budget(other, diagnostics=diagnostics)
+    assert "those of another solution" in said(error)
+
+
+def test_diagnostics_of_other_stars_are_refused(steps):
+    """As many stars of the same truth: nothing but their positions differs."""
+    _, _, posterior, _ = steps
+    others, _ = simulated(300, seed=2)
+    with pytest.raises(InputError) as error:
+        diagnose(posterior, others)
+    assert "made from other stars" in said(error)
+    fit = fit_linear(others, posterior.model)
+    other = sample(fit, others, target_ess=100, target_rhat=1.05)
+    with pytest.raises(InputError) as error:
+        check_requirements(posterior, [EASY], diagnostics=diagnose(other, others, fit=fit))
     assert "those of another solution" in said(error)
 
 

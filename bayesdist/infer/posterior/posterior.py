@@ -134,6 +134,8 @@ class Posterior(Solution):
     own_places : bool
         True if the stars' positions are unknowns of the solution, as in a self-calibration: the
         matches then have the positions of the mean, which are those of no other draw.
+    matches_digest : str
+        `Matches.digest` of the stars; empty if it is not known, as in a file.
 
     Examples
     --------
@@ -163,6 +165,7 @@ class Posterior(Solution):
     sampler: SamplerInfo
     certificate: Certificate | None = None
     own_places: bool = False
+    matches_digest: str = ""
 
     def __repr__(self) -> str:
         c = self.convergence

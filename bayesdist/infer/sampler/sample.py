@@ -172,6 +172,7 @@ def sample(
             convergence=chains.verdict,
             sampler=chains.info(seed, started, exact=exact),
             certificate=certificate,
+            matches_digest=matches.digest() if isinstance(matches, Matches) else "",
         )
 
 
