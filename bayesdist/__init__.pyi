@@ -1,4 +1,4 @@
-"""Names of the package, each with the module where it is at home; loaded when first used."""
+"""Public names and the modules that define them; each is imported on first use."""
 
 from .app.calibrate import calibrate as calibrate
 from .app.commands.on_files.calibrations import read_calibration as read_calibration

@@ -73,9 +73,11 @@ def calibrate(
     settings: Mapping[str, Mapping[str, Any]] | None = None,
     progress: bool = False,
 ) -> Run:
-    """Fit, sample, diagnose and evaluate the distortion that matched stars show.
+    """Calibrate the geometric distortion of a detector from matched stars.
 
-    The same stars, settings and seed give the same numbers as ``bayesdist run``, bit for bit.
+    The distortion is fitted and its posterior sampled, the residuals are examined, and the errors
+    of positions are evaluated.  The same stars, settings and seed give the same numbers as
+    ``bayesdist run``, bit for bit.
 
     Parameters
     ----------
@@ -269,8 +271,8 @@ def _stars(matches: Any, sigma: Any, options: Mapping[str, Any]) -> tuple[Matche
     check_sigma(sigma)
     stars = matches.as_read(sigma)
     if sigma == "by_magnitude" and stars.in_memory:
-        # the circle cuts the residuals from which these errors come: the likelihood must not count
-        # it again, and a check compares its radius with the errors
+        # These errors are estimated from residuals that the match circle has truncated, so that
+        # the likelihood must not correct for the circle a second time.
         no_errors = dict.fromkeys(("sigma_u", "sigma_v", "u_nominal", "v_nominal"))
         stars = stars.with_columns(**no_errors)
     return stars, sigma
@@ -337,7 +339,7 @@ def _requirement_block(requirement: Requirement) -> Settings:
 
 
 def _merged(configured: Settings, settings: Mapping[str, Any]) -> Settings:
-    """Configuration with the user's settings in it, without what is not given."""
+    """Merge the user's settings into the configuration, and drop sections without content."""
     out = _plain(configured)
     for key, section in _plain(settings).items():
         given = out.get(key) or {}

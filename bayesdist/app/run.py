@@ -124,7 +124,7 @@ class Run:
 
     @property
     def solution(self) -> Posterior:
-        """Posterior with all errors of the parameters that the diagnostics found, as exported."""
+        """Posterior with the errors that the diagnostics found added; it is written to files."""
         return self.results.solution
 
     @property
@@ -155,7 +155,7 @@ class Run:
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """Sentences that a reader of the numbers has to know."""
+        """Warnings about the fit and its errors, as sentences."""
         return warnings_of(self.evaluation.checks)
 
     @property
@@ -447,7 +447,7 @@ class Run:
 
     @property
     def _level(self) -> str:
-        """Level of the verdict; that of a note if nothing was asked and nothing is wrong."""
+        """Level of the worst margin or check; 'note' if all is well and nothing was required."""
         level = self.evaluation.verdict[0] if self.converged else "fail"
         return "note" if level == "pass" and not self.margins else level
 

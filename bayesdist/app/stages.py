@@ -85,11 +85,6 @@ def run(
     Raises
     ------
     BayesdistError
-
-    Examples
-    --------
-    >>> directory = bd.run("config.toml", "run")  # doctest: +SKIP
-    >>> posterior = bd.load_posterior(directory / "posterior.nc")  # doctest: +SKIP
     """
     settings, text = load_config(config)
     directory = RunDirectory.plan(
@@ -119,9 +114,9 @@ def make_stages(
     ready: Mapping[str, Any] | None = None,
     source: str = "",
 ) -> Results:
-    """Results with the artefacts of some stages: each that does not stand is made and saved.
+    """Run stages that are not up to date, and save what they make.
 
-    What the other stages made is loaded where it is needed.
+    Results of other stages are loaded from the folder when they are needed.
 
     Parameters
     ----------
@@ -200,7 +195,7 @@ def _sampled(r: Results) -> Posterior:
 def continue_stage(
     path: str | Path, stage: str, *, strict: bool = False, pdf: bool = False
 ) -> RunDirectory:
-    """One stage of a run; 'assess' stands for 'diagnose' and 'evaluate'.
+    """Run one stage of an existing run; 'assess' means 'diagnose' and 'evaluate'.
 
     Parameters
     ----------
@@ -234,7 +229,7 @@ def continue_stage(
 
 @contextmanager
 def initialized(directory: RunDirectory) -> Iterator[Results]:
-    """Results of a run whose folder is there, once it is known that it can be carried out."""
+    """Check that a run can be carried out, create its folder, and open its results."""
     with open_results(directory) as results:
         begins = directory.is_planned
         if begins:

@@ -1,6 +1,7 @@
 """The error budget and the verdicts of a solution, for those who use single functions.
 
-A run makes the same of the same stars, terms and seed: `bayesdist.assess.evaluation` has the parts.
+The results equal those of a run with the same stars, terms and seed; see
+`bayesdist.assess.evaluation`.
 """
 
 from __future__ import annotations
@@ -77,8 +78,8 @@ def error_budget(
     solution : Posterior or LinearFit
         With `diagnostics` the posterior that they were made of.
     diagnostics : Diagnostics, optional
-        What the residuals show, as of `diagnose`: structure beyond the model, differences between
-        exposures, and the noise of the stars as it is observed then count in.
+        Result of `diagnose`, which adds structure beyond the model, differences between exposures
+        and the observed noise of the stars.
     catalogue : Catalogue, optional
         Error of the reference catalogue.
     terms : sequence of ErrorTerm
@@ -87,7 +88,7 @@ def error_budget(
         'mean' for a position in the mean of the exposures; 'single' for one in a single exposure,
         which deviates as the diagnostics have found.
     aligned : bool
-        True if shift and rotation of the exposure are the observer's to fit, as of `ErrorModel`.
+        True if the observer fits shift and rotation of the exposure, so that they are no errors.
     grid : tuple of int
         Points on x and y of each chip.
     epoch : float, Time or str, optional
@@ -356,7 +357,10 @@ def _error_model(
 
 
 def _posterior_of(solution: Solution, diagnostics: Diagnostics) -> Posterior:
-    """The solution, which is the posterior that the diagnostics are of; else InputError."""
+    """The solution, checked to be the posterior that was diagnosed.
+
+    Raises InputError if it is another one.
+    """
     where = "diagnostics"
     if not isinstance(diagnostics, Diagnostics):
         raise InputError(

@@ -219,7 +219,7 @@ def diagnose(
         The fit that the sampler started from; by default a fit with the default rejection limits
         is made.  Give it if it was made with other limits.
     rng : int or numpy.random.Generator
-        Seed of a run.  Of a generator the numbers are used from their beginning.
+        Seed of the run.  A generator is restarted from its initial state.
     priors : GaussianPriors, optional
         Priors of the parameters, as given to `sample`; flat by default.
     match_radius : float or Quantity, optional

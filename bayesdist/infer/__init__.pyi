@@ -1,4 +1,4 @@
-"""Names of the package, each with the module where it is at home; loaded when first used."""
+"""Public names and the modules that define them; each is imported on first use."""
 
 from .catalogue.by_magnitude import fit_by_magnitude as fit_by_magnitude
 from .catalogue.star_errors import (

@@ -1,7 +1,7 @@
 """Calibrations written as files of any format: from Python, and by `bayesdist convert`.
 
-A calibration of which a format cannot hold a part is refused.  The caller then says what is to be
-done: an epoch for a calibration that depends on time, an order for a polynomial in place of look-up
+A calibration is refused if the format cannot represent all of it.  The caller then says what to
+do: an epoch for a calibration that depends on time, an order for a polynomial in place of look-up
 tables.
 """
 
@@ -195,7 +195,7 @@ def built_for(
 
 
 def places_of(built: Sequence[Built], target: Path) -> list[Path]:
-    """Paths of files that were built: in a folder, or the file and those that stand beside it.
+    """Output paths: inside `target` if it is a folder, else `target` and its companion files.
 
     InputError for a file name where there are several files beside those with parameters.
     """
@@ -212,7 +212,7 @@ def places_of(built: Sequence[Built], target: Path) -> list[Path]:
 
 
 def write_built(built: Sequence[Built], places: Sequence[Path]) -> None:
-    """Write files; none takes its name before all have been written."""
+    """Write all files to temporary names, then rename them."""
     with ExitStack() as stack:
         # the last that is entered is the first to take its name: a file follows those beside it
         for place, one in reversed(list(zip(places, built, strict=True))):
