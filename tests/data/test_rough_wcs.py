@@ -319,3 +319,13 @@ def test_motions_need_both_epochs():
     with pytest.raises(InputError, match="has proper motions, and the epoch of its positions is"):
         match(seen, catalogue, **options, epoch=2024.0)
     assert len(match(seen, catalogue, **options, epoch=2024.0, catalogue_epoch=2016.0)) > 0
+
+
+def test_errors_of_the_catalogue_alone_are_named():
+    """Detections without errors of their own: the errors of the match are larger than stated."""
+    seen, catalogue, _ = field()
+    seen = {key: seen[key] for key in ("x", "y", "mag")}
+    alone = match(seen, catalogue, radius=RADIUS, wcs=tan_wcs())
+    assert any("catalogue alone" in note and "by_magnitude" in note for note in alone.notes)
+    estimated = match(seen, catalogue, radius=RADIUS, wcs=tan_wcs(), sigma="by_magnitude")
+    assert not estimated.has_sigma and not any("alone" in note for note in estimated.notes)

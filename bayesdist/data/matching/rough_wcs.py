@@ -11,7 +11,7 @@ import os
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from astropy.table import Column, MaskedColumn, QTable, Table
@@ -42,12 +42,13 @@ from bayesdist.files.tables import read_table
 from bayesdist.utils.arrays import Float, Int
 from bayesdist.utils.quantities import Direction, Epoch, Number, value_in
 
-if TYPE_CHECKING:
-    pass
-
 DETECTIONS, CATALOGUE = "detections", "catalogue"
 UNMATCHED = "no counterpart in the catalogue"
 OUTSIDE = "outside the field of the WCS"
+CATALOGUE_ERRORS_ALONE = (
+    "the errors are those of the catalogue alone, because the detections have none; give "
+    "sigma = 'by_magnitude' to estimate them from the residuals"
+)
 _FROM_DETECTIONS = (
     *("exposure", "chip", "filter", "epoch", "mag", "flux", "colour", "sigma_u", "sigma_v"),
 )
@@ -530,6 +531,9 @@ class _Found:
                 taken[key] = stars.columns
         for key, columns in taken.items():
             table[key] = _column(columns, key, index if columns is seen.columns else partner)
+        notes = list(self.notes)
+        if options.sigma == "columns" and "sigma_ra" in taken and "sigma_u" not in taken:
+            notes.append(CATALOGUE_ERRORS_ALONE)
         if "star" not in table.colnames:
             table["star"] = stars.rows[partner]
         table["u_nominal"], table["v_nominal"] = nominal.T
@@ -552,7 +556,7 @@ class _Found:
             "n_rows": seen.n_rows,
             "rejected": {**seen.rejected, **lost, **arguments["rejected"]},
             "match_radius": radius,
-            "notes": (*seen.notes, *stars.notes, *self.notes, *arguments["notes"]),
+            "notes": (*seen.notes, *stars.notes, *notes, *arguments["notes"]),
         }
         matches = Matches.of_distinct_rows(**arguments).as_read(options.sigma)
         u, v = (matches.column(name) for name in ("u_nominal", "v_nominal"))
