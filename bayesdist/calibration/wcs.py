@@ -471,6 +471,7 @@ class CalibrationWCS(BaseLowLevelWCS, HighLevelWCSMixin):
         except BayesdistError as error:
             lines.append(f"  {error.cause}")
         lines.append(f"  {'1 sigma':<9} {self._sigma_words(x, y)}")
+        lines += [f"  {'note':<9} {note}" for note in self.chip_map.notes]
         return "\n".join(lines) + ">"
 
     def _centre_lines(self, x: float, y: float) -> list[str]:
