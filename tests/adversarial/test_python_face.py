@@ -114,6 +114,14 @@ def test_nothing_is_met_that_the_truth_misses(every, capsys):
     assert [name for name, margin in margins.items() if margin.verdict == "met"] == []
 
 
+def test_a_truth_inside_the_family_is_met(tmp_path):
+    """A face that never decides would pass all other tests."""
+    rng = np.random.default_rng([41, 0])
+    steps = carried(of_map(rng, STARS, fields.smooth(rng, 270, 0.0)), tmp_path, 1)
+    limit = bd.Requirement("above", "p95", 4.0 * steps.true_p95())
+    assert steps.margins([limit])[0].verdict == "met"
+
+
 def test_nothing_is_decided_without_a_look_at_the_residuals(every):
     for _, steps in every:
         for solution in (steps.posterior, steps.fit):
