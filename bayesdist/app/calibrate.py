@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping, Sequence
+from contextlib import nullcontext
 from dataclasses import fields
 from pathlib import Path
 from typing import Any
@@ -153,7 +154,7 @@ def calibrate(
     """
     settings = _checked(settings or {})
     stars, data = None, {"matches": MATCHES_FILE, "sigma": sigma}
-    if is_path(matches):
+    if _is_path(matches):
         data["matches"] = _absolute(matches)
     else:
         options = dict(settings.pop("data", {}))
@@ -196,7 +197,7 @@ def calibrate(
     if stars is None:
         stars = MATCHES.read(config, Path.cwd())
     results = Results(
-        RunDirectory.unsaved(config, text, files=is_path(matches)),
+        RunDirectory.unsaved(config, text, files=_is_path(matches)),
         StarReader(config.resources()),
         made={"inputs": stars},
     )
@@ -222,18 +223,15 @@ def _calibrated(results: Results, progress: bool) -> Results:
     """Results with fit, posterior, diagnostics and evaluation."""
     config = results.config
     results = rehearse(results)
-    if progress:
-        with progress_bar("sample") as update:
-            posterior = sample(results.data, config, progress=update)
-    else:
-        posterior = sample(results.data, config)
+    with progress_bar("sample") if progress else nullcontext() as update:
+        posterior = sample(results.data, config, progress=update)
     results = results.having(posterior=posterior)
     diagnostics = diagnose(results.posterior, results.data, config, results.base)
     results = results.having(stored=diagnostics)
     return results.having(evaluation=evaluated(results))
 
 
-def is_path(matches: Any) -> bool:
+def _is_path(matches: Any) -> bool:
     """True if stars are given by the names of files."""
     if isinstance(matches, str | os.PathLike):
         return True

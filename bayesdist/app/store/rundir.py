@@ -12,7 +12,6 @@ from bayesdist.app.config import (
     Config,
     config_of_record,
     load_config,
-    load_text,
 )
 from bayesdist.app.store import ArtefactStore, Made, Record, as_json, versions
 from bayesdist.app.store.made_from import (
@@ -148,8 +147,8 @@ class RunDirectory(ArtefactStore):
 
     @property
     def text(self) -> str:
-        """The configuration as its user wrote it, in TOML."""
-        return self._text if self.is_planned else load_text(self / "config.toml")
+        """The configuration of a planned run as its user wrote it, in TOML."""
+        return self._text
 
     def begin(self) -> None:
         """Write down what is about to be done.
