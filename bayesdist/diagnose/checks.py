@@ -207,12 +207,17 @@ def _held(correlated: Discrepancy | None, test: ScoreTest) -> bool:
     if correlated is None:
         return False
     scatter = set() if correlated.linear is None else set(correlated.linear.scatter)
+    of_exposures = correlated.facts.get("exposure_fields", {})
+    enough = STRUCTURE_IN_BUDGET.value * test.size
     held = {
         "": False,
         "noise": True,
         "structure": bool(correlated.structure),
         "exposures": bool(scatter - {CURVATURE}),
         "curvature": CURVATURE in scatter,
+        "second order": of_exposures.get("second_order", 0.0) >= enough > 0,
+        "exposure fields": of_exposures.get("field", 0.0) >= enough > 0,
+        "time": False,
     }
     return held[test.held_by]
 

@@ -11,6 +11,7 @@ import numpy as np
 
 from bayesdist.data.matches import Matches
 from bayesdist.diagnose.correlated.deviations import MAX_EXPOSURES, linear_deviations
+from bayesdist.diagnose.correlated.exposure_fields import detection_scores, exposure_fields
 from bayesdist.diagnose.correlated.functions import StructureFunctions
 from bayesdist.diagnose.correlated.information import (
     CellSums,
@@ -112,6 +113,15 @@ def estimate_discrepancy(
         information, working, chips, near, priors, pixel, n_draws, rng
     )
     linear = linear_deviations(information, working, priors, n_draws, rng, exposures=exposures)
+    near_stars = stars if stars is not None else sample
+    detections = None
+    if near_stars is not None and len(near_stars.exposure_names) > 1:
+        prepared, order = prepare(model, near_stars)
+        codes = np.arange(len(order)) if near_stars.star is None else near_stars.star[order]
+        detections = detection_scores(
+            model, prepared, likelihood, near_stars.exposure[order], codes
+        )
+    fields = exposure_fields(information, working, detections, priors, n_draws, rng)
     formal, noise = working.covariance, working.sandwich()
     if repeated is not None:
         noise = noise + repeated.covariance(model, mean, formal)
@@ -122,10 +132,15 @@ def estimate_discrepancy(
         theta = settling.mean(theta)
         if linear is not None:
             linear = replace(linear, theta=settling.mean(linear.theta))
+        if fields is not None:
+            fields = replace(fields, theta=settling.mean(fields.theta))
     facts |= {"unit": model.unit, "noise_ratio": ratio}
     if linear is not None:
         facts |= linear.facts
-    return Discrepancy(model, mean, formal, noise, found, theta, linear, facts)
+    if fields is not None:
+        half = max(max(chip.size) for chip in model.chips) / 2
+        facts["exposure_fields"] = fields.facts | {"length_pix": fields.facts["length"] * half}
+    return Discrepancy(model, mean, formal, noise, found, theta, linear, facts, fields)
 
 
 def _several(stars: Matches) -> bool:

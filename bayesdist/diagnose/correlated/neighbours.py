@@ -44,7 +44,7 @@ class SharedVariance:
 
     def of_field(self, length: float) -> Callable[[float], float]:
         """Log likelihood of a Matern field's amplitude, by its correlation length in half sides."""
-        at_unit = _matern(self.separation / length) - _matern(np.array(self.apart / length))
+        at_unit = matern(self.separation / length) - matern(np.array(self.apart / length))
 
         def log_likelihood(amplitude: float) -> float:
             left = self.covariance - at_unit * amplitude**2
@@ -54,7 +54,7 @@ class SharedVariance:
         return log_likelihood
 
 
-def _matern(separation: Float) -> Float:
+def matern(separation: Float) -> Float:
     """Correlation of the field of `StructureFunctions`, by separation in correlation lengths."""
     z = np.sqrt(3.0) * separation
     return np.asarray((1 + z) * np.exp(-z))

@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from bayesdist.data.matches import Matches
-from bayesdist.diagnose.score.exposures import exposure_test
+from bayesdist.diagnose.score.exposure_fields import exposure_field_test
+from bayesdist.diagnose.score.exposures import exposure_tests
 from bayesdist.diagnose.score.gap import gap_test
 from bayesdist.diagnose.score.motions import motion_test
 from bayesdist.diagnose.score.noise import noise_tests
@@ -64,7 +65,8 @@ def score_tests(
         gap_test(projection),
         motion_test(sample),
         *noise_tests(sample),
-        exposure_test(projection),
+        *exposure_tests(projection),
+        exposure_field_test(sample),
         pattern_test(sample),
         truncation_test(sample, match_radius),
     ]
