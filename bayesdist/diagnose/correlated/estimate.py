@@ -137,6 +137,11 @@ def estimate_discrepancy(
     facts |= {"unit": model.unit, "noise_ratio": ratio}
     if linear is not None:
         facts |= linear.facts
+        if linear.outlying:
+            names = model.exposures
+            if stars is not None and model.frames == "none":
+                names = stars.exposure_names
+            facts["exposures_outlying"] = [names[code] for code in linear.outlying]
     if fields is not None:
         half = max(max(chip.size) for chip in model.chips) / 2
         facts["exposure_fields"] = fields.facts | {"length_pix": fields.facts["length"] * half}

@@ -34,6 +34,7 @@ from bayesdist.diagnose.correlated.priors import (
     log_half_cauchy,
     log_widths,
 )
+from bayesdist.infer.exposures.hierarchy import MOST_OUTLYING
 from bayesdist.infer.exposures.scatter import OUTLYING, OUTLYING_FRACTION
 from bayesdist.infer.stars.likelihood import Likelihood
 from bayesdist.infer.stars.stars import Stars
@@ -45,7 +46,6 @@ STEPS = 40  # of an amplitude
 RANGE = 10.0  # range of amplitudes about the prior's median and what the data resolve
 SHAPE = 0.3  # by which the correlation at a separation may differ from that of a Matern field
 SINES = 10  # along each side of a chip: finer ones move no polynomial
-MOST_OUTLYING = 0.2  # fraction of the exposures beyond which deviant ones are the rule
 QUADRATIC = polynomial_terms(SECOND_ORDER)[len(polynomial_terms(SECOND_ORDER - 1)) :]
 STARS_PER_TERM = 2  # of an exposure on a chip; with fewer its second order is not looked at
 
