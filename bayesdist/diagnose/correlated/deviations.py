@@ -78,6 +78,8 @@ class LinearDeviations:
     outlying: tuple[int, ...] = ()
     # median correlation time of the deviations in years; 0 if they are independent
     correlation_time: float = 0.0
+    # rms of the curvature over the detector and the dates beyond lines in time, both axes together
+    bend: float = 0.0
 
     @property
     def facts(self) -> dict[str, object]:
@@ -334,7 +336,7 @@ def deviation_draws(
         # the fit absorbs a deviation; the truth lies on the other side
         theta=-coefficients @ taken.T,
         terms=columns.terms,
-        curvature=coefficients[:, columns.n_of_exposures :] * columns.size,
+        curvature=(curvature := coefficients[:, columns.n_of_exposures :] * columns.size),
         epoch=columns.middle,
         scatter={name: amplitudes[:, k] for k, name in enumerate(names)},
         n_exposures=columns.n_exposures,
@@ -342,7 +344,22 @@ def deviation_draws(
         size=columns.size,
         outlying=tuple(int(code) for code in columns.code[wrong]) if per else (),
         correlation_time=float(np.median(np.concatenate(times))),
+        bend=_bend(columns, curvature),
     )
+
+
+def _bend(columns: DeviationColumns, curvature: Float) -> float:
+    """Rms of curvatures (n, terms) over the detector and the dates, beyond lines in time."""
+    if not columns.terms:
+        return 0.0
+    years = columns.epoch - columns.middle
+    square = years**2
+    design = np.column_stack([np.ones(len(years)), years])
+    square = square - design @ np.linalg.lstsq(design, square)[0]
+    mean_square = columns.model.basis().mean_squares
+    area = np.array([mean_square[term] for _, _, term in columns.terms])
+    area = area / len({chip for chip, _, _ in columns.terms})
+    return float(0.5 * np.sqrt(np.mean(square**2) * np.mean(curvature**2 @ area)))
 
 
 @dataclass(frozen=True, eq=False)

@@ -12,6 +12,7 @@ import numpy as np
 from bayesdist.data.matches import Matches
 from bayesdist.diagnose.correlated.deviations import MAX_EXPOSURES, linear_deviations
 from bayesdist.diagnose.correlated.exposure_fields import detection_scores, exposure_fields
+from bayesdist.diagnose.correlated.exposure_time import correlated_hierarchy
 from bayesdist.diagnose.correlated.functions import StructureFunctions
 from bayesdist.diagnose.correlated.information import (
     CellSums,
@@ -113,6 +114,15 @@ def estimate_discrepancy(
         information, working, chips, near, priors, pixel, n_draws, rng
     )
     linear = linear_deviations(information, working, priors, n_draws, rng, exposures=exposures)
+    if linear is not None and parameter_priors is not None:
+        dates = dates_of_exposures(working)
+        correlation = correlated_hierarchy(
+            model, mean, working.covariance, parameter_priors, dates, n_draws, rng
+        )
+        if correlation is not None:
+            linear = replace(
+                linear, theta=linear.theta + correlation[0], correlation_time=correlation[1]
+            )
     near_stars = stars if stars is not None else sample
     detections = None
     if near_stars is not None and len(near_stars.exposure_names) > 1:
@@ -143,9 +153,16 @@ def estimate_discrepancy(
                 names = stars.exposure_names
             facts["exposures_outlying"] = [names[code] for code in linear.outlying]
     if fields is not None:
-        half = max(max(chip.size) for chip in model.chips) / 2
-        facts["exposure_fields"] = fields.facts | {"length_pix": fields.facts["length"] * half}
+        facts["exposure_fields"] = fields.facts(model.chips[0].size)
     return Discrepancy(model, mean, formal, noise, found, theta, linear, facts, fields)
+
+
+def dates_of_exposures(information: Information) -> Float:
+    """Dates (E,) of the exposures of a model, decimal years; NaN for one without stars."""
+    groups = information.sums.groups
+    out = np.full(len(information.model.exposures), np.nan)
+    out[groups.exposure] = groups.epoch
+    return out
 
 
 def _several(stars: Matches) -> bool:

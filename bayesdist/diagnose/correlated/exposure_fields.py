@@ -61,13 +61,19 @@ class ExposureFields:
     length: Float  # (n,) its correlation length in longer half sides of a chip
     n_exposures: int
 
-    @property
-    def facts(self) -> dict[str, Any]:
-        """Rms of both kinds over a chip, both axes together, for summaries."""
+    def facts(self, size: tuple[float, float]) -> dict[str, Any]:
+        """Median rms of both kinds over a chip, both axes together, for summaries.
+
+        `size` are the columns and rows of the chip. The field is without its terms up to second
+        order.
+        """
         second = float(np.sqrt(2 * len(QUADRATIC)) * np.median(self.second_order))
-        field = float(np.sqrt(2) * np.median(self.amplitude))
+        left = [modes(size, float(length)).left for length in LENGTHS]
+        left = np.array(left)[np.searchsorted(LENGTHS, self.length)]
+        field = float(np.median(self.amplitude * np.sqrt(2 * left)))
         length = float(np.average(self.length, weights=self.amplitude**2))
-        return {"second_order": second, "field": field, "length": length}
+        length_pix = length * max(size) / 2
+        return {"second_order": second, "field": field, "length_pix": length_pix}
 
     def functions(self, chip: Chip) -> StructureFunctions:
         """Sines of the field on a chip, without their part in terms up to second order."""
@@ -362,7 +368,7 @@ def _log_likelihood(chip: ExposureProducts, amplitude: Float, length: float) -> 
     expected = amplitude[:, None] ** 2 * chip.expected(length)
     left = chip.covariance - expected
     variance = chip.variance + (SHAPE * expected) ** 2
-    by_chance = 2.0 / (chip.n_fields * modes(chip.size, length)[0])
+    by_chance = 2.0 / (chip.n_fields * modes(chip.size, length).patches)
     # a matrix of rank 1 beside the diagonal
     common = 1 + by_chance * (expected**2 / variance).sum(axis=1)
     along = (left * expected / variance).sum(axis=1)

@@ -55,7 +55,7 @@ class DetectionScores:
 
 @dataclass(frozen=True, eq=False)
 class ExposureProducts:
-    """Covariance of displacements within exposures on a chip, in excess of that across exposures."""
+    """Covariance of displacements within exposures on a chip, in excess of that across them."""
 
     size: tuple[float, float]  # columns and rows of the chip
     covariance: Float  # (b,) in the squared unit of u, v, both axes together
@@ -259,13 +259,23 @@ def _expected(size: tuple[float, float], length: float) -> Float:
     return np.asarray(covariance / np.maximum(pairs, 0.5))
 
 
-@lru_cache(maxsize=64)
-def modes(size: tuple[float, float], length: float) -> tuple[float, float]:
-    """Degrees of freedom of the mean square of a field, and those of a sum of its products.
+@dataclass(frozen=True)
+class Modes:
+    """What is left of a field of unit variance without its terms up to second order.
 
-    The field has no terms up to second order.  For eigenvalues L of its covariance the first is
-    (sum L)^2 / sum L^2, the second (sum L^2)^3 / (sum L^3)^2, as of the skewness of a chi-square.
+    L are the eigenvalues of its covariance over a chip.
     """
+
+    left: float  # mean square of what is left
+    patches: float  # (sum L)^2 / sum L^2: degrees of freedom of the mean square
+    dof: (
+        float  # (sum L^2)^3 / (sum L^3)^2: of the chi-square with the skewness of a sum of products
+    )
+
+
+@lru_cache(maxsize=64)
+def modes(size: tuple[float, float], length: float) -> Modes:
+    """Modes of a field over a chip; `length` is the correlation length in longer half sides."""
     side = 12  # smooth fields: more cells change these little
     nx, ny = (max(2, round(side * s / max(size))) for s in size)
     half = np.array(size) / max(size)
@@ -276,8 +286,8 @@ def modes(size: tuple[float, float], length: float) -> tuple[float, float]:
     K -= phi @ (phi.T @ K)
     K -= (K @ phi) @ phi.T
     values = np.linalg.eigvalsh(K)
-    second, third = (values**2).sum(), (values**3).sum()
-    return float(values.sum() ** 2 / second), float(second**3 / third**2)
+    total, second, third = values.sum(), (values**2).sum(), (values**3).sum()
+    return Modes(float(total / len(values)), float(total**2 / second), float(second**3 / third**2))
 
 
 def _middles(n: int) -> Float:

@@ -40,12 +40,13 @@ def exposure_field_test(sample: ScoredSample) -> Outcome | None:
         return None
     tried = [_tried(list(chips.values()), length) for length in LENGTHS]
     p, statistic, dof, variance, error, length = min(tried)
-    # of both axes; what noise makes of it is already taken away
-    size = np.sqrt(2 * max(variance, 0.0))
+    # of both axes, without terms up to second order; what noise makes of it is taken away
+    left = 2 * modes(next(iter(chips.values())).size, length).left
+    size = np.sqrt(left * max(variance, 0.0))
 
     def smallest(level: float) -> float:
         limit = _deviate(level / len(LENGTHS), dof)
-        return float(np.sqrt(2 * error * max(limit - _deviate(POWER, dof), 0.0)))
+        return float(np.sqrt(left * error * max(limit - _deviate(POWER, dof), 0.0)))
 
     half = max(max(chip.size) for chip in sample.model.chips) / 2
     family = EXPOSURE_FIELDS
@@ -81,7 +82,7 @@ def _tried(
     fits = np.array([one.amplitude(length) for one in chips])
     weight = fits[:, 1] ** -2
     variance, error = float(fits[:, 0] @ weight / weight.sum()), float(weight.sum() ** -0.5)
-    dof = sum(one.n_fields * modes(one.size, length)[1] for one in chips)
+    dof = sum(one.n_fields * modes(one.size, length).dof for one in chips)
     T = max(dof + variance / error * np.sqrt(2 * dof), 0.0)
     return float(chi2_sf(T, dof)), T, dof, variance, error, length
 

@@ -18,10 +18,12 @@ import numpy as np
 
 from bayesdist.diagnose.clusters import add_over, sums_over
 from bayesdist.diagnose.efficient import EfficientScore, independent_directions, squares_of
+from bayesdist.diagnose.score.exposure_time import exposure_time_test
 from bayesdist.diagnose.score.projection import Projection, contracted, weighted
 from bayesdist.diagnose.score.result import Family, Outcome, outcome
 from bayesdist.diagnose.score.sample import Block
 from bayesdist.diagnose.significance import chi_square_of, hotelling_p
+from bayesdist.infer.equations.priors import GaussianPriors
 from bayesdist.model.frames import LINEAR_MATRICES, frame_names
 from bayesdist.utils.arrays import Float, Int
 from bayesdist.utils.distributions import chi2_sf
@@ -126,18 +128,22 @@ class _Meat:
         return left.T @ left, rest
 
 
-def exposure_tests(projection: Projection) -> list[Outcome]:
-    """Tests of linear and of second-order deviations of exposures.
+def exposure_tests(projection: Projection, theta: Float, priors: GaussianPriors) -> list[Outcome]:
+    """Tests of linear and of second-order deviations of exposures, and of their course in time.
 
     Both are left out for one exposure, and where fewer than two exposures have enough stars. The
     first is left out where the frames fit all linear terms, the second for polynomials of order 1.
+    `theta` (D,) and `priors` are those of the solution.
     """
     model = projection.sample.model
     names = [name for name in frame_names("affine") if name not in frame_names(model.frames)]
     if len({block.exposure for block in projection.sample.blocks}) < 2:
         return []
     by_order: list[list[_Deviations]] = [[], []]
-    for pair in _deviations(projection, names):
+    estimates: dict[int, Float] = {}
+    for code, estimate, pair in _deviations(projection, names):
+        if estimate.size:
+            estimates[code] = estimate
         for deviations, part in zip(by_order, pair, strict=True):
             if part is not None:
                 deviations.append(part)
@@ -145,11 +151,13 @@ def exposure_tests(projection: Projection) -> list[Outcome]:
     if model.frames != "affine":
         remedy = f"set model.frames to 'affine', or {remedy}"
     families = replace(EXPOSURES, remedy=remedy), SECOND_ORDER
-    return [
+    out = [
         _summed(projection, family, deviations)
         for family, deviations in zip(families, by_order, strict=True)
         if len(deviations) > 1
     ]
+    in_time = exposure_time_test(projection, estimates, theta, priors)
+    return out if in_time is None else [*out, in_time]
 
 
 def _summed(projection: Projection, family: Family, deviations: list[_Deviations]) -> Outcome:
@@ -187,8 +195,11 @@ def _summed(projection: Projection, family: Family, deviations: list[_Deviations
 
 def _deviations(
     projection: Projection, names: list[str]
-) -> Iterator[tuple[_Deviations | None, _Deviations | None]]:
-    """Linear and second-order deviations of each exposure; None where there are too few stars."""
+) -> Iterator[tuple[int, Float, tuple[_Deviations | None, _Deviations | None]]]:
+    """Linear and second-order deviations of each exposure; None where there are too few stars.
+
+    With the code of the exposure, and estimates (m,) of its linear deviations.
+    """
     meat, model = None, projection.sample.model
     if len(projection.sample) * projection.n_global**2 < MAX_PRODUCTS:
         meat = _Meat.of(projection)
@@ -213,7 +224,9 @@ def _deviations(
         if m:  # the second order beside all linear terms
             S = every.information
             quadratic[:m] = -np.linalg.lstsq(S[:m, :m], S[:m, m:])[0]
-        yield _independent(every, whole, linear), _independent(every, whole, quadratic)
+        estimate = np.linalg.lstsq(every.own[:m, :m], every.score[:m])[0]
+        pair = _independent(every, whole, linear), _independent(every, whole, quadratic)
+        yield blocks[0].exposure, estimate, pair
 
 
 def _independent(every: _Deviations, whole: Float, combinations: Float) -> _Deviations | None:
