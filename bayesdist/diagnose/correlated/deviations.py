@@ -30,7 +30,7 @@ from bayesdist.infer.exposures.hierarchy import MOST_OUTLYING
 from bayesdist.infer.exposures.scatter import OUTLYING, OUTLYING_FRACTION
 from bayesdist.model import DistortionModel, Groups
 from bayesdist.model.frames import LINEAR_MATRICES
-from bayesdist.utils.arrays import Float, Int
+from bayesdist.utils.arrays import Bool, Float, Int
 
 # deviations of an exposure that scatter together, and the frames that fit them already
 KINDS = {
@@ -52,6 +52,7 @@ MAX_EXPOSURES = 40
 # there
 COARSE, REFINED = (12, 8, 6, 5), (30, 18, 11, 6)
 RANGE = 10.0  # range of amplitudes about the prior's median and the resolution of the data
+ITERATIONS = 12  # of the scatter, to find the exposures that went wrong
 WIDE = 100.0  # times the amplitudes that are expected: as good as free
 MIN_OF_OTHERS = 5  # exposures: of fewer, none can be told from the others
 NEGLIGIBLE = 1e-3  # of the density, below the largest of an amplitude
@@ -388,7 +389,7 @@ def _roots(
     if not n or columns.model.time is None:
         return [independent]
     mean, _ = _given(S, score, np.where(loose > 0, loose, WIDE * scale[index]))
-    wrong = loose[:n].reshape(E, -1).any(axis=1)
+    wrong: Bool = np.asarray(loose[:n].reshape(E, -1).any(axis=1))
     typical = mean[:n].reshape(E, -1)[~wrong]
     p, _ = correlation_p(typical, columns.epoch[~wrong], columns.model.time.breaks)
     if p > SUSPECTED:
@@ -397,7 +398,7 @@ def _roots(
     for fraction in CORRELATION_TIMES:
         time = float(fraction * np.ptp(columns.epoch))
         matrix = np.diag(own)
-        root = correlation_root(columns.epoch, time, ~wrong)
+        root = correlation_root(columns.epoch, time, np.logical_not(wrong))
         matrix[:n, :n] = own[:n, None] * np.kron(root, np.eye(n // E))
         out.append(_Root(time, (1 - UNCORRELATED) / len(CORRELATION_TIMES), matrix))
     return out
@@ -423,26 +424,23 @@ def _outlying(columns: DeviationColumns, S: Float, score: Float, index: Int, sca
         return out
     kind, which = index[:per], np.arange(E * per).reshape(E, per)
     while (out[which].any(axis=1)).sum() <= MOST_OUTLYING * E:
-        tight = ~out[which].any(axis=1)
+        tight: Bool = np.logical_not(out[which].any(axis=1))
         spread = np.where(out > 0, out, WIDE * scale[index])
-        mean, _ = _given(S, score, spread)
-        b = mean[which]
-        b = b - np.median(b[tight], axis=0)
-        # scatter of each kind among the others, first robust and then by their squares
-        sizes = np.array([1.4826 * np.median(np.abs(b[tight][:, kind == k])) for k in kind])
-        spread = np.where(out > 0, out, 0.0)
-        spread[which[tight]] = np.maximum(sizes, 1e-2 * scale[kind])
-        spread[E * per :] = WIDE * scale[index[E * per :]]
-        mean, cov = _given(S, score, spread)
-        squares = (mean**2 + np.diag(cov))[which]
+        for step in range(ITERATIONS):  # to the most probable scatter of the others
+            mean, cov = _given(S, score, spread)
+            if step == 0:
+                b = mean[which] - np.median(mean[which][tight], axis=0)
+            squares = (mean**2 + np.diag(cov))[which]
+            sizes = np.array([np.sqrt(np.mean(squares[tight][:, kind == k])) for k in kind])
+            if step + 1 < ITERATIONS:
+                spread[which[tight]] = np.maximum(sizes, 1e-3 * scale[kind])
         odds = np.full(E, -np.inf)
         for e in np.flatnonzero(tight):
             rows = which[e]
             inverse = np.linalg.inv(cov[np.ix_(rows, rows)])
             information = inverse - np.diag(spread[rows] ** -2.0)
             pull = inverse @ mean[rows]
-            others = tight.copy()
-            others[e] = False
+            others = np.logical_and(tight, np.arange(E) != e)
             rest = np.array([np.mean(squares[others][:, kind == k]) for k in kind])
             evidence = []
             for times in (1.0, OUTLYING):

@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 import scipy.linalg
 
+from bayesdist.diagnose.correlated.deviations import ITERATIONS
 from bayesdist.diagnose.correlated.exposure_products import (
     LENGTHS,
     SECOND_ORDER,
@@ -43,6 +44,7 @@ from bayesdist.model.basis import polynomial_terms
 from bayesdist.utils.arrays import Float, Int
 
 STEPS = 40  # of an amplitude
+WIDE = 30.0  # times what the data resolve: as good as free
 RANGE = 10.0  # range of amplitudes about the prior's median and what the data resolve
 SHAPE = 0.3  # by which the correlation at a separation may differ from that of a Matern field
 SINES = 10  # along each side of a chip: finer ones move no polynomial
@@ -68,8 +70,8 @@ class ExposureFields:
         order.
         """
         second = float(np.sqrt(2 * len(QUADRATIC)) * np.median(self.second_order))
-        left = [modes(size, float(length)).left for length in LENGTHS]
-        left = np.array(left)[np.searchsorted(LENGTHS, self.length)]
+        by_length = np.array([modes(size, float(length)).left for length in LENGTHS])
+        left = by_length[np.searchsorted(LENGTHS, self.length)]
         field = float(np.median(self.amplitude * np.sqrt(2 * left)))
         length = float(np.average(self.length, weights=self.amplitude**2))
         length_pix = length * max(size) / 2
@@ -285,9 +287,9 @@ def _second_order_draws(
     known = np.concatenate([terms.values.ravel() for terms in chips])
     known = known[known > 1e-8 * known.max()]
     resolved = float(np.median(known)) ** -0.5
-    chips = [_with_loose(terms, max(median, resolved)) for terms in chips]
+    chips = [_with_loose(terms, WIDE * resolved) for terms in chips]
     largest = max(
-        float(np.sqrt(np.mean(terms.given(10 * resolved).squares()[terms.loose == 0])))
+        float(np.sqrt(np.mean(terms.given(WIDE * resolved).squares()[terms.loose == 0])))
         for terms in chips
     )
     grid = np.geomspace(
@@ -315,9 +317,11 @@ def _with_loose(terms: _Terms, start: float) -> _Terms:
     E, q = terms.values.shape
     loose = np.zeros(E)
     while (loose > 0).sum() <= MOST_OUTLYING * E:
-        given = replace(terms, loose=loose).given(start)
-        squares = given.squares()
-        tight = loose == 0
+        tight, tau = loose == 0, start
+        for _ in range(ITERATIONS):  # to the most probable scatter of the others
+            given = replace(terms, loose=loose).given(tau)
+            squares = given.squares()
+            tau = float(np.sqrt(np.mean(squares[tight])))
         total, count = squares[tight].sum(), q * (tight.sum() - tight)
         rest = (total - np.where(tight, squares.sum(axis=1), 0.0)) / np.maximum(count, 1)
         common = scipy.linalg.solve_triangular(given.factor, given.half, trans=1, lower=True)

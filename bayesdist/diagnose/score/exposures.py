@@ -224,7 +224,7 @@ def _deviations(
         if m:  # the second order beside all linear terms
             S = every.information
             quadratic[:m] = -np.linalg.lstsq(S[:m, :m], S[:m, m:])[0]
-        estimate = np.linalg.lstsq(every.own[:m, :m], every.score[:m])[0]
+        estimate = np.asarray(np.linalg.lstsq(every.own[:m, :m], every.score[:m])[0], float)
         pair = _independent(every, whole, linear), _independent(every, whole, quadratic)
         yield blocks[0].exposure, estimate, pair
 
