@@ -89,7 +89,8 @@ def verdict_of(
         )
         if on_asked or on_missed:
             bound = asked if on_asked else MISSED_BELOW
-            reason = f"{near} {bound:g} ({more}): more draws (sampler.target_ess, assess.draws) decide it"
+            reason = f"{near} {bound:g} ({more}): "
+            reason += "more draws (sampler.target_ess, assess.draws) decide it"
     doubts = doubts_of(checks)
     if not doubts or (verdict == "missed" and all(one.doubt == LARGER for one in doubts)):
         return verdict, reason

@@ -293,7 +293,7 @@ def _statement(m: Margin) -> str:
     met = counted(m.probability_met, m.mc_error, m.n_effective)
     return (
         f"{m.verdict}: {number(m.value * scale.factor)} of {limit}\n"
-        f"P(≤ limit) {met}, asked {m.requirement.probability:.3g}"
+        f"P(≤ limit): {met}, asked {m.requirement.probability:.3g}"
     )
 
 
