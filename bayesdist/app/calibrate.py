@@ -103,8 +103,8 @@ def calibrate(
         or one number in the unit of u and v.  By default their own if they have any, else the
         estimate by magnitude.
     outliers : OutlierMixture or {'gaussian', 'uniform', 'none'}
-        Distribution of false matches.  The match radius is that of `matches` if they were made by
-        `match`.
+        Distribution of false matches.  If it has no match radius, that of `matches` is used: those
+        that `match` made state it, also in the files that they were written to.
     catalogue : Catalogue, optional
         Systematic position error of the reference catalogue.  Without it verdicts are undecided,
         because no residual shows this error.
@@ -179,7 +179,7 @@ def calibrate(
             "frames": frames,
             "tdd": None if time is None else _drift(time),
         },
-        "outliers": _outliers(outliers, stars),
+        "outliers": _outliers(outliers, None if stars is None else stars.unit),
         "sampler": {"seed": seed},
         "assess": {"epoch": None if epoch is None else year_of(epoch), "exposure": exposure},
         "holdout": {"fraction": held_out} if held_out else None,
@@ -267,13 +267,7 @@ def _stars(matches: Any, sigma: Any, options: Mapping[str, Any]) -> tuple[Matche
     elif not isinstance(sigma, str):
         sigma = value_in(sigma, matches.unit, "sigma")
     check_sigma(sigma)
-    stars = matches.as_read(sigma)
-    if sigma == "by_magnitude" and stars.in_memory:
-        # These errors are estimated from residuals that the match circle has truncated, so that
-        # the likelihood must not correct for the circle a second time.
-        no_errors = dict.fromkeys(("sigma_u", "sigma_v", "u_nominal", "v_nominal"))
-        stars = stars.with_columns(**no_errors)
-    return stars, sigma
+    return matches.as_read(sigma), sigma
 
 
 def _absolute(paths: Any) -> str | list[str]:
@@ -300,8 +294,8 @@ def _chips(chips: Sequence[Chip]) -> Sequence[Chip]:
     return chips
 
 
-def _outliers(outliers: OutlierMixture | str, stars: Matches | None) -> Settings:
-    """Section [outliers] of a mixture; the match radius is that of the stars if they state one."""
+def _outliers(outliers: OutlierMixture | str, unit: str | None) -> Settings:
+    """Section [outliers] of a mixture; `unit` is that of u and v, None if it is not known yet."""
     if not isinstance(outliers, str | OutlierMixture):
         raise InputError(
             f"outliers is {outliers!r}",
@@ -309,8 +303,9 @@ def _outliers(outliers: OutlierMixture | str, stars: Matches | None) -> Settings
             do="give 'gaussian', 'uniform', 'none' or bayesdist.OutlierMixture(...)",
         )
     if isinstance(outliers, str):
-        radius = None if stars is None else stars.match_radius
-        return {"match_radius": radius} | ({} if outliers == "gaussian" else {"model": outliers})
+        return {} if outliers == "gaussian" else {"model": outliers}
+    if unit is not None:
+        outliers = outliers.in_unit(unit)
     section = {field.name: getattr(outliers, field.name) for field in fields(outliers)}
     jitter = section["jitter"]
     return section | {"jitter": "fit" if jitter is None else jitter}
@@ -378,6 +373,13 @@ def _plain(tree: Any) -> Any:
         return {key: _plain(value) for key, value in tree.items() if value is not None}
     if isinstance(tree, list | tuple):
         return [_plain(value) for value in tree]
+    if hasattr(tree, "unit"):
+        raise ConfigError(
+            f"{tree} has a unit, and the configuration takes numbers",
+            where=WHERE,
+            do="give the number in the unit of docs/configuration.md; lengths of an "
+            "OutlierMixture may have units if the stars have been read before",
+        )
     if isinstance(tree, np.ndarray | np.generic):
         return tree.tolist()
     return str(tree) if isinstance(tree, Path) else tree

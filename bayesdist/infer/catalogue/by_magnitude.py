@@ -64,7 +64,8 @@ def fit_by_magnitude(
     fit : LinearFit
         Of all matches with these errors.
     matches : Matches
-        With these errors.
+        With these errors, and without nominal positions: residuals that the match circle has cut
+        give errors that describe the selected stars, which must not be corrected a second time.
     errors : MagnitudeErrors
         The law at its nodes, and the scatter about each.
 
@@ -91,7 +92,7 @@ def fit_by_magnitude(
         )
     count = max(STARS, PER_EXPOSURE * len(model.exposures) * len(model.chips))
     errors = _law(matches.sample(count), model, rejection, priors)
-    table = matches.with_errors(errors)
+    table = matches.without("u_nominal", "v_nominal").with_errors(errors)
     fit = fit_linear(table, model, rejection=rejection, priors=priors, compute=compute)
     return fit, table, errors
 

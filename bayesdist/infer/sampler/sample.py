@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from importlib import metadata
 from pathlib import Path
 
@@ -66,7 +67,7 @@ def sample(
     matches : Matches or Shards
         All stars: none is clipped.
     outliers : OutlierMixture, optional
-        Gaussian outliers by default, within the match radius of the matches if they have one.
+        Gaussian outliers by default.  If it has no match radius, that of the matches is used.
     priors : GaussianPriors, optional
     seed : int
         All random numbers follow from it.
@@ -133,8 +134,10 @@ def sample(
         raise InputError("steps must be positive", where="sampler")
     started = time.monotonic()
     with opened(fit.model, matches, compute) as shards:
-        radius = matches.match_radius if isinstance(matches, Matches) else None
-        mixture = (outliers or OutlierMixture(match_radius=radius)).in_unit(fit.model.unit)
+        mixture = outliers or OutlierMixture()
+        if mixture.match_radius is None and isinstance(matches, Matches):
+            mixture = replace(mixture, match_radius=matches.match_radius)
+        mixture = mixture.in_unit(fit.model.unit)
         priors = priors or GaussianPriors.none(fit.model)
         target = Target(shards, mixture, priors)
         folder = None if folder is None else Path(folder)
