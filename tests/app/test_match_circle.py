@@ -125,7 +125,10 @@ def test_a_self_calibration_has_none():
 
 # -- the radius that stars state ------------------------------------------------------------------
 
-SHORT = {"sampler": {"target_ess": 100, "target_rhat": 1.05}, "assess": {"grid": (5, 5), "draws": 100}}
+SHORT = {
+    "sampler": {"target_ess": 100, "target_rhat": 1.05},
+    "assess": {"grid": (5, 5), "draws": 100},
+}
 FILES = ("stars.ecsv", "stars.parquet", "matches.h5")
 
 
