@@ -44,9 +44,9 @@ def write_partitioned(
     """Write tables of matches as a folder of Parquet files, parts of one table.
 
     Only one of the tables need be in memory at a time.  Reading the folder gives the same numbers
-    bit for bit.  The tangent point and the match radius are written, too.  Not written are the
-    rows and files that the stars come from, and what was rejected; labels that no star has; and exposures, chips and filters where the first
-    table has none but the default.
+    bit for bit, with the tangent point and the match radius.  Not written are the rows and files
+    that the stars come from, and what was rejected; labels that no star has; and exposures, chips
+    and filters where the first table has none but the default.
 
     Parameters
     ----------
