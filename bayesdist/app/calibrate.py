@@ -17,6 +17,7 @@ from bayesdist.app.config.assess import RequirementBlock
 from bayesdist.app.kinds.fit_data import StarReader
 from bayesdist.app.kinds.kind import MATCHES
 from bayesdist.app.pipeline import diagnose, sample
+from bayesdist.app.python_terms import in_python_terms
 from bayesdist.app.rehearsal import rehearse
 from bayesdist.app.results import Results
 from bayesdist.app.run import Run, as_requirements
@@ -51,6 +52,7 @@ DEFAULTS = {
 Settings = dict[str, Any]
 
 
+@in_python_terms()
 def calibrate(
     matches: Any,
     *,
@@ -213,6 +215,14 @@ def _checked(settings: Mapping[str, Any]) -> dict[str, Any]:
             do='give sections with their keys, as in {"sampler": {"max_steps": 40000}}',
         )
     checked = dict(settings)
+    for name, section in checked.items():
+        blocks = section if isinstance(section, list | tuple) else [section]
+        if not isinstance(name, str) or not all(isinstance(b, Mapping) for b in blocks):
+            raise ConfigError(
+                f"settings[{name!r}] is {section!r}",
+                where=WHERE,
+                do='give sections with their keys, as in {"sampler": {"max_steps": 40000}}',
+            )
     earlier = checked.get("prior_calibration")
     if isinstance(earlier, Mapping) and isinstance(earlier.get("source"), str | os.PathLike):
         checked["prior_calibration"] = {**earlier, "source": _absolute(earlier["source"])}
@@ -282,6 +292,10 @@ def _in(value: Any, unit: str, what: str) -> float | None:
 
 
 def _drift(time: TimeDependence) -> Settings:
+    if not isinstance(time, TimeDependence):
+        raise InputError(
+            f"time is {time!r}", where=WHERE, do="give bayesdist.TimeDependence(terms, epoch0)"
+        )
     return {"epoch0": list(time.epoch0), "terms": list(time.terms), "breaks": list(time.breaks)}
 
 
@@ -315,6 +329,12 @@ def _budget(catalogue: Catalogue | None, terms: Sequence[UserTerm]) -> list[Sett
     """[[budget]] rows of the errors that the user states."""
     require_catalogue(catalogue)
     rows = [] if catalogue is None else [catalogue.budget_row()]
+    if isinstance(terms, UserTerm):
+        terms = [terms]
+    if not isinstance(terms, Sequence):
+        raise InputError(
+            f"terms is {terms!r}", where=WHERE, do="give a list of bayesdist.UserTerm"
+        )
     for term in terms:
         if not isinstance(term, UserTerm):
             raise InputError(
