@@ -6,6 +6,8 @@ import os
 from collections.abc import Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import fields
+from datetime import date
+from datetime import time as time_of_day
 from pathlib import Path
 from typing import Any
 
@@ -33,7 +35,7 @@ from bayesdist.data.reading.table import match_arguments
 from bayesdist.errors import ConfigError, InputError
 from bayesdist.infer import OutlierMixture
 from bayesdist.model import Chip, TimeDependence
-from bayesdist.utils.quantities import value_in, year_of
+from bayesdist.utils.quantities import value_in, values_in, year_of
 
 __all__ = ["calibrate"]
 
@@ -154,7 +156,7 @@ def calibrate(
     >>> run.check(bd.Requirement("whole field", "p95", 0.1))[0].verdict
     'met'
     """
-    settings = _checked(settings or {})
+    settings = _checked({} if settings is None else settings)
     stars, data = None, {"matches": MATCHES_FILE, "sigma": sigma}
     if _is_path(matches):
         data["matches"] = _absolute(matches)
@@ -164,7 +166,11 @@ def calibrate(
         stars, data["sigma"] = _stars(matches, sigma, options)
     configured: Settings = {
         "data": data,
-        "detector": {"name": name, "size": size, "scale_mas": _in(scale_mas, "mas", "scale_mas")},
+        "detector": {
+            "name": name,
+            "size": _pixels(size, "size"),
+            "scale_mas": _in(scale_mas, "mas", "scale_mas"),
+        },
         "chip": [
             {
                 "number": chip.number,
@@ -177,18 +183,20 @@ def calibrate(
         ],
         "model": {
             "order": order,
-            "reference_pixel": reference_pixel,
+            "reference_pixel": _pixels(reference_pixel, "reference_pixel"),
             "frames": frames,
             "tdd": None if time is None else _drift(time),
         },
         "outliers": _outliers(outliers, None if stars is None else stars.unit),
         "sampler": {"seed": seed},
         "assess": {"epoch": None if epoch is None else year_of(epoch), "exposure": exposure},
-        "holdout": {"fraction": held_out} if held_out else None,
+        "holdout": None
+        if isinstance(held_out, int | float) and held_out == 0
+        else {"fraction": held_out},
         "budget": _budget(catalogue, terms),
         "requirement": [_requirement_block(one) for one in as_requirements(requirements)],
     }
-    text = _toml(_merged(configured, settings))
+    text = tomli_w.dumps(_merged(configured, settings))
     config = parse_config(text, WHERE)
     if not isinstance(config, MatchesConfig):
         raise ConfigError(
@@ -291,6 +299,14 @@ def _in(value: Any, unit: str, what: str) -> float | None:
     return None if value is None else value_in(value, unit, what)
 
 
+def _pixels(pair: Any, what: str) -> Any:
+    """Pair of numbers without a unit; pixels are the only one."""
+    has_unit = hasattr(pair, "unit")
+    if isinstance(pair, list | tuple):
+        has_unit = any(hasattr(value, "unit") for value in pair)
+    return values_in(pair, "pix", what).tolist() if has_unit else pair
+
+
 def _drift(time: TimeDependence) -> Settings:
     if not isinstance(time, TimeDependence):
         raise InputError(
@@ -332,9 +348,7 @@ def _budget(catalogue: Catalogue | None, terms: Sequence[UserTerm]) -> list[Sett
     if isinstance(terms, UserTerm):
         terms = [terms]
     if not isinstance(terms, Sequence):
-        raise InputError(
-            f"terms is {terms!r}", where=WHERE, do="give a list of bayesdist.UserTerm"
-        )
+        raise InputError(f"terms is {terms!r}", where=WHERE, do="give a list of bayesdist.UserTerm")
     for term in terms:
         if not isinstance(term, UserTerm):
             raise InputError(
@@ -369,37 +383,43 @@ def _merged(configured: Settings, settings: Mapping[str, Any]) -> Settings:
     return {key: value for key, value in out.items() if value not in ({}, [])}
 
 
-def _toml(settings: Settings) -> str:
-    """Settings as the text of a TOML file."""
-    try:
-        return tomli_w.dumps(settings)
-    except (TypeError, ValueError) as error:
-        raise ConfigError(
-            f"a value cannot be written in TOML ({error})",
-            where=WHERE,
-            do="give numbers, texts, lists and mappings",
-        ) from error
-
-
 def _given_twice(key: str) -> ConfigError:
     return ConfigError(
         "is given by an argument and in settings", where=f"{WHERE}: {key}", do="give it once"
     )
 
 
-def _plain(tree: Any) -> Any:
-    """Tree of values that TOML can hold, without None."""
+def _plain(tree: Any, key: str = "") -> Any:
+    """Tree of values that TOML can hold, without None; `key` is where it stands."""
     if isinstance(tree, Mapping):
-        return {key: _plain(value) for key, value in tree.items() if value is not None}
+        for name in tree:
+            if not isinstance(name, str):
+                raise _no_value(name, key)
+        dotted = {name: f"{key}.{name}" if key else name for name in tree}
+        return {
+            name: _plain(value, dotted[name]) for name, value in tree.items() if value is not None
+        }
     if isinstance(tree, list | tuple):
-        return [_plain(value) for value in tree]
+        return [_plain(value, key) for value in tree]
     if hasattr(tree, "unit"):
         raise ConfigError(
-            f"{tree} has a unit, and the configuration takes numbers",
-            where=WHERE,
+            f"{tree} has a unit, which the configuration cannot hold",
+            where=f"{WHERE}: {key}",
             do="give the number in the unit of docs/configuration.md; lengths of an "
             "OutlierMixture may have units if the stars have been read before",
         )
     if isinstance(tree, np.ndarray | np.generic):
         return tree.tolist()
-    return str(tree) if isinstance(tree, Path) else tree
+    if isinstance(tree, Path):
+        return str(tree)
+    if not isinstance(tree, str | int | float | date | time_of_day):
+        raise _no_value(tree, key)
+    return tree
+
+
+def _no_value(value: Any, key: str) -> ConfigError:
+    return ConfigError(
+        f"{value!r} is no value of TOML",
+        where=f"{WHERE}: {key}",
+        do="give numbers, texts, lists and mappings",
+    )

@@ -37,7 +37,7 @@ SECTIONS = {
 }
 OPTIONS = {"force": "overwrite=True", "resume": "resume=True", "seed": "seed"}
 # messages that name both the argument and the option are left as they are
-_BILINGUAL = re.compile(r"in Python|on the command line|of convert|docs/")
+_BILINGUAL = re.compile(r"in Python|on the command line|of convert")
 _KEY = re.compile(
     r"(?<![\w./\[\"])(" + "|".join(MatchesConfig.model_fields) + r")\.([a-z_]\w*)((?:\.\w+)*)"
 )

@@ -461,7 +461,8 @@ class Run:
         if len(verdicts) == 1:
             row = margin_rows(self.margins)[0]
             value = f"{row['Limit']}, now {row['Value']}, P(met) {row['P(met)']}"
-            return f"{verdicts[0].upper()}: {row['Requirement']}: {value}"
+            known = " by the known errors alone" if verdicts[0] == "undecided" else ""
+            return f"{verdicts[0].upper()}: {row['Requirement']}: {value}{known}"
         counts = [(verdicts.count(name), name) for name in ("missed", "undecided", "met")]
         return f"{len(verdicts)} requirements: " + ", ".join(
             f"{count} {name}" for count, name in counts if count
@@ -543,6 +544,11 @@ class Run:
         InputError
             If the format or a setting is unknown, the file exists, or the format cannot hold the
             calibration.
+
+        Warns
+        -----
+        bayesdist.errors.BayesdistWarning
+            As for `Calibration.write`.
         """
         if self.model.time is not None and not format_of(format).holds_time:
             settings = {"epoch": self.results.epoch} | settings

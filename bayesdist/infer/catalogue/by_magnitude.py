@@ -28,6 +28,7 @@ from bayesdist.infer.stars.likelihood import good_probability
 from bayesdist.infer.stars.shards import Compute
 from bayesdist.infer.stars.stars import groups_of, in_table_order, prepare
 from bayesdist.model import DistortionModel
+from bayesdist.utils.arguments import takes
 from bayesdist.utils.arrays import Float
 
 STARS = 200_000  # from which the law is estimated: it is then known to a part in a thousand
@@ -39,6 +40,7 @@ WIDER = 10.0  # false matches scatter at least this many times as wide as the wo
 LEAST_WEIGHT = 1e-9  # of a star: a fit needs finite errors
 
 
+@takes(matches=Matches, model=DistortionModel, rejection=Rejection, compute=Compute)
 def fit_by_magnitude(
     matches: Matches,
     model: DistortionModel,

@@ -30,6 +30,7 @@ from bayesdist.infer.stars.loading import opened
 from bayesdist.infer.stars.mixture import OutlierMixture
 from bayesdist.infer.stars.shards import Compute, Shards
 from bayesdist.infer.stars.stars import Stars
+from bayesdist.utils.arguments import takes
 from bayesdist.utils.memory import require_memory
 
 STEPS_KEPT = 100  # at least, of each walker
@@ -38,6 +39,7 @@ FORMAT = 3  # of the checkpoints
 ENGINES = ("emcee", "numba", "numpy", "scipy")  # another version may compute other bits
 
 
+@takes(fit=LinearFit, matches=(Matches, Shards), outliers=OutlierMixture, compute=Compute)
 @one_thread
 def sample(
     fit: LinearFit,
