@@ -12,6 +12,8 @@ from bayesdist.app.store.rundir import RunDirectory
 
 X, Y = (a.ravel() for a in np.meshgrid(np.linspace(1, 1000, 9), np.linspace(1, 800, 7)))
 
+pytestmark = pytest.mark.filterwarnings("ignore::bayesdist.errors.BayesdistWarning")
+
 
 def test_a_run_has_the_calibration_that_it_exports(finished):
     with open_results(RunDirectory(finished.path)) as results:

@@ -14,6 +14,7 @@ from astropy.wcs import WCS
 
 import bayesdist as bd
 from bayesdist.calibration.calibration import Calibration, calibration_of
+from bayesdist.errors import BayesdistWarning
 from bayesdist.formats import describe, lint, list_formats
 from bayesdist.products.formats.common.document import Choice
 from bayesdist.products.registry import open_document, product_settings
@@ -25,6 +26,7 @@ SCALE_MAS = 110.0
 EXACT = 1e-9  # pixels
 # pixels by which positions of a file may differ: seven digits of WISE's entries over 508 pixels;
 # tables state their rounding and what lies between their nodes
+pytestmark = pytest.mark.filterwarnings("ignore::bayesdist.errors.BayesdistWarning")
 LIMITS = {"wise_meta": 1e-4, "sip": 1e-6}
 TABLES = ("cpdis", "stdgdc")
 HOLD_TABLES = ("cpdis", "jwst", "roman", "stdgdc")
@@ -304,3 +306,13 @@ def test_a_header_without_its_size_asks_for_it(tmp_path):
 def test_a_calibration_is_shown_in_one_line(calibration, text):
     shown = repr(calibration)
     assert text in shown and shown.startswith("<Calibration '") and "\n" not in shown
+
+
+def test_what_other_programs_will_make_of_a_file_is_warned_of_once(tmp_path):
+    """The warning is that of the caller's line."""
+    with pytest.warns(BayesdistWarning) as caught:
+        IN_PIXELS.write("sip", tmp_path / "camera.hdr", scale_mas=50)
+    texts = [str(one.message) for one in caught]
+    assert len(texts) == len(set(texts)) and all("camera.hdr: " in text for text in texts)
+    assert any("CRVAL is a placeholder" in text for text in texts)
+    assert {one.filename for one in caught} == {__file__}
