@@ -22,11 +22,11 @@ from bayesdist.products.registry import open_document, product_settings
 from .support import PIXEL, StandIn, on_sky, some_covariance, some_solution, wfc_model
 from .test_formats import SETTINGS, calibration_for
 
+pytestmark = pytest.mark.filterwarnings("ignore::bayesdist.errors.BayesdistWarning")
 SCALE_MAS = 110.0
 EXACT = 1e-9  # pixels
 # pixels by which positions of a file may differ: seven digits of WISE's entries over 508 pixels;
 # tables state their rounding and what lies between their nodes
-pytestmark = pytest.mark.filterwarnings("ignore::bayesdist.errors.BayesdistWarning")
 LIMITS = {"wise_meta": 1e-4, "sip": 1e-6}
 TABLES = ("cpdis", "stdgdc")
 HOLD_TABLES = ("cpdis", "jwst", "roman", "stdgdc")
