@@ -50,10 +50,9 @@ class Margin:
         The limit minus the value that the statistic stays at or under with the probability asked
         for: not negative if and only if `probability_met` is at least that probability.
     probability_met : float
-        Probability that the limit is met, if all errors are as stated: the fraction of draws at or
-        under it.  It is given for an undecided requirement as well; there the reason says why it
-        cannot be relied on.  Without `diagnostics`, for example, errors that the residuals would
-        show are in no draw.
+        Probability that the limit is met by the known errors: the fraction of draws at or under it.
+        It may be 1 where the verdict is 'undecided', because the residuals were not examined, for
+        example, or an error of the catalogue is not stated: other errors are in no draw.
     mc_error : float
         Monte-Carlo standard error of `probability_met`.
     verdict : str
@@ -124,10 +123,12 @@ class Margin:
         r = self.requirement
         where = "" if self.epoch is None else f" in {self.epoch:.2f}"
         scope = f" {r.scope}" if r.scope else ""
+        known = " by the known errors alone" if self.verdict == "undecided" else ""
         value = rounded(self.value, (self.interval[1] - self.interval[0]) / 4)
         return (
             f"{r.name}: {self.verdict}: {r.statistic}{scope}{where} {value} {r.unit}, "
-            f"limit {r.limit:g} {r.unit}, {self.probability_words}, {r.probability:g} asked for: "
+            f"limit {r.limit:g} {r.unit}, {self.probability_words}{known}, "
+            f"{r.probability:g} asked for: "
             f"{self.reason}"
         )
 
