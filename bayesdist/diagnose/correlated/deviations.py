@@ -52,7 +52,6 @@ MAX_EXPOSURES = 40
 # there
 COARSE, REFINED = (12, 8, 6, 5), (30, 18, 11, 6)
 RANGE = 10.0  # range of amplitudes about the prior's median and the resolution of the data
-ITERATIONS = 12  # of the scatter, to find the exposures that went wrong
 WIDE = 100.0  # times the amplitudes that are expected: as good as free
 MIN_OF_OTHERS = 5  # exposures: of fewer, none can be told from the others
 NEGLIGIBLE = 1e-3  # of the density, below the largest of an amplitude
@@ -426,14 +425,14 @@ def _outlying(columns: DeviationColumns, S: Float, score: Float, index: Int, sca
     while (out[which].any(axis=1)).sum() <= MOST_OUTLYING * E:
         tight: Bool = np.logical_not(out[which].any(axis=1))
         spread = np.where(out > 0, out, WIDE * scale[index])
-        for step in range(ITERATIONS):  # to the most probable scatter of the others
-            mean, cov = _given(S, score, spread)
-            if step == 0:
-                b = mean[which] - np.median(mean[which][tight], axis=0)
-            squares = (mean**2 + np.diag(cov))[which]
-            sizes = np.array([np.sqrt(np.mean(squares[tight][:, kind == k])) for k in kind])
-            if step + 1 < ITERATIONS:
-                spread[which[tight]] = np.maximum(sizes, 1e-3 * scale[kind])
+        mean, _ = _given(S, score, spread)
+        b = mean[which] - np.median(mean[which][tight], axis=0)
+        # an exposure that went wrong would raise a scatter that is not robust, and excuse itself
+        robust = (1.4826 * np.median(np.abs(b[tight]), axis=0)) ** 2
+        sizes = np.sqrt([np.mean(robust[kind == k]) for k in kind])
+        spread[which[tight]] = np.maximum(sizes, 1e-2 * scale[kind])
+        mean, cov = _given(S, score, spread)
+        squares = (mean**2 + np.diag(cov))[which]
         odds = np.full(E, -np.inf)
         for e in np.flatnonzero(tight):
             rows = which[e]

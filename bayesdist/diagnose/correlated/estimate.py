@@ -114,8 +114,8 @@ def estimate_discrepancy(
         information, working, chips, near, priors, pixel, n_draws, rng
     )
     linear = linear_deviations(information, working, priors, n_draws, rng, exposures=exposures)
-    if linear is not None and parameter_priors is not None:
-        dates = dates_of_exposures(working)
+    if linear is not None and parameter_priors is not None and model.frames != "none":
+        dates = _dates_of_exposures(working)
         correlation = correlated_hierarchy(
             model, mean, working.covariance, parameter_priors, dates, n_draws, rng
         )
@@ -157,7 +157,7 @@ def estimate_discrepancy(
     return Discrepancy(model, mean, formal, noise, found, theta, linear, facts, fields)
 
 
-def dates_of_exposures(information: Information) -> Float:
+def _dates_of_exposures(information: Information) -> Float:
     """Dates (E,) of the exposures of a model, decimal years; NaN for one without stars."""
     groups = information.sums.groups
     out = np.full(len(information.model.exposures), np.nan)

@@ -19,7 +19,6 @@ from typing import Any
 import numpy as np
 import scipy.linalg
 
-from bayesdist.diagnose.correlated.deviations import ITERATIONS
 from bayesdist.diagnose.correlated.exposure_products import (
     LENGTHS,
     SECOND_ORDER,
@@ -44,6 +43,7 @@ from bayesdist.model.basis import polynomial_terms
 from bayesdist.utils.arrays import Float, Int
 
 STEPS = 40  # of an amplitude
+ITERATIONS = 12  # of the scatter, to find the exposures that went wrong
 WIDE = 30.0  # times what the data resolve: as good as free
 RANGE = 10.0  # range of amplitudes about the prior's median and what the data resolve
 SHAPE = 0.3  # by which the correlation at a separation may differ from that of a Matern field
