@@ -17,7 +17,7 @@ import scipy.linalg
 from numpy.typing import NDArray
 
 from bayesdist.diagnose.correlated.information import GroupCells, Information
-from bayesdist.diagnose.correlated.priors import DiscrepancyPriors, log_half_cauchy, log_widths
+from bayesdist.diagnose.correlated.priors import DiscrepancyPriors, log_half_t, log_widths
 from bayesdist.diagnose.efficient import EfficientScore
 from bayesdist.model import DistortionModel, Groups
 from bayesdist.model.frames import LINEAR_MATRICES
@@ -277,7 +277,7 @@ def deviation_draws(
             _, factor, z = conditional(np.array(amplitude))
             density[at] = 0.5 * z @ z - np.log(np.diag(factor)).sum()
             density[at] += sum(
-                log_half_cauchy(a, medians[name]) for a, name in zip(amplitude, names, strict=True)
+                log_half_t(a, medians[name]) for a, name in zip(amplitude, names, strict=True)
             )
         weight = np.exp(density - density.max()) * reduce(np.multiply, widths)
         return np.asarray(weight / weight.max())

@@ -112,7 +112,7 @@ def estimate_discrepancy(
         information, working, chips, near, priors, pixel, n_draws, rng
     )
     linear = linear_deviations(information, working, priors, n_draws, rng, exposures=exposures)
-    formal, noise = working.covariance, working.sandwich()
+    formal, noise = working.covariance, working.squared_scores().by_evidence
     if repeated is not None:
         noise = noise + repeated.covariance(model, mean, formal)
         facts["star_rms"] = repeated.rms

@@ -12,11 +12,13 @@ import math
 from dataclasses import dataclass, fields
 
 import numpy as np
+from scipy.special import stdtrit
 
 from bayesdist.errors import InputError
 from bayesdist.utils.arrays import Float
 
-TERM_STEPS = 24  # of the amplitude of the higher orders
+TERM_STEPS = 30  # of the amplitude of the higher orders
+STRUCTURE_DOF = 0.25
 
 
 @dataclass(frozen=True)
@@ -49,8 +51,8 @@ class DiscrepancyPriors:
         For a median that is not positive.
     """
 
-    higher_order: float = 3e-4
-    structure: float = 1.5e-4
+    higher_order: float = 1e-5
+    structure: float = 5e-6
     exposure: float = 3e-6
     curvature: float = 5e-8
     star: float = 1e-3
@@ -66,23 +68,24 @@ class DiscrepancyPriors:
                 )
 
 
-def log_widths(grid: Float) -> Float:
+def log_widths(grid: Float, *, beyond: float = 1.0) -> Float:
     """Logarithms of the weights of ascending amplitudes in an integral over their logarithm.
 
-    They are those of the trapezoidal rule, plus the mass of a half-Cauchy density beyond both ends:
-    it falls in proportion to the amplitude, or its inverse.
+    They are those of the trapezoidal rule, plus the mass beyond both ends of a half-Cauchy density,
+    which is proportional to the amplitude there, or to its inverse.  `beyond` is the mass beyond
+    the upper end in units of the density there: 0 for a density that ends at the last amplitude.
     """
     x = np.log(grid)
     width = np.empty(len(x))
     width[1:-1] = (x[2:] - x[:-2]) / 2
-    width[0], width[-1] = (x[1] - x[0]) / 2 + 1, (x[-1] - x[-2]) / 2 + 1
+    width[0], width[-1] = (x[1] - x[0]) / 2 + 1, (x[-1] - x[-2]) / 2 + beyond
     return np.asarray(np.log(width))
 
 
-def log_half_cauchy(value: Float, median: float) -> Float:
-    """Log density of log(value), up to a constant."""
-    z = np.asarray(value, float) / median
-    return np.asarray(np.log(z) - np.log1p(z**2))
+def log_half_t(value: Float, median: float, dof: float = 1.0) -> Float:
+    """Log density of log(value), up to a constant, if value is half-t with this median."""
+    z = np.asarray(value, float) * (stdtrit(dof, 0.75) / median)
+    return np.asarray(np.log(z) - (dof + 1) / 2 * np.log1p(z**2 / dof))
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,9 +103,11 @@ class AmplitudeGrid:
     ) -> AmplitudeGrid:
         """Grid about prior medians, and about what the information (T,) of single terms resolves.
 
-        `noise` is the typical error of one star, a few times which limits the amplitudes.
+        `noise` is the typical error of one star, jitter included, which limits the amplitudes: the
+        scatter of the residuals holds the structure too.
         """
         resolved = 1 / np.sqrt(max(float(np.median(information)), 1e-300))
-        low, high = 0.2 * min(higher_order, structure, resolved), max(3 * noise, 10 * structure)
-        terms = np.geomspace(low, 3 * high, TERM_STEPS)
-        return cls(low, high, terms, log_half_cauchy(terms, higher_order) + log_widths(terms))
+        low, high = 0.2 * min(higher_order, structure, resolved), max(noise, 10 * structure)
+        terms = np.geomspace(low, high, TERM_STEPS)
+        log_prior = log_half_t(terms, higher_order, STRUCTURE_DOF)
+        return cls(low, high, terms, log_prior + log_widths(terms, beyond=0.0))

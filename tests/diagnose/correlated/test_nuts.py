@@ -8,10 +8,12 @@ import numpy as np
 import pytest
 from numpy.polynomial.legendre import legvander2d
 from scipy.stats import kurtosis
+from scipy.stats import t as student_t
 
 from bayesdist.diagnose.correlated import DiscrepancyPriors
 from bayesdist.diagnose.correlated.deviations import DeviationColumns, deviation_draws
 from bayesdist.diagnose.correlated.functions import StructureFunctions
+from bayesdist.diagnose.correlated.priors import STRUCTURE_DOF
 from bayesdist.diagnose.correlated.structure import LENGTHS, structure_posterior
 from tests.infer.by_nuts import needs_numpyro, nuts_draws
 from tests.reduced import only_in_full
@@ -114,9 +116,9 @@ def test_structure(found, capsys):
     stars, poly, every, points = (jnp.array(z) for z in (data, P, B, at))
     centre, spread = (jnp.array(z) for z in (np.linalg.lstsq(P, data, rcond=None)[0].T, root))
 
-    def half_cauchy(t, median):
-        z = jnp.exp(t) / median
-        return jnp.log(z) - jnp.log1p(z**2)
+    def half_t(t, median):
+        z = jnp.exp(t) / median * student_t(STRUCTURE_DOF).ppf(0.75)
+        return jnp.log(z) - (STRUCTURE_DOF + 1) / 2 * jnp.log1p(z**2 / STRUCTURE_DOF)
 
     def density():
         flat = dist.ImproperUniform(dist.constraints.real, (), (2, len(POWERS)))
@@ -131,8 +133,8 @@ def test_structure(found, capsys):
         inside = 1 - 0.5 * (jnp.exp(np.log(low) - a[0]) + jnp.exp(a[0] - np.log(high)))
         apart = jnp.log(0.5) - jnp.abs(a[0] - a[1])
         rms = 0.5 * jnp.log(0.5 * jnp.exp(2 * a).sum())
-        alike = jnp.log(0.8) + half_cauchy(a[0], medians["structure"]) + apart - jnp.log(inside)
-        unlike = jnp.log(0.2) + half_cauchy(rms, medians["structure"]) + apart
+        alike = jnp.log(0.8) + half_t(a[0], medians["structure"]) + apart - jnp.log(inside)
+        unlike = jnp.log(0.2) + half_t(rms, medians["structure"]) + apart
         logs, fields = [], []
         for prior, sizes in ((alike, a[jnp.array([0, 0])]), (unlike, a)):
             for spectrum in spectra:
@@ -140,7 +142,7 @@ def test_structure(found, capsys):
                 logs.append(prior - 0.5 * ((base - z @ every[:, T:].T) ** 2).sum() / SIGMA**2)
                 fields.append(jnp.concatenate([z_terms, z], axis=1) @ points.T)
         logs = jnp.stack(logs)
-        numpyro.factor("posterior", half_cauchy(of_terms, medians["higher_order"]))
+        numpyro.factor("posterior", half_t(of_terms, medians["higher_order"]))
         numpyro.factor("mixture", jax.scipy.special.logsumexp(logs))
         pick = numpyro.sample("pick", dist.Uniform())
         which = jnp.searchsorted(jnp.cumsum(jax.nn.softmax(logs)), pick)
