@@ -32,7 +32,7 @@ from tests.infer.support import draw_prior
 from .places import one_thread
 
 ORDER, STARS = 3, 1500
-MOST = 3 * SIGMA  # amplitudes beyond are not looked for
+MOST = SIGMA  # the prior of amplitudes ends at the error of a star
 STATISTICS = ("rms", "p95", "max")
 AT = [(k, k) for k in (0, 4, 8, 12, 16)]  # of the grid: a corner, the middle, the other corner
 EXACT = {
@@ -56,7 +56,7 @@ def structure(rng: np.random.Generator) -> fields.Field:
     priors, size = DiscrepancyPriors(), float(fields.SIDE)
     functions = StructureFunctions.for_stars(ORDER, (size, size), STARS)
     length = float(rng.choice(LENGTHS))
-    of_terms = half_t(rng, priors.higher_order, 3 * MOST)
+    of_terms = half_t(rng, priors.higher_order, MOST)
     sizes = np.full(2, half_t(rng, priors.structure, MOST))
     if rng.uniform() < UNLIKE:
         # the rms of both is half-t, the logarithm of their ratio double exponential

@@ -1,5 +1,7 @@
 """Runs of many sizes whose truth is in the fitted family, against the exact posterior.
 
+`python -m tests.coverage.sizes RESULTS.jsonl --seeds 10` makes the table of docs/validation.md.
+
 The errors of the stars are normal, independent and as quoted, the map is a polynomial of the fitted
 order, and exposures differ by the shift and rotation that are fitted to them.  The exact posterior
 is then that of least squares: its covariance is computed here with numpy alone.
@@ -7,9 +9,13 @@ is then that of least squares: its covariance is computed here with numpy alone.
 
 from __future__ import annotations
 
+import argparse
+import json
+import logging
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from functools import cached_property
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -113,7 +119,8 @@ class Inside:
         quoted, size = np.full(self.size.stars, SIGMA), self.size
         columns: dict[str, Any] = {}
         if size.chips > 1:
-            columns["chip_number"] = self.chip + 1
+            columns["chip"] = self.chip
+            columns["chip_numbers"] = tuple(range(1, size.chips + 1))
         if size.exposures > 1:
             columns["exposure"] = self.exposure
             columns["exposure_names"] = tuple(f"e{k:02d}" for k in range(size.exposures))
@@ -286,3 +293,31 @@ def _cells(runs: list[Compared], most: float | None) -> list[str]:
         f"{met} of {sum(run.exactly_met for run in runs)}",
         str(sum(run.verdict == "missed" for run in runs)),
     ]
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(prog="python -m tests.coverage.sizes", description=__doc__)
+    parser.add_argument("results", type=Path, help="file of JSON lines; what it holds is kept")
+    parser.add_argument("--seeds", type=int, default=10, help="truths of each size (default 10)")
+    parser.add_argument("--most", type=int, default=10**9, help="largest number of stars")
+    a = parser.parse_args()
+    logging.getLogger("bayesdist").setLevel(logging.ERROR)
+    runs = dict[tuple[Size, int], Compared]()
+    if a.results.exists():
+        for line in a.results.read_text().splitlines():
+            row = json.loads(line)
+            seed, size = row.pop("seed"), Size(**row.pop("size"))
+            runs[size, seed] = Compared(size, **row | {"within": tuple(row["within"])})
+    with a.results.open("a") as file:
+        for seed in range(a.seeds):
+            for size in SIZES:
+                if (size, seed) not in runs and size.stars <= a.most:
+                    runs[size, seed] = compared(size, seed)
+                    row = asdict(runs[size, seed]) | {"seed": seed}
+                    file.write(json.dumps(row) + "\n")
+                    file.flush()
+    print(table_of(run for size in SIZES for run in runs.values() if run.size == size))
+
+
+if __name__ == "__main__":
+    main()

@@ -42,7 +42,11 @@ MAX_EXPOSURES = 40
 # steps in each amplitude, by the number of scatters: first to find where the density is, then only
 # there
 COARSE, REFINED = (12, 8, 6, 5), (30, 18, 11, 6)
-RANGE = 10.0  # range of amplitudes about the prior's median and the resolution of the data
+# amplitudes range from this fraction of the prior's median or of what the data resolve, the smaller
+LEAST = 1 / 3
+# up to multiples of the median and of what the data resolve, the larger
+MOST, MOST_RESOLVED = 100.0, 10.0
+MOST_CURVATURE = 10.0  # of the median: few dates say nothing of it
 NEGLIGIBLE = 1e-3  # of the density, below the largest of an amplitude
 
 
@@ -256,8 +260,9 @@ def deviation_draws(
         known = np.diag(S)[index == k]
         known = known[known > 1e-8 * max(float(known.max()), 1e-300)]
         resolved = 1 / np.sqrt(np.median(known)) if known.size else medians[name]
-        low = min(medians[name], resolved) / RANGE
-        high = RANGE * max(medians[name], resolved if resolved < 1e-2 else 0.0)
+        low = LEAST * min(medians[name], resolved)
+        high = (MOST_CURVATURE if name == CURVATURE else MOST) * medians[name]
+        high = max(high, MOST_RESOLVED * resolved if resolved < 1e-2 else 0.0)
         grids.append(np.geomspace(low, high, COARSE[len(names) - 1]))
     values, vectors = np.linalg.eigh(S)
     S = (vectors * np.maximum(values, 0.0)) @ vectors.T

@@ -1,9 +1,17 @@
-"""Priors of the discrepancy: half-Cauchy distributions of a few amplitudes.
+"""Priors of the discrepancy: half-t distributions of a few amplitudes.
 
-A half-Cauchy distribution has most of its weight below its scale and a tail that falls as the
-inverse square, so that it neither insists on a discrepancy where the data exclude one nor resists
-where they show one (Gelman 2006, Bayesian Analysis 1, 515; Polson and Scott 2012, ibid. 7, 887).
-The scale is the median.
+A calibration either is nearly free of a discrepancy or shows one of any size up to the errors of
+single stars, so the priors have their bulk at small amplitudes and heavy tails (as those of
+half-Cauchy scales: Gelman 2006, Bayesian Analysis 1, 515; Carvalho, Polson and Scott 2010,
+Biometrika 97, 465).  A larger median widens the errors of calibrations that show nothing; a lighter
+tail resists a discrepancy that stars begin to show.  Tails differ by what the data say:
+
+- structure: half-t with `STRUCTURE_DOF` degrees of freedom, nearly flat in the logarithm from the
+  median up to the error of a star, where it ends.  It moves aside as soon as stars show structure.
+- scatter of exposures, curvature of drifts, errors of catalogue stars: half-Cauchy.  Two or three
+  exposures say little of a scatter, and a heavier tail would be most of what is stated.
+
+The scale is given by the median.
 """
 
 from __future__ import annotations
@@ -18,6 +26,7 @@ from bayesdist.errors import InputError
 from bayesdist.utils.arrays import Float
 
 TERM_STEPS = 30  # of the amplitude of the higher orders
+# Half of the calibrations have structure above the median, and one in 13 above 2000 times as much.
 STRUCTURE_DOF = 0.25
 
 
@@ -25,10 +34,11 @@ STRUCTURE_DOF = 0.25
 class DiscrepancyPriors:
     """Prior medians of the discrepancy's amplitudes.
 
-    The defaults are below what published calibrations leave in residuals (0.01 to 0.03 pixels rms
-    in ACS ISR 2015-06 after its look-up tables, 0.02 in the WISE partition pattern of WSDC D-T033,
-    scale changes of some 1e-5 from exposure to exposure for HST): the tail of the distribution
-    reaches these, and its bulk does not widen the errors of a calibration that shows nothing.
+    The defaults are far below what published calibrations leave in residuals (0.01 to 0.03 pixels
+    rms in ACS ISR 2015-06 after its look-up tables, 0.02 in the WISE partition pattern of WSDC
+    D-T033, scale changes of some 1e-5 from exposure to exposure for HST): the tail of the
+    distribution reaches these, and its bulk does not widen the errors of a calibration that shows
+    nothing.
 
     Parameters
     ----------
@@ -53,7 +63,7 @@ class DiscrepancyPriors:
 
     higher_order: float = 1e-5
     structure: float = 5e-6
-    exposure: float = 3e-6
+    exposure: float = 3e-7
     curvature: float = 5e-8
     star: float = 1e-3
 

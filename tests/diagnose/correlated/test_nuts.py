@@ -110,7 +110,7 @@ def test_structure(found, capsys):
 
     grid = posterior.terms_amplitude
     low = 0.01 * float(grid[0])
-    high = max(3 * SIGMA, 10 * medians["structure"])
+    high = max(SIGMA, 10 * medians["structure"])
     decline = jnp.array(functions.decline())
     spectra = jnp.array(np.stack([np.sqrt(functions.spectrum(s)) for s in LENGTHS]))
     stars, poly, every, points = (jnp.array(z) for z in (data, P, B, at))
@@ -126,7 +126,7 @@ def test_structure(found, capsys):
         terms = numpyro.sample("terms", dist.Normal(0, 1).expand((2, T)))
         sines = numpyro.sample("sines", dist.Normal(0, 1).expand((2, m - T)))
         within = dist.Uniform(np.log(low), np.log(high))
-        of_terms = numpyro.sample("of_terms", dist.Uniform(np.log(low), np.log(3 * high)))
+        of_terms = numpyro.sample("of_terms", dist.Uniform(np.log(low), np.log(high)))
         a = jnp.stack([numpyro.sample(f"of_field_{k}", within) for k in "uv"])
         z_terms = jnp.exp(of_terms) * decline * terms
         base = stars.T - theta @ poly.T - z_terms @ every[:, :T].T
