@@ -227,7 +227,7 @@ class Compared:
     exactly_met: bool  # whether the exact posterior meets it with the probability that is asked
 
 
-def compared(size: Size, seed: int, settings: dict[str, Any] | None = None) -> Compared:
+def compared(size: Size, seed: int) -> Compared:
     """A truth carried through a run in memory."""
     truth = Inside.drawn(size, seed)
     middle = (SIDE + 1) / 2
@@ -239,8 +239,7 @@ def compared(size: Size, seed: int, settings: dict[str, Any] | None = None) -> C
         frames="shift_rotation" if size.frames else "none",
         catalogue=EXACT,
         seed=seed + 1,
-        settings={"sampler": {"target_ess": 400}, "assess": {"grid": GRID, "draws": DRAWS}}
-        | (settings or {}),
+        settings={"sampler": {"target_ess": 400}, "assess": {"grid": GRID, "draws": DRAWS}},
     )
     total = run.budget().total
     stated = np.column_stack([total.u, total.v])
