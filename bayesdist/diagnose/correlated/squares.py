@@ -49,18 +49,20 @@ class SquaredScores:
         """Weight of the sandwich: 0 if the stars show no differences of their variances.
 
         With d the squared distance of the unbiased sum from `scale` times the expected one, and b
-        the part of d that is due to the scatter of single squares, it is max(0, 1 - b / d), the
-        weight of linear shrinkage with the least expected squared error (Ledoit and Wolf 2004,
-        Journal of Multivariate Analysis 88, 365; James and Stein's estimator as an empirical Bayes
-        estimate: Efron and Morris 1973, Journal of the American Statistical Association 68, 117).
-        Distances are measured in units of the likelihood's covariance, which takes the place of
-        Ledoit and Wolf's identity matrix, so that parameters may be chosen in any way.
+        the part of d that is due to the scatter of single squares, 1 - b / d is the weight of
+        linear shrinkage with the least expected squared error (Ledoit and Wolf 2004, Journal of
+        Multivariate Analysis 88, 365; James and Stein's estimator as an empirical Bayes estimate:
+        Efron and Morris 1973, Journal of the American Statistical Association 68, 117).  It is
+        doubled, since errors that are too small are worse than errors that are too large: the
+        sandwich stands alone once chance explains less than half of the difference.  Distances are
+        measured in units of the likelihood's covariance, which takes the place of Ledoit and Wolf's
+        identity matrix, so that parameters may be chosen in any way.
         """
         whitened = self.covariance @ (self.unbiased - self.scale * self.expected)
         distance = float(np.sum(whitened * whitened.T))
         squares, crossed, expected = self.products
         by_chance = squares - 2 * self.scale * crossed + self.scale**2 * expected
-        return max(0.0, 1.0 - by_chance / distance) if distance > 0 else 0.0
+        return float(np.clip(2 * (1 - by_chance / distance), 0.0, 1.0)) if distance > 0 else 0.0
 
     def sandwich(self, weight: float = 1.0) -> Float:
         """Covariance (D, D) with this weight of the jackknife, the rest that of the likelihood."""

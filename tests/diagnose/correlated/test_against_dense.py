@@ -39,7 +39,7 @@ def test_the_information_is_that_of_all_stars(lone):
     np.testing.assert_allclose(information.score, J.T @ r / SIGMA**2, rtol=1e-7, atol=1e-5)
 
 
-def test_the_sandwich_is_hc3_and_its_weight_that_of_ledoit_and_wolf(lone):
+def test_the_sandwich_is_hc3_and_its_weight_twice_that_of_ledoit_and_wolf(lone):
     """With the hat matrix and every star's product of scores written out."""
     information, J, r = lone
     inverse = np.linalg.inv(J.T @ J)
@@ -64,15 +64,14 @@ def test_the_sandwich_is_hc3_and_its_weight_that_of_ledoit_and_wolf(lone):
     factor = np.trace(unbiased.sum(axis=0)) / np.trace(of_each.sum(axis=0))
     assert squares.scale == pytest.approx(factor / SIGMA**2, rel=1e-8)
     left = unbiased - factor * of_each
-    weight = 1 - np.sum(left**2) / np.sum(left.sum(axis=0) ** 2)
-    assert squares.weight == pytest.approx(max(0.0, weight), abs=1e-8)
+    weight = np.clip(2 * (1 - np.sum(left**2) / np.sum(left.sum(axis=0) ** 2)), 0.0, 1.0)
+    assert squares.weight == pytest.approx(weight, abs=1e-8)
     mixed = weight * jackknife.sum(axis=0) + (1 - weight) * factor * np.eye(len(root))
-    if weight > 0:
-        np.testing.assert_allclose(
-            squares.by_evidence / np.outer(scale, scale),
-            root @ mixed @ root.T / np.outer(scale, scale),
-            atol=1e-7,
-        )
+    np.testing.assert_allclose(
+        squares.by_evidence / np.outer(scale, scale),
+        root @ mixed @ root.T / np.outer(scale, scale),
+        atol=1e-7,
+    )
 
 
 def test_sines_are_orthogonal_to_the_polynomials_over_the_chip():

@@ -68,7 +68,7 @@ def test_stars_that_are_alike_have_the_covariance_of_the_likelihood(n, order):
     # the scale is known to 1 / sqrt(2 (2 n - D)), 0.05 in a data set of 100 stars
     assert 0.9 < by_evidence < 1.1
     assert jackknife > 1.05
-    assert np.mean(weights) < 0.25
+    assert np.mean(weights) < 0.4
 
 
 @pytest.mark.parametrize("noise", [worse_corner, worse_axis])
@@ -81,7 +81,7 @@ def test_stars_that_differ_have_the_covariance_of_the_sandwich(noise):
         ratios.append(stated / variances(fit, exact(fit, table, noise)).mean())
         weights.append(squares.weight)
     assert np.sqrt(np.mean(ratios)) == pytest.approx(1.0, abs=0.1)
-    assert np.min(weights) > 0.6
+    assert np.min(weights) > 0.9
 
 
 def test_few_stars_that_differ_are_covered():
