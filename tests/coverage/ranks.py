@@ -12,6 +12,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import numpy as np
+from scipy.stats import t as student_t
 
 from bayesdist.app.results import errors_of, margins_of
 from bayesdist.assess import Requirement
@@ -19,6 +20,7 @@ from bayesdist.assess.domain import EvaluationDomain
 from bayesdist.assess.statistics import field_statistic
 from bayesdist.diagnose.correlated import DiscrepancyPriors
 from bayesdist.diagnose.correlated.functions import StructureFunctions
+from bayesdist.diagnose.correlated.priors import STRUCTURE_DOF
 from bayesdist.diagnose.correlated.structure import LENGTHS, UNLIKE
 from bayesdist.infer import OutlierMixture
 from bayesdist.model.grid import grid_pixels, mesh
@@ -30,7 +32,7 @@ from tests.infer.support import draw_prior
 from .places import one_thread
 
 ORDER, STARS = 3, 1500
-MOST = 3 * SIGMA  # amplitudes beyond are not looked for
+MOST = SIGMA  # the prior of amplitudes ends at the error of a star
 STATISTICS = ("rms", "p95", "max")
 AT = [(k, k) for k in (0, 4, 8, 12, 16)]  # of the grid: a corner, the middle, the other corner
 EXACT = {
@@ -42,8 +44,9 @@ EXACT = {
 }
 
 
-def half_cauchy(rng: np.random.Generator, median: float, most: float) -> float:
-    while (value := median * abs(rng.standard_cauchy())) > most:
+def half_t(rng: np.random.Generator, median: float, most: float) -> float:
+    scale = median / student_t(STRUCTURE_DOF).ppf(0.75)
+    while (value := scale * abs(rng.standard_t(STRUCTURE_DOF))) > most:
         pass
     return float(value)
 
@@ -53,10 +56,10 @@ def structure(rng: np.random.Generator) -> fields.Field:
     priors, size = DiscrepancyPriors(), float(fields.SIDE)
     functions = StructureFunctions.for_stars(ORDER, (size, size), STARS)
     length = float(rng.choice(LENGTHS))
-    of_terms = half_cauchy(rng, priors.higher_order, 3 * MOST)
-    sizes = np.full(2, half_cauchy(rng, priors.structure, MOST))
+    of_terms = half_t(rng, priors.higher_order, MOST)
+    sizes = np.full(2, half_t(rng, priors.structure, MOST))
     if rng.uniform() < UNLIKE:
-        # the rms of both is half-Cauchy, the logarithm of their ratio double exponential
+        # the rms of both is half-t, the logarithm of their ratio double exponential
         apart = np.exp(rng.laplace(size=1) * [0.5, -0.5])
         sizes *= apart / np.sqrt(np.mean(apart**2))
     waves = functions.finer_waves(rng)

@@ -24,7 +24,7 @@ from bayesdist.diagnose.correlated.exposure_time import (
     correlation_root,
 )
 from bayesdist.diagnose.correlated.information import GroupCells, Information
-from bayesdist.diagnose.correlated.priors import DiscrepancyPriors, log_half_cauchy, log_widths
+from bayesdist.diagnose.correlated.priors import DiscrepancyPriors, log_half_t, log_widths
 from bayesdist.diagnose.efficient import EfficientScore
 from bayesdist.infer.exposures.hierarchy import MOST_OUTLYING
 from bayesdist.infer.exposures.scatter import OUTLYING, OUTLYING_FRACTION
@@ -51,9 +51,13 @@ MAX_EXPOSURES = 40
 # steps in each amplitude, by the number of scatters: first to find where the density is, then only
 # there
 COARSE, REFINED = (12, 8, 6, 5), (30, 18, 11, 6)
-RANGE = 10.0  # range of amplitudes about the prior's median and the resolution of the data
 WIDE = 100.0  # times the amplitudes that are expected: as good as free
 MIN_OF_OTHERS = 5  # exposures: of fewer, none can be told from the others
+# amplitudes range from this fraction of the prior's median or of what the data resolve, the smaller
+LEAST = 1 / 3
+# up to multiples of the median and of what the data resolve, the larger
+MOST, MOST_RESOLVED = 100.0, 10.0
+MOST_CURVATURE = 10.0  # of the median: few dates say nothing of it
 NEGLIGIBLE = 1e-3  # of the density, below the largest of an amplitude
 
 
@@ -281,8 +285,9 @@ def deviation_draws(
         known = np.diag(S)[index == k]
         known = known[known > 1e-8 * max(float(known.max()), 1e-300)]
         resolved = 1 / np.sqrt(np.median(known)) if known.size else medians[name]
-        low = min(medians[name], resolved) / RANGE
-        high = RANGE * max(medians[name], resolved if resolved < 1e-2 else 0.0)
+        low = LEAST * min(medians[name], resolved)
+        high = (MOST_CURVATURE if name == CURVATURE else MOST) * medians[name]
+        high = max(high, MOST_RESOLVED * resolved if resolved < 1e-2 else 0.0)
         grids.append(np.geomspace(low, high, COARSE[len(names) - 1]))
     values, vectors = np.linalg.eigh(S)
     S = (vectors * np.maximum(values, 0.0)) @ vectors.T
@@ -308,7 +313,7 @@ def deviation_draws(
                 _, factor, z = conditional(k, np.array(amplitude))
                 log = 0.5 * z @ z - np.log(np.diag(factor)).sum() + np.log(root.prior)
                 density[(k, *at)] = log + sum(
-                    log_half_cauchy(a, medians[name])
+                    log_half_t(a, medians[name])
                     for a, name in zip(amplitude, names, strict=True)
                 )
         weight = np.exp(density - density.max()) * reduce(np.multiply, widths)

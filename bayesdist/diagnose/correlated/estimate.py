@@ -132,7 +132,7 @@ def estimate_discrepancy(
             model, prepared, likelihood, near_stars.exposure[order], codes
         )
     fields = exposure_fields(information, working, detections, priors, n_draws, rng)
-    formal, noise = working.covariance, working.sandwich()
+    formal, noise = working.covariance, working.squared_scores().by_evidence
     if repeated is not None:
         noise = noise + repeated.covariance(model, mean, formal)
         facts["star_rms"] = repeated.rms

@@ -31,7 +31,7 @@ from bayesdist.diagnose.correlated.functions import FINE, StructureFunctions, le
 from bayesdist.diagnose.correlated.information import GroupCells, Information
 from bayesdist.diagnose.correlated.priors import (
     DiscrepancyPriors,
-    log_half_cauchy,
+    log_half_t,
     log_widths,
 )
 from bayesdist.infer.exposures.hierarchy import MOST_OUTLYING
@@ -296,7 +296,7 @@ def _second_order_draws(
         min(median, resolved) / RANGE, RANGE * max(median, resolved, largest), STEPS
     )
     log = np.array([sum(terms.given(tau).log_evidence for terms in chips) for tau in grid])
-    log += log_half_cauchy(grid, median) + log_widths(grid)
+    log += log_half_t(grid, median) + log_widths(grid)
     weight = np.exp(log - log.max())
     which = rng.permutation(np.repeat(np.arange(STEPS), rng.multinomial(n, weight / weight.sum())))
     for k in np.unique(which):
@@ -360,7 +360,7 @@ def _field_draws(
     log = np.empty((len(LENGTHS), STEPS))
     for k, length in enumerate(LENGTHS):
         log[k] = sum(_log_likelihood(chip, grid, length) for chip in chips)
-    log += log_half_cauchy(grid, median) + log_widths(grid)
+    log += log_half_t(grid, median) + log_widths(grid)
     weight = np.exp(log - log.max()).ravel()
     counts = rng.multinomial(n, weight / weight.sum())
     which = rng.permutation(np.repeat(np.arange(len(counts)), counts))

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from bayesdist.data.matches import Matches
-from bayesdist.diagnose.correlated.priors import log_half_cauchy
+from bayesdist.diagnose.correlated.priors import log_half_t
 from bayesdist.infer.catalogue.star_sums import StarSums, influence_by_group
 from bayesdist.infer.stars.likelihood import Likelihood
 from bayesdist.infer.stars.stars import Stars, prepare
@@ -70,7 +70,7 @@ def shared_stars(
     g_u, g_v, h_uu, h_uv, h_vv = likelihood.scores(stars)
     good = (h_uu > 0) & (h_vv > 0)
     size = np.geomspace(median / RANGE, median * RANGE, STEPS)
-    log_density = log_half_cauchy(size, median)
+    log_density = log_half_t(size, median)
     summed = []
     for g, h in ((g_u, h_uu), (g_v, h_vv)):
         top, bottom = (np.bincount(code[good], w[good], minlength=len(repeated)) for w in (g, h))

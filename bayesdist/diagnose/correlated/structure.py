@@ -23,7 +23,12 @@ import numpy as np
 
 from bayesdist.diagnose.correlated.functions import FINE, StructureFunctions
 from bayesdist.diagnose.correlated.neighbours import SharedVariance
-from bayesdist.diagnose.correlated.priors import AmplitudeGrid, log_half_cauchy, log_widths
+from bayesdist.diagnose.correlated.priors import (
+    STRUCTURE_DOF,
+    AmplitudeGrid,
+    log_half_t,
+    log_widths,
+)
 from bayesdist.utils.arrays import Float, Int
 
 Shared = TypeVar("Shared")
@@ -297,7 +302,7 @@ def _refined(
     sized = [at(a) for a in grid]
     for _ in range(HALVINGS):
         tops = np.array([(prior + one.views).max(axis=1) for one in sized])
-        tops += log_half_cauchy(np.exp(grid), median)[:, None]
+        tops += log_half_t(np.exp(grid), median, STRUCTURE_DOF)[:, None]
         best = tops.max(axis=0)  # of this length: a peak may lie between two points
         # part by part only where they may differ
         several = len(best) - 1
@@ -320,16 +325,18 @@ def _density(sized: Sequence[_Sized], median: float) -> Float:
     (n, TERM_STEPS) for one part, (n, n, TERM_STEPS) for two.
     """
     amplitude = np.array([one.amplitude for one in sized])
-    width = log_widths(amplitude)
+    width = log_widths(amplitude, beyond=0.0)
     evidence = np.stack([one.evidence for one in sized], axis=1)
     if len(evidence) == 1:
-        return np.asarray((log_half_cauchy(amplitude, median) + width)[:, None] + evidence[0])
+        return np.asarray(
+            (log_half_t(amplitude, median, STRUCTURE_DOF) + width)[:, None] + evidence[0]
+        )
     u, v = evidence
     both = np.add.outer(amplitude**2, amplitude**2) / 2
     apart = np.abs(np.subtract.outer(np.log(amplitude), np.log(amplitude)))
     differ = np.log(UNLIKE / 2) - apart + width
     np.fill_diagonal(differ, np.log(1 - UNLIKE))
-    density = log_half_cauchy(np.sqrt(both), median) + width[:, None] + differ
+    density = log_half_t(np.sqrt(both), median, STRUCTURE_DOF) + width[:, None] + differ
     return np.asarray(density[..., None] + u[:, None] + v)
 
 

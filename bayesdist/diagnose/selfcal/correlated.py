@@ -21,7 +21,7 @@ from bayesdist.diagnose.selfcal.eliminated import (
     eliminated,
     without_parameters,
 )
-from bayesdist.diagnose.selfcal.sandwich import sandwich
+from bayesdist.diagnose.selfcal.sandwich import squared_scores
 from bayesdist.diagnose.selfcal.scores import score_excess, scores_of_detections
 from bayesdist.infer.equations.scaled import one_thread
 from bayesdist.infer.selfcal.mode import SelfCalibrationMode
@@ -49,7 +49,7 @@ def selfcal_discrepancy(
     working = scores_of_detections(solution)
     flat = working.flattened(score_excess(solution, working))
     cov = solution.cov
-    noise, ratio = not_narrower(sandwich(solution, working), cov)
+    noise, ratio = not_narrower(squared_scores(solution, working).by_evidence, cov)
 
     some = EvenStars.of(solution)
     flat, working = flat.at(some.rows), working.at(some.rows)
