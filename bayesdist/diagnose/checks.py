@@ -15,7 +15,7 @@ from bayesdist.diagnose.score.result import ScoreTest
 from bayesdist.infer import LinearFit
 from bayesdist.infer.exposures.frame_choice import frames_that_help
 from bayesdist.infer.posterior.checks import fit_checks, pixel_doubt
-from bayesdist.utils.checks import LARGER, Check
+from bayesdist.utils.checks import EITHER, LARGER, Check
 from bayesdist.utils.limits import (
     CHI2_TOO_LARGE,
     EXPOSURE_CHI2,
@@ -30,6 +30,7 @@ from bayesdist.utils.numbers import count, number, percent, probability, size_of
 
 FIT, HELD_OUT, SCORE_TESTS = "Fit", "Held-out truth", "Score tests"
 MATCHING, ASSUMPTIONS = "Matching", "Assumptions"
+DISPLACING = ("shape", "matching")  # groups of score tests
 
 
 def input_checks(
@@ -124,12 +125,14 @@ def matching_checks(
 
 
 def structure_checks(
-    misfits: Sequence[Misfit], correlated: Discrepancy | None = None
+    misfits: Sequence[Misfit],
+    correlated: Discrepancy | None = None,
+    tests: Sequence[ScoreTest] = (),
 ) -> Iterator[Check]:
     """Checks of the structure that a fit leaves in the residuals.
 
     There is one misfit for each chip, or none; `correlated` errors of the solution hold some of the
-    structure.
+    structure. Score `tests` may have found where it comes from.
     """
     if not misfits:
         return
@@ -148,6 +151,9 @@ def structure_checks(
         sentence = f"{one.finding}, and the budget holds {what} of it"
         if correlated is None:
             sentence = one.sentence
+        if displacing(tests):
+            sentence += "; it may come from residuals that are lopsided or cut, of which score "
+            sentence += "tests have found some"
         if (held or 0.0) < STRUCTURE_IN_BUDGET.value * one.structure:
             doubt = LARGER
     yield Check(
@@ -181,16 +187,20 @@ def score_checks(
 ) -> Iterator[Check]:
     """Checks of what targeted tests have found, one for each remedy, or that they found nothing.
 
-    Verdicts stand where correlated errors hold what the tests have found.
+    Verdicts stand where correlated errors hold what the tests have found.  Noise is held by the
+    sandwich covariance, unless the residuals are lopsided or the match radius has cut them: that
+    covariance holds the scatter of a solution, and not its displacement.
     """
     limit = f"p at least {number(SCORE_LIMIT.value, 1)}"
     found: dict[str, list[ScoreTest]] = {}
     for test in tests:
         if test.significant:
             found.setdefault(test.remedy, []).append(test)
+    displaced = displacing(tests)
     for remedy, several in found.items():
         sentence = f"{'; '.join(test.finding for test in several)}: {remedy}"
-        doubt = "" if all(_held(correlated, test) for test in several) else LARGER
+        doubts = {test.doubt for test in several if not _held(correlated, test, displaced)}
+        doubt = EITHER if EITHER in doubts else LARGER if doubts else ""
         names = ", ".join(test.name for test in several)
         value = "; ".join(
             f"{size_of(test.size, test.unit, 2)} rms, {probability(test.p_value)}"
@@ -202,14 +212,22 @@ def score_checks(
         yield Check(SCORE_TESTS, name, "nothing found", limit, "pass")
 
 
-def _held(correlated: Discrepancy | None, test: ScoreTest) -> bool:
-    """True where correlated errors hold what a test has found."""
+def displacing(tests: Sequence[ScoreTest]) -> bool:
+    """True where tests have found residuals that displace the solution, as noise does not."""
+    return any(test.significant and test.group in DISPLACING for test in tests)
+
+
+def _held(correlated: Discrepancy | None, test: ScoreTest, displaced: bool) -> bool:
+    """True where correlated errors hold what a test has found.
+
+    `displaced`: whether the residuals displace the solution.
+    """
     if correlated is None:
         return False
     scatter = set() if correlated.linear is None else set(correlated.linear.scatter)
     held = {
         "": False,
-        "noise": True,
+        "noise": not displaced,
         "structure": bool(correlated.structure),
         "exposures": bool(scatter - {CURVATURE}),
         "curvature": CURVATURE in scatter,

@@ -15,7 +15,8 @@ from bayesdist.diagnose.score.regressor_tests import regressor_tests
 from bayesdist.diagnose.score.regressors import functions_for
 from bayesdist.diagnose.score.result import ScoreTest, corrected
 from bayesdist.diagnose.score.sample import scored_sample
-from bayesdist.diagnose.score.truncation import truncation_test
+from bayesdist.diagnose.score.shape import shape_tests
+from bayesdist.diagnose.score.truncation import radius_test, truncation_test
 from bayesdist.infer.equations.priors import GaussianPriors
 from bayesdist.infer.solution.solution import Solution
 
@@ -54,18 +55,20 @@ def score_tests(
         was fitted.
     """
     projection = projection_of(
-        functions_for(scored_sample(table, solution)),
+        functions_for(scored_sample(table, solution, match_radius)),
         np.asarray(solution.mean, float),
         priors or GaussianPriors.none(solution.model),
     )
     sample = projection.scored
     found = [
+        truncation_test(sample, match_radius),
+        radius_test(sample),
+        *shape_tests(sample),
         *regressor_tests(projection),
         gap_test(projection),
         motion_test(sample),
         *noise_tests(sample),
         exposure_test(projection),
         pattern_test(sample),
-        truncation_test(sample, match_radius),
     ]
     return corrected([one for one in found if one is not None])

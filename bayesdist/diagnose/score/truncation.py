@@ -1,10 +1,14 @@
-"""Test for matches that are missing at large radii: residuals that end too abruptly.
+"""Tests of the match radius: residuals that end too abruptly, or elsewhere than it says.
 
 Matching takes no pair beyond its radius.  Where that cuts into the true matches, their residuals
 are too small: the errors seem too large, chi-square is too small, and so is the scatter that
 everything else is judged by.  Errors that are merely quoted too large shrink all residuals alike;
 so the scale of the residuals is taken from themselves, and the question is how many of them should
 lie beyond the last ones that there are.
+
+The likelihood of false matches, and of the circle about nominal positions, takes the radius as it is
+stated.  Where matches were cut at a smaller one, the likelihood expects some beyond the last ones
+that there are; where they were not cut at it, there are matches beyond it.
 """
 
 from __future__ import annotations
@@ -18,10 +22,27 @@ from scipy import optimize, special
 from bayesdist.diagnose.score.result import Family, Outcome
 from bayesdist.diagnose.score.sample import ScoredSample
 from bayesdist.diagnose.significance import chi_square_of
+from bayesdist.infer.kernel import GAUSSIAN, UNIFORM
 from bayesdist.utils.arrays import Float, Int
+from bayesdist.utils.checks import EITHER
+from bayesdist.utils.limits import SCORE_TESTS
 
 TRUNCATION = Family(
-    "truncation", "match again with a wider radius", "", "the residuals do not end abruptly"
+    "truncation",
+    "match again with a wider radius",
+    "",
+    "the residuals do not end abruptly",
+    group="matching",
+    cause="the match radius",
+)
+RADIUS = Family(
+    "match radius",
+    "",
+    "",
+    "the matches end where the stated match radius says",
+    group="matching",
+    cause="the match radius",
+    doubt=EITHER,
 )
 MIN_STARS = 50
 LARGEST_LEVERAGE = 0.5
@@ -29,7 +50,13 @@ MAX_FRACTION_BEYOND = 0.25  # of the expected number: with more, nothing ends at
 STARS_PER_PART = 150  # with errors alike, from which their scatter is measured
 MAX_PARTS = 12
 MIN_EXPECTED = 0.5  # expected matches whose absence says nothing
+MOST_TESTS = 100  # score tests of a run, at most
 BEYOND = (0, 3)  # stars that may lie beyond a radius: the edge need not be sharp
+INSIDE = 0.9  # of the stated radius: matches that end nearer to it are not said to end elsewhere
+# Without nominal positions, of which residuals are measured from others: how far beyond the stated
+# radius they may lie, in radii, and which fraction of the false ones.
+NEAR = 1.25
+STRAY = 0.01
 NODES, WEIGHTS = np.polynomial.hermite_e.hermegauss(15)
 ANGLES = (np.arange(8) + 0.5) * np.pi / 16  # of a quarter of the circle
 
@@ -108,6 +135,59 @@ class _Radii:
         return float(np.sqrt(np.average(self.variance.mean(axis=0) * excess, weights=count)))
 
 
+@dataclass(frozen=True, eq=False)
+class _Distances:
+    """Distances of the matches from where they were looked for, and those that are expected."""
+
+    distance: Float  # (N,) from the nominal position, or from the model's where there is none
+    offset: Float  # (N,) of the model's position from there; 0 without nominal positions
+    variance: Float  # (N,) of a true match along an axis, the larger one
+    radius: float  # as is stated
+    fraction: float  # of false matches
+    wide: float | None  # variance of false matches; None where they are even within the circle
+
+    @classmethod
+    def of(cls, sample: ScoredSample, radius: float) -> _Distances | None:
+        """Distances of a sample; None where its likelihood has no false matches."""
+        constants = sample.mixture
+        if constants is None or constants.kind not in (GAUSSIAN, UNIFORM):
+            return None
+        seen, offset = sample.residual, np.zeros(len(sample))
+        if sample.from_nominal is not None:
+            seen = sample.from_nominal
+            offset = np.hypot(*(seen - sample.residual))
+        fraction, wide = (float(np.ravel(c)[0]) for c in (np.exp(constants.log_f), constants.out))
+        return cls(
+            np.hypot(*seen),
+            offset,
+            sample.variance.max(axis=0),
+            radius,
+            fraction,
+            wide if constants.kind == GAUSSIAN else None,
+        )
+
+    def expected(self, radius: float) -> tuple[float, float]:
+        """Numbers of true and of false matches between a radius and the stated one."""
+        n = len(self.distance)
+        true = (1.0 - self.fraction) * _between(radius, self.radius, self.offset, self.variance)
+        if self.wide is None:
+            share = np.full(n, 1.0 - (radius / self.radius) ** 2)
+        else:
+            share = _between(radius, self.radius, self.offset, np.full(n, self.wide))
+        return float(true.sum()), float(self.fraction * share.sum())
+
+
+def _between(low: float, high: float, offset: Float, variance: Float) -> Float:
+    """Probability (N,) that round Gaussians about offsets, within a radius, are beyond a smaller one.
+
+    Offsets and variances are (N,).
+    """
+    inner, outer = (
+        special.chndtr(radius**2 / variance, 2, offset**2 / variance) for radius in (low, high)
+    )
+    return np.asarray(np.where(outer > 0, 1.0 - inner / np.maximum(outer, 1e-300), 0.0))
+
+
 def _weights(sample: ScoredSample) -> Float:
     """Probabilities (N,) of true matches, without those whose residuals the fit has taken."""
     leverage = np.broadcast_to(sample.leverage, sample.score.shape)
@@ -166,6 +246,105 @@ def truncation_test(sample: ScoredSample, match_radius: float | None) -> Outcome
         partial(_smallest, sigma, n, len(found)),
         sample.model.unit,
     )
+
+
+def radius_test(sample: ScoredSample) -> Outcome | None:
+    """Test whether the matches end at the match radius that is stated.
+
+    None without such a radius, and for less than `MIN_STARS` matches.
+    """
+    radius = sample.match_radius
+    if radius is None or len(sample) < MIN_STARS:
+        return None
+    if sample.from_nominal is None:
+        beyond = np.hypot(*sample.residual)
+        far = beyond[beyond > NEAR * radius]
+        false = float((1.0 - sample.inlier).sum())
+        p_value = float(special.gammainc(len(far), STRAY * false + 0.5)) if len(far) else 1.0
+        if p_value < SCORE_TESTS.value / MOST_TESTS:
+            return _beyond_radius(sample, radius, far, p_value)
+    distances = _Distances.of(sample, radius)
+    if distances is None:
+        return None
+    deficits = []
+    for k, end in _ends(distances.distance):
+        true, false = distances.expected(min(end, radius))
+        spread = false / max(true + false, 1e-300) / np.sqrt(max(false, 1.0))
+        deficits.append(_Deficit(true + false, k, end, sample.model.unit, float(spread)))
+    worst = min(deficits, key=lambda deficit: (deficit.p_value, -deficit.expected))
+    p_value = min(1.0, len(deficits) * worst.p_value)
+    if worst.radius > INSIDE * radius:
+        p_value = 1.0
+    return _ends_inside(sample, radius, worst, p_value)
+
+
+def _ends_inside(
+    sample: ScoredSample, radius: float, deficit: _Deficit, p_value: float
+) -> Outcome:
+    """Outcome of a test whose matches end at a radius that may be smaller than the stated one."""
+    unit, n = sample.model.unit, len(sample)
+    centre, columns = "nominal positions", ""
+    if sample.from_nominal is None:
+        centre, columns = "the solution", ", and give the columns u_nominal and v_nominal"
+    remedy = (
+        f"state outliers.match_radius = {_rounded_up(deficit.radius)}, or the radius that the "
+        f"matches were cut at{columns}"
+    )
+    present = (
+        f"the matches end {deficit.radius:.3g} {unit} from {centre}, far inside the stated match "
+        f"radius of {radius:.3g}: {deficit.expected:.3g} matches are expected beyond, most of them "
+        f"false, and there are {deficit.beyond}"
+    )
+
+    def smallest(level: float) -> float:
+        needed = -np.log(level / len(BEYOND))
+        return float(deficit.radius * np.sqrt(min(needed / n, 1.0) / 2))
+
+    # of the matches that are missing, if they lie just beyond the others
+    size = deficit.radius * np.sqrt(deficit.expected / n / 2)
+    return Outcome(
+        replace(RADIUS, present=present, remedy=remedy),
+        chi_square_of(p_value, 1),
+        1,
+        None,
+        p_value,
+        float(size),
+        smallest,
+        unit,
+    )
+
+
+def _beyond_radius(
+    sample: ScoredSample, radius: float, far: Float, p_value: float
+) -> Outcome:
+    """Outcome of a test that has found matches far beyond the stated radius."""
+    unit, n = sample.model.unit, len(sample)
+    largest = float(far.max())
+    present = (
+        f"{len(far)} of {n} residuals are larger than {NEAR:g} times the stated match radius of "
+        f"{radius:.3g} {unit}, up to {largest:.3g}"
+    )
+    remedy = (
+        "state as outliers.match_radius the radius that the matches were cut at, some "
+        f"{_rounded_up(largest)}, or leave out what lies beyond it"
+    )
+    size = float(np.sqrt((far**2).sum() / (2 * n)))
+    return Outcome(
+        replace(RADIUS, present=present, remedy=remedy),
+        chi_square_of(p_value, 1),
+        1,
+        None,
+        p_value,
+        size,
+        lambda level: size,
+        unit,
+    )
+
+
+def _rounded_up(radius: float) -> str:
+    """Three digits of a radius, not below it."""
+    step = 10.0 ** (np.floor(np.log10(radius)) - 2)
+    return f"{np.ceil(radius / step) * step:.3g}"
 
 
 def _in_sigmas(radii: _Radii) -> list[_Deficit]:
