@@ -12,7 +12,8 @@ matches with a wide scatter of their own.  Nothing else is assumed of the noise;
 detections of a star are independent, and vary by their own squares.
 
 Terms of the polynomials that the model may lack, up to two orders above its own, and low terms of
-each exposure are taken from the residuals before.
+each exposure are taken from the residuals before. Where these are larger than the errors, nothing is
+said of the shape.
 """
 
 from __future__ import annotations
@@ -69,7 +70,13 @@ TWO_CORES = replace(
 TERMS = ((0, 0), (1, 0), (0, 1), (1, 1), (2, 0), (0, 2))
 AREA = np.array([1 / ((2 * i + 1) * (2 * j + 1)) for i, j in TERMS])  # mean squares
 HIGHER = 2  # orders above the model's that are taken from the residuals
-STARS_PER_TERM = 10  # of polynomials that are taken from the residuals
+STARS_PER_TERM = 6  # of polynomials that are taken from the residuals
+# How much smaller the residuals may be without these polynomials: where the model lacks more, their
+# shape is that of what it lacks.
+MOST_MISSING = 1.3
+PASSES = 4  # of a robust fit
+RIDGE = 1e-12  # of normal equations, relative
+TINY = 1e-300
 MIN_STARS = 100  # of a chip, for any test
 MIN_STARS_OF_EXPOSURE = 200  # for a test of its own
 LARGEST_LEVERAGE = 0.5
@@ -97,6 +104,7 @@ class _Chip:
     exposure: Int  # (n,)
     sigma: float  # usual error along an axis, in the unit of u and v
     size: tuple[float, float]  # pixels
+    free: float = 1.0  # degrees of freedom of the residuals, over their number
 
     @property
     def n_stars(self) -> int:
@@ -165,8 +173,14 @@ def _chips(sample: ScoredSample) -> Iterator[_Chip]:
             float(np.sqrt(np.median(variance))),
             chip.size,
         )
-        part = _without_means(part, sample.model.order)
-        scale = float(np.sqrt(part.inlier @ (part.z**2).sum(axis=0) / (2 * part.inlier.sum())))
+        order = _higher_order(sample.model.order, part.n_stars)
+        if order == sample.model.order:
+            continue
+        z, before = _without_means(part, order), _scale(part.z)
+        if before > MOST_MISSING * _scale(z):
+            continue
+        part = replace(part, z=z, free=1.0 - len(polynomial_terms(order)) / part.n_stars)
+        scale = _scale(part.z, part.inlier)
         part = replace(part, z=part.z / scale, sigma=part.sigma * scale)
         if free is not None:  # of the disc about the solution that lies in the match circle
             reach = free[rows] / (scale * np.sqrt(variance.max(axis=0)))
@@ -195,16 +209,17 @@ def _legendre(X: Float, Y: Float, terms: tuple[tuple[int, int], ...]) -> Float:
     return np.asarray(legendre.legvander(X, i.max())[:, i] * legendre.legvander(Y, j.max())[:, j])
 
 
-def _without_means(chip: _Chip, order: int) -> _Chip:
-    """Residuals less the polynomials that the model may lack, and low terms of each exposure."""
-    orders = [
-        total
-        for total in range(order + 1, order + HIGHER + 1)
-        if STARS_PER_TERM * len(polynomial_terms(total)) <= chip.n_stars
-    ]
-    z = chip.z
-    if orders:
-        z = _smoothed_away(_legendre(chip.X, chip.Y, polynomial_terms(orders[-1])), z, chip.inlier)
+def _higher_order(order: int, n_stars: int) -> int:
+    """Highest order above that of the model that so many stars determine; else the model's."""
+    for total in range(order + HIGHER, order, -1):
+        if STARS_PER_TERM * len(polynomial_terms(total)) <= n_stars:
+            return total
+    return order
+
+
+def _without_means(chip: _Chip, order: int) -> Float:
+    """Residuals (2, n) less polynomials up to an order, and low terms of each exposure."""
+    z = _smoothed_away(_legendre(chip.X, chip.Y, polynomial_terms(order)), chip.z)
     codes, of = np.unique(chip.exposure, return_inverse=True)
     if len(codes) > 1:
         z = z.copy()
@@ -213,15 +228,30 @@ def _without_means(chip: _Chip, order: int) -> _Chip:
             low = [n for n in (2, 1, 0) if STARS_PER_TERM * len(polynomial_terms(n)) <= len(rows)]
             if low:
                 F = _legendre(chip.X[rows], chip.Y[rows], polynomial_terms(low[0]))
-                z[:, rows] = _smoothed_away(F, z[:, rows], chip.inlier[rows])
-    return replace(chip, z=z)
+                z[:, rows] = _smoothed_away(F, z[:, rows])
+    return z
 
 
-def _smoothed_away(F: Float, z: Float, weight: Float) -> Float:
-    """Residuals z (2, n) less their weighted fit by functions F (n, K)."""
-    root = np.sqrt(weight)
-    c = np.linalg.lstsq(F * root[:, None], (z * root).T, rcond=None)[0]
-    return np.asarray(z - (F @ c).T)
+def _smoothed_away(F: Float, z: Float) -> Float:
+    """Residuals z (2, n) less their robust fit by functions F (n, K)."""
+    left, ridge = z, RIDGE * np.eye(F.shape[1])
+    for _ in range(PASSES):
+        weight = np.exp(-(left**2).sum(axis=0) / (2 * (REST * _scale(left)) ** 2))
+        WF = F * weight[:, None]
+        normal = WF.T @ F
+        left = z - (F @ np.linalg.solve(normal + np.trace(normal) * ridge, WF.T @ z.T)).T
+    return np.asarray(left)
+
+
+def _scale(z: Float, weight: Float | None = None) -> float:
+    """Scatter along an axis of residuals (2, n), by the weighted median of their squares."""
+    square = (z**2).sum(axis=0)
+    if weight is None:
+        return float(np.sqrt(max(np.median(square), TINY) / (2 * np.log(2))))
+    order = np.argsort(square)
+    total = np.cumsum(weight[order])
+    median = square[order][np.searchsorted(total, total[-1] / 2)]
+    return float(np.sqrt(max(median, TINY) / (2 * np.log(2))))
 
 
 def _displacements(z: Float) -> tuple[tuple[Float, Float], tuple[Float, Float]]:
@@ -344,7 +374,12 @@ def _correlated(chip: _Chip) -> _Part | None:
         step = np.linalg.inv(F.T @ F) * chip.sigma / (2 * unit)
     except (np.linalg.LinAlgError, ZeroDivisionError):
         return None
-    return _Part.of(F * (product - product.mean())[:, None] @ step, chip.star, AREA[1:])
+    part = _Part.of(F * (product - product.mean())[:, None] @ step, chip.star, AREA[1:])
+    if part is None:
+        return None
+    # what the fit takes from all residuals together correlates them: the variance of sums of their
+    # products is larger than the squares of these show, by the inverse of what is left
+    return replace(part, statistic=part.statistic * chip.free)
 
 
 def _patch(chips: list[_Chip], unit: str) -> Outcome | None:
