@@ -35,9 +35,10 @@ from bayesdist.utils.distributions import beta_sf, chi2_sf, norm_isf, norm_sf
 
 GROUP = "shape"
 REMEDY = (
-    "exposures or visits without a label, blends, ghosts or charge-transfer tails make such "
-    "residuals: give the exposure of each star and fit frames, or cut the stars that are "
-    "displaced; a higher order or larger errors do not help"
+    "exposures or visits without a label, blends, ghosts, charge-transfer tails, or a match radius "
+    "that cuts true matches make such residuals: give the exposure of each star and fit frames, "
+    "cut the stars that are displaced, or give u_nominal and v_nominal; a higher order or larger "
+    "errors do not help"
 )
 SKEWNESS = Family(
     "skewness by position",

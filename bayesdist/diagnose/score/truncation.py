@@ -22,7 +22,7 @@ from scipy import optimize, special
 from bayesdist.diagnose.score.result import Family, Outcome
 from bayesdist.diagnose.score.sample import ScoredSample
 from bayesdist.diagnose.significance import chi_square_of
-from bayesdist.infer.kernel import GAUSSIAN, UNIFORM
+from bayesdist.infer.kernel import GAUSSIAN
 from bayesdist.utils.arrays import Float, Int
 from bayesdist.utils.checks import EITHER
 from bayesdist.utils.limits import SCORE_TESTS
@@ -53,6 +53,11 @@ MIN_EXPECTED = 0.5  # expected matches whose absence says nothing
 MOST_TESTS = 100  # score tests of a run, at most
 BEYOND = (0, 3)  # stars that may lie beyond a radius: the edge need not be sharp
 INSIDE = 0.9  # of the stated radius: matches that end nearer to it are not said to end elsewhere
+CLEAR = 4.5  # errors beyond which a match is clearly false, if errors are not larger than quoted
+MIN_FALSE = 8
+SHARE = 0.9  # of the clearly false ones, that lie within what is called their end
+FAR = 1.5  # median of their squared distances beyond those of true ones, over the largest of these:
+# that of Student's t with four degrees of freedom is 0.4
 # Without nominal positions, of which residuals are measured from others: how far beyond the stated
 # radius they may lie, in radii, and which fraction of the false ones.
 NEAR = 1.25
@@ -136,56 +141,61 @@ class _Radii:
 
 
 @dataclass(frozen=True, eq=False)
-class _Distances:
-    """Distances of the matches from where they were looked for, and those that are expected."""
+class _FalseMatches:
+    """Matches that are clearly false, by their distances from where they were looked for."""
 
-    distance: Float  # (N,) from the nominal position, or from the model's where there is none
-    offset: Float  # (N,) of the model's position from there; 0 without nominal positions
-    variance: Float  # (N,) of a true match along an axis, the larger one
-    radius: float  # as is stated
-    fraction: float  # of false matches
-    wide: float | None  # variance of false matches; None where they are even within the circle
+    square: Float  # (m,) squared distances, ascending
+    hidden2: float  # squared distance up to which true ones hide them
+    gaussian: bool  # whether the likelihood takes their distances for Gaussian
 
     @classmethod
-    def of(cls, sample: ScoredSample, radius: float) -> _Distances | None:
-        """Distances of a sample; None where its likelihood has no false matches."""
-        constants = sample.mixture
-        if constants is None or constants.kind not in (GAUSSIAN, UNIFORM):
+    def of(
+        cls, distance: Float, residual: Float, sigma: Float, *, gaussian: bool
+    ) -> _FalseMatches | None:
+        """By distances (N,), sizes of the residuals (N,) and errors along an axis (N,).
+
+        None for fewer than `MIN_FALSE`.
+        """
+        clear = residual > CLEAR * sigma
+        if clear.sum() < MIN_FALSE:
             return None
-        seen, offset = sample.residual, np.zeros(len(sample))
-        if sample.from_nominal is not None:
-            seen = sample.from_nominal
-            offset = np.hypot(*(seen - sample.residual))
-        fraction, wide = (float(np.ravel(c)[0]) for c in (np.exp(constants.log_f), constants.out))
-        return cls(
-            np.hypot(*seen),
-            offset,
-            sample.variance.max(axis=0),
-            radius,
-            fraction,
-            wide if constants.kind == GAUSSIAN else None,
-        )
+        square = np.sort(distance[clear]) ** 2
+        return cls(square, min(float(np.median((CLEAR * sigma) ** 2)), square[-1] / 2), gaussian)
 
-    def expected(self, radius: float) -> tuple[float, float]:
-        """Numbers of true and of false matches between a radius and the stated one."""
-        n = len(self.distance)
-        true = (1.0 - self.fraction) * _between(radius, self.radius, self.offset, self.variance)
-        if self.wide is None:
-            share = np.full(n, 1.0 - (radius / self.radius) ** 2)
-        else:
-            share = _between(radius, self.radius, self.offset, np.full(n, self.wide))
-        return float(true.sum()), float(self.fraction * share.sum())
+    @property
+    def end2(self) -> float:
+        """Squared distance within which `SHARE` of them lie."""
+        return float(self.square[int(np.ceil(SHARE * len(self.square))) - 1])
 
+    @property
+    def numbers(self) -> tuple[int, int, float]:
+        """Numbers in the outer half of the area within the end, and beyond; where that begins."""
+        middle2 = (self.hidden2 + self.end2) / 2
+        beyond = int((self.square > self.end2).sum())
+        return int((self.square > middle2).sum()) - beyond, beyond, middle2
 
-def _between(low: float, high: float, offset: Float, variance: Float) -> Float:
-    """Probability (N,) that round Gaussians about offsets, within a radius, are beyond a smaller one.
+    def expected(self, radius: float) -> float:
+        """Number beyond the end if they are even within a radius."""
+        outer, _, middle2 = self.numbers
+        return outer * (radius**2 - self.end2) / (self.end2 - middle2)
 
-    Offsets and variances are (N,).
-    """
-    inner, outer = (
-        special.chndtr(radius**2 / variance, 2, offset**2 / variance) for radius in (low, high)
-    )
-    return np.asarray(np.where(outer > 0, 1.0 - inner / np.maximum(outer, 1e-300), 0.0))
+    def p_value(self, radius: float) -> float:
+        """Probability of so few beyond the end if they are even within a radius.
+
+        At least that of their distances if these are Gaussian, or a long tail of those of the true
+        ones: they become few by themselves.
+        """
+        if self.end2 > (INSIDE * radius) ** 2 or self.end2 <= self.hidden2:
+            return 1.0
+        outer, beyond, middle2 = self.numbers
+        share = (radius**2 - self.end2) / (radius**2 - middle2)
+        even = float(special.bdtr(beyond, outer + beyond, share))
+        over = self.square.clip(self.hidden2) - self.hidden2
+        if not self.gaussian and np.median(over) > FAR * self.hidden2:
+            return even
+        # squares of Gaussian distances are exponential, those of other tails longer
+        largest = -np.expm1(-over[-1] / max(float(over.mean()), 1e-300))
+        return max(even, float(largest ** len(over)))
 
 
 def _weights(sample: ScoredSample) -> Float:
@@ -263,55 +273,71 @@ def radius_test(sample: ScoredSample) -> Outcome | None:
         p_value = float(special.gammainc(len(far), STRAY * false + 0.5)) if len(far) else 1.0
         if p_value < SCORE_TESTS.value / MOST_TESTS:
             return _beyond_radius(sample, radius, far, p_value)
-    distances = _Distances.of(sample, radius)
-    if distances is None:
-        return None
-    deficits = []
-    for k, end in _ends(distances.distance):
-        true, false = distances.expected(min(end, radius))
-        spread = false / max(true + false, 1e-300) / np.sqrt(max(false, 1.0))
-        deficits.append(_Deficit(true + false, k, end, sample.model.unit, float(spread)))
-    worst = min(deficits, key=lambda deficit: (deficit.p_value, -deficit.expected))
-    p_value = min(1.0, len(deficits) * worst.p_value)
-    if worst.radius > INSIDE * radius:
-        p_value = 1.0
-    return _ends_inside(sample, radius, worst, p_value)
+    return _ends_inside(sample, radius)
 
 
-def _ends_inside(
-    sample: ScoredSample, radius: float, deficit: _Deficit, p_value: float
-) -> Outcome:
-    """Outcome of a test whose matches end at a radius that may be smaller than the stated one."""
+def _ends_inside(sample: ScoredSample, radius: float) -> Outcome:
+    """Outcome of a test whose matches may end inside the stated radius."""
     unit, n = sample.model.unit, len(sample)
-    centre, columns = "nominal positions", ""
-    if sample.from_nominal is None:
-        centre, columns = "the solution", ", and give the columns u_nominal and v_nominal"
+    residual, sigma = np.hypot(*sample.residual), np.sqrt(sample.variance.max(axis=0))
+    # by the median: false matches within the circle are taken for larger errors if its area is wrong
+    ratio = float(np.median(residual / sigma)) / np.sqrt(2 * np.log(2))
+    distance, centre, columns = residual, "the solution", ", and give u_nominal and v_nominal"
+    if sample.from_nominal is not None:
+        distance, centre, columns = np.hypot(*sample.from_nominal), "nominal positions", ""
+    false = _FalseMatches.of(
+        distance,
+        residual,
+        sigma * min(ratio, 1.0),
+        gaussian=sample.mixture is not None and sample.mixture.kind == GAUSSIAN,
+    )
+    cut = _cut_by_circle(sample, distance)
+    p_false = 1.0 if false is None else false.p_value(radius)
+    p_value = min(1.0, 2 * min(p_false, cut.p_value))
+    largest = float(distance.max())
+    if false is not None and p_false <= cut.p_value:
+        end, expected = np.sqrt(false.end2), false.expected(radius)
+        beyond = false.numbers[1]
+        kind = "false"
+    else:
+        end, expected, beyond = cut.radius, cut.expected, cut.beyond
+        kind = "true"
+    if largest > INSIDE * radius:
+        largest = end
     remedy = (
-        f"state outliers.match_radius = {_rounded_up(deficit.radius)}, or the radius that the "
-        f"matches were cut at{columns}"
+        f"state outliers.match_radius = {_rounded_up(largest)}, or the radius that the matches "
+        f"were cut at{columns}"
     )
     present = (
-        f"the matches end {deficit.radius:.3g} {unit} from {centre}, far inside the stated match "
-        f"radius of {radius:.3g}: {deficit.expected:.3g} matches are expected beyond, most of them "
-        f"false, and there are {deficit.beyond}"
+        f"the matches end far inside the stated match radius of {radius:.3g} {unit}: "
+        f"{expected:.3g} {kind} ones are expected beyond {end:.3g} {unit} from {centre}, and there "
+        f"are {beyond}"
     )
+    size = end * np.sqrt(max(expected - beyond, 0.0) / n / 2) if p_value < 1 else 0.0
+    return _radius_outcome(replace(RADIUS, present=present, remedy=remedy), sample, p_value, size)
 
-    def smallest(level: float) -> float:
-        needed = -np.log(level / len(BEYOND))
-        return float(deficit.radius * np.sqrt(min(needed / n, 1.0) / 2))
 
-    # of the matches that are missing, if they lie just beyond the others
-    size = deficit.radius * np.sqrt(deficit.expected / n / 2)
-    return Outcome(
-        replace(RADIUS, present=present, remedy=remedy),
-        chi_square_of(p_value, 1),
-        1,
-        None,
-        p_value,
-        float(size),
-        smallest,
-        unit,
-    )
+def _cut_by_circle(sample: ScoredSample, distance: Float) -> _Deficit:
+    """True matches that are missing beyond the largest distances (N,) from nominal positions."""
+    unit = sample.model.unit
+    nothing = _Deficit(0.0, 0, float(distance.max()), unit, 0.0)
+    if sample.from_nominal is None or sample.match_radius is None:
+        return nothing
+    offset = np.hypot(*(sample.from_nominal - sample.residual))
+    variance = sample.variance.max(axis=0)
+    deficits = [nothing]
+    for k, end in _ends(distance):
+        if end > INSIDE * sample.match_radius:
+            continue
+        # of round Gaussians about the offsets
+        tail = 1.0 - special.chndtr(end**2 / variance, 2, offset**2 / variance)
+        total = float(sample.inlier @ tail)
+        # the logarithm of a tail goes with that of the variance by some half its square
+        relative = np.sqrt(1.0 / max(float(sample.inlier.sum()), 1.0))
+        slope = float(sample.inlier @ (tail * (end - offset).clip(0) ** 2 / variance)) / 2
+        spread = relative * slope / max(total, 1e-300)
+        deficits.append(_Deficit(total, k, end, unit, spread))
+    return min(deficits, key=lambda deficit: deficit.p_value)
 
 
 def _beyond_radius(
@@ -326,18 +352,31 @@ def _beyond_radius(
     )
     remedy = (
         "state as outliers.match_radius the radius that the matches were cut at, some "
-        f"{_rounded_up(largest)}, or leave out what lies beyond it"
+        f"{_rounded_up(largest)}, or leave out what lies beyond it; if the matches lie within the "
+        "radius of other positions, give these as u_nominal and v_nominal"
     )
     size = float(np.sqrt((far**2).sum() / (2 * n)))
+    return _radius_outcome(replace(RADIUS, present=present, remedy=remedy), sample, p_value, size)
+
+
+def _radius_outcome(
+    family: Family, sample: ScoredSample, p_value: float, size: float
+) -> Outcome:
+    """Outcome whose size is the rms, along an axis, of the matches that are missing or astray."""
+    radius, n = float(sample.match_radius or 0.0), len(sample)
+
+    def smallest(level: float) -> float:
+        return float(radius * np.sqrt(min(-np.log(level) / n, 1.0) / 2))
+
     return Outcome(
-        replace(RADIUS, present=present, remedy=remedy),
+        family,
         chi_square_of(p_value, 1),
         1,
         None,
         p_value,
-        size,
-        lambda level: size,
-        unit,
+        float(size),
+        smallest,
+        sample.model.unit,
     )
 
 
