@@ -25,8 +25,8 @@ pytestmark = pytest.mark.usefixtures("one_thread")
 
 NULL = dict(scenes_of_null())
 # by construction: one that looks at several radii, and one that asks two tests to agree (edges
-# alone, and edges beside the orders); one that counts overlapping patches as if they were apart, and
-# one whose statistic is positive for all noise that is no mixture of Gaussians
+# alone, and edges beside the orders); one that counts overlapping patches as if they were apart,
+# and one whose statistic is positive for all noise that is a mixture of Gaussians
 CONSERVATIVE = {"truncation", "edges", "skewness of a patch", "two cores"}
 
 

@@ -74,7 +74,9 @@ class ScoredSample:
     # (2, N) fraction of the noise of each detection that the fit follows, along u and v; 0 where it
     # is not known
     leverage: Float | float = 0.0
-    from_nominal: Float | None = None  # (2, N) data minus nominal positions, where the table has them
+    from_nominal: Float | None = (
+        None  # (2, N) data minus nominal positions, where the table has them
+    )
     match_radius: float | None = None  # within which the stars were matched, as is stated
     mixture: Constants | None = None  # of the likelihood, where it models false matches
 

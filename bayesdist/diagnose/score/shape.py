@@ -12,8 +12,8 @@ matches with a wide scatter of their own.  Nothing else is assumed of the noise;
 detections of a star are independent, and vary by their own squares.
 
 Terms of the polynomials that the model may lack, up to two orders above its own, and low terms of
-each exposure are taken from the residuals before. Where these are larger than the errors, nothing is
-said of the shape.
+each exposure are taken from the residuals before. Where these are larger than the errors, the shape
+is not tested.
 """
 
 from __future__ import annotations
@@ -289,9 +289,7 @@ def _skewness(chips: list[_Chip], unit: str) -> Outcome | None:
             T, dof, dof_residual = alone[:3]
         p_value = min(1.0, 2 * min(p_value, alone[3]))
     square, noise = np.mean([part.squares for part in parts], axis=0)
-    return outcome(
-        SKEWNESS, T, dof, dof_residual, p_value, square=square, noise=noise, unit=unit
-    )
+    return outcome(SKEWNESS, T, dof, dof_residual, p_value, square=square, noise=noise, unit=unit)
 
 
 @dataclass(frozen=True, eq=False)

@@ -6,9 +6,9 @@ everything else is judged by.  Errors that are merely quoted too large shrink al
 so the scale of the residuals is taken from themselves, and the question is how many of them should
 lie beyond the last ones that there are.
 
-The likelihood of false matches, and of the circle about nominal positions, takes the radius as it is
-stated.  Where matches were cut at a smaller one, the likelihood expects some beyond the last ones
-that there are; where they were not cut at it, there are matches beyond it.
+The likelihood of false matches, and of the circle about nominal positions, takes the radius as it
+is stated.  Where matches were cut at a smaller one, false matches are missing beyond the last ones
+that there are; where they were cut at a larger one, there are matches beyond the stated radius.
 """
 
 from __future__ import annotations
@@ -280,7 +280,7 @@ def _ends_inside(sample: ScoredSample, radius: float) -> Outcome:
     """Outcome of a test whose matches may end inside the stated radius."""
     unit, n = sample.model.unit, len(sample)
     residual, sigma = np.hypot(*sample.residual), np.sqrt(sample.variance.max(axis=0))
-    # by the median: false matches within the circle are taken for larger errors if its area is wrong
+    # by the median: false matches pass for larger errors if the area of the circle is wrong
     ratio = float(np.median(residual / sigma)) / np.sqrt(2 * np.log(2))
     distance, centre, columns = residual, "the solution", ", and give u_nominal and v_nominal"
     if sample.from_nominal is not None:
@@ -340,9 +340,7 @@ def _cut_by_circle(sample: ScoredSample, distance: Float) -> _Deficit:
     return min(deficits, key=lambda deficit: deficit.p_value)
 
 
-def _beyond_radius(
-    sample: ScoredSample, radius: float, far: Float, p_value: float
-) -> Outcome:
+def _beyond_radius(sample: ScoredSample, radius: float, far: Float, p_value: float) -> Outcome:
     """Outcome of a test that has found matches far beyond the stated radius."""
     unit, n = sample.model.unit, len(sample)
     largest = float(far.max())
@@ -359,9 +357,7 @@ def _beyond_radius(
     return _radius_outcome(replace(RADIUS, present=present, remedy=remedy), sample, p_value, size)
 
 
-def _radius_outcome(
-    family: Family, sample: ScoredSample, p_value: float, size: float
-) -> Outcome:
+def _radius_outcome(family: Family, sample: ScoredSample, p_value: float, size: float) -> Outcome:
     """Outcome whose size is the rms, along an axis, of the matches that are missing or astray."""
     radius, n = float(sample.match_radius or 0.0), len(sample)
 

@@ -41,7 +41,9 @@ def test_the_number_that_is_expected_is_that_of_even_matches():
     rng = np.random.default_rng(2)
     inside, _ = nominal_within(rng, 3000, 0.25, false=0.2)
     found = at_radius(inside, "uniform", 1.0)
-    number, end = (float(found.finding.split(word)[0].split()[-1]) for word in (" false", " pix from"))
+    number, end = (
+        float(found.finding.split(word)[0].split()[-1]) for word in (" false", " pix from")
+    )
     n_false = 0.2 * 3000  # in 0.25 px: sixteen times as many in 1 px
     assert number == pytest.approx(n_false * (1.0 - end**2) / 0.25**2, rel=0.15)
 

@@ -99,9 +99,7 @@ def test_blends_that_are_cut():
 
 @pytest.mark.parametrize("model", ["uniform", "gaussian"])
 def test_a_match_radius_that_is_corrected(model):
-    matches, _ = nominal_within(
-        np.random.default_rng(3), 5000, 0.06, off=0.03, false=0.05
-    )
+    matches, _ = nominal_within(np.random.default_rng(3), 5000, 0.06, off=0.03, false=0.05)
     before = Carried(matches, bd.OutlierMixture(model, match_radius=0.25))
     before.assert_doubted("state outliers.match_radius = 0.06")
     radius = float(re.search(r"match_radius = ([\d.]+\d)", before.advice()).group(1))

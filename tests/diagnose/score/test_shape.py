@@ -19,6 +19,7 @@ from .shaped import (
     SHAPE,
     SIDE,
     SIGMA,
+    examined,
     gaussian,
     halo,
     matches_of,
@@ -29,7 +30,6 @@ from .shaped import (
     student,
     student_by_axis,
     tail,
-    examined,
     true_map,
     two_visits,
     unequal,
@@ -65,7 +65,7 @@ def test_a_halo_of_false_matches_is_found_where_it_is():
     # a displacement of half the stars by 3 sigma at most, in 7 % of the field
     assert 0 < found.size < 1.5 * SIGMA * np.sqrt(0.07)
     middle = np.random.default_rng(4)
-    x, y = middle.uniform(0.5, SIDE + 0.5, (2, 5000))
+    _x, _y = middle.uniform(0.5, SIDE + 0.5, (2, 5000))
     gaussian(middle, 5000)
     expected = middle.uniform(400, SIDE - 400, 2)
     named = found.finding.split("pixel (")[1].split(")")[0].split(", ")
@@ -94,7 +94,7 @@ def p_values(name: str, seed: int) -> dict[str, float]:
 
 def test_probabilities_are_even_inside_the_family(full):
     """Those of patches and of two cores are larger than chance, by construction."""
-    runs = {name: (300 if full else 4) for name in INSIDE} | {"many": 60 if full else 0}
+    runs = dict.fromkeys(INSIDE, 300 if full else 4) | {"many": 60 if full else 0}
     jobs = [(name, seed) for name, n in runs.items() for seed in range(n)]
     found = seeds.over(p_values, jobs, lot=10) if full else [p_values(*job) for job in jobs]
     for test in SHAPE:
