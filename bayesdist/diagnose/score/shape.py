@@ -334,7 +334,7 @@ def _together(parts: list[_Part]) -> tuple[float, float, float | None, float]:
 
 def _displaced(chip: _Chip) -> _Part | None:
     """Displacement of the core from the rest of a chip's residuals, as `TERMS` of position."""
-    F, change = chip.terms, 0.0
+    F, change = chip.terms, np.zeros((len(chip.X), 2 * len(TERMS)))
     for sign, (score, derivative) in zip((1, -1), _displacements(chip.z), strict=True):
         try:
             inverse = np.linalg.inv((F * derivative[:, None]).T @ F)
@@ -342,7 +342,7 @@ def _displaced(chip: _Chip) -> _Part | None:
             return None
         step = F @ inverse
         change = change + sign * np.concatenate([step * axis[:, None] for axis in score], axis=1)
-    return _Part.of(np.asarray(change) * chip.sigma, chip.star, np.tile(AREA, 2))
+    return _Part.of(change * chip.sigma, chip.star, np.tile(AREA, 2))
 
 
 def _correlation(chips: list[_Chip], unit: str) -> Outcome | None:
