@@ -105,7 +105,7 @@ def test_blends_that_are_cut():
 
 
 def test_a_match_radius_that_is_corrected():
-    """Errors cover then; structure in the mean residuals, which the circle cuts, is still doubted."""
+    """Errors cover; structure in the mean residuals, which the circle cuts, is still doubted."""
     matches, _ = nominal_within(np.random.default_rng(3), 5000, 0.06, off=0.03, false=0.05)
     before = Carried(matches, bd.OutlierMixture("uniform", match_radius=0.25))
     before.assert_doubted("state outliers.match_radius = 0.06")
