@@ -16,7 +16,7 @@ from bayesdist.diagnose.score.result import ScoreTest
 from bayesdist.infer import LinearFit
 from bayesdist.infer.exposures.frame_choice import frames_that_help
 from bayesdist.infer.posterior.checks import fit_checks, pixel_doubt
-from bayesdist.utils.checks import LARGER, Check
+from bayesdist.utils.checks import EITHER, LARGER, Check
 from bayesdist.utils.limits import (
     CHI2_TOO_LARGE,
     EXPOSURE_CHI2,
@@ -31,6 +31,7 @@ from bayesdist.utils.numbers import count, number, percent, probability, size_of
 
 FIT, HELD_OUT, SCORE_TESTS = "Fit", "Held-out truth", "Score tests"
 MATCHING, ASSUMPTIONS = "Matching", "Assumptions"
+DISPLACING = ("shape", "matching")  # groups of score tests
 
 
 def input_checks(
@@ -134,12 +135,14 @@ def matching_checks(
 
 
 def structure_checks(
-    misfits: Sequence[Misfit], correlated: Discrepancy | None = None
+    misfits: Sequence[Misfit],
+    correlated: Discrepancy | None = None,
+    tests: Sequence[ScoreTest] = (),
 ) -> Iterator[Check]:
     """Checks of the structure that a fit leaves in the residuals.
 
     There is one misfit for each chip, or none; `correlated` errors of the solution hold some of the
-    structure.
+    structure. Score `tests` may have found where it comes from.
     """
     if not misfits:
         return
@@ -158,6 +161,9 @@ def structure_checks(
         sentence = f"{one.finding}, and the budget holds {what} of it"
         if correlated is None:
             sentence = one.sentence
+        if displacing(tests):
+            sentence += "; it may come from residuals that are lopsided or cut, of which score "
+            sentence += "tests have found some"
         if (held or 0.0) < STRUCTURE_IN_BUDGET.value * one.structure:
             doubt = LARGER
     yield Check(
@@ -191,16 +197,20 @@ def score_checks(
 ) -> Iterator[Check]:
     """Checks of what targeted tests have found, one for each remedy, or that they found nothing.
 
-    Verdicts stand where correlated errors hold what the tests have found.
+    Verdicts stand where correlated errors hold what the tests have found.  Noise is held by the
+    sandwich covariance, unless the residuals are lopsided or the match radius has cut them: that
+    covariance holds the scatter of a solution, and not its displacement.
     """
     limit = f"p at least {number(SCORE_LIMIT.value, 1)}"
     found: dict[str, list[ScoreTest]] = {}
     for test in tests:
         if test.significant:
             found.setdefault(test.remedy, []).append(test)
+    displaced = displacing(tests)
     for remedy, several in found.items():
         sentence = f"{'; '.join(test.finding for test in several)}: {remedy}"
-        doubt = "" if all(_held(correlated, test, tests) for test in several) else LARGER
+        doubts = {test.doubt for test in several if not _held(correlated, test, tests, displaced)}
+        doubt = EITHER if EITHER in doubts else LARGER if doubts else ""
         names = ", ".join(test.name for test in several)
         value = "; ".join(
             f"{size_of(test.size, test.unit, 2)} rms, {probability(test.p_value)}"
@@ -212,8 +222,18 @@ def score_checks(
         yield Check(SCORE_TESTS, name, "nothing found", limit, "pass")
 
 
-def _held(correlated: Discrepancy | None, test: ScoreTest, tests: Sequence[ScoreTest]) -> bool:
-    """True where correlated errors hold what one of the tests has found."""
+def displacing(tests: Sequence[ScoreTest]) -> bool:
+    """True where tests have found residuals that displace the solution, as noise does not."""
+    return any(test.significant and test.group in DISPLACING for test in tests)
+
+
+def _held(
+    correlated: Discrepancy | None, test: ScoreTest, tests: Sequence[ScoreTest], displaced: bool
+) -> bool:
+    """True where correlated errors hold what one of the tests has found.
+
+    `displaced`: whether the residuals displace the solution.
+    """
     if correlated is None:
         return False
     of_exposures = correlated.facts.get("exposure_fields", {})
@@ -225,7 +245,7 @@ def _held(correlated: Discrepancy | None, test: ScoreTest, tests: Sequence[Score
     wandering = any(one.significant and one.held_by == "time" for one in tests)
     held = {
         "": False,
-        "noise": True,
+        "noise": not displaced,
         "structure": bool(correlated.structure),
         "exposures": bool(scatter - {CURVATURE}),
         # a parabola does not hold deviations that wander

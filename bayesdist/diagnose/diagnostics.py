@@ -175,7 +175,7 @@ class Diagnostics:
         out = [
             *holdout_checks(self.holdout),
             *score_checks(self.score_tests, self.correlated),
-            *structure_checks(self.misfits, self.correlated),
+            *structure_checks(self.misfits, self.correlated, self.score_tests),
         ]
         out += [*coverage_checks(self.coverage), *exposure_checks(self.sample.by_exposure)]
         out += outlying_checks(self.correlated)

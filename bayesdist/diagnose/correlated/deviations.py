@@ -313,8 +313,7 @@ def deviation_draws(
                 _, factor, z = conditional(k, np.array(amplitude))
                 log = 0.5 * z @ z - np.log(np.diag(factor)).sum() + np.log(root.prior)
                 density[(k, *at)] = log + sum(
-                    log_half_t(a, medians[name])
-                    for a, name in zip(amplitude, names, strict=True)
+                    log_half_t(a, medians[name]) for a, name in zip(amplitude, names, strict=True)
                 )
         weight = np.exp(density - density.max()) * reduce(np.multiply, widths)
         return np.asarray(weight / weight.max())

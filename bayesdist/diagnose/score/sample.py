@@ -8,7 +8,9 @@ from functools import cached_property
 import numpy as np
 
 from bayesdist.data.matches import Matches
+from bayesdist.infer.kernel.mixture import Constants
 from bayesdist.infer.solution.solution import Solution, likelihood_of
+from bayesdist.infer.stars.likelihood import MixtureAt
 from bayesdist.infer.stars.stars import Stars, prepare
 from bayesdist.model import DistortionModel
 from bayesdist.utils.arrays import Bool, Float, Int
@@ -72,6 +74,11 @@ class ScoredSample:
     # (2, N) fraction of the noise of each detection that the fit follows, along u and v; 0 where it
     # is not known
     leverage: Float | float = 0.0
+    from_nominal: Float | None = (
+        None  # (2, N) data minus nominal positions, where the table has them
+    )
+    match_radius: float | None = None  # within which the stars were matched, as is stated
+    mixture: Constants | None = None  # of the likelihood, where it models false matches
 
     def __len__(self) -> int:
         return len(self.X)
@@ -111,11 +118,13 @@ class ScoredSample:
         return replace(self, curvature=np.stack([good[:, 0, 0], good[:, 0, 1], good[:, 1, 1]]))
 
 
-def scored_sample(table: Matches, solution: Solution) -> ScoredSample:
+def scored_sample(
+    table: Matches, solution: Solution, match_radius: float | None = None
+) -> ScoredSample:
     """Sample of the detections of a table, with their scores at a solution.
 
-    The table has errors; of more than `SAMPLE` rows, every k-th is taken. Raises InputError where
-    the table does not go with the solution.
+    The table has errors; of more than `SAMPLE` rows, every k-th is taken. `match_radius` is in the
+    unit of u and v. Raises InputError where the table does not go with the solution.
     """
     table = table.sample(SAMPLE)
     by_exposure = np.argsort(table.exposure, kind="stable")
@@ -147,7 +156,16 @@ def scored_sample(table: Matches, solution: Solution) -> ScoredSample:
         blocks=blocks,
         motion=_both(table.pm_u, table.pm_v, rows),
         motion_sigma=_both(table.sigma_pm_u, table.sigma_pm_v, rows),
+        from_nominal=_from_nominal(table, rows),
+        match_radius=match_radius,
+        mixture=likelihood.constants if isinstance(likelihood, MixtureAt) else None,
     )
+
+
+def _from_nominal(table: Matches, rows: Int) -> Float | None:
+    """Data minus nominal positions (2, n) of some rows, where the table has them."""
+    nominal = _both(table.u_nominal, table.v_nominal, rows)
+    return None if nominal is None else np.stack([table.u[rows], table.v[rows]]) - nominal
 
 
 def _both(u: Float | None, v: Float | None, rows: Int) -> Float | None:

@@ -16,7 +16,8 @@ from bayesdist.diagnose.score.regressor_tests import regressor_tests
 from bayesdist.diagnose.score.regressors import functions_for
 from bayesdist.diagnose.score.result import ScoreTest, corrected
 from bayesdist.diagnose.score.sample import scored_sample
-from bayesdist.diagnose.score.truncation import truncation_test
+from bayesdist.diagnose.score.shape import shape_tests
+from bayesdist.diagnose.score.truncation import radius_test, truncation_test
 from bayesdist.infer.equations.priors import GaussianPriors
 from bayesdist.infer.solution.solution import Solution
 
@@ -55,9 +56,14 @@ def score_tests(
         was fitted.
     """
     priors, mean = priors or GaussianPriors.none(solution.model), np.asarray(solution.mean, float)
-    projection = projection_of(functions_for(scored_sample(table, solution)), mean, priors)
+    projection = projection_of(
+        functions_for(scored_sample(table, solution, match_radius)), mean, priors
+    )
     sample = projection.scored
     found = [
+        truncation_test(sample, match_radius),
+        radius_test(sample),
+        *shape_tests(sample),
         *regressor_tests(projection),
         gap_test(projection),
         motion_test(sample),
@@ -65,6 +71,5 @@ def score_tests(
         *exposure_tests(projection, mean, priors),
         exposure_field_test(sample),
         pattern_test(sample),
-        truncation_test(sample, match_radius),
     ]
     return corrected([one for one in found if one is not None])
