@@ -29,6 +29,7 @@ from bayesdist.assess.terms.given import Catalogue, require_catalogue
 from bayesdist.data import Matches, ReadOptions
 from bayesdist.data.reading.options import check_sigma
 from bayesdist.data.reading.table import match_arguments
+from bayesdist.data.repeated_stars import SAME_POSITION, check_same_position, with_star_codes
 from bayesdist.errors import ConfigError, InputError
 from bayesdist.infer import OutlierMixture
 from bayesdist.model import Chip, TimeDependence
@@ -38,7 +39,10 @@ __all__ = ["calibrate"]
 
 WHERE = "calibrate"  # stands for the name of the configuration in messages
 # keys of [data] by which a table is read
-READING = "columns unit pixel_origin tangent_point epoch catalogue_epoch not_finite".split()
+READING = (
+    *("columns", "unit", "pixel_origin", "tangent_point", "epoch", "catalogue_epoch"),
+    *("not_finite", "same_position"),
+)
 
 # arguments that settings may replace while they have their defaults
 DEFAULTS = {
@@ -159,6 +163,7 @@ def calibrate(
     else:
         options = dict(settings.pop("data", {}))
         data["simulated"] = options.pop("simulated", None)
+        data["same_position"] = options.get("same_position")
         stars, data["sigma"] = _stars(matches, sigma, options)
     configured: Settings = {
         "data": data,
@@ -256,12 +261,17 @@ def _stars(matches: Any, sigma: Any, options: Mapping[str, Any]) -> tuple[Matche
                 do=f"give one of {', '.join(READING)}",
             )
         matches = Matches(**match_arguments(matches, ReadOptions(**options)))
-    elif options:
+    elif options.keys() - {"same_position"}:
         raise ConfigError(
-            f"data.{next(iter(options))} is an option of reading, and the matches have been read",
+            f"data.{min(options.keys() - {'same_position'})} is an option of reading, and the "
+            "matches have been read",
             where=WHERE,
             do="give it to bayesdist.read_matches or Matches.from_table",
         )
+    else:
+        same_position = options.get("same_position", SAME_POSITION[0])
+        check_same_position(same_position)
+        matches = with_star_codes(matches, same_position)
     if sigma is None:
         sigma = "by_magnitude" if matches.has_mag and not matches.has_sigma else "columns"
     elif not isinstance(sigma, str):

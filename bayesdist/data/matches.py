@@ -170,6 +170,7 @@ class Matches(MatchColumns):
         catalogue_epoch: Epoch | None = None,
         chips: Mapping[str, int] | None = None,
         not_finite: str = "refuse",
+        same_position: str = "one_star",
     ) -> Matches:
         """Matches from any object with columns.
 
@@ -184,6 +185,9 @@ class Matches(MatchColumns):
             pyarrow Table, a DuckDB result); a mapping of arrays or lists; a structured array.
         columns, unit, sigma, pixel_origin, tangent_point, epoch, catalogue_epoch, chips, not_finite
             As for `ReadOptions`.
+        same_position : {'one_star', 'separate_stars'}, optional
+            As for `ReadOptions`: rows with the same reference position belong to one star by
+            default, if there is no column `star`.
 
         Returns
         -------
@@ -211,6 +215,7 @@ class Matches(MatchColumns):
             catalogue_epoch,
             chips,
             not_finite,
+            same_position,
         )
         return cls(**match_arguments(table, options)).as_read(sigma)
 

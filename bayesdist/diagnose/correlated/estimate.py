@@ -10,6 +10,7 @@ from operator import add
 import numpy as np
 
 from bayesdist.data.matches import Matches
+from bayesdist.data.repeated_stars import error_codes
 from bayesdist.diagnose.correlated.deviations import MAX_EXPOSURES, linear_deviations
 from bayesdist.diagnose.correlated.functions import StructureFunctions
 from bayesdist.diagnose.correlated.information import (
@@ -72,8 +73,8 @@ def estimate_discrepancy(
     sample : Matches, optional
         Some of the matches, or all: structure finer than the functions shows in neighbouring stars.
     stars : Matches, optional
-        The matches in memory.  By the star codes, errors common to a star's matches are estimated,
-        and exposures without frames of their own are separated.
+        The matches in memory.  Errors common to the matches of a star, or of a tight group of
+        stars, are estimated, and exposures without frames of their own are separated.
     structure : bool
         False for no structure beyond the model, where look-up tables were fitted to it.
     exposures : bool
@@ -102,8 +103,9 @@ def estimate_discrepancy(
     working = Information(model, mean, sums, parameter_priors or GaussianPriors.none(model))
     pixel = model.pixel_size(mean)
     repeated = None
-    if stars is not None and stars.star is not None:
-        repeated = shared_stars(stars, likelihood, model, priors.star * pixel)
+    code = None if stars is None else error_codes(stars.u, stars.v, stars.star)
+    if stars is not None and code is not None:
+        repeated = shared_stars(stars, code, likelihood, model, priors.star * pixel)
     excess = score_excess(working) * (1.0 if repeated is None else repeated.repetition)
     information = replace(working, excess=excess)
     chips = range(len(model.chips)) if structure else ()

@@ -20,6 +20,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from bayesdist.data.matches import Matches
+from bayesdist.data.repeated_stars import error_codes
 from bayesdist.infer.stars.likelihood import Likelihood
 from bayesdist.infer.stars.stars import prepare
 from bayesdist.model import DistortionModel
@@ -66,12 +67,13 @@ def shared_variances(
     """Evidence of neighbouring stars on the two axes of each chip, by its code.
 
     The matches are those of the solution with this likelihood, or some of them.  A star that is
-    matched several times is no neighbour of itself: its catalogue position has one error.  None for
-    an axis with too few pairs.
+    matched several times is no neighbour of itself: its catalogue position has one error.  Stars of
+    a tight group are no neighbours of each other either.  None for an axis with too few pairs.
     """
     stars, order = prepare(model, table)
     g_u, g_v, h_uu, h_uv, h_vv = likelihood.scores(stars)
-    code = np.arange(len(order)) if table.star is None else table.star[order]
+    shared = error_codes(table.u, table.v, table.star)
+    code = np.arange(len(order)) if shared is None else shared[order]
     g = np.stack([g_u, g_v], axis=1)
     h = np.stack([h_uu, h_uv, h_uv, h_vv], axis=1).reshape(-1, 2, 2)
     good = (h_uu > 0) & (h_vv > 0)
@@ -89,20 +91,33 @@ def shared_variances(
         here = here[:: max(1, round(float(np.sqrt(expected / MAX_PAIRS))))]
         at = np.column_stack([stars.X[here] * one.size[0], stars.Y[here] * one.size[1]]) / 2
         pairs = cKDTree(at).query_pairs(EDGES[-1], output_type="ndarray")
-        pairs = pairs[code[here][pairs[:, 0]] != code[here][pairs[:, 1]]]
+        star = np.unique(code[here], return_inverse=True)[1]
+        pairs = pairs[star[pairs[:, 0]] != star[pairs[:, 1]]]
         separation = np.linalg.norm(at[pairs[:, 0]] - at[pairs[:, 1]], axis=1)
         half = max(one.size) / 2
-        u, v = (_shared(g[here, a], h[here, a, a], pairs, separation, half) for a in (0, 1))
+        # pairs of detections of the same two stars repeat one product of their errors
+        of_stars = None if len(star) == star.max(initial=-1) + 1 else star[pairs]
+        u, v = (
+            _shared(g[here, a], h[here, a, a], pairs, separation, half, of_stars) for a in (0, 1)
+        )
         out[c] = u, v
     return out
 
 
 def _shared(
-    g: Float, h: Float, pairs: Int, separation: Float, half: float
+    g: Float, h: Float, pairs: Int, separation: Float, half: float, stars: Int | None
 ) -> SharedVariance | None:
+    """Excess covariance by pairs (n, 2) of detections; `stars` (n, 2) are theirs, if repeated."""
     bins = np.clip(np.searchsorted(EDGES, separation, side="right") - 1, 0, len(EDGES) - 2)
     i, j = pairs.T
     product, weight = g[i] * g[j], h[i] * h[j]
+    if stars is not None and len(stars):
+        first, second = np.sort(stars, axis=1).T
+        keys = (first * (int(stars.max()) + 1) + second) * len(EDGES) + bins
+        keys, of = np.unique(keys, return_inverse=True)
+        bins = keys % len(EDGES)
+        separation = np.bincount(of, separation) / np.bincount(of)
+        product, weight = np.bincount(of, product), np.bincount(of, weight)
     count, total, together, distance = (
         np.bincount(bins, w, minlength=len(EDGES) - 1).astype(float)
         for w in (None, weight, product, separation)
