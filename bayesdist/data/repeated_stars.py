@@ -204,10 +204,8 @@ def tight_groups(u: Float, v: Float, star: Int | None = None) -> TightGroups | N
     isolated = distinct & (size <= LARGEST_GROUP) & (apart > ISOLATION * extent)
     if size[isolated].sum() < MOST * n:
         return None
-    # members of what is no isolated group are stars by themselves
-    own = np.where(isolated[group], group, n_groups + np.arange(n))
     return TightGroups(
-        np.unique(own, return_inverse=True)[1][code],
+        group[code],  # groups that are not isolated too, now that most are
         int(isolated.sum()),
         int(np.median(size[isolated])),
         float(np.median(extent[isolated])),

@@ -94,7 +94,8 @@ def estimate_discrepancy(
     """
     model, likelihood = solution.model, likelihood_of(solution)
     priors = priors or DiscrepancyPriors()
-    if exposures and stars is not None and model.frames == "none" and _several(stars):
+    apart = exposures and stars is not None and model.frames == "none" and _several(stars)
+    if stars is not None and apart:
         sums = _by_exposure(stars, likelihood, model)
     else:
         with opened(model, matches) as shards:
@@ -106,8 +107,15 @@ def estimate_discrepancy(
     code = None if stars is None else error_codes(stars.u, stars.v, stars.star)
     if stars is not None and code is not None:
         repeated = shared_stars(stars, code, likelihood, model, priors.star * pixel)
-    excess = score_excess(working) * (1.0 if repeated is None else repeated.repetition)
-    information = replace(working, excess=excess)
+    information = replace(working, excess=score_excess(working))
+    if stars is not None and repeated is not None:
+        excess = repeated.repetition
+        if apart:
+            by_star = _by_exposure(stars, likelihood, model, excess)
+        else:
+            prepared, order = prepare(model, stars)
+            by_star = cell_sums(prepared, likelihood, sums.side, excess[order])
+        information = replace(information, sums=by_star)
     chips = range(len(model.chips)) if structure else ()
     near = {} if sample is None or not structure else shared_variances(sample, likelihood, model)
     found, theta, facts = _structures(
@@ -135,14 +143,21 @@ def _several(stars: Matches) -> bool:
     return 1 < len(stars.exposure_names) <= MAX_EXPOSURES
 
 
-def _by_exposure(stars: Matches, likelihood: Likelihood, model: DistortionModel) -> CellSums:
-    """Sums with separate groups for exposures that have no frames of their own."""
+def _by_exposure(
+    stars: Matches, likelihood: Likelihood, model: DistortionModel, excess: Float | None = None
+) -> CellSums:
+    """Sums with separate groups for exposures that have no frames of their own.
+
+    `excess` (N,) is as of `cell_sums`, in the order of the matches.
+    """
     side = cells_per_side(len(stars.exposure_names) * len(model.chips))
     parts = []
     for code in range(len(stars.exposure_names)):
         rows = np.flatnonzero(stars.exposure == code)
         if rows.size:
-            part = cell_sums(prepare(model, stars.select(rows))[0], likelihood, side)
+            prepared, order = prepare(model, stars.select(rows))
+            own = None if excess is None else excess[rows][order]
+            part = cell_sums(prepared, likelihood, side, own)
             of = np.full(len(part.groups), code)
             parts.append(replace(part, groups=replace(part.groups, exposure=of)))
     return reduce(add, parts)

@@ -23,9 +23,9 @@ class SharedStars:
     """Errors that stars of the catalogue have in all of their matches."""
 
     rms: float  # of a star on an axis, in the unit of u, v; 0 where no star is matched twice
-    # mean factor, over the matches, by which a star's matches determine the structure at its
-    # position less than as many stars would
-    repetition: float
+    # factor (N,), in the order of the table, by which the matches of a star determine the
+    # structure at its position less than as many stars would
+    repetition: Float
     stars: Stars
     code: Int  # star (N,) of each match, in the order of `stars`
     curvature: Float  # minus second derivatives (3, N) uu, uv, vv of the log-likelihood
@@ -73,7 +73,7 @@ def shared_stars(
     good = (h_uu > 0) & (h_vv > 0)
     size = np.geomspace(median / RANGE, median * RANGE, STEPS)
     log_density = log_half_cauchy(size, median)
-    others = []  # curvature of a star's other matches, beside any one of them
+    others = []  # (n_stars,) curvature of a star's other matches, beside any one of them
     for g, h in ((g_u, h_uu), (g_v, h_vv)):
         top, bottom, squares = (
             np.bincount(code[good], w[good], minlength=len(repeated)) for w in (g, h, h**2)
@@ -88,5 +88,6 @@ def shared_stars(
     weight = np.exp(log_density - log_density.max())
     variance = float(weight @ size**2 / weight.sum())
     curvature = np.stack([h_uu, h_uv, h_vv]) * good
-    repetition = float(np.average(1 + variance * np.mean(others, axis=0), weights=n_matches))
+    repetition = np.empty(len(order))
+    repetition[order] = (1 + variance * np.mean(others, axis=0))[code]
     return SharedStars(float(np.sqrt(variance)), repetition, stars, code, curvature)
