@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from functools import reduce
+from functools import partial, reduce
 from operator import add
 
 import numpy as np
@@ -19,12 +19,16 @@ from bayesdist.diagnose.correlated.information import (
     cell_sums,
     cells_per_side,
 )
-from bayesdist.diagnose.correlated.neighbours import SharedVariance, shared_variances
+from bayesdist.diagnose.correlated.neighbours import (
+    NeighbourScores,
+    SharedVariance,
+    neighbour_scores,
+)
 from bayesdist.diagnose.correlated.noise import not_narrower, score_excess
 from bayesdist.diagnose.correlated.priors import DiscrepancyPriors
 from bayesdist.diagnose.correlated.result import ChipStructure, Discrepancy
 from bayesdist.diagnose.correlated.shared_stars import shared_stars
-from bayesdist.diagnose.correlated.structure import structure_posterior
+from bayesdist.diagnose.correlated.structure import Structure, structure_posterior
 from bayesdist.diagnose.efficient import EfficientScore
 from bayesdist.infer.equations.priors import GaussianPriors
 from bayesdist.infer.equations.scaled import one_thread
@@ -39,6 +43,7 @@ from bayesdist.model.grid import cell_index
 from bayesdist.utils.arrays import Float
 
 DRAWS = 2000
+RESOLVED = 50  # draws of what the functions resolve, before neighbouring stars are compared
 
 
 @one_thread
@@ -117,7 +122,7 @@ def estimate_discrepancy(
             by_star = cell_sums(prepared, likelihood, sums.side, excess[order])
         information = replace(information, sums=by_star)
     chips = range(len(model.chips)) if structure else ()
-    near = {} if sample is None or not structure else shared_variances(sample, likelihood, model)
+    near = {} if sample is None or not structure else neighbour_scores(sample, likelihood, model)
     found, theta, facts = _structures(
         information, working, chips, near, priors, pixel, n_draws, rng
     )
@@ -167,7 +172,7 @@ def _structures(
     information: Information,
     working: Information,
     chips: Sequence[int],
-    neighbours: Mapping[int, tuple[SharedVariance | None, SharedVariance | None]],
+    neighbours: Mapping[int, NeighbourScores],
     priors: DiscrepancyPriors,
     pixel: float,
     n: int,
@@ -193,15 +198,44 @@ def _structures(
             noise=_star_error(information, code),
             higher_order=priors.higher_order * pixel,
             structure=priors.structure * pixel,
-            pairs=neighbours.get(code, (None, None)),
+            pairs=(None, None)
+            if code not in neighbours
+            else partial(_finer_evidence, neighbours[code], working, taken, code, rng),
         )
-        found = replace(chip_waves, coefficients=np.stack(posterior.draws(n, rng), axis=1))
+        coefficients = posterior.draws(n, rng, [[chip_waves.waves]] * 2)
+        found = replace(chip_waves, coefficients=np.stack(coefficients, axis=1))
         for a in (0, 1):
             # the fit absorbs structure into polynomials; the truth lies on the other side
             theta -= found.coefficients[:, a] @ (working.covariance @ taken[a]).T
         rows += found.sizes(chip, posterior.length)
         out[chip.number] = found
     return out, theta, {"structure": rows}
+
+
+def _finer_evidence(
+    near: NeighbourScores,
+    working: Information,
+    taken: Sequence[Float],
+    code: int,
+    rng: np.random.Generator,
+    structure: Structure,
+) -> tuple[SharedVariance | None, SharedVariance | None]:
+    """Evidence of neighbouring stars for structure finer than the functions of a chip.
+
+    `structure` is the posterior of what these resolve, and `taken` (D, functions) for each axis the
+    products of the functions with the parameters of the fit, which has absorbed a part.
+    """
+    model, (functions,) = working.model, structure.functions[0]
+    phi = model.basis(model.chips[code].number).evaluate_scaled(near.X, near.Y)
+    values = functions.evaluate(near.X, near.Y)
+    drawn = structure.draws(RESOLVED, rng)
+    known = functions.n_known
+    absorbed = sum(z @ (working.covariance @ t[:, :known]).T for z, t in zip(drawn, taken, strict=True))
+    resolved = np.empty((RESOLVED, len(phi), 2))
+    for a in (0, 1):
+        columns = model.coefficient_slice(model.chips[code].number, a)
+        resolved[..., a] = drawn[a] @ values.T - absorbed[:, columns] @ phi.T
+    return near.shared_variances(resolved)
 
 
 def _star_error(information: Information, chip: int) -> float:

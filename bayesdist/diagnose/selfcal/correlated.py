@@ -113,11 +113,12 @@ def _structure(
         structure=priors.structure * pixel,
         lengths=LENGTHS,
     )
-    drawn = posterior.draws(DRAWS, rng)
+    waves = {code: one.finer_waves(rng) for code, one in functions.items()}
+    drawn = posterior.draws(DRAWS, rng, [[w for w in waves.values() for _ in "uv"]])
     out, rows, known = dict[int, ChipStructure](), list[dict[str, object]](), []
     for k, (code, one) in enumerate(functions.items()):
         chip, pair = model.chips[code], drawn[2 * k : 2 * k + 2]
-        found = ChipStructure(one, one.finer_waves(rng), np.stack(pair, axis=1))
+        found = ChipStructure(one, waves[code], np.stack(pair, axis=1))
         rows += found.sizes(chip, posterior.length)
         out[chip.number] = found
         known += [axis[:, : one.n_known] for axis in pair]
