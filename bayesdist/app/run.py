@@ -140,12 +140,12 @@ class Run:
     @cached_property
     def calibration(self) -> Calibration:
         """Calibration of the detector as it is written to files, with all errors of positions."""
-        results = self.results
+        results, correlated = self.results, self.diagnostics.correlated
         return replace(
             results.product.calibration,
             pixel_mas=results.config.detector.scale_mas,
             before=results.fitted.tables.tables,
-            further=further_errors(self.evaluation.budget.rows()),
+            further=further_errors(self.evaluation.budget.rows(), correlated and correlated.facts),
         )
 
     @property

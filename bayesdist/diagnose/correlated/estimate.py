@@ -26,7 +26,11 @@ from bayesdist.diagnose.correlated.neighbours import (
 )
 from bayesdist.diagnose.correlated.noise import not_narrower, score_excess
 from bayesdist.diagnose.correlated.priors import DiscrepancyPriors
-from bayesdist.diagnose.correlated.result import ChipStructure, Discrepancy
+from bayesdist.diagnose.correlated.result import (
+    ChipStructure,
+    Discrepancy,
+    structure_correlation,
+)
 from bayesdist.diagnose.correlated.shared_stars import shared_stars
 from bayesdist.diagnose.correlated.structure import Structure, structure_posterior
 from bayesdist.diagnose.efficient import EfficientScore
@@ -138,6 +142,7 @@ def estimate_discrepancy(
         if linear is not None:
             linear = replace(linear, theta=settling.mean(linear.theta))
     facts |= {"unit": model.unit, "noise_ratio": ratio}
+    facts["structure_correlation"] = structure_correlation(model, found, theta)
     if linear is not None:
         facts |= linear.facts
     return Discrepancy(model, mean, formal, noise, found, theta, linear, facts)

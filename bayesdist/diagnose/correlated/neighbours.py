@@ -31,6 +31,7 @@ from bayesdist.infer.stars.likelihood import Likelihood
 from bayesdist.infer.stars.stars import prepare
 from bayesdist.model import DistortionModel
 from bayesdist.utils.arrays import Float, Int
+from bayesdist.utils.matern import matern
 
 # of separations, in pixels; the last bin is of pairs farther apart
 EDGES = np.array([0.0, 6.0, 12.0, 24.0, 48.0, 96.0])
@@ -77,12 +78,6 @@ class SharedVariance:
             return float(-0.5 * np.sum(left**2 / variance))
 
         return log_likelihood
-
-
-def matern(separation: Float) -> Float:
-    """Correlation of the field of `StructureFunctions`, by separation in correlation lengths."""
-    z = np.sqrt(3.0) * separation
-    return np.asarray((1 + z) * np.exp(-z))
 
 
 def _below(cut: float, length: float, separation: Float) -> Float:

@@ -13,7 +13,11 @@ from bayesdist.diagnose.correlated.deviations import deviation_draws
 from bayesdist.diagnose.correlated.functions import MIN_SIDE, StructureFunctions
 from bayesdist.diagnose.correlated.noise import not_narrower
 from bayesdist.diagnose.correlated.priors import DiscrepancyPriors
-from bayesdist.diagnose.correlated.result import ChipStructure, Discrepancy
+from bayesdist.diagnose.correlated.result import (
+    ChipStructure,
+    Discrepancy,
+    structure_correlation,
+)
 from bayesdist.diagnose.correlated.structure import structure_posterior
 from bayesdist.diagnose.selfcal.eliminated import (
     Columns,
@@ -67,6 +71,7 @@ def selfcal_discrepancy(
         solution, functions, (S[:m, :m], score[:m], taken[:, :m]), priors, rng
     )
     facts: dict[str, object] = {"structure": sizes, "unit": model.unit, "noise_ratio": ratio}
+    facts["structure_correlation"] = structure_correlation(model, found, theta)
     linear = None
     if deviations is not None:
         linear = deviation_draws(deviations, S[m:, m:], score[m:], taken[:, m:], priors, DRAWS, rng)

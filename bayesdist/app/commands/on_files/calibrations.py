@@ -121,7 +121,10 @@ def _calibration_of_run(solution: Solution, path: Path) -> Calibration:
         scale=scale,
     )
     budget = [] if summary is None else summary.budget or []
-    further = further_errors([row.model_dump() for row in budget])
+    facts = None if summary is None else (summary.discrepancy or None)
+    further = further_errors(
+        [row.model_dump() for row in budget], None if facts is None else facts.model_dump()
+    )
     return replace(found, pixel_mas=mas, before=tables, further=further)
 
 
