@@ -29,7 +29,6 @@ from bayesdist.assess.terms.given import Catalogue, require_catalogue
 from bayesdist.data import Matches, ReadOptions
 from bayesdist.data.reading.options import check_sigma
 from bayesdist.data.reading.table import match_arguments
-from bayesdist.data.repeated_stars import SAME_POSITION, check_same_position, with_star_codes
 from bayesdist.errors import ConfigError, InputError
 from bayesdist.infer import OutlierMixture
 from bayesdist.model import Chip, TimeDependence
@@ -269,9 +268,7 @@ def _stars(matches: Any, sigma: Any, options: Mapping[str, Any]) -> tuple[Matche
             do="give it to bayesdist.read_matches or Matches.from_table",
         )
     else:
-        same_position = options.get("same_position", SAME_POSITION[0])
-        check_same_position(same_position)
-        matches = with_star_codes(matches, same_position)
+        matches = matches.with_star_codes(**options)
     if sigma is None:
         sigma = "by_magnitude" if matches.has_mag and not matches.has_sigma else "columns"
     elif not isinstance(sigma, str):

@@ -16,7 +16,9 @@ class FurtherError:
     """Row of an error budget beside the covariance: root mean squares over the detector."""
 
     name: str
-    kind: str  # 'systematic' (shared by the stars of an image), 'random' (of each star) or 'local' (of a place)
+    # 'systematic' (shared by the stars of an image), 'random' (of each star) or 'local' (shared by
+    # the stars near a position)
+    kind: str
     u: float  # standard deviation, in the unit of u, v
     v: float
     source: str = ""

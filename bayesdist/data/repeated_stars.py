@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.sparse import coo_array
@@ -19,9 +18,6 @@ from scipy.spatial import cKDTree
 from bayesdist.errors import InputError
 from bayesdist.utils.arrays import Float, Int
 from bayesdist.utils.numbers import count
-
-if TYPE_CHECKING:
-    from bayesdist.data.matches import Matches
 
 # what rows with equal reference positions are: option `same_position` of reading
 SAME_POSITION = ("one_star", "separate_stars")
@@ -76,19 +72,6 @@ def star_codes(first: Float, second: Float, same_position: str) -> tuple[Int | N
     if same_position == "separate_stars":
         return np.arange(len(code)), f"{words}, and count as separate stars (data.same_position)"
     return code, f"{words}: their matches count as those of one star (data.same_position)"
-
-
-def with_star_codes(matches: Matches, same_position: str = SAME_POSITION[0]) -> Matches:
-    """Matches with codes of stars by their positions u, v.
-
-    They are returned unchanged if they have codes, if no position occurs twice, or on disk.
-    """
-    if not matches.in_memory or matches.star is not None:
-        return matches
-    star, note = star_codes(matches.u, matches.v, same_position)
-    if star is None:
-        return matches
-    return matches.with_columns(star=star, notes=(*matches.notes, note))
 
 
 def repeated_words(number: Int) -> str:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 
 from bayesdist.data import MagnitudeErrors, Matches
-from bayesdist.data.repeated_stars import error_codes, with_star_codes
+from bayesdist.data.repeated_stars import error_codes
 from bayesdist.diagnose.checks import (
     coverage_checks,
     exposure_checks,
@@ -258,7 +258,7 @@ def diagnose(
     True
     """
     _refuse_other_posterior(posterior, matches, fit)
-    matches = with_star_codes(matches)
+    matches = matches.with_star_codes()
     rng = assessment_rng(rng)
     priors = priors or GaussianPriors.none(posterior.model)
     circle = posterior.mixture.match_radius

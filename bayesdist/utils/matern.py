@@ -1,6 +1,7 @@
 """Correlation of Gaussian fields, by separation and correlation length.
 
-The Matern field of smoothness 3/2 has a slope everywhere (Rasmussen and Williams 2006, Section 4.2).
+The Matern field of smoothness 3/2 has a slope everywhere (Rasmussen and Williams 2006,
+Section 4.2).
 """
 
 from __future__ import annotations

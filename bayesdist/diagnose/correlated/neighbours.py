@@ -66,16 +66,17 @@ class SharedVariance:
         separation = np.append(self.separation, self.apart)
         at = matern(separation / length) - _below(cut, length, separation)
         at_unit = at[:-1] - at[-1]
-        # A pattern's correlation may differ from the field's by SHAPE of its variance.  Its size is
-        # estimated first: a tolerance that grew with the amplitude would draw it to smaller ones.
+        # A pattern's correlation may differ from the field's by SHAPE of its variance.  Beyond the
+        # most likely size this does not grow: the growth alone would draw to smaller amplitudes.
         weight = at_unit / self.variance
-        size = max(float(weight @ self.covariance / max(weight @ at_unit, 1e-300)), 0.0)
+        likely = max(float(weight @ self.covariance / max(weight @ at_unit, 1e-300)), 0.0)
         finer = float((1 + cut**2 * length**2 / 3) ** -1.5)
-        variance = self.variance + (SHAPE * finer * size) ** 2
 
         def log_likelihood(amplitude: float) -> float:
             left = self.covariance - at_unit * amplitude**2
-            return float(-0.5 * np.sum(left**2 / variance))
+            tolerance = SHAPE * finer * min(amplitude**2, likely)
+            variance = self.variance + tolerance**2
+            return float(-0.5 * np.sum(left**2 / variance + np.log(variance / self.variance)))
 
         return log_likelihood
 
@@ -96,9 +97,10 @@ def shared_variances(
 ) -> dict[int, tuple[SharedVariance | None, SharedVariance | None]]:
     """Evidence of neighbouring stars on the two axes of each chip, by its code.
 
-    Nothing is taken out of the scores.  The matches are those of the solution with this likelihood, or some of them.  A star that is
-    matched several times is no neighbour of itself: its catalogue position has one error.  Stars of
-    a tight group are no neighbours of each other either.  None for an axis with too few pairs.
+    Nothing is taken out of the scores.  The matches are those of the solution with this likelihood,
+    or some of them.  A star that is matched several times is no neighbour of itself: its catalogue
+    position has one error.  Stars of a tight group are no neighbours of each other either.  None
+    for an axis with too few pairs.
     """
     return {
         code: chip.shared_variances()
@@ -108,12 +110,12 @@ def shared_variances(
 
 @dataclass(frozen=True, eq=False)
 class NeighbourScores:
-    """Stars of one chip with gradient and curvature of their likelihood, axes of the polynomials."""
+    """Stars of one chip, with their scores along the axes of the polynomials."""
 
     X: Float  # scaled positions (n,)
     Y: Float
-    score: Float  # (n, 2)
-    curvature: Float  # (n, 2, 2)
+    score: Float  # (n, 2) gradient of the log-likelihood
+    curvature: Float  # (n, 2, 2) minus its second derivatives
     star: Int  # (n,) what shares an error of the reference, from 0
     pairs: Int  # (p, 2) rows of neighbours that are different stars
     separation: Float  # (p,) in pixels
@@ -131,9 +133,7 @@ class NeighbourScores:
         out = []
         for a in (0, 1):
             h = self.curvature[:, a, a]
-            shared = _shared(
-                score[:, a], h, self.pairs, self.separation, self.half, of_stars, bins
-            )
+            shared = _shared(score[:, a], h, self.pairs, self.separation, self.half, of_stars, bins)
             if shared is not None and resolved is not None:
                 shared = shared.raised(self._uncertain(resolved[..., a], h, bins))
             out.append(shared)

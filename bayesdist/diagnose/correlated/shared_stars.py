@@ -16,6 +16,8 @@ from bayesdist.utils.arrays import Float, Int
 
 STEPS = 60
 RANGE = 300.0
+NEGLIGIBLE = 1e-8  # of the density, below the largest
+MIN_FREE = 0.1  # fraction of the stars' errors that is left by the fit
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,22 +73,30 @@ def shared_stars(
         return None
     g_u, g_v, h_uu, h_uv, h_vv = likelihood.scores(stars)
     good = (h_uu > 0) & (h_vv > 0)
-    size = np.geomspace(median / RANGE, median * RANGE, STEPS)
-    log_density = log_half_cauchy(size, median)
-    others = []  # (n_stars,) curvature of a star's other matches, beside any one of them
+    # what the fit has taken of the stars' errors is not in their scores
+    free = 1 - min(model.n_params / (2 * len(repeated)), 1 - MIN_FREE)
+    squares, others = [], []  # over curvature, (n_stars,); k of each star
     for g, h in ((g_u, h_uu), (g_v, h_vv)):
-        top, bottom, squares = (
+        top, bottom, sums = (
             np.bincount(code[good], w[good], minlength=len(repeated)) for w in (g, h, h**2)
         )
         bottom = np.maximum(bottom, 1e-300)
-        rest = np.maximum(bottom - squares / bottom, 0.0)
-        others.append(rest)
-        square, widening = (top**2 / bottom)[repeated], size[:, None] ** 2 * rest[repeated]
-        log_density = log_density + 0.5 * (
+        squares.append(top**2 / bottom / free)
+        others.append(np.maximum(bottom - sums / bottom, 0.0))
+    square, rest = (np.concatenate([z[repeated] for z in both]) for both in (squares, others))
+    low, high = median / RANGE, median * RANGE
+    for _ in range(2):  # then where the density is: many stars determine the size to a few percent
+        size = np.geomspace(low, high, STEPS)
+        widening = size[:, None] ** 2 * rest
+        log_density = log_half_cauchy(size, median) + 0.5 * (
             square * widening / (1 + widening) - np.log1p(widening)
         ).sum(axis=1)
-    weight = np.exp(log_density - log_density.max())
+        weight = np.exp(log_density - log_density.max())
+        likely = np.flatnonzero(weight > NEGLIGIBLE)
+        low, high = size[max(likely[0] - 1, 0)], size[min(likely[-1] + 1, STEPS - 1)]
     variance = float(weight @ size**2 / weight.sum())
+    repetition = np.empty(len(order))
+    repetition[order] = (1 + variance * np.mean(others, axis=0))[code]
     curvature = np.stack([h_uu, h_uv, h_vv]) * good
     repetition = np.empty(len(order))
     repetition[order] = (1 + variance * np.mean(others, axis=0))[code]

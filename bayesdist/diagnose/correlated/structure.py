@@ -173,8 +173,8 @@ class Structure:
             terms[rows] = one.draws(amplitude[rows], rng)
             variance[rows] = one.variance
         sines = np.empty_like(variance)
-        for field, rows in _rows_of([one.field for one in sized], point):
-            sines[rows] = field.draws(terms[rows], variance[rows], rng)
+        for of_length, rows in _rows_of([one.field for one in sized], point):
+            sines[rows] = of_length.draws(terms[rows], variance[rows], rng)
         return terms, sines
 
     def _finer(self, part: int, waves: Sequence[Float]) -> Float:
@@ -222,10 +222,10 @@ def structure_posterior(
     For the `functions` of each part `information` (m, m) is that of their coefficients, and `score`
     (m,) the gradient of the log-likelihood where they are zero, both with the part that the fit
     absorbs eliminated; `pairs` is the evidence of neighbouring stars on each part, or a function
-    that finds it once a posterior without it tells what the functions resolve.  `noise` is the typical error
-    of one star, a few times which limits the amplitudes; `higher_order` and `structure` are prior
-    medians of the amplitudes, in the unit of the positions; `lengths` of the field are `LENGTHS` by
-    default.
+    that finds it once a posterior without it tells what the functions resolve.  `noise` is the
+    typical error of one star, a few times which limits the amplitudes; `higher_order` and
+    `structure` are prior medians of the amplitudes, in the unit of the positions; `lengths` of the
+    field are `LENGTHS` by default.
     """
     known = [_terms_first(*one) for one in zip(functions, information, score, strict=True)]
     amplitudes = AmplitudeGrid.of(

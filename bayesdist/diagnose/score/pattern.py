@@ -31,8 +31,8 @@ def pattern_test(sample: ScoredSample) -> Outcome | None:
     At each frequency k the length of sum g exp(i k x), over the scores g of one axis, is that of a
     walk of steps |g| in directions of chance where there is no wave, whatever the errors of single
     stars.  Detections of one star share the error of its reference position, and are one step
-    |sum g exp(i k x)|.  The longest of all frequencies counts as one of so many walks: at lengths that matter,
-    even neighbours of the finer frequencies hardly ever exceed it together.
+    |sum g exp(i k x)|.  The longest of all frequencies counts as one of so many walks: at lengths
+    that matter, even neighbours of the finer frequencies hardly ever exceed it together.
 
     None for less than `MIN_STARS` stars.
     """
@@ -105,7 +105,7 @@ class _Walks:
     star: Int | None  # (N,) star of each, from 0; None if each star has one detection
 
     def candidates(self, lengths: Float) -> list[tuple[int, int]]:
-        """Rows and columns (j, i) of the longest walks; the longest alone if all steps are alike."""
+        """Rows and columns (j, i) of the longest walks, or of the longest if steps are alike."""
         n = 1 if self.star is None else CANDIDATES
         longest = np.argpartition(lengths.ravel(), -n)[-n:]
         rows, columns = np.unravel_index(longest, lengths.shape)
