@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from astropy.table import Table
 
-import bayesdist as bd
 from bayesdist.data import Matches, read_matches
 from bayesdist.data.repeated_stars import (
     position_codes,
@@ -145,13 +144,3 @@ def test_stars_are_no_groups():
         assert tight_groups(np.asarray(u), np.asarray(v)) is None
     u, v = np.tile(rng.uniform(0, 2000, (2, 200)), 3)
     assert tight_groups(u, v, np.arange(600)) is None
-
-
-def test_calibrate_takes_the_option():
-    with pytest.raises(InputError, match="same_position"):
-        bd.calibrate(
-            Matches(**{k: v for k, v in repeated(50, 2).items() if k != "true"}),
-            order=1,
-            size=(1000, 1000),
-            settings={"data": {"same_position": "two"}},
-        )

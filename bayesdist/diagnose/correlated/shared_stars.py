@@ -98,6 +98,4 @@ def shared_stars(
     repetition = np.empty(len(order))
     repetition[order] = (1 + variance * np.mean(others, axis=0))[code]
     curvature = np.stack([h_uu, h_uv, h_vv]) * good
-    repetition = np.empty(len(order))
-    repetition[order] = (1 + variance * np.mean(others, axis=0))[code]
     return SharedStars(float(np.sqrt(variance)), repetition, stars, code, curvature)
