@@ -12,7 +12,7 @@ from astropy.io import fits
 from astropy.table import Table
 from astropy.wcs import WCS
 
-from bayesdist.app.commands.on_files.calibrations import calibration_at
+from bayesdist.app.calibrations import calibration_at
 from bayesdist.infer import LinearFit, fit_linear, save_fit
 from bayesdist.model import Chip, DistortionModel, TimeDependence
 from bayesdist.products import idctab_from_solution, write_idctab

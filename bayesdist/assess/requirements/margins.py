@@ -40,7 +40,9 @@ class Margin:
         The limit minus the value that the statistic stays at or under with the probability asked
         for: not negative exactly where `probability_met` is at least that probability.
     probability_met : float
-        Fraction of draws at or under the limit.
+        Fraction of draws at or under the limit.  It counts the errors that are known and no
+        others: it may be 1 where the verdict is 'undecided', because the residuals were not
+        examined, for example, or an error of the catalogue is not stated.
     mc_error : float
         Monte-Carlo standard error of `probability_met`.
     verdict : str
@@ -108,9 +110,11 @@ class Margin:
         r = self.requirement
         where = "" if self.epoch is None else f" in {self.epoch:.2f}"
         scope = f" {r.scope}" if r.scope else ""
+        known = " by the known errors alone" if self.verdict == "undecided" else ""
         return (
             f"{r.name}: {self.verdict}: {r.statistic} at most {r.limit:g} {r.unit}{scope}{where} "
-            f"with P = {self.probability_met:.3f}, {r.probability:g} asked for: {self.reason}"
+            f"with P = {self.probability_met:.3f}{known}, {r.probability:g} asked for: "
+            f"{self.reason}"
         )
 
     @property

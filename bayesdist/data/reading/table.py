@@ -228,7 +228,7 @@ def match_arguments(
         if star is not None:
             out |= {"star": star, "notes": (*out.get("notes", ()), note)}
     if "ra" not in found:
-        out |= header_arguments(table.meta)
+        out |= header_arguments(table.meta, out["unit"], source=source)
     if exposure_name is not None:
         out.setdefault("exposure_names", (exposure_name,))
     out["notes"] = (*notes, *out.get("notes", ()))
