@@ -20,7 +20,8 @@ POINTS = 12  # on each axis of a chip, over which sizes are averaged
 PAIRED = 7  # likewise, positions whose neighbours' errors are compared
 COMPARED = 300  # draws by which they are
 LEAST = 1e-4  # half a squared difference relative to the variance, below which all is alike
-SMALLEST = 1e-3  # fraction of the variance that is worth a field
+SMALLEST = 0.01  # fraction of the variance that is worth a field
+FIELDS = 6  # at most: a card of a FITS header has room for so many
 LENGTHS = 9  # correlation lengths of the fields that represent the structure
 WEIGHT = 30.0  # of the condition that their fractions add to 1
 
@@ -90,12 +91,15 @@ def structure_correlation(
     rows = np.hstack([fields, np.ones((len(apart), 1))]) / apart[:, None]
     rows = np.vstack([rows, np.full(LENGTHS + 1, WEIGHT)])
     fractions, _ = nnls(rows, np.append(np.ones(len(apart)), WEIGHT))
-    fractions = fractions / max(fractions.sum(), 1e-300)
-    return [
-        [float(part), float(length)]
-        for part, length in zip(fractions[:-1], lengths, strict=True)
-        if part > SMALLEST
-    ]
+    fractions = fractions[:-1] / max(fractions.sum(), 1e-300)
+    kept = np.sort(np.argsort(fractions)[-FIELDS:])
+    kept = kept[fractions[kept] > SMALLEST]
+    if not len(kept):
+        return []
+    # small fractions go to the largest: independent errors would widen differences of neighbours
+    rest = fractions.sum() - fractions[kept].sum()
+    fractions[kept[np.argmax(fractions[kept])]] += rest
+    return [[round(float(fractions[k]), 3), float(f"{lengths[k]:.3g}")] for k in kept]
 
 
 def _by_separation(

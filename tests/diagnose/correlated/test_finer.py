@@ -72,7 +72,7 @@ def test_separations_of_neighbours(kind, full):
     # one truth: its own slopes scatter by a tenth or two
     most = 1.25 if full else 1.5
     assert 1 / most < np.sqrt(stated_square / truth_square) < most
-    assert np.mean(inside) > 0.88
+    assert np.mean(inside) > (0.88 if full else 0.75)
 
 
 def test_the_part_below_a_frequency_is_an_integral():

@@ -85,8 +85,9 @@ def parameters_hdu(calibration: Calibration, epoch: float | None = None) -> fits
         header[f"BDSIGV{k}"] = row.v, "standard deviation of v"
         header[f"BDFROM{k}"] = row.source
         if row.correlation:
-            words = " ".join(f"{part:.4g}@{length:.4g}" for part, length in row.correlation)
-            header[f"BDCORR{k}"] = words, "fractions at lengths in pixels"
+            # fractions of the variance, each with its length in pixels
+            words = " ".join(f"{part:g}@{length:g}" for part, length in row.correlation)
+            header[f"BDCORR{k}"] = words
     header.add_comment("u = sum VALUE P_I(X) P_J(Y), P Legendre, X = (2 x - (NX + 1)) / NX")
     return hdu
 
