@@ -235,9 +235,9 @@ def _finer_evidence(
     values = functions.evaluate(near.X, near.Y)
     drawn = structure.draws(RESOLVED, rng)
     known = functions.n_known
-    absorbed = sum(
-        z @ (working.covariance @ t[:, :known]).T for z, t in zip(drawn, taken, strict=True)
-    )
+    absorbed = np.zeros((RESOLVED, model.n_params))
+    for z, t in zip(drawn, taken, strict=True):
+        absorbed += z @ (working.covariance @ t[:, :known]).T
     resolved = np.empty((RESOLVED, len(phi), 2))
     for a in (0, 1):
         columns = model.coefficient_slice(model.chips[code].number, a)

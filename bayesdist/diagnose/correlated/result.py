@@ -115,15 +115,15 @@ def _by_separation(
     angle = np.pi * (1 + np.sqrt(5)) * np.arange(X.size)
     separations = np.append(0.0, separations)
     step = 2 * separations[:, None] / np.array(chip.size)[:, None, None]
-    at = []
-    for z, moved in zip((X, Y), (np.cos(angle), np.sin(angle)), strict=True):
-        other = z + step[len(at)] * moved
+    at = np.empty((2, len(separations), X.size))
+    for k, (z, moved) in enumerate(((X, np.cos(angle)), (Y, np.sin(angle)))):
+        other = z + step[k] * moved
         # to the other side where it would leave the chip
-        at.append(np.where(np.abs(other) <= 1, other, z - step[len(at)] * moved))
+        at[k] = np.where(np.abs(other) <= 1, other, z - step[k] * moved)
     inside = (np.abs(at[0]) <= 1) & (np.abs(at[1]) <= 1)
     draws = slice(None, None, max(1, len(theta) // COMPARED))
-    values = found.evaluate(*(z.ravel() for z in at)).astype(found.coefficients.dtype)
-    phi = model.basis(chip.number).evaluate_scaled(*(z.ravel() for z in at))
+    values = found.evaluate(at[0].ravel(), at[1].ravel()).astype(found.coefficients.dtype)
+    phi = model.basis(chip.number).evaluate_scaled(at[0].ravel(), at[1].ravel())
     out = np.zeros(len(separations))
     for a in (0, 1):
         in_fit = theta[draws, model.coefficient_slice(chip.number, a)] @ phi.T

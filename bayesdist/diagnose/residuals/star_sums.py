@@ -109,8 +109,8 @@ def star_bins(
         size = model.chips[model.chip_code(number)].size
         own, star = values[:, here], code[here]
         for nx, ny in several:
-            scaled = (2 * (own[k] - 0.5) / size[k] - 1 for k in (0, 1))
-            cell = cell_index(*scaled, (nx, ny))
+            X, Y = (2 * (own[k] - 0.5) / size[k] - 1 for k in (0, 1))
+            cell = cell_index(X, Y, (nx, ny))
             _, of = joint_clusters(cell, star)
             means = [np.bincount(of, z) / np.bincount(of) for z in own]
             out[number, (nx, ny)] = binned_sums(*means, bins=(nx, ny), size=size)
