@@ -55,6 +55,9 @@ class HoldsRun(Protocol):
         """Folder of the run, whose configuration is a file; None if the run is in memory."""
 
 
+Held = TypeVar("Held", bound=HoldsRun)
+
+
 @contextmanager
 def in_python_terms(*, keys: bool = True) -> Iterator[None]:
     """Context in which errors name arguments in place of options, and of `keys` if these are True.
@@ -71,12 +74,12 @@ def in_python_terms(*, keys: bool = True) -> Iterator[None]:
 
 
 def python_terms(
-    method: Callable[Concatenate[HoldsRun, P], R],
-) -> Callable[Concatenate[HoldsRun, P], R]:
+    method: Callable[Concatenate[Held, P], R],
+) -> Callable[Concatenate[Held, P], R]:
     """Method of a run whose errors are worded for Python."""
 
     @wraps(method)
-    def worded(self: HoldsRun, /, *args: P.args, **kwargs: P.kwargs) -> R:
+    def worded(self: Held, /, *args: P.args, **kwargs: P.kwargs) -> R:
         with in_python_terms(keys=self.folder is None):
             return method(self, *args, **kwargs)
 

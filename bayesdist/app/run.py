@@ -25,6 +25,7 @@ from bayesdist.assess import ErrorBudget, Margin, Requirement, UncertaintyMap
 from bayesdist.assess.budget.budget import budget_of, place_budget
 from bayesdist.assess.drawn import DrawnErrors
 from bayesdist.assess.evaluation import Evaluation, position_map
+from bayesdist.assess.requirements.verdict import VERDICT_LEVELS
 from bayesdist.calibration.calibration import Calibration, calibration_of_exposure
 from bayesdist.calibration.chip_map import chosen_chip
 from bayesdist.calibration.sky_distribution import sky_distribution
@@ -42,7 +43,7 @@ from bayesdist.report.html import (
     summary_text,
 )
 from bayesdist.utils.checks import warnings_of
-from bayesdist.utils.numbers import with_mas
+from bayesdist.utils.numbers import number, with_mas
 from bayesdist.utils.quantities import Random, year_of
 
 if TYPE_CHECKING:
@@ -435,11 +436,16 @@ class Run:
         ]
         if self.folder is not None:
             facts.append(("Folder", str(self.folder)))
+        not_shown = [
+            f"{m.requirement.name}: not shown: {m.reason}"
+            for m in self.margins
+            if m.verdict == "not shown"
+        ]
         return RunSummary(
             title=title_of(config) or "calibration",
             verdict_level=self._level,
             headline=self._headline,
-            warnings=self.warnings,
+            warnings=(*self.warnings, *not_shown),
             facts=facts,
             margins_rows=margin_rows(self.margins),
             budget_rows=budget_rows(evaluation.budget, scale_mas=scale_mas),
@@ -460,13 +466,24 @@ class Run:
             return "No requirement was given"
         verdicts = [margin.verdict for margin in self.margins]
         if len(verdicts) == 1:
-            row = margin_rows(self.margins)[0]
-            value = f"{row['Limit']}, now {row['Value']}, P(met) {row['P(met)']}"
-            known = " by the known errors alone" if verdicts[0] == "undecided" else ""
-            return f"{verdicts[0].upper()}: {row['Requirement']}: {value}{known}"
-        counts = [(verdicts.count(name), name) for name in ("missed", "undecided", "met")]
+            return self._verdict_words(self.margins[0])
+        counts = [(verdicts.count(name), name) for name in reversed(VERDICT_LEVELS)]
         return f"{len(verdicts)} requirements: " + ", ".join(
             f"{count} {name}" for count, name in counts if count
+        )
+
+    def _verdict_words(self, margin: Margin) -> str:
+        """Verdict on a requirement with value, limit and probability."""
+        asked, row = margin.requirement, margin_rows([margin])[0]
+        statistic = f"{asked.statistic} {asked.scope}".strip()
+        scale_mas = self.results.config.detector.scale_mas
+        value = f"{row['Value']} {margin.unit}"
+        if margin.unit == "pix" and scale_mas is not None:
+            value += f" ({number(margin.value * scale_mas, 3)} mas)"
+        known = " by the known errors alone" if margin.verdict == "undecided" else ""
+        return (
+            f"{margin.verdict.upper()}: {asked.name}: {statistic} {value}, "
+            f"limit {asked.limit:g} {asked.unit}, {margin.probability_words}{known}"
         )
 
     @python_terms

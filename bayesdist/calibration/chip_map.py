@@ -303,7 +303,7 @@ def chosen_chip(
     """
     if chip is None and len(numbers) == 1:
         return numbers[0]
-    if chip in numbers:
+    if chip is not None and chip in numbers:
         return int(chip)
     raise InputError(
         f"has {len(numbers)} chips, and none is named"

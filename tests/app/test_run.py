@@ -13,6 +13,7 @@ import tomllib
 import warnings
 from html.parser import HTMLParser
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -22,6 +23,7 @@ from astropy.table import Table
 from astropy.wcs import WCS, FITSFixedWarning
 
 import bayesdist
+from bayesdist.app.commands.on_runs.validate import exit_code
 from bayesdist.app.config import load_config, parse_config
 from bayesdist.app.report import title_of
 from bayesdist.app.screen import progress_bar
@@ -716,7 +718,21 @@ def test_validate_of_an_unconverged_run_is_not_met(unconverged, tmp_path):
     run = shutil.copytree(unconverged[0], tmp_path / "run")
     path = _requirements(tmp_path / "a.toml", loose)
     result = cli("requirements", run, "--requirements", path)
-    assert result.code == 4 and "undecided" in result.out
+    assert result.code == 6 and "undecided: the posterior is not converged" in result.out
+
+
+@pytest.mark.parametrize(
+    ("verdicts", "code"),
+    [
+        ((), 0),
+        (("met", "met"), 0),
+        (("met", "not shown"), 5),
+        (("not shown", "undecided", "met"), 6),
+        (("undecided", "missed", "not shown"), 4),
+    ],
+)
+def test_the_exit_code_of_requirements_tells_the_verdicts_apart(verdicts, code):
+    assert exit_code([SimpleNamespace(verdict=verdict) for verdict in verdicts]) == code
 
 
 def test_check_samples_nothing(finished):
