@@ -217,7 +217,7 @@ def score_checks(
             found.setdefault(test.remedy, []).append(test)
     for remedy, several in found.items():
         sentence = f"{'; '.join(test.finding for test in several)}: {remedy}"
-        doubt = "" if all(_held(correlated, test) for test in several) else LARGER
+        doubt = "" if all(_held(correlated, test, tests) for test in several) else LARGER
         names = ", ".join(test.name for test in several)
         value = "; ".join(
             f"{size_of(test.size, test.unit, 2)} rms, {probability(test.p_value)}"
@@ -229,17 +229,27 @@ def score_checks(
         yield Check(SCORE_TESTS, name, "nothing found", limit, "pass")
 
 
-def _held(correlated: Discrepancy | None, test: ScoreTest) -> bool:
-    """True where correlated errors hold what a test has found."""
+def _held(correlated: Discrepancy | None, test: ScoreTest, tests: Sequence[ScoreTest]) -> bool:
+    """True where correlated errors hold what one of the tests has found."""
     if correlated is None:
         return False
-    scatter = set() if correlated.linear is None else set(correlated.linear.scatter)
+    of_exposures = correlated.facts.get("exposure_fields", {})
+    enough = STRUCTURE_IN_BUDGET.value * test.size
+    linear = correlated.linear
+    scatter = set() if linear is None else set(linear.scatter)
+    bend = 0.0 if linear is None else linear.bend
+    in_time = linear is not None and linear.correlation_time > 0
+    wandering = any(one.significant and one.held_by == "time" for one in tests)
     held = {
         "": False,
         "noise": True,
         "structure": bool(correlated.structure),
         "exposures": bool(scatter - {CURVATURE}),
-        "curvature": CURVATURE in scatter,
+        # a parabola does not hold deviations that wander
+        "curvature": in_time or (bend >= enough and not wandering),
+        "second order": of_exposures.get("second_order", 0.0) >= enough > 0,
+        "exposure fields": of_exposures.get("field", 0.0) >= enough > 0,
+        "time": in_time,
     }
     return held[test.held_by]
 
@@ -285,6 +295,22 @@ def exposure_checks(found: ExposureScatter | None) -> Iterator[Check]:
         "warn" if sentence else "pass",
         sentence,
     )
+
+
+def outlying_checks(correlated: Discrepancy | None) -> Iterator[Check]:
+    """Check that names exposures whose linear terms are far beyond the scatter of the others."""
+    names = [] if correlated is None else correlated.facts.get("exposures_outlying", [])
+    if names:
+        yield Check(
+            FIT,
+            "Exposures that deviate far more than the others",
+            count(len(names)),
+            "none",
+            "warn",
+            f"{', '.join(names[:3])}{f' and {len(names) - 3} more' if len(names) > 3 else ''} "
+            "lie shifted, turned or stretched against the other exposures, far beyond their "
+            "scatter, which is stated without them: leave out what went wrong, or set model.frames",
+        )
 
 
 def holdout_checks(found: HoldoutValidation | None) -> Iterator[Check]:

@@ -16,6 +16,7 @@ from bayesdist.diagnose.checks import (
     exposure_checks,
     holdout_checks,
     input_checks,
+    outlying_checks,
     score_checks,
     structure_checks,
 )
@@ -183,6 +184,7 @@ class Diagnostics:
             *structure_checks(self.misfits, self.correlated),
         ]
         out += [*coverage_checks(self.coverage), *exposure_checks(self.sample.by_exposure)]
+        out += outlying_checks(self.correlated)
         if self.epoch_shift is not None and self.epoch_shift.significant:
             text = self.epoch_shift.sentence
             out.append(Check("Fit", "Epochs of the exposures", level="warn", sentence=text))

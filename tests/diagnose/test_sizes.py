@@ -24,9 +24,9 @@ from .test_results import outcome
 pytestmark = pytest.mark.usefixtures("one_thread")
 
 NULL = dict(scenes_of_null())
-# by construction: one that looks at several radii, and one that asks two tests to agree (edges
-# alone, and edges beside the orders)
-CONSERVATIVE = {"truncation", "edges"}
+# by construction: those that look at several radii or lengths, and one that asks two tests to agree
+# (edges alone, and edges beside the orders)
+CONSERVATIVE = {"truncation", "edges", "fields of exposures"}
 
 
 def p_values(name: str, seed: int) -> tuple[dict[str, float], bool]:

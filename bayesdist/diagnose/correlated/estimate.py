@@ -12,6 +12,8 @@ import numpy as np
 from bayesdist.data.matches import Matches
 from bayesdist.data.repeated_stars import error_codes
 from bayesdist.diagnose.correlated.deviations import MAX_EXPOSURES, linear_deviations
+from bayesdist.diagnose.correlated.exposure_fields import detection_scores, exposure_fields
+from bayesdist.diagnose.correlated.exposure_time import correlated_hierarchy
 from bayesdist.diagnose.correlated.functions import StructureFunctions
 from bayesdist.diagnose.correlated.information import (
     CellSums,
@@ -131,6 +133,25 @@ def estimate_discrepancy(
         information, working, chips, near, priors, pixel, n_draws, rng
     )
     linear = linear_deviations(information, working, priors, n_draws, rng, exposures=exposures)
+    if linear is not None and parameter_priors is not None and model.frames != "none":
+        dates = _dates_of_exposures(working)
+        correlation = correlated_hierarchy(
+            model, mean, working.covariance, parameter_priors, dates, n_draws, rng
+        )
+        if correlation is not None:
+            linear = replace(
+                linear, theta=linear.theta + correlation[0], correlation_time=correlation[1]
+            )
+    near_stars = stars if stars is not None else sample
+    detections = None
+    if near_stars is not None and len(near_stars.exposure_names) > 1:
+        prepared, order = prepare(model, near_stars)
+        shared = error_codes(near_stars.u, near_stars.v, near_stars.star)
+        codes = np.arange(len(order)) if shared is None else shared[order]
+        detections = detection_scores(
+            model, prepared, likelihood, near_stars.exposure[order], codes
+        )
+    fields = exposure_fields(information, working, detections, priors, n_draws, rng)
     formal, noise = working.covariance, working.sandwich()
     if repeated is not None:
         noise = noise + repeated.covariance(model, mean, formal)
@@ -141,11 +162,28 @@ def estimate_discrepancy(
         theta = settling.mean(theta)
         if linear is not None:
             linear = replace(linear, theta=settling.mean(linear.theta))
+        if fields is not None:
+            fields = replace(fields, theta=settling.mean(fields.theta))
     facts |= {"unit": model.unit, "noise_ratio": ratio}
     facts["structure_correlation"] = structure_correlation(model, found, theta)
     if linear is not None:
         facts |= linear.facts
-    return Discrepancy(model, mean, formal, noise, found, theta, linear, facts)
+        if linear.outlying:
+            names = model.exposures
+            if stars is not None and model.frames == "none":
+                names = stars.exposure_names
+            facts["exposures_outlying"] = [names[code] for code in linear.outlying]
+    if fields is not None:
+        facts["exposure_fields"] = fields.facts(model.chips[0].size)
+    return Discrepancy(model, mean, formal, noise, found, theta, linear, facts, fields)
+
+
+def _dates_of_exposures(information: Information) -> Float:
+    """Dates (E,) of the exposures of a model, decimal years; NaN for one without stars."""
+    groups = information.sums.groups
+    out = np.full(len(information.model.exposures), np.nan)
+    out[groups.exposure] = groups.epoch
+    return out
 
 
 def _several(stars: Matches) -> bool:

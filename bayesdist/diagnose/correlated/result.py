@@ -11,6 +11,7 @@ import numpy as np
 from scipy.optimize import nnls
 
 from bayesdist.diagnose.correlated.deviations import LinearDeviations
+from bayesdist.diagnose.correlated.exposure_fields import ExposureFields
 from bayesdist.diagnose.correlated.functions import StructureFunctions
 from bayesdist.model import Chip, DistortionModel
 from bayesdist.utils.arrays import Float
@@ -158,6 +159,8 @@ class Discrepancy:
         Of exposures and drifts.
     facts : mapping
         Sizes, for summaries: JSON-able.
+    fields : ExposureFields or None
+        Second-order terms and smooth fields of single exposures; None for one exposure.
     """
 
     model: DistortionModel
@@ -168,6 +171,7 @@ class Discrepancy:
     structure_theta: Float
     linear: LinearDeviations | None
     facts: Mapping[str, Any] = field(default_factory=dict)
+    fields: ExposureFields | None = None
 
     @property
     def n_draws(self) -> int:
@@ -185,22 +189,23 @@ class Discrepancy:
 
     def moved(self, matrix: Float) -> Discrepancy:
         """Discrepancy with all errors of the parameters multiplied by a matrix (D, D)."""
-        linear = self.linear
+        linear, fields = self.linear, self.fields
         return replace(
             self,
             formal=matrix @ self.formal @ matrix.T,
             noise=matrix @ self.noise @ matrix.T,
             structure_theta=self.structure_theta @ matrix.T,
             linear=linear and replace(linear, theta=linear.theta @ matrix.T),
+            fields=fields and replace(fields, theta=fields.theta @ matrix.T),
         )
 
     @cached_property
     def covariance(self) -> Float:
         """Covariance (D, D) of the parameters' errors by all causes; about zero, not their mean."""
         out = self.noise.copy()
-        for theta in (self.structure_theta, None if self.linear is None else self.linear.theta):
-            if theta is not None:
-                out += theta.T @ theta / len(theta)
+        parts = [part.theta for part in (self.linear, self.fields) if part is not None]
+        for theta in (self.structure_theta, *parts):
+            out += theta.T @ theta / len(theta)
         return out
 
     @property

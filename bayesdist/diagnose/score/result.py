@@ -15,7 +15,9 @@ from bayesdist.utils.distributions import chi2_isf, f_isf
 from bayesdist.utils.limits import SCORE_TESTS
 from bayesdist.utils.numbers import p_words
 
-HeldBy = Literal["", "noise", "structure", "exposures", "curvature"]
+HeldBy = Literal[
+    "", "noise", "structure", "exposures", "curvature", "second order", "exposure fields", "time"
+]
 
 POWER = 0.9  # with which the smallest effect that is stated would have been found
 
@@ -67,8 +69,9 @@ class ScoreTest:
     significant : bool
         More than chance, corrected for the number of tests (Holm 1979, at `limits.SCORE_TESTS`).
     held_by : str
-        Kind of correlated errors that hold what was found: 'noise', 'structure', 'exposures' or
-        'curvature'; empty where none do.
+        Kind of correlated errors that hold what was found: 'noise', 'structure', 'exposures',
+        'curvature', 'second order' or 'exposure fields' (of single exposures), 'time'
+        (deviations of exposures that are correlated in time); empty where none do.
     """
 
     name: str

@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from bayesdist.data.matches import Matches
-from bayesdist.diagnose.score.exposures import exposure_test
+from bayesdist.diagnose.score.exposure_fields import exposure_field_test
+from bayesdist.diagnose.score.exposures import exposure_tests
 from bayesdist.diagnose.score.gap import gap_test
 from bayesdist.diagnose.score.motions import motion_test
 from bayesdist.diagnose.score.noise import noise_tests
@@ -53,18 +54,16 @@ def score_tests(
         When the table does not go with the solution's model, or the solution does not say how it
         was fitted.
     """
-    projection = projection_of(
-        functions_for(scored_sample(table, solution)),
-        np.asarray(solution.mean, float),
-        priors or GaussianPriors.none(solution.model),
-    )
+    priors, mean = priors or GaussianPriors.none(solution.model), np.asarray(solution.mean, float)
+    projection = projection_of(functions_for(scored_sample(table, solution)), mean, priors)
     sample = projection.scored
     found = [
         *regressor_tests(projection),
         gap_test(projection),
         motion_test(sample),
         *noise_tests(sample),
-        exposure_test(projection),
+        *exposure_tests(projection, mean, priors),
+        exposure_field_test(sample),
         pattern_test(sample),
         truncation_test(sample, match_radius),
     ]

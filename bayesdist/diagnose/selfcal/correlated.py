@@ -76,6 +76,8 @@ def selfcal_discrepancy(
     if deviations is not None:
         linear = deviation_draws(deviations, S[m:, m:], score[m:], taken[:, m:], priors, DRAWS, rng)
         facts |= linear.facts
+        if linear.outlying:
+            facts["exposures_outlying"] = [model.exposures[code] for code in linear.outlying]
     if model.frames != "affine" and not (linear and linear.scatter):
         facts["exposures_measured"] = False
     return Discrepancy(model, solution.theta, cov, noise, found, theta, linear, facts)
