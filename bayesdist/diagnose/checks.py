@@ -6,6 +6,7 @@ from collections.abc import Iterator, Sequence
 from math import isclose
 
 from bayesdist.data.matches import Matches
+from bayesdist.data.repeated_stars import repeated_detections, tight_groups
 from bayesdist.diagnose.correlated import Discrepancy
 from bayesdist.diagnose.correlated.deviations import CURVATURE
 from bayesdist.diagnose.holdout.validation import HoldoutValidation
@@ -97,6 +98,22 @@ def input_checks(
             f"which was used, and {stated:g} {fit.unit} by the matches",
         )
     yield from matching_checks(match_radius, reference_sigma, in_circle=in_circle)
+    if matched_before:
+        yield from repeated_star_checks(table)
+
+
+def repeated_star_checks(table: Matches) -> Iterator[Check]:
+    """Checks of stars with several detections in one exposure, and of tight groups of stars."""
+    repeated = repeated_detections(table.u, table.v, table.exposure, table.star)
+    if repeated is not None:
+        name = "Stars with several detections in one exposure"
+        value = f"{count(repeated.stars)} of {count(repeated.n_stars)}"
+        yield Check(MATCHING, name, value, "none", "warn", repeated.sentence)
+    groups = tight_groups(table.u, table.v, table.star)
+    if groups is not None:
+        value = f"{count(groups.groups)} of {groups.size} stars"
+        sentence = groups.sentence(table.unit)
+        yield Check(MATCHING, "Tight groups of stars", value, "none", "warn", sentence)
 
 
 def frames_doubt(fit: LinearFit, table: Matches, *, suspicious: bool) -> str:

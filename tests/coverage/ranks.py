@@ -64,12 +64,13 @@ def structure(rng: np.random.Generator) -> fields.Field:
         sizes *= apart / np.sqrt(np.mean(apart**2))
     waves = functions.finer_waves(rng)
     spread = np.sqrt(functions.spectrum(length))
+    finer = np.sqrt(functions.finer_spectrum(length, waves))
     coefficients = [
         np.concatenate(
             [
                 of_terms * functions.decline() * rng.standard_normal(functions.n_terms),
                 a * spread * rng.standard_normal(functions.n_sines),
-                a * np.sqrt(functions.finer(length)) * rng.standard_normal(2 * len(waves)),
+                a * np.tile(finer, 2) * rng.standard_normal(2 * len(waves)),
             ]
         )
         for a in sizes

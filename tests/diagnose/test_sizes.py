@@ -24,9 +24,9 @@ from .test_results import outcome
 pytestmark = pytest.mark.usefixtures("one_thread")
 
 NULL = dict(scenes_of_null())
-# by construction: those that look at several radii or lengths, and one that asks two tests to agree (edges
-# alone, and edges beside the orders); one that counts overlapping patches as if they were apart,
-# and one whose statistic is positive for all noise that is a mixture of Gaussians
+# by construction: those that look at several radii or lengths; one that asks two tests to agree
+# (edges alone, and edges beside the orders); one that counts overlapping patches as if they were
+# apart; and one whose statistic is positive for all noise that is a mixture of Gaussians
 CONSERVATIVE = {"truncation", "edges", "fields of exposures", "skewness of a patch", "two cores"}
 
 

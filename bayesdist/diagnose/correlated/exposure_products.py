@@ -24,10 +24,10 @@ import scipy.fft
 from numpy.typing import NDArray
 
 from bayesdist.diagnose.correlated.functions import legendre_products
-from bayesdist.diagnose.correlated.neighbours import matern
 from bayesdist.model.basis import polynomial_terms
 from bayesdist.model.grid import cell_index
 from bayesdist.utils.arrays import Float, Int
+from bayesdist.utils.matern import matern
 
 SIDE = 32  # cells along the longer side of a chip
 SECOND_ORDER = 2  # highest total order of the terms that are taken out of each exposure

@@ -204,9 +204,18 @@ def cells_per_side(n_groups: int) -> int:
     return next(side for most, side in SIDES if n_groups <= most)
 
 
-def cell_sums(stars: Stars, likelihood: Likelihood, side: int) -> CellSums:
-    """Sums over some stars with `side` cells on each side of a chip, as a task for `Shards.sum`."""
-    g_u, g_v, h_uu, h_uv, h_vv = likelihood.scores(stars)
+def cell_sums(
+    stars: Stars, likelihood: Likelihood, side: int, excess: Float | None = None
+) -> CellSums:
+    """Sums over some stars with `side` cells on each side of a chip, as a task for `Shards.sum`.
+
+    `excess` (N,) is the variance of the gradient of each star relative to its curvature, 1 by
+    default, by which both are divided.
+    """
+    columns_of_stars = likelihood.scores(stars)
+    if excess is not None:
+        columns_of_stars = columns_of_stars / excess
+    g_u, g_v, h_uu, h_uv, h_vv = columns_of_stars
     # Where a star may or may not be a false match its curvature is negative.  Such stars are left
     # out, so that every sum of curvatures is that of a possible likelihood.
     good = (h_uu > 0) & (h_vv > 0)

@@ -8,6 +8,7 @@ from functools import cached_property
 import numpy as np
 
 from bayesdist.data.matches import Matches
+from bayesdist.data.repeated_stars import error_codes
 from bayesdist.infer.kernel.mixture import Constants
 from bayesdist.infer.solution.solution import Solution, likelihood_of
 from bayesdist.infer.stars.likelihood import MixtureAt
@@ -54,8 +55,8 @@ class ScoredSample:
     mag: Float | None  # (N,)
     colour: Float | None
     epoch: Float | None
-    # (N,) number of the star, from 0: detections of one star share the error of its reference
-    # position
+    # (N,) number of the star, or of the tight group of stars, from 0: its detections share the
+    # error of the reference position
     star: Int
     # chip, exposure (N,): codes into the model's chips, and into the exposures of the data
     chip: Int
@@ -98,6 +99,12 @@ class ScoredSample:
         """Score (2, N), given back what the fit has taken (Bell and McCaffrey 2002)."""
         return np.asarray(self.score / np.sqrt(1.0 - self.leverage))
 
+    @cached_property
+    def share(self) -> Float:
+        """Weight (N,) of each used detection by which those of one star count as one."""
+        number = np.bincount(self.star, self.used)
+        return np.asarray(1.0 / np.maximum(number, 1.0)[self.star])
+
     def blocks_by(self, name: str) -> list[list[Block]]:
         """Blocks that have a code in common: 'exposure', 'frame_exposure'."""
         found: dict[int, list[Block]] = {}
@@ -132,7 +139,8 @@ def scored_sample(
     stars, order = prepare(solution.model, table.select(by_exposure))
     rows = by_exposure[order]
     columns = likelihood.scores(stars)
-    codes = np.arange(len(rows)) if table.star is None else table.star[rows]
+    shared = error_codes(table.u, table.v, table.star)
+    codes = np.arange(len(rows)) if shared is None else shared[rows]
     blocks = _blocks(stars, table.exposure[rows], likelihood.theta)
     turn = np.empty((len(rows), 2, 2))
     for block in blocks:

@@ -199,9 +199,13 @@ class _FalseMatches:
 
 
 def _weights(sample: ScoredSample) -> Float:
-    """Probabilities (N,) of true matches, without those whose residuals the fit has taken."""
+    """Probabilities (N,) of true matches, those of one star divided by their number.
+
+    They are 0 for residuals that the fit has taken.  Detections that share the error of one
+    reference position lie beyond a radius together, or not at all.
+    """
     leverage = np.broadcast_to(sample.leverage, sample.score.shape)
-    return np.asarray(sample.inlier * (leverage.max(axis=0) < LARGEST_LEVERAGE))
+    return np.asarray(sample.inlier * sample.share * (leverage.max(axis=0) < LARGEST_LEVERAGE))
 
 
 def _alike(variance: Float, inlier: Float) -> Int:
