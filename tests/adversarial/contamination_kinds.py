@@ -13,7 +13,7 @@ import numpy as np
 from . import fields
 from .star_kinds import BRIGHT, FAINT, OF_MAGNITUDE, centroid_sigma, magnitudes
 from .static_kinds import CATALOGUE_WORDS, STRUCTURE
-from .truth import SIGMA, TWO, Frame, Truth, kind, mapped, observed, order_config, pixels
+from .truth import SIGMA, Frame, Piece, Truth, kind, mapped, observed, order_config, pixels
 
 MIXED = (
     *("unlabelled", "visit", "blend", "ghost", "lopsided", "one-sided", "one side", "skew"),
@@ -234,14 +234,27 @@ def wrong_exposure_names(rng: np.random.Generator, n: int) -> Truth:
     return Truth(stars, true_map, config, None, frames)
 
 
-@contaminated("wrong_chip", *OF_LABELS, "wrong chip", "rejection", n=2500)
+CHANNELS = (
+    Piece(1, fields.SIDE, fields.SIDE, 0.0),
+    Piece(2, fields.SIDE, fields.SIDE, fields.SIDE),
+)
+
+
+@contaminated("wrong_chip", *OF_LABELS, "wrong chip", n=3000)
 def wrong_chip(rng: np.random.Generator, n: int) -> Truth:
-    """Of 3 % of the rows the number of the chip is that of the other one."""
-    true_map = mapped(fields.distortion(rng))
+    """Two channels see the same field through optics that differ by 0.1 px rms; of 6 % of the rows,
+    most of them of one side, the number of the channel is that of the other one."""
+    first = mapped(fields.distortion(rng))
+    apart = fields.of_rms(fields.random_polynomial(rng, {0: 1.0, 1: 1.0, 2: 1.0}), 0.1)
+
+    def true_map(x: np.ndarray, y: np.ndarray, epoch: float | None = None) -> np.ndarray:
+        second = np.asarray(y) > fields.SIDE + 0.5  # in the mosaic above the first one
+        y = y - fields.SIDE * second
+        return first(x, y, epoch) + second[..., None] * apart(x, y)
+
     x, y = pixels(rng, n)
-    half = fields.SIDE // 2
-    upper = y > half + 0.5
-    wrong = rng.uniform(size=n) < 0.03
-    columns = {"chip": np.where(upper ^ wrong, 1, 2)}
-    stars = observed(rng, x, np.where(upper, y - half, y), true_map(x, y, None), **columns)
-    return Truth(stars, true_map, order_config(3), chips=TWO)
+    second = rng.uniform(size=n) < 0.5
+    wrong = rng.uniform(size=n) < rising(0.0, 0.12)(x, y)
+    seen = true_map(x, y + fields.SIDE * second)
+    stars = observed(rng, x, y, seen, chip=np.where(second ^ wrong, 2, 1))
+    return Truth(stars, true_map, order_config(3), chips=CHANNELS)
