@@ -10,7 +10,18 @@ import numpy as np
 
 from . import fields
 from .static_kinds import CATALOGUE_WORDS, STRUCTURE
-from .truth import SIGMA, Frame, Map, Truth, kind, mapped, observed, order_config, pixels
+from .truth import (
+    SIGMA,
+    Frame,
+    Map,
+    Truth,
+    catalogue_row,
+    kind,
+    mapped,
+    observed,
+    order_config,
+    pixels,
+)
 
 BREATHING = 2e-5  # scatter of scale and shears
 EPOCH0 = 2007.0
@@ -108,6 +119,8 @@ def campaign(
     if dates is not None:
         columns["epoch"] = epoch = np.linspace(*dates, exposures)[code]
         config["model"]["tdd"] = TDD
+        if catalogue is None:
+            config["budget"].append(catalogue_row(0.0, "proper motions"))
         assessed = dates[1] + beyond
     w = true_map(x, y, epoch)
     if deviations is not None:

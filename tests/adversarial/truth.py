@@ -193,15 +193,10 @@ def order_config(order: int, **model: Any) -> dict[str, Any]:
     return {"model": {"order": order, **model}, "budget": [catalogue_row(CATALOGUE)]}
 
 
-def catalogue_row(sigma: float) -> dict[str, Any]:
-    """The budget row of a reference catalogue."""
-    return {
-        "name": "reference catalogue",
-        "kind": "systematic",
-        "sigma_u": sigma,
-        "sigma_v": sigma,
-        "unit": "pix",
-    }
+def catalogue_row(sigma: float, name: str = "reference catalogue") -> dict[str, Any]:
+    """The budget row of a reference catalogue, or of something else that it may have errors in."""
+    row = {"name": name, "kind": "systematic", "sigma_u": sigma, "sigma_v": sigma, "unit": "pix"}
+    return row if sigma else row | {"source": "exact in the simulation"}
 
 
 def observed(
