@@ -1,7 +1,7 @@
 """Public names and the modules that define them; each is imported on first use."""
 
 from .app.calibrate import calibrate as calibrate
-from .app.commands.on_files.calibrations import read_calibration as read_calibration
+from .app.calibrations import read_calibration as read_calibration
 from .app.run import (
     Run as Run,
     open_run as open_run,

@@ -12,6 +12,7 @@ from typing import TypeVar
 
 __all__ = [
     "BayesdistError",
+    "BayesdistWarning",
     "ConfigError",
     "DegenerateError",
     "FormatError",
@@ -64,6 +65,13 @@ class BayesdistError(Exception):
         """The whole message as one sentence."""
         head = f"{self.where}: {self.cause}" if self.where else self.cause
         return f"{head}; {self.do}." if self.do else f"{head}."
+
+
+class BayesdistWarning(UserWarning):
+    """Warning about what other programs will make of a file, or what the file does not hold.
+
+    It is issued by functions that write files, once for each sentence.
+    """
 
 
 class InputError(BayesdistError):

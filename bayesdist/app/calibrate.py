@@ -6,6 +6,8 @@ import os
 from collections.abc import Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import fields
+from datetime import date
+from datetime import time as time_of_day
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +19,7 @@ from bayesdist.app.config.assess import RequirementBlock
 from bayesdist.app.kinds.fit_data import StarReader
 from bayesdist.app.kinds.kind import MATCHES
 from bayesdist.app.pipeline import diagnose, sample
+from bayesdist.app.python_terms import in_python_terms
 from bayesdist.app.rehearsal import rehearse
 from bayesdist.app.results import Results
 from bayesdist.app.run import Run, as_requirements
@@ -32,7 +35,7 @@ from bayesdist.data.reading.table import match_arguments
 from bayesdist.errors import ConfigError, InputError
 from bayesdist.infer import OutlierMixture
 from bayesdist.model import Chip, TimeDependence
-from bayesdist.utils.quantities import value_in, year_of
+from bayesdist.utils.quantities import value_in, values_in, year_of
 
 __all__ = ["calibrate"]
 
@@ -51,6 +54,7 @@ DEFAULTS = {
 Settings = dict[str, Any]
 
 
+@in_python_terms()
 def calibrate(
     matches: Any,
     *,
@@ -103,8 +107,8 @@ def calibrate(
         or one number in the unit of u and v.  By default their own if they have any, else the
         estimate by magnitude.
     outliers : OutlierMixture or {'gaussian', 'uniform', 'none'}
-        Distribution of false matches.  The match radius is that of `matches` if they were made by
-        `match`.
+        Distribution of false matches.  If it has no match radius, that of `matches` is used: those
+        that `match` made state it, also in the files that they were written to.
     catalogue : Catalogue, optional
         Systematic position error of the reference catalogue.  Without it verdicts are undecided,
         because no residual shows this error.
@@ -152,7 +156,7 @@ def calibrate(
     >>> run.check(bd.Requirement("whole field", "p95", 0.1))[0].verdict
     'met'
     """
-    settings = _checked(settings or {})
+    settings = _checked({} if settings is None else settings)
     stars, data = None, {"matches": MATCHES_FILE, "sigma": sigma}
     if _is_path(matches):
         data["matches"] = _absolute(matches)
@@ -162,7 +166,11 @@ def calibrate(
         stars, data["sigma"] = _stars(matches, sigma, options)
     configured: Settings = {
         "data": data,
-        "detector": {"name": name, "size": size, "scale_mas": _in(scale_mas, "mas", "scale_mas")},
+        "detector": {
+            "name": name,
+            "size": _pixels(size, "size"),
+            "scale_mas": _in(scale_mas, "mas", "scale_mas"),
+        },
         "chip": [
             {
                 "number": chip.number,
@@ -175,18 +183,20 @@ def calibrate(
         ],
         "model": {
             "order": order,
-            "reference_pixel": reference_pixel,
+            "reference_pixel": _pixels(reference_pixel, "reference_pixel"),
             "frames": frames,
             "tdd": None if time is None else _drift(time),
         },
-        "outliers": _outliers(outliers, stars),
+        "outliers": _outliers(outliers, None if stars is None else stars.unit),
         "sampler": {"seed": seed},
         "assess": {"epoch": None if epoch is None else year_of(epoch), "exposure": exposure},
-        "holdout": {"fraction": held_out} if held_out else None,
+        "holdout": None
+        if isinstance(held_out, int | float) and held_out == 0
+        else {"fraction": held_out},
         "budget": _budget(catalogue, terms),
         "requirement": [_requirement_block(one) for one in as_requirements(requirements)],
     }
-    text = _toml(_merged(configured, settings))
+    text = tomli_w.dumps(_merged(configured, settings))
     config = parse_config(text, WHERE)
     if not isinstance(config, MatchesConfig):
         raise ConfigError(
@@ -213,6 +223,14 @@ def _checked(settings: Mapping[str, Any]) -> dict[str, Any]:
             do='give sections with their keys, as in {"sampler": {"max_steps": 40000}}',
         )
     checked = dict(settings)
+    for name, section in checked.items():
+        blocks = section if isinstance(section, list | tuple) else [section]
+        if not isinstance(name, str) or not all(isinstance(b, Mapping) for b in blocks):
+            raise ConfigError(
+                f"settings[{name!r}] is {section!r}",
+                where=WHERE,
+                do='give sections with their keys, as in {"sampler": {"max_steps": 40000}}',
+            )
     earlier = checked.get("prior_calibration")
     if isinstance(earlier, Mapping) and isinstance(earlier.get("source"), str | os.PathLike):
         checked["prior_calibration"] = {**earlier, "source": _absolute(earlier["source"])}
@@ -267,13 +285,7 @@ def _stars(matches: Any, sigma: Any, options: Mapping[str, Any]) -> tuple[Matche
     elif not isinstance(sigma, str):
         sigma = value_in(sigma, matches.unit, "sigma")
     check_sigma(sigma)
-    stars = matches.as_read(sigma)
-    if sigma == "by_magnitude" and stars.in_memory:
-        # These errors are estimated from residuals that the match circle has truncated, so that
-        # the likelihood must not correct for the circle a second time.
-        no_errors = dict.fromkeys(("sigma_u", "sigma_v", "u_nominal", "v_nominal"))
-        stars = stars.with_columns(**no_errors)
-    return stars, sigma
+    return matches.as_read(sigma), sigma
 
 
 def _absolute(paths: Any) -> str | list[str]:
@@ -287,7 +299,19 @@ def _in(value: Any, unit: str, what: str) -> float | None:
     return None if value is None else value_in(value, unit, what)
 
 
+def _pixels(pair: Any, what: str) -> Any:
+    """Pair of numbers without a unit; pixels are the only one."""
+    has_unit = hasattr(pair, "unit")
+    if isinstance(pair, list | tuple):
+        has_unit = any(hasattr(value, "unit") for value in pair)
+    return values_in(pair, "pix", what).tolist() if has_unit else pair
+
+
 def _drift(time: TimeDependence) -> Settings:
+    if not isinstance(time, TimeDependence):
+        raise InputError(
+            f"time is {time!r}", where=WHERE, do="give bayesdist.TimeDependence(terms, epoch0)"
+        )
     return {"epoch0": list(time.epoch0), "terms": list(time.terms), "breaks": list(time.breaks)}
 
 
@@ -300,8 +324,8 @@ def _chips(chips: Sequence[Chip]) -> Sequence[Chip]:
     return chips
 
 
-def _outliers(outliers: OutlierMixture | str, stars: Matches | None) -> Settings:
-    """Section [outliers] of a mixture; the match radius is that of the stars if they state one."""
+def _outliers(outliers: OutlierMixture | str, unit: str | None) -> Settings:
+    """Section [outliers] of a mixture; `unit` is that of u and v, None if it is not known yet."""
     if not isinstance(outliers, str | OutlierMixture):
         raise InputError(
             f"outliers is {outliers!r}",
@@ -309,8 +333,9 @@ def _outliers(outliers: OutlierMixture | str, stars: Matches | None) -> Settings
             do="give 'gaussian', 'uniform', 'none' or bayesdist.OutlierMixture(...)",
         )
     if isinstance(outliers, str):
-        radius = None if stars is None else stars.match_radius
-        return {"match_radius": radius} | ({} if outliers == "gaussian" else {"model": outliers})
+        return {} if outliers == "gaussian" else {"model": outliers}
+    if unit is not None:
+        outliers = outliers.in_unit(unit)
     section = {field.name: getattr(outliers, field.name) for field in fields(outliers)}
     jitter = section["jitter"]
     return section | {"jitter": "fit" if jitter is None else jitter}
@@ -320,6 +345,10 @@ def _budget(catalogue: Catalogue | None, terms: Sequence[UserTerm]) -> list[Sett
     """[[budget]] rows of the errors that the user states."""
     require_catalogue(catalogue)
     rows = [] if catalogue is None else [catalogue.budget_row()]
+    if isinstance(terms, UserTerm):
+        terms = [terms]
+    if not isinstance(terms, Sequence):
+        raise InputError(f"terms is {terms!r}", where=WHERE, do="give a list of bayesdist.UserTerm")
     for term in terms:
         if not isinstance(term, UserTerm):
             raise InputError(
@@ -354,30 +383,43 @@ def _merged(configured: Settings, settings: Mapping[str, Any]) -> Settings:
     return {key: value for key, value in out.items() if value not in ({}, [])}
 
 
-def _toml(settings: Settings) -> str:
-    """Settings as the text of a TOML file."""
-    try:
-        return tomli_w.dumps(settings)
-    except (TypeError, ValueError) as error:
-        raise ConfigError(
-            f"a value cannot be written in TOML ({error})",
-            where=WHERE,
-            do="give numbers, texts, lists and mappings",
-        ) from error
-
-
 def _given_twice(key: str) -> ConfigError:
     return ConfigError(
         "is given by an argument and in settings", where=f"{WHERE}: {key}", do="give it once"
     )
 
 
-def _plain(tree: Any) -> Any:
-    """Tree of values that TOML can hold, without None."""
+def _plain(tree: Any, key: str = "") -> Any:
+    """Tree of values that TOML can hold, without None; `key` is where it stands."""
     if isinstance(tree, Mapping):
-        return {key: _plain(value) for key, value in tree.items() if value is not None}
+        for name in tree:
+            if not isinstance(name, str):
+                raise _no_value(name, key)
+        dotted = {name: f"{key}.{name}" if key else name for name in tree}
+        return {
+            name: _plain(value, dotted[name]) for name, value in tree.items() if value is not None
+        }
     if isinstance(tree, list | tuple):
-        return [_plain(value) for value in tree]
+        return [_plain(value, key) for value in tree]
+    if hasattr(tree, "unit"):
+        raise ConfigError(
+            f"{tree} has a unit, which the configuration cannot hold",
+            where=f"{WHERE}: {key}",
+            do="give the number in the unit of docs/configuration.md; lengths of an "
+            "OutlierMixture may have units if the stars have been read before",
+        )
     if isinstance(tree, np.ndarray | np.generic):
         return tree.tolist()
-    return str(tree) if isinstance(tree, Path) else tree
+    if isinstance(tree, Path):
+        return str(tree)
+    if not isinstance(tree, str | int | float | date | time_of_day):
+        raise _no_value(tree, key)
+    return tree
+
+
+def _no_value(value: Any, key: str) -> ConfigError:
+    return ConfigError(
+        f"{value!r} is no value of TOML",
+        where=f"{WHERE}: {key}",
+        do="give numbers, texts, lists and mappings",
+    )

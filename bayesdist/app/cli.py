@@ -42,8 +42,9 @@ RENAMED = {
 }
 EPILOG = (
     "Exit codes: 0 success, 1 bad input, 2 wrong usage, 3 not converged under --strict, "
-    "4 requirement missed or undecided, 65 input nested too deep, 70 a defect of bayesdist, "
-    "71 too little memory, 74 refused by the system, 130 interrupted."
+    "4 a requirement missed, 5 one not shown, 6 one undecided, "
+    "65 input nested too deep, 70 a defect of bayesdist, 71 too little memory, "
+    "74 refused by the system, 130 interrupted."
 )
 
 

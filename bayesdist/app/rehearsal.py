@@ -71,6 +71,7 @@ def _rehearse_evaluation(data: FitData, config: Config, n_draws: int) -> None:
         grid=settings.grid,
         epoch=settings.epoch,
         pixel_scale=settings.pixel_scale(errors),
+        adaptive=False,
     )
 
 

@@ -283,5 +283,6 @@ def probability_met(
         grid=settings.grid,
         epoch=settings.epoch,
         pixel_scale=settings.pixel_scale(errors),
+        adaptive=False,
     )
     return margin.probability_met

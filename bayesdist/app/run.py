@@ -13,7 +13,8 @@ from typing import TYPE_CHECKING, Any, Self, TypeAlias
 
 import numpy as np
 
-from bayesdist.app.products.made_files import further_errors
+from bayesdist.app.products.made_files import with_facts_of_run
+from bayesdist.app.python_terms import in_python_terms, python_terms
 from bayesdist.app.report import title_of, write_html_report
 from bayesdist.app.results import Results, errors_of, margins_of, results_of
 from bayesdist.app.run_folder import copy_run, save_run
@@ -24,7 +25,9 @@ from bayesdist.assess import ErrorBudget, Margin, Requirement, UncertaintyMap
 from bayesdist.assess.budget.budget import budget_of, place_budget
 from bayesdist.assess.drawn import DrawnErrors
 from bayesdist.assess.evaluation import Evaluation, position_map
+from bayesdist.assess.requirements.verdict import VERDICT_LEVELS
 from bayesdist.calibration.calibration import Calibration, calibration_of_exposure
+from bayesdist.calibration.chip_map import chosen_chip
 from bayesdist.calibration.sky_distribution import sky_distribution
 from bayesdist.data import Matches
 from bayesdist.diagnose.diagnostics import Diagnostics
@@ -40,7 +43,7 @@ from bayesdist.report.html import (
     summary_text,
 )
 from bayesdist.utils.checks import warnings_of
-from bayesdist.utils.numbers import with_mas
+from bayesdist.utils.numbers import number, with_mas
 from bayesdist.utils.quantities import Random, year_of
 
 if TYPE_CHECKING:
@@ -141,11 +144,11 @@ class Run:
     def calibration(self) -> Calibration:
         """Calibration of the detector as it is written to files, with all errors of positions."""
         results = self.results
-        return replace(
+        return with_facts_of_run(
             results.product.calibration,
-            pixel_mas=results.config.detector.scale_mas,
-            before=results.fitted.tables.tables,
-            further=further_errors(self.evaluation.budget.rows()),
+            results.config,
+            results.fitted.tables.tables,
+            self.evaluation.budget.rows(),
         )
 
     @property
@@ -165,6 +168,7 @@ class Run:
 
     # -- questions --------------------------------------------------------------------------------
 
+    @python_terms
     def budget(
         self,
         *,
@@ -228,6 +232,7 @@ class Run:
         """Draws of all errors of a position."""
         return errors_of(self.results)
 
+    @python_terms
     def check(
         self, requirements: Requirement | Sequence[Requirement] | None = None
     ) -> tuple[Margin, ...]:
@@ -251,6 +256,7 @@ class Run:
             return self.margins
         return margins_of(self.results, as_requirements(requirements))
 
+    @python_terms
     def map(self, *, chip: int | None = None, epoch: Any = None) -> UncertaintyMap:
         """Map of the position uncertainty over a chip.
 
@@ -282,15 +288,7 @@ class Run:
     def _chip(self, number: int | None) -> int:
         """Number of a chip of the model; it has to be given if there are several."""
         numbers = [chip.number for chip in self.model.chips]
-        if number is None and len(numbers) == 1:
-            return numbers[0]
-        if number not in numbers:
-            raise InputError(
-                "the run has several chips" if number is None else f"there is no chip {number}",
-                where="chip",
-                do=f"give one of {', '.join(map(str, numbers))}",
-            )
-        return number
+        return chosen_chip(numbers, number, where=str(self.folder or "the run"))
 
     # -- objects of other packages ----------------------------------------------------------------
 
@@ -311,6 +309,7 @@ class Run:
             rows=results.kind.rows,
         )
 
+    @python_terms
     def wcs(
         self,
         chip: int | None = None,
@@ -380,6 +379,7 @@ class Run:
                 return float(stars.epoch[rows].mean())
         return self.results.epoch
 
+    @python_terms
     def to_model(self, chip: int | None = None, *, epoch: Any = None, **sky: Any) -> Model:
         """Compound model of astropy.modeling from 0-based pixels to the sky, or to u and v.
 
@@ -435,11 +435,16 @@ class Run:
         ]
         if self.folder is not None:
             facts.append(("Folder", str(self.folder)))
+        not_shown = [
+            f"{m.requirement.name}: not shown: {m.reason}"
+            for m in self.margins
+            if m.verdict == "not shown"
+        ]
         return RunSummary(
             title=title_of(config) or "calibration",
             verdict_level=self._level,
             headline=self._headline,
-            warnings=self.warnings,
+            warnings=(*self.warnings, *not_shown),
             facts=facts,
             margins_rows=margin_rows(self.margins),
             budget_rows=budget_rows(evaluation.budget, scale_mas=scale_mas),
@@ -460,14 +465,27 @@ class Run:
             return "No requirement was given"
         verdicts = [margin.verdict for margin in self.margins]
         if len(verdicts) == 1:
-            row = margin_rows(self.margins)[0]
-            value = f"{row['Limit']}, now {row['Value']}, P(met) {row['P(met)']}"
-            return f"{verdicts[0].upper()}: {row['Requirement']}: {value}"
-        counts = [(verdicts.count(name), name) for name in ("missed", "undecided", "met")]
+            return self._verdict_words(self.margins[0])
+        counts = [(verdicts.count(name), name) for name in reversed(VERDICT_LEVELS)]
         return f"{len(verdicts)} requirements: " + ", ".join(
             f"{count} {name}" for count, name in counts if count
         )
 
+    def _verdict_words(self, margin: Margin) -> str:
+        """Verdict on a requirement with value, limit and probability."""
+        asked, row = margin.requirement, margin_rows([margin])[0]
+        statistic = f"{asked.statistic} {asked.scope}".strip()
+        scale_mas = self.results.config.detector.scale_mas
+        value = f"{row['Value']} {margin.unit}"
+        if margin.unit == "pix" and scale_mas is not None:
+            value += f" ({number(margin.value * scale_mas, 3)} mas)"
+        known = " by the known errors alone" if margin.verdict == "undecided" else ""
+        return (
+            f"{margin.verdict.upper()}: {asked.name}: {statistic} {value}, "
+            f"limit {asked.limit:g} {asked.unit}, {margin.probability_words}{known}"
+        )
+
+    @python_terms
     def to_sky(
         self, table: Any, *, draws: int | None = None, rng: Random = 1, **options: Any
     ) -> QTable | SkyCoord:
@@ -519,6 +537,7 @@ class Run:
 
     # -- files ------------------------------------------------------------------------------------
 
+    @python_terms
     def write(self, format: str, file: str | os.PathLike[str], **settings: Any) -> list[Path]:
         """Write the calibration in the format of a pipeline.
 
@@ -542,11 +561,17 @@ class Run:
         InputError
             If the format or a setting is unknown, the file exists, or the format cannot hold the
             calibration.
+
+        Warns
+        -----
+        bayesdist.errors.BayesdistWarning
+            As for `Calibration.write`.
         """
         if self.model.time is not None and not format_of(format).holds_time:
             settings = {"epoch": self.results.epoch} | settings
         return self.calibration.write(format, file, **settings)
 
+    @python_terms
     def report(self, path: str | os.PathLike[str]) -> Path:
         """Write the report of the run as one HTML file.
 
@@ -572,6 +597,7 @@ class Run:
         folder = Path(tempfile.mkdtemp(prefix="bayesdist-"))
         webbrowser.open(self.report(folder / "report.html").as_uri())
 
+    @python_terms
     def save(self, folder: str | os.PathLike[str]) -> Path:
         """Write the run to a folder, which `open_run` and all commands read.
 
@@ -608,6 +634,7 @@ class Run:
         self.close()
 
 
+@in_python_terms(keys=False)
 def open_run(folder: str | os.PathLike[str]) -> Run:
     """Open a run that is in a folder.
 
@@ -647,6 +674,7 @@ def open_run(folder: str | os.PathLike[str]) -> Run:
     return Run(results_of(directory))
 
 
+@in_python_terms(keys=False)
 def run(
     config: str | os.PathLike[str],
     folder: str | os.PathLike[str],

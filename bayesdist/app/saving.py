@@ -8,14 +8,17 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from bayesdist.app.assessment.checks import in_circle
 from bayesdist.app.assessment.diagnosing import holdout_summary, holdout_table
 from bayesdist.app.assessment.error_terms import idle_dates
 from bayesdist.app.assessment.periods import periods_summary, periods_table
 from bayesdist.app.config import Config
 from bayesdist.app.kinds.fit_data import FitData
 from bayesdist.app.kinds.fitted import Fitted
-from bayesdist.app.kinds.matches.added_errors import added_errors_rows, grouping_sentence
+from bayesdist.app.kinds.matches.added_errors import (
+    added_errors_rows,
+    grouping_sentence,
+    in_circle,
+)
 from bayesdist.app.kinds.matches.plausibility import doubts_on_stars
 from bayesdist.app.rehearsal import rehearse_solution
 from bayesdist.app.results import Results
@@ -102,7 +105,8 @@ def save_sampled(results: Results) -> None:
     table = data.stars if data.stars.in_memory else None
     save_posterior(posterior, table, run / "posterior.nc", provenance=provenance)
     write_star_files(data.stars, data.fit, posterior, run / FOLDER)
-    run.summarise(**sample_sections(posterior, in_circle=in_circle(data, results.config)))
+    circle = in_circle(data.matched.stars, results.config)
+    run.summarise(**sample_sections(posterior, in_circle=circle))
     c, n = posterior.convergence, posterior.sampler
     if posterior.approximation:
         log.warning("sample: %s", posterior.approximation)

@@ -7,11 +7,10 @@ draws.
 
 from __future__ import annotations
 
-import math
 import os
 import zlib
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 
@@ -27,6 +26,7 @@ from bayesdist.assess.terms.forms import (
     ErrorTerm,
     Image,
     NoiseField,
+    Pool,
 )
 from bayesdist.infer.equations.scaled import one_thread
 from bayesdist.infer.solution.solution import Solution
@@ -62,6 +62,8 @@ class DrawnErrors:
     image: Image
     n_draws: int
     seed: int  # of the errors that are independent from position to position, and of the terms
+    # makes so many further draws of the same errors, another set for each number from 1 on
+    further: Callable[[int, int], DrawnErrors] | None = None
     _cache: dict[EvaluationDomain, tuple[ErrorField, ...]] = field(default_factory=dict, repr=False)
 
     @property
@@ -71,19 +73,19 @@ class DrawnErrors:
 
     @property
     def n_effective(self) -> float:
-        """Independent draws that are worth as much as those of the solution; at least 1.
+        """Independent draws that are worth at least as much as these; at least 1.
 
-        Drawing n rows from a chain worth `ess` independent samples adds the chain's own Monte-Carlo
-        variance to that of the drawing: 1 / n_eff = 1 / n + 1 / ess.  Draws of a fit are
-        independent; a posterior is worth the smaller of its bulk and tail effective sample sizes (a
-        probability far from a half is a matter of the tails).
+        Taking n draws from a finite set worth m independent ones, as a chain is, adds the set's own
+        Monte-Carlo variance to that of the drawing.  The shares of several sets in the variance of
+        a probability add up to 1 at most: 1 / n_eff = 1 / n + 1 / m at most, for the smallest m.
         """
-        convergence = self.solution.convergence
-        if convergence is None:
-            return float(self.n_draws)
-        sizes = [convergence.ess_bulk_min, convergence.ess_tail_min]
-        ess = 1.0 if any(math.isnan(s) for s in sizes) else max(min(sizes), 1.0)
-        return max(1.0 / (1.0 / self.n_draws + 1.0 / ess), 1.0)
+        least = min((pool.size for pool in self.pools), default=np.inf)
+        return max(1.0 / (1.0 / self.n_draws + 1.0 / least), 1.0)
+
+    @property
+    def pools(self) -> tuple[Pool, ...]:
+        """Finite sets that draws of the terms are taken from."""
+        return tuple(pool for one in self.draws for pool in one.pools)
 
     def at(self, domain: EvaluationDomain) -> tuple[ErrorField, ...]:
         """The errors of each term at the positions of a domain."""
@@ -112,7 +114,7 @@ class DrawnErrors:
                 old if new is term else new.draw(self.n_draws, rng)
                 for old, term, new, rng in zip(self.draws, self.terms, way, random, strict=True)
             )
-            out.append(replace(self, terms=way, draws=draws, _cache={}))
+            out.append(replace(self, terms=way, draws=draws, further=None, _cache={}))
         return tuple(out)
 
     def statistics(

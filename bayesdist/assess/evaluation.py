@@ -17,7 +17,7 @@ from bayesdist.assess.model import ErrorModel
 from bayesdist.assess.requirements.margins import Margin, judge
 from bayesdist.assess.requirements.requirement import Requirement
 from bayesdist.assess.requirements.validity import ValidityPeriod, validity_period
-from bayesdist.assess.requirements.verdict import rests_on
+from bayesdist.assess.requirements.verdict import VERDICT_LEVELS, rests_on
 from bayesdist.assess.terms.correlated import StructureErrors
 from bayesdist.assess.terms.forms import Known
 from bayesdist.assess.terms.given import Centroids, centroids_of
@@ -37,7 +37,6 @@ VALIDITY_EPOCHS = 40  # of a curve
 YEARS_AHEAD = 10.0  # to which the budget at every position is extrapolated
 
 ERRORS = "Errors"
-VERDICT_LEVELS = {"met": "pass", "undecided": "warn", "missed": "fail"}
 
 
 @dataclass(frozen=True, eq=False)

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 from scipy.linalg import solve_triangular
@@ -83,7 +84,10 @@ class ErrorModel:
             where="assess.draws",
             do="ask for fewer",
         )
-        rng = generator_of(rng)
+        return self._drawn(n, generator_of(rng))
+
+    def _drawn(self, n: int, rng: np.random.Generator) -> DrawnErrors:
+        """Draws of all errors, which know how to make further ones."""
         one = self.solution.draw(n, rng)
         solution, fitted = self.solution.solution, self.solution.fitted_exposures
         image = Image()
@@ -96,7 +100,13 @@ class ErrorModel:
             term.draw(n, own)
             for term, own in zip(self.terms, generators(self.terms, seed), strict=True)
         ]
-        return DrawnErrors(solution, (self.solution, *self.terms), (one, *draws), image, n, seed)
+        terms = (self.solution, *self.terms)
+        further = partial(self._further, seed)
+        return DrawnErrors(solution, terms, (one, *draws), image, n, seed, further)
+
+    def _further(self, seed: int, n: int, number: int) -> DrawnErrors:
+        """Further draws beside those of a seed, another set for each number from 1 on."""
+        return self._drawn(n, np.random.default_rng([seed, number]))
 
     def with_terms(self, *terms: ErrorTerm) -> ErrorModel:
         """Error model with more terms; errors of centroids replace those that were there."""

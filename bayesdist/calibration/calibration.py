@@ -427,6 +427,11 @@ class Calibration:
         InputError
             For an unknown format or setting, an existing file, a folder that does not exist, and
             whatever the format cannot hold, such as look-up tables or the dependence on time.
+
+        Warns
+        -----
+        bayesdist.errors.BayesdistWarning
+            On what other programs will make of the file, and on what was changed for the format.
         """
         written: list[Path] = load_object(hooks.WRITE)(
             self,

@@ -7,7 +7,7 @@ it, which are evaluated at the corrected pixel; they have no part in the covaria
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -291,6 +291,27 @@ def chip_of(maps: Mapping[int, ChipMap], number: int, where: str) -> ChipMap:
             do=f"choose one of {', '.join(map(str, maps))}",
         )
     return maps[number]
+
+
+def chosen_chip(
+    numbers: Sequence[int], chip: int | None, *, where: str, argument: str = "chip"
+) -> int:
+    """Number of the chip that is asked for; it may be omitted if there is only one.
+
+    `argument` is what the user gives it by: an argument in Python, or an option of a command.
+    InputError if there is no such chip, or there are several and none is given.
+    """
+    if chip is None and len(numbers) == 1:
+        return numbers[0]
+    if chip is not None and chip in numbers:
+        return int(chip)
+    raise InputError(
+        f"has {len(numbers)} chips, and none is named"
+        if chip is None
+        else f"there is no chip {chip!r}",
+        where=where,
+        do=f"give {argument}, one of {', '.join(map(str, numbers))}",
+    )
 
 
 def sampling_of(solution: Solution) -> tuple[float, tuple[str, ...]]:

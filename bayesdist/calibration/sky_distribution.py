@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from bayesdist.calibration.calibration import Calibration
+from bayesdist.calibration.chip_map import chosen_chip
 from bayesdist.calibration.plane import SkyPlacement
 from bayesdist.calibration.sky_positions import (
     coefficient_covariance,
@@ -92,12 +93,8 @@ def sky_distribution(
             where=calibration.name,
             do="give a calibration with a covariance, or the errors of the centroids",
         )
-    if chip is None and len(calibration.numbers) > 1:
-        raise InputError(
-            "has several chips, and none is named",
-            where=calibration.name,
-            do=f"give chip, one of {', '.join(map(str, calibration.numbers))}",
-        )
+    if chip is None:
+        chosen_chip(calibration.numbers, chip, where=calibration.name)
     generator = generator_of(rng)
     epoch = None if epoch is None else year_of(epoch)
     px, py = (np.atleast_1d(values_in(a, "pix", name)) for name, a in (("x", x), ("y", y)))

@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike
 
 from bayesdist.calibration import hooks
 from bayesdist.calibration.calibration import Calibration, GaussianSolution
-from bayesdist.calibration.chip_map import ChipMap, chip_of
+from bayesdist.calibration.chip_map import ChipMap, chosen_chip
 from bayesdist.calibration.modeling import plane_model, sky_model
 from bayesdist.calibration.plane import Plane, SkyPlacement
 from bayesdist.calibration.sky_positions import placement_of, plane_covariances, sky_positions
@@ -520,16 +520,9 @@ def wcs_of_chip(
     pixel_scale: Number | None,
 ) -> CalibrationWCS:
     """WCS of a chip; arguments as for `Calibration.wcs`."""
-    numbers = calibration.numbers
-    if chip is None and len(numbers) > 1:
-        raise InputError(
-            "has several chips and no chip is given",
-            where=calibration.name,
-            do=f"choose one of {', '.join(map(str, numbers))}",
-        )
+    number = chosen_chip(calibration.numbers, chip, where=calibration.name)
     date = None if epoch is None else year_of(epoch)
-    number = numbers[0] if chip is None else chip
-    chip_of(calibration.at(date), number, calibration.name)
+    calibration.at(date)  # refuses a date that the calibration cannot be brought to
     placement = None
     if calibration.plane.point is not None or point is not None:
         angle = scale = None

@@ -623,7 +623,13 @@ class Matches(MatchColumns):
         dropped = {} if reason is None or n == len(self) else {reason: len(self) - n}
         return merged_counts([self.rejected, dropped])
 
-    def mapped(self, step: Callable[[Matches], Matches], *, adds: Collection[str] = ()) -> Matches:
+    def mapped(
+        self,
+        step: Callable[[Matches], Matches],
+        *,
+        adds: Collection[str] = (),
+        drops: Collection[str] = (),
+    ) -> Matches:
         """Stars as a step makes them that acts on each row by itself.
 
         Parameters
@@ -633,6 +639,8 @@ class Matches(MatchColumns):
             it is taken when they are read, and must be one that can be pickled.
         adds : collection of str
             Columns that the stars have afterwards, whether or not they had them before.
+        drops : collection of str
+            Columns that the step removes.
 
         Returns
         -------
@@ -641,7 +649,24 @@ class Matches(MatchColumns):
         if self._readers is None:
             return step(self)
         readers = [_Deferred(one, step, len(one)) for one in self._readers]
-        return Matches.from_readers(readers, self.labels, self._stored | set(adds))
+        stored = (self._stored | set(adds)) - set(drops)
+        return Matches.from_readers(readers, self.labels, stored)
+
+    def without(self, *columns: str) -> Matches:
+        """These stars without some of the columns that they may have.
+
+        Parameters
+        ----------
+        *columns : str
+            Optional columns, such as 'sigma_u' and 'sigma_v'.
+
+        Returns
+        -------
+        Matches
+        """
+        if not any(self.has(name) for name in columns):
+            return self
+        return self.mapped(partial(_without, columns=columns), drops=columns)
 
     def with_columns(self, **changes: Any) -> Matches:
         """Stars in memory with some columns or labels replaced.
@@ -805,6 +830,11 @@ class _Deferred:
     def load(self) -> Matches:
         """Rows after the step."""
         return self.step(self.reader.load())
+
+
+def _without(batch: Matches, columns: Sequence[str]) -> Matches:
+    """Stars in memory without some columns."""
+    return batch.with_columns(**dict.fromkeys(columns))
 
 
 def _by_bits(batch: Matches, bits: NDArray[np.uint8]) -> Matches:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from math import isclose
 
 from bayesdist.data.matches import Matches
 from bayesdist.diagnose.correlated import Discrepancy
@@ -84,6 +85,15 @@ def input_checks(
             level="warn",
             sentence="the matches have nominal positions, and outliers.match_radius is not given: "
             "the likelihood does not know that they were selected",
+        )
+    stated = table.match_radius
+    if stated is not None and match_radius is not None and not isclose(stated, match_radius):
+        yield Check(
+            MATCHING,
+            "Match radius of the settings",
+            level="warn",
+            sentence=f"the match radius is {match_radius:g} {fit.unit} by the settings, "
+            f"which was used, and {stated:g} {fit.unit} by the matches",
         )
     yield from matching_checks(match_radius, reference_sigma, in_circle=in_circle)
 

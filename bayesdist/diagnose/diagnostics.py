@@ -52,6 +52,7 @@ from bayesdist.infer.equations.scaled import one_thread
 from bayesdist.infer.exposures.chip_offsets import Settling
 from bayesdist.infer.stars.likelihood import Likelihood
 from bayesdist.infer.stars.loading import opened
+from bayesdist.utils.arguments import takes
 from bayesdist.utils.arrays import Float, Int
 from bayesdist.utils.checks import EITHER, Check, warnings_of
 from bayesdist.utils.quantities import Number, Random, value_in
@@ -191,6 +192,7 @@ class Diagnostics:
         return tuple(out)
 
 
+@takes(matches=Matches, fit=LinearFit, compute=Compute)
 def diagnose(
     posterior: Posterior,
     matches: Matches,

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import json
 import os
 from collections import Counter
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -21,6 +22,7 @@ if TYPE_CHECKING:
     import pyarrow
     import pyarrow.parquet
 
+HEADER = "bayesdist"  # key of the metadata in which matches state what no column holds
 _BUFFER = 2**18  # bytes: without a buffer, Arrow loads the columns of a whole row group
 
 
@@ -56,7 +58,7 @@ def parquet_table(path: Path) -> Table:
         announced = 8.0 * metadata.num_rows * max(1, metadata.num_columns)
         refuse_inflated(announced, os.fstat(stream.fileno()).st_size, str(path))
         units = parquet_units(stored.schema_arrow)
-        table = Table()
+        table = Table(meta=parquet_header(stored.schema_arrow))
         for name, column in zip(stored.schema_arrow.names, stored.read().columns, strict=True):
             table[name] = parquet_column(column, units.get(name))
     return table
@@ -75,6 +77,7 @@ def arrow_table(data: Any) -> Table:
     return Table(
         [parquet_column(one, units.get(n)) for n, one in zip(names, rows.columns, strict=True)],
         names=names,
+        meta=parquet_header(rows.schema),
     )
 
 
@@ -139,6 +142,19 @@ def arrow_array(values: NDArray[Any]) -> pyarrow.Array:
         held = [None, pyarrow.py_buffer(ends), pyarrow.py_buffer(b"".join(texts))]
         return pyarrow.Array.from_buffers(pyarrow.string(), len(values), held)
     return pyarrow.array(values)
+
+
+def parquet_header(schema: pyarrow.Schema) -> dict[str, Any]:
+    """Header of a table: that which astropy stores, or the entry `HEADER` of the metadata."""
+    metadata = schema.metadata or {}
+    if b"table_meta_yaml" in metadata:
+        text = metadata[b"table_meta_yaml"].decode()
+        return dict(get_header_from_yaml(text.splitlines()).get("meta") or {})
+    try:
+        stated = json.loads(metadata.get(HEADER.encode(), b"null"))
+    except ValueError:  # an entry of another program
+        return {}
+    return {HEADER: stated} if isinstance(stated, Mapping) else {}
 
 
 def parquet_units(schema: pyarrow.Schema) -> dict[str, str]:

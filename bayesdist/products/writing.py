@@ -7,8 +7,8 @@ tables.
 
 from __future__ import annotations
 
-import logging
 import os
+import warnings
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import replace
@@ -19,7 +19,7 @@ import numpy as np
 from pydantic import ValidationError
 
 from bayesdist.calibration.calibration import Calibration, calibration_of_maps
-from bayesdist.errors import InputError, require_known
+from bayesdist.errors import BayesdistWarning, InputError, require_known
 from bayesdist.files.atomic import atomic_path
 from bayesdist.products.formats.common.document import (
     PARAMETERS,
@@ -32,8 +32,7 @@ from bayesdist.products.registry import build, format_of, product_settings
 from bayesdist.utils.arrays import Float
 from bayesdist.utils.quantities import Epoch, Number, value_in, year_of
 
-log = logging.getLogger("bayesdist")
-
+CALLER = 3  # frames from here to whoever calls `Calibration.write`
 LONGEST_NAME = 40  # characters of a file name from which names in headers are made: a card has 68
 
 
@@ -88,9 +87,9 @@ def write_calibration(
                 "this file exists", where=str(place), do="replace it with overwrite=True"
             )
     write_built(built, places)
-    warnings = dict.fromkeys(w for one in built for w in one.warnings)
-    for text in (*notes, *warnings):
-        log.warning("%s: WARNING: %s", places[-1], text)
+    remarks = (*notes, *(w for one in built for w in one.warnings))
+    for text in dict.fromkeys(remarks):
+        warnings.warn(f"{places[-1]}: {text}", BayesdistWarning, stacklevel=CALLER)
     return places
 
 

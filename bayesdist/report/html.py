@@ -9,6 +9,7 @@ from textwrap import fill
 from typing import TYPE_CHECKING
 
 from bayesdist.assess.maps.uncertainty import per_axis
+from bayesdist.assess.requirements.verdict import VERDICT_LEVELS
 from bayesdist.utils.numbers import (
     MISSING,
     counted,
@@ -31,7 +32,6 @@ WIDTH = 88  # letters of a line of text
 MARKS = {"pass": "✓", "warn": "!", "fail": "✗", "note": "·"}
 # dark enough on white and light enough on black, and told apart in every colour blindness
 COLORS = {"pass": "#009E73", "warn": "#E69F00", "fail": "#D55E00", "note": "#888888"}
-LEVEL_OF_CELL = {"met": "pass", "undecided": "warn", "missed": "fail"}
 
 # of the page behind it, be it light or dark: nothing here sets a background or a text colour
 _PLAIN = "background:none;color:inherit"
@@ -195,7 +195,7 @@ def _cell(text: str, is_words: bool, *, head: bool = False) -> str:
     style = f"text-align:{align};padding:1px 10px 1px 0;border:none;border-bottom:{_RULE}"
     if head:
         return f'<th scope="col" style="{style}">{_text(text)}</th>'
-    level = LEVEL_OF_CELL.get(text)
+    level = VERDICT_LEVELS.get(text)
     if level is None:
         return f'<td style="{style}">{_text(text)}</td>'
     mark = f'<b style="color:{COLORS[level]}">{MARKS[level]}</b> '

@@ -132,6 +132,12 @@ FALSE_MATCHES = Limit(
 
 DIFFERENCE = Limit(0.01, "at least", "probability by chance under which a difference is called one")
 CONFIDENCE = Limit(0.99, "at least", "of the Monte-Carlo interval that a verdict rests on")
+EXCEEDS = Limit(
+    0.95, "at least", "probability that a limit is exceeded, for a requirement to be called missed"
+)
+COUNTING_ERROR = Limit(
+    0.005, "at most", "of a probability near the one asked for, for its estimate to decide"
+)
 
 # -- files ----------------------------------------------------------------------------------------
 

@@ -119,17 +119,23 @@ def broken_name(name: str) -> str:
 
 
 def counted(fraction: Any, error: Any, n: Any) -> str:
-    """Probability counted in n draws: a bound where none or all of them are counted."""
+    """Probability counted in n draws: '> 0.9993', a bound, where all or none are counted."""
     p, draws = _finite(fraction), _finite(n)
     if p is None or draws is None or draws <= 0:
         return MISSING
     decimals = max(1, math.ceil(math.log10(draws)))
     least = math.ceil(10**decimals / draws) / 10**decimals  # one draw, rounded up
     if p * draws < 0.5:
-        return f"below {least:.{decimals}f}"
+        return f"< {least:.{decimals}f}"
     if (1 - p) * draws < 0.5:
-        return f"above {1 - least:.{decimals}f}"
+        return f"> {1 - least:.{decimals}f}"
     return rounded(p, error)
+
+
+def probability_words(fraction: Any, error: Any, n: Any) -> str:
+    """Probability counted in n draws, in ASCII: 'P = 0.953 +- 0.004', or 'P > 0.9993'."""
+    text = counted(fraction, error, n)
+    return f"P {text}" if text[0] in "<>" else f"P = {text} +- {error:.1g}"
 
 
 # -- lengths and their units ----------------------------------------------------------------------

@@ -19,8 +19,8 @@ from bayesdist.app.config import load_config
 from bayesdist.app.results import Results, margins_of
 from bayesdist.app.store.rundir import RunDirectory
 from bayesdist.assess import Margin, Requirement
+from bayesdist.assess.requirements.verdict import verdict_of
 from bayesdist.assess.statistics import field_statistic
-from bayesdist.diagnose.significance import clopper_pearson
 from bayesdist.model.grid import grid_pixels, mesh
 from bayesdist.utils.streams import restarted
 from tests.app.support import after_stages
@@ -164,10 +164,10 @@ def attainable(margin: Margin, factor: float) -> float:
     """
     asked, draws = margin.requirement.probability, np.sort(margin.draws)
     fractions = np.linspace(asked, 1.0, 501)
-    lower = np.array([clopper_pearson(f, margin.n_effective, 0.99)[0] for f in fractions])
-    enough = fractions[lower >= asked]
+    n = margin.n_effective
+    enough = [f for f in fractions if verdict_of(f, n, asked)[0] == "met"]
     at_or_under = np.searchsorted(draws, factor * draws, side="right") / draws.size
-    return float(np.mean(at_or_under >= enough[0])) if enough.size else 0.0
+    return float(np.mean(at_or_under >= enough[0])) if enough else 0.0
 
 
 def judged(results: Results, error: np.ndarray) -> list[dict[str, Any]]:

@@ -198,21 +198,21 @@ def test_dates_are_times_or_years():
 
 
 WRONG = {
-    "order": ({"order": 13}, "model.order"),
+    "order": ({"order": 13}, "calibrate: order"),
     "size": ({"size": None}, "size"),
-    "frames": ({"frames": "rotation"}, "model.frames"),
+    "frames": ({"frames": "rotation"}, "calibrate: frames"),
     "unknown key": ({"settings": {"sampler": {"max_step": 5}}}, "max_steps"),
     "given twice": ({"settings": {"model": {"order": 3}}}, "give it once"),
     "unit": ({"scale_mas": 50 * u.s}, "scale_mas"),
     "requirement": ({"requirements": ["p95"]}, "bayesdist.Requirement"),
     "term": ({"terms": [0.1]}, "bayesdist.UserTerm"),
-    "seed": ({"seed": -1}, "sampler.seed"),
+    "seed": ({"seed": -1}, "calibrate: seed"),
     "catalogue": ({"catalogue": "Gaia DR3"}, "bd.Catalogue"),
     "outliers": ({"outliers": None}, "bayesdist.OutlierMixture"),
     "chips": ({"chips": 5}, "bayesdist.Chip"),
     "no settings": ({"settings": "x"}, "sections"),
     "no TOML": ({"settings": {"sampler": {"max_steps": object()}}}, "TOML"),
-    "not finite": ({"size": (np.nan, 800)}, "detector.size"),
+    "not finite": ({"size": (np.nan, 800)}, "calibrate: size"),
     "options of reading": ({"settings": {"data": {"epoch": 2020.0}}}, "have been read"),
     "another kind": ({"settings": {"campaign": {"catalogue": "x"}}}, "give one"),
 }

@@ -201,7 +201,6 @@ def test_a_key_like_no_other_lists_the_known_ones():
         ("sampler", {"seed": -1}, ["sampler.seed"]),
         ("sampler", {"ensembles": 1}, ["sampler.ensembles"]),
         ("sampler", {"max_steps": 0}, ["sampler.max_steps"]),
-        ("outliers", {"model": "uniform"}, ["outliers.match_radius"]),
         ("outliers", {"jitter": -1}, ["outliers.jitter", "'fit'"]),
         ("outliers", {"fraction_prior": [0, 1]}, ["outliers.fraction_prior[1]"]),
         ("compute", {"engine": "dsak"}, ["compute.engine", "'threads' or 'dask'"]),

@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+import astropy.units as u
 import numpy as np
 import pytest
 
+import bayesdist as bd
 from bayesdist import load_posterior
 from bayesdist.app.config import parse_config
+from bayesdist.data.formats.record import write_matches
 from bayesdist.errors import ConfigError
 from tests.app.support import (
+    CENTRE,
+    SIZE,
     as_table,
     config_text,
     good,
@@ -116,3 +121,95 @@ def test_a_self_calibration_has_none():
     )  # fmt: skip
     with pytest.raises(ConfigError, match="nominal positions are of matches in"):
         parse_config(text, "c.toml")
+
+
+# -- the radius that stars state ------------------------------------------------------------------
+
+SHORT = {
+    "sampler": {"target_ess": 100, "target_rhat": 1.05},
+    "assess": {"grid": (5, 5), "draws": 100},
+}
+FILES = ("stars.ecsv", "stars.parquet", "matches.h5")
+
+
+@pytest.fixture(scope="module")
+def stated():
+    """Matches that state the radius in which they were looked for, with magnitudes."""
+    table, _ = in_circles(900)
+    table["mag"] = np.linspace(12.0, 18.0, len(table))
+    return bd.Matches.from_table(table).with_columns(match_radius=RADIUS)
+
+
+def calibrated(stars, sigma=None, outliers="gaussian"):
+    return bd.calibrate(
+        stars, order=2, size=SIZE, reference_pixel=CENTRE, name="A", sigma=sigma,
+        outliers=outliers, settings=SHORT,
+    )  # fmt: skip
+
+
+def written(matches, folder):
+    """Paths of the files that hold matches with their radius."""
+    folder.mkdir()
+    matches.to_table().write(folder / FILES[0])
+    matches.to_table().write(folder / FILES[1])
+    write_matches(folder / FILES[2], matches)
+    return [folder / name for name in FILES]
+
+
+@pytest.mark.parametrize("sigma", ["columns", "by_magnitude"])
+def test_object_file_and_command_line_agree_to_the_bit(stated, tmp_path, sigma, no_report):
+    run = calibrated(stated, sigma)
+    assert run.posterior.mixture.match_radius == RADIUS
+    assert run.matches.has_nominal == (sigma == "columns")
+    paths = written(stated, tmp_path / "files")
+    for path in paths:
+        with calibrated(path, sigma) as other:
+            np.testing.assert_array_equal(other.posterior.theta, run.posterior.theta)
+            assert other.budget().rows() == run.budget().rows()
+            assert other.warnings == run.warnings
+    config = write_job(
+        tmp_path / "job", stated.to_table(), data={"matches": str(paths[0]), "sigma": sigma},
+        budget=[], **SHORT,
+    )  # fmt: skip
+    good("run", config, "-o", tmp_path / "run")
+    with bd.open_run(tmp_path / "run") as other:
+        np.testing.assert_array_equal(other.posterior.theta, run.posterior.theta)
+    assert ("match_circle" in summary_of(tmp_path / "run")["outliers"]) == (sigma == "columns")
+
+
+def test_a_saved_run_is_calibrated_again_with_the_same_result(stated, tmp_path):
+    run = calibrated(stated)
+    folder = run.save(tmp_path / "run")
+    with bd.open_run(folder) as other:
+        np.testing.assert_array_equal(other.posterior.theta, run.posterior.theta)
+    with calibrated(folder / "matches.h5") as other:
+        np.testing.assert_array_equal(other.posterior.theta, run.posterior.theta)
+
+
+def test_a_radius_of_the_settings_wins_and_differences_are_reported(stated):
+    wider = calibrated(stated, outliers=bd.OutlierMixture(match_radius=2 * RADIUS * u.pix))
+    assert wider.posterior.mixture.match_radius == 2 * RADIUS
+    [warning] = [text for text in wider.warnings if "by the settings" in text]
+    assert "0.1 pix" in warning and "0.05 pix by the matches" in warning
+    default = calibrated(stated, outliers=bd.OutlierMixture())
+    assert default.posterior.mixture.match_radius == RADIUS
+    assert not any("by the settings" in text for text in default.warnings)
+
+
+def test_single_steps_use_the_radius_of_the_matches(stated):
+    model = bd.build_model(stated, order=2, size=SIZE, reference_pixel=CENTRE)
+    fit, posteriors = bd.fit_linear(stated, model), []
+    for outliers in (None, bd.OutlierMixture(), bd.OutlierMixture(match_radius=RADIUS)):
+        posteriors.append(bd.sample(fit, stated, outliers=outliers, target_ess=50, max_steps=400))
+    for posterior in posteriors:
+        np.testing.assert_array_equal(posterior.theta, posteriors[0].theta)
+    _, by_magnitude, _ = bd.fit_by_magnitude(stated, model)
+    assert not by_magnitude.has_nominal and by_magnitude.match_radius == RADIUS
+
+
+def test_uniform_outliers_take_the_radius_of_the_file(stated, tmp_path):
+    path = written(stated.without("u_nominal", "v_nominal"), tmp_path / "files")[0]
+    with calibrated(path, outliers="uniform") as run:
+        assert run.posterior.mixture.match_radius == RADIUS
+    with pytest.raises(bd.InputError, match="need the radius of the match circle"):
+        calibrated(stated.with_columns(match_radius=None), outliers="uniform")

@@ -123,6 +123,8 @@ def test_an_idctab_holds_the_drift_too(run):
 def test_products_say_what_the_total_is_with_them(run):
     found, total = summary_of(run), rows_of(run)["total"]["radial"]
     for product in found["products"]:
+        if product["path"].endswith("_parameters.fits"):
+            continue
         assert product["total_rms"] == pytest.approx(np.hypot(total, product["forward_rms"]))
 
 

@@ -13,6 +13,7 @@ import tomllib
 import warnings
 from html.parser import HTMLParser
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -22,6 +23,7 @@ from astropy.table import Table
 from astropy.wcs import WCS, FITSFixedWarning
 
 import bayesdist
+from bayesdist.app.commands.on_runs.validate import exit_code
 from bayesdist.app.config import load_config, parse_config
 from bayesdist.app.report import title_of
 from bayesdist.app.screen import progress_bar
@@ -388,7 +390,7 @@ def test_the_inverse_closes_as_stated(finished, rng):
     back = forward + np.column_stack([polynomial(k, *forward.T) for k in ("AP", "BP")])
     assert header["AP_ORDER"] == 4
     worst = np.abs(back - p).max()
-    (product,) = summary_of(finished.path)["products"]
+    _, product = summary_of(finished.path)["products"]  # after the file of parameters
     assert worst <= 1.05 * product["closure_pix"] < 1e-3
     assert np.abs(polynomial("A", *p.T)).max() <= header["A_DMAX"] * (1 + 1e-9)
     assert np.abs(polynomial("A", *p.T)).max() > 0.9 * header["A_DMAX"]
@@ -716,7 +718,21 @@ def test_validate_of_an_unconverged_run_is_not_met(unconverged, tmp_path):
     run = shutil.copytree(unconverged[0], tmp_path / "run")
     path = _requirements(tmp_path / "a.toml", loose)
     result = cli("requirements", run, "--requirements", path)
-    assert result.code == 4 and "undecided" in result.out
+    assert result.code == 6 and "undecided: the posterior is not converged" in result.out
+
+
+@pytest.mark.parametrize(
+    ("verdicts", "code"),
+    [
+        ((), 0),
+        (("met", "met"), 0),
+        (("met", "not shown"), 5),
+        (("not shown", "undecided", "met"), 6),
+        (("undecided", "missed", "not shown"), 4),
+    ],
+)
+def test_the_exit_code_of_requirements_tells_the_verdicts_apart(verdicts, code):
+    assert exit_code([SimpleNamespace(verdict=verdict) for verdict in verdicts]) == code
 
 
 def test_check_samples_nothing(finished):

@@ -29,8 +29,8 @@ def test_table_text_aligns_text_left_and_numbers_right():
 def test_probabilities_have_the_digits_of_their_error():
     """A counted probability is never certain, and its error never none."""
     row = {"name": "corner", "statistic": "max", "value": 0.01, "limit": 0.02, "unit": "pix"}
-    row |= {"probability": 0.95, "verdict": "met"}
-    for p, error, text in ((1.0, 0.000177, "1.00000 +- 0.0002"), (0.91, 0.0061, "0.9100 +- 0.006")):
+    row |= {"probability": 0.95, "verdict": "met", "n_effective": 2000.0}
+    for p, error, text in ((1.0, 0.000177, "> 0.9995"), (0.91, 0.0061, "0.9100 +- 0.006")):
         assert text in margins_text([row | {"probability_met": p, "mc_error": error}])
 
 

@@ -21,6 +21,7 @@ from bayesdist.diagnose.diagnostics import diagnose
 from bayesdist.errors import InputError
 from bayesdist.infer import build_model, fit_linear, sample
 from bayesdist.model import Chip, DistortionModel
+from bayesdist.utils.numbers import rounded
 from bayesdist.utils.streams import assessment_rng
 from tests.app.support import CENTRE, SIZE, simulated
 
@@ -295,8 +296,11 @@ def test_representations_are_short_and_lead_with_what_matters(steps):
     assert [line.split("  ")[0] for line in table[2:]] == [row["name"] for row in budget.rows()]
     (margin,) = check_requirements(posterior, [HARD], **options)
     assert repr(margin).startswith(
-        "Margin(hard: missed: rms at most 1e-06 pix with P = 0.000, 0.95 asked for: "
+        f"Margin(hard: missed: rms {rounded(margin.value, np.ptp(margin.interval) / 4)} pix, "
     )
+    least = 1.0 / margin.n_effective  # one draw, rounded up to its first digits
+    bound = float(re.search(r"limit 1e-06 pix, P < ([\d.]+), 0.95 asked for: ", repr(margin))[1])
+    assert least <= bound < least + 1e-3
     assert "array" not in repr(margin) and "\n" not in str(margin)
     found = uncertainty_map(posterior, grid=(5, 3))
     assert re.fullmatch(

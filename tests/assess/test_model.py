@@ -321,7 +321,7 @@ def test_a_term_that_is_new_is_in_every_result():
     (margin,) = margins_by_draws(CERTAIN, [asked], terms=[toy], n_draws=DRAWS, rng=rng, grid=(9, 3))
     expected = stats.rayleigh(scale=0.03 * highest).cdf(limit)
     assert margin.probability_met == pytest.approx(expected, abs=5 * np.sqrt(0.25 / DRAWS))
-    assert margin.verdict == "missed" and margin.remedy.term == "ripple"
+    assert margin.verdict == "not shown" and margin.remedy.term == "ripple"
     errors = drawn(toy)
     course = validity_period(errors, asked, [2008.0, 2009.0, 2010.0], grid=(9, 3))
     np.testing.assert_allclose(course.probability, expected, atol=5 * np.sqrt(0.25 / DRAWS))

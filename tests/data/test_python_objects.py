@@ -310,6 +310,35 @@ def test_a_table_of_matches_is_written_and_read(tmp_path):
     assert again.tangent_point == (30.0, 5.0)
 
 
+def test_the_radius_is_in_the_unit_of_the_positions():
+    matches = full_matches().with_columns(match_radius=0.5)  # arcsec
+    table = matches.to_table()
+    for name in ("u", "v", "sigma_u", "sigma_v", "u_nominal", "v_nominal"):
+        table[name] = table[name].to("mas")
+    again = Matches.from_table(table)
+    assert again.unit == "mas" and again.match_radius == pytest.approx(500.0)
+
+
+def test_files_of_matches_keep_tangent_point_and_radius(tmp_path):
+    from pyarrow import parquet
+
+    from bayesdist.data import open_matches, write_partitioned
+
+    matches = full_matches().with_columns(tangent_point=(30.0, 5.0), match_radius=0.5)
+    matches.to_table().write(tmp_path / "astropy.parquet")
+    parquet.write_table(pyarrow.table(matches), tmp_path / "arrow.parquet")
+    write_partitioned([matches], tmp_path / "parts")
+    for place in ("astropy.parquet", "arrow.parquet", "parts"):
+        for read in (read_matches, open_matches):
+            again = read(tmp_path / place)
+            assert again.tangent_point == (30.0, 5.0) and again.match_radius == 0.5
+    other = matches.with_columns(match_radius=0.25, x=matches.x + 0.5)
+    write_partitioned([matches, other], tmp_path / "differing")
+    for read in (read_matches, open_matches):
+        with pytest.raises(InputError, match="match radii differ"):
+            read(tmp_path / "differing")
+
+
 def test_matches_are_an_arrow_stream():
     matches = full_matches()
     table = pyarrow.table(matches)

@@ -49,7 +49,9 @@ SETTINGS = {
 }
 # errors that a file has by itself; what more there is stands in a file beside it
 HOLD_COVARIANCE = ("cpdis", "idctab", "jwst", "parameters", "roman", "stdgdc")
-ALONE = dict.fromkeys(("ast", "siaf", "tpv"), "none") | dict.fromkeys(HOLD_COVARIANCE, "covariance")
+ALONE = dict.fromkeys(("ast", "siaf", "sip", "tpv"), "none") | dict.fromkeys(
+    HOLD_COVARIANCE, "covariance"
+)
 SCALE = 0.11
 OPTIONS = BuildOptions(scale_arcsec=SCALE)
 SIZES = {

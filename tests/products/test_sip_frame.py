@@ -43,9 +43,9 @@ def fit():
 def made(fit, tmp_path, **settings):
     calibration = calibration_of(fit, "run")
     files = build("sip", calibration, product_settings()["sip"](**settings), BuildOptions())
-    path = tmp_path / files[0].file_name
-    path.write_bytes(files[0].content)
-    return files, path
+    for one in files:
+        (tmp_path / one.file_name).write_bytes(one.content)
+    return files, tmp_path / files[-1].file_name
 
 
 @pytest.mark.parametrize("linear", ["cd"])
@@ -61,7 +61,7 @@ def test_astropy_gives_u_and_v_of_linear_axes(fit, tmp_path, linear):
     x, y = rng.uniform(1, 900, 300), rng.uniform(1, 700, 300)
     expected = calibration_of(fit).forward(x, y, chip=1)
     np.testing.assert_allclose(np.stack(wcs.all_pix2world(x, y, 1), axis=-1), expected, atol=1e-6)
-    assert files[0].warnings == ()
+    assert files[-1].warnings == ()
     found = read_calibration(path)
     assert found.unit == "pix"
     np.testing.assert_allclose(found.forward(x, y, chip=1), expected, atol=1e-6)
@@ -71,12 +71,12 @@ def test_astropy_gives_u_and_v_of_linear_axes(fit, tmp_path, linear):
 
 
 def test_what_programs_would_make_of_a_header_is_warned_of(fit, tmp_path):
-    [one], _ = made(fit, tmp_path)
+    [_, one], _ = made(fit, tmp_path)
     [warning] = one.warnings
     assert "CRVAL is a placeholder" in warning and "axes = 'linear'" in warning
     determinant = np.linalg.det(calibration_of(fit).chip().linear)
     assert ("mirror" in warning) == (determinant > 0)
-    [one], _ = made(fit, tmp_path, crval=(10.0, 20.0))
+    [_, one], _ = made(fit, tmp_path, crval=(10.0, 20.0))
     assert "check that they are" in one.warnings[0]  # a crval that is given is not asked for
     assert "crval" not in one.warnings[0].lower()
 
@@ -85,9 +85,9 @@ def test_constant_and_linear_terms_are_warned_of(tmp_path):
     rng = np.random.default_rng(3)
     matches, _ = simulate_wise(400, rng=rng)
     fit = bd.fit_linear(matches, bd.build_model(matches, order=3, size=(1016, 1016)))
-    [one], _ = made(fit, tmp_path, linear="sip")
+    [_, one], _ = made(fit, tmp_path, linear="sip")
     assert any("stwcs and gwcs drop" in w for w in one.warnings)
-    [one], _ = made(fit, tmp_path, linear="cd")
+    [_, one], _ = made(fit, tmp_path, linear="cd")
     assert not any("stwcs" in w for w in one.warnings)
 
 
@@ -97,7 +97,7 @@ def test_axes_of_the_sky_are_not_linear(fit, tmp_path):
 
 
 def test_parameters_beside_a_header_have_the_covariance(fit, tmp_path):
-    """Read together they are the solution; apart the sigmas, with a note; changed an error."""
+    """Together they are the solution, alone the header has no errors; changed, an error."""
     chip = bd.Chip(1, "camera", (900.0, 700.0), (450.5, 350.5))
     model = bd.DistortionModel(3, (chip,), "arcsec")
     further = (FurtherError("structure", "local", 0.002, 0.001),)
@@ -105,7 +105,7 @@ def test_parameters_beside_a_header_have_the_covariance(fit, tmp_path):
     mean[[0, model.n_terms]] = 20.0, -10.0
     solution = GaussianSolution(model, mean, 0.0625 * fit.cov)
     calibration = Calibration("run", solution, Plane("sky", point=(30.0, 60.0)), further=further)
-    files = build("sip", calibration, product_settings()["sip"](parameters=True), BuildOptions())
+    files = build("sip", calibration, product_settings()["sip"](), BuildOptions())
     for one in files:
         (tmp_path / one.file_name).write_bytes(one.content)
     assert [one.file_name for one in files] == ["sip_parameters.fits", "sip.hdr"]
@@ -113,7 +113,8 @@ def test_parameters_beside_a_header_have_the_covariance(fit, tmp_path):
     np.testing.assert_array_equal(found.solution.cov, solution.cov)
     assert found.errors == "covariance" and found.further == further
     used = open_document(tmp_path / "sip.hdr").calibration(Choice(as_used=True))
-    assert used.errors == "sigma"
+    assert used.errors == "none"
+    assert not any("AE and BE" in note for note in found.notes)
     text = (tmp_path / "sip.hdr").read_text()
     card = next(line for line in text.splitlines() if line.startswith("CD1_1"))
     value = float(card[10:].split("/")[0])
@@ -123,4 +124,5 @@ def test_parameters_beside_a_header_have_the_covariance(fit, tmp_path):
     (tmp_path / "sip.hdr").write_text(text)
     (tmp_path / "sip_parameters.fits").unlink()
     found = read_calibration(tmp_path / "sip.hdr")
-    assert found.errors == "sigma" and "which is not here" in found.notes[-1]
+    assert found.errors == "none" and "which is not here" in found.notes[-1]
+    assert "its errors are not stated: AE and BE" in found.notes[0]

@@ -14,6 +14,7 @@ from astropy.wcs import WCS
 
 import bayesdist as bd
 from bayesdist.calibration.calibration import Calibration, calibration_of
+from bayesdist.errors import BayesdistWarning
 from bayesdist.formats import describe, lint, list_formats
 from bayesdist.products.formats.common.document import Choice
 from bayesdist.products.registry import open_document, product_settings
@@ -21,6 +22,7 @@ from bayesdist.products.registry import open_document, product_settings
 from .support import PIXEL, StandIn, on_sky, some_covariance, some_solution, wfc_model
 from .test_formats import SETTINGS, calibration_for
 
+pytestmark = pytest.mark.filterwarnings("ignore::bayesdist.errors.BayesdistWarning")
 SCALE_MAS = 110.0
 EXACT = 1e-9  # pixels
 # pixels by which positions of a file may differ: seven digits of WISE's entries over 508 pixels;
@@ -108,7 +110,7 @@ def test_astropy_finds_the_same_sky(tmp_path, key, limit):
     assert far < limit * PIXEL
 
 
-@pytest.mark.parametrize(("key", "extra"), [("tpv", {}), ("ast", {}), ("sip", {"parameters": True}),
+@pytest.mark.parametrize(("key", "extra"), [("tpv", {}), ("ast", {}), ("sip", {}),
                                             ("siaf", {"aperture": "MADE_UP"})])  # fmt: skip
 def test_files_beside_are_named_after_the_file(tmp_path, key, extra):
     """Two calibrations in one folder keep their own covariances."""
@@ -260,7 +262,7 @@ def test_bad_requests_get_one_sentence(tmp_path, format, settings, message):
 
 def test_axes_of_a_frame_need_no_scale(tmp_path):
     """SIP with linear axes has no angles."""
-    [path] = IN_PIXELS.write("sip", tmp_path / "frame.hdr", axes="linear")
+    _, path = IN_PIXELS.write("sip", tmp_path / "frame.hdr", axes="linear")
     assert distances(IN_PIXELS, bd.read_calibration(path)).max() < LIMITS["sip"]
 
 
@@ -282,7 +284,7 @@ def test_bad_places_get_one_sentence(tmp_path):
 
 
 def test_a_header_without_its_size_asks_for_it(tmp_path):
-    [path] = on_sky(4).write("sip", tmp_path / "camera.hdr")
+    [path] = on_sky(4).write("sip", tmp_path / "camera.hdr", parameters=False)
     lines = path.read_text().splitlines()
     kept = [line for line in lines if not line.startswith(("NAXIS", "IMAGE"))]
     path.write_text("\n".join(kept) + "\n")
@@ -304,3 +306,13 @@ def test_a_header_without_its_size_asks_for_it(tmp_path):
 def test_a_calibration_is_shown_in_one_line(calibration, text):
     shown = repr(calibration)
     assert text in shown and shown.startswith("<Calibration '") and "\n" not in shown
+
+
+def test_what_other_programs_will_make_of_a_file_is_warned_of_once(tmp_path):
+    """The warning is that of the caller's line."""
+    with pytest.warns(BayesdistWarning) as caught:
+        IN_PIXELS.write("sip", tmp_path / "camera.hdr", scale_mas=50)
+    texts = [str(one.message) for one in caught]
+    assert len(texts) == len(set(texts)) and all("camera.hdr: " in text for text in texts)
+    assert any("CRVAL is a placeholder" in text for text in texts)
+    assert {one.filename for one in caught} == {__file__}

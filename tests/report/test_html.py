@@ -176,7 +176,7 @@ def test_status_has_each_criterion_with_number_limit_and_outcome(page, converged
     for margin in converged.margins:
         row = next(r for name, r in found.items() if name.startswith(margin.requirement.name))
         assert row[3].endswith(
-            {"met": "pass", "missed": "FAIL", "undecided": "warn"}[margin.verdict]
+            {"met": "pass", "missed": "FAIL", "not shown": "warn"}[margin.verdict]
         )
 
 
@@ -216,10 +216,14 @@ def _only(run, *verdicts):
 
 
 def test_verdict_in_words(converged, not_converged):
-    assert {m.verdict for m in converged.margins} == {"met", "missed", "undecided"}
+    assert {m.verdict for m in converged.margins} == {"met", "missed", "not shown"}
     assert verdict(_only(converged, "met")).level == "pass"
-    assert verdict(_only(converged, "met", "undecided")).level == "warn"
-    assert verdict(_only(converged, "met", "undecided", "missed")).level == "fail"
+    assert verdict(_only(converged, "met", "not shown")).level == "warn"
+    doubted = [replace(m, verdict="undecided") for m in _only(converged, "met").margins]
+    run = replace(converged, margins=(*converged.margins, *doubted))
+    assert verdict(_only(run, "met", "undecided")).level == "warn"
+    assert "is undecided and 1 not shown" in verdict(_only(run, "undecided", "not shown")).headline
+    assert verdict(_only(converged, "met", "not shown", "missed")).level == "fail"
     assert verdict(_only(converged)).level == "pass"
     assert "No requirement" in " ".join(verdict(_only(converged)).sentences)
     assert verdict(_only(not_converged)).level == "fail"

@@ -7,7 +7,6 @@ from typing import Any
 
 from bayesdist.app.config import Config
 from bayesdist.app.kinds.fit_data import FitData
-from bayesdist.app.kinds.matches.added_errors import knows_circle
 from bayesdist.assess.checks import assumption_checks
 from bayesdist.diagnose.diagnostics import Diagnostics
 from bayesdist.infer import Posterior
@@ -41,11 +40,6 @@ def run_checks(
             motions_stated=motions,
         ),
     )
-
-
-def in_circle(data: FitData, config: Config) -> bool:
-    """Boolean: the likelihood is of stars that were matched in circles about nominal positions."""
-    return knows_circle(config) and data.matched.stars.has_nominal
 
 
 def _kind_checks(data: FitData, series: Mapping[str, Any] | None) -> tuple[Check, ...]:

@@ -9,12 +9,12 @@ from typing import Any
 import numpy as np
 from astropy.table import Table
 
-from bayesdist.app.assessment.checks import in_circle
 from bayesdist.app.assessment.error_terms import assessment_rng, errors_of_run, evaluation_settings
 from bayesdist.app.assessment.periods import period_settings
 from bayesdist.app.config import Config
 from bayesdist.app.kinds.fit_data import FitData
 from bayesdist.app.kinds.kind import kind_of
+from bayesdist.app.kinds.matches.added_errors import in_circle
 from bayesdist.app.store.summary import CoverageRow, Holdout, HoldoutTest
 from bayesdist.assess.evaluation import EvaluationSettings
 from bayesdist.assess.model import ErrorModel, with_diagnosed_errors
@@ -39,7 +39,7 @@ def diagnose_run(posterior: Posterior, data: FitData, config: Config, base: Path
         tested=data.matched.with_motions(data.sample),
         discrepancy=config.discrepancy.priors(),
         priors=fitted.priors,
-        match_radius=config.outliers.match_radius,
+        match_radius=config.match_radius(data.matched.stars.match_radius),
         # tables that were fitted have taken it; their errors, and what they leave between their
         # nodes, are terms of the budget
         structure=scatter is None or config.tables.method == "none",
@@ -73,8 +73,8 @@ def diagnose_residuals(posterior: Posterior | None, data: FitData, config: Confi
         eliminated=None if fitted.solved is None else fitted.solved.mode,
         centroid=fitted.errors.by_magnitude if measured else "residuals",
         known=fitted.priors.joint is not None,
-        match_radius=config.outliers.match_radius,
-        in_circle=in_circle(data, config),
+        match_radius=config.match_radius(data.matched.stars.match_radius),
+        in_circle=in_circle(data.matched.stars, config),
         matched_before=config.data is not None,
         error_scale=data.error_scale_sentence,
         rows=kind.rows,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from functools import wraps
 from typing import Any
 
@@ -126,19 +126,3 @@ image_size = click.option(
     metavar="NX NY",
     help="Size of the image in pixels, for a file that does not state it.",
 )
-
-
-def chip_of(numbers: Sequence[int], chip: int | None, where: str) -> int:
-    """Number of the chip that --chip names, which may be left out where there is one."""
-    listed = ", ".join(map(str, numbers))
-    if chip is None and len(numbers) == 1:
-        return numbers[0]
-    if chip is None:
-        raise InputError(
-            f"has {len(numbers)} chips, and none is named",
-            where=where,
-            do=f"add --chip, one of {listed}",
-        )
-    if chip not in numbers:
-        raise InputError(f"has no chip {chip}", where=where, do=f"choose one of {listed}")
-    return chip

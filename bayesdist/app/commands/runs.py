@@ -10,7 +10,6 @@ import click
 from bayesdist.app.commands.options import ON_RUNS, column_names, command, force
 
 STAGES = ("match", "fit", "sample", "diagnose", "evaluate", "assess", "export", "report")
-MISSED = 4  # exit code of requirements that are not all met
 
 
 @command()
@@ -113,12 +112,16 @@ def stage(name: str, run: str, strict: bool, pdf: bool) -> None:
     help="File of [[requirement]] blocks.",
 )
 def requirements(run: str, requirements: str) -> int:
-    """Judge a run by requirements; exit with 4 unless all are met."""
+    """Judge a run by requirements; exit with 0 if all are met.
+
+    Exits with 4 if one is missed; else with 6 if one is undecided, because something is in doubt;
+    else with 5, if one is not shown to be met or missed.
+    """
     from bayesdist.app.commands.on_runs.validate import validate
 
-    text, met = validate(run, requirements)
+    text, code = validate(run, requirements)
     click.echo(text)
-    return 0 if met else MISSED
+    return code
 
 
 @command(calls=f"{ON_RUNS}.budget:budget_at")

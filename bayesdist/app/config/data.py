@@ -198,7 +198,7 @@ class MatchesConfig(RunConfig):
                 "outliers.jitter_by is 'chip', and there is one chip; leave it out, or give "
                 "[[chip]] blocks"
             )
-        if self.data.has_nominal:
+        if self.data.has_nominal and self.outliers.match_radius is not None:
             yield from self.circle_faults()
         if self.prior_calibration is not None and self.fit.radial_weight != 1.0:
             yield (
@@ -225,10 +225,8 @@ class MatchesConfig(RunConfig):
         return quoted and self.outliers.jitter == "fit" and self.outliers.jitter_by != "one"
 
     def circle_faults(self) -> Iterator[str]:
-        """What cannot go with matches in a circle about their nominal positions."""
-        if self.outliers.match_radius is None:
-            return
-        cut = "matches with nominal positions and outliers.match_radius are cut by the match circle"
+        """Settings that cannot go with matches in circles about their nominal positions."""
+        cut = "matches with nominal positions and a match radius are cut by the match circle"
         if self.data.sigma == "by_magnitude":
             yield (
                 f"{cut}, and so are residuals, from which data.sigma = 'by_magnitude' takes the "

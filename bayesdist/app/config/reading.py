@@ -89,7 +89,8 @@ def parse_config(text: str, where: str) -> Config:
     config = _validated(CONFIG, KINDS, raw, where)
     with _as_config_errors(where):
         config.time()
-        config.mixture()
+        # matches may state their radius, which is not known before they are read
+        config.mixture(None if config.data is None else 1.0)
         config.user_terms()
         config.requirements()
         config.spans()

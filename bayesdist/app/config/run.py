@@ -124,9 +124,14 @@ class RunConfig(Section):
         """Boolean: the drift is that of this run's own exposures."""
         return self.model.tdd is None or self.model.tdd.rates == FREE
 
-    def mixture(self) -> OutlierMixture:
-        """The outlier mixture."""
-        return self.outliers.mixture(self.outliers.match_radius)
+    def match_radius(self, stated: float | None) -> float | None:
+        """Radius in which stars were matched: the configured one, or else that which they state."""
+        configured = self.outliers.match_radius
+        return stated if configured is None else configured
+
+    def mixture(self, stated: float | None = None) -> OutlierMixture:
+        """Outlier mixture; `stated` is the match radius that the stars state."""
+        return self.outliers.mixture(self.match_radius(stated))
 
     def resources(self) -> Compute:
         """Where the work is done."""

@@ -140,6 +140,6 @@ class SelfcalConfig(RunConfig):
         named.append(None if reference is None else reference.catalog)
         return [base / name for name in dict.fromkeys(named) if name is not None]
 
-    def mixture(self) -> OutlierMixture:
-        """The outlier mixture."""
+    def mixture(self, stated: float | None = None) -> OutlierMixture:  # noqa: ARG002 - of stars
+        """Outlier mixture, within the configured radius of a detection."""
         return self.outliers.mixture(self.selfcal.match_radius)

@@ -21,7 +21,7 @@ from bayesdist.assess.terms.solution import COEFFICIENTS, EXPOSURE_FRAME, TIME_D
 from bayesdist.calibration.calibration import Calibration, calibration_of
 from bayesdist.calibration.further import FurtherError
 from bayesdist.calibration.orientation import lay_on
-from bayesdist.calibration.plane import Plane
+from bayesdist.calibration.plane import ARCSEC, Plane
 from bayesdist.diagnose.diagnostics import Diagnostics
 from bayesdist.infer import Posterior
 from bayesdist.infer.solution.solution import Solution
@@ -61,6 +61,24 @@ def further_errors(budget: Sequence[Mapping[str, Any]]) -> tuple[FurtherError, .
         for row in budget
         if row["name"] not in IN_COVARIANCE and row["kind"] not in (PRODUCT, TOTAL)
     )
+
+
+def with_facts_of_run(
+    calibration: Calibration,
+    config: Config,
+    tables: tuple[LookupTable, ...],
+    budget: Sequence[Mapping[str, Any]],
+) -> Calibration:
+    """Calibration of the solution of a run, with all else that the run knows.
+
+    That is the size of a pixel, the look-up tables, and the rows of the budget that the covariance
+    does not hold.
+    """
+    mas, unit = config.detector.scale_mas, calibration.unit
+    if unit != "pix" and mas is not None:
+        scale = mas / (1000 * ARCSEC[unit])
+        calibration = replace(calibration, scale=scale, scale_from="detector.scale_mas")
+    return replace(calibration, pixel_mas=mas, before=tables, further=further_errors(budget))
 
 
 def product_input(solution: Solution, data: FitData, config: Config, source: str) -> ProductInput:

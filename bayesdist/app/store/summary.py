@@ -169,7 +169,8 @@ class MarginRow(Part):
     probability: float = Field(description="that is asked for")
     probability_met: Number
     mc_error: Number = Field(description="Monte-Carlo error of probability_met")
-    verdict: str
+    n_effective: Number = Field(description="independent draws that probability_met rests on")
+    verdict: str = Field(description="met, missed, not shown or undecided")
     reason: str
     rests_on: list[str]
     worst: WorstPosition

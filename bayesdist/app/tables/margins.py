@@ -13,7 +13,7 @@ from bayesdist.app.store.rundir import RunDirectory
 from bayesdist.app.store.summary import MarginRow, WorstPosition
 from bayesdist.assess import Margin, Requirement
 from bayesdist.assess.maps.uncertainty import per_axis
-from bayesdist.utils.numbers import rounded
+from bayesdist.utils.numbers import probability_words
 
 # of what a requirement is, beside chip and epoch
 SCOPE = ("region", "epochs", "relative", "separation", "magnitude")
@@ -81,6 +81,7 @@ def results_text(run: RunDirectory) -> str:
         "",
         "Margins",
         margins_text(summary["margins"]),
+        *reasons_of(summary["margins"]),
         "",
         f"Sampler: {state}; R-hat {number(c['rhat_max'], 5)}, ESS bulk {number(c['ess_bulk_min'])} "
         f"and tail {number(c['ess_tail_min'])}, {c['passes']} passes, {number(c['wall_s'], 3)} s",
@@ -99,6 +100,23 @@ def _budget_row(row: Mapping[str, Any]) -> dict[str, Any]:
     }
 
 
+def _probability(row: Mapping[str, Any]) -> str:
+    """Probability of meeting a limit with its Monte-Carlo error, or '> 0.9993'."""
+    words = probability_words(row["probability_met"], row["mc_error"], row["n_effective"])
+    return words.removeprefix("P ").removeprefix("= ")
+
+
+def reasons_of(rows: Sequence[Mapping[str, Any]]) -> list[str]:
+    """Sentences on the requirements that are not met: the reason, and what would help."""
+    out = []
+    for r in rows:
+        if r["verdict"] != "met":
+            out.append(f"{r['name']}: {r['verdict']}: {r['reason']}")
+        if r["remedy"]:
+            out.append(f"{r['name']}: {r['remedy']}")
+    return out
+
+
 def margins_text(rows: list[dict]) -> str:
     """Margins as a table for the screen; what the statistic is of, where that is said of one."""
     scopes = [requirement_of(r).scope for r in rows]
@@ -110,7 +128,7 @@ def margins_text(rows: list[dict]) -> str:
             "value": r["value"],
             "limit": r["limit"],
             "unit": r["unit"],
-            "P(met)": f"{rounded(r['probability_met'], r['mc_error'])} +- {r['mc_error']:.1g}",
+            "P(met)": _probability(r),
             "asked": r["probability"],
             "verdict": r["verdict"],
         }

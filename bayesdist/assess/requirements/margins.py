@@ -6,6 +6,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from html import escape
+from itertools import count
 
 import numpy as np
 
@@ -13,16 +14,25 @@ from bayesdist.assess.domain import EvaluationDomain, WorstPosition
 from bayesdist.assess.drawn import DrawnErrors
 from bayesdist.assess.requirements.reduction import RequiredReduction, required_reduction
 from bayesdist.assess.requirements.requirement import Requirement
-from bayesdist.assess.requirements.verdict import counting_error, verdict_of
+from bayesdist.assess.requirements.tally import Tally
+from bayesdist.assess.requirements.verdict import (
+    MISSED_BELOW,
+    counting_error,
+    undecided_by_draws,
+    verdict_of,
+)
 from bayesdist.assess.solution import place_of
 from bayesdist.assess.units import convert
 from bayesdist.errors import InputError
 from bayesdist.model import Chip, DistortionModel
 from bayesdist.model.grid import DEFAULT_GRID
 from bayesdist.utils.arrays import Float
-from bayesdist.utils.checks import Check, doubts_of
+from bayesdist.utils.checks import LARGER, Check, doubts_of
+from bayesdist.utils.numbers import counted, probability_words, rounded
 
 EPOCHS = 9  # of a range that are judged, its ends and what lies evenly between
+MOST_DRAWS = 512_000  # 99.9 % of verdicts are right 0.001 from the probability 0.95 asked for
+DRAWS_AT_ONCE = 32_000  # that are added, for memory
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,13 +48,17 @@ class Margin:
         Central 95 % of the statistic over the draws.
     margin : float
         The limit minus the value that the statistic stays at or under with the probability asked
-        for: not negative exactly where `probability_met` is at least that probability.
+        for: not negative if and only if `probability_met` is at least that probability.
     probability_met : float
-        Fraction of draws at or under the limit.
+        Probability that the limit is met by the known errors: the fraction of draws at or under it.
+        It may be 1 where the verdict is 'undecided', because the residuals were not examined, for
+        example, or an error of the catalogue is not stated: other errors are in no draw.
     mc_error : float
         Monte-Carlo standard error of `probability_met`.
     verdict : str
-        'met', 'missed' or 'undecided'.
+        'met' if the limit is met with the probability asked for; 'missed' if it is exceeded with
+        a probability of at least 0.95; 'not shown' if neither; 'undecided' if something is in doubt
+        that the probability does not include.
     reason : str
         Why, in words.
     unit : str
@@ -52,16 +66,17 @@ class Margin:
     epoch : float or None
         At which it was judged; of a range of epochs the worst one.
     n_effective : float
-        Independent draws that the draws are worth.
+        Independent draws that all draws are worth.
     draws : ndarray, shape (n,)
-        The statistic of every draw; over a range of epochs the largest.
+        The statistic of each of the draws that were asked for; over a range of epochs the largest.
+        Near the probability asked for the other numbers rest on more draws.
     worst : WorstPosition
         Where the error is largest, at that epoch; its size in `unit`.
     rests_on : tuple of str
         What the verdict takes for granted or has measured, as clauses.
     remedy : RequiredReduction or None
-        The term that must be reduced, and to what level, for the requirement to be met; None where
-        it is met, and where there is doubt about all numbers.
+        The term that must be reduced, and to what level, for the requirement to be met; None if it
+        is met or undecided.
 
     Examples
     --------
@@ -104,14 +119,23 @@ class Margin:
 
     @property
     def sentence(self) -> str:
-        """Requirement, verdict, probability and reason in one line."""
+        """Requirement, verdict, value, limit, probability and reason in one line."""
         r = self.requirement
         where = "" if self.epoch is None else f" in {self.epoch:.2f}"
         scope = f" {r.scope}" if r.scope else ""
+        known = " by the known errors alone" if self.verdict == "undecided" else ""
+        value = rounded(self.value, (self.interval[1] - self.interval[0]) / 4)
         return (
-            f"{r.name}: {self.verdict}: {r.statistic} at most {r.limit:g} {r.unit}{scope}{where} "
-            f"with P = {self.probability_met:.3f}, {r.probability:g} asked for: {self.reason}"
+            f"{r.name}: {self.verdict}: {r.statistic}{scope}{where} {value} {r.unit}, "
+            f"limit {r.limit:g} {r.unit}, {self.probability_words}{known}, "
+            f"{r.probability:g} asked for: "
+            f"{self.reason}"
         )
+
+    @property
+    def probability_words(self) -> str:
+        """Probability of meeting the limit, in ASCII: 'P = 0.953 +- 0.004' or 'P > 0.9993'."""
+        return probability_words(self.probability_met, self.mc_error, self.n_effective)
 
     @property
     def percent(self) -> float:
@@ -128,6 +152,7 @@ def judge(
     chip: int | None = None,
     pixel_scale: float | None = None,
     checks: Sequence[Check] = (),
+    adaptive: bool = True,
 ) -> tuple[Margin, ...]:
     """Margins of requirements on drawn errors, in the order of the requirements.
 
@@ -142,7 +167,11 @@ def judge(
     pixel_scale : float, optional
         Size of one pixel in mas.
     checks : sequence of Check
-        Their doubts keep verdicts from being given; that of convergence is among them.
+        Their doubts leave requirements undecided; that of convergence is among them.
+    adaptive : bool
+        Whether draws are added near the probability asked for, and near that of a missed limit: as
+        many as there are, again and again, until the verdict no longer depends on Monte-Carlo error
+        or there are `MOST_DRAWS`.  The additional draws follow from the seed of the first ones.
 
     Raises
     ------
@@ -154,35 +183,103 @@ def judge(
     model, unit = errors.solution.model, errors.unit
     for r in requirements:
         convert(r.limit, r.unit, unit, pixel_scale, where=r.where)
+    factors = [convert(1.0, unit, r.unit, pixel_scale) for r in requirements]
     cases = [domains_of(r, model, grid, epoch=epoch, chip=chip) for r in requirements]
-    wanted: dict[EvaluationDomain, set[str]] = {}
-    for r, case in zip(requirements, cases, strict=True):
-        for domain in case:
-            wanted.setdefault(domain, set()).add(r.statistic)
-    ways, found = (errors, *errors.treatments(grid)), {}
-    for domain, names in wanted.items():
-        owner = next(r for r, case in zip(requirements, cases, strict=True) if domain in case)
-        with _named(owner):  # its separation or magnitude may be wrong
-            found[domain] = [one.statistics(domain, sorted(names)) for one in ways]
-
     doubts = doubts_of(checks)
-    n_effective = errors.n_effective
+    tallies = _tallied(errors, requirements, cases, factors, grid, doubts, adaptive=adaptive)
     varying = [t.rows[0].name for t in errors.terms if getattr(t, "varies", False)]
-    margins = []
-    for r, case in zip(requirements, cases, strict=True):
-        factor = convert(1.0, unit, r.unit, pixel_scale)
-        extremes = []
-        for k, way in enumerate(ways):
-            draws = [factor * found[domain][k][r.statistic] for domain in case]
-            extremes.append(_margin(r, case, draws, way, factor, n_effective, doubts))
+    ways, margins = (errors, *errors.treatments(grid)), []
+    for r, case, factor, (by_epoch, by_way) in zip(
+        requirements, cases, factors, tallies, strict=True
+    ):
+        extremes = [
+            _margin(r, case, by_epoch[k], way, factor, by_way[k], doubts)
+            for k, way in enumerate(ways)
+        ]
         worse = min(range(len(ways)), key=lambda k: extremes[k].probability_met)
         margin = _of_extremes(extremes, extremes[worse], varying, doubts)
-        if extremes[worse].verdict == "missed" and not doubts:
-            worst_epoch = next(one for one in case if one.epoch == margin.epoch)
+        if extremes[worse].verdict in ("missed", "not shown") and not doubts:
+            worst_epoch = next(domain for domain in case if domain.epoch == margin.epoch)
             remedy = required_reduction(ways[worse], r, worst_epoch, factor)
             margin = replace(margin, remedy=remedy)
         margins.append(margin)
     return tuple(margins)
+
+
+def _tallied(
+    errors: DrawnErrors,
+    requirements: Sequence[Requirement],
+    cases: Sequence[tuple[EvaluationDomain, ...]],
+    factors: Sequence[float],
+    grid: tuple[int, int],
+    doubts: Sequence[Check],
+    *,
+    adaptive: bool,
+) -> list[tuple[list[list[Float]], list[Tally]]]:
+    """Statistics of each requirement, with more draws where Monte-Carlo error would decide.
+
+    For each requirement, and in it for each way in which errors may vary over the field: the
+    statistic (n,) of the first draws at each epoch, and the tally of all draws.
+    """
+    batch, total, out = errors, 0, list[tuple[list[list[Float]], list[Tally]]]()
+    undecided = list(range(len(requirements)))
+    for number in count(1):
+        ways = (batch, *batch.treatments(grid))
+        wanted: dict[EvaluationDomain, set[str]] = {}
+        for i in undecided:
+            for domain in cases[i]:
+                wanted.setdefault(domain, set()).add(requirements[i].statistic)
+        statistics = {}
+        for domain, names in wanted.items():
+            owner = next(i for i in undecided if domain in cases[i])
+            with _named(requirements[owner]):  # its separation or magnitude may be wrong
+                statistics[domain] = [way.statistics(domain, sorted(names)) for way in ways]
+        for i in undecided:
+            r = requirements[i]
+            by_epoch = [
+                [factors[i] * statistics[domain][k][r.statistic] for domain in cases[i]]
+                for k in range(len(ways))
+            ]
+            if number == 1:
+                out.append((by_epoch, [Tally(r.limit) for _ in ways]))
+            for tally, draws, way in zip(out[i][1], by_epoch, ways, strict=True):
+                tally.add(np.max(draws, axis=0), way.pools)
+        total += batch.n_draws
+        undecided = [
+            i
+            for i in undecided
+            if _more_draws_decide(out[i][1], requirements[i].probability, errors.n_draws, doubts)
+        ]
+        if not (adaptive and undecided and errors.further and total < MOST_DRAWS):
+            return out
+        more = min(total, max(errors.n_draws, DRAWS_AT_ONCE), MOST_DRAWS - total)
+        batch = errors.further(more, number)
+    raise AssertionError("the loop returns")
+
+
+def _more_draws_decide(
+    tallies: Sequence[Tally], asked: float, n_first: int, doubts: Sequence[Check]
+) -> bool:
+    """Whether a verdict is open because of too few draws, and more of them could settle it.
+
+    `tallies`: of each way in which errors may vary. `asked`: probability asked for. `n_first`:
+    number of draws that were asked for. `doubts`: with those that may make errors smaller nothing
+    is decided, with others only that a requirement is missed.
+    """
+    if any(check.doubt != LARGER for check in doubts):
+        return False
+    fractions = [tally.fraction for tally in tallies]
+    bounds = [(int(np.argmax(fractions)), MISSED_BELOW)]  # missed in every way
+    if not doubts:
+        bounds.append((int(np.argmin(fractions)), asked))  # met in every way
+    for k, bound in bounds:
+        now, most = tallies[k].effective()
+        if not undecided_by_draws(fractions[k], now, [bound]):
+            continue
+        # how much draws of the same sets have in common is known from a few draws of each
+        if tallies[k].n < 4 * n_first or not undecided_by_draws(fractions[k], most, [bound]):
+            return True
+    return False
 
 
 def domains_of(
@@ -272,17 +369,23 @@ def _of_extremes(
     margins: Sequence[Margin], worse: Margin, names: Sequence[str], doubts: Sequence[Check]
 ) -> Margin:
     """The least favourable margin, `worse`, with a verdict that holds for all of them."""
-    if worse.verdict != "missed" or all(m.verdict == "missed" for m in margins):
-        return worse
     better = max(margins, key=lambda m: m.probability_met)
+    if all(m.verdict == worse.verdict for m in margins) or worse.verdict == "undecided":
+        return worse
     vary = "varies" if len(names) == 1 else "vary"
     reason = (
         f"it depends on how {' and '.join(names)} {vary} over the field: as one offset, a smooth "
-        f"field, or independent errors, P(met) is {worse.probability_met:.3g} to "
-        f"{better.probability_met:.3g}"
+        f"field, or independent errors, P(met) is {_fraction(worse)} to {_fraction(better)}"
     )
-    texts = [*(one.sentence for one in doubts), reason]
-    return replace(worse, verdict="undecided", reason="; ".join(texts))
+    if doubts:
+        texts = [*(check.sentence for check in doubts), reason]
+        return replace(worse, verdict="undecided", reason="; ".join(texts))
+    return replace(worse, verdict="not shown", reason=f"{reason}; {worse.reason}")
+
+
+def _fraction(margin: Margin) -> str:
+    """Probability of meeting the limit, as text."""
+    return counted(margin.probability_met, margin.mc_error, margin.n_effective)
 
 
 def _margin(
@@ -291,13 +394,13 @@ def _margin(
     by_epoch: Sequence[Float],
     errors: DrawnErrors,
     factor: float,
-    n_effective: float,
+    tally: Tally,
     doubts: Sequence[Check],
 ) -> Margin:
     asked = requirement.probability
-    draws = np.max(by_epoch, axis=0)
+    draws = tally.all_values
     worst_epoch = case[int(np.argmax([np.quantile(d, asked) for d in by_epoch]))]
-    met = float(np.mean(draws <= requirement.limit))
+    met, (n_effective, _) = tally.fraction, tally.effective()
     low, median, high = np.quantile(draws, [0.025, 0.5, 0.975])
     # the empirical quantile without interpolation, so that its side of the limit agrees with `met`
     reached = np.quantile(draws, asked, method="inverted_cdf")
@@ -316,6 +419,6 @@ def _margin(
         unit=requirement.unit,
         epoch=worst_epoch.epoch,
         n_effective=n_effective,
-        draws=draws,
+        draws=tally.values[0],
         worst=replace(position, rms=factor * position.rms),
     )

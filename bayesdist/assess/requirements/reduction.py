@@ -32,7 +32,7 @@ class RequiredReduction:
         if not self.enough:
             return (
                 f"no term can do it alone: the largest, {self.term} ({self.now:.3g} {self.unit} "
-                "radial rms), could vanish and the limit would still be missed"
+                "radial rms), could vanish and the requirement would still not be met"
             )
         return (
             f"it would be met if {self.term} fell from {self.now:.3g} to {self.needed:.3g} "
@@ -42,8 +42,8 @@ class RequiredReduction:
 
 def required_reduction(
     errors: DrawnErrors, requirement: Requirement, domain: EvaluationDomain, factor: float
-) -> RequiredReduction:
-    """The term of which the least shrinking meets a requirement.
+) -> RequiredReduction | None:
+    """The term that has to shrink least for a requirement to be met; None if it is nearly met.
 
     Each term by itself is multiplied by a number between 0 and 1, with the same draws throughout.
 
@@ -59,6 +59,8 @@ def required_reduction(
             np.mean(factor * found[statistic] <= requirement.limit) >= requirement.probability
         )
 
+    if met("", 1.0):  # on these draws: no term has to shrink by a size that could be stated
+        return None
     sizes = {name: factor * size for name, size in errors.sizes(domain).items()}
     largest = max(sizes, key=lambda name: sizes[name])
     best, most = "", 0.0

@@ -14,8 +14,12 @@ from bayesdist.model import DistortionModel
 from bayesdist.utils.arrays import Float
 from bayesdist.utils.checks import LARGER, Check, doubts_of
 from bayesdist.utils.distributions import beta_std
-from bayesdist.utils.limits import CONFIDENCE
-from bayesdist.utils.numbers import count
+from bayesdist.utils.limits import CONFIDENCE, COUNTING_ERROR, EXCEEDS
+from bayesdist.utils.numbers import count, probability_words
+
+# level of a check by the word of a verdict, from good to bad
+VERDICT_LEVELS = {"met": "pass", "not shown": "warn", "undecided": "warn", "missed": "fail"}
+MISSED_BELOW = round(1.0 - EXCEEDS.value, 12)  # probability of meeting a limit that is missed
 
 
 def counting_error(fraction: float, n: float) -> float:
@@ -24,28 +28,69 @@ def counting_error(fraction: float, n: float) -> float:
     return beta_std(k + 0.5, n - k + 0.5)
 
 
+def undecided_by_draws(fraction: float, n: float, bounds: Sequence[float]) -> bool:
+    """Whether the 99 % Clopper-Pearson interval of a probability has a bound within it.
+
+    `fraction`: of draws that meet the limit. `n`: effective number of draws.
+    """
+    low, high = clopper_pearson(fraction, n, CONFIDENCE.value)
+    return any(low < bound <= high for bound in bounds)
+
+
 def verdict_of(
     fraction: float, n: float, asked: float, checks: Sequence[Check] = ()
 ) -> tuple[str, str]:
     """Verdict on the probability of meeting a limit, and its reason.
 
-    `fraction`: of draws that meet the limit. `n`: effective number of draws. `asked`: the
-    probability asked for. `checks`: nothing is met while one of them is a doubt. Returns `verdict`:
-    'met' or 'missed' where the 99 % Clopper-Pearson interval lies wholly above or below the
-    probability asked for, else 'undecided'.  With doubts 'missed' where the interval says so and
-    all of them make errors larger, else 'undecided'. `reason`: what decided, and with doubts what
-    the draws alone point to.
+    Parameters
+    ----------
+    fraction : float
+        Of draws that meet the limit.
+    n : float
+        Effective number of draws.
+    asked : float
+        Probability asked for.
+    checks : sequence of Check
+        Their doubts leave a requirement undecided.
+
+    Returns
+    -------
+    verdict : str
+        'met' if the probability of meeting the limit is at least the one asked for; 'missed' if
+        the limit is exceeded with a probability of at least 0.95; else 'not shown'.  The estimate
+        decides if its 99 % Clopper-Pearson interval lies on one side, or if its standard error is
+        at most 0.005; else nothing is shown.  With doubts 'undecided'; but 'missed' stays if all
+        of them can only make errors larger.
+    reason : str
+        What decided, and with doubts what the draws alone point to.
     """
-    low, high = clopper_pearson(fraction, n, CONFIDENCE.value)
-    interval = f"the probability is {low:.4f} to {high:.4f} (99 % Monte-Carlo interval)"
-    if low >= asked:
-        verdict, reason = "met", f"{interval}, at or above the {asked:g} asked for"
-    elif high < asked:
-        verdict, reason = "missed", f"{interval}, below the {asked:g} asked for"
+    error = counting_error(fraction, n)
+    exact = COUNTING_ERROR.met_by(error)
+    near = f"{probability_words(fraction, error, n)}, within its Monte-Carlo error of"
+    more = f"{count(n)} effective draws"
+    on_asked, on_missed = (
+        undecided_by_draws(fraction, n, [bound]) for bound in (asked, MISSED_BELOW)
+    )
+    if fraction >= asked and (exact or not on_asked):
+        verdict, reason = "met", f"the probability is at least the {asked:g} asked for"
+        if on_asked:
+            reason = f"{near} the {asked:g} asked for ({more})"
+    elif fraction <= MISSED_BELOW and (exact or not on_missed):
+        verdict = "missed"
+        reason = f"the limit is exceeded with a probability of at least {EXCEEDS.value:g}"
+        if on_missed:
+            reason = f"{near} {MISSED_BELOW:g} ({more})"
     else:
-        verdict = "undecided"
-        reason = f"{interval}, on both sides of the {asked:g} asked for: too few effective draws"
-        reason += f" ({count(n)})"
+        verdict = "not shown"
+        reason = (
+            f"the probability is below the {asked:g} asked for, and that of exceeding the limit is "
+            f"below {EXCEEDS.value:g}: errors have to be smaller, by more stars or exposures, or "
+            "by better knowledge of the largest term"
+        )
+        if on_asked or on_missed:
+            bound = asked if on_asked else MISSED_BELOW
+            reason = f"{near} {bound:g} ({more}): "
+            reason += "more draws (sampler.target_ess, assess.draws) decide it"
     doubts = doubts_of(checks)
     if not doubts or (verdict == "missed" and all(one.doubt == LARGER for one in doubts)):
         return verdict, reason
@@ -53,7 +98,7 @@ def verdict_of(
     alone = {
         "met": f"the stated errors alone would meet it ({reason})",
         "missed": f"the stated errors alone would miss it ({reason})",
-        "undecided": reason,
+        "not shown": f"the stated errors alone would show neither ({reason})",
     }[verdict]
     return "undecided", f"{texts}; {alone}"
 

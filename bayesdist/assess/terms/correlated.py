@@ -16,6 +16,7 @@ from bayesdist.assess.terms.forms import (
     Functions,
     Image,
     Polynomials,
+    Pool,
     Row,
     Together,
 )
@@ -53,8 +54,11 @@ class StructureErrors:
     def draw(self, n: int, rng: np.random.Generator) -> ErrorDraws:
         """The first n draws, over and over."""
         found, shift = self.discrepancy, self.discrepancy.structure_theta
-        theta = _moved(found, shift[np.arange(n) % len(shift)], self.frames)
-        fit = Polynomials(self.rows[0], found.model, found.mean, theta, frames=self.frames)
+        rows = np.arange(n) % len(shift)
+        theta, pool = _moved(found, shift[rows], self.frames), Pool(rows, len(shift))
+        fit = Polynomials(
+            self.rows[0], found.model, found.mean, theta, frames=self.frames, pools=(pool,)
+        )
         if not self.left:
             return fit
         coefficients: dict[int | None, NDArray[np.floating]] = {
@@ -99,8 +103,17 @@ class Deviations:
         theta = _moved(found, linear.theta[rows], self.frames)
         seed = int(rng.integers(2**63)) if self.single else None
         more = partial(_bending, linear, np.asarray(found.mean, float), rows, seed)
+        pools = [Pool(rows, len(linear.theta))]
+        if self.single:  # their deviations are new in each set of draws
+            pools.append(Pool(rows, len(linear.theta), renewed=True))
         return Polynomials(
-            self.rows[0], found.model, found.mean, theta, frames=self.frames, more=more
+            self.rows[0],
+            found.model,
+            found.mean,
+            theta,
+            frames=self.frames,
+            more=more,
+            pools=tuple(pools),
         )
 
 

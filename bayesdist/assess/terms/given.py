@@ -18,6 +18,7 @@ from bayesdist.assess.terms.forms import (
     ErrorTerm,
     Functions,
     Independent,
+    Pool,
     Row,
 )
 from bayesdist.assess.units import UNITS, convert
@@ -379,7 +380,8 @@ class SmoothTerm:
             m = phi.shape[1]
             coefficients[chip.number] = size * unit * rng.standard_normal((n_own, 2, m))
             covariance[chip.number] = np.square(size * unit)[:, :, None] * np.eye(m)
-        return Functions(self.rows[0], coefficients, self, n, covariance=covariance)
+        pool = Pool(np.arange(n) % n_own, n_own, renewed=True)
+        return Functions(self.rows[0], coefficients, self, n, covariance=covariance, pools=(pool,))
 
     def __call__(self, chip: int, x: Float, y: Float) -> Float:
         """Polynomials (N, m) on a chip."""

@@ -15,6 +15,7 @@ from bayesdist.assess.terms.forms import (
     ErrorDraws,
     ErrorTerm,
     Polynomials,
+    Pool,
     Row,
     Together,
 )
@@ -189,9 +190,11 @@ class ExposureVariation:
         mean = np.array(self.mean, float)
         mean[at] = 0.0
         theta = np.tile(mean, (n, 1))
-        tau = self.tau[rng.integers(len(self.tau), size=n)]
+        rows = rng.integers(len(self.tau), size=n)
+        tau = self.tau[rows]
         theta[:, at] = tau * rng.standard_normal(tau.shape)
-        own = Polynomials(self.rows[0], self.model, mean, theta, self._exposure)
+        pools = (Pool(rows, len(self.tau)),)
+        own = Polynomials(self.rows[0], self.model, mean, theta, self._exposure, pools=pools)
         if self.aberration is None:
             return own
         return Together((own, self.aberration.draw(n, rng)))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
@@ -13,6 +14,7 @@ from bayesdist.assess.terms.forms import (
     Image,
     PolynomialField,
     Polynomials,
+    Pool,
     Row,
     TogetherField,
     polynomial_errors,
@@ -73,6 +75,23 @@ class SolutionDraws:
     joint: tuple[Float, Int]
     shown: tuple[Float, Int]
     catalogue: tuple[Polynomials, ...] = ()
+
+    @property
+    def pools(self) -> tuple[Pool, ...]:
+        """The stored draws of a sampler; nothing for a fit, each draw of which is a new one.
+
+        They are worth the smaller of the bulk and tail effective sample sizes, as a probability far
+        from a half is a matter of the tails.
+        """
+        convergence = self.of.solution.convergence
+        if convergence is None:
+            return ()
+        sizes = [convergence.ess_bulk_min, convergence.ess_tail_min]
+        ess = 1.0 if any(math.isnan(size) for size in sizes) else max(min(sizes), 1.0)
+        theta, rows = self.joint
+        # draws that were transformed one by one do not say which of the sampler's they are
+        anonymous = len(theta) == len(rows) and np.array_equal(rows, np.arange(len(rows)))
+        return (Pool(None if anonymous else rows, ess),)
 
     def on(self, domain: EvaluationDomain, image: Image) -> TogetherField:
         """The errors at the positions of a domain."""

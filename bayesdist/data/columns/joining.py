@@ -56,7 +56,9 @@ def joined_arguments(tables: Sequence[MatchColumns]) -> dict[str, Any]:
         "notes": tuple(dict.fromkeys(note for t in tables for note in t.notes)),
         "unit": first.unit,
         "tangent_point": first.tangent_point,
-        "match_radius": _common_radius(tables),
+        "match_radius": common_radius(
+            [t.match_radius for t in tables], [", ".join(t.sources) for t in tables]
+        ),
         "n_rows": sum(t.n_rows for t in tables),
         "rejected": merged_counts([t.rejected for t in tables]),
     }
@@ -89,18 +91,18 @@ def merged_codes(
     return np.concatenate(renumbered), tuple(every)
 
 
-def _common_radius(tables: Sequence[MatchColumns]) -> float | None:
+def common_radius(radii: Sequence[float | None], sources: Sequence[str]) -> float | None:
     """Match radius of all tables; None if one has none.  InputError if they differ."""
-    radii = {table.match_radius for table in tables if table.match_radius is not None}
-    if any(table.match_radius is None for table in tables):
+    stated = {radius for radius in radii if radius is not None}
+    if len(stated) == 0 or None in radii:
         return None
-    if len(radii) > 1:
+    if len(stated) > 1:
         raise InputError(
-            f"match radii differ: {', '.join(f'{radius:g}' for radius in sorted(radii))}",
-            where=", ".join(source for table in tables for source in table.sources),
+            f"match radii differ: {', '.join(f'{radius:g}' for radius in sorted(stated))}",
+            where=", ".join(sources),
             do="match all tables with one radius",
         )
-    return radii.pop()
+    return stated.pop()
 
 
 def merged_optional(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterable, Mapping
 from html import escape
 from typing import TYPE_CHECKING, Any
@@ -10,13 +11,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bayesdist.data.columns.checked import COLUMNS, MatchColumns, column_unit
-from bayesdist.files.parquet import arrow_array
+from bayesdist.data.tables.units import check_unit, conversion
+from bayesdist.files.parquet import HEADER, arrow_array
 
 if TYPE_CHECKING:
     import pyarrow
     from astropy.table import QTable
 
-META = "bayesdist"  # key of the header of a table for what no column holds
 _LEFT_OUT = frozenset(("source",))  # the header names the files
 
 
@@ -36,31 +37,42 @@ def table_of(matches: MatchColumns) -> QTable:
         if labels is not None:
             values = labels[values]
         table[name] = values if unit is None else values * apu.Unit(unit)
-    header = {
+    table.meta[HEADER] = {
         "sources": list(matches.sources),
         "n_rows": matches.n_rows,
         "rejected": dict(matches.rejected),
         "notes": list(matches.notes),
-    }
-    if matches.tangent_point is not None:
-        header["tangent_point"] = list(matches.tangent_point)
-    if matches.match_radius is not None:
-        header["match_radius"] = matches.match_radius
-    table.meta[META] = header
+    } | geometry_header(matches)
     return table
 
 
-def header_arguments(header: Mapping[str, Any]) -> dict[str, Any]:
-    """Arguments of `Matches` in the header of a table that `table_of` made; else nothing."""
-    own = header.get(META)
-    if not isinstance(own, Mapping):
+def geometry_header(matches: MatchColumns) -> dict[str, Any]:
+    """Tangent point and match radius of matches, with the unit of the radius, if they have any."""
+    header: dict[str, Any] = {}
+    if matches.tangent_point is not None:
+        header["tangent_point"] = list(matches.tangent_point)
+    if matches.match_radius is not None:
+        header |= {"match_radius": matches.match_radius, "unit": matches.unit}
+    return header
+
+
+def header_arguments(header: Mapping[str, Any], unit: str, *, source: str) -> dict[str, Any]:
+    """Arguments of `Matches` in the header of a table that holds a `geometry_header`.
+
+    `unit` is that of u and v, to which the match radius is converted.  A table of other programs
+    has no such header: the result is then empty.
+    """
+    stated = header.get(HEADER)
+    if not isinstance(stated, Mapping):
         return {}
     out: dict[str, Any] = {}
-    point, radius = own.get("tangent_point"), own.get("match_radius")
+    point, radius = stated.get("tangent_point"), stated.get("match_radius")
     if isinstance(point, list | tuple) and len(point) == 2:
         out["tangent_point"] = (float(point[0]), float(point[1]))
-    if isinstance(radius, float):
-        out["match_radius"] = radius
+    if isinstance(radius, int | float) and radius > 0:
+        unit_of_radius = str(stated.get("unit", unit))
+        check_unit(unit_of_radius, where=source)
+        out["match_radius"] = float(radius) * conversion(unit_of_radius, unit, where=source)
     return out
 
 
@@ -98,7 +110,8 @@ def arrow_stream(
             kind = pyarrow.float64()
         metadata = None if unit is None else {"unit": unit}
         fields.append(pyarrow.field(name, kind, nullable=False, metadata=metadata))
-    schema = pyarrow.schema(fields)
+    header = json.dumps(geometry_header(matches))
+    schema = pyarrow.schema(fields, metadata={HEADER: header})
 
     def made() -> Iterable[pyarrow.RecordBatch]:
         for batch in batches:

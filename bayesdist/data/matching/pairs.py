@@ -5,9 +5,11 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial import ConvexHull, QhullError, cKDTree
 
-from bayesdist.data.matching.linear_map import MAX_SAMPLE
+from bayesdist.data.matching.linear_map import MAX_SAMPLE, MIN_PAIRS
 from bayesdist.utils.arrays import Bool, Float, Int
 
+CONVINCING_PAIRS = 15  # pairs that convince although most stars have none
+NARROW = 0.25  # mean distances between reference stars: reach of the last pairs of a linear map
 _MAX_PROBES = 20_000  # displaced detections that sample chance matches
 _DIRECTIONS = np.exp(2j * np.pi * np.arange(8) / 8)
 
@@ -106,6 +108,14 @@ def chance_rate(points: Float, tree: cKDTree, radius: float | Float, step: float
         distance, _ = tree.query(moved, distance_upper_bound=float(reach.max()))
         found += int((distance <= reach).sum())
     return found / (len(sample) * len(_DIRECTIONS))
+
+
+def are_enough(n: int, n_points: int, n_reference: int) -> bool:
+    """True if n pairs convince, of so many points and of the reference stars among them.
+
+    These are `MIN_PAIRS`, and half of the smaller set or `CONVINCING_PAIRS`.
+    """
+    return n >= MIN_PAIRS and n >= min(CONVINCING_PAIRS, 0.5 * min(n_points, n_reference))
 
 
 def beats_chance(points: Float, reference: Float, tree: cKDTree, distance: Float) -> bool:

@@ -21,7 +21,14 @@ from bayesdist.data.catalog import ReferenceCatalog
 from bayesdist.data.matches import Matches
 from bayesdist.data.matching.exposure import Pairs, iterated_pairs
 from bayesdist.data.matching.linear_map import MIN_PAIRS, LinearMap, best_similarity, iterated_map
-from bayesdist.data.matching.pairs import beats_chance, chance_rate, mutual_pairs, overlap
+from bayesdist.data.matching.pairs import (
+    NARROW,
+    are_enough,
+    beats_chance,
+    chance_rate,
+    mutual_pairs,
+    overlap,
+)
 from bayesdist.data.matching.similarity import (
     brightest,
     find_similarity,
@@ -54,8 +61,6 @@ _FROM_DETECTIONS = (
 )
 _FROM_CATALOGUE = ("ra", "dec", *SKY_QUANTITIES, "mag", "flux", "colour", "star")
 _MARGIN = 0.5  # field radii around the detections in which catalogue stars are looked for
-_NARROW = 0.25  # mean distances between reference stars: reach of the last pairs of the linear map
-_CONVINCING_PAIRS = 15  # pairs that convince although most stars have none
 _DISPLACEMENT = 10.0  # radii by which detections are displaced to count chance pairs
 
 
@@ -640,8 +645,8 @@ def _aligned_pairs(
             found = find_similarity(points, patterns, mag=mag, source=name)
         except InputError:
             raise failure from None
-        start = grown_map(brightest(points, mag), found, patterns, narrow=_NARROW)
-        reach = max(_NARROW * patterns.spacing, radius)
+        start = grown_map(brightest(points, mag), found, patterns, narrow=NARROW)
+        reach = max(NARROW * patterns.spacing, radius)
     linear = iterated_map(points, reference, tree, start, reach, radius)
     if linear is None:
         raise failure
@@ -662,10 +667,8 @@ def _agrees(points: Float, reference: Float, tree: cKDTree, radius: float) -> bo
 
 
 def _enough(n: int, points: Float, reference: Float) -> bool:
-    """True if n pairs are enough to convince."""
-    return n >= MIN_PAIRS and n >= min(
-        _CONVINCING_PAIRS, 0.5 * min(len(points), overlap(points, reference)[0])
-    )
+    """True if n pairs are enough to convince, of the reference stars where the points are."""
+    return are_enough(n, len(points), overlap(points, reference)[0])
 
 
 def _words(group: _Group, points: Float, reference: Float, pairs: Pairs, radius: float) -> str:

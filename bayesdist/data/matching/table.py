@@ -9,8 +9,15 @@ from numpy.typing import ArrayLike
 
 from bayesdist.data.catalog import ReferenceCatalog
 from bayesdist.data.matches import Matches
-from bayesdist.data.matching.linear_map import MIN_PAIRS, LinearMap, iterated_map
-from bayesdist.data.matching.pairs import beats_chance, chance_radius, mutual_pairs, overlap
+from bayesdist.data.matching.linear_map import LinearMap, iterated_map
+from bayesdist.data.matching.pairs import (
+    NARROW,
+    are_enough,
+    beats_chance,
+    chance_radius,
+    mutual_pairs,
+    overlap,
+)
 from bayesdist.data.matching.similarity import (
     brightest,
     find_similarity,
@@ -21,9 +28,7 @@ from bayesdist.errors import InputError
 from bayesdist.utils.arrays import Int
 from bayesdist.utils.quantities import Number, value_in
 
-_NARROW = 0.25  # mean distances between reference stars: reach of its last pairs
 _FALSE_RATE = 0.02  # chance matches of a detection that the default radius allows
-_CONVINCING_PAIRS = 15  # pairs that convince although most stars have none
 
 
 @dataclass(frozen=True, eq=False)
@@ -132,20 +137,18 @@ def match_to_catalog(
             where=source,
             do="check the field, or allow a larger offset",
         )
-    rough = grown_map(brightest(points, magnitudes), found, patterns, narrow=_NARROW)
+    rough = grown_map(brightest(points, magnitudes), found, patterns, narrow=NARROW)
     n_over, area = overlap(rough(points), reference)
     if radius is None:
         radius = chance_radius(_FALSE_RATE, n_over, area)
-    reach = max(_NARROW * patterns.spacing, radius)
+    reach = max(NARROW * patterns.spacing, radius)
     transformation = iterated_map(points, reference, patterns.tree, rough, reach, radius)
     if transformation is None:
         raise failure
     moved = transformation(points)
     index, catalog_index, distance = mutual_pairs(moved, reference, radius, tree=patterns.tree)
-    few = len(index) < MIN_PAIRS or len(index) < min(
-        _CONVINCING_PAIRS, 0.5 * min(len(points), n_over)
-    )
-    if few or not beats_chance(moved, reference, patterns.tree, distance):
+    enough = are_enough(len(index), len(points), n_over)
+    if not enough or not beats_chance(moved, reference, patterns.tree, distance):
         raise failure
     return Matching(
         index=index,

@@ -200,7 +200,7 @@ def match_arguments(
 
     out = match_columns(Quantities(table, found, source, place), options)
     if "ra" not in found:
-        out |= header_arguments(table.meta)
+        out |= header_arguments(table.meta, out["unit"], source=source)
     if exposure_name is not None:
         out.setdefault("exposure_names", (exposure_name,))
     out["notes"] = (*notes, *out.get("notes", ()))

@@ -10,7 +10,9 @@ import numpy as np
 from astropy.table import Column
 from numpy.typing import NDArray
 
+from bayesdist.data.columns.joining import common_radius
 from bayesdist.data.columns.labels import DEFAULT_LABELS, LABELS_OF_CODES, Labels, recoded
+from bayesdist.data.columns.output import header_arguments
 from bayesdist.data.reading.columns import (
     columns_read,
     match_columns,
@@ -180,9 +182,33 @@ def scan(parts: Sequence[StoredFile]) -> Labels:
         filter_names=tuple(rows.numbers["filter"]),
         sources=tuple(one.source for one in parts),
         n_rows=n_rows,
-        tangent_point=parts[0].options.tangent_point,
+        **_geometry(parts),
         notes=tuple(dict.fromkeys(note for one in parts for note in one.notes)),
     )
+
+
+def _geometry(parts: Sequence[StoredFile]) -> dict[str, Any]:
+    """Tangent point and match radius of all parts, as arguments of `Labels`.
+
+    InputError if parts state different ones.
+    """
+    first = parts[0]
+    if first.on_sky:
+        return {"tangent_point": first.options.tangent_point}
+    stated = [header_arguments(one.part.header, one.unit, source=one.source) for one in parts]
+    points = [header.get("tangent_point") for header in stated]
+    for point, one in zip(points, parts, strict=True):
+        if point != points[0]:
+            raise InputError(
+                f"tangent point is {point}, but {points[0]} in {first.source}",
+                where=one.source,
+                do="bring all parts to one",
+            )
+    radii = [header.get("match_radius") for header in stated]
+    return {
+        "tangent_point": points[0],
+        "match_radius": common_radius(radii, [one.source for one in parts]),
+    }
 
 
 def _named(parts: Sequence[StoredFile], row: int) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
@@ -12,18 +13,20 @@ from numpy.typing import NDArray
 
 from bayesdist.data.batches import BATCH
 from bayesdist.data.columns.labels import DEFAULT_LABELS, LABELS_OF_CODES
+from bayesdist.data.columns.output import geometry_header
 from bayesdist.data.matches import Matches
 from bayesdist.data.tables.checks import columns_of
 from bayesdist.errors import InputError
 from bayesdist.files.atomic import atomic_path, made_folder
-from bayesdist.files.parquet import arrow_array
+from bayesdist.files.parquet import HEADER, arrow_array
 from bayesdist.utils.arrays import Int
 
 if TYPE_CHECKING:
     import pyarrow
 
 Labelled = tuple[Int, tuple[str, ...]]
-Part = tuple[Mapping[str, NDArray[Any] | Labelled], Mapping[str, str]]
+# columns, their units, and what no column holds
+Part = tuple[Mapping[str, NDArray[Any] | Labelled], Mapping[str, str], Mapping[str, Any]]
 
 _NUMBERS = (
     *("x", "y", "u", "v", "sigma_u", "sigma_v", "epoch", "mag", "colour"),
@@ -41,9 +44,9 @@ def write_partitioned(
     """Write tables of matches as a folder of Parquet files, parts of one table.
 
     Only one of the tables need be in memory at a time.  Reading the folder gives the same numbers
-    bit for bit.  Not written are the rows and files that the stars come from, what was rejected,
-    and the tangent point; labels that no star has; and exposures, chips and filters where the first
-    table has none but the default.
+    bit for bit, with the tangent point and the match radius.  Not written are the rows and files
+    that the stars come from, and what was rejected; labels that no star has; and exposures, chips
+    and filters where the first table has none but the default.
 
     Parameters
     ----------
@@ -98,7 +101,8 @@ def _parts(tables: Iterable[Matches], folder: Path) -> Iterator[Part]:
                 where=str(folder),
                 do="give tables of one kind",
             )
-        yield columns, dict.fromkeys(_LENGTHS, unit) | {"x": "pix", "y": "pix", "epoch": "yr"}
+        units = dict.fromkeys(_LENGTHS, unit) | {"x": "pix", "y": "pix", "epoch": "yr"}
+        yield columns, units, geometry_header(table)
 
 
 def write_parts(
@@ -107,9 +111,9 @@ def write_parts(
     """Files part-00000.parquet and so on of columns and units; none is left if one fails."""
     written: list[Path] = []
     try:
-        for columns, units in parts:
+        for columns, units, header in parts:
             path = folder / f"part-{len(written):05d}.parquet"
-            write_columns(path, columns, units, rows_per_group=rows_per_group)
+            write_columns(path, columns, units, header=header, rows_per_group=rows_per_group)
             written.append(path)
     except BaseException:
         for path in written:
@@ -141,11 +145,13 @@ def write_columns(
     columns: Mapping[str, NDArray[Any] | Labelled],
     units: Mapping[str, str],
     *,
+    header: Mapping[str, Any] | None = None,
     rows_per_group: int | None = None,
 ) -> None:
     """Write a Parquet file, with units in the metadata of its fields; replaced atomically.
 
     `columns` are arrays (N,), or codes and the labels that they stand for, stored as a dictionary.
+    `header` is stored as JSON in the metadata of the file.
     """
     import pyarrow.parquet
 
@@ -155,7 +161,8 @@ def write_columns(
         metadata = {"unit": units[name]} if name in units else None
         fields.append(pyarrow.field(name, array.type, nullable=False, metadata=metadata))
         arrays.append(array)
-    table = pyarrow.table(arrays, schema=pyarrow.schema(fields))
+    metadata_of_file = {HEADER: json.dumps(dict(header))} if header else None
+    table = pyarrow.table(arrays, schema=pyarrow.schema(fields, metadata=metadata_of_file))
     with atomic_path(path) as temporary:
         pyarrow.parquet.write_table(
             table,

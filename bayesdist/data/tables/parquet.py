@@ -19,7 +19,13 @@ from bayesdist.data.tables.checks import Place
 from bayesdist.data.tables.column import EncodedColumn
 from bayesdist.errors import InputError
 from bayesdist.files.faults import naming_faults
-from bayesdist.files.parquet import numpy_array, open_parquet, parquet_column, parquet_units
+from bayesdist.files.parquet import (
+    numpy_array,
+    open_parquet,
+    parquet_column,
+    parquet_header,
+    parquet_units,
+)
 from bayesdist.utils.arrays import Int
 
 if TYPE_CHECKING:
@@ -65,6 +71,7 @@ class ParquetPart:
     colnames: tuple[str, ...]
     units: Mapping[str, str]
     texts: frozenset[str]  # columns of strings, or of dictionaries
+    header: Mapping[str, Any]  # of the table
 
     @property
     def n_rows(self) -> int:
@@ -204,6 +211,7 @@ def describe_part(path: Path) -> ParquetPart:
             _names(stored),
             parquet_units(schema),
             frozenset(one.name for one in schema if any(kind(one.type) for kind in is_text)),
+            parquet_header(schema),
         )
 
 

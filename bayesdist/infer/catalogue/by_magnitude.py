@@ -28,6 +28,7 @@ from bayesdist.infer.stars.likelihood import good_probability
 from bayesdist.infer.stars.shards import Compute
 from bayesdist.infer.stars.stars import groups_of, in_table_order, prepare
 from bayesdist.model import DistortionModel
+from bayesdist.utils.arguments import takes
 from bayesdist.utils.arrays import Float
 
 STARS = 200_000  # from which the law is estimated: it is then known to a part in a thousand
@@ -39,6 +40,7 @@ WIDER = 10.0  # false matches scatter at least this many times as wide as the wo
 LEAST_WEIGHT = 1e-9  # of a star: a fit needs finite errors
 
 
+@takes(matches=Matches, model=DistortionModel, rejection=Rejection, compute=Compute)
 def fit_by_magnitude(
     matches: Matches,
     model: DistortionModel,
@@ -64,7 +66,8 @@ def fit_by_magnitude(
     fit : LinearFit
         Of all matches with these errors.
     matches : Matches
-        With these errors.
+        With these errors, and without nominal positions: residuals that the match circle has cut
+        give errors that describe the selected stars, which must not be corrected a second time.
     errors : MagnitudeErrors
         The law at its nodes, and the scatter about each.
 
@@ -91,7 +94,7 @@ def fit_by_magnitude(
         )
     count = max(STARS, PER_EXPOSURE * len(model.exposures) * len(model.chips))
     errors = _law(matches.sample(count), model, rejection, priors)
-    table = matches.with_errors(errors)
+    table = matches.without("u_nominal", "v_nominal").with_errors(errors)
     fit = fit_linear(table, model, rejection=rejection, priors=priors, compute=compute)
     return fit, table, errors
 

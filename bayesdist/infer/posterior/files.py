@@ -13,6 +13,7 @@ import json
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
+from types import NoneType
 from typing import TYPE_CHECKING, Any
 
 import h5netcdf
@@ -34,6 +35,7 @@ from bayesdist.infer.solution.linear import LinearFit
 from bayesdist.infer.stars.likelihood import Clip
 from bayesdist.infer.stars.mixture import OutlierMixture
 from bayesdist.model import DistortionModel
+from bayesdist.utils.arguments import takes
 
 if TYPE_CHECKING:
     import xarray
@@ -44,6 +46,7 @@ LEAST_RHAT = 0.5  # chains of four draws have 0.87 at least
 FIT_NUMBERS = ("n_rows", "n_used", "rms_u", "rms_v", "rms_rejected", "chi2", "dof", "condition")
 
 
+@takes(posterior=Posterior, matches=(Matches, NoneType))
 def save_posterior(
     posterior: Posterior,
     matches: Matches | None,

@@ -13,6 +13,7 @@ from bayesdist.infer.stars.likelihood import star_averages, star_log_likelihoods
 from bayesdist.infer.stars.mixture import Hyper
 from bayesdist.infer.stars.shards import Shards
 from bayesdist.infer.stars.stars import Stars, in_table_order, prepare
+from bayesdist.utils.arguments import takes
 from bayesdist.utils.arrays import Float, Int
 
 MOST_DRAWS, LEAST_DRAWS = 64, 8
@@ -57,6 +58,7 @@ def some_draws(theta: Float, h: Float, n_stars: int) -> tuple[Float, Float]:
     return theta[rows], h[rows]
 
 
+@takes(posterior=Posterior, matches=Matches)
 def memberships(posterior: Posterior, matches: Matches) -> Memberships:
     """Probability that each star is a false match, and its log-likelihood.
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from importlib import metadata
 from pathlib import Path
 
@@ -29,6 +30,7 @@ from bayesdist.infer.stars.loading import opened
 from bayesdist.infer.stars.mixture import OutlierMixture
 from bayesdist.infer.stars.shards import Compute, Shards
 from bayesdist.infer.stars.stars import Stars
+from bayesdist.utils.arguments import takes
 from bayesdist.utils.memory import require_memory
 
 STEPS_KEPT = 100  # at least, of each walker
@@ -37,6 +39,7 @@ FORMAT = 3  # of the checkpoints
 ENGINES = ("emcee", "numba", "numpy", "scipy")  # another version may compute other bits
 
 
+@takes(fit=LinearFit, matches=(Matches, Shards), outliers=OutlierMixture, compute=Compute)
 @one_thread
 def sample(
     fit: LinearFit,
@@ -66,7 +69,7 @@ def sample(
     matches : Matches or Shards
         All stars: none is clipped.
     outliers : OutlierMixture, optional
-        Gaussian outliers by default, within the match radius of the matches if they have one.
+        Gaussian outliers by default.  If it has no match radius, that of the matches is used.
     priors : GaussianPriors, optional
     seed : int
         All random numbers follow from it.
@@ -133,8 +136,10 @@ def sample(
         raise InputError("steps must be positive", where="sampler")
     started = time.monotonic()
     with opened(fit.model, matches, compute) as shards:
-        radius = matches.match_radius if isinstance(matches, Matches) else None
-        mixture = (outliers or OutlierMixture(match_radius=radius)).in_unit(fit.model.unit)
+        mixture = outliers or OutlierMixture()
+        if mixture.match_radius is None and isinstance(matches, Matches):
+            mixture = replace(mixture, match_radius=matches.match_radius)
+        mixture = mixture.in_unit(fit.model.unit)
         priors = priors or GaussianPriors.none(fit.model)
         target = Target(shards, mixture, priors)
         folder = None if folder is None else Path(folder)

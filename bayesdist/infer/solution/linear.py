@@ -29,6 +29,7 @@ from bayesdist.infer.stars.loading import opened
 from bayesdist.infer.stars.shards import Compute, Shards
 from bayesdist.infer.stars.stars import Stars, in_table_order, prepare
 from bayesdist.model import Chip, DistortionModel, TimeDependence
+from bayesdist.utils.arguments import takes
 from bayesdist.utils.arrays import Bool, Float
 from bayesdist.utils.quantities import value_in, values_in
 
@@ -179,6 +180,7 @@ class LinearFit(Solution):
         return replace(self, cov=matrix @ self.cov @ matrix.T)
 
 
+@takes(matches=Matches, time=TimeDependence)
 def build_model(
     matches: Matches,
     *,
@@ -259,6 +261,7 @@ def build_model(
     )
 
 
+@takes(matches=(Matches, Shards), model=DistortionModel, rejection=Rejection, compute=Compute)
 def fit_linear(
     matches: Matches | Shards,
     model: DistortionModel,

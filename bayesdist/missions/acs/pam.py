@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from bayesdist.app.commands.on_files.calibrations import calibration_at, images_of, notes_of
+from bayesdist.app.commands.on_files.calibrations import calibration_of_scale, images_of, notes_of
 from bayesdist.app.screen import number
 from bayesdist.app.store.output import refuse_existing
 from bayesdist.calibration.area import PixelAreaMap, pixel_area_map
@@ -38,7 +38,7 @@ def write_area_maps(
             do="choose a name that ends in .fits",
         )
     refuse_existing(output, force)
-    found = calibration_at(path, filter=filter, scale=scale)
+    found = calibration_of_scale(path, filter=filter, scale=scale)
     chips, (pixel, source) = found.in_frame(epoch), found.pixel(epoch)
     images = images_of(found, image=image)
     numbers = list(images or chips)

@@ -14,6 +14,7 @@ from matplotlib.patches import Patch
 from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
 
 from bayesdist.assess.maps.uncertainty import per_axis
+from bayesdist.assess.requirements.verdict import VERDICT_LEVELS
 from bayesdist.assess.terms.forms import PRODUCT
 from bayesdist.errors import InputError
 from bayesdist.report.figures.style import (
@@ -33,9 +34,9 @@ if TYPE_CHECKING:
     from bayesdist.assess import ErrorBudget, Margin
     from bayesdist.assess.requirements.validity import ValidityPeriod
 
-VERDICT_LEVELS = {"met": "pass", "undecided": "warn", "missed": "fail"}
 SHOWN_QUANTILES = (0.001, 0.999)  # of the draws between which a histogram is drawn
-MARKERS = {"met": "o", "undecided": "D", "missed": "X"}  # shape in addition to colour
+# shape in addition to colour
+MARKERS = {"met": "o", "not shown": "s", "undecided": "D", "missed": "X"}
 KIND_COLORS = {
     "random": PALETTE["sky"],
     "systematic": PALETTE["blue"],

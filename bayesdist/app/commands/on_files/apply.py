@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from bayesdist.app.commands.on_files.calibrations import calibration_at, images_of
+from bayesdist.app.commands.on_files.calibrations import calibration_of_scale, images_of
 from bayesdist.app.commands.on_files.position_table import (
     OUT,
     add_positions,
@@ -61,12 +61,12 @@ def apply_to_table(
     column chip unless `chip` gives it.  `method` is one of METHODS: Newton's method on the forward
     polynomials, a polynomial fitted here, of an `order`, or the INVERSE rows of an IDCTAB; `epoch`
     is in decimal years; `origin` is the output pixel of the zero point, (0, 0) by default.  Filter,
-    scale and size are as of `calibration_at`; image, ltv and corner as of `images_of`.  What is to
-    be printed is returned.
+    scale and size are as of `calibration_of_scale`; image, ltv and corner as of `images_of`.  What
+    is to be printed is returned.
     """
     output = Path(output)
     check_output(output, force)
-    found = calibration_at(path, filter=filter, scale=scale, size=size)
+    found = calibration_of_scale(path, filter=filter, scale=scale, size=size)
     chips_of = found.in_frame(epoch)
     pixel, source = found.pixel(epoch)
     ox, oy = origin or (0.0, 0.0)

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from bayesdist.app.commands.on_files.calibrations import calibration_at, on_the_sky
+from bayesdist.app.calibrations import calibration_at, on_the_sky
 from bayesdist.app.screen import number as digits
 from bayesdist.app.store.output import refuse_existing
 from bayesdist.calibration.calibration import Calibration

@@ -9,7 +9,7 @@ import numpy as np
 from astropy.io import fits
 from astropy.table import QTable, Table
 
-from bayesdist.app.commands.on_files.calibrations import calibration_at, on_the_sky
+from bayesdist.app.calibrations import calibration_at, on_the_sky
 from bayesdist.app.commands.on_files.position_table import (
     check_output,
     closing_lines,

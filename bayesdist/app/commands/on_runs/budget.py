@@ -6,13 +6,13 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from bayesdist.app.commands.options import chip_of
 from bayesdist.app.results import errors_of, open_results
 from bayesdist.app.screen import number, table_text
 from bayesdist.app.store.rundir import RunDirectory
 from bayesdist.assess.budget.budget import TOTAL, ErrorBudget, place_budget
 from bayesdist.assess.maps.uncertainty import circular_error, per_axis
 from bayesdist.assess.terms.forms import PRODUCT
+from bayesdist.calibration.chip_map import chosen_chip
 
 
 def budget_at(
@@ -32,7 +32,8 @@ def budget_at(
     """
     with open_results(RunDirectory.open(run)) as results:
         results.run.require("budget", ("fit", "sample"))
-        number_of = chip_of([one.number for one in results.posterior.model.chips], chip, str(run))
+        numbers = [one.number for one in results.posterior.model.chips]
+        number_of = chosen_chip(numbers, chip, where=str(run), argument="--chip")
         errors = errors_of(results)
         x, y = zip(at, *to, strict=True)
         found = place_budget(

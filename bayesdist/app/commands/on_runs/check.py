@@ -6,11 +6,10 @@ from collections.abc import Iterator
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-from bayesdist.app.assessment.checks import in_circle
 from bayesdist.app.assessment.error_terms import idle_dates
 from bayesdist.app.config import Config, load_config
 from bayesdist.app.kinds.fit_data import FitData
-from bayesdist.app.kinds.matches.added_errors import grouping_sentence
+from bayesdist.app.kinds.matches.added_errors import grouping_sentence, in_circle
 from bayesdist.app.kinds.matches.plausibility import doubts_on_stars
 from bayesdist.app.rehearsal import rehearse
 from bayesdist.app.results import Results, open_results
@@ -87,13 +86,13 @@ def _cost(data: FitData, config: Config) -> str:
     """Expected passes and seconds, from the numbers of stars and parameters."""
     sampler, n = config.sampler, len(data.shards)
     limits = Limits(sampler.target_ess, sampler.target_rhat)
-    n_params = data.model.n_params + len(config.mixture().hyper)
+    n_params = data.model.n_params + len(config.mixture(data.matched.stars.match_radius).hyper)
     passes, how = expected_passes(n_params, n, limits, sampler.ensembles), ""
     if sampler.method == "certified":
         exact = has_second_stage(sampler.second_stage, passes, n)
         passes = PILOTS + (passes if exact else 0)
         how = "certified, with an exact second stage; " if exact else "certified, approximate; "
-    dear = IN_CIRCLE if in_circle(data, config) else 1.0
+    dear = IN_CIRCLE if in_circle(data.matched.stars, config) else 1.0
     per_pass = dear * STAR_S * n
     total = dear * EXPANSIONS * EXPANSION_S * n + passes * (per_pass + OVERHEAD_S) + FIXED_S
     return (

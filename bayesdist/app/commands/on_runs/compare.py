@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from astropy.table import Table, vstack
 
-from bayesdist.app.commands.on_files.calibrations import calibration_at, run_of
+from bayesdist.app.calibrations import calibration_at, run_of
 from bayesdist.app.store.keys import attributes
 from bayesdist.app.store.output import record_folder, write_table
 from bayesdist.assess.comparison.compare import (

@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 from astropy.table import Table
 
-from bayesdist.app.commands.options import chip_of
 from bayesdist.app.config import load_config
 from bayesdist.app.kinds.errors import QUOTED
 from bayesdist.app.kinds.fit_data import FitData
@@ -20,6 +19,7 @@ from bayesdist.app.results import Results, open_results
 from bayesdist.app.screen import table_text
 from bayesdist.app.store.output import refuse_existing, write_table
 from bayesdist.app.store.rundir import RunDirectory
+from bayesdist.calibration.chip_map import chosen_chip
 from bayesdist.data import Matches
 from bayesdist.errors import DegenerateError, InputError
 from bayesdist.files.atomic import atomic_path
@@ -66,7 +66,7 @@ def order(
             do="run it, and see whether the report asks for terms of a higher order",
         )
     chips = [one.number for one in config.chips()]
-    number_of = chip_of(chips or [1], chip, str(path))
+    number_of = chosen_chip(chips or [1], chip, where=str(path), argument="--chip")
     with TemporaryDirectory() as nowhere:
         run = RunDirectory.plan(nowhere, config, text, Path(path).resolve().parent)
         with open_results(run) as results:

@@ -10,17 +10,20 @@ from bayesdist.app.assessment.error_terms import idle_dates
 from bayesdist.app.config import load_requirements
 from bayesdist.app.results import margins_of, open_results, validity_periods_of
 from bayesdist.app.store.rundir import RunDirectory
-from bayesdist.app.tables.margins import margin_rows, margins_text
+from bayesdist.app.tables.margins import margin_rows, margins_text, reasons_of
 from bayesdist.app.tables.result_files import save_margins
 from bayesdist.assess import Margin, Requirement
 from bayesdist.errors import InputError
 
+# by the verdict, in the order in which they count where several are given
+EXIT_CODES = {"missed": 4, "undecided": 6, "not shown": 5}
 
-def validate(run: str | Path, requirements: str | Path) -> tuple[str, bool]:
+
+def validate(run: str | Path, requirements: str | Path) -> tuple[str, int]:
     """Judge a run that has been sampled, and replace its margins and validity periods.
 
-    `requirements` is a TOML file of ``[[requirement]]`` blocks.  Text to print, and truth of all
-    being met.
+    `requirements` is a TOML file of ``[[requirement]]`` blocks.  Returns the text to print and the
+    exit code, which is that of the first of `EXIT_CODES` whose verdict is given.
     """
     asked = load_requirements(requirements)
     directory = RunDirectory.open(run)
@@ -39,7 +42,13 @@ def validate(run: str | Path, requirements: str | Path) -> tuple[str, bool]:
     lines += [f"WARNING: {text}" for text in warnings if text]
     if outdated:
         lines.append(f"{report} shows earlier margins; renew it by 'bayesdist stage report {run}'")
-    return "\n".join(lines), all(m.verdict == "met" for m in margins)
+    return "\n".join(lines), exit_code(margins)
+
+
+def exit_code(margins: Sequence[Margin]) -> int:
+    """Exit code of verdicts: that of the first word of `EXIT_CODES` which is given; 0 if none."""
+    verdicts = {m.verdict for m in margins}
+    return next((code for word, code in EXIT_CODES.items() if word in verdicts), 0)
 
 
 @contextmanager
@@ -54,9 +63,6 @@ def _named_after(path: str | Path, asked: Sequence[Requirement]) -> Iterator[Non
 
 
 def _lines(margins: Sequence[Margin]) -> Iterator[str]:
-    yield margins_text(margin_rows(margins))
-    for m in margins:
-        if m.verdict != "met":
-            yield f"{m.requirement.name}: {m.verdict}: {m.reason}"
-        if m.remedy is not None:
-            yield f"{m.requirement.name}: {m.remedy.sentence}"
+    rows = margin_rows(margins)
+    yield margins_text(rows)
+    yield from reasons_of(rows)

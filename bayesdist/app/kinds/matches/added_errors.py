@@ -25,7 +25,7 @@ def compared_errors(
     None where that is not asked: where errors come from the residuals themselves, where the jitter
     is given or is to be one, and where the match circle has cut the residuals.
     """
-    if not config.compares_jitters or (knows_circle(config) and sample.has_nominal):
+    if not config.compares_jitters or in_circle(sample, config):
         return None
     by = config.outliers.jitter_by
     try:
@@ -41,9 +41,14 @@ def compared_errors(
         return None
 
 
-def knows_circle(config: Config) -> bool:
-    """Truth of a radius in which stars with nominal positions are said to have been matched."""
-    return config.data is not None and config.outliers.match_radius is not None
+def in_circle(stars: Matches, config: Config) -> bool:
+    """True if stars were matched within a known radius of nominal positions that they have.
+
+    The likelihood is then that of selected stars.
+    """
+    if config.data is None or not stars.has_nominal:
+        return False
+    return config.match_radius(stars.match_radius) is not None
 
 
 def added_errors_rows(found: GroupedErrors) -> dict[str, Any]:

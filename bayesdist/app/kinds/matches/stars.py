@@ -16,7 +16,7 @@ from bayesdist.app.kinds.errors import QUOTED, ErrorLaw
 from bayesdist.app.kinds.fit_data import FitData, StarReader
 from bayesdist.app.kinds.fitted import FIT, Fitted, converged_posterior
 from bayesdist.app.kinds.matched import Matched, set_aside
-from bayesdist.app.kinds.matches.added_errors import compared_errors, knows_circle
+from bayesdist.app.kinds.matches.added_errors import compared_errors, in_circle
 from bayesdist.app.kinds.matches.plausibility import doubts_on_stars, refuse_empty_segments
 from bayesdist.app.kinds.matches.sources import check_chips, read_configured
 from bayesdist.app.store.rundir import RunDirectory
@@ -50,11 +50,19 @@ SAMPLING = 1  # of the random streams that follow from the one seed: that of the
 
 
 def match_stars(stars: Matches, config: MatchesConfig) -> Matched:
-    """Matched stars of a configuration, those that are fitted and those that are held out."""
-    if stars.has_nominal:  # in columns that were found by their names
+    """Stars to fit, and stars that are held out, of a configuration."""
+    where = ", ".join(stars.sources)
+    if config.data.sigma == "by_magnitude":
+        # These errors are estimated from residuals that the match circle has truncated, so that
+        # the likelihood must not correct for the circle a second time.
+        if stars.has_nominal:
+            log.info("fit: nominal positions are not used with errors by magnitude")
+        stars = stars.without("sigma_u", "sigma_v", "u_nominal", "v_nominal")
+    if in_circle(stars, config):
         for fault in config.circle_faults():
             cause, _, do = fault.partition("; ")
-            raise ConfigError(cause, where=", ".join(stars.sources), do=do)
+            raise ConfigError(cause, where=where, do=do)
+    config.mixture(stars.match_radius)  # uniform outliers need a radius
     return Matched(*set_aside(config, stars))
 
 
@@ -163,8 +171,8 @@ def shards_of(
 ) -> Shards:
     """Stars as passes go over them, none of them outside the circle in which it was matched."""
     shards = reader.shards(model, stars, errors)
-    if knows_circle(config) and stars.has_nominal:
-        shards.survey.check_circle(config.outliers.match_radius)
+    if in_circle(stars, config):
+        shards.survey.check_circle(config.match_radius(stars.match_radius))
     return shards
 
 
@@ -184,7 +192,7 @@ def sample_stars(
     posterior = sample(
         data.fit,
         data.shards,
-        outliers=config.mixture(),
+        outliers=config.mixture(data.matched.stars.match_radius),
         priors=data.fitted.priors,
         folder=folder,
         progress=progress,

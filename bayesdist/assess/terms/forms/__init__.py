@@ -18,6 +18,7 @@ from bayesdist.assess.terms.forms.rows import (
     ErrorField,
     ErrorTerm,
     Image,
+    Pool,
     Row,
 )
 from bayesdist.assess.terms.forms.together import Together, TogetherField
@@ -41,6 +42,7 @@ __all__ = [
     "NoiseField",
     "PolynomialField",
     "Polynomials",
+    "Pool",
     "Row",
     "Together",
     "TogetherField",

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bayesdist.assess.domain import EvaluationDomain
-from bayesdist.assess.terms.forms.rows import DrawnField, Image, Row, Scale
+from bayesdist.assess.terms.forms.rows import DrawnField, Image, Pool, Row, Scale
 from bayesdist.model.grid import DEFAULT_GRID, grid_pixels, mesh
 from bayesdist.utils.arrays import Float
 
@@ -32,6 +32,7 @@ class Functions:
     # (2, m, m), of the coefficients, where it is stated: mean squares are exact then, and it is not
     # known how well their size is
     covariance: Mapping[int | None, Float] | None = None
+    pools: tuple[Pool, ...] = ()  # finite sets that the coefficients are taken from
     _cache: dict[EvaluationDomain, FunctionField] = field(default_factory=dict, repr=False)
 
     def on(self, domain: EvaluationDomain, image: Image) -> FunctionField:

@@ -4,17 +4,20 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from typing import ClassVar
 
 import numpy as np
 
 from bayesdist.assess.domain import EvaluationDomain
-from bayesdist.assess.terms.forms.rows import ErrorField, Image, Row
+from bayesdist.assess.terms.forms.rows import ErrorField, Image, Pool, Row
 from bayesdist.utils.arrays import Float
 
 
 @dataclass(frozen=True, eq=False)
 class Independent:
     """Errors that are independent from position to position."""
+
+    pools: ClassVar[tuple[Pool, ...]] = ()
 
     row: Row
     # standard deviations (N, 2) at the positions of a domain; None where there is no such error, as
@@ -59,6 +62,8 @@ class NoiseField(ErrorField):
 @dataclass(frozen=True, eq=False)
 class Known:
     """Displacements that are known, and no error."""
+
+    pools: ClassVar[tuple[Pool, ...]] = ()
 
     row: Row  # in no total
     # takes pixels x, y (N,), a chip number and an epoch (or None) to (N, 2)

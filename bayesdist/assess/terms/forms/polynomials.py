@@ -9,7 +9,7 @@ import numpy as np
 
 from bayesdist.assess.domain import EvaluationDomain
 from bayesdist.assess.solution import place_of
-from bayesdist.assess.terms.forms.rows import DrawnField, Image, Row, Scale
+from bayesdist.assess.terms.forms.rows import DrawnField, Image, Pool, Row, Scale
 from bayesdist.calibration.chip_map import position_moments
 from bayesdist.infer.compare.frame_fields import mean_squares
 from bayesdist.model import DistortionModel
@@ -92,6 +92,7 @@ class Polynomials:
     frames: bool = False  # whether the frame of the exposure of each draw's star errs
     # takes an epoch and a chip number to what is added to these polynomials, (n, 2, K)
     more: Callable[[float | None, int], Float] | None = None
+    pools: tuple[Pool, ...] = ()  # finite sets that the parameters are taken from
 
     def on(self, domain: EvaluationDomain, image: Image) -> PolynomialField:
         """The errors at the positions of a domain, less what an alignment takes up."""

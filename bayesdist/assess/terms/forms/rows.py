@@ -50,6 +50,19 @@ class Image:
     aligned_by: Float | None = None
 
 
+@dataclass(frozen=True, eq=False)
+class Pool:
+    """Finite set of draws from which those of a term are taken, some of them more than once.
+
+    More draws than these make a probability no better known, except for what other terms add.
+    """
+
+    # (n,), which draw of the set each draw of the term is; None where that is not known
+    rows: Int | None
+    size: float  # independent draws that the whole set is worth
+    renewed: bool = False  # True if further draws of the term are taken from another set
+
+
 class ErrorTerm(Protocol):
     """Something that moves positions: all that a new one has to give."""
 
@@ -65,6 +78,11 @@ class ErrorTerm(Protocol):
 
 class ErrorDraws(Protocol):
     """Draws of a term: one of the forms of this module."""
+
+    @property
+    def pools(self) -> tuple[Pool, ...]:
+        """Finite sets that the draws are taken from; empty where each draw is a new one."""
+        ...
 
     def on(self, domain: EvaluationDomain, image: Image) -> ErrorField:
         """The errors at the positions of a domain."""

@@ -10,7 +10,7 @@ import numpy as np
 from bayesdist.assess.domain import EvaluationDomain
 from bayesdist.assess.terms.forms.functions import Functions
 from bayesdist.assess.terms.forms.polynomials import Polynomials
-from bayesdist.assess.terms.forms.rows import DrawnField, Image, Scale
+from bayesdist.assess.terms.forms.rows import DrawnField, Image, Pool, Scale
 from bayesdist.utils.arrays import Float
 
 
@@ -26,6 +26,11 @@ class Together:
     draws: tuple[Polynomials | Functions, ...]  # one for each row
     # whether the last row counts as much as the joint error has beyond the other rows
     remainder: bool = False
+
+    @property
+    def pools(self) -> tuple[Pool, ...]:
+        """Finite sets that the draws of the rows are taken from."""
+        return tuple(pool for one in self.draws for pool in one.pools)
 
     def on(self, domain: EvaluationDomain, image: Image) -> TogetherField:
         """The errors at the positions of a domain."""

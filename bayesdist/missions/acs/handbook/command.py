@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 from astropy.table import Table
 
-from bayesdist.app.commands.on_files.calibrations import calibration_at
+from bayesdist.app.commands.on_files.calibrations import calibration_of_scale
 from bayesdist.app.results import open_results
 from bayesdist.app.screen import table_text
 from bayesdist.app.store.output import record_folder, write_table
@@ -50,7 +50,7 @@ def handbook(
             where="--magnification",
             do="give a positive number",
         )
-    found = calibration_at(path, filter=filter, scale=scale)
+    found = calibration_of_scale(path, filter=filter, scale=scale)
     pixel, _ = found.pixel(epoch)
     if detector is None and found.instrument == "ACS":
         detector = found.detector

@@ -145,7 +145,7 @@ def write_rvb(batches: Iterable[RvbPairs], folder: str | os.PathLike[str]) -> in
 
     def parts() -> Iterator[Part]:
         for pairs in chain(first, batches):
-            yield _columns(pairs), _units(pairs)
+            yield _columns(pairs), _units(pairs), {}
             sizes.append(len(pairs))
 
     try:

@@ -27,7 +27,7 @@ from bayesdist.calibration.inverse import detector_grid
 from bayesdist.calibration.plane import Plane
 from bayesdist.errors import FormatError
 from bayesdist.model import Chip, DistortionModel
-from bayesdist.products.formats.common.cards import named_in
+from bayesdist.products.formats.common.cards import named_in, printable
 from bayesdist.products.formats.common.content import Content, Hdu, fits_bytes
 
 EXTENSION = "BDPARAM"
@@ -77,13 +77,13 @@ def parameters_hdu(calibration: Calibration, epoch: float | None = None) -> fits
         header["BDSCALE"] = float(calibration.scale), "size of a corrected pixel"
     for keyword, text in (("DETECTOR", calibration.detector), ("FILTER", calibration.filter)):
         if text:
-            header[keyword] = text
+            header[keyword] = printable(text)
     for k, row in enumerate(calibration.further, start=1):
-        header[f"BDNAME{k}"] = row.name
+        header[f"BDNAME{k}"] = printable(row.name)
         header[f"BDKIND{k}"] = row.kind
         header[f"BDSIGU{k}"] = row.u, "standard deviation of u"
         header[f"BDSIGV{k}"] = row.v, "standard deviation of v"
-        header[f"BDFROM{k}"] = row.source
+        header[f"BDFROM{k}"] = printable(row.source)
     header.add_comment("u = sum VALUE P_I(X) P_J(Y), P Legendre, X = (2 x - (NX + 1)) / NX")
     return hdu
 

@@ -19,12 +19,12 @@ from bayesdist.products.formats.common.parameters import (
     parameters_content,
     refuse_other,
 )
-from bayesdist.products.formats.sip.header import SIP_ORDERS, SipHeader
+from bayesdist.products.formats.sip.header import SIDE_FILE, SIP_ORDERS, SipHeader
 from bayesdist.utils.arrays import Float
 
 NO_LINEAR_ERRORS = (
-    "its errors are those of the non-linear terms alone: a SIP header cannot hold those of "
-    "offset, scale and rotation; write it with parameters = true"
+    "its errors are not stated: AE and BE are those of the non-linear terms alone, and a position "
+    "errs by offset, scale and rotation, too; a file of parameters beside the header has them all"
 )
 
 
@@ -36,8 +36,9 @@ def sip_calibration(
     pixels: bool = False,
     notes: tuple[str, ...] = (),
 ) -> Calibration:
-    """Calibration of a SIP header: one chip without number, with the header's sigmas if any.
+    """Calibration of a SIP header: one chip without number, with the header's sigmas if complete.
 
+    Sigmas of the non-linear terms alone are left out: errors of positions would be too small.
     `size` is columns and rows, for a header without them (else MissingSizeError); with `pixels`,
     for a file without CD, (u, v) are corrected pixels, else arcseconds; `notes` go to the reader.
     """
@@ -60,7 +61,7 @@ def sip_calibration(
         unit="pix" if pixels or sip.linear_axes else "arcsec",
         monomial_cov=_variances(sip, linear, order),
     )
-    if one.cov is not None:
+    if sip.has_sigmas and not sip.has_linear_sigmas:
         notes = (*notes, NO_LINEAR_ERRORS)
     plane = Plane("detector") if pixels else Plane("sky", point=sip.crval)
     if sip.linear_axes:
@@ -77,8 +78,11 @@ def sip_calibration(
 
 
 def _variances(sip: SipHeader, linear: Float, order: int) -> Float | None:
-    """Variances of a linear map of the header's sigmas; None where there are none."""
-    if not sip.sigma_a and not sip.sigma_b:
+    """Covariance (2 K, 2 K) of the coefficients from the header's sigmas.
+
+    None if the header has no sigmas, or none of the constant and linear terms.
+    """
+    if not sip.has_linear_sigmas:
         return None
     terms = polynomial_terms(order)
     sigma = [float(s.get(t, 0.0)) for s in (sip.sigma_a, sip.sigma_b) for t in terms]
@@ -86,14 +90,13 @@ def _variances(sip: SipHeader, linear: Float, order: int) -> Float | None:
     return (turn * np.array(sigma) ** 2) @ turn.T
 
 
-KEYWORD = "BDPARAM"  # name of the file that has the covariance
 AGREE = 1e-4  # pixels: a header is brought to the plane of its CRVAL to a tenth of that
 _GRID = 33
 
 
 def with_side_file(sip: SipHeader, name: str) -> SipHeader:
     """Header that names the file with its covariance."""
-    return replace(sip, cards=(*sip.cards, text_card(KEYWORD, name, "file with the covariance")))
+    return replace(sip, cards=(*sip.cards, text_card(SIDE_FILE, name, "file with the covariance")))
 
 
 def side_file(calibration: Calibration, chip: int, epoch: float | None, header: str) -> Built:
@@ -107,7 +110,7 @@ def side_file(calibration: Calibration, chip: int, epoch: float | None, header: 
 def agreeing(stored: Calibration, found: Calibration) -> Calibration:
     """Stored calibration of a header, after a check that what was read says the same."""
     refuse_other(_difference(found, stored), AGREE, found.name)
-    return replace(stored, notes=found.notes)
+    return replace(stored, notes=tuple(n for n in found.notes if n != NO_LINEAR_ERRORS))
 
 
 def _difference(found: Calibration, stored: Calibration) -> float:

@@ -22,13 +22,12 @@ from bayesdist.products.formats.common.document import (
 from bayesdist.products.formats.common.parameters import with_parameters
 from bayesdist.products.formats.sip.build import sip_from_solution
 from bayesdist.products.formats.sip.calibration import (
-    KEYWORD,
     agreeing,
     side_file,
     sip_calibration,
     with_side_file,
 )
-from bayesdist.products.formats.sip.header import SIP_ORDERS, SipHeader
+from bayesdist.products.formats.sip.header import SIDE_FILE, SIP_ORDERS, SipHeader
 from bayesdist.products.formats.sip.lint import lint_sip
 from bayesdist.products.formats.sip.positions import sip_read_back
 from bayesdist.products.formats.sip.read import holds_sip, sip_of
@@ -42,7 +41,7 @@ class Settings(FormatSettings):
     linear: Literal["cd", "sip"] = "cd"
     axes: Literal["sky", "linear"] = "sky"
     crval: tuple[float, float] | None = None
-    parameters: bool = False  # whether a file with the covariance is written beside
+    parameters: bool = True  # whether a file with the covariance is written beside
 
 
 def _parse(content: Content) -> Content | None:
@@ -68,7 +67,7 @@ def _calibration(content: Content, name: str, choice: Choice) -> Calibration:
     found = sip_calibration(sip, name, size=choice.size, notes=notes)
     if choice.as_used:
         return found
-    named = str(header_of(sip.cards).get(KEYWORD, ""))
+    named = str(header_of(sip.cards).get(SIDE_FILE, ""))
     return with_parameters(found, content.beside(named), named, agreeing)
 
 

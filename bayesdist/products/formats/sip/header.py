@@ -22,6 +22,7 @@ from bayesdist.utils.arrays import Float
 
 Terms = Mapping[tuple[int, int], float]
 
+SIDE_FILE = "BDPARAM"  # keyword with the name of the file that has the covariance
 # Programs ignore lower orders, and a keyword has room for one digit.
 SIP_ORDERS = (2, 9)
 LINEAR_AXES = ("U", "V")  # CTYPE of a frame of pixels, which no program takes for a sky
@@ -100,6 +101,20 @@ class SipHeader:
     def linear_axes(self) -> bool:
         """True for positions in a frame of pixels: `cd` is in these, and CRVAL is their (u, v)."""
         return self.ctype == LINEAR_AXES
+
+    @property
+    def has_sigmas(self) -> bool:
+        """True if standard deviations are stated, if only those of some of the terms."""
+        return bool(self.sigma_a or self.sigma_b)
+
+    @property
+    def has_linear_sigmas(self) -> bool:
+        """True if the standard deviations include those of the constant and linear terms.
+
+        Without these the errors of positions are not known.
+        """
+        low = ((0, 0), (1, 0), (0, 1))
+        return all(term in sigma for sigma in (self.sigma_a, self.sigma_b) for term in low)
 
     @property
     def a_dmax(self) -> float | None:

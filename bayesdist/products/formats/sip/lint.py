@@ -21,7 +21,7 @@ from bayesdist.products.formats.sip.families import (
     values_by_keyword,
     with_coefficient,
 )
-from bayesdist.products.formats.sip.header import SIP_ORDERS, SipHeader, worst_closure
+from bayesdist.products.formats.sip.header import SIDE_FILE, SIP_ORDERS, SipHeader, worst_closure
 from bayesdist.products.formats.sip.implied import implied_values, with_error
 
 # Closure that a good inverse reaches, and one that only a wrong coefficient leaves; pixels.
@@ -52,6 +52,7 @@ def lint_sip(sip: SipHeader, size: tuple[int, int] | None = None) -> tuple[Findi
         *_orders(sip),
         *_low_terms(sip, size),
         *_repeated(sip),
+        *_sigmas(sip),
     ]
     if size is None:
         findings.append(
@@ -62,6 +63,16 @@ def lint_sip(sip: SipHeader, size: tuple[int, int] | None = None) -> tuple[Findi
     elif forward_is_used(sip):
         findings += [*_dmax(sip, size), *_inverse(sip, size)]
     return tuple(findings)
+
+
+def _sigmas(sip: SipHeader) -> Iterator[Finding]:
+    beside = any(card.startswith(SIDE_FILE) for card in sip.cards)
+    if sip.has_sigmas and not sip.has_linear_sigmas and not beside:
+        yield Finding(
+            "note",
+            "AE, BE",
+            "are errors of the non-linear terms alone: errors of positions are not stated",
+        )
 
 
 def _frame(sip: SipHeader) -> Iterator[Finding]:

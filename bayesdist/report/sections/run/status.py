@@ -13,9 +13,9 @@ import numpy as np
 
 from bayesdist.assess.maps.uncertainty import per_axis
 from bayesdist.assess.requirements.validity import ValidityPeriod
+from bayesdist.assess.requirements.verdict import VERDICT_LEVELS
 from bayesdist.report.contents import REPORT
 from bayesdist.report.context import ReportInput, needed
-from bayesdist.report.plots.errors import VERDICT_LEVELS
 from bayesdist.report.texttable import TextTable, check_cells
 from bayesdist.utils.checks import GROUPS, LEVELS, Check, doubts_of, warnings_of, worst
 from bayesdist.utils.numbers import counted, rounded, with_mas
@@ -132,13 +132,14 @@ def status_table(r: ReportInput) -> TextTable:
 
 
 def _margin_checks(r: ReportInput) -> tuple[Check, ...]:
-    """Checks of requirements; those undecided name the rows that keep them so, or the reason."""
+    """Checks of requirements; those undecided name the rows that are the reason."""
     doubts = "; ".join(f"“{one.name}”" for one in doubts_of(r.checks))
 
     def why(m: Margin) -> str:
-        if m.verdict != "undecided":
+        if m.verdict not in ("undecided", "not shown"):
             return ""
-        return f"; undecided: {f'see {doubts}' if doubts else m.reason}"
+        see = f"see {doubts}" if doubts and m.verdict == "undecided" else m.reason
+        return f"; {m.verdict}: {see}"
 
     return tuple(
         Check(
@@ -198,7 +199,8 @@ def _requirements_clause(r: ReportInput) -> str:
     counts = {v: sum(m.verdict == v for m in r.margins) for v in VERDICT_LEVELS}
     if counts["met"] == n:
         return f"every requirement is met{at}"
-    (first, k), *others = [(v, counts[v]) for v in ("missed", "undecided") if counts[v]]
+    del counts["met"]
+    (first, k), *others = [(v, counts[v]) for v in reversed(VERDICT_LEVELS) if counts.get(v)]
     of = f"{k} of {n} requirements {'is' if k == 1 else 'are'}" if n > 1 else "the requirement is"
     return " and ".join([f"{of} {first}", *(f"{more} {v}" for v, more in others)]) + at
 
@@ -223,7 +225,7 @@ def _margin_sentence(r: ReportInput) -> str:
         by_verdict.setdefault(m.verdict, []).append(m.requirement.name)
     parts = [
         f"{len(by_verdict[v])} {v} ({', '.join(by_verdict[v])})"
-        for v in ("met", "missed", "undecided")
+        for v in VERDICT_LEVELS
         if v in by_verdict
     ]
     return f"Requirements: {'; '.join(parts)}."

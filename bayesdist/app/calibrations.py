@@ -1,0 +1,173 @@
+"""Calibration of a file or a run, for `bayesdist.read_calibration` and for commands."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import replace
+from pathlib import Path
+
+from pydantic import TypeAdapter
+
+from bayesdist.app.kinds.fitted import FIT_AGAIN, TABLES, read_tables
+from bayesdist.app.products.made_files import with_facts_of_run
+from bayesdist.app.results import open_results
+from bayesdist.app.store.rundir import RunDirectory
+from bayesdist.app.store.summary import Summary
+from bayesdist.calibration.calibration import Calibration, calibration_of
+from bayesdist.calibration.plane import Plane
+from bayesdist.errors import InputError
+from bayesdist.files.documents import read_json_as
+from bayesdist.infer import LinearFit, load_fit, load_posterior
+from bayesdist.infer.solution.solution import Solution
+from bayesdist.products import registry
+
+__all__ = ["read_calibration"]
+
+_SUMMARY = TypeAdapter(Summary)
+
+
+def read_calibration(
+    file: str | os.PathLike[str],
+    *,
+    filter: str | None = None,
+    size: tuple[float, float] | None = None,
+) -> Calibration:
+    """Calibration of a file of any format, or of a run.
+
+    Parameters
+    ----------
+    file : path
+        A calibration file (its format is recognized by its content), the folder of a run, or the
+        ``posterior.nc`` or ``fit.nc`` in it.
+    filter : str, optional
+        Filter of an IDCTAB, with the names of both wheels joined by a comma, or the band of WISE
+        meta-data.  Needed if the file has several.
+    size : tuple of float, optional
+        Number of columns and rows.  Needed for a header that does not state them.
+
+    Returns
+    -------
+    Calibration
+        With the errors that the file states.  A calibration of a run has all errors of the
+        parameters that the run found, and lies on the sky if the positions of its stars did.
+
+    Raises
+    ------
+    InputError
+        For a file that cannot be read, is of no known format or holds no calibration, and for a
+        filter or size that is missing.
+
+    Examples
+    --------
+    >>> rng = np.random.default_rng(1)
+    >>> chip = bd.Chip(1, "camera", (1000, 1000), (500.5, 500.5))
+    >>> model = bd.DistortionModel(1, (chip,), "arcsec")
+    >>> stars, _ = bd.simulate_matches(model, [0, 100, 0, 0, 0, 100], 500, sigma=0.01, rng=rng)
+    >>> fit = bd.fit_linear(stars, model)
+    >>> written = bd.Calibration.from_solution(fit).write("parameters", "camera.fits")
+    >>> bd.read_calibration("camera.fits")
+    <Calibration 'camera.fits': chip 1, order 1, u and v in arcsec, covariance>
+    """
+    return on_the_sky(Path(file), calibration_at(file, filter=filter, size=size))
+
+
+def calibration_at(
+    path: str | os.PathLike[str],
+    *,
+    filter: str | None = None,
+    size: tuple[float, float] | None = None,
+) -> Calibration:
+    """Calibration of a file or a run; arguments as of `read_calibration`.
+
+    The plane of u and v of a run is free, also if the positions of its stars were on the sky.
+    """
+    path = Path(path)
+    if not path.exists():
+        raise InputError("there is no such file", where=str(path), do="check the name")
+    solution = solution_at(path)
+    if solution is None:
+        return registry.read_calibration(path, filter=filter, size=size)
+    return _calibration_of_run(solution, path)
+
+
+def _calibration_of_run(solution: Solution, path: Path) -> Calibration:
+    """Calibration of a solution, with what its run knows: a folder, or a file in it."""
+    run, summary = run_of(path), _summary_of(path)
+    if run is None:
+        return calibration_of(solution, str(path))
+    tables = read_tables(run / TABLES, do=FIT_AGAIN).tables
+    calibration = calibration_of(
+        solution,
+        str(path),
+        detector=run.config.detector.name,
+        filter=next((table.filter for table in tables if table.filter), ""),
+    )
+    budget = [] if summary is None else summary.budget or []
+    rows = [row.model_dump() for row in budget]
+    return with_facts_of_run(calibration, run.config, tables, rows)
+
+
+def solution_at(path: Path) -> Solution | None:
+    """The fit or posterior at a place; None where it is no such file.
+
+    A run directory, or posterior.nc in it, stands for the posterior with the errors that the run
+    was assessed with, or for the fit where there is no posterior yet.
+    """
+    if path.is_dir():
+        if not (path / "run.json").exists() and not (path / "posterior.nc").exists():
+            raise InputError("is a folder, and no run", where=str(path), do="give a file in it")
+        if not (path / "run.json").exists():
+            raise InputError(
+                "has no run.json, without which the errors that the run was assessed with are not "
+                "known",
+                where=str(path),
+                do=f"restore it, or give {path / 'posterior.nc'}, the bare posterior",
+            )
+        if "sample" in RunDirectory(path).record.artefacts or not (path / "fit.nc").exists():
+            return _as_assessed(path)
+        return _fit_at(path / "fit.nc")
+    if path.suffix != ".nc":
+        return None
+    if path.name == "fit.nc":
+        return _fit_at(path)
+    return _as_assessed(path.parent) if path.name == "posterior.nc" else load_posterior(path)
+
+
+def _fit_at(path: Path) -> LinearFit:
+    """The fit of a file, which is as it was written where it is that of a run."""
+    if (path.parent / "run.json").exists():
+        RunDirectory(path.parent).refuse_damaged("fit")
+    return load_fit(path)
+
+
+def _as_assessed(folder: Path) -> Solution:
+    """The posterior of a folder, with the errors as assessed where it is that of a run."""
+    if not (folder / "run.json").exists():
+        return load_posterior(folder)
+    run = RunDirectory(folder)
+    run.require("calibration", ("fit", "sample", "diagnose"))
+    with open_results(run) as results:
+        return results.solution
+
+
+def on_the_sky(path: Path, found: Calibration) -> Calibration:
+    """Calibration of a run about the point where its stars touch the sky, where they do."""
+    summary = _summary_of(path)
+    point = None if summary is None or summary.data is None else summary.data.tangent_point
+    if point is None or found.plane.kind != "free":
+        return found
+    return replace(found, plane=Plane("sky", point=(point[0], point[1])))
+
+
+def run_of(path: Path) -> RunDirectory | None:
+    """The run that a folder is, or that a file is of; None where it is of none."""
+    home = path if path.is_dir() else path.parent
+    return RunDirectory(home) if (home / "run.json").exists() else None
+
+
+def _summary_of(path: Path) -> Summary | None:
+    """Summary of the run that a file or folder is of; None where there is none."""
+    run = run_of(path)
+    if run is None or not (run / "summary.json").exists():
+        return None
+    return read_json_as(_SUMMARY, run / "summary.json", do="resume the run, which writes it again")

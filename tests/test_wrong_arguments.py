@@ -1,0 +1,96 @@
+"""Arguments of the wrong type: one sentence with the argument, and no exception of Python."""
+
+from __future__ import annotations
+
+import astropy.units as u
+import numpy as np
+import pytest
+
+import bayesdist as bd
+
+CHIP = bd.Chip(1, "camera", (1000, 1000), (500.5, 500.5))
+MODEL = bd.DistortionModel(1, (CHIP,), "pix")
+WRONG = {
+    "number": -3.5,
+    "text": "x",
+    "object": object(),
+    "list": [1, 2],
+    "mapping": {"a": 1},
+    "nan": float("nan"),
+    "seconds": 5 * u.s,
+}
+# values of `WRONG` that are right for an argument of `calibrate`
+RIGHT = {"name": {"text"}, "size": {"list"}, "reference_pixel": {"list"}}
+ARGUMENTS = (
+    "order size chips reference_pixel scale_mas frames time sigma outliers catalogue terms "
+    "requirements epoch exposure held_out seed name settings"
+).split()
+
+
+@pytest.fixture(scope="module")
+def stars():
+    rng = np.random.default_rng(1)
+    return bd.simulate_matches(MODEL, [0, 500, 0, 0, 0, 500], 100, sigma=0.01, rng=rng)[0]
+
+
+def refusal(function, **arguments):
+    with pytest.raises(bd.InputError) as caught:
+        function(**arguments)
+    text = str(caught.value)
+    assert caught.value.do and "\n" not in text
+    return text
+
+
+@pytest.mark.parametrize("kind", WRONG)
+@pytest.mark.parametrize("name", ARGUMENTS)
+def test_calibrate_names_the_argument(stars, name, kind):
+    if kind in RIGHT.get(name, ()):
+        pytest.skip("a right value")
+    arguments = {"order": 1, "size": (1000, 1000), name: WRONG[kind]}
+    text = refusal(bd.calibrate, matches=stars, **arguments)
+    for words in ("detector.", "sampler.", "model.", "assess.", "[[", "--"):
+        assert words not in text
+    if name != "settings":  # where the key is named, or the value
+        assert name.rstrip("s") in text
+
+
+@pytest.mark.parametrize("kind", WRONG)
+def test_matches_that_are_none(kind):
+    refusal(bd.calibrate, matches=WRONG[kind], order=1, size=(1000, 1000))
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [{"data": 5}, {"sampler": "x"}, {5: {}}, {"sampler": {"max_steps": "x"}}, {"budget": [5]}],
+    ids=str,
+)
+def test_sections_of_settings(stars, settings):
+    text = refusal(bd.calibrate, matches=stars, order=1, size=(1000, 1000), settings=settings)
+    assert "settings[" in text
+
+
+def test_a_quantity_in_settings_is_no_number(stars):
+    """Its unit would be lost."""
+    settings = {"outliers": {"match_radius": 5 * u.arcsec}}
+    text = refusal(bd.calibrate, matches=stars, order=1, size=(1000, 1000), settings=settings)
+    assert "has a unit" in text
+
+
+@pytest.mark.parametrize("kind", ["number", "text", "object", "list", "mapping"])
+def test_objects_of_other_types(stars, kind):
+    fit, wrong = bd.fit_linear(stars, MODEL), WRONG[kind]
+    cases = [
+        (bd.build_model, {"matches": wrong, "order": 1, "size": (1000, 1000)}, "matches"),
+        (bd.fit_linear, {"matches": stars, "model": wrong}, "model"),
+        (bd.fit_linear, {"matches": wrong, "model": MODEL}, "matches"),
+        (bd.fit_linear, {"matches": stars, "model": MODEL, "rejection": wrong}, "rejection"),
+        (bd.fit_by_magnitude, {"matches": wrong, "model": MODEL}, "matches"),
+        (bd.sample, {"fit": wrong, "matches": stars}, "fit"),
+        (bd.sample, {"fit": fit, "matches": wrong}, "matches"),
+        (bd.sample, {"fit": fit, "matches": stars, "outliers": wrong}, "outliers"),
+        (bd.memberships, {"posterior": wrong, "matches": stars}, "posterior"),
+        (bd.save_posterior, {"posterior": wrong, "matches": None, "path": "x.nc"}, "posterior"),
+    ]
+    for function, arguments, name in cases:
+        text = refusal(function, **arguments)
+        assert text.startswith(f"{function.__name__}: {name} is a")
