@@ -11,5 +11,5 @@ print(run)  # verdict, warnings, error budget; a table in a notebook
 print("largest radius, formal:   ", bd.uncertainty_map(run.fit).radius_max, run.model.unit)
 print("largest radius, posterior:", run.map().radius_max, run.model.unit)
 print(run.budget(at=(10, 10), to=(1000, 1000)))  # of a separation
-run.write("sip", "w2.hdr", linear="sip", scale_mas=2750)
+run.write("sip", "w2.hdr", axes="linear")
 run.save("w2-run")  # as the command line does; bd.open_run("w2-run") reads it

@@ -25,7 +25,6 @@ from bayesdist import formats
 from bayesdist.app.cli import bayesdist as root
 from bayesdist.app.config import KINDS
 from bayesdist.app.config.data import data_sections
-from bayesdist.errors import BayesdistWarning
 from bayesdist.mission import load_object
 from bayesdist.missions import wise
 
@@ -89,8 +88,7 @@ def _keys(value: object) -> set[str]:
 
 def test_the_tutorial_in_python_runs(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    with pytest.warns(BayesdistWarning):
-        namespace = run_page(DOCS / "tutorial_python.md")
+    namespace = run_page(DOCS / "tutorial_python.md")
     assert namespace["margin"].verdict == "met" and Path("w2.hdr").is_file()
     assert Path("w2-run/summary.json").is_file() and Path("w2.html").is_file()
 
