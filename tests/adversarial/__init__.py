@@ -7,10 +7,13 @@ called met that the truth misses, and is a refusal given for the right reason?
 
 from . import (  # noqa: F401  (each enters its kinds)
     campaign_kinds,
+    contamination_kinds,
     exposure_kinds,
     selfcal_kinds,
     star_kinds,
     static_kinds,
+    time_kinds,
+    varying_kinds,
 )
 from .truth import KINDS
 

@@ -3,16 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import numpy as np
 
 from . import fields
-from .campaign_truth import BRIGHT, LAST, REACH, TWO, CampaignTruth, Recipe, made
+from .campaign_truth import BRIGHT, LAST, REACH, CampaignTruth, Recipe, made
+from .contamination_kinds import MIXED, direction, rising, some_displaced
 from .exposure_kinds import BREATHING, OF_TIME, heavy_deviations, linear, normal_deviations
 from .star_kinds import OF_MAGNITUDE
 from .static_kinds import CATALOGUE_WORDS, ORDER, STRUCTURE
-from .truth import kind
+from .time_kinds import IN_TIME, autoregressive
+from .truth import TWO, kind
+from .varying_kinds import NO_HELP, OF_FIELDS, VARYING
 
 QUIET = 3e-6  # scatter of scale and shears, where breathing is not what is asked about
 RATE = 0.004  # px a year at half a side: of each of the linear terms that drift
@@ -201,3 +205,50 @@ def catalogue(rng: np.random.Generator, n: int) -> CampaignTruth:
         return own(x, y)
 
     return usual(rng, stars=n, astray=astray)
+
+
+varied = partial(kind, kindest=True, misleading=NO_HELP)
+
+
+@varied("campaign_tail_by_position", *MIXED, n=300)
+def tail_by_position(rng: np.random.Generator, n: int) -> CampaignTruth:
+    """Detections have a tail to one side of the detector, half of them in the upper rows."""
+    way = 0.06 * direction(rng)
+    blends = some_displaced(rng, rising(0.0, 0.5, 1), lambda m: rng.exponential(size=(m, 1)) * way)
+    return usual(rng, stars=n, displaced=blends)
+
+
+@varied("campaign_second_order", *VARYING, n=300)
+def second_order(rng: np.random.Generator, n: int) -> CampaignTruth:
+    """Terms of second order differ from exposure to exposure, by 0.01 px rms."""
+    return usual(rng, stars=n, varying=lambda rng: fields.random_polynomial(rng, {2: 0.01}))
+
+
+@varied("campaign_atmosphere", *OF_FIELDS, n=300)
+def atmosphere(rng: np.random.Generator, n: int) -> CampaignTruth:
+    """Each exposure has a smooth field of its own, 0.008 px rms at a scale of 500 px."""
+    return usual(rng, stars=n, varying=lambda rng: fields.smooth(rng, 500, 0.008, expected=True))
+
+
+@varied("campaign_ar1", *IN_TIME, n=200, exposures=30)
+def ar1(rng: np.random.Generator, n: int, exposures: int) -> CampaignTruth:
+    """Scale and shears are an autoregressive chain, beside a drift; positions are those of
+    exposures that continue it."""
+    return usual(
+        rng,
+        stars=n,
+        exposures=exposures,
+        deviations=lambda rng, n: autoregressive(rng, n, 0.95, 2 * BREATHING),
+    )
+
+
+@varied("campaign_chip_moved", *OF_GAP, "chip", "break", n=300)
+def chip_moved(rng: np.random.Generator, n: int) -> CampaignTruth:
+    """One of two chips is displaced by 0.04 px midway, and turned by 0.01 px at its side."""
+    step, turn = 0.04 * direction(rng), 2e-5 * rng.choice([-1.0, 1.0])
+
+    def moved(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+        around = np.stack([-(np.asarray(y) - 1536.0), np.asarray(x) - fields.MIDDLE], axis=-1)
+        return (np.asarray(y) > fields.MIDDLE)[..., None] * (step + turn * around)
+
+    return usual(rng, stars=n, chips=TWO, rate=_chips_drift(rng), jump=moved)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 from unittest.mock import patch
@@ -23,16 +24,16 @@ from bayesdist.utils.streams import restarted
 from tests.app.support import after_stages
 
 from .campaign_truth import ARCSEC, BRIGHT, EPOCH0, FAINT, NEW, TERMS, CampaignTruth
+from .truth import Piece
 from .written import toml_text
 
 STAGES = ("match", "fit", "sample")
 GRID, DRAWS = (17, 17), 2000
 
 
-def configuration(truth: CampaignTruth, seed: int) -> dict[str, Any]:
-    """What a user writes for this campaign, by block."""
-    files = {"catalog": "catalog.ecsv", "exposures": "exposures.ecsv", "lists": "lists"}
-    chips = [
+def chip_blocks(chips: Sequence[Piece]) -> list[dict[str, Any]]:
+    """Blocks [[chip]] of a configuration, the first chip that of reference."""
+    return [
         {
             "number": chip.number,
             "name": f"CHIP{chip.number}",
@@ -40,13 +41,18 @@ def configuration(truth: CampaignTruth, seed: int) -> dict[str, Any]:
             "reference_pixel": [(chip.columns + 1) / 2, (chip.rows + 1) / 2],
             "reference": k == 0,
         }
-        for k, chip in enumerate(truth.chips)
+        for k, chip in enumerate(chips)
     ]
+
+
+def configuration(truth: CampaignTruth, seed: int) -> dict[str, Any]:
+    """What a user writes for this campaign, by block."""
+    files = {"catalog": "catalog.ecsv", "exposures": "exposures.ecsv", "lists": "lists"}
     return {
         "campaign": files | {"initial_distortion": "start_idc.fits", "mag": [BRIGHT, FAINT]},
         "tables": {"method": "none"},
         "detector": {"scale_mas": 1000 * ARCSEC},
-        "chip": chips,
+        "chip": chip_blocks(truth.chips),
         "model": {"order": 3, "tdd": {"epoch0": EPOCH0, "terms": TERMS}},
         "sampler": {"target_ess": 400, "seed": seed + 1},
         "assess": {"grid": list(GRID), "draws": DRAWS, "epoch": truth.epoch},

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +13,7 @@ from astropy.io import fits
 from astropy.table import Table
 
 from .fields import MIDDLE, SIDE, Field, distortion, random_polynomial, total
-from .truth import Frame
+from .truth import ONE, Frame, Piece
 
 FIRST, LAST, EPOCH0 = 2002.0, 2012.0, 2007.0  # dates of the exposures, and of the catalogue
 BRIGHT, FAINT = -14.0, -10.0  # instrumental magnitudes
@@ -24,28 +25,10 @@ REACH = 1750.0  # px: the catalogue's half side
 DITHER = 150.0  # px
 ARCSEC = 0.05  # a pixel, in the known distortion
 NEW = 12  # exposures that are yet to come: one by itself says little of how they deviate
+JUMP = 2007.3  # date at which something changes for good
 TERMS = [["u", 1, 0], ["v", 1, 0], ["v", 0, 1]]
 
 Map = Callable[[np.ndarray, np.ndarray, Any], np.ndarray]  # mosaic x, y, epoch -> (N, 2)
-Bent = Callable[[np.ndarray, np.ndarray], np.ndarray]  # positions, deviation -> positions
-
-
-@dataclass(frozen=True)
-class Piece:
-    """A chip: its number, columns, rows, and where its rows begin in the mosaic."""
-
-    number: int
-    columns: int
-    rows: int
-    below: float
-
-    def mosaic(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Pixels as those of one detector of `SIDE` pixels."""
-        return np.asarray(x, float), np.asarray(y, float) + self.below
-
-
-ONE = (Piece(1, SIDE, SIDE, 0.0),)
-TWO = (Piece(2, SIDE, SIDE // 2, 0.0), Piece(1, SIDE, SIDE // 2, SIDE / 2))
 
 
 @dataclass(frozen=True, eq=False)
@@ -116,6 +99,10 @@ class Recipe:
         Random generator and number to scale and shears (n, 3) of exposures.
     rate, bend : callable, optional
         Fields of the drift, in px a year and px a year squared.
+    jump : callable, optional
+        Field that is there from `JUMP` on.
+    varying : callable, optional
+        Random generator to the field that an exposure has by itself.
     beside : tuple of callable
         Fields that the model does not have.
     beyond : float
@@ -138,6 +125,8 @@ class Recipe:
     deviations: Callable[[np.random.Generator, int], np.ndarray] | None = None
     rate: Field | None = None
     bend: Field | None = None
+    jump: Field | None = None
+    varying: Callable[[np.random.Generator], Field] | None = None
     beside: tuple[Field, ...] = ()
     beyond: float = 0.0
     displaced: Callable[..., np.ndarray] | None = None
@@ -168,6 +157,8 @@ def made(rng: np.random.Generator, recipe: Recipe) -> CampaignTruth:
         for power, change in ((1, recipe.rate), (2, recipe.bend)):
             if change is not None:
                 out = out + (epoch - EPOCH0) ** power * change(x, y)
+        if recipe.jump is not None and epoch > JUMP:
+            out = out + recipe.jump(x, y)
         return out
 
     n = recipe.exposures
@@ -176,22 +167,28 @@ def made(rng: np.random.Generator, recipe: Recipe) -> CampaignTruth:
     deviations = np.zeros((n + NEW, 3))
     if recipe.deviations is not None:
         deviations = recipe.deviations(rng, n + NEW)
+    of_each = [total()] * (n + NEW)
+    if recipe.varying is not None:
+        of_each = [recipe.varying(rng) for _ in range(n + NEW)]
     sky = _Sky(rng, recipe)
     va = 1 + 5e-5 * np.sin(2 * np.pi * epochs + rng.uniform(0, 2 * np.pi))
     names = [f"e{k:02d}" for k in range(n)]
+
+    def shown(x: np.ndarray, y: np.ndarray, epoch: float, k: int) -> np.ndarray:
+        return deviating(common(x, y, epoch), deviations[k]) + of_each[k](x, y)
+
     lists = {}
-    for name, epoch, deviation, factor in zip(names, epochs, deviations, va, strict=False):
+    for k, (name, epoch, factor) in enumerate(zip(names, epochs, va, strict=True)):
         frame = Frame(tuple(rng.uniform(-DITHER, DITHER, 2)), rng.uniform(0, 2 * np.pi))
         target = frame.undone(sky.at(epoch) / factor)
-        lists[name] = _detected(rng, recipe, sky.mag, target, common, epoch, deviation)
-    own = deviations[n:]
+        lists[name] = _detected(rng, recipe, sky.mag, target, partial(shown, k=k), epoch)
     return CampaignTruth(
         catalogue=sky.catalogue(rng),
         log={"exposure": np.array(names), "epoch": epochs, "vafactor": va}
         | {"filter": np.full(n, "F606W"), "pa_v3": np.zeros(n)},
         lists=lists,
         chips=recipe.chips,
-        true_map=lambda x, y, epoch, k=0: deviating(common(x, y, epoch), own[k]),
+        true_map=lambda x, y, epoch, k=0: shown(x, y, epoch, n + k),
         common=common,
         beside=total(*recipe.beside),
         known=lambda x, y, epoch: common(x, y, EPOCH0) + nearly(x, y),
@@ -241,12 +238,11 @@ def _detected(
     recipe: Recipe,
     mag: np.ndarray,
     target: np.ndarray,
-    common: Map,
+    true_map: Map,
     epoch: float,
-    deviation: np.ndarray,
 ) -> dict[str, np.ndarray]:
-    """Columns of the star list of one exposure, from positions along the axes of the map."""
-    x, y = _mosaic_of(lambda x, y: deviating(common(x, y, epoch), deviation), target)
+    """Columns of the star list of one exposure, from positions along the axes of its map."""
+    x, y = _mosaic_of(lambda x, y: true_map(x, y, epoch), target)
     columns: dict[str, list[np.ndarray]] = {key: [] for key in ("x", "y", "chip", "mag", "q")}
     for chip in recipe.chips:
         here = (x > 0.5) & (x < chip.columns + 0.5)

@@ -10,7 +10,18 @@ import numpy as np
 
 from . import fields
 from .static_kinds import CATALOGUE_WORDS, STRUCTURE
-from .truth import SIGMA, Frame, Map, Truth, kind, mapped, observed, order_config, pixels
+from .truth import (
+    SIGMA,
+    Frame,
+    Map,
+    Truth,
+    catalogue_row,
+    kind,
+    mapped,
+    observed,
+    order_config,
+    pixels,
+)
 
 BREATHING = 2e-5  # scatter of scale and shears
 EPOCH0 = 2007.0
@@ -108,6 +119,8 @@ def campaign(
     if dates is not None:
         columns["epoch"] = epoch = np.linspace(*dates, exposures)[code]
         config["model"]["tdd"] = TDD
+        if catalogue is None:
+            config["budget"].append(catalogue_row(0.0, "proper motions"))
         assessed = dates[1] + beyond
     w = true_map(x, y, epoch)
     if deviations is not None:
@@ -196,13 +209,18 @@ def motions_sheared(rng: np.random.Generator, n: int) -> Truth:
     return campaign(rng, n, true_map, exposures=12, dates=(2002.0, 2012.0), catalogue=catalogue)
 
 
+SAME = (*CATALOGUE_WORDS, "same star", "each star", "err together")
+
+
+@kind("same_stars_unnamed", *SAME, "coincid", kindest=True, n=3000, named=False)
 @kind("stars_that_move", "motion", "stars move", n=3000, moving=0.2)
-@kind("same_stars", *CATALOGUE_WORDS, "same star", "each star", "err together", n=3000)
-def same_stars(rng: np.random.Generator, n: int, moving: float = 0.0) -> Truth:
+@kind("same_stars", *SAME, n=3000)
+def same_stars(rng: np.random.Generator, n: int, moving: float = 0.0, named: bool = True) -> Truth:
     """The same stars in ten dithered exposures: they share the catalogue's errors, 0.01 px.
 
     With a fraction of them that moves, the exposures have dates over ten years, and motions of
-    0.01 px a year are not in the catalogue.
+    0.01 px a year are not in the catalogue.  Where they are not `named` the table does not say
+    which star a row is of.
     """
     exposures, quoted = 10, np.hypot(SIGMA, 0.01)
     true_map = mapped(fields.distortion(rng))
@@ -232,6 +250,8 @@ def same_stars(rng: np.random.Generator, n: int, moving: float = 0.0) -> Truth:
         seen_at = seen_at + (of["epoch"] - EPOCH0)[:, None] * 0.01 * move[star]
         config["model"]["tdd"], assessed = TDD, 2012.0
     config["model"]["frames"] = "shift_rotation"
+    if not named:
+        del of["star"]
     stars = observed(
         rng,
         of.pop("x"),

@@ -67,7 +67,12 @@ def distortion(rng: np.random.Generator, order: int = 3) -> Field:
 
 
 def smooth(
-    rng: np.random.Generator, scale: float, rms: float, roughness: float | None = None
+    rng: np.random.Generator,
+    scale: float,
+    rms: float,
+    roughness: float | None = None,
+    *,
+    expected: bool = False,
 ) -> Field:
     """A homogeneous Gaussian random field, by random Fourier features.
 
@@ -80,6 +85,8 @@ def smooth(
         On each axis over the detector.
     roughness : float, optional
         nu of a Matern covariance; by default it is the squared exponential.
+    expected : bool
+        Whether the rms is that of many fields: each by itself has another one.
     """
     waves = rng.standard_normal((2, 2, WAVES)) / scale  # axis, (x, y), wave
     if roughness is not None:
@@ -92,6 +99,9 @@ def smooth(
             [np.cos(at @ w + p).sum(axis=-1) for w, p in zip(waves, phase, strict=True)], axis=-1
         )
 
+    if expected:  # the mean square of a wave is one half
+        factor = rms / np.sqrt(WAVES / 2)
+        return lambda x, y: factor * field(x, y)
     return of_rms(field, rms)
 
 

@@ -10,19 +10,22 @@ import numpy as np
 
 from .truth import KINDS
 
-MOST_FALSE_MET = 0.05  # of verdicts on limits that the actual error exceeds, over all kinds
+# of the truths of a kind, on limits that the actual error exceeds: p95, max, or both
+MOST_FALSE_MET = 0.05
 WITHIN_68 = (0.60, 0.85)
 LEAST_WITHIN_95 = 0.90
-LEAST_EXCUSED = 0.9  # of the runs of a kind: undecided with a right reason
+LEAST_EXCUSED = 0.9  # of the runs of a kind: no verdict, with a right reason
+MOST_MISLED = 0.1  # of the runs of a kind: with advice that makes nothing better
 # Inside the family, of limits 1.6 times the actual p95 that exact errors would let be called met:
 # 45 to 90 % of all, as the actual p95 is often well below its 95 % quantile.
 LEAST_MET = 0.8
+BELOW = 2  # limits that are missed, for each exposure that is judged
 WIDTH = 1.3  # inside the family: stated over actual rms, or the inverse
 
 HEAD = (
     "| kind | runs | rms error/stated | cover 68/95 % | false met (0.9) "
-    "| met at 1.6, of attainable | undecided | warned | reason right |\n"
-    "|---|---|---|---|---|---|---|---|---|"
+    "| met at 1.6, of attainable | undecided | warned | reason right | misled |\n"
+    "|---|---|---|---|---|---|---|---|---|---|"
 )
 
 
@@ -39,18 +42,21 @@ class Row:
     within_68, within_95 : float
         Fractions of positions and axes whose error is within the stated intervals.
     false_met : float
-        Fraction of verdicts 'met' on limits that are 0.9 times the actual p95 or max.
+        Fraction of truths with a verdict 'met' on a limit of 0.9 times the actual p95 or max.
     met, attainable : float
         Fraction of verdicts 'met' on limits that are 1.6 times the actual p95, and what it is on
         the mean where stated errors are exact.
     undecided : float
-        Fraction of all verdicts.
+        Fraction of all verdicts that are neither 'met' nor 'missed'.
     warned : float
         Fraction of runs with a warning.
     right : float
         Fraction of runs in which a reason or a warning names the right cause.
     excused : float
-        Fraction of runs whose verdict above the actual p95 is 'undecided', with such a reason.
+        Fraction of runs whose verdict above the actual p95 is 'undecided' where a reason or a
+        warning names the right cause, or 'not shown' for a reason that names it.
+    misled : float
+        Fraction of runs in which a warning has advice that makes nothing better.
     """
 
     kind: str
@@ -65,6 +71,7 @@ class Row:
     warned: float
     right: float
     excused: float
+    misled: float
 
     @property
     def inside(self) -> bool:
@@ -83,6 +90,11 @@ class Row:
         return self.covers or self.excused >= LEAST_EXCUSED
 
     @property
+    def believable(self) -> bool:
+        """Whether next to nothing is called met that the truth misses."""
+        return self.false_met <= MOST_FALSE_MET
+
+    @property
     def decides(self) -> bool:
         """Inside the family: whether what is clearly met is called met."""
         return not self.inside or self.met >= LEAST_MET * self.attainable
@@ -91,6 +103,33 @@ class Row:
     def of_right_width(self) -> bool:
         """Inside the family: whether stated errors have the size of the actual ones."""
         return not self.inside or 1 / WIDTH <= self.ratio <= WIDTH
+
+
+def names_cause(words: Iterable[str], texts: Iterable[str]) -> bool:
+    """Whether one of the words stands in one of the texts, in any case of letters."""
+    said = " ".join(texts).lower()
+    return any(word in said for word in words)
+
+
+def names_right_cause(run: dict[str, Any]) -> bool:
+    """Whether a reason or a warning of a run names the cause that its kind has."""
+    texts = [*(m.get("reason", "") for m in run["margins"]), *run["warnings"]]
+    return names_cause(KINDS[run["kind"]].words, texts)
+
+
+def excused(run: dict[str, Any]) -> bool:
+    """Whether a verdict that could be 'met' is withheld, and for the right reason."""
+    above = [m for m in run["margins"] if m["name"].startswith("above")]
+    if any(m["verdict"] == "undecided" for m in above) and names_right_cause(run):
+        return True
+    words = KINDS[run["kind"]].words
+    return any(m["verdict"] == "not shown" and names_cause(words, [m["reason"]]) for m in above)
+
+
+def falsely_met(run: dict[str, Any]) -> list[bool]:
+    """Whether a limit that is missed is called met, for each exposure that is judged."""
+    below = [m["verdict"] == "met" for m in run["margins"] if m["name"].startswith("below")]
+    return [any(below[k : k + BELOW]) for k in range(0, len(below), BELOW)]
 
 
 def row_of(kind: str, runs: Sequence[dict[str, Any]]) -> Row:
@@ -102,6 +141,9 @@ def row_of(kind: str, runs: Sequence[dict[str, Any]]) -> Row:
     def verdicts(run: dict[str, Any], names: str) -> list[str]:
         return [m["verdict"] for m in run["margins"] if m["name"].startswith(names)]
 
+    def misled(run: dict[str, Any]) -> bool:
+        return names_cause(KINDS[run["kind"]].misleading, run["warnings"])
+
     return Row(
         kind,
         len(runs),
@@ -111,13 +153,14 @@ def row_of(kind: str, runs: Sequence[dict[str, Any]]) -> Row:
         ),
         mean(r["within_68"] for r in runs),
         mean(r["within_95"] for r in runs),
-        mean(v == "met" for r in runs for v in verdicts(r, "below")),
+        mean(wrong for r in runs for wrong in falsely_met(r)),
         mean(v == "met" for r in runs for v in verdicts(r, "above")),
         mean(m["attainable"] for r in runs for m in r["margins"] if m["name"] == "above p95"),
-        mean(v == "undecided" for r in runs for v in verdicts(r, "")),
+        mean(v not in ("met", "missed") for r in runs for v in verdicts(r, "")),
         mean(bool(r["warnings"]) for r in runs),
-        mean(r["right_reason"] for r in runs),
-        mean("undecided" in verdicts(r, "above") and r["right_reason"] for r in runs),
+        mean(names_right_cause(r) for r in runs),
+        mean(excused(r) for r in runs),
+        mean(misled(r) for r in runs),
     )
 
 
@@ -141,6 +184,7 @@ def _line(row: Row, *, over_all: bool = False) -> str:
         return text if good else f"*{text}*"
 
     inside = row.inside and not over_all
+    warns = not over_all and row.kind in KINDS and bool(KINDS[row.kind].misleading)
     wordless = over_all or (row.kind in KINDS and not KINDS[row.kind].words)
     return (
         "| "
@@ -150,11 +194,12 @@ def _line(row: Row, *, over_all: bool = False) -> str:
                 str(row.runs),
                 "" if over_all else cell(f"{row.ratio:.2f}", row.of_right_width),
                 cell(f"{row.within_68:.2f} / {row.within_95:.2f}", over_all or row.honest),
-                cell(f"{row.false_met:.2f}", row.false_met <= MOST_FALSE_MET),
+                cell(f"{row.false_met:.2f}", row.believable),
                 cell(f"{row.met:.2f} of {row.attainable:.2f}", row.decides),
                 f"{row.undecided:.2f}",
                 f"{row.warned:.2f}",
                 "" if wordless else f"{row.right:.2f}",
+                cell(f"{row.misled:.2f}", row.misled <= MOST_MISLED) if warns else "",
             )
         )
         + " |"

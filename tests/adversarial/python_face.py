@@ -17,7 +17,7 @@ from bayesdist.diagnose.diagnostics import Diagnostics, diagnose
 from bayesdist.model.grid import grid_pixels, mesh
 
 from .fields import SIDE
-from .measure import DRAWS, GRID
+from .measure import DRAWS, GRID, without_motion
 from .truth import Truth
 
 
@@ -43,11 +43,7 @@ class Steps:
         return bd.error_budget(self.posterior, **given)
 
     def actual_error(self) -> np.ndarray:
-        """Predicted less true positions (ny * nx, 2), the best shift and rotation taken off.
-
-        A statement on positions can be read as one of relative positions, and this is its kindest
-        reading: no frame of the observer makes the error smaller.
-        """
+        """Predicted less true positions (ny * nx, 2), the best shift and rotation taken off."""
         model, mean = self.posterior.model, np.asarray(self.posterior.mean)
         x, y = mesh(*grid_pixels(model.chips[0].size, GRID))
         epoch = self.truth.epoch
@@ -59,14 +55,7 @@ class Steps:
             code = int(np.random.default_rng([7, self.seed]).integers(1, len(model.exposures)))
             seen = model.predict(mean, x, y, exposure=np.full(x.size, code), **when)
             error = self.truth.frames[model.exposures[code]].undone(np.asarray(seen)) - true
-        one, zero = np.ones(x.size), np.zeros(x.size)
-        u, v = true.T
-        design = np.concatenate(
-            [np.column_stack([one, zero, -v]), np.column_stack([zero, one, u])]
-        )  # shift along u and v, and a small rotation
-        along = error.T.ravel()
-        left = along - design @ np.linalg.lstsq(design, along, rcond=None)[0]
-        return left.reshape(2, -1).T
+        return without_motion(error, true)
 
     def true_p95(self) -> float:
         return float(field_statistic("p95", self.actual_error()))

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 from astropy.table import Table
 from numpy.polynomial import legendre
@@ -53,18 +51,14 @@ def moved(uv: np.ndarray, by: np.ndarray) -> np.ndarray:
     return np.stack([p * u - q * v + r, q * u + p * v + s], axis=1)
 
 
-def selfcal_error(results: Results, truth: Truth, rng: np.random.Generator) -> np.ndarray:
+def selfcal_error(results: Results, truth: Truth, seen: np.ndarray, code: int) -> np.ndarray:
     """Predicted less true positions (ny * nx, 2) over the grid, in the gauge of the run.
 
-    In an exposure chosen at random among those whose frames were fitted, along the axes of the
-    polynomials.
+    Of positions `seen` in the exposure of that code, along the axes of the polynomials.
     """
     solution = results.solution
     model, mean = solution.model, np.asarray(solution.mean)
     x, y = mesh(*grid_pixels(model.chips[0].size, results.config.assess.grid))
-    code = int(rng.integers(1, len(model.exposures)))
-    at: dict[str, Any] = {"exposure": np.full(x.size, code)}
     frame = truth.frames[model.exposures[code]]
     true = moved(frame.seen(truth.true_map(x, y, None)), aligned(results, truth))
-    error = np.asarray(model.predict(mean, x, y, **at)) - true
-    return np.linalg.solve(model.frame(mean, code)[0], error.T).T
+    return np.linalg.solve(model.frame(mean, code)[0], (seen - true).T).T

@@ -3,15 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import numpy as np
 
 from . import fields
+from .contamination_kinds import MIXED, direction, rising, some_displaced
 from .exposure_kinds import OF_EXPOSURES, Scatter, deviating, heavy_deviations, pixels_of
 from .star_kinds import BRIGHT, OF_MAGNITUDE, magnitudes
 from .static_kinds import ORDER, STRUCTURE
+from .time_kinds import IN_TIME, autoregressive
 from .truth import SIGMA, Frame, Map, Truth, kind, mapped
+from .varying_kinds import NO_HELP, OF_FIELDS, VARYING
 
 FALSE = 0.02  # fraction of detections that are displaced
 FALSE_SIGMA = 0.6  # px: by which, on each axis
@@ -51,6 +55,7 @@ def dithered(
     true_map: Map,
     *,
     deviations: Scatter | None = None,
+    varying: Callable[[np.random.Generator], fields.Field] | None = None,
     displaced: Shift | None = None,
     motions: float = 0.0,
     years: float = 0.0,
@@ -65,6 +70,8 @@ def dithered(
     true_map : callable
     deviations : callable, optional
         Of scale and shears of the exposures.
+    varying : callable, optional
+        A random generator to the field that an exposure has by itself.
     displaced : callable, optional
         By which detections are displaced on the detector.
     motions : float
@@ -87,6 +94,8 @@ def dithered(
         if own is not None:  # inverted to first order: they are small
             w = 2 * w - deviating(w, np.tile(own[k], (len(w), 1)))
         x, y = pixels_of(true_map, w)
+        if varying is not None:
+            x, y = pixels_of(true_map, w - varying(rng)(x, y))
         at = np.stack([x, y], axis=1)
         if displaced is not None:
             at = at + displaced(x, y, mag[near])
@@ -172,3 +181,38 @@ def charge_trails(rng: np.random.Generator, n: int) -> Truth:
 def motions(rng: np.random.Generator, n: int) -> Truth:
     """Stars move by 0.004 px a year over six years, and are taken to stand still."""
     return dithered(rng, n, mapped(small_distortion(rng)), motions=0.004, years=6.0)
+
+
+varied = partial(kind, kindest=True, misleading=NO_HELP)
+
+
+@varied("selfcal_second_order", *OF_EXPOSURES, *VARYING, n=DETECTIONS)
+def second_order(rng: np.random.Generator, n: int) -> Truth:
+    """Terms of second order differ from exposure to exposure, by 0.01 px rms."""
+    more = partial(fields.random_polynomial, rms_of_order={2: 0.01})
+    return dithered(rng, n, mapped(small_distortion(rng)), varying=more)
+
+
+@varied("selfcal_atmosphere", *OF_EXPOSURES, *OF_FIELDS, n=DETECTIONS)
+def atmosphere(rng: np.random.Generator, n: int) -> Truth:
+    """Each exposure has a smooth field of its own, 0.008 px rms at a scale of 500 px."""
+    more = partial(fields.smooth, scale=500, rms=0.008, expected=True)
+    return dithered(rng, n, mapped(small_distortion(rng)), varying=more)
+
+
+@varied("selfcal_scales", *OF_EXPOSURES, *IN_TIME, n=DETECTIONS)
+def scales(rng: np.random.Generator, n: int) -> Truth:
+    """Columns are stretched against rows from exposure to exposure, more and more so."""
+
+    def stretching(rng: np.random.Generator, n: int) -> np.ndarray:
+        return autoregressive(rng, n, 0.9, 4e-5) * np.array([0.0, 1.0, 0.0])
+
+    return dithered(rng, n, mapped(small_distortion(rng)), deviations=stretching)
+
+
+@varied("selfcal_tail_by_position", *MIXED, n=DETECTIONS)
+def tail_by_position(rng: np.random.Generator, n: int) -> Truth:
+    """Detections have a tail to one side of the detector, half of them in the upper rows."""
+    way = 0.06 * direction(rng)
+    blends = some_displaced(rng, rising(0.0, 0.5, 1), lambda m: rng.exponential(size=(m, 1)) * way)
+    return dithered(rng, n, mapped(small_distortion(rng)), displaced=blends)

@@ -6,7 +6,18 @@ import numpy as np
 
 from . import fields
 from .static_kinds import CATALOGUE_WORDS, STRUCTURE
-from .truth import SIGMA, Truth, kind, mapped, normal_noise, observed, order_config, pixels
+from .truth import (
+    FALSE,
+    SIGMA,
+    Map,
+    Truth,
+    kind,
+    mapped,
+    normal_noise,
+    observed,
+    order_config,
+    pixels,
+)
 
 QUOTED = ("quoted", "errors are too small", "jitter", "noise")
 OF_MAGNITUDE = ("magnitude", "brightness", "bright stars", "faint stars")
@@ -97,17 +108,24 @@ def brighter_fatter(rng: np.random.Generator, n: int) -> Truth:
     return Truth(stars, true_map, order_config(3))
 
 
-@kind("colour_with_column", "colour", "color", n=3000, column=True)
+@kind("colour_gradient", "colour", "color", kindest=True, n=3000, lateral=0.008, tilt=0.9)
+@kind("colour_with_column", "colour", "color", n=3000)
 @kind("colour_without_column", "colour", "color", *STRUCTURE, n=3000, column=False)
-def colour(rng: np.random.Generator, n: int, column: bool) -> Truth:
-    """Lateral colour, 0.004 px per magnitude at half a side from the middle, of stars that are
+def colour(
+    rng: np.random.Generator,
+    n: int,
+    column: bool = True,
+    lateral: float = 0.004,
+    tilt: float = 0.5,
+) -> Truth:
+    """Lateral colour, so many px per magnitude at half a side from the middle, of stars that are
     redder on one side of the field; the true map is that of stars of colour 1."""
     true_map = mapped(fields.distortion(rng))
     x, y = pixels(rng, n)
-    colours = 1.0 + 0.6 * rng.standard_normal(n) + 0.5 * fields.scaled(x)
-    lateral = 0.004 * (colours - 1.0)[:, None] * fields.radius(x, y)
+    colours = 1.0 + 0.6 * rng.standard_normal(n) + tilt * fields.scaled(x)
+    moved = lateral * (colours - 1.0)[:, None] * fields.radius(x, y)
     columns = {"colour": colours} if column else {}
-    stars = observed(rng, x, y, true_map(x, y, None) + lateral, **columns)
+    stars = observed(rng, x, y, true_map(x, y, None) + moved, **columns)
     return Truth(stars, true_map, order_config(3))
 
 
@@ -134,26 +152,52 @@ def wrong_epochs(rng: np.random.Generator, n: int) -> Truth:
     return Truth(observed(rng, x, y, true_map(x, y, None) + motion), true_map, order_config(3))
 
 
-@kind("cut_at_4.0", "match radius", "match_radius", "truncat", "cut off", sigmas=4.0)
-@kind("cut_at_3.0", "match radius", "match_radius", "truncat", "cut off", sigmas=3.0)
-@kind("cut_at_2.4", "match radius", "match_radius", "truncat", "cut off", sigmas=2.4)
+RADIUS = ("match radius", "match_radius", "truncat", "cut off")
+NO_RADIUS = ("raise model.order", "scale_mas", "are too small", "depend on position")
+
+
+@kind("stated_100_cut_025", *RADIUS, kindest=True, misleading=NO_RADIUS, cut=0.25, stated=1.0)
+@kind("stated_060_cut_015", *RADIUS, kindest=True, misleading=NO_RADIUS, cut=0.15, stated=0.6)
+@kind("stated_015_cut_040", *RADIUS, kindest=True, misleading=NO_RADIUS, cut=0.4, stated=0.15)
+def stated_radius(rng: np.random.Generator, n: int, cut: float, stated: float) -> Truth:
+    """The radius of the match is not the one that is stated; a fifth of the matches are false, and
+    even within the true radius."""
+    stars, true_map = matched_within(rng, n, cut, noise=0.04, off=0.06, false=0.2)
+    outliers = {"model": "uniform", "match_radius": stated}
+    return Truth(stars, true_map, order_config(3) | {"outliers": outliers})
+
+
+@kind("cut_at_4.0", *RADIUS, sigmas=4.0)
+@kind("cut_at_3.0", *RADIUS, sigmas=3.0)
+@kind("cut_at_2.4", *RADIUS, sigmas=2.4)
 def cut(rng: np.random.Generator, n: int, sigmas: float) -> Truth:
     """Only stars within so many sigmas (of one axis, 0.05 px) of a nominal solution were matched,
     which is off by 0.08 px rms; false matches are even within that radius."""
-    noise, off = 0.05, 0.08
-    radius = sigmas * noise
+    radius = sigmas * 0.05
+    stars, true_map = matched_within(rng, n, radius, noise=0.05, off=0.08, false=FALSE)
+    outliers = {"model": "uniform", "match_radius": radius}
+    return Truth(stars, true_map, order_config(3) | {"outliers": outliers})
+
+
+def matched_within(
+    rng: np.random.Generator, n: int, radius: float, *, noise: float, off: float, false: float
+) -> tuple[dict[str, np.ndarray], Map]:
+    """Stars that were matched within a radius of a nominal solution, and the true map.
+
+    The nominal solution is off by a smooth field of rms `off`.  Of the matches a fraction `false`
+    are false, and even within the radius.
+    """
     true_map = mapped(fields.distortion(rng))
     error = fields.smooth(rng, 700, off / np.sqrt(2))
     x, y = pixels(rng, 8 * n)
     residual = normal_noise(rng, x.size, noise)
     kept = np.linalg.norm(residual - error(x, y), axis=1) < radius
-    false = rng.uniform(size=x.size) < 0.04 * kept.mean()  # of those that stay, the usual fraction
+    chance = rng.uniform(size=x.size) < false * kept.mean()  # of those that stay
     inner = radius * np.sqrt(rng.uniform(size=(x.size, 1)))
     angle = rng.uniform(0, 2 * np.pi, x.size)
     anywhere = error(x, y) + inner * np.stack([np.cos(angle), np.sin(angle)], axis=1)
-    residual = np.where(false[:, None], anywhere, residual)
-    rows = np.flatnonzero(kept | false)[:n]
+    residual = np.where(chance[:, None], anywhere, residual)
+    rows = np.flatnonzero(kept | chance)[:n]
     x, y, residual = x[rows], y[rows], residual[rows]
-    stars = observed(rng, x, y, true_map(x, y, None), noise=residual, sigma=noise, false=0.0)
-    outliers = {"model": "uniform", "match_radius": radius}
-    return Truth(stars, true_map, order_config(3) | {"outliers": outliers})
+    uv = true_map(x, y, None)
+    return observed(rng, x, y, uv, noise=residual, sigma=noise, false=0.0), true_map

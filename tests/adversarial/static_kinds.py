@@ -112,6 +112,55 @@ def tree_rings(rng: np.random.Generator, n: int) -> Truth:
     return of_map(rng, n, fields.tree_rings(rng, 0.003))
 
 
+@kind("bump_at_edge", *STRUCTURE, "edge", kindest=True, n=2500)
+def bump_at_edge(rng: np.random.Generator, n: int) -> Truth:
+    """The detector bulges about a point of one edge: 0.06 px, over 250 px."""
+    along = rng.uniform(300, fields.SIDE - 300)
+
+    def bump(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+        away = np.stack([np.asarray(x, float) - fields.SIDE, np.asarray(y, float) - along], axis=-1)
+        square = (away**2).sum(axis=-1, keepdims=True) / 250.0**2
+        return 0.06 * away / 250.0 * np.exp((1 - square) / 2)
+
+    return of_map(rng, n, bump)
+
+
+@kind("pixel_phase_corner", *STRUCTURE, "pixel", kindest=True, n=2500)
+def pixel_phase_corner(rng: np.random.Generator, n: int) -> Truth:
+    """Images are undersampled in one corner, where the phase of the pixel displaces stars."""
+    wave = fields.ridges(rng, 1.0, 0.04)
+
+    def phase(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+        undersampled = ((1 + fields.scaled(x)) * (1 + fields.scaled(y)) / 4)[..., None]
+        return undersampled * wave(x, y)
+
+    return of_map(rng, n, phase)
+
+
+@kind("quantised_third", *STRUCTURE, "pixel", kindest=True, n=2500)
+def quantised_third(rng: np.random.Generator, n: int) -> Truth:
+    """On a third of the columns a list has centroids that are cut off after a digit that stands
+    for 0.04 px; the true map is that of the stars themselves."""
+    true_map = mapped(fields.distortion(rng))
+    x, y = pixels(rng, n)
+    uv = true_map(x, y, None)
+    cut = np.maximum(np.floor(x / 0.04) * 0.04, 0.5)
+    stars = observed(rng, np.where(x > 2 / 3 * fields.SIDE, cut, x), y, uv)
+    return Truth(stars, true_map, order_config(3))
+
+
+@kind("catalogue_zones", *CATALOGUE_WORDS, *STRUCTURE, kindest=True, n=2500)
+def catalogue_zones(rng: np.random.Generator, n: int) -> Truth:
+    """The catalogue was put together from 16 plates, which are displaced by 0.008 px each."""
+    true_map = mapped(fields.distortion(rng))
+    x, y = pixels(rng, n)
+    plates = 0.008 * rng.standard_normal((4, 4, 2))
+    i, j = (np.minimum((at - 0.5) // (fields.SIDE / 4), 3).astype(int) for at in (x, y))
+    return Truth(
+        observed(rng, x, y, true_map(x, y, None) + plates[i, j]), true_map, order_config(3)
+    )
+
+
 @kind("catalogue_listed", *CATALOGUE_WORDS, n=3000, listed=True)
 @kind("catalogue_unlisted", *CATALOGUE_WORDS, n=3000, listed=False)
 def catalogue(rng: np.random.Generator, n: int, listed: bool) -> Truth:

@@ -49,6 +49,24 @@ class Frame:
         return (uv - np.array(self.shift)) @ self.matrix
 
 
+@dataclass(frozen=True)
+class Piece:
+    """A chip: its number, columns, rows, and where its rows begin in the mosaic."""
+
+    number: int
+    columns: int
+    rows: int
+    below: float
+
+    def mosaic(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Pixels as those of one detector of `SIDE` pixels."""
+        return np.asarray(x, float), np.asarray(y, float) + self.below
+
+
+ONE = (Piece(1, SIDE, SIDE, 0.0),)
+TWO = (Piece(2, SIDE, SIDE // 2, 0.0), Piece(1, SIDE, SIDE // 2, SIDE / 2))
+
+
 @dataclass(frozen=True, eq=False)
 class Truth:
     """Matched stars, and what is true of them.
@@ -68,6 +86,8 @@ class Truth:
         Of the exposures, by name; empty where the model has none.
     dates : dict of str to float
         Of the exposures of a self-calibration, where it is given any.
+    chips : tuple of Piece
+        Of the detector; true_map takes pixels of the mosaic, the stars have those of their chip.
     """
 
     stars: dict[str, np.ndarray]
@@ -76,6 +96,7 @@ class Truth:
     epoch: float | None = None
     frames: Mapping[str, Frame] = field(default_factory=dict)
     dates: Mapping[str, float] = field(default_factory=dict)
+    chips: tuple[Piece, ...] = ONE
 
     @property
     def self_calibrated(self) -> bool:
@@ -98,6 +119,11 @@ class Kind:
         Any of them, in lower case, in a verdict's reason or a warning names the right cause.
     inside : bool
         Whether the truth is in the family that is fitted.
+    kindest : bool
+        Whether the actual error is what the best shift and rotation of the predicted positions
+        leave: no reading of a position in any frame makes it smaller.
+    misleading : tuple of str
+        Any of them, in lower case, in a warning is advice that makes nothing better.
     """
 
     name: str
@@ -105,6 +131,8 @@ class Kind:
     n: int
     words: tuple[str, ...] = ()
     inside: bool = False
+    kindest: bool = False
+    misleading: tuple[str, ...] = ()
 
     def truth(self, seed: int, n: int | None = None) -> Truth:
         """The truth of a seed, with another number of stars if one is given."""
@@ -116,7 +144,13 @@ KINDS: dict[str, Kind] = {}
 
 
 def kind(
-    name: str, *words: str, n: int = 1500, inside: bool = False, **options: Any
+    name: str,
+    *words: str,
+    n: int = 1500,
+    inside: bool = False,
+    kindest: bool = False,
+    misleading: tuple[str, ...] = (),
+    **options: Any,
 ) -> Callable[[Callable[..., Truth]], Callable[..., Truth]]:
     """A decorator that enters a function among the kinds, with options that it is called with.
 
@@ -125,7 +159,9 @@ def kind(
 
     def entered(make: Callable[..., Truth]) -> Callable[..., Truth]:
         assert name not in KINDS, name
-        KINDS[name] = Kind(name, lambda rng, n: make(rng, n, **options), n, words, inside)
+        KINDS[name] = Kind(
+            name, lambda rng, n: make(rng, n, **options), n, words, inside, kindest, misleading
+        )
         return make
 
     return entered
@@ -157,15 +193,10 @@ def order_config(order: int, **model: Any) -> dict[str, Any]:
     return {"model": {"order": order, **model}, "budget": [catalogue_row(CATALOGUE)]}
 
 
-def catalogue_row(sigma: float) -> dict[str, Any]:
-    """The budget row of a reference catalogue."""
-    return {
-        "name": "reference catalogue",
-        "kind": "systematic",
-        "sigma_u": sigma,
-        "sigma_v": sigma,
-        "unit": "pix",
-    }
+def catalogue_row(sigma: float, name: str = "reference catalogue") -> dict[str, Any]:
+    """The budget row of a reference catalogue, or of something else that it may have errors in."""
+    row = {"name": name, "kind": "systematic", "sigma_u": sigma, "sigma_v": sigma, "unit": "pix"}
+    return row if sigma else row | {"source": "exact in the simulation"}
 
 
 def observed(

@@ -13,8 +13,8 @@ from bayesdist.report.figures.style import figure_style
 
 from .campaigns import KINDS
 from .figure import ranks_figure, reliability_figure
-from .runs import JUDGED, all_ranks, coverage, probabilities
-from .summary import covered_by_term, excess, farthest, reliability
+from .runs import EXPOSURES, JUDGED, all_ranks, coverage, probabilities
+from .summary import covered_by_term, evenness, excess, farthest, reliability
 
 
 def kept(path: Path, make: Callable[[], Any]) -> Any:
@@ -35,6 +35,7 @@ def main() -> None:
     pieces = {f"coverage {k}": lambda k=k: coverage(k, full=True) for k in KINDS}
     pieces |= {f"probability {k}": lambda k=k: probabilities(k) for k in JUDGED}
     pieces["ranks"] = lambda: all_ranks(full=True)
+    pieces["ranks exposures"] = lambda: all_ranks(full=True, exposures=EXPOSURES)
     names = [a.only] if a.only else list(pieces)
     found = {n: kept(a.results / f"{n.replace(' ', '_')}.pkl", pieces[n]) for n in names}
     for name, result in found.items():
@@ -47,7 +48,10 @@ def main() -> None:
                 )
         elif what == "ranks":
             for quantity, one in result.items():
-                print(f"{quantity:18} farthest from even {farthest(one):.2f} of {len(one)}")
+                print(
+                    f"{kind} {quantity:22} farthest from even {farthest(one):.2f} of {len(one)}, "
+                    f"chi-square p {evenness(one):.4f}"
+                )
         else:
             for one in reliability(*result):
                 print(

@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 
 from bayesdist.report.figures.style import CYCLE, WIDTH, figure_style, new_figure
 
-from .summary import WITHIN, reliability, simultaneous_band
+from .summary import RANK_BINS, WITHIN, reliability, simultaneous_band
 
 TITLES = {
     "drift": "Drift, extrapolated by five years",
@@ -55,28 +55,32 @@ def reliability_figure(found: Mapping[str, tuple[np.ndarray, np.ndarray]]) -> Fi
     return fig
 
 
-BINS = 10
+STATISTICS = ("rms", "p95", "max")
 
 
 def ranks_figure(found: Mapping[str, np.ndarray]) -> Figure:
-    """Histograms of ranks of three kinds of quantities, and all distributions less an even one."""
+    """Histograms of ranks of four kinds of quantities, and all distributions less an even one."""
     kinds = {
-        "coefficients": [r for name, r in found.items() if "_" in name],
+        "coefficients": [r for name, r in found.items() if name[:2] in ("u_", "v_")],
         "positions": [r for name, r in found.items() if " at " in name],
-        "rms, 95th percentile, maximum": [found[s] for s in ("rms", "p95", "max")],
+        "rms, p95, maximum": [found[name] for name in STATISTICS],
     }
+    rest = {name for name in found if name[:2] not in ("u_", "v_") and " at " not in name}
+    kinds["likelihood, mixture, structure"] = [found[name] for name in rest - {*STATISTICS}]
     n = len(found["rms"])
     with figure_style():
         fig = new_figure(WIDTH, 4.6)
-        upper, lower = fig.subplots(2, 3, sharey="row")
+        upper, lower = fig.subplots(2, len(kinds), sharey="row")
         z = np.linspace(*WITHIN, 97)
         band = simultaneous_band(n, 0.95) * np.sqrt(z * (1 - z) / n)
         for top, below, (kind, ranks) in zip(upper, lower, kinds.items(), strict=True):
-            counts, edges = np.histogram(np.concatenate(ranks), np.linspace(0, 1, BINS + 1))
+            counts, edges = np.histogram(np.concatenate(ranks), np.linspace(0, 1, RANK_BINS + 1))
             total = counts.sum()
-            top.bar(edges[:-1], counts / total, 1 / BINS, align="edge", color=CYCLE[0], alpha=0.5)
-            top.axhline(1 / BINS, color="#9AA5B1", lw=0.8)
-            top.set_title(f"{len(ranks)} {kind}" if len(ranks) > 3 else kind)
+            top.bar(
+                edges[:-1], counts / total, 1 / RANK_BINS, align="edge", color=CYCLE[0], alpha=0.5
+            )
+            top.axhline(1 / RANK_BINS, color="#9AA5B1", lw=0.8)
+            top.set_title(f"{len(ranks)} {kind}" if len(ranks) > 8 else kind)
             top.set_xlabel("rank of the truth")
             below.fill_between(z, -band, band, color=CYCLE[0], alpha=0.22, lw=0)
             for one in ranks:

@@ -1,32 +1,38 @@
 """Ranks of the truth among what a whole run claims, the truth drawn from the priors.
 
 Jitter, share and scatter of false matches, higher orders, field and its length are drawn from their
-priors, the polynomial from anywhere, as its prior is flat.  If draws of the error are what the data
-leave open, the actual error has an even rank among them (Talts et al. 2018, arXiv:1804.06788).
+priors, the polynomial from anywhere, as its prior is flat; of exposures, too, the scatter of scale
+and shears.  If draws of the error are what the data leave open, the actual error has an even rank
+among them (Talts et al. 2018, arXiv:1804.06788).  Errors that are right one by one may be wrong
+together, and then the likelihood of the data has uneven ranks (Modrak et al. 2023,
+arXiv:2211.02383): it is among the quantities, and so are the amplitudes of what is left out.
 """
 
 from __future__ import annotations
 
 from contextlib import closing
+from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import Any
 
 import numpy as np
 from scipy.stats import t as student_t
 
-from bayesdist.app.results import errors_of, margins_of
+from bayesdist.app.results import Results, errors_of, margins_of
 from bayesdist.assess import Requirement
 from bayesdist.assess.domain import EvaluationDomain
 from bayesdist.assess.statistics import field_statistic
-from bayesdist.diagnose.correlated import DiscrepancyPriors
+from bayesdist.diagnose.correlated import Discrepancy, DiscrepancyPriors
 from bayesdist.diagnose.correlated.functions import StructureFunctions
 from bayesdist.diagnose.correlated.priors import STRUCTURE_DOF
 from bayesdist.diagnose.correlated.structure import LENGTHS, UNLIKE
 from bayesdist.infer import OutlierMixture
 from bayesdist.model.grid import grid_pixels, mesh
 from tests.adversarial import fields
+from tests.adversarial.exposure_kinds import deviating, in_frames, pointings
 from tests.adversarial.measure import GRID, assessed
-from tests.adversarial.truth import SIGMA, Truth, mapped, order_config, pixels
+from tests.adversarial.truth import SIGMA, Frame, Truth, mapped, order_config, pixels
 from tests.infer.support import draw_prior
 
 from .places import one_thread
@@ -34,6 +40,9 @@ from .places import one_thread
 ORDER, STARS = 3, 1500
 MOST = SIGMA  # the prior of amplitudes ends at the error of a star
 STATISTICS = ("rms", "p95", "max")
+FEW = 400  # draws of the likelihood
+MOST_SCATTER = 10.0  # in units of its prior median: scatters beyond are not looked for
+ALL = slice(None)
 AT = [(k, k) for k in (0, 4, 8, 12, 16)]  # of the grid: a corner, the middle, the other corner
 EXACT = {
     "name": "reference catalogue",
@@ -44,15 +53,60 @@ EXACT = {
 }
 
 
-def half_t(rng: np.random.Generator, median: float, most: float) -> float:
-    scale = median / student_t(STRUCTURE_DOF).ppf(0.75)
-    while (value := scale * abs(rng.standard_t(STRUCTURE_DOF))) > most:
+def half_t(
+    rng: np.random.Generator, median: float, most: float, dof: float = STRUCTURE_DOF
+) -> float:
+    scale = median / student_t(dof).ppf(0.75)
+    while (value := scale * abs(rng.standard_t(dof))) > most:
         pass
     return float(value)
 
 
-def structure(rng: np.random.Generator) -> fields.Field:
-    """A field with the prior of what the model leaves out."""
+@dataclass(frozen=True, eq=False)
+class DrawnStructure:
+    """What the model leaves out, and its parts.
+
+    Parameters
+    ----------
+    functions : StructureFunctions
+    waves : ndarray
+        Of what is finer than the functions.
+    coefficients : ndarray, shape (..., 2, m)
+        Of terms, sines and finer waves, along u and v.
+    """
+
+    functions: StructureFunctions
+    waves: np.ndarray
+    coefficients: np.ndarray
+
+    @classmethod
+    def of_run(cls, kept: Discrepancy) -> DrawnStructure:
+        """All draws of a run with one chip."""
+        (chip,) = kept.structure.values()
+        return cls(chip.functions, chip.waves, np.asarray(chip.coefficients, float))
+
+    def values(self, x: np.ndarray, y: np.ndarray, draws: slice = ALL) -> np.ndarray:
+        """Displacements (..., N, 2) at pixels (N,)."""
+        along = self.coefficients[draws] if self.coefficients.ndim > 2 else self.coefficients
+        return np.swapaxes(along @ self._at(x, y).T, -1, -2)
+
+    def amplitudes(self) -> dict[str, np.ndarray]:
+        """Rms (...) over the detector of the higher orders and of the field, both axes together."""
+        here, terms = self._at(*fields.even_pixels(12)), self.functions.n_terms
+        parts = {"higher orders": slice(0, terms), "field": slice(terms, None)}
+        return {
+            name: np.sqrt(np.mean((self.coefficients[..., p] @ here[:, p].T) ** 2, axis=(-1, -2)))
+            for name, p in parts.items()
+        }
+
+    def _at(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+        X, Y = fields.scaled(x), fields.scaled(y)
+        every = [self.functions.evaluate(X, Y), self.functions.evaluate_finer(self.waves, X, Y)]
+        return np.concatenate(every, axis=1)
+
+
+def structure(rng: np.random.Generator) -> DrawnStructure:
+    """What the model leaves out, from its prior."""
     priors, size = DiscrepancyPriors(), float(fields.SIDE)
     functions = StructureFunctions.for_stars(ORDER, (size, size), STARS)
     length = float(rng.choice(LENGTHS))
@@ -75,62 +129,143 @@ def structure(rng: np.random.Generator) -> fields.Field:
         )
         for a in sizes
     ]
-
-    def field(x: np.ndarray, y: np.ndarray) -> np.ndarray:
-        X, Y = fields.scaled(x).ravel(), fields.scaled(y).ravel()
-        every = [functions.evaluate(X, Y), functions.evaluate_finer(waves, X, Y)]
-        values = np.concatenate(every, axis=1) @ np.transpose(coefficients)
-        return values.reshape(*np.shape(x), 2)
-
-    return field
+    return DrawnStructure(functions, waves, np.array(coefficients))
 
 
-def from_priors(seed: int) -> tuple[Truth, fields.Field]:
-    """Matched stars, and the polynomial beneath them."""
-    rng = np.random.default_rng([31, seed])
-    polynomial = fields.distortion(rng, ORDER)
-    true_map = mapped(polynomial, structure(rng))
+@dataclass(frozen=True, eq=False)
+class Drawn:
+    """A truth from the priors, part by part.
+
+    Parameters
+    ----------
+    truth : Truth
+    polynomial : callable
+        Beneath all that is left out.
+    left_out : DrawnStructure
+    hyper : dict of str to float
+        f, j and s_out.
+    scatter : float or None
+        Of scale and shears of the exposures; None of one exposure.
+    """
+
+    truth: Truth
+    polynomial: fields.Field
+    left_out: DrawnStructure
+    hyper: dict[str, float]
+    scatter: float | None = None
+
+
+def from_priors(seed: int, exposures: int = 1) -> Drawn:
+    """Matched stars of one exposure, or of several that point somewhere else each."""
+    rng = np.random.default_rng([31, seed] if exposures == 1 else [33, seed])
+    polynomial, left_out = fields.distortion(rng, ORDER), structure(rng)
+    true_map = mapped(polynomial, left_out.values)
     hyper = OutlierMixture("gaussian").bind(SIGMA)
     drawn = {k: float(v[0]) for k, v in hyper.values(draw_prior(hyper, 1, rng)).items()}
     x, y = pixels(rng, STARS)
     uv, false = true_map(x, y, None), rng.uniform(size=STARS) < drawn["f"]
+    scatter, frames, config, columns = None, {}, order_config(ORDER), {}
+    if exposures > 1:
+        median = DiscrepancyPriors().exposure
+        scatter = half_t(rng, median, MOST_SCATTER * median, dof=1.0)
+        frames, code = pointings(rng, exposures), np.arange(STARS) % exposures
+        frames["e00"] = Frame((0.0, 0.0), 0.0)  # the polynomials are along its axes
+        uv = deviating(uv, scatter * rng.standard_normal((exposures, 3))[code])
+        uv = in_frames(uv, code, frames)
+        columns["exposure"] = np.array(list(frames))[code]
+        config = order_config(ORDER, frames="shift_rotation")
     core = np.hypot(SIGMA, drawn["j"])
     uv += np.where(false, drawn["s_out"], core)[:, None] * rng.standard_normal((STARS, 2))
     quoted = np.full(STARS, SIGMA)
     stars = {"x": x, "y": y, "u": uv[:, 0], "v": uv[:, 1], "sigma_u": quoted, "sigma_v": quoted}
-    config = order_config(ORDER) | {"budget": [EXACT | {"unit": "pix"}]}
-    return Truth(stars, true_map, config), polynomial
+    config["budget"] = [EXACT | {"unit": "pix"}]
+    truth = Truth(stars | columns, true_map, config, frames=frames)
+    return Drawn(truth, polynomial, left_out, drawn, scatter)
 
 
-def ranks(seed: int) -> dict[str, float]:
+def log_likelihood(residual: np.ndarray, f: Any, j: Any, s_out: Any) -> np.ndarray:
+    """Of residuals (..., N, 2) whose quoted errors are `SIGMA`, as written in docs/method.md."""
+    square = np.sum(residual**2, axis=-1)
+    core, out = (np.asarray(a)[..., None] for a in (SIGMA**2 + np.square(j), np.square(s_out)))
+    f = np.asarray(f)[..., None]
+    inner = np.log1p(-f) - np.log(2 * np.pi * core) - square / (2 * core)
+    outer = np.log(f) - np.log(2 * np.pi * out) - square / (2 * out)
+    return np.logaddexp(inner, outer).sum(axis=-1)
+
+
+def ranks(seed: int, exposures: int = 1) -> dict[str, float]:
     """Fractions of the draws that are below the truth, by name."""
-    truth, polynomial = from_priors(seed)
+    drawn = from_priors(seed, exposures)
     with (
         one_thread(),
         TemporaryDirectory() as folder,
-        closing(assessed(truth, Path(folder), seed)) as results,
+        closing(assessed(drawn.truth, Path(folder), seed)) as results,
     ):
-        model, mean = results.solution.model, np.asarray(results.solution.mean)
-        basis, points = model.basis(), fields.even_pixels(24)
-        at = np.stack(points, axis=1) - fields.MIDDLE + polynomial(*points)
-        true = np.linalg.lstsq(basis.evaluate(*points), at, rcond=None)[0].T.ravel()
-        errors, kept = errors_of(results), results.diagnostics.correlated
-        n, rng = errors.n_draws, np.random.default_rng([32, seed])
-        with_structure = kept.structure_theta[np.arange(n) % kept.n_draws]
-        coefficients = results.errors.solution.solution.draws(n, rng) - mean + with_structure
-        found = {
-            name: float(np.mean(draws < actual))
-            for name, draws, actual in zip(model.names, coefficients.T, true - mean, strict=True)
-        }
-        x, y = mesh(*grid_pixels(model.chips[0].size, GRID))
-        error = truth.true_map(x, y, None) - model.predict(mean, x, y)
-        drawn = errors.errors(EvaluationDomain.of_chips(model, GRID))(slice(0, n), np.zeros(1))
-        for i, j in AT:
-            k = j * GRID[0] + i
-            for axis, name in enumerate("uv"):
-                found[f"{name} at {i}, {j}"] = float(np.mean(drawn[:, k, axis] < error[k, axis]))
-        asked = tuple(Requirement(s, s, 1.0) for s in STATISTICS)
-        for margin in margins_of(results, asked):
-            name = margin.requirement.statistic
-            found[name] = float(np.mean(margin.draws < field_statistic(name, error)))
-    return found
+        out = _of_coefficients(results, drawn, seed) | _of_positions(results, drawn)
+        kept = results.diagnostics.correlated
+        amplitudes = DrawnStructure.of_run(kept).amplitudes()
+        for name, true in drawn.left_out.amplitudes().items():
+            out[name] = rank(amplitudes[name], true)
+        if drawn.scatter is not None:
+            out["scatter of exposures"] = rank(kept.linear.scatter["shape"], drawn.scatter)
+        return out
+
+
+def rank(draws: np.ndarray, true: Any) -> float:
+    """Fraction of draws that are below the truth."""
+    return float(np.mean(draws < true))
+
+
+def _of_coefficients(results: Results, drawn: Drawn, seed: int) -> dict[str, float]:
+    """Ranks of the coefficients and, of one exposure, of the mixture and the likelihood."""
+    model = results.solution.model
+    basis, points = model.basis(), fields.even_pixels(24)
+    at = np.stack(points, axis=1) - fields.MIDDLE + drawn.polynomial(*points)
+    true = np.linalg.lstsq(basis.evaluate(*points), at, rcond=None)[0].T
+    kept, own = results.diagnostics.correlated, results.errors.solution.solution
+    n, rng = results.settings.draws, np.random.default_rng([32, seed])
+    flat, rows = own.drawn_rows(n, rng)
+    which = np.arange(n) % kept.n_draws
+    theta = flat[rows] + kept.structure_theta[which]
+    if kept.linear is not None and drawn.scatter is not None:
+        theta = theta + kept.linear.theta[rng.integers(len(kept.linear.theta), size=n)]
+    slices = [model.coefficient_slice(1, axis) for axis in (0, 1)]
+    out = {}
+    for axis, part in enumerate(slices):
+        for name, draws, actual in zip(
+            model.names[part], theta[:, part].T, true[axis], strict=True
+        ):
+            out[name] = rank(draws, actual)
+    if drawn.scatter is not None:
+        return out
+    hyper = {name: values.ravel()[rows] for name, values in own.hyper.items()}
+    out |= {name: rank(draws, drawn.hyper[name]) for name, draws in hyper.items()}
+    stars, some = drawn.truth.stars, slice(0, FEW)
+    x, y = stars["x"], stars["y"]
+    seen = np.column_stack([stars["u"], stars["v"]])
+    design = basis.evaluate(x, y)
+    fitted = np.stack([theta[some, part] @ design.T for part in slices], axis=-1)
+    residual = seen - fitted - DrawnStructure.of_run(kept).values(x, y, some)
+    said = log_likelihood(residual, *(hyper[name][some] for name in ("f", "j", "s_out")))
+    actual = log_likelihood(seen - drawn.truth.true_map(x, y, None), **drawn.hyper)
+    return out | {"log-likelihood": rank(said, actual)}
+
+
+def _of_positions(results: Results, drawn: Drawn) -> dict[str, float]:
+    """Ranks of errors of positions, and of their statistics over the field."""
+    model, mean = results.solution.model, np.asarray(results.solution.mean)
+    errors = errors_of(results)
+    n, true_map = errors.n_draws, drawn.truth.true_map
+    x, y = mesh(*grid_pixels(model.chips[0].size, GRID))
+    error = true_map(x, y, None) - model.predict(mean, x, y)
+    out = {}
+    said = errors.errors(EvaluationDomain.of_chips(model, GRID))(slice(0, n), np.zeros(1))
+    for i, j in AT:
+        k = j * GRID[0] + i
+        for axis, name in enumerate("uv"):
+            out[f"{name} at {i}, {j}"] = rank(said[:, k, axis], error[k, axis])
+    asked = tuple(Requirement(s, s, 1.0) for s in STATISTICS)
+    for margin in margins_of(results, asked):
+        name = margin.requirement.statistic
+        out[name] = rank(margin.draws, field_statistic(name, error))
+    return out

@@ -18,6 +18,7 @@ from .ranks import ranks
 CAMPAIGNS = {True: 24, False: 1}  # of each kind, in full and reduced
 CALIBRATIONS, PILOTS = 200, 8  # in full alone
 TRUTHS = {True: 200, False: 3}  # from the priors
+EXPOSURES = 8  # of truths with several
 JUDGED = ("drift", "pattern")
 
 
@@ -43,7 +44,7 @@ def probabilities(kind: str) -> tuple[np.ndarray, np.ndarray]:
     return said, met
 
 
-def all_ranks(*, full: bool) -> dict[str, np.ndarray]:
+def all_ranks(*, full: bool, exposures: int = 1) -> dict[str, np.ndarray]:
     """Ranks of each quantity among the draws, one for each truth from the priors."""
-    found = over(ranks, [(k,) for k in range(TRUTHS[full])], full=full)
+    found = over(ranks, [(k, exposures) for k in range(TRUTHS[full])], full=full)
     return {name: np.array([one[name] for one in found]) for name in found[0]}

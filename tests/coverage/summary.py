@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from functools import cache
 
 import numpy as np
-from scipy.stats import binom
+from scipy.stats import binom, chisquare
 
 from .places import LEVELS
 
@@ -130,6 +130,15 @@ def farthest(ranks: np.ndarray) -> float:
     shares = np.mean(ranks[..., None] <= z, axis=-2)
     distance = np.abs(shares - z) / np.sqrt(z * (1 - z) / n)
     return distance.max(axis=-1)
+
+
+RANK_BINS = 10
+
+
+def evenness(ranks: np.ndarray) -> float:
+    """Chi-square probability that ranks (n,) in ten bins are as uneven as these, or more so."""
+    counts, _ = np.histogram(ranks, np.linspace(0, 1, RANK_BINS + 1))
+    return float(chisquare(counts).pvalue)
 
 
 @cache

@@ -223,8 +223,8 @@ def match_arguments(
     out = match_columns(quantities, options)
     if identify and "star" not in out:
         # as in the catalogue: motions bring one star to another place in each exposure
-        at = sky_columns(quantities) if "ra" in found else (out["u"], out["v"])
-        star, note = star_codes(*at, options.same_position)
+        first, second = sky_columns(quantities) if "ra" in found else (out["u"], out["v"])
+        star, note = star_codes(first, second, options.same_position)
         if star is not None:
             out |= {"star": star, "notes": (*out.get("notes", ()), note)}
     if "ra" not in found:
