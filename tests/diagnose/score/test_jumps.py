@@ -42,6 +42,7 @@ def test_noise_alone_does_not_jump(shape, full):
         if shape == "repeated":  # each star four times: its rows are no news of each other
             rows = np.tile(np.arange(500), 4)
             x, y = np.stack([table.x, table.y])[:, rows] + rng.normal(0, 0.005, (2, len(rows)))
+            x, y = np.clip([x, y], 1, SIDE)
             table = matches_of(x, y, np.stack([table.u, table.v], axis=1)[rows], star=rows)
         p.append(examined(table)["jumps"].p_value)
     assert_no_smaller_than_chance("jumps", np.array(p))
