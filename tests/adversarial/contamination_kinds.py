@@ -22,7 +22,13 @@ MIXED = (
 OF_FALSE = ("false", "chance", "outlier", *MIXED)
 OF_LABELS = ("wrong exposure", "label", *MIXED)
 # what makes no error smaller where some stars are displaced
-NO_HELP = ("raise model.order", "scale_mas", "are too small", "depend on position", "give larger errors")
+NO_HELP = (
+    "raise model.order",
+    "scale_mas",
+    "are too small",
+    "depend on position",
+    "give larger errors",
+)
 
 contaminated = partial(kind, kindest=True, misleading=NO_HELP)
 
