@@ -41,7 +41,10 @@ __all__ = ["calibrate"]
 
 WHERE = "calibrate"  # stands for the name of the configuration in messages
 # keys of [data] by which a table is read
-READING = "columns unit pixel_origin tangent_point epoch catalogue_epoch not_finite".split()
+READING = (
+    *("columns", "unit", "pixel_origin", "tangent_point", "epoch", "catalogue_epoch"),
+    *("not_finite", "same_position"),
+)
 
 # arguments that settings may replace while they have their defaults
 DEFAULTS = {
@@ -163,6 +166,7 @@ def calibrate(
     else:
         options = dict(settings.pop("data", {}))
         data["simulated"] = options.pop("simulated", None)
+        data["same_position"] = options.get("same_position")
         stars, data["sigma"] = _stars(matches, sigma, options)
     configured: Settings = {
         "data": data,
@@ -274,12 +278,15 @@ def _stars(matches: Any, sigma: Any, options: Mapping[str, Any]) -> tuple[Matche
                 do=f"give one of {', '.join(READING)}",
             )
         matches = Matches(**match_arguments(matches, ReadOptions(**options)))
-    elif options:
+    elif options.keys() - {"same_position"}:
         raise ConfigError(
-            f"data.{next(iter(options))} is an option of reading, and the matches have been read",
+            f"data.{min(options.keys() - {'same_position'})} is an option of reading, and the "
+            "matches have been read",
             where=WHERE,
             do="give it to bayesdist.read_matches or Matches.from_table",
         )
+    else:
+        matches = matches.with_star_codes(**options)
     if sigma is None:
         sigma = "by_magnitude" if matches.has_mag and not matches.has_sigma else "columns"
     elif not isinstance(sigma, str):

@@ -104,7 +104,10 @@ def _calibration_of_run(solution: Solution, path: Path) -> Calibration:
     )
     budget = [] if summary is None else summary.budget or []
     rows = [row.model_dump() for row in budget]
-    return with_facts_of_run(calibration, run.config, tables, rows)
+    discrepancy = None
+    if summary is not None and summary.discrepancy is not None:
+        discrepancy = summary.discrepancy.model_dump()
+    return with_facts_of_run(calibration, run.config, tables, rows, discrepancy)
 
 
 def solution_at(path: Path) -> Solution | None:

@@ -143,12 +143,13 @@ class Run:
     @cached_property
     def calibration(self) -> Calibration:
         """Calibration of the detector as it is written to files, with all errors of positions."""
-        results = self.results
+        results, correlated = self.results, self.diagnostics.correlated
         return with_facts_of_run(
             results.product.calibration,
             results.config,
             results.fitted.tables.tables,
             self.evaluation.budget.rows(),
+            None if correlated is None else correlated.facts,
         )
 
     @property

@@ -15,7 +15,7 @@ from scipy.linalg import solve_triangular
 from bayesdist.assess.budget.budget import ErrorBudget, budget_of
 from bayesdist.assess.domain import EvaluationDomain
 from bayesdist.assess.drawn import DrawnErrors, generators
-from bayesdist.assess.terms.correlated import Deviations, StructureErrors
+from bayesdist.assess.terms.correlated import Deviations, FieldsOfExposures, StructureErrors
 from bayesdist.assess.terms.forms import ErrorTerm, Image
 from bayesdist.assess.terms.given import Centroids, UserTerm
 from bayesdist.assess.terms.local import LocalErrors, table_of
@@ -227,6 +227,9 @@ def diagnosed_error_model(
         measured.append(StructureErrors(correlated, frames, structure_left))
     if correlated is not None and correlated.linear is not None:
         measured.append(Deviations(correlated, single, frames))
+    if correlated is not None and correlated.fields is not None:
+        # of a campaign positions are assessed in a new exposure
+        measured.append(FieldsOfExposures(correlated, single or aligned, frames))
     own = SolutionErrors(with_diagnosed_errors(posterior, diagnostics, hierarchy, noise_alone=True))
     if diagnostics.catalogue is not None:
         of_catalogue = catalogue_terms(posterior, diagnostics.catalogue, catalogue)

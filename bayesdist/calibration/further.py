@@ -16,10 +16,15 @@ class FurtherError:
     """Row of an error budget beside the covariance: root mean squares over the detector."""
 
     name: str
-    kind: str  # 'systematic' (shared by the stars of an image), 'random' or 'local' (of each star)
+    # 'systematic' (shared by the stars of an image), 'random' (of each star) or 'local' (shared by
+    # the stars near a position)
+    kind: str
     u: float  # standard deviation, in the unit of u, v
     v: float
     source: str = ""
+    # of a local error: fractions of its variance with the correlation lengths, in pixels, of fields
+    # that the stars of a chip share; the rest is independent from star to star
+    correlation: tuple[tuple[float, float], ...] = ()
 
     @property
     def shared(self) -> bool:
@@ -42,6 +47,7 @@ def further_from(records: Sequence[Mapping[str, Any]], where: str) -> tuple[Furt
                 float(one["u"]),
                 float(one["v"]),
                 str(one.get("source", "")),
+                tuple((float(part), float(length)) for part, length in one.get("correlation", ())),
             )
             for one in records
         )

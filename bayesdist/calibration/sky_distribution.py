@@ -20,6 +20,7 @@ from bayesdist.calibration.sky_positions import (
 from bayesdist.data.sky.tangent import plane_axes
 from bayesdist.errors import InputError
 from bayesdist.utils.arrays import Float
+from bayesdist.utils.matern import drawn_fields
 from bayesdist.utils.quantities import Direction, Epoch, Random, generator_of, values_in, year_of
 
 if TYPE_CHECKING:
@@ -113,7 +114,19 @@ def sky_distribution(
     design = designs(calibration, maps, px, py, numbers)
     errors = design @ (root @ generator.standard_normal((len(root), n_draws)))  # (N, 2, n_draws)
     errors += _root(shared_covariance(calibration)) @ generator.standard_normal((2, n_draws))
-    own = _root(own_covariances(calibration, slope, centroids))
+    alone = own_covariances(calibration, slope, centroids)
+    for row in calibration.further:
+        if not row.correlation:
+            continue
+        fraction = sum(part for part, _ in row.correlation)
+        for axis, sigma in enumerate((row.u, row.v)):
+            alone[:, axis, axis] -= fraction * sigma**2
+            for number in np.unique(numbers):
+                here = np.flatnonzero(numbers == number)
+                at = np.column_stack([px[here], py[here]])
+                field = drawn_fields(at, row.correlation, n_draws, generator)
+                errors[here, axis] += sigma * field
+    own = _root(alone)
     errors += own @ generator.standard_normal((px.size, 2, n_draws))
     steps = placement.steps(ra, dec)  # mas to the east and to the north
     drawn_ra, drawn_dec = _moved(ra, dec, np.radians((steps @ errors) / 3.6e6))

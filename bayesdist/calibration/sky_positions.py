@@ -6,7 +6,8 @@ of a step on the sky (east, north) by one on the plane, two stars n and m have t
     A_n phi_n S phi_m A_m + A_n T A_m + [n = m] A_n (L + J C J) A_n
 
 where T are errors that all stars of an image share, L those of each star by itself, C that of its
-centroid in pixels and J the slope of the map.
+centroid in pixels and J the slope of the map.  Of local errors that are correlated over some pixels
+a part is in the covariance of stars of one chip, by their separation.
 """
 
 from __future__ import annotations
@@ -19,9 +20,11 @@ from numpy.typing import ArrayLike
 
 from bayesdist.calibration.calibration import Calibration
 from bayesdist.calibration.chip_map import ChipMap
+from bayesdist.calibration.further import FurtherError
 from bayesdist.calibration.plane import ARCSEC, SkyPlacement
 from bayesdist.errors import InputError
 from bayesdist.utils.arrays import Float, Int
+from bayesdist.utils.matern import correlation_at
 from bayesdist.utils.quantities import Direction, Epoch, direction_in, values_in, year_of
 
 
@@ -123,6 +126,11 @@ def plane_covariances(
         "nak,kl,mbl->namb", design, coefficient_covariance(calibration, epoch), design
     )
     whole += shared[None, :, None, :]
+    for row in calibration.further:
+        if row.correlation:
+            nearby = local_correlation(row, x, y, chip)
+            whole[:, 0, :, 0] += row.u**2 * nearby
+            whole[:, 1, :, 1] += row.v**2 * nearby
     rows = np.arange(x.size)
     whole[rows, :, rows, :] += own
     return single, whole
@@ -191,10 +199,19 @@ def shared_covariance(calibration: Calibration) -> Float:
     return np.diag([float(sum(r.u**2 for r in rows)), float(sum(r.v**2 for r in rows))])
 
 
+def local_correlation(row: FurtherError, x: Float, y: Float, chip: Int) -> Float:
+    """Correlations (N, N) of a local error between different stars; 0 between chips."""
+    at = np.column_stack([x, y])
+    separation = np.linalg.norm(at[:, None] - at, axis=2)
+    out = np.where(chip[:, None] == chip, correlation_at(separation, row.correlation), 0.0)
+    np.fill_diagonal(out, 0.0)
+    return out
+
+
 def own_covariances(
     calibration: Calibration, slope: Float, centroids: tuple[ArrayLike, ArrayLike] | None
 ) -> Float:
-    """Covariances (N, 2, 2) on the plane of errors that each star has by itself."""
+    """Covariances (N, 2, 2) on the plane of local errors, and those of each star by itself."""
     alone = [row for row in calibration.further if not row.shared]
     out = np.zeros(slope.shape)
     out[:, 0, 0] = sum(row.u**2 for row in alone)

@@ -93,6 +93,10 @@ def errors_in(calibration: Calibration, centroids: Sequence[str] | None) -> list
         out.append(("coefficients, without their correlations", "correlated between stars"))
     for row in calibration.further:
         shared = "the same for all stars" if row.shared else "of each star by itself"
+        if row.correlation:
+            low, high = (f(length for _, length in row.correlation) for f in (min, max))
+            over = f"{low:.0f}" if low == high else f"{low:.0f} to {high:.0f}"
+            shared = f"correlated between stars over {over} pixels"
         out.append((row.name, shared))
     if centroids is not None:
         out.append(("centroids", "of each star by itself"))

@@ -21,6 +21,7 @@ from bayesdist.data.magnitude_errors import AddedErrors, MagnitudeErrors, no_mag
 from bayesdist.data.reading.options import ReadOptions, refuse_missing_errors
 from bayesdist.data.reading.sky_table import sky_table
 from bayesdist.data.reading.table import match_arguments
+from bayesdist.data.repeated_stars import check_same_position, star_codes
 from bayesdist.errors import InputError
 from bayesdist.utils.arrays import Float
 from bayesdist.utils.quantities import Direction, Epoch, Number, values_in
@@ -170,6 +171,7 @@ class Matches(MatchColumns):
         catalogue_epoch: Epoch | None = None,
         chips: Mapping[str, int] | None = None,
         not_finite: str = "refuse",
+        same_position: str = "one_star",
     ) -> Matches:
         """Matches from any object with columns.
 
@@ -184,6 +186,9 @@ class Matches(MatchColumns):
             pyarrow Table, a DuckDB result); a mapping of arrays or lists; a structured array.
         columns, unit, sigma, pixel_origin, tangent_point, epoch, catalogue_epoch, chips, not_finite
             As for `ReadOptions`.
+        same_position : {'one_star', 'separate_stars'}, optional
+            As for `ReadOptions`: rows with the same reference position belong to one star by
+            default, if there is no column `star`.
 
         Returns
         -------
@@ -211,6 +216,7 @@ class Matches(MatchColumns):
             catalogue_epoch,
             chips,
             not_finite,
+            same_position,
         )
         return cls(**match_arguments(table, options)).as_read(sigma)
 
@@ -687,6 +693,31 @@ class Matches(MatchColumns):
         """
         given = {one.name: getattr(self, one.name) for one in fields(self) if one.init}
         return Matches.of_distinct_rows(**(given | changes))
+
+    def with_star_codes(self, same_position: str = "one_star") -> Matches:
+        """These stars with codes by their reference positions.
+
+        Parameters
+        ----------
+        same_position : {'one_star', 'separate_stars'}, optional
+            As for `ReadOptions`.
+
+        Returns
+        -------
+        Matches
+            They are returned unchanged if they have codes, if no position occurs twice, or if they
+            are on disk.
+
+        Raises
+        ------
+        InputError
+            For an unknown `same_position`.
+        """
+        check_same_position(same_position)
+        if not self.in_memory or self.star is not None:
+            return self
+        star, note = star_codes(self.u, self.v, same_position)
+        return self if star is None else self.with_columns(star=star, notes=(*self.notes, note))
 
     def with_counts(self, n_rows: int, rejected: Mapping[str, int]) -> Matches:
         """These stars with other counts of the rows that they were selected from.

@@ -25,7 +25,13 @@ from bayesdist.data.matches import Matches
 from bayesdist.data.matching.table import match_table
 from bayesdist.data.reading.columns import numbered, text_labels
 from bayesdist.data.reading.options import ReadOptions
-from bayesdist.data.reading.table import is_table, match_arguments, sky_positions
+from bayesdist.data.reading.table import (
+    catalogue_positions,
+    is_table,
+    match_arguments,
+    sky_positions,
+)
+from bayesdist.data.repeated_stars import star_codes
 from bayesdist.data.sky.tangent import mean_direction
 from bayesdist.data.tables.checks import absent
 from bayesdist.data.tables.column import SourceColumn
@@ -53,6 +59,7 @@ def read_matches(
     catalogue_epoch: Epoch | None = None,
     chips: Mapping[str, int] | None = None,
     not_finite: str = "refuse",
+    same_position: str = "one_star",
 ) -> Matches:
     r"""Read matched star positions.
 
@@ -70,6 +77,9 @@ def read_matches(
         adds, or 'auto': by name and content.
     columns, unit, sigma, pixel_origin, tangent_point, epoch, catalogue_epoch, chips, not_finite
         As `ReadOptions`.
+    same_position : {'one_star', 'separate_stars'}, optional
+        As `ReadOptions`: rows with the same reference position, in one file or in several, belong
+        to one star by default, if there is no column `star`.
 
     Returns
     -------
@@ -103,6 +113,7 @@ def read_matches(
         catalogue_epoch,
         chips,
         not_finite,
+        same_position,
     )
     if is_table(path):
         if format not in ("auto", "table"):
@@ -142,13 +153,39 @@ def _read_plain(
         "bayesdist": lambda file, _: _read_record(file, options),
         "astrometry.net": lambda file, name: _read_corr(file, tables[file], name, options),
         "table": lambda file, name: Matches(
-            **match_arguments(tables[file], options, source=str(file), exposure_name=name)
+            **match_arguments(
+                tables[file], options, source=str(file), exposure_name=name, identify=False
+            )
         ),
     }
     readers |= dict.fromkeys(own, readers["table"])
-    return Matches.concatenate(
+    matches = Matches.concatenate(
         [readers[kind](file, name) for file, kind, name in zip(files, kinds, names, strict=True)]
     )
+    if matches.star is not None or len(tables) < len(files):
+        return matches  # lists and records have no reference positions, or state the stars
+    corr = "astrometry.net" in set(kinds)
+    return _with_stars(matches, tables, _CORR if corr else options.columns, options.same_position)
+
+
+def _with_stars(
+    matches: Matches,
+    tables: Mapping[Path, Table],
+    columns: Mapping[str, str] | None,
+    same_position: str,
+) -> Matches:
+    """Matches with codes of the stars, if some have the same reference position."""
+    sky = [catalogue_positions(table, columns, source=str(file)) for file, table in tables.items()]
+    at = matches.u, matches.v
+    on_sky = [positions for positions in sky if positions is not None]
+    if len(on_sky) == len(sky):
+        first = np.cumsum([0, *(len(ra) for ra, _ in on_sky)])[matches.source]
+        ra, dec = (np.concatenate(axis) for axis in zip(*on_sky, strict=True))
+        at = ra[first + matches.row], dec[first + matches.row]
+    star, note = star_codes(*at, same_position)
+    if star is None:
+        return matches
+    return matches.with_columns(star=star, notes=(*matches.notes, note))
 
 
 def _with_common_point(
@@ -207,7 +244,9 @@ def _read_corr(file: Path, table: Table, name: str | None, options: ReadOptions)
         options.refuse(str(file), "astrometry.net", "unit")
     columns = _CORR | ({"flux": "FLUX"} if "FLUX" in table.colnames else {})
     options = replace(options, columns=columns, unit=None, sigma="by_magnitude")
-    return Matches(**match_arguments(table, options, source=str(file), exposure_name=name))
+    return Matches(
+        **match_arguments(table, options, source=str(file), exposure_name=name, identify=False)
+    )
 
 
 def _read_with_master(files: Sequence[Path], kinds: Sequence[str], options: ReadOptions) -> Matches:

@@ -6,6 +6,7 @@ from collections.abc import Iterator, Sequence
 from math import isclose
 
 from bayesdist.data.matches import Matches
+from bayesdist.data.repeated_stars import repeated_detections, tight_groups
 from bayesdist.diagnose.correlated import Discrepancy
 from bayesdist.diagnose.correlated.deviations import CURVATURE
 from bayesdist.diagnose.holdout.validation import HoldoutValidation
@@ -16,7 +17,7 @@ from bayesdist.diagnose.score.result import ScoreTest
 from bayesdist.infer import LinearFit
 from bayesdist.infer.exposures.frame_choice import frames_that_help
 from bayesdist.infer.posterior.checks import fit_checks, pixel_doubt
-from bayesdist.utils.checks import LARGER, Check
+from bayesdist.utils.checks import EITHER, LARGER, Check
 from bayesdist.utils.limits import (
     CHI2_TOO_LARGE,
     EXPOSURE_CHI2,
@@ -31,6 +32,7 @@ from bayesdist.utils.numbers import count, number, percent, probability, size_of
 
 FIT, HELD_OUT, SCORE_TESTS = "Fit", "Held-out truth", "Score tests"
 MATCHING, ASSUMPTIONS = "Matching", "Assumptions"
+DISPLACING = ("shape", "matching")  # groups of score tests
 
 
 def input_checks(
@@ -96,6 +98,22 @@ def input_checks(
             f"which was used, and {stated:g} {fit.unit} by the matches",
         )
     yield from matching_checks(match_radius, reference_sigma, in_circle=in_circle)
+    if matched_before:
+        yield from repeated_star_checks(table)
+
+
+def repeated_star_checks(table: Matches) -> Iterator[Check]:
+    """Checks of stars with several detections in one exposure, and of tight groups of stars."""
+    repeated = repeated_detections(table.u, table.v, table.exposure, table.star)
+    if repeated is not None:
+        name = "Stars with several detections in one exposure"
+        value = f"{count(repeated.stars)} of {count(repeated.n_stars)}"
+        yield Check(MATCHING, name, value, "none", "warn", repeated.sentence)
+    groups = tight_groups(table.u, table.v, table.star)
+    if groups is not None:
+        value = f"{count(groups.groups)} of {groups.size} stars"
+        sentence = groups.sentence(table.unit)
+        yield Check(MATCHING, "Tight groups of stars", value, "none", "warn", sentence)
 
 
 def frames_doubt(fit: LinearFit, table: Matches, *, suspicious: bool) -> str:
@@ -134,12 +152,14 @@ def matching_checks(
 
 
 def structure_checks(
-    misfits: Sequence[Misfit], correlated: Discrepancy | None = None
+    misfits: Sequence[Misfit],
+    correlated: Discrepancy | None = None,
+    tests: Sequence[ScoreTest] = (),
 ) -> Iterator[Check]:
     """Checks of the structure that a fit leaves in the residuals.
 
     There is one misfit for each chip, or none; `correlated` errors of the solution hold some of the
-    structure.
+    structure. Score `tests` may have found where it comes from.
     """
     if not misfits:
         return
@@ -158,6 +178,9 @@ def structure_checks(
         sentence = f"{one.finding}, and the budget holds {what} of it"
         if correlated is None:
             sentence = one.sentence
+        if displacing(tests):
+            sentence += "; it may come from residuals that are lopsided or cut, of which score "
+            sentence += "tests have found some"
         if (held or 0.0) < STRUCTURE_IN_BUDGET.value * one.structure:
             doubt = LARGER
     yield Check(
@@ -191,16 +214,20 @@ def score_checks(
 ) -> Iterator[Check]:
     """Checks of what targeted tests have found, one for each remedy, or that they found nothing.
 
-    Verdicts stand where correlated errors hold what the tests have found.
+    Verdicts stand where correlated errors hold what the tests have found.  Noise is held by the
+    sandwich covariance, unless the residuals are lopsided or the match radius has cut them: that
+    covariance holds the scatter of a solution, and not its displacement.
     """
     limit = f"p at least {number(SCORE_LIMIT.value, 1)}"
     found: dict[str, list[ScoreTest]] = {}
     for test in tests:
         if test.significant:
             found.setdefault(test.remedy, []).append(test)
+    displaced = displacing(tests)
     for remedy, several in found.items():
         sentence = f"{'; '.join(test.finding for test in several)}: {remedy}"
-        doubt = "" if all(_held(correlated, test) for test in several) else LARGER
+        doubts = {test.doubt for test in several if not _held(correlated, test, tests, displaced)}
+        doubt = EITHER if EITHER in doubts else LARGER if doubts else ""
         names = ", ".join(test.name for test in several)
         value = "; ".join(
             f"{size_of(test.size, test.unit, 2)} rms, {probability(test.p_value)}"
@@ -212,17 +239,37 @@ def score_checks(
         yield Check(SCORE_TESTS, name, "nothing found", limit, "pass")
 
 
-def _held(correlated: Discrepancy | None, test: ScoreTest) -> bool:
-    """True where correlated errors hold what a test has found."""
+def displacing(tests: Sequence[ScoreTest]) -> bool:
+    """True where tests have found residuals that displace the solution, as noise does not."""
+    return any(test.significant and test.group in DISPLACING for test in tests)
+
+
+def _held(
+    correlated: Discrepancy | None, test: ScoreTest, tests: Sequence[ScoreTest], displaced: bool
+) -> bool:
+    """True where correlated errors hold what one of the tests has found.
+
+    `displaced`: whether the residuals displace the solution.
+    """
     if correlated is None:
         return False
-    scatter = set() if correlated.linear is None else set(correlated.linear.scatter)
+    of_exposures = correlated.facts.get("exposure_fields", {})
+    enough = STRUCTURE_IN_BUDGET.value * test.size
+    linear = correlated.linear
+    scatter = set() if linear is None else set(linear.scatter)
+    bend = 0.0 if linear is None else linear.bend
+    in_time = linear is not None and linear.correlation_time > 0
+    wandering = any(one.significant and one.held_by == "time" for one in tests)
     held = {
         "": False,
-        "noise": True,
+        "noise": not displaced,
         "structure": bool(correlated.structure),
         "exposures": bool(scatter - {CURVATURE}),
-        "curvature": CURVATURE in scatter,
+        # a parabola does not hold deviations that wander
+        "curvature": in_time or (bend >= enough and not wandering),
+        "second order": of_exposures.get("second_order", 0.0) >= enough > 0,
+        "exposure fields": of_exposures.get("field", 0.0) >= enough > 0,
+        "time": in_time,
     }
     return held[test.held_by]
 
@@ -268,6 +315,22 @@ def exposure_checks(found: ExposureScatter | None) -> Iterator[Check]:
         "warn" if sentence else "pass",
         sentence,
     )
+
+
+def outlying_checks(correlated: Discrepancy | None) -> Iterator[Check]:
+    """Check that names exposures whose linear terms are far beyond the scatter of the others."""
+    names = [] if correlated is None else correlated.facts.get("exposures_outlying", [])
+    if names:
+        yield Check(
+            FIT,
+            "Exposures that deviate far more than the others",
+            count(len(names)),
+            "none",
+            "warn",
+            f"{', '.join(names[:3])}{f' and {len(names) - 3} more' if len(names) > 3 else ''} "
+            "lie shifted, turned or stretched against the other exposures, far beyond their "
+            "scatter, which is stated without them: leave out what went wrong, or set model.frames",
+        )
 
 
 def holdout_checks(found: HoldoutValidation | None) -> Iterator[Check]:

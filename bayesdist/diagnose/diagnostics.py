@@ -10,11 +10,13 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 
 from bayesdist.data import MagnitudeErrors, Matches
+from bayesdist.data.repeated_stars import error_codes
 from bayesdist.diagnose.checks import (
     coverage_checks,
     exposure_checks,
     holdout_checks,
     input_checks,
+    outlying_checks,
     score_checks,
     structure_checks,
 )
@@ -42,7 +44,12 @@ from bayesdist.diagnose.residuals.sample import (
     likelihood_shown,
     star_sample,
 )
-from bayesdist.diagnose.residuals.star_sums import StarSums, flagged_by_exposure, star_sums
+from bayesdist.diagnose.residuals.star_sums import (
+    StarSums,
+    flagged_by_exposure,
+    star_bins,
+    star_sums,
+)
 from bayesdist.diagnose.score.result import ScoreTest
 from bayesdist.diagnose.score.tests import score_tests
 from bayesdist.errors import InputError
@@ -174,9 +181,10 @@ class Diagnostics:
         out = [
             *holdout_checks(self.holdout),
             *score_checks(self.score_tests, self.correlated),
-            *structure_checks(self.misfits, self.correlated),
+            *structure_checks(self.misfits, self.correlated, self.score_tests),
         ]
         out += [*coverage_checks(self.coverage), *exposure_checks(self.sample.by_exposure)]
+        out += outlying_checks(self.correlated)
         if self.epoch_shift is not None and self.epoch_shift.significant:
             text = self.epoch_shift.sentence
             out.append(Check("Fit", "Epochs of the exposures", level="warn", sentence=text))
@@ -254,6 +262,7 @@ def diagnose(
     True
     """
     _refuse_other_posterior(posterior, matches, fit)
+    matches = matches.with_star_codes()
     rng = assessment_rng(rng)
     priors = priors or GaussianPriors.none(posterior.model)
     circle = posterior.mixture.match_radius
@@ -374,7 +383,7 @@ def diagnose_fit(
     several = len(model.chips) > 1
     sample = star_sample(table, len(stars), fit, posterior)
     if eliminated is None:
-        misfits = misfits_of(fit, partitions, sums)
+        misfits = _misfits(fit, stars, partitions, sums, shown)
     else:
         from bayesdist.diagnose.selfcal.misfit import dithered_misfit
 
@@ -437,6 +446,31 @@ def residual_sums(
     wanted = {chip: tuple(dict.fromkeys(bins.values())) for chip, bins in partitions.items()}
     clipped = fit.likelihood
     return partitions, shards.sum(star_sums, clipped, solution or clipped, wanted)
+
+
+def _misfits(
+    fit: LinearFit,
+    stars: Matches,
+    partitions: Mapping[int, Mapping[str, Bins]],
+    sums: StarSums,
+    shown: Likelihood,
+) -> tuple[Misfit, ...]:
+    """Structure in the residuals of each chip; detections of one star count as one.
+
+    `partitions` and `sums` are those of `residual_sums`, whose detections are taken as they are
+    where stars have one each, or stay on disk.
+    """
+    code = error_codes(stars.u, stars.v, stars.star) if stars.in_memory else None
+    if code is None or len(distinct := np.unique(code)) == len(stars):
+        return misfits_of(fit, partitions, sums)
+    used = fit.n_used * len(distinct) / len(stars)
+    by_star = {
+        chip.number: partitions_for(round(used * (stars.chip_number == chip.number).mean()))
+        for chip in fit.model.chips
+    }
+    wanted = {chip: tuple(dict.fromkeys(bins.values())) for chip, bins in by_star.items()}
+    binned = star_bins(stars, code, fit.model, shown, wanted)
+    return misfits_of(fit, by_star, replace(sums, binned=binned))
 
 
 def misfits_of(

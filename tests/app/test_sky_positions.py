@@ -45,7 +45,13 @@ def calibration():
         GaussianSolution(model, theta, root @ root.T),
         Plane("sky", point=POINT),
         further=(
-            FurtherError("unmodelled structure", "local", 0.002, 0.001),
+            FurtherError(
+                "unmodelled structure",
+                "local",
+                0.002,
+                0.001,
+                correlation=((0.25, 30.0), (0.5, 120.0)),
+            ),
             FurtherError("catalogue", "systematic", 0.004, 0.003, "given by the user"),
             FurtherError("readout", "random", 0.0, 0.002),
         ),
@@ -85,8 +91,12 @@ def test_the_covariance_is_that_of_draws(calibration, stars):
         for axis in (0, 1):
             of_axis = theta[:, calibration.model.coefficient_slice(number, axis)]
             uv[axis, :, mine] = np.einsum("nsk,nk->sn", phi, of_axis)
-    uv[0] += 0.004 * rng.normal(size=(n, 1)) + 0.002 * rng.normal(size=(n, 6))
-    uv[1] += 0.003 * rng.normal(size=(n, 1)) + np.hypot(0.001, 0.002) * rng.normal(size=(n, 6))
+    apart = np.sqrt(3) * np.hypot(x[:, None] - x, y[:, None] - y)
+    near = sum(f * (1 + apart / l) * np.exp(-apart / l) for f, l in ((0.25, 30.0), (0.5, 120.0)))
+    near = np.where(chip[:, None] == chip, near, 0.0) + 0.25 * np.eye(6)
+    local = rng.normal(size=(2, n, 6)) @ np.linalg.cholesky(near).T
+    uv[0] += 0.004 * rng.normal(size=(n, 1)) + 0.002 * local[0]
+    uv[1] += 0.003 * rng.normal(size=(n, 1)) + 0.001 * local[1] + 0.002 * rng.normal(size=(n, 6))
     u, v = uv.reshape(2, -1)
     drawn_sky = SkyCoord(*_gnomonic().wcs_pix2world(u / 3600, v / 3600, 0), unit="deg")
     east, north = true.spherical_offsets_to(drawn_sky)
@@ -106,11 +116,14 @@ def _gnomonic():
 
 
 def test_what_all_stars_share_drops_out_of_differences(calibration, stars):
-    """Of two stars nearly at one pixel only the errors of each by itself are left."""
+    """Of two stars nearly at one pixel only the errors of each by itself are left.
+
+    They are a quarter of the local error; the rest is shared by neighbours.
+    """
     x, y = [100.0, 100.0 + 1e-6], [50.0, 50.0]
     at = sky_positions(calibration, x, y, 1, joint=True)
     difference = np.array([1.0, 0.0, -1.0, 0.0])
-    alone = 2 * (1e3 * 0.002) ** 2
+    alone = 2 * 0.25 * (1e3 * 0.002) ** 2
     assert difference @ at.joint @ difference == pytest.approx(alone, rel=1e-3)
     assert at.cov[0, 0, 0] > alone
 
@@ -152,7 +165,7 @@ def test_the_command_writes_what_python_gives(calibration, stars, tmp_path):
     for line in (
         "coefficients, with their covariance (correlated between stars)",
         "catalogue (the same for all stars)",
-        "unmodelled structure (of each star by itself)",
+        "unmodelled structure (correlated between stars over 30 to 120 pixels)",
         "centroids (of each star by itself)",
     ):
         assert line in done.out

@@ -17,6 +17,7 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
+from scipy.stats import t as student_t
 
 from bayesdist.app.results import Results, errors_of, margins_of
 from bayesdist.assess import Requirement
@@ -24,6 +25,7 @@ from bayesdist.assess.domain import EvaluationDomain
 from bayesdist.assess.statistics import field_statistic
 from bayesdist.diagnose.correlated import Discrepancy, DiscrepancyPriors
 from bayesdist.diagnose.correlated.functions import StructureFunctions
+from bayesdist.diagnose.correlated.priors import STRUCTURE_DOF
 from bayesdist.diagnose.correlated.structure import LENGTHS, UNLIKE
 from bayesdist.infer import OutlierMixture
 from bayesdist.model.grid import grid_pixels, mesh
@@ -36,7 +38,7 @@ from tests.infer.support import draw_prior
 from .places import one_thread
 
 ORDER, STARS = 3, 1500
-MOST = 3 * SIGMA  # amplitudes beyond are not looked for
+MOST = SIGMA  # the prior of amplitudes ends at the error of a star
 STATISTICS = ("rms", "p95", "max")
 FEW = 400  # draws of the likelihood
 MOST_SCATTER = 10.0  # in units of its prior median: scatters beyond are not looked for
@@ -51,8 +53,11 @@ EXACT = {
 }
 
 
-def half_cauchy(rng: np.random.Generator, median: float, most: float) -> float:
-    while (value := median * abs(rng.standard_cauchy())) > most:
+def half_t(
+    rng: np.random.Generator, median: float, most: float, dof: float = STRUCTURE_DOF
+) -> float:
+    scale = median / student_t(dof).ppf(0.75)
+    while (value := scale * abs(rng.standard_t(dof))) > most:
         pass
     return float(value)
 
@@ -105,20 +110,21 @@ def structure(rng: np.random.Generator) -> DrawnStructure:
     priors, size = DiscrepancyPriors(), float(fields.SIDE)
     functions = StructureFunctions.for_stars(ORDER, (size, size), STARS)
     length = float(rng.choice(LENGTHS))
-    of_terms = half_cauchy(rng, priors.higher_order, 3 * MOST)
-    sizes = np.full(2, half_cauchy(rng, priors.structure, MOST))
+    of_terms = half_t(rng, priors.higher_order, MOST)
+    sizes = np.full(2, half_t(rng, priors.structure, MOST))
     if rng.uniform() < UNLIKE:
-        # the rms of both is half-Cauchy, the logarithm of their ratio double exponential
+        # the rms of both is half-t, the logarithm of their ratio double exponential
         apart = np.exp(rng.laplace(size=1) * [0.5, -0.5])
         sizes *= apart / np.sqrt(np.mean(apart**2))
     waves = functions.finer_waves(rng)
     spread = np.sqrt(functions.spectrum(length))
+    finer = np.sqrt(functions.finer_spectrum(length, waves))
     coefficients = [
         np.concatenate(
             [
                 of_terms * functions.decline() * rng.standard_normal(functions.n_terms),
                 a * spread * rng.standard_normal(functions.n_sines),
-                a * np.sqrt(functions.finer(length)) * rng.standard_normal(2 * len(waves)),
+                a * np.tile(finer, 2) * rng.standard_normal(2 * len(waves)),
             ]
         )
         for a in sizes
@@ -161,7 +167,7 @@ def from_priors(seed: int, exposures: int = 1) -> Drawn:
     scatter, frames, config, columns = None, {}, order_config(ORDER), {}
     if exposures > 1:
         median = DiscrepancyPriors().exposure
-        scatter = half_cauchy(rng, median, MOST_SCATTER * median)
+        scatter = half_t(rng, median, MOST_SCATTER * median, dof=1.0)
         frames, code = pointings(rng, exposures), np.arange(STARS) % exposures
         frames["e00"] = Frame((0.0, 0.0), 0.0)  # the polynomials are along its axes
         uv = deviating(uv, scatter * rng.standard_normal((exposures, 3))[code])

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from bayesdist.diagnose.score.exposures import exposure_test
+from bayesdist.diagnose.score.exposures import exposure_tests
 from bayesdist.diagnose.score.projection import Projection, projection_of
 from bayesdist.diagnose.score.questions import CONSTANT, Products, Question
 from bayesdist.diagnose.score.regressor_tests import regressor_tests
@@ -239,7 +239,7 @@ def test_deviations_of_exposures_are_those_of_dense_matrices(case, shared):
     if shared:
         table = table.with_columns(star=np.arange(len(table)) % (len(table) // 3))
     fit = scene.solve(model, table)
-    found = exposure_test(projected(table, fit))
+    found = exposure_tests(projected(table, fit), fit.mean, GaussianPriors.none(model))[0]
     dense = Dense(table, fit)
     w = model.predict(fit.mean, table.x, table.y, **columns_of(table)) - model.origin
     shapes = {
@@ -284,7 +284,8 @@ def test_deviations_of_exposures_do_not_depend_on_the_unit_of_positions():
         origin = (unit * model.origin[0], unit * model.origin[1])
         part = table.with_columns(**there)
         fit = scene.solve(replace(model, origin=origin), part)
-        p.append(exposure_test(projected(part, fit)).p_value)
+        none = GaussianPriors.none(fit.model)
+        p.append(exposure_tests(projected(part, fit), fit.mean, none)[0].p_value)
     assert p[1] == pytest.approx(p[0], rel=1e-6)
 
 

@@ -71,16 +71,21 @@ def test_every_question_has_a_row_where_the_data_can_be_asked():
     always |= {"pixel phase"}
     always |= {"repeating pattern"}
     always |= {"noise by position", "noise by magnitude", "noise by axis"}
+    always |= {"skewness by position", "skewness of a patch", "correlation by position"}
+    always |= {"two cores"}
     assert set(one.tests(1)) == always
-    several = {"exposures", "noise by exposure"}
+    of_fields = {"second order of exposures", "fields of exposures"}
+    several = {"exposures", "noise by exposure"} | of_fields
     assert set(Scene(1500, 2, "shift", 5).tests(1)) == always | several | {
         "drift",
         "magnitude in time",
     }
     timed = {"drift", "curvature in time", "magnitude in time"}
+    dates = Scene(1500, 2, "shift", 10, time=TIME).tests(1)
+    assert set(dates) == always | several | timed | {"exposures in time"}
     assert set(Scene(1500, 2, "shift", 5, time=TIME).tests(1)) == always | several | timed
     # frames that fit all linear terms leave no deviations, and no drift
-    assert set(Scene(1500, 2, "affine", 5).tests(1)) == always | {
+    assert set(Scene(1500, 2, "affine", 5).tests(1)) == always | of_fields | {
         "noise by exposure",
         "magnitude in time",
     }
@@ -111,29 +116,47 @@ def test_every_test_says_which_correlated_errors_hold_it():
     held = {name: one.held_by for name, one in found.items() if one.held_by}
     assert held == {
         "order 3": "structure", "order 4": "structure", "exposures": "exposures",
+        "second order of exposures": "second order", "fields of exposures": "exposure fields",
         "curvature in time": "curvature", "noise by position": "noise",
         "noise by magnitude": "noise", "noise by exposure": "noise", "noise by axis": "noise",
     }  # fmt: skip
 
 
 @pytest.mark.parametrize(
-    ("scatter", "structure", "held"),
+    ("linear", "structure", "fields", "held"),
     [
-        ((), (), {"noise"}),
-        ((), ("a field",), {"noise", "structure"}),
-        (("shape",), (), {"noise", "exposures"}),
-        (("curvature",), (), {"noise", "curvature"}),
+        (None, (), {}, {"noise"}),
+        (None, ("a field",), {}, {"noise", "structure"}),
+        ({"scatter": {"shape": 0}}, (), {}, {"noise", "exposures"}),
+        # half of what was found, 0.5 pixels, has to be in the budget
+        ({"scatter": {"curvature": 0}, "bend": 0.26}, (), {}, {"noise", "curvature"}),
+        ({"scatter": {"curvature": 0}, "bend": 0.24}, (), {}, {"noise"}),
+        ({"scatter": {}, "correlation_time": 2.0}, (), {}, {"noise", "curvature", "time"}),
+        (None, (), {"second_order": 0.26, "field": 0.24}, {"noise", "second order"}),
+        (None, (), {"second_order": 0.24, "field": 0.26}, {"noise", "exposure fields"}),
     ],
 )
-def test_verdicts_stand_where_correlated_errors_hold_a_finding(scatter, structure, held):
-    linear = SimpleNamespace(scatter=dict.fromkeys(scatter)) if scatter else None
-    correlated = SimpleNamespace(linear=linear, structure=structure)
-    for kind in ("", "noise", "structure", "exposures", "curvature"):
+def test_verdicts_stand_where_correlated_errors_hold_a_finding(linear, structure, fields, held):
+    if linear is not None:
+        linear = SimpleNamespace(**{"bend": 0.0, "correlation_time": 0.0} | linear)
+    correlated = SimpleNamespace(
+        linear=linear, structure=structure, facts={"exposure_fields": fields}
+    )
+    kinds = ("", "noise", "structure", "exposures", "curvature", "time")
+    for kind in (*kinds, "second order", "exposure fields"):
         one = outcome(0.0)
         tests = corrected([replace(one, family=replace(one.family, held_by=kind))])
         [alone], [beside] = score_checks(tests), score_checks(tests, correlated)
         assert alone.doubt
         assert bool(beside.doubt) == (kind not in held)
+
+
+def test_a_curvature_does_not_hold_deviations_that_wander():
+    linear = SimpleNamespace(scatter={"curvature": 0}, bend=0.5, correlation_time=0.0)
+    correlated = SimpleNamespace(linear=linear, structure=(), facts={})
+    families = [Family(kind, kind, "", "", held_by=kind) for kind in ("curvature", "time")]
+    tests = corrected([replace(outcome(0.0), family=family) for family in families])
+    assert all(row.doubt for row in score_checks(tests, correlated))
 
 
 def test_tests_that_find_nothing_are_one_row():

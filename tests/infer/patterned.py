@@ -63,9 +63,11 @@ def patterned(
     return Patterned(model, theta, moved(matches, pattern(matches.x, matches.y)), pattern)
 
 
-def mode_of(matches: Matches, model: DistortionModel) -> tuple[Posterior, LinearFit]:
+def mode_of(
+    matches: Matches, model: DistortionModel, mixture: OutlierMixture | None = None
+) -> tuple[Posterior, LinearFit]:
     """A posterior that is its mode: all that the robust covariance wants to know of it."""
-    target, fit = target_of(model, load(model, matches), OutlierMixture())
+    target, fit = target_of(model, load(model, matches), mixture or OutlierMixture())
     psi = starting_point(target, fit)
     for _ in range(60):
         value, gradient, matrix = target.expand(psi)

@@ -9,7 +9,13 @@ from pydantic import Field, PositiveFloat, field_validator
 from pydantic_core import PydanticCustomError
 
 from bayesdist.app.config.section import Epoch, Section, Unit
-from bayesdist.assess.terms.correlated import DEVIATIONS, STRUCTURE, STRUCTURE_IN_FIT
+from bayesdist.assess.terms.correlated import (
+    DEVIATIONS,
+    FIELDS,
+    FIELDS_IN_FIT,
+    STRUCTURE,
+    STRUCTURE_IN_FIT,
+)
 from bayesdist.assess.terms.forms import GIVEN
 from bayesdist.assess.terms.given import (
     TERM_KINDS,
@@ -26,7 +32,8 @@ GridPoints = Annotated[int, Field(ge=2, le=10_000)]  # more than a detector has 
 # rows of every budget, and what its totals are called
 MEASURED_TERMS = (
     *(COEFFICIENTS, TIME_DEPENDENCE, EXPOSURE_FRAME),
-    *("total", "model", STRUCTURE, STRUCTURE_IN_FIT, DEVIATIONS, "look-up tables"),
+    *("total", "model", STRUCTURE, STRUCTURE_IN_FIT, DEVIATIONS, FIELDS, FIELDS_IN_FIT),
+    "look-up tables",
 )
 
 

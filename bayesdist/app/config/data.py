@@ -50,6 +50,7 @@ class Data(Section):
     epoch: Epoch | str | None = None
     catalogue_epoch: Epoch | None = None
     not_finite: Literal["refuse", "reject"] = "refuse"
+    same_position: Literal["one_star", "separate_stars"] = "one_star"
     simulated: bool = False
 
     one_array: ClassVar[bool] = False  # matches of this format are of one chip

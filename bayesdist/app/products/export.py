@@ -68,7 +68,8 @@ def export(
         tables = published_tables(data.fitted.tables, held=held)
         number, solutions = config.chips()[0].number, {data.matched.filter: product.solution}
         products += write_files(release, number, base, folder, solutions, tables)
-    calibration = replace(product.calibration, further=further_errors(budget))
+    facts = None if found is None or found.correlated is None else found.correlated.facts
+    calibration = replace(product.calibration, further=further_errors(budget, facts))
     product = replace(product, calibration=calibration)
     for key, files in made_files(product, config).items():
         left_out = _left_out(key, product)

@@ -14,7 +14,7 @@ from bayesdist.app.kinds.fit_data import FitData
 from bayesdist.app.kinds.fitted import Fitted
 from bayesdist.assess.budget.budget import TOTAL
 from bayesdist.assess.model import with_diagnosed_errors
-from bayesdist.assess.terms.correlated import DEVIATIONS, STRUCTURE_IN_FIT
+from bayesdist.assess.terms.correlated import DEVIATIONS, STRUCTURE, STRUCTURE_IN_FIT
 from bayesdist.assess.terms.forms import PRODUCT
 from bayesdist.assess.terms.parameters import ABERRATION, CATALOGUE, MOTIONS
 from bayesdist.assess.terms.solution import COEFFICIENTS, EXPOSURE_FRAME, TIME_DEPENDENCE
@@ -48,8 +48,15 @@ class ProductInput:
     aligned: bool = False  # the user of a file fits shift and rotation of an exposure
 
 
-def further_errors(budget: Sequence[Mapping[str, Any]]) -> tuple[FurtherError, ...]:
-    """Rows of a budget of errors that the covariance of the exported solution does not hold."""
+def further_errors(
+    budget: Sequence[Mapping[str, Any]], discrepancy: Mapping[str, Any] | None = None
+) -> tuple[FurtherError, ...]:
+    """Rows of a budget of errors that the covariance of the exported solution does not hold.
+
+    `discrepancy` are the facts of the estimated one, by which its structure is correlated between
+    positions.
+    """
+    correlation = tuple((discrepancy or {}).get("structure_correlation", ()))
     return tuple(
         FurtherError(
             str(row["name"]),
@@ -57,6 +64,9 @@ def further_errors(budget: Sequence[Mapping[str, Any]]) -> tuple[FurtherError, .
             float(row["u"]),
             float(row["v"]),
             str(row.get("source", "")),
+            tuple((float(part), float(length)) for part, length in correlation)
+            if row["name"] == STRUCTURE
+            else (),
         )
         for row in budget
         if row["name"] not in IN_COVARIANCE and row["kind"] not in (PRODUCT, TOTAL)
@@ -68,17 +78,19 @@ def with_facts_of_run(
     config: Config,
     tables: tuple[LookupTable, ...],
     budget: Sequence[Mapping[str, Any]],
+    discrepancy: Mapping[str, Any] | None = None,
 ) -> Calibration:
     """Calibration of the solution of a run, with all else that the run knows.
 
     That is the size of a pixel, the look-up tables, and the rows of the budget that the covariance
-    does not hold.
+    does not hold, correlated between positions as the facts of the `discrepancy` say.
     """
     mas, unit = config.detector.scale_mas, calibration.unit
     if unit != "pix" and mas is not None:
         scale = mas / (1000 * ARCSEC[unit])
         calibration = replace(calibration, scale=scale, scale_from="detector.scale_mas")
-    return replace(calibration, pixel_mas=mas, before=tables, further=further_errors(budget))
+    further = further_errors(budget, discrepancy)
+    return replace(calibration, pixel_mas=mas, before=tables, further=further)
 
 
 def product_input(solution: Solution, data: FitData, config: Config, source: str) -> ProductInput:

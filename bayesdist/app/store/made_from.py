@@ -59,8 +59,8 @@ STAGES = {
     "match": Stage(revision=2),
     "fit": Stage(revision=4),
     "sample": Stage(revision=3, checkpoints=("chain-*.h5",)),
-    "diagnose": Stage(revision=6),
-    "evaluate": Stage(revision=3),
+    "diagnose": Stage(revision=7),
+    "evaluate": Stage(revision=4),
     "export": Stage(),
     "report": Stage(),
 }

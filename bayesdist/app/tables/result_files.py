@@ -84,7 +84,8 @@ def load_diagnostics(run: RunDirectory, fit: LinearFit, posterior: Posterior) ->
 def _row(test: ScoreTest) -> dict[str, Any]:
     """A test as a row of summary.json."""
     row = asdict(test)
-    del row["held_by"]
+    for key in ("held_by", "group", "doubt"):
+        del row[key]
     # JSON has no infinity: what no effect can show has no smallest size
     return row | {"smallest": test.smallest if np.isfinite(test.smallest) else None}
 

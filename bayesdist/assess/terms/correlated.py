@@ -28,6 +28,8 @@ from bayesdist.utils.arrays import Float, Int
 STRUCTURE = "unmodelled structure"
 STRUCTURE_IN_FIT = "unmodelled structure in coefficients"
 DEVIATIONS = "unmodelled exposure-to-exposure variation"
+FIELDS = "unmodelled fields of exposures"
+FIELDS_IN_FIT = "unmodelled fields of exposures in coefficients"
 SOURCE = f"{MEASURED}, with a prior on its size"
 
 
@@ -115,6 +117,50 @@ class Deviations:
             more=more,
             pools=tuple(pools),
         )
+
+
+@dataclass(frozen=True, eq=False)
+class FieldsOfExposures:
+    """Error by second-order terms and smooth fields that differ from exposure to exposure.
+
+    The parameters follow their mean over the exposures.  A position in a single exposure that is
+    yet to come has the field of that exposure besides.
+    """
+
+    discrepancy: Discrepancy  # with `fields`
+    single: bool = False  # as of `Deviations`
+    frames: bool = False  # as of `StructureErrors`
+
+    @property
+    def rows(self) -> tuple[Row, ...]:
+        """The part in the parameters, and with `single` that of the exposure."""
+        in_fit = Row(FIELDS_IN_FIT, source=SOURCE)
+        return (in_fit, Row(FIELDS, source=SOURCE)) if self.single else (in_fit,)
+
+    def draw(self, n: int, rng: np.random.Generator) -> ErrorDraws:
+        """Draws in random order, as they have nothing to do with other terms."""
+        found = self.discrepancy
+        fields = required(found.fields, "no fields of exposures were estimated")
+        theta = _moved(found, fields.theta[rng.integers(len(fields.theta), size=n)], self.frames)
+        fit = Polynomials(self.rows[0], found.model, found.mean, theta, frames=self.frames)
+        if not self.single:
+            return fit
+        coefficients: dict[int | None, NDArray[np.floating]] = {
+            chip.number: fields.coefficients(chip, rng) for chip in found.model.chips
+        }
+        waves = {chip.number: fields.functions(chip).finer_waves(rng) for chip in found.model.chips}
+        own = Functions(self.rows[1], coefficients, partial(_of_exposure, found, waves), n)
+        return Together((fit, own))
+
+
+def _of_exposure(
+    discrepancy: Discrepancy, waves: dict[int, Float], number: int, x: Float, y: Float
+) -> NDArray[np.floating]:
+    """Functions (N, m) of the field of an exposure on a chip."""
+    model = discrepancy.model
+    fields = required(discrepancy.fields, "no fields of exposures were estimated")
+    chip = model.chips[model.chip_code(number)]
+    return fields.evaluate(chip, waves[number], *model.basis(number).scaled(x, y))
 
 
 def _bending(

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from bayesdist.data.magnitude_errors import no_magnitudes
+from bayesdist.data.repeated_stars import check_same_position
 from bayesdist.data.tables.checks import check_not_finite
 from bayesdist.errors import InputError
 from bayesdist.utils.quantities import Number, direction_in, year_of
@@ -48,11 +49,15 @@ class ReadOptions:
     not_finite : {'refuse', 'reject'}, optional
         Rows with NaN or infinity are an error, or left out and counted.  Rows with missing (masked)
         values are always left out and counted, in `rejected`.
+    same_position : {'one_star', 'separate_stars'}, optional
+        Meaning of rows with the same reference position, where the table has no column `star`: they
+        are measurements of one star, which share the error of its position, or of separate stars
+        with independent errors.  Catalogue positions are compared before proper motions.
 
     Raises
     ------
     InputError
-        For `sigma` or `not_finite` that are none of these.
+        For `sigma`, `not_finite` or `same_position` that are none of these.
     """
 
     columns: Mapping[str, str] | None = None
@@ -64,10 +69,12 @@ class ReadOptions:
     catalogue_epoch: Any = None  # the same
     chips: Mapping[str, int] | None = None
     not_finite: str = "refuse"
+    same_position: str = "one_star"
 
     def __post_init__(self) -> None:
         check_sigma(self.sigma)
         check_not_finite(self.not_finite)
+        check_same_position(self.same_position)
         if self.tangent_point is not None:
             point = direction_in(self.tangent_point, "tangent_point", where="data.tangent_point")
             object.__setattr__(self, "tangent_point", point)

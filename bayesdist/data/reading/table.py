@@ -13,6 +13,7 @@ from astropy.time import Time
 from bayesdist.data.columns.output import header_arguments
 from bayesdist.data.reading.columns import columns_read, is_on_sky, match_columns
 from bayesdist.data.reading.options import ReadOptions
+from bayesdist.data.repeated_stars import star_codes
 from bayesdist.data.sky.positions import MOTIONS, SPARED, sky_columns
 from bayesdist.data.tables.checks import absent, row_number, without_missing
 from bayesdist.data.tables.column import Quantities
@@ -101,7 +102,21 @@ def _without_none(column: Any) -> Any:
 def sky_positions(
     table: Table, columns: Mapping[str, str] | None, *, source: str
 ) -> tuple[Float, Float] | None:
-    """Degrees (N,) of ra and of dec where the reference positions are on the sky, else None."""
+    """Degrees (n,) of ra and of dec in the rows that have both; None for positions u, v."""
+    sky = catalogue_positions(table, columns, source=source)
+    if sky is None:
+        return None
+    there = np.isfinite(sky[0])
+    return sky[0][there], sky[1][there]
+
+
+def catalogue_positions(
+    table: Table, columns: Mapping[str, str] | None, *, source: str
+) -> tuple[Float, Float] | None:
+    """Degrees (N,) of ra and of dec as they stand in a table, NaN where a row lacks one.
+
+    None if the reference positions are u, v.
+    """
     table = with_sky_columns(table)
     found = find_columns(table.colnames, columns, ALIASES, source=source, pairs=PAIRS)
     if not is_on_sky(table.colnames, found, columns, source):
@@ -109,8 +124,10 @@ def sky_positions(
     stay = ~(
         absent(table[found["ra"]], not_finite=True) | absent(table[found["dec"]], not_finite=True)
     )
-    table = table if stay.all() else table[stay]
-    return sky_columns(Quantities(table, found, source))
+    out = np.full((2, len(table)), np.nan)
+    if stay.any():
+        out[:, stay] = sky_columns(Quantities(table if stay.all() else table[stay], found, source))
+    return out[0], out[1]
 
 
 def with_sky_columns(table: Table) -> Table:
@@ -150,6 +167,7 @@ def match_arguments(
     *,
     source: str = "table",
     exposure_name: str | None = None,
+    identify: bool = True,
 ) -> dict[str, Any]:
     """Arguments of `Matches` from a table's columns.
 
@@ -162,6 +180,9 @@ def match_arguments(
         File, for errors.
     exposure_name : str, optional
         Name of the one exposure, where the table has no column of them.
+    identify : bool, optional
+        Whether stars are recognised by equal reference positions if there is no column of them;
+        False for a part of the data, whose stars may be in the other parts too.
 
     Returns
     -------
@@ -198,7 +219,14 @@ def match_arguments(
         def place(index: int) -> str:
             return row_number(int(rows[index]))
 
-    out = match_columns(Quantities(table, found, source, place), options)
+    quantities = Quantities(table, found, source, place)
+    out = match_columns(quantities, options)
+    if identify and "star" not in out:
+        # as in the catalogue: motions bring one star to another place in each exposure
+        first, second = sky_columns(quantities) if "ra" in found else (out["u"], out["v"])
+        star, note = star_codes(first, second, options.same_position)
+        if star is not None:
+            out |= {"star": star, "notes": (*out.get("notes", ()), note)}
     if "ra" not in found:
         out |= header_arguments(table.meta, out["unit"], source=source)
     if exposure_name is not None:

@@ -8,7 +8,7 @@ the prior decides, as it must in any extrapolation.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import reduce
 from itertools import product
 
@@ -16,12 +16,21 @@ import numpy as np
 import scipy.linalg
 from numpy.typing import NDArray
 
+from bayesdist.diagnose.correlated.exposure_time import (
+    CORRELATION_TIMES,
+    SUSPECTED,
+    UNCORRELATED,
+    correlation_p,
+    correlation_root,
+)
 from bayesdist.diagnose.correlated.information import GroupCells, Information
-from bayesdist.diagnose.correlated.priors import DiscrepancyPriors, log_half_cauchy, log_widths
+from bayesdist.diagnose.correlated.priors import DiscrepancyPriors, log_half_t, log_widths
 from bayesdist.diagnose.efficient import EfficientScore
+from bayesdist.infer.exposures.hierarchy import MOST_OUTLYING
+from bayesdist.infer.exposures.scatter import OUTLYING, OUTLYING_FRACTION
 from bayesdist.model import DistortionModel, Groups
 from bayesdist.model.frames import LINEAR_MATRICES
-from bayesdist.utils.arrays import Float, Int
+from bayesdist.utils.arrays import Bool, Float, Int
 
 # deviations of an exposure that scatter together, and the frames that fit them already
 KINDS = {
@@ -42,7 +51,13 @@ MAX_EXPOSURES = 40
 # steps in each amplitude, by the number of scatters: first to find where the density is, then only
 # there
 COARSE, REFINED = (12, 8, 6, 5), (30, 18, 11, 6)
-RANGE = 10.0  # range of amplitudes about the prior's median and the resolution of the data
+WIDE = 100.0  # times the amplitudes that are expected: as good as free
+MIN_OF_OTHERS = 5  # exposures: of fewer, none can be told from the others
+# amplitudes range from this fraction of the prior's median or of what the data resolve, the smaller
+LEAST = 1 / 3
+# up to multiples of the median and of what the data resolve, the larger
+MOST, MOST_RESOLVED = 100.0, 10.0
+MOST_CURVATURE = 10.0  # of the median: few dates say nothing of it
 NEGLIGIBLE = 1e-3  # of the density, below the largest of an amplitude
 
 
@@ -63,12 +78,21 @@ class LinearDeviations:
     # deviations of each exposure: of 'shift', 'rotation', 'scale' and 'shear'
     kinds: tuple[str, ...] = ()
     size: float = 1.0  # half the longer side of a chip, in the unit of u, v: that of a shift of 1
+    # codes of the exposures that went wrong, which are no part of the scatter
+    outlying: tuple[int, ...] = ()
+    # median correlation time of the deviations in years; 0 if they are independent
+    correlation_time: float = 0.0
+    # rms of the curvature over the detector and the dates beyond lines in time, both axes together
+    bend: float = 0.0
 
     @property
     def facts(self) -> dict[str, object]:
         """Number of exposures and median scatters, for summaries."""
         scatter = {name: float(np.median(values)) for name, values in self.scatter.items()}
-        return {"exposures": self.n_exposures, "scatter": scatter}
+        out: dict[str, object] = {"exposures": self.n_exposures, "scatter": scatter}
+        if self.correlation_time > 0:
+            out["correlation_years"] = self.correlation_time
+        return out
 
     def polynomials(self, epoch: float | None, chip: int) -> Float:
         """Coefficients (n, 2, K) on a chip of the curvature alone, at an epoch."""
@@ -113,6 +137,9 @@ class DeviationColumns:
     n_exposures: int
     middle: float  # zero of time; NaN without terms
     size: float  # half the longer side of a chip, in the unit of u, v
+    # code, epoch (n_exposures,): of each exposure, and its date in decimal years
+    code: Int
+    epoch: Float
 
     def __len__(self) -> int:
         return len(self.scatter)
@@ -179,6 +206,8 @@ def deviation_columns(
         n_exposures=n_exposures,
         middle=float(np.average(groups.epoch, weights=counts)) if terms else np.nan,
         size=model.pixel_size(theta) * max(max(c.size) for c in model.chips) / 2,
+        code=distinct[:, 0].astype(np.int64),
+        epoch=distinct[:, 1],
     )
 
 
@@ -256,57 +285,180 @@ def deviation_draws(
         known = np.diag(S)[index == k]
         known = known[known > 1e-8 * max(float(known.max()), 1e-300)]
         resolved = 1 / np.sqrt(np.median(known)) if known.size else medians[name]
-        low = min(medians[name], resolved) / RANGE
-        high = RANGE * max(medians[name], resolved if resolved < 1e-2 else 0.0)
+        low = LEAST * min(medians[name], resolved)
+        high = (MOST_CURVATURE if name == CURVATURE else MOST) * medians[name]
+        high = max(high, MOST_RESOLVED * resolved if resolved < 1e-2 else 0.0)
         grids.append(np.geomspace(low, high, COARSE[len(names) - 1]))
     values, vectors = np.linalg.eigh(S)
     S = (vectors * np.maximum(values, 0.0)) @ vectors.T
+    first = np.array([grid[len(grid) // 2] for grid in grids])
+    loose = _outlying(columns, S, score, index, first)
+    roots = _roots(columns, S, score, index, loose, first)
+    starts = [root.started(S, score) for root in roots]
 
-    def conditional(amplitude: Float) -> tuple[Float, Float, Float]:
+    def conditional(k: int, amplitude: Float) -> tuple[Float, Float, Float]:
         """Scales of the coefficients, factor of their scaled precision, and the scaled score."""
-        spread = amplitude[index]
-        scaled = S * np.outer(spread, spread) + np.eye(total)
+        spread = np.where(loose > 0, 1.0, amplitude[index])
+        information, pull = starts[k]
+        scaled = information * np.outer(spread, spread) + np.eye(total)
         factor = scipy.linalg.cholesky(scaled, lower=True, check_finite=False)
-        return spread, factor, scipy.linalg.solve_triangular(factor, spread * score, lower=True)
+        return spread, factor, scipy.linalg.solve_triangular(factor, spread * pull, lower=True)
 
     def weights(grids: Sequence[Float]) -> Float:
-        """Posterior weights of all combinations, the largest 1."""
+        """Posterior weights of all correlation times and combinations, the largest 1."""
         widths = np.ix_(*(np.exp(log_widths(g)) for g in grids))
-        density = np.empty([len(g) for g in grids])
-        for at, amplitude in zip(np.ndindex(density.shape), product(*grids), strict=True):
-            _, factor, z = conditional(np.array(amplitude))
-            density[at] = 0.5 * z @ z - np.log(np.diag(factor)).sum()
-            density[at] += sum(
-                log_half_cauchy(a, medians[name]) for a, name in zip(amplitude, names, strict=True)
-            )
+        density = np.empty([len(roots), *(len(g) for g in grids)])
+        for k, root in enumerate(roots):
+            for at, amplitude in zip(np.ndindex(density.shape[1:]), product(*grids), strict=True):
+                _, factor, z = conditional(k, np.array(amplitude))
+                log = 0.5 * z @ z - np.log(np.diag(factor)).sum() + np.log(root.prior)
+                density[(k, *at)] = log + sum(
+                    log_half_t(a, medians[name]) for a, name in zip(amplitude, names, strict=True)
+                )
         weight = np.exp(density - density.max()) * reduce(np.multiply, widths)
         return np.asarray(weight / weight.max())
 
-    grids = _where_it_counts(grids, weights(grids))
+    grids = _where_it_counts(grids, weights(grids).max(axis=0))
     weight = weights(grids)
     counts = rng.multinomial(n, (weight / weight.sum()).ravel())
-    drawn, sizes = [], []
-    for amplitude, m in zip(product(*grids), counts, strict=True):
+    drawn, sizes, times = [], [], []
+    combinations = product(range(len(roots)), product(*grids))
+    for (k, amplitude), m in zip(combinations, counts, strict=True):
         if m:
-            spread, factor, z = conditional(np.array(amplitude))
+            spread, factor, z = conditional(k, np.array(amplitude))
             z = z[:, None] + rng.standard_normal((total, m))
             z = scipy.linalg.solve_triangular(factor, z, trans=1, lower=True)
-            drawn.append(spread * z.T)
+            drawn.append((roots[k].matrix @ (spread[:, None] * z)).T)
             sizes.append(np.tile(amplitude, (m, 1)))
+            times.append(np.full(m, roots[k].time))
     order = rng.permutation(n)
     coefficients, amplitudes = np.concatenate(drawn)[order], np.concatenate(sizes)[order]
+    per = columns.n_of_exposures // max(columns.n_exposures, 1)
+    wrong = loose[: columns.n_of_exposures].reshape(columns.n_exposures, -1).any(axis=1)
     return LinearDeviations(
         model=columns.model,
         # the fit absorbs a deviation; the truth lies on the other side
         theta=-coefficients @ taken.T,
         terms=columns.terms,
-        curvature=coefficients[:, columns.n_of_exposures :] * columns.size,
+        curvature=(curvature := coefficients[:, columns.n_of_exposures :] * columns.size),
         epoch=columns.middle,
         scatter={name: amplitudes[:, k] for k, name in enumerate(names)},
         n_exposures=columns.n_exposures,
         kinds=columns.kinds,
         size=columns.size,
+        outlying=tuple(int(code) for code in columns.code[wrong]) if per else (),
+        correlation_time=float(np.median(np.concatenate(times))),
+        bend=_bend(columns, curvature),
     )
+
+
+def _bend(columns: DeviationColumns, curvature: Float) -> float:
+    """Rms of curvatures (n, terms) over the detector and the dates, beyond lines in time."""
+    if not columns.terms:
+        return 0.0
+    years = columns.epoch - columns.middle
+    square = years**2
+    design = np.column_stack([np.ones(len(years)), years])
+    square = square - design @ np.linalg.lstsq(design, square)[0]
+    mean_square = columns.model.basis().mean_squares
+    area = np.array([mean_square[term] for _, _, term in columns.terms])
+    area = area / len({chip for chip, _, _ in columns.terms})
+    return float(0.5 * np.sqrt(np.mean(square**2) * np.mean(curvature**2 @ area)))
+
+
+@dataclass(frozen=True, eq=False)
+class _Root:
+    """Coefficients as combinations of independent ones, for one correlation time."""
+
+    time: float  # in years; 0 for independent exposures
+    prior: float  # probability
+    matrix: Float  # (n, n), but for the scales of what is not loose
+
+    def started(self, S: Float, score: Float) -> tuple[Float, Float]:
+        """Information and score of the independent coefficients."""
+        return self.matrix.T @ S @ self.matrix, self.matrix.T @ score
+
+
+def _roots(
+    columns: DeviationColumns, S: Float, score: Float, index: Int, loose: Float, scale: Float
+) -> list[_Root]:
+    """Correlation times of the deviations; of independent ones alone if nothing speaks for more.
+
+    Only a drift depends on them.
+    """
+    n, E = columns.n_of_exposures, columns.n_exposures
+    own = np.where(loose > 0, loose, 1.0)
+    independent = _Root(0.0, 1.0, np.diag(own))
+    if not n or columns.model.time is None:
+        return [independent]
+    mean, _ = _given(S, score, np.where(loose > 0, loose, WIDE * scale[index]))
+    wrong: Bool = np.asarray(loose[:n].reshape(E, -1).any(axis=1))
+    typical = mean[:n].reshape(E, -1)[~wrong]
+    p, _ = correlation_p(typical, columns.epoch[~wrong], columns.model.time.breaks)
+    if p > SUSPECTED:
+        return [independent]
+    out = [replace(independent, prior=UNCORRELATED)]
+    for fraction in CORRELATION_TIMES:
+        time = float(fraction * np.ptp(columns.epoch))
+        matrix = np.diag(own)
+        root = correlation_root(columns.epoch, time, np.logical_not(wrong))
+        matrix[:n, :n] = own[:n, None] * np.kron(root, np.eye(n // E))
+        out.append(_Root(time, (1 - UNCORRELATED) / len(CORRELATION_TIMES), matrix))
+    return out
+
+
+def _given(S: Float, score: Float, spread: Float) -> tuple[Float, Float]:
+    """Mean (n,) and covariance (n, n) of coefficients with these prior standard deviations."""
+    scaled = S * np.outer(spread, spread) + np.eye(len(S))
+    inverse = scipy.linalg.inv(scaled) * np.outer(spread, spread)
+    return inverse @ score, inverse
+
+
+def _outlying(columns: DeviationColumns, S: Float, score: Float, index: Int, scale: Float) -> Float:
+    """Prior standard deviations (n,) of exposures that went wrong; 0 for all others.
+
+    They are set aside one by one, the worst first, by the odds of ten times the scatter of the
+    others (`infer.exposures.scatter`); none are where they would be more than a fifth.
+    """
+    total, E = len(S), columns.n_exposures
+    out = np.zeros(total)
+    per = columns.n_of_exposures // max(E, 1)
+    if E < MIN_OF_OTHERS or not per:
+        return out
+    kind, which = index[:per], np.arange(E * per).reshape(E, per)
+    while (out[which].any(axis=1)).sum() <= MOST_OUTLYING * E:
+        tight: Bool = np.logical_not(out[which].any(axis=1))
+        spread = np.where(out > 0, out, WIDE * scale[index])
+        mean, _ = _given(S, score, spread)
+        b = mean[which] - np.median(mean[which][tight], axis=0)
+        # an exposure that went wrong would raise a scatter that is not robust, and excuse itself
+        robust = (1.4826 * np.median(np.abs(b[tight]), axis=0)) ** 2
+        sizes = np.sqrt([np.mean(robust[kind == k]) for k in kind])
+        spread[which[tight]] = np.maximum(sizes, 1e-2 * scale[kind])
+        mean, cov = _given(S, score, spread)
+        squares = (mean**2 + np.diag(cov))[which]
+        odds = np.full(E, -np.inf)
+        for e in np.flatnonzero(tight):
+            rows = which[e]
+            inverse = np.linalg.inv(cov[np.ix_(rows, rows)])
+            information = inverse - np.diag(spread[rows] ** -2.0)
+            pull = inverse @ mean[rows]
+            others = np.logical_and(tight, np.arange(E) != e)
+            rest = np.array([np.mean(squares[others][:, kind == k]) for k in kind])
+            evidence = []
+            for times in (1.0, OUTLYING):
+                precision = 1 / (times**2 * rest)
+                values = np.linalg.eigvalsh(information / np.sqrt(np.outer(precision, precision)))
+                fit = pull @ np.linalg.solve(information + np.diag(precision), pull)
+                evidence.append(0.5 * (fit - np.log1p(np.maximum(values, 0.0)).sum()))
+            odds[e] = evidence[1] - evidence[0]
+        odds += np.log(OUTLYING_FRACTION / (1 - OUTLYING_FRACTION))
+        worst = int(np.argmax(odds))
+        if odds[worst] <= 0:
+            return out
+        size = np.array([np.sqrt(np.mean(b[worst, kind == k] ** 2)) for k in kind])
+        out[which[worst]] = np.maximum(size, OUTLYING * spread[which[worst]])
+    return np.zeros(total)
 
 
 def _where_it_counts(grids: Sequence[Float], weight: Float) -> list[Float]:

@@ -4,13 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from functools import reduce
+from functools import partial, reduce
 from operator import add
 
 import numpy as np
 
 from bayesdist.data.matches import Matches
+from bayesdist.data.repeated_stars import error_codes
 from bayesdist.diagnose.correlated.deviations import MAX_EXPOSURES, linear_deviations
+from bayesdist.diagnose.correlated.exposure_fields import detection_scores, exposure_fields
+from bayesdist.diagnose.correlated.exposure_time import correlated_hierarchy
 from bayesdist.diagnose.correlated.functions import StructureFunctions
 from bayesdist.diagnose.correlated.information import (
     CellSums,
@@ -18,12 +21,20 @@ from bayesdist.diagnose.correlated.information import (
     cell_sums,
     cells_per_side,
 )
-from bayesdist.diagnose.correlated.neighbours import SharedVariance, shared_variances
+from bayesdist.diagnose.correlated.neighbours import (
+    NeighbourScores,
+    SharedVariance,
+    neighbour_scores,
+)
 from bayesdist.diagnose.correlated.noise import not_narrower, score_excess
 from bayesdist.diagnose.correlated.priors import DiscrepancyPriors
-from bayesdist.diagnose.correlated.result import ChipStructure, Discrepancy
+from bayesdist.diagnose.correlated.result import (
+    ChipStructure,
+    Discrepancy,
+    structure_correlation,
+)
 from bayesdist.diagnose.correlated.shared_stars import shared_stars
-from bayesdist.diagnose.correlated.structure import structure_posterior
+from bayesdist.diagnose.correlated.structure import Structure, structure_posterior
 from bayesdist.diagnose.efficient import EfficientScore
 from bayesdist.infer.equations.priors import GaussianPriors
 from bayesdist.infer.equations.scaled import one_thread
@@ -38,6 +49,7 @@ from bayesdist.model.grid import cell_index
 from bayesdist.utils.arrays import Float
 
 DRAWS = 2000
+RESOLVED = 50  # draws of what the functions resolve, before neighbouring stars are compared
 
 
 @one_thread
@@ -72,8 +84,8 @@ def estimate_discrepancy(
     sample : Matches, optional
         Some of the matches, or all: structure finer than the functions shows in neighbouring stars.
     stars : Matches, optional
-        The matches in memory.  By the star codes, errors common to a star's matches are estimated,
-        and exposures without frames of their own are separated.
+        The matches in memory.  Errors common to the matches of a star, or of a tight group of
+        stars, are estimated, and exposures without frames of their own are separated.
     structure : bool
         False for no structure beyond the model, where look-up tables were fitted to it.
     exposures : bool
@@ -93,7 +105,8 @@ def estimate_discrepancy(
     """
     model, likelihood = solution.model, likelihood_of(solution)
     priors = priors or DiscrepancyPriors()
-    if exposures and stars is not None and model.frames == "none" and _several(stars):
+    apart = exposures and stars is not None and model.frames == "none" and _several(stars)
+    if stars is not None and apart:
         sums = _by_exposure(stars, likelihood, model)
     else:
         with opened(model, matches) as shards:
@@ -102,17 +115,44 @@ def estimate_discrepancy(
     working = Information(model, mean, sums, parameter_priors or GaussianPriors.none(model))
     pixel = model.pixel_size(mean)
     repeated = None
-    if stars is not None and stars.star is not None:
-        repeated = shared_stars(stars, likelihood, model, priors.star * pixel)
-    excess = score_excess(working) * (1.0 if repeated is None else repeated.repetition)
-    information = replace(working, excess=excess)
+    code = None if stars is None else error_codes(stars.u, stars.v, stars.star)
+    if stars is not None and code is not None:
+        repeated = shared_stars(stars, code, likelihood, model, priors.star * pixel)
+    information = replace(working, excess=score_excess(working))
+    if stars is not None and repeated is not None:
+        excess = repeated.repetition
+        if apart:
+            by_star = _by_exposure(stars, likelihood, model, excess)
+        else:
+            prepared, order = prepare(model, stars)
+            by_star = cell_sums(prepared, likelihood, sums.side, excess[order])
+        information = replace(information, sums=by_star)
     chips = range(len(model.chips)) if structure else ()
-    near = {} if sample is None or not structure else shared_variances(sample, likelihood, model)
+    near = {} if sample is None or not structure else neighbour_scores(sample, likelihood, model)
     found, theta, facts = _structures(
         information, working, chips, near, priors, pixel, n_draws, rng
     )
     linear = linear_deviations(information, working, priors, n_draws, rng, exposures=exposures)
-    formal, noise = working.covariance, working.sandwich()
+    if linear is not None and parameter_priors is not None and model.frames != "none":
+        dates = _dates_of_exposures(working)
+        correlation = correlated_hierarchy(
+            model, mean, working.covariance, parameter_priors, dates, n_draws, rng
+        )
+        if correlation is not None:
+            linear = replace(
+                linear, theta=linear.theta + correlation[0], correlation_time=correlation[1]
+            )
+    near_stars = stars if stars is not None else sample
+    detections = None
+    if near_stars is not None and len(near_stars.exposure_names) > 1:
+        prepared, order = prepare(model, near_stars)
+        shared = error_codes(near_stars.u, near_stars.v, near_stars.star)
+        codes = np.arange(len(order)) if shared is None else shared[order]
+        detections = detection_scores(
+            model, prepared, likelihood, near_stars.exposure[order], codes
+        )
+    fields = exposure_fields(information, working, detections, priors, n_draws, rng)
+    formal, noise = working.covariance, working.squared_scores().by_evidence
     if repeated is not None:
         noise = noise + repeated.covariance(model, mean, formal)
         facts["star_rms"] = repeated.rms
@@ -122,10 +162,28 @@ def estimate_discrepancy(
         theta = settling.mean(theta)
         if linear is not None:
             linear = replace(linear, theta=settling.mean(linear.theta))
+        if fields is not None:
+            fields = replace(fields, theta=settling.mean(fields.theta))
     facts |= {"unit": model.unit, "noise_ratio": ratio}
+    facts["structure_correlation"] = structure_correlation(model, found, theta)
     if linear is not None:
         facts |= linear.facts
-    return Discrepancy(model, mean, formal, noise, found, theta, linear, facts)
+        if linear.outlying:
+            names = model.exposures
+            if stars is not None and model.frames == "none":
+                names = stars.exposure_names
+            facts["exposures_outlying"] = [names[code] for code in linear.outlying]
+    if fields is not None:
+        facts["exposure_fields"] = fields.facts(model.chips[0].size)
+    return Discrepancy(model, mean, formal, noise, found, theta, linear, facts, fields)
+
+
+def _dates_of_exposures(information: Information) -> Float:
+    """Dates (E,) of the exposures of a model, decimal years; NaN for one without stars."""
+    groups = information.sums.groups
+    out = np.full(len(information.model.exposures), np.nan)
+    out[groups.exposure] = groups.epoch
+    return out
 
 
 def _several(stars: Matches) -> bool:
@@ -133,14 +191,21 @@ def _several(stars: Matches) -> bool:
     return 1 < len(stars.exposure_names) <= MAX_EXPOSURES
 
 
-def _by_exposure(stars: Matches, likelihood: Likelihood, model: DistortionModel) -> CellSums:
-    """Sums with separate groups for exposures that have no frames of their own."""
+def _by_exposure(
+    stars: Matches, likelihood: Likelihood, model: DistortionModel, excess: Float | None = None
+) -> CellSums:
+    """Sums with separate groups for exposures that have no frames of their own.
+
+    `excess` (N,) is as of `cell_sums`, in the order of the matches.
+    """
     side = cells_per_side(len(stars.exposure_names) * len(model.chips))
     parts = []
     for code in range(len(stars.exposure_names)):
         rows = np.flatnonzero(stars.exposure == code)
         if rows.size:
-            part = cell_sums(prepare(model, stars.select(rows))[0], likelihood, side)
+            prepared, order = prepare(model, stars.select(rows))
+            own = None if excess is None else excess[rows][order]
+            part = cell_sums(prepared, likelihood, side, own)
             of = np.full(len(part.groups), code)
             parts.append(replace(part, groups=replace(part.groups, exposure=of)))
     return reduce(add, parts)
@@ -150,7 +215,7 @@ def _structures(
     information: Information,
     working: Information,
     chips: Sequence[int],
-    neighbours: Mapping[int, tuple[SharedVariance | None, SharedVariance | None]],
+    neighbours: Mapping[int, NeighbourScores],
     priors: DiscrepancyPriors,
     pixel: float,
     n: int,
@@ -176,15 +241,46 @@ def _structures(
             noise=_star_error(information, code),
             higher_order=priors.higher_order * pixel,
             structure=priors.structure * pixel,
-            pairs=neighbours.get(code, (None, None)),
+            pairs=(None, None)
+            if code not in neighbours
+            else partial(_finer_evidence, neighbours[code], working, taken, code, rng),
         )
-        found = replace(chip_waves, coefficients=np.stack(posterior.draws(n, rng), axis=1))
+        coefficients = posterior.draws(n, rng, [[chip_waves.waves]] * 2)
+        found = replace(chip_waves, coefficients=np.stack(coefficients, axis=1))
         for a in (0, 1):
             # the fit absorbs structure into polynomials; the truth lies on the other side
             theta -= found.coefficients[:, a] @ (working.covariance @ taken[a]).T
         rows += found.sizes(chip, posterior.length)
         out[chip.number] = found
     return out, theta, {"structure": rows}
+
+
+def _finer_evidence(
+    near: NeighbourScores,
+    working: Information,
+    taken: Sequence[Float],
+    code: int,
+    rng: np.random.Generator,
+    structure: Structure,
+) -> tuple[SharedVariance | None, SharedVariance | None]:
+    """Evidence of neighbouring stars for structure finer than the functions of a chip.
+
+    `structure` is the posterior of what these resolve, and `taken` (D, functions) for each axis the
+    products of the functions with the parameters of the fit, which has absorbed a part.
+    """
+    model, (functions,) = working.model, structure.functions[0]
+    phi = model.basis(model.chips[code].number).evaluate_scaled(near.X, near.Y)
+    values = functions.evaluate(near.X, near.Y)
+    drawn = structure.draws(RESOLVED, rng)
+    known = functions.n_known
+    absorbed = np.zeros((RESOLVED, model.n_params))
+    for z, t in zip(drawn, taken, strict=True):
+        absorbed += z @ (working.covariance @ t[:, :known]).T
+    resolved = np.empty((RESOLVED, len(phi), 2))
+    for a in (0, 1):
+        columns = model.coefficient_slice(model.chips[code].number, a)
+        resolved[..., a] = drawn[a] @ values.T - absorbed[:, columns] @ phi.T
+    return near.shared_variances(resolved)
 
 
 def _star_error(information: Information, chip: int) -> float:

@@ -22,6 +22,9 @@ FALL = 0.5  # rms of an order relative to the one below it
 MARGIN = 0.3  # fraction of the longer half side by which the box is larger than the chip
 SMOOTHNESS = 1.5  # of the Matern field: its slope exists
 FINE = 48  # waves that represent structure finer than the sines
+SHORTEST = 0.02  # correlation length, in longer half sides
+HIGHEST = 5.0  # frequency of a wave, in units of the frequency where the spectrum bends
+GOLDEN = (np.sqrt(5.0) - 1) / 2
 MIN_SIDE, MAX_SIDE = 6, 20  # sines along a square chip
 STARS_PER_SINE = 4.0
 
@@ -136,10 +139,25 @@ class StructureFunctions:
         return np.stack([one[0][i, a] * one[1][j, b] for a, b in low])
 
     def finer_waves(self, rng: np.random.Generator) -> Float:
-        """Wave vectors (FINE, 2) of structure finer than the sines, in inverse half sides."""
-        frequency = self.cut * rng.uniform(size=FINE) ** (-1 / (2 * SMOOTHNESS))
-        angle = rng.uniform(0, 2 * np.pi, FINE)
+        """Wave vectors (FINE, 2) of structure finer than the sines, in inverse half sides.
+
+        Frequencies are spread evenly in their logarithm over all that a field of any length has,
+        directions evenly over the half circle, each independently of the other.
+        """
+        k = np.arange(FINE)
+        highest = HIGHEST * max(self.cut, np.sqrt(2 * SMOOTHNESS) / SHORTEST)
+        frequency = self.cut * (highest / self.cut) ** ((k + rng.uniform(size=FINE)) / FINE)
+        angle = np.pi * ((k * GOLDEN + rng.uniform()) % 1.0)
         return frequency[:, None] * np.column_stack([np.cos(angle), np.sin(angle)])
+
+    def finer_spectrum(self, length: float, waves: Float) -> Float:
+        """Variances (FINE,) of the waves of a field of unit variance, by its correlation length.
+
+        Their mean is `finer(length)`, as `evaluate_finer` divides by the number of waves.
+        """
+        k2, square = 2 * SMOOTHNESS / length**2, (waves**2).sum(axis=1)
+        density = square * (k2 + square) ** (-SMOOTHNESS - 1)  # of the logarithm of the frequency
+        return np.asarray(self.finer(length) * density / density.mean())
 
     def evaluate_finer(self, waves: Float, X: Float, Y: Float) -> Float:
         """Cosines and sines (N, 2 FINE) of waves at scaled positions; mean squares add to 1."""

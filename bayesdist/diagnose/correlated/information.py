@@ -13,6 +13,7 @@ from functools import cached_property
 
 import numpy as np
 
+from bayesdist.diagnose.correlated.squares import MIN_FREE, SquaredScores
 from bayesdist.infer.equations.normal import NormalEquations
 from bayesdist.infer.equations.priors import GaussianPriors
 from bayesdist.infer.equations.scaled import scaled_inverse
@@ -23,8 +24,6 @@ from bayesdist.model import DistortionModel, Groups
 from bayesdist.model.grid import cell_index
 from bayesdist.utils.arrays import Float, Int
 
-# A star that alone determines a parameter has no residual: its squared score is uninformative.
-MIN_FREE = 0.1
 # cells along each side of a chip, by largest number of groups: limits memory and time
 SIDES = ((8, 64), (32, 48), (10**9, 32))
 COLUMNS = 9  # n, g_u, g_v, h_uu, h_uv, h_vv, g_u^2, g_u g_v, g_v^2
@@ -138,27 +137,45 @@ class Information:
             out[cells.columns] += cells.onto_parameters(cells.score[..., None])[:, 0]
         return out
 
-    def leverage(self, cells: GroupCells) -> Float:
-        """Fraction (C, 2) of its own residual that a star of each cell absorbs, on each axis."""
+    def position_covariance(self, cells: GroupCells) -> Float:
+        """Covariance (C, 2, 2) of the model's u and v in each cell by `covariance`."""
         cov = self.covariance[np.ix_(cells.columns, cells.columns)]
         d = cells.derivative
-        within = np.einsum("akm,mn,aln->akl", d, cov, d, optimize=True)
-        variance = np.einsum("ck,akl,cl->ca", cells.phi, within, cells.phi, optimize=True)
-        per_star = np.einsum("caa->ca", cells.curvature) / cells.count[:, None]
-        return np.asarray(np.clip(per_star * variance, 0.0, 1 - MIN_FREE))
+        within = np.einsum("akm,mn,bln->abkl", d, cov, d, optimize=True)
+        return np.asarray(np.einsum("ck,abkl,cl->cab", cells.phi, within, cells.phi, optimize=True))
 
-    def sandwich(self) -> Float:
-        """Covariance (D, D) of the parameters, valid for any variances of single stars.
+    def leverage(self, cells: GroupCells) -> Float:
+        """Fraction (C, 2) of its own residual that a star of each cell absorbs, on each axis."""
+        return _leverage(cells, self.position_covariance(cells))
 
-        Each squared score is divided by the square of one minus its leverage (HC3 of MacKinnon and
-        White 1985, Journal of Econometrics 29, 305): a jackknife, to first order.
-        """
-        weights = []
+    def squared_scores(self) -> SquaredScores:
+        """Sums over the stars of products of their scores, and what is expected of them."""
+        unbiased, jackknife, products = [], [], np.zeros(3)
         for cells in self.groups():
-            free = 1 - self.leverage(cells)
-            weights.append(cells.squares / (free[:, :, None] * free[:, None, :]))
-        meat = self._assembled(weights) + self.priors.information(len(self.theta))
-        return np.asarray(self.covariance @ meat @ self.covariance)
+            position = self.position_covariance(cells)
+            free = 1 - _leverage(cells, position)
+            product = free[:, :, None] * free[:, None, :]
+            unbiased.append(cells.squares / np.sqrt(product))
+            jackknife.append(cells.squares / product)
+            # stars of one cell together: they scatter more than single ones only where they are
+            # many, and the scatter of all is negligible
+            X, H = position @ unbiased[-1], position @ cells.curvature
+            products += [np.einsum("cab,cba->", *pair) for pair in ((X, X), (X, H), (H, H))]
+        prior = self.priors.information(len(self.theta))
+        return SquaredScores(
+            self.covariance,
+            self.precision - prior,
+            prior,
+            self._assembled(unbiased),
+            self._assembled(jackknife),
+            (float(products[0]), float(products[1]), float(products[2])),
+        )
+
+
+def _leverage(cells: GroupCells, position: Float) -> Float:
+    """Leverage (C, 2), given the covariance (C, 2, 2) of positions."""
+    per_star = np.einsum("caa->ca", cells.curvature) / cells.count[:, None]
+    return np.asarray(np.clip(per_star * np.einsum("caa->ca", position), 0.0, 1 - MIN_FREE))
 
 
 @dataclass(frozen=True, eq=False)
@@ -187,9 +204,18 @@ def cells_per_side(n_groups: int) -> int:
     return next(side for most, side in SIDES if n_groups <= most)
 
 
-def cell_sums(stars: Stars, likelihood: Likelihood, side: int) -> CellSums:
-    """Sums over some stars with `side` cells on each side of a chip, as a task for `Shards.sum`."""
-    g_u, g_v, h_uu, h_uv, h_vv = likelihood.scores(stars)
+def cell_sums(
+    stars: Stars, likelihood: Likelihood, side: int, excess: Float | None = None
+) -> CellSums:
+    """Sums over some stars with `side` cells on each side of a chip, as a task for `Shards.sum`.
+
+    `excess` (N,) is the variance of the gradient of each star relative to its curvature, 1 by
+    default, by which both are divided.
+    """
+    columns_of_stars = likelihood.scores(stars)
+    if excess is not None:
+        columns_of_stars = columns_of_stars / excess
+    g_u, g_v, h_uu, h_uv, h_vv = columns_of_stars
     # Where a star may or may not be a false match its curvature is negative.  Such stars are left
     # out, so that every sum of curvatures is that of a possible likelihood.
     good = (h_uu > 0) & (h_vv > 0)

@@ -7,29 +7,40 @@ makes
 
     sum g_i g_j = C(d) sum h_i h_j
 
-on the mean over pairs, but for the parts that the fit has absorbed and that are smooth.  Both are
-the same for pairs a little farther apart, so that only the difference to these is used.
+on the mean over pairs.  What the functions have resolved is taken out of the scores first: for its
+posterior mean f and covariance S at the stars,
+
+    C(d) sum h_i h_j = sum [(g_i - h_i f_i) (g_j - h_j f_j) + h_i h_j S_ij]
+
+so that C is that of what is finer.  What is left of smoother parts is the same for pairs a little
+farther apart; only the difference to these is used.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.spatial import cKDTree
+from scipy.special import j0
 
 from bayesdist.data.matches import Matches
+from bayesdist.data.repeated_stars import error_codes
 from bayesdist.infer.stars.likelihood import Likelihood
 from bayesdist.infer.stars.stars import prepare
 from bayesdist.model import DistortionModel
 from bayesdist.utils.arrays import Float, Int
+from bayesdist.utils.matern import matern
 
 # of separations, in pixels; the last bin is of pairs farther apart
 EDGES = np.array([0.0, 6.0, 12.0, 24.0, 48.0, 96.0])
 MAX_PAIRS = 2_000_000
 SHAPE = 0.3  # by which the correlation at a separation may differ: patterns are periodic
+MAX_COMPARED = 20_000  # pairs over which the uncertainty of what is resolved is averaged
 MIN_PAIRS = 50  # of a bin; the variance of fewer cannot be estimated
+
+NODES, WEIGHTS = np.polynomial.legendre.leggauss(64)
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,23 +52,44 @@ class SharedVariance:
     # (b,) in excess of that of the pairs farther apart, in the squared unit of u, v
     covariance: Float
     variance: Float  # (b,) of the covariance, by the scatter of the products
+    bins: Int  # (b,) number of each bin among `EDGES`
 
-    def of_field(self, length: float) -> Callable[[float], float]:
-        """Log likelihood of a Matern field's amplitude, by its correlation length in half sides."""
-        at_unit = _matern(self.separation / length) - _matern(np.array(self.apart / length))
+    def raised(self, by: Float) -> SharedVariance:
+        """Evidence with covariances in all bins of `EDGES` added."""
+        return replace(self, covariance=self.covariance + by[self.bins] - by[-1])
+
+    def of_field(self, length: float, cut: float = 0.0) -> Callable[[float], float]:
+        """Log likelihood of a Matern field's amplitude, by its correlation length in half sides.
+
+        It is that of the field's part at angular frequencies above `cut` (inverse half sides).
+        """
+        separation = np.append(self.separation, self.apart)
+        at = matern(separation / length) - _below(cut, length, separation)
+        at_unit = at[:-1] - at[-1]
+        # A pattern's correlation may differ from the field's by SHAPE of its variance.  Beyond the
+        # most likely size this does not grow: the growth alone would draw to smaller amplitudes.
+        weight = at_unit / self.variance
+        likely = max(float(weight @ self.covariance / max(weight @ at_unit, 1e-300)), 0.0)
+        finer = float((1 + cut**2 * length**2 / 3) ** -1.5)
 
         def log_likelihood(amplitude: float) -> float:
             left = self.covariance - at_unit * amplitude**2
-            variance = self.variance + (SHAPE * amplitude**2) ** 2
+            tolerance = SHAPE * finer * min(amplitude**2, likely)
+            variance = self.variance + tolerance**2
             return float(-0.5 * np.sum(left**2 / variance + np.log(variance / self.variance)))
 
         return log_likelihood
 
 
-def _matern(separation: Float) -> Float:
-    """Correlation of the field of `StructureFunctions`, by separation in correlation lengths."""
-    z = np.sqrt(3.0) * separation
-    return np.asarray((1 + z) * np.exp(-z))
+def _below(cut: float, length: float, separation: Float) -> Float:
+    """Covariance by separation of the part of a field of unit variance at frequencies below `cut`.
+
+    The integral of J0(k d) over the spectral density of the Matern field in two dimensions.
+    """
+    k, weight = (NODES + 1) * cut / 2, WEIGHTS * cut / 2
+    k2 = 3 / length**2
+    density = 3 * k * k2**1.5 * (k2 + k**2) ** -2.5
+    return np.asarray(j0(np.outer(separation, k)) @ (weight * density))
 
 
 def shared_variances(
@@ -65,13 +97,69 @@ def shared_variances(
 ) -> dict[int, tuple[SharedVariance | None, SharedVariance | None]]:
     """Evidence of neighbouring stars on the two axes of each chip, by its code.
 
-    The matches are those of the solution with this likelihood, or some of them.  A star that is
-    matched several times is no neighbour of itself: its catalogue position has one error.  None for
-    an axis with too few pairs.
+    Nothing is taken out of the scores.  The matches are those of the solution with this likelihood,
+    or some of them.  A star that is matched several times is no neighbour of itself: its catalogue
+    position has one error.  Stars of a tight group are no neighbours of each other either.  None
+    for an axis with too few pairs.
     """
+    return {
+        code: chip.shared_variances()
+        for code, chip in neighbour_scores(table, likelihood, model).items()
+    }
+
+
+@dataclass(frozen=True, eq=False)
+class NeighbourScores:
+    """Stars of one chip, with their scores along the axes of the polynomials."""
+
+    X: Float  # scaled positions (n,)
+    Y: Float
+    score: Float  # (n, 2) gradient of the log-likelihood
+    curvature: Float  # (n, 2, 2) minus its second derivatives
+    star: Int  # (n,) what shares an error of the reference, from 0
+    pairs: Int  # (p, 2) rows of neighbours that are different stars
+    separation: Float  # (p,) in pixels
+    half: float  # longer half side of the chip, in pixels
+
+    def shared_variances(
+        self, resolved: Float | None = None
+    ) -> tuple[SharedVariance | None, SharedVariance | None]:
+        """Evidence on both axes; `resolved` (draws, n, 2) is what the functions have resolved."""
+        single = len(self.star) == self.star.max(initial=-1) + 1
+        of_stars = None if single else self.star[self.pairs]
+        score, bins = self.score, _bins(self.separation)
+        if resolved is not None:
+            score = score - np.einsum("nab,nb->na", self.curvature, resolved.mean(axis=0))
+        out = []
+        for a in (0, 1):
+            h = self.curvature[:, a, a]
+            shared = _shared(score[:, a], h, self.pairs, self.separation, self.half, of_stars, bins)
+            if shared is not None and resolved is not None:
+                shared = shared.raised(self._uncertain(resolved[..., a], h, bins))
+            out.append(shared)
+        return out[0], out[1]
+
+    def _uncertain(self, resolved: Float, h: Float, bins: Int) -> Float:
+        """Mean covariance in each bin of what is resolved, by its draws (d, n)."""
+        some = slice(None, None, max(1, len(self.pairs) // MAX_COMPARED))
+        i, j = self.pairs[some].T
+        # divided by the number of draws: the mean that is taken out is that of these draws, too
+        left = (resolved - resolved.mean(axis=0)).T
+        weight = h[i] * h[j]
+        product = np.einsum("pd,pd->p", left[i], left[j]) / len(resolved)
+        n = len(EDGES) - 1
+        total, sums = (np.bincount(bins[some], w, n) for w in (weight, weight * product))
+        return np.asarray(sums / np.maximum(total, 1e-300))
+
+
+def neighbour_scores(
+    table: Matches, likelihood: Likelihood, model: DistortionModel
+) -> dict[int, NeighbourScores]:
+    """Scores of neighbouring stars of each chip, by its code; arguments as `shared_variances`."""
     stars, order = prepare(model, table)
     g_u, g_v, h_uu, h_uv, h_vv = likelihood.scores(stars)
-    code = np.arange(len(order)) if table.star is None else table.star[order]
+    shared = error_codes(table.u, table.v, table.star)
+    code = np.arange(len(order)) if shared is None else shared[order]
     g = np.stack([g_u, g_v], axis=1)
     h = np.stack([h_uu, h_uv, h_uv, h_vv], axis=1).reshape(-1, 2, 2)
     good = (h_uu > 0) & (h_vv > 0)
@@ -89,20 +177,43 @@ def shared_variances(
         here = here[:: max(1, round(float(np.sqrt(expected / MAX_PAIRS))))]
         at = np.column_stack([stars.X[here] * one.size[0], stars.Y[here] * one.size[1]]) / 2
         pairs = cKDTree(at).query_pairs(EDGES[-1], output_type="ndarray")
-        pairs = pairs[code[here][pairs[:, 0]] != code[here][pairs[:, 1]]]
+        star = np.unique(code[here], return_inverse=True)[1]
+        pairs = pairs[star[pairs[:, 0]] != star[pairs[:, 1]]]
         separation = np.linalg.norm(at[pairs[:, 0]] - at[pairs[:, 1]], axis=1)
         half = max(one.size) / 2
-        u, v = (_shared(g[here, a], h[here, a, a], pairs, separation, half) for a in (0, 1))
-        out[c] = u, v
+        X, Y = stars.X[here], stars.Y[here]
+        out[c] = NeighbourScores(X, Y, g[here], h[here], star, pairs, separation, half)
     return out
 
 
+def _bins(separation: Float) -> Int:
+    """Bin of each separation among `EDGES`."""
+    return np.clip(np.searchsorted(EDGES, separation, side="right") - 1, 0, len(EDGES) - 2)
+
+
 def _shared(
-    g: Float, h: Float, pairs: Int, separation: Float, half: float
+    g: Float,
+    h: Float,
+    pairs: Int,
+    separation: Float,
+    half: float,
+    stars: Int | None,
+    bins: Int,
 ) -> SharedVariance | None:
-    bins = np.clip(np.searchsorted(EDGES, separation, side="right") - 1, 0, len(EDGES) - 2)
+    """Excess covariance by pairs (p, 2) of detections in bins (p,) of their separations.
+
+    `stars` (p, 2) are those of the detections, None if each star has one: pairs of detections of
+    the same two stars repeat one product of their errors.
+    """
     i, j = pairs.T
     product, weight = g[i] * g[j], h[i] * h[j]
+    if stars is not None and len(stars):
+        first, second = np.sort(stars, axis=1).T
+        keys = (first * (int(stars.max()) + 1) + second) * len(EDGES) + bins
+        keys, of = np.unique(keys, return_inverse=True)
+        bins = keys % len(EDGES)
+        separation = np.bincount(of, separation) / np.bincount(of)
+        product, weight = np.bincount(of, product), np.bincount(of, weight)
     count, total, together, distance = (
         np.bincount(bins, w, minlength=len(EDGES) - 1).astype(float)
         for w in (None, weight, product, separation)
@@ -122,4 +233,5 @@ def _shared(
         float(distance[-1]),
         mean[some] - mean[-1],
         variance[some] + variance[-1],
+        some,
     )

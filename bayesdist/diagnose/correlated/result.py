@@ -8,13 +8,23 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
+from scipy.optimize import nnls
 
 from bayesdist.diagnose.correlated.deviations import LinearDeviations
+from bayesdist.diagnose.correlated.exposure_fields import ExposureFields
 from bayesdist.diagnose.correlated.functions import StructureFunctions
 from bayesdist.model import Chip, DistortionModel
 from bayesdist.utils.arrays import Float
+from bayesdist.utils.matern import matern
 
 POINTS = 12  # on each axis of a chip, over which sizes are averaged
+PAIRED = 7  # likewise, positions whose neighbours' errors are compared
+COMPARED = 300  # draws by which they are
+LEAST = 1e-4  # half a squared difference relative to the variance, below which all is alike
+SMALLEST = 0.01  # fraction of the variance that is worth a field
+FIELDS = 6  # at most: a card of a FITS header has room for so many
+LENGTHS = 9  # correlation lengths of the fields that represent the structure
+WEIGHT = 30.0  # of the condition that their fractions add to 1
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,6 +65,78 @@ class ChipStructure:
         return rows
 
 
+def structure_correlation(
+    model: DistortionModel, structure: Mapping[int, ChipStructure], theta: Float
+) -> list[list[float]]:
+    """Correlation between positions of the structure that the parameters' errors do not hold.
+
+    The structure and the error `theta` (n, D) of the parameters that belongs to it have a joint
+    covariance.  What it has beyond that of the parameters is represented by a sum of independent
+    Matern fields: rows of their fraction of the variance and their correlation length in pixels.
+    Fractions add to 1 at most; the rest is independent from position to position.
+    """
+    half = max(max(chip.size) for chip in model.chips) / 2
+    separations = np.geomspace(2.0, half, 14)
+    variance, squares = 0.0, np.zeros(len(separations))
+    for chip in model.chips:
+        if chip.number in structure:
+            own = _by_separation(model, chip, structure[chip.number], theta, separations)
+            variance, squares = variance + own[0], squares + own[1:]
+    if not variance > 0:
+        return []
+    # half the squared difference of errors, relative to their variance
+    apart = np.clip(squares / (2 * variance), LEAST, 1.0)
+    lengths = np.geomspace(4.0, 2 * half, LENGTHS)
+    fields = 1 - matern(separations[:, None] / lengths)
+    # differences of neighbours to the same relative precision as those of stars far apart
+    rows = np.hstack([fields, np.ones((len(apart), 1))]) / apart[:, None]
+    rows = np.vstack([rows, np.full(LENGTHS + 1, WEIGHT)])
+    fractions, _ = nnls(rows, np.append(np.ones(len(apart)), WEIGHT))
+    fractions = fractions[:-1] / max(fractions.sum(), 1e-300)
+    kept = np.sort(np.argsort(fractions)[-FIELDS:])
+    kept = kept[fractions[kept] > SMALLEST]
+    if not len(kept):
+        return []
+    # small fractions go to the largest: independent errors would widen differences of neighbours
+    rest = fractions.sum() - fractions[kept].sum()
+    fractions[kept[np.argmax(fractions[kept])]] += rest
+    return [[round(float(fractions[k]), 3), float(f"{lengths[k]:.3g}")] for k in kept]
+
+
+def _by_separation(
+    model: DistortionModel, chip: Chip, found: ChipStructure, theta: Float, separations: Float
+) -> Float:
+    """Variance of what the parameters' errors do not hold, and mean squared differences of it.
+
+    The first of (1 + s,) is the variance, the others are the squared differences between positions
+    at these separations (s,) in pixels.
+    """
+    line = (np.arange(PAIRED) + 0.5) * 2 / PAIRED - 1
+    X, Y = (z.ravel() for z in np.meshgrid(line, line))
+    angle = np.pi * (1 + np.sqrt(5)) * np.arange(X.size)
+    separations = np.append(0.0, separations)
+    step = 2 * separations[:, None] / np.array(chip.size)[:, None, None]
+    at = np.empty((2, len(separations), X.size))
+    for k, (z, moved) in enumerate(((X, np.cos(angle)), (Y, np.sin(angle)))):
+        other = z + step[k] * moved
+        # to the other side where it would leave the chip
+        at[k] = np.where(np.abs(other) <= 1, other, z - step[k] * moved)
+    inside = (np.abs(at[0]) <= 1) & (np.abs(at[1]) <= 1)
+    draws = slice(None, None, max(1, len(theta) // COMPARED))
+    values = found.evaluate(at[0].ravel(), at[1].ravel()).astype(found.coefficients.dtype)
+    phi = model.basis(chip.number).evaluate_scaled(at[0].ravel(), at[1].ravel())
+    out = np.zeros(len(separations))
+    for a in (0, 1):
+        in_fit = theta[draws, model.coefficient_slice(chip.number, a)] @ phi.T
+        every = found.coefficients[draws, a] @ values.T + in_fit
+        for sign, errors in ((1, every), (-1, in_fit)):
+            shaped = errors.reshape(len(errors), len(separations), -1)
+            square = np.mean((shaped - shaped[:, :1]) ** 2, axis=0)
+            square[0] = np.mean(shaped[:, 0] ** 2, axis=0)
+            out += sign * (square * inside).sum(axis=1) / np.maximum(inside.sum(axis=1), 1)
+    return out
+
+
 @dataclass(frozen=True, eq=False)
 class Discrepancy:
     """Structure outside the fitted model, as independent draws.
@@ -77,6 +159,8 @@ class Discrepancy:
         Of exposures and drifts.
     facts : mapping
         Sizes, for summaries: JSON-able.
+    fields : ExposureFields or None
+        Second-order terms and smooth fields of single exposures; None for one exposure.
     """
 
     model: DistortionModel
@@ -87,6 +171,7 @@ class Discrepancy:
     structure_theta: Float
     linear: LinearDeviations | None
     facts: Mapping[str, Any] = field(default_factory=dict)
+    fields: ExposureFields | None = None
 
     @property
     def n_draws(self) -> int:
@@ -104,22 +189,23 @@ class Discrepancy:
 
     def moved(self, matrix: Float) -> Discrepancy:
         """Discrepancy with all errors of the parameters multiplied by a matrix (D, D)."""
-        linear = self.linear
+        linear, fields = self.linear, self.fields
         return replace(
             self,
             formal=matrix @ self.formal @ matrix.T,
             noise=matrix @ self.noise @ matrix.T,
             structure_theta=self.structure_theta @ matrix.T,
             linear=linear and replace(linear, theta=linear.theta @ matrix.T),
+            fields=fields and replace(fields, theta=fields.theta @ matrix.T),
         )
 
     @cached_property
     def covariance(self) -> Float:
         """Covariance (D, D) of the parameters' errors by all causes; about zero, not their mean."""
         out = self.noise.copy()
-        for theta in (self.structure_theta, None if self.linear is None else self.linear.theta):
-            if theta is not None:
-                out += theta.T @ theta / len(theta)
+        parts = [part.theta for part in (self.linear, self.fields) if part is not None]
+        for theta in (self.structure_theta, *parts):
+            out += theta.T @ theta / len(theta)
         return out
 
     @property

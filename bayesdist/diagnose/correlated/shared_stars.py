@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from bayesdist.data.matches import Matches
-from bayesdist.diagnose.correlated.priors import log_half_cauchy
+from bayesdist.diagnose.correlated.priors import log_half_t
 from bayesdist.infer.catalogue.star_sums import StarSums, influence_by_group
 from bayesdist.infer.stars.likelihood import Likelihood
 from bayesdist.infer.stars.stars import Stars, prepare
@@ -16,6 +16,8 @@ from bayesdist.utils.arrays import Float, Int
 
 STEPS = 60
 RANGE = 300.0
+NEGLIGIBLE = 1e-8  # of the density, below the largest
+MIN_FREE = 0.1  # fraction of the stars' errors that is left by the fit
 
 
 @dataclass(frozen=True, eq=False)
@@ -23,9 +25,9 @@ class SharedStars:
     """Errors that stars of the catalogue have in all of their matches."""
 
     rms: float  # of a star on an axis, in the unit of u, v; 0 where no star is matched twice
-    # mean factor, over the matches, by which a star's matches determine the structure at its
-    # position less than as many stars would
-    repetition: float
+    # factor (N,), in the order of the table, by which the matches of a star determine the
+    # structure at its position less than as many stars would
+    repetition: Float
     stars: Stars
     code: Int  # star (N,) of each match, in the order of `stars`
     curvature: Float  # minus second derivatives (3, N) uu, uv, vv of the log-likelihood
@@ -48,42 +50,52 @@ class SharedStars:
 
 
 def shared_stars(
-    table: Matches, likelihood: Likelihood, model: DistortionModel, median: float
+    table: Matches, code: Int, likelihood: Likelihood, model: DistortionModel, median: float
 ) -> SharedStars | None:
     """Size of the errors that stars have in all of their matches; None where none is repeated.
 
-    A star with an error a in all of its matches has a summed score of mean a h, h its summed
-    curvature, so that with a ~ N(0, w^2)
+    The likelihood knows the variance 1 / h_i of each match, quoted errors and jitter, and the
+    shared error is a part of it.  The summed score g of a star whose matches share a variance w^2
+    then has the variance h (1 + w^2 k), where h is the sum of the h_i and k = h - sum h_i^2 / h, so
+    that
 
-        log p(w) = sum over stars and axes of [g^2 w^2 / (1 + w^2 h) - log(1 + w^2 h)] / 2
+        log p(w) = sum over stars and axes of [g^2 / h w^2 k / (1 + w^2 k) - log(1 + w^2 k)] / 2
 
-    Stars that are matched once are left out: their likelihood could not separate w from a jitter.
-    The table has codes of the stars; `median` is that of the half-Cauchy prior of w, in the unit of
-    u, v.
+    Stars that are matched once are left out: k is 0.
+    `code` (N,) is the star of each match, or the tight group of stars; `median` is that of the
+    half-Cauchy prior of w, in the unit of u, v.
     """
     stars, order = prepare(model, table)
-    code = table.column("star")[order]
+    code = np.unique(code[order], return_inverse=True)[1]
     n_matches = np.bincount(code)
     repeated = n_matches > 1
     if repeated.sum() < 2:
         return None
     g_u, g_v, h_uu, h_uv, h_vv = likelihood.scores(stars)
     good = (h_uu > 0) & (h_vv > 0)
-    size = np.geomspace(median / RANGE, median * RANGE, STEPS)
-    log_density = log_half_cauchy(size, median)
-    summed = []
+    # what the fit has taken of the stars' errors is not in their scores
+    free = 1 - min(model.n_params / (2 * len(repeated)), 1 - MIN_FREE)
+    squares, others = [], []  # over curvature, (n_stars,); k of each star
     for g, h in ((g_u, h_uu), (g_v, h_vv)):
-        top, bottom = (np.bincount(code[good], w[good], minlength=len(repeated)) for w in (g, h))
-        summed.append(bottom)
-        top, bottom = top[repeated], bottom[repeated]
-        widened = 1 + size[:, None] ** 2 * bottom
-        log_density = log_density + 0.5 * (
-            size[:, None] ** 2 * top**2 / widened - np.log(widened)
+        top, bottom, sums = (
+            np.bincount(code[good], w[good], minlength=len(repeated)) for w in (g, h, h**2)
+        )
+        bottom = np.maximum(bottom, 1e-300)
+        squares.append(top**2 / bottom / free)
+        others.append(np.maximum(bottom - sums / bottom, 0.0))
+    square, rest = (np.concatenate([z[repeated] for z in both]) for both in (squares, others))
+    low, high = median / RANGE, median * RANGE
+    for _ in range(2):  # then where the density is: many stars determine the size to a few percent
+        size = np.geomspace(low, high, STEPS)
+        widening = size[:, None] ** 2 * rest
+        log_density = log_half_t(size, median) + 0.5 * (
+            square * widening / (1 + widening) - np.log1p(widening)
         ).sum(axis=1)
-    weight = np.exp(log_density - log_density.max())
-    square = float(weight @ size**2 / weight.sum())
+        weight = np.exp(log_density - log_density.max())
+        likely = np.flatnonzero(weight > NEGLIGIBLE)
+        low, high = size[max(likely[0] - 1, 0)], size[min(likely[-1] + 1, STEPS - 1)]
+    variance = float(weight @ size**2 / weight.sum())
+    repetition = np.empty(len(order))
+    repetition[order] = (1 + variance * np.mean(others, axis=0))[code]
     curvature = np.stack([h_uu, h_uv, h_vv]) * good
-    # the matches of a star share its error; one match alone would show only its own part
-    rest = np.mean(summed, axis=0) * (1 - 1 / np.maximum(n_matches, 1))
-    repetition = float(np.average(1 + square * rest, weights=n_matches))
-    return SharedStars(float(np.sqrt(square)), repetition, stars, code, curvature)
+    return SharedStars(float(np.sqrt(variance)), repetition, stars, code, curvature)

@@ -8,28 +8,35 @@ structure's functions through a score s and an information S, so that for amplit
 
 The amplitude and the correlation length of the Matern field and the amplitude of the higher orders
 are integrated on a grid that is refined where the density is.  Structure too fine for the functions
-shows in neighbouring stars (`SharedVariance`), whose likelihood is a factor.
+shows in neighbouring stars (`SharedVariance`), whose likelihood is a factor: that of the field's
+part finer than the functions, once what these resolve is taken out of the stars' scores.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from functools import partial
 from itertools import pairwise
 from typing import TypeVar
 
 import numpy as np
 
-from bayesdist.diagnose.correlated.functions import FINE, StructureFunctions
+from bayesdist.diagnose.correlated.functions import FINE, SHORTEST, StructureFunctions
 from bayesdist.diagnose.correlated.neighbours import SharedVariance
-from bayesdist.diagnose.correlated.priors import AmplitudeGrid, log_half_cauchy, log_widths
+from bayesdist.diagnose.correlated.priors import (
+    STRUCTURE_DOF,
+    AmplitudeGrid,
+    log_half_t,
+    log_widths,
+)
 from bayesdist.utils.arrays import Float, Int
 
 Shared = TypeVar("Shared")
+Evidence = Sequence[SharedVariance | None]
 
 # of the field, in longer half sides; all equally probable beforehand
-LENGTHS = np.geomspace(0.02, 0.6, 7)
+LENGTHS = np.geomspace(SHORTEST, 0.6, 7)
 STEPS = 8  # of the amplitude, before the grid is refined
 HALVINGS = 6  # at most: neighbouring stars may determine an amplitude to some percent
 CHANGE = 0.7  # of the log density between two points, below which none is inserted between them,
@@ -133,8 +140,14 @@ class Structure:
     points: tuple[_Point, ...]  # lengths and amplitudes of the field
     weight: Float  # posterior probability (points, TERM_STEPS) of each combination
 
-    def draws(self, n: int, rng: np.random.Generator) -> list[Float]:
-        """Coefficients (n, n_known + 2 FINE) of terms, sines and finer waves of each function."""
+    def draws(
+        self, n: int, rng: np.random.Generator, waves: Sequence[Sequence[Float]] | None = None
+    ) -> list[Float]:
+        """Coefficients (n, n_known + 2 FINE) of terms, sines and finer waves of each function.
+
+        `waves` are the wave vectors (FINE, 2) of each function of each part; without them finer
+        waves are left out.
+        """
         counts = rng.multinomial(n, self.weight.ravel())
         drawn = rng.permutation(np.repeat(np.arange(len(counts)), counts))
         point, by_terms = np.divmod(drawn, self.weight.shape[1])
@@ -142,10 +155,12 @@ class Structure:
         out = []
         for k, some in enumerate(self.functions):
             terms, sines = self._known(k, point, amplitude, rng)
-            waves = rng.standard_normal((len(some), n, 2 * FINE))
-            waves *= self._finer(k)[:, point, None]
+            finer = rng.standard_normal((len(some), n, 2 * FINE if waves else 0))
+            if waves:
+                spread = self._finer(k, waves[k])[:, point]
+                finer *= np.concatenate([spread, spread], axis=2)  # cosines and sines
             first, start = 0, 0
-            for own, wave in zip(some, waves, strict=True):
+            for own, wave in zip(some, finer, strict=True):
                 of_terms = terms[:, first : first + own.n_terms] * own.decline()
                 along = sines[:, start : start + own.n_sines]
                 out.append(np.concatenate([of_terms, along, wave], axis=1))
@@ -163,17 +178,17 @@ class Structure:
             terms[rows] = one.draws(amplitude[rows], rng)
             variance[rows] = one.variance
         sines = np.empty_like(variance)
-        for field, rows in _rows_of([one.field for one in sized], point):
-            sines[rows] = field.draws(terms[rows], variance[rows], rng)
+        for of_length, rows in _rows_of([one.field for one in sized], point):
+            sines[rows] = of_length.draws(terms[rows], variance[rows], rng)
         return terms, sines
 
-    def _finer(self, part: int) -> Float:
-        """Standard deviations (functions, points) of what is finer than the sines of a part."""
+    def _finer(self, part: int, waves: Sequence[Float]) -> Float:
+        """Standard deviations (functions, points, FINE) of the waves finer than a part's sines."""
         size, length = np.array([(p.amplitudes[part], p.length) for p in self.points]).T
         lengths, of_point = np.unique(length, return_inverse=True)
-        some = self.functions[part]
-        fraction = np.array([[one.finer(value) for value in lengths] for one in some])
-        return np.asarray(size * np.sqrt(fraction)[:, of_point])
+        functions = zip(self.functions[part], waves, strict=True)
+        variance = np.array([[f.finer_spectrum(l, w) for l in lengths] for f, w in functions])
+        return np.asarray(size[:, None] * np.sqrt(variance)[:, of_point])
 
     @property
     def length(self) -> float:
@@ -199,7 +214,7 @@ def structure_posterior(
     noise: float,
     higher_order: float,
     structure: float,
-    pairs: Sequence[SharedVariance | None] = (None, None),
+    pairs: Evidence | Callable[[Structure], Evidence] = (None, None),
     lengths: Float | None = None,
 ) -> Structure:
     """Posterior of the coefficients of structure functions, of one part or two.
@@ -211,10 +226,11 @@ def structure_posterior(
 
     For the `functions` of each part `information` (m, m) is that of their coefficients, and `score`
     (m,) the gradient of the log-likelihood where they are zero, both with the part that the fit
-    absorbs eliminated; `pairs` is the evidence of neighbouring stars.  `noise` is the typical error
-    of one star, a few times which limits the amplitudes; `higher_order` and `structure` are prior
-    medians of the amplitudes, in the unit of the positions; `lengths` of the field are `LENGTHS` by
-    default.
+    absorbs eliminated; `pairs` is the evidence of neighbouring stars on each part, or a function
+    that finds it once a posterior without it tells what the functions resolve.  `noise` is the
+    typical error of one star, a few times which limits the amplitudes; `higher_order` and
+    `structure` are prior medians of the amplitudes, in the unit of the positions; `lengths` of the
+    field are `LENGTHS` by default.
     """
     known = [_terms_first(*one) for one in zip(functions, information, score, strict=True)]
     amplitudes = AmplitudeGrid.of(
@@ -223,14 +239,37 @@ def structure_posterior(
         higher_order=higher_order,
         structure=structure,
     )
-    by_length = list[tuple[float, list[_Sized], Float]]()
-    for length in LENGTHS if lengths is None else lengths:
-        fields = [Field.of(some, length, S, s) for some, S, s in known]
-        near = pairs[: len(known)]
-        shared = [None if p is None else p.of_field(length) for p in near]
-        sized = _refined(
-            partial(_Sized.of, fields, shared, amplitudes.terms), amplitudes, structure
+    by_amplitude = {
+        float(length): _SizedFields(
+            [Field.of(some, float(length), S, s) for some, S, s in known], amplitudes.terms
         )
+        for length in (LENGTHS if lengths is None else lengths)
+    }
+    cuts = [some[0].cut for some in functions]
+    if callable(pairs):
+        pairs = pairs(_weighed(functions, by_amplitude, amplitudes, structure, (), cuts))
+    return _weighed(functions, by_amplitude, amplitudes, structure, pairs, cuts)
+
+
+def _weighed(
+    functions: Sequence[Sequence[StructureFunctions]],
+    by_amplitude: Mapping[float, _SizedFields],
+    amplitudes: AmplitudeGrid,
+    structure: float,
+    pairs: Evidence,
+    cuts: Sequence[float],
+) -> Structure:
+    """Posterior over lengths and amplitudes, with the evidence of neighbouring stars.
+
+    `cuts` are the frequencies of each part above which that evidence is.
+    """
+    by_length = list[tuple[float, list[_Sized], Float]]()
+    for length, fields in by_amplitude.items():
+        shared = [
+            None if p is None else p.of_field(length, cut)
+            for p, cut in zip(pairs, cuts, strict=False)
+        ]
+        sized = _refined(partial(_Sized.of, fields, shared), amplitudes, structure)
         by_length.append((length, sized, amplitudes.log_prior + _density(sized, structure)))
     largest = max(density.max() for _, _, density in by_length)
     points, log_weight = list[_Point](), list[Float]()
@@ -260,6 +299,23 @@ def _terms_first(
 
 
 @dataclass(frozen=True, eq=False)
+class _SizedFields:
+    """Fields of one length in all parts, by their amplitude; each is worked out once."""
+
+    fields: Sequence[Field]
+    of_terms: Float  # amplitudes (TERM_STEPS,) of the terms
+    _cache: dict[float, tuple[tuple[SizedField, ...], Float]] = field(default_factory=dict)
+
+    def at(self, log_amplitude: float) -> tuple[tuple[SizedField, ...], Float]:
+        """Likelihoods of the terms, and their evidence (parts, TERM_STEPS)."""
+        if log_amplitude not in self._cache:
+            parts = tuple(f.at(float(np.exp(log_amplitude))) for f in self.fields)
+            evidence = np.stack([part.log_evidence(self.of_terms) for part in parts])
+            self._cache[log_amplitude] = parts, evidence
+        return self._cache[log_amplitude]
+
+
+@dataclass(frozen=True, eq=False)
 class _Sized:
     """One amplitude of the field, and the evidence (parts, TERM_STEPS) of each part for it."""
 
@@ -270,17 +326,17 @@ class _Sized:
     @classmethod
     def of(
         cls,
-        fields: Sequence[Field],
+        fields: _SizedFields,
         shared: Sequence[Callable[[float], float] | None],
-        of_terms: Float,
         log_amplitude: float,
     ) -> _Sized:
-        """By the fields of all parts, the evidence of neighbours, and amplitudes of the terms."""
+        """By the fields of all parts, and the evidence of neighbours."""
         amplitude = float(np.exp(log_amplitude))
-        parts = tuple(field.at(amplitude) for field in fields)
-        near = [0.0 if known is None else known(amplitude) for known in shared]
-        evidence = [one.log_evidence(of_terms) + k for one, k in zip(parts, near, strict=True)]
-        return cls(amplitude, parts, np.stack(evidence))
+        parts, evidence = fields.at(float(log_amplitude))
+        near = np.zeros(len(parts))
+        for k, known in enumerate(shared):
+            near[k] = 0.0 if known is None else known(amplitude)
+        return cls(amplitude, parts, evidence + near[:, None])
 
     @property
     def views(self) -> Float:
@@ -297,7 +353,7 @@ def _refined(
     sized = [at(a) for a in grid]
     for _ in range(HALVINGS):
         tops = np.array([(prior + one.views).max(axis=1) for one in sized])
-        tops += log_half_cauchy(np.exp(grid), median)[:, None]
+        tops += log_half_t(np.exp(grid), median, STRUCTURE_DOF)[:, None]
         best = tops.max(axis=0)  # of this length: a peak may lie between two points
         # part by part only where they may differ
         several = len(best) - 1
@@ -320,16 +376,18 @@ def _density(sized: Sequence[_Sized], median: float) -> Float:
     (n, TERM_STEPS) for one part, (n, n, TERM_STEPS) for two.
     """
     amplitude = np.array([one.amplitude for one in sized])
-    width = log_widths(amplitude)
+    width = log_widths(amplitude, beyond=0.0)
     evidence = np.stack([one.evidence for one in sized], axis=1)
     if len(evidence) == 1:
-        return np.asarray((log_half_cauchy(amplitude, median) + width)[:, None] + evidence[0])
+        return np.asarray(
+            (log_half_t(amplitude, median, STRUCTURE_DOF) + width)[:, None] + evidence[0]
+        )
     u, v = evidence
     both = np.add.outer(amplitude**2, amplitude**2) / 2
     apart = np.abs(np.subtract.outer(np.log(amplitude), np.log(amplitude)))
     differ = np.log(UNLIKE / 2) - apart + width
     np.fill_diagonal(differ, np.log(1 - UNLIKE))
-    density = log_half_cauchy(np.sqrt(both), median) + width[:, None] + differ
+    density = log_half_t(np.sqrt(both), median, STRUCTURE_DOF) + width[:, None] + differ
     return np.asarray(density[..., None] + u[:, None] + v)
 
 

@@ -11,14 +11,18 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from bayesdist.data.matches import Matches
+from bayesdist.diagnose.clusters import joint_clusters
 from bayesdist.diagnose.residuals.binned import BinnedSums, binned_sums
 from bayesdist.infer.kernel import Constants
 from bayesdist.infer.posterior import Posterior
 from bayesdist.infer.posterior.memberships import averaged_draws
 from bayesdist.infer.stars.likelihood import Likelihood, star_averages
 from bayesdist.infer.stars.shards import Shards
-from bayesdist.infer.stars.stars import Stars
+from bayesdist.infer.stars.stars import Stars, prepare
 from bayesdist.infer.stars.sums import Sums
+from bayesdist.model import DistortionModel
+from bayesdist.model.grid import cell_index
 from bayesdist.utils.arrays import Bool, Float, Int
 
 Bins = tuple[int, int]
@@ -80,6 +84,37 @@ def star_sums(
         for bins in several:
             binned[number, bins] = binned_sums(*here, bins=bins, size=size)
     return StarSums(binned, exposures)
+
+
+def star_bins(
+    table: Matches,
+    code: Int,
+    model: DistortionModel,
+    solution: Likelihood,
+    partitions: Mapping[int, tuple[Bins, ...]],
+) -> dict[tuple[int, Bins], BinnedSums]:
+    """Sums over bins in which the detections of one star count as one, at their mean.
+
+    Detections of a star share the error of its reference position: the means of bins scatter by
+    the number of stars.  `code` (N,) is the star of each match, or the tight group of stars; other
+    arguments are as for `star_sums`.
+    """
+    stars, order = prepare(model, table)
+    used, residual = solution.inliers(stars) > 0.5, stars.residuals(solution.theta)
+    values = np.stack([*stars.pixels(), *_along_gauge(stars, solution.theta, residual).T])
+    chip, code = _of_groups(stars, stars.groups.chip), code[order]
+    out = {}
+    for number, several in partitions.items():
+        here = used & (chip == model.chip_code(number))
+        size = model.chips[model.chip_code(number)].size
+        own, star = values[:, here], code[here]
+        for nx, ny in several:
+            X, Y = (2 * (own[k] - 0.5) / size[k] - 1 for k in (0, 1))
+            cell = cell_index(X, Y, (nx, ny))
+            _, of = joint_clusters(cell, star)
+            means = [np.bincount(of, z) / np.bincount(of) for z in own]
+            out[number, (nx, ny)] = binned_sums(*means, bins=(nx, ny), size=size)
+    return out
 
 
 def _along_gauge(stars: Stars, theta: Float, residual: Float) -> Float:

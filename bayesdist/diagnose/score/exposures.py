@@ -1,8 +1,9 @@
-"""Test of linear deviations of single exposures that their frames do not fit.
+"""Tests of deviations of single exposures: linear terms that frames do not fit, and second order.
 
 Every exposure e has a statistic T_e of its own, of the shift, rotation, scale and shears that are
-no parameters of its frame: a chi-square of the same probability as Hotelling's statistic, with the
-covariance of the scores from its own stars.  Exposures deviate in ways of their own, and the sum of
+no parameters of its frame, or of second-order terms on every chip beside all linear ones: a
+chi-square of the same probability as Hotelling's statistic, with the covariance of the scores from
+its own stars.  Exposures deviate in ways of their own, and the sum of
 the T_e is what is tested: it does not need the covariance of hundreds of scores.  Through the
 polynomials, which all fit together, the T_e are slightly dependent; mean and variance of the sum
 are those of a scaled chi-square (Satterthwaite 1946).
@@ -17,10 +18,12 @@ import numpy as np
 
 from bayesdist.diagnose.clusters import add_over, sums_over
 from bayesdist.diagnose.efficient import EfficientScore, independent_directions, squares_of
+from bayesdist.diagnose.score.exposure_time import exposure_time_test
 from bayesdist.diagnose.score.projection import Projection, contracted, weighted
 from bayesdist.diagnose.score.result import Family, Outcome, outcome
 from bayesdist.diagnose.score.sample import Block
 from bayesdist.diagnose.significance import chi_square_of, hotelling_p
+from bayesdist.infer.equations.priors import GaussianPriors
 from bayesdist.model.frames import LINEAR_MATRICES, frame_names
 from bayesdist.utils.arrays import Float, Int
 from bayesdist.utils.distributions import chi2_sf
@@ -32,6 +35,14 @@ EXPOSURES = Family(
     "no deviations of single exposures are left in the residuals",
     held_by="exposures",
     denial="deviating exposures do not explain it",
+)
+SECOND_ORDER = Family(
+    "second order of exposures",
+    "calibrate exposures one by one, or take more of them, in whose mean such terms average out",
+    "exposures differ in second-order terms",
+    "exposures do not differ in second-order terms",
+    held_by="second order",
+    denial="terms of second order in single exposures do not explain it",
 )
 STARS_PER_DIRECTION = 4  # of an exposure that is tested
 MAX_PRODUCTS = 1e10  # of scores: beyond, those of other exposures count by their mean
@@ -117,65 +128,119 @@ class _Meat:
         return left.T @ left, rest
 
 
-def exposure_test(projection: Projection) -> Outcome | None:
-    """Test of the exposures' own deviations.
+def exposure_tests(projection: Projection, theta: Float, priors: GaussianPriors) -> list[Outcome]:
+    """Tests of linear and of second-order deviations of exposures, and of their course in time.
 
-    None where there is one exposure, where the frames fit all linear terms, and where no two
-    exposures have stars enough.
+    Both are left out for one exposure, and where fewer than two exposures have enough stars. The
+    first is left out where the frames fit all linear terms, the second for polynomials of order 1.
+    `theta` (D,) and `priors` are those of the solution.
     """
     model = projection.sample.model
     names = [name for name in frame_names("affine") if name not in frame_names(model.frames)]
-    if not names or len({block.exposure for block in projection.sample.blocks}) < 2:
-        return None
-    found = list(_deviations(projection, names))
-    if len(found) < 2:
-        return None
-    T, n = sum(one.statistic for one in found), sum(len(one.score) for one in found)
-    squares = [squares_of(one.score, one.own, one.covariance, one.square) for one in found]
+    if len({block.exposure for block in projection.sample.blocks}) < 2:
+        return []
+    by_order: list[list[_Deviations]] = [[], []]
+    estimates: dict[int, Float] = {}
+    for code, estimate, pair in _deviations(projection, names):
+        if estimate.size:
+            estimates[code] = estimate
+        for deviations, part in zip(by_order, pair, strict=True):
+            if part is not None:
+                deviations.append(part)
+    remedy = EXPOSURES.remedy
+    if model.frames != "affine":
+        remedy = f"set model.frames to 'affine', or {remedy}"
+    families = replace(EXPOSURES, remedy=remedy), SECOND_ORDER
+    out = [
+        _summed(projection, family, deviations)
+        for family, deviations in zip(families, by_order, strict=True)
+        if len(deviations) > 1
+    ]
+    in_time = exposure_time_test(projection, estimates, theta, priors)
+    return out if in_time is None else [*out, in_time]
+
+
+def _summed(projection: Projection, family: Family, deviations: list[_Deviations]) -> Outcome:
+    """Outcome of the sum of the statistics of all exposures."""
+    T = sum(part.statistic for part in deviations)
+    n = sum(len(part.score) for part in deviations)
+    squares = [
+        squares_of(part.score, part.own, part.covariance, part.square) for part in deviations
+    ]
     apart = 0.0
-    for one in found:
-        alone = np.linalg.solve(one.information, one.own - one.information)
+    for part in deviations:
+        alone = np.linalg.solve(part.information, part.own - part.information)
         apart += float(np.trace(alone @ alone))
     G = projection.n_global
-    shared = sum(one.cross.T @ np.linalg.solve(one.information, one.cross) for one in found)
+    shared = sum(
+        part.cross.T @ np.linalg.solve(part.information, part.cross) for part in deviations
+    )
     together = projection.covariance[:G, :G] @ shared
     # mean n, variance 2 n (1 + ...), as a multiple of a chi-square
     stretch = 1.0 + (float((together * together.T).sum()) - apart) / n
     dof = n / stretch
     T = T / stretch
     square, noise = (float(values) for values in np.mean(squares, axis=0))
-    remedy = EXPOSURES.remedy
-    if model.frames != "affine":
-        remedy = f"set model.frames to 'affine', or {remedy}"
     return outcome(
-        replace(EXPOSURES, remedy=remedy),
+        family,
         T,
         dof,
         None,
         float(chi2_sf(T, dof)),
         square=square,
         noise=noise,
-        unit=model.unit,
+        unit=projection.sample.model.unit,
     )
 
 
-def _deviations(projection: Projection, names: list[str]) -> Iterator[_Deviations]:
-    """Deviations of every exposure with stars enough, along the directions that it has left."""
-    meat = None
+def _deviations(
+    projection: Projection, names: list[str]
+) -> Iterator[tuple[int, Float, tuple[_Deviations | None, _Deviations | None]]]:
+    """Linear and second-order deviations of each exposure; None where there are too few stars.
+
+    With the code of the exposure, and estimates (m,) of its linear deviations.
+    """
+    meat, model = None, projection.sample.model
     if len(projection.sample) * projection.n_global**2 < MAX_PRODUCTS:
         meat = _Meat.of(projection)
+    second = [k for k, powers in enumerate(model.basis().terms) if sum(powers) == 2]
     for blocks in projection.sample.blocks_by("exposure"):
         n = sum(int(projection.sample.used[block.rows].sum()) for block in blocks)
-        if n < STARS_PER_DIRECTION * len(names):
+        chips = sorted({block.chip for block in blocks})
+        columns = [(chip, axis, k) for chip in chips for axis in (0, 1) for k in second]
+        if n < STARS_PER_DIRECTION * (len(names) + len(columns)):
+            columns = []
+        if n < STARS_PER_DIRECTION * len(names) or not (names or columns):
             continue
-        whole, one = _of_exposure(projection, blocks, names, meat)
-        N = independent_directions(whole, one.information, INDEPENDENT)
-        if N.shape[1]:
-            yield one.along(N)
+        fields = [
+            np.concatenate(
+                [_linear(block, names, model.origin), _second_order(block, columns)], axis=2
+            )
+            for block in blocks
+        ]
+        whole, every = _of_exposure(projection, blocks, fields, meat)
+        unit, m = np.eye(len(whole)), len(names)
+        linear, quadratic = unit[:, :m], unit[:, m:].copy()
+        if m:  # the second order beside all linear terms
+            S = every.information
+            quadratic[:m] = -np.linalg.lstsq(S[:m, :m], S[:m, m:])[0]
+        estimate = np.asarray(np.linalg.lstsq(every.own[:m, :m], every.score[:m])[0], float)
+        pair = _independent(every, whole, linear), _independent(every, whole, quadratic)
+        yield blocks[0].exposure, estimate, pair
 
 
-def _fields(block: Block, names: list[str], origin: tuple[float, float]) -> Float:
-    """Changes (2, K, n) of the polynomial of a block by unit deviations."""
+def _independent(every: _Deviations, whole: Float, combinations: Float) -> _Deviations | None:
+    """Deviations along combinations (n, q) that the parameters have left; None without any."""
+    N = independent_directions(
+        combinations.T @ whole @ combinations,
+        combinations.T @ every.information @ combinations,
+        INDEPENDENT,
+    )
+    return every.along(combinations @ N) if N.shape[1] else None
+
+
+def _linear(block: Block, names: list[str], origin: tuple[float, float]) -> Float:
+    """Changes (2, K, n) of the polynomial of a block by unit linear deviations."""
     out = np.zeros((*block.effective.shape, len(names)))
     about = block.effective.copy()
     about[:, 0] -= origin
@@ -187,16 +252,27 @@ def _fields(block: Block, names: list[str], origin: tuple[float, float]) -> Floa
     return out
 
 
+def _second_order(block: Block, columns: list[tuple[int, int, int]]) -> Float:
+    """Changes (2, K, n) of the polynomial of a block by units of terms: chip, axis, number."""
+    out = np.zeros((*block.effective.shape, len(columns)))
+    for n, (chip, axis, k) in enumerate(columns):
+        if chip == block.chip:
+            out[axis, k, n] = 1.0
+    return out
+
+
 def _of_exposure(
-    projection: Projection, blocks: list[Block], names: list[str], meat: _Meat | None
+    projection: Projection, blocks: list[Block], fields: list[Float], meat: _Meat | None
 ) -> tuple[Float, _Deviations]:
-    """Information before anything is projected out, and one exposure's deviations."""
+    """Information before anything is projected out, and one exposure's deviations.
+
+    `fields` are the changes (2, K, n) of the polynomial of each block by unit deviations.
+    """
     sample, model = projection.sample, projection.sample.model
-    n, D = len(names), model.n_params
+    n, D = fields[0].shape[2], model.n_params
     whole, cross, score = np.zeros((n, n)), np.zeros((D, n)), np.zeros(n)
     square = np.zeros((n, n))
     area = model.basis().mean_squares
-    fields = [_fields(block, names, model.origin) for block in blocks]
     for block, Z in zip(blocks, fields, strict=True):
         F = projection.functions.polynomials(block.rows)
         WZ = weighted(F, sample.curvature[:, block.rows], Z)

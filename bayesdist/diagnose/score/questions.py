@@ -81,6 +81,7 @@ EDGES = Family(
     "leave out the margins of the detector, or fit a look-up table",
     "the residuals rise towards the edges of the detector",
     "the residuals do not rise towards the edges of the detector",
+    overruled_by=("matching", "shape"),
 )
 PIXEL_PHASE = Family(
     "pixel phase",
@@ -121,6 +122,7 @@ def order_family(total: int, order: int) -> Family:
         group="orders",
         held_by="structure",
         denial="the missing order does not explain it",
+        overruled_by=("matching", "shape"),
     )
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Literal
@@ -11,11 +11,14 @@ import numpy as np
 from scipy import special
 
 from bayesdist.diagnose.significance import holm
+from bayesdist.utils.checks import LARGER
 from bayesdist.utils.distributions import chi2_isf, f_isf
 from bayesdist.utils.limits import SCORE_TESTS
 from bayesdist.utils.numbers import p_words
 
-HeldBy = Literal["", "noise", "structure", "exposures", "curvature"]
+HeldBy = Literal[
+    "", "noise", "structure", "exposures", "curvature", "second order", "exposure fields", "time"
+]
 
 POWER = 0.9  # with which the smallest effect that is stated would have been found
 
@@ -35,6 +38,11 @@ class Family:
     held_by: HeldBy = ""
     explained_by: str = ""  # name or group of a finding that this one may come from
     denial: str = ""  # clause that denies it, for findings that it may explain
+    cause: str = ""  # name of the finding, as a cause of others that it overrules
+    # groups of findings that account for this one, the first of them first: it has their remedy
+    # where they are there, and its own would not help
+    overruled_by: tuple[str, ...] = ()
+    doubt: str = LARGER  # what the finding does to verdicts, as of `Check`
 
 
 @dataclass(frozen=True)
@@ -67,8 +75,13 @@ class ScoreTest:
     significant : bool
         More than chance, corrected for the number of tests (Holm 1979, at `limits.SCORE_TESTS`).
     held_by : str
-        Kind of correlated errors that hold what was found: 'noise', 'structure', 'exposures' or
-        'curvature'; empty where none do.
+        Kind of correlated errors that hold what was found: 'noise', 'structure', 'exposures',
+        'curvature', 'second order' or 'exposure fields' (of single exposures), 'time'
+        (deviations of exposures that are correlated in time); empty where none do.
+    group : str
+        Group of related tests, which others name together; empty for a test by itself.
+    doubt : str
+        What the finding does to verdicts, as of `Check`.
     """
 
     name: str
@@ -83,6 +96,8 @@ class ScoreTest:
     finding: str
     significant: bool
     held_by: HeldBy = ""
+    group: str = ""
+    doubt: str = LARGER
 
 
 @dataclass(frozen=True, eq=False)
@@ -137,8 +152,8 @@ def corrected(outcomes: Sequence[Outcome]) -> tuple[ScoreTest, ...]:
     """
     significant = holm([one.p_value for one in outcomes]) <= SCORE_TESTS.value
     # of a group the last finding has the remedy of all: a higher order holds the lower ones
-    remedies = {
-        one.family.group or one.name: one.family.remedy
+    by_group = {
+        one.family.group or one.name: one.family
         for one, found in zip(outcomes, significant, strict=True)
         if found
     }
@@ -149,9 +164,13 @@ def corrected(outcomes: Sequence[Outcome]) -> tuple[ScoreTest, ...]:
         smallest = one.smallest(SCORE_TESTS.value / len(outcomes))
         finding = f"{family.absent} ({smallest:.2g} {one.unit} rms would have been found)"
         if found:
-            remedy = remedies[family.group or one.name]
+            cause = _cause(family, by_group)
+            remedy = cause.remedy
+            explanation = _explanation(one, outcomes)
+            if cause.group != family.group:
+                explanation = f", which may come from {cause.cause}"
             size = f"{one.size:.2g} {one.unit} rms, {p_words(one.p_value)}"
-            finding = f"{family.present}{_explanation(one, outcomes)} ({size})"
+            finding = f"{family.present}{explanation} ({size})"
         out.append(
             ScoreTest(
                 one.name,
@@ -166,9 +185,22 @@ def corrected(outcomes: Sequence[Outcome]) -> tuple[ScoreTest, ...]:
                 finding,
                 bool(found),
                 family.held_by,
+                family.group,
+                family.doubt,
             )
         )
     return tuple(out)
+
+
+def _cause(family: Family, significant: Mapping[str, Family]) -> Family:
+    """Family whose remedy a finding has: of its own group, or of what accounts for the finding.
+
+    `significant`: the last family of each group that has found something.
+    """
+    for group in family.overruled_by:
+        if group in significant:
+            return _cause(significant[group], significant)
+    return significant[family.group or family.name]
 
 
 def _explanation(one: Outcome, outcomes: Sequence[Outcome]) -> str:

@@ -8,7 +8,10 @@ from functools import cached_property
 import numpy as np
 
 from bayesdist.data.matches import Matches
+from bayesdist.data.repeated_stars import error_codes
+from bayesdist.infer.kernel.mixture import Constants
 from bayesdist.infer.solution.solution import Solution, likelihood_of
+from bayesdist.infer.stars.likelihood import MixtureAt
 from bayesdist.infer.stars.stars import Stars, prepare
 from bayesdist.model import DistortionModel
 from bayesdist.utils.arrays import Bool, Float, Int
@@ -52,8 +55,8 @@ class ScoredSample:
     mag: Float | None  # (N,)
     colour: Float | None
     epoch: Float | None
-    # (N,) number of the star, from 0: detections of one star share the error of its reference
-    # position
+    # (N,) number of the star, or of the tight group of stars, from 0: its detections share the
+    # error of the reference position
     star: Int
     # chip, exposure (N,): codes into the model's chips, and into the exposures of the data
     chip: Int
@@ -72,6 +75,11 @@ class ScoredSample:
     # (2, N) fraction of the noise of each detection that the fit follows, along u and v; 0 where it
     # is not known
     leverage: Float | float = 0.0
+    from_nominal: Float | None = (
+        None  # (2, N) data minus nominal positions, where the table has them
+    )
+    match_radius: float | None = None  # within which the stars were matched, as is stated
+    mixture: Constants | None = None  # of the likelihood, where it models false matches
 
     def __len__(self) -> int:
         return len(self.X)
@@ -90,6 +98,12 @@ class ScoredSample:
     def whole_score(self) -> Float:
         """Score (2, N), given back what the fit has taken (Bell and McCaffrey 2002)."""
         return np.asarray(self.score / np.sqrt(1.0 - self.leverage))
+
+    @cached_property
+    def share(self) -> Float:
+        """Weight (N,) of each used detection by which those of one star count as one."""
+        number = np.bincount(self.star, self.used)
+        return np.asarray(1.0 / np.maximum(number, 1.0)[self.star])
 
     def blocks_by(self, name: str) -> list[list[Block]]:
         """Blocks that have a code in common: 'exposure', 'frame_exposure'."""
@@ -111,11 +125,13 @@ class ScoredSample:
         return replace(self, curvature=np.stack([good[:, 0, 0], good[:, 0, 1], good[:, 1, 1]]))
 
 
-def scored_sample(table: Matches, solution: Solution) -> ScoredSample:
+def scored_sample(
+    table: Matches, solution: Solution, match_radius: float | None = None
+) -> ScoredSample:
     """Sample of the detections of a table, with their scores at a solution.
 
-    The table has errors; of more than `SAMPLE` rows, every k-th is taken. Raises InputError where
-    the table does not go with the solution.
+    The table has errors; of more than `SAMPLE` rows, every k-th is taken. `match_radius` is in the
+    unit of u and v. Raises InputError where the table does not go with the solution.
     """
     table = table.sample(SAMPLE)
     by_exposure = np.argsort(table.exposure, kind="stable")
@@ -123,7 +139,8 @@ def scored_sample(table: Matches, solution: Solution) -> ScoredSample:
     stars, order = prepare(solution.model, table.select(by_exposure))
     rows = by_exposure[order]
     columns = likelihood.scores(stars)
-    codes = np.arange(len(rows)) if table.star is None else table.star[rows]
+    shared = error_codes(table.u, table.v, table.star)
+    codes = np.arange(len(rows)) if shared is None else shared[rows]
     blocks = _blocks(stars, table.exposure[rows], likelihood.theta)
     turn = np.empty((len(rows), 2, 2))
     for block in blocks:
@@ -147,7 +164,16 @@ def scored_sample(table: Matches, solution: Solution) -> ScoredSample:
         blocks=blocks,
         motion=_both(table.pm_u, table.pm_v, rows),
         motion_sigma=_both(table.sigma_pm_u, table.sigma_pm_v, rows),
+        from_nominal=_from_nominal(table, rows),
+        match_radius=match_radius,
+        mixture=likelihood.constants if isinstance(likelihood, MixtureAt) else None,
     )
+
+
+def _from_nominal(table: Matches, rows: Int) -> Float | None:
+    """Data minus nominal positions (2, n) of some rows, where the table has them."""
+    nominal = _both(table.u_nominal, table.v_nominal, rows)
+    return None if nominal is None else np.stack([table.u[rows], table.v[rows]]) - nominal
 
 
 def _both(u: Float | None, v: Float | None, rows: Int) -> Float | None:

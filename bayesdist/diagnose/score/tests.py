@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from bayesdist.data.matches import Matches
-from bayesdist.diagnose.score.exposures import exposure_test
+from bayesdist.diagnose.score.exposure_fields import exposure_field_test
+from bayesdist.diagnose.score.exposures import exposure_tests
 from bayesdist.diagnose.score.gap import gap_test
 from bayesdist.diagnose.score.motions import motion_test
 from bayesdist.diagnose.score.noise import noise_tests
@@ -15,7 +16,8 @@ from bayesdist.diagnose.score.regressor_tests import regressor_tests
 from bayesdist.diagnose.score.regressors import functions_for
 from bayesdist.diagnose.score.result import ScoreTest, corrected
 from bayesdist.diagnose.score.sample import scored_sample
-from bayesdist.diagnose.score.truncation import truncation_test
+from bayesdist.diagnose.score.shape import shape_tests
+from bayesdist.diagnose.score.truncation import radius_test, truncation_test
 from bayesdist.infer.equations.priors import GaussianPriors
 from bayesdist.infer.solution.solution import Solution
 
@@ -53,19 +55,21 @@ def score_tests(
         When the table does not go with the solution's model, or the solution does not say how it
         was fitted.
     """
+    priors, mean = priors or GaussianPriors.none(solution.model), np.asarray(solution.mean, float)
     projection = projection_of(
-        functions_for(scored_sample(table, solution)),
-        np.asarray(solution.mean, float),
-        priors or GaussianPriors.none(solution.model),
+        functions_for(scored_sample(table, solution, match_radius)), mean, priors
     )
     sample = projection.scored
     found = [
+        truncation_test(sample, match_radius),
+        radius_test(sample),
+        *shape_tests(sample),
         *regressor_tests(projection),
         gap_test(projection),
         motion_test(sample),
         *noise_tests(sample),
-        exposure_test(projection),
+        *exposure_tests(projection, mean, priors),
+        exposure_field_test(sample),
         pattern_test(sample),
-        truncation_test(sample, match_radius),
     ]
     return corrected([one for one in found if one is not None])

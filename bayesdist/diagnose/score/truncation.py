@@ -1,10 +1,14 @@
-"""Test for matches that are missing at large radii: residuals that end too abruptly.
+"""Tests of the match radius: residuals that end too abruptly, or elsewhere than it says.
 
 Matching takes no pair beyond its radius.  Where that cuts into the true matches, their residuals
 are too small: the errors seem too large, chi-square is too small, and so is the scatter that
 everything else is judged by.  Errors that are merely quoted too large shrink all residuals alike;
 so the scale of the residuals is taken from themselves, and the question is how many of them should
 lie beyond the last ones that there are.
+
+The likelihood of false matches, and of the circle about nominal positions, takes the radius as it
+is stated.  Where matches were cut at a smaller one, false matches are missing beyond the last ones
+that there are; where they were cut at a larger one, there are matches beyond the stated radius.
 """
 
 from __future__ import annotations
@@ -18,10 +22,27 @@ from scipy import optimize, special
 from bayesdist.diagnose.score.result import Family, Outcome
 from bayesdist.diagnose.score.sample import ScoredSample
 from bayesdist.diagnose.significance import chi_square_of
+from bayesdist.infer.kernel import GAUSSIAN
 from bayesdist.utils.arrays import Float, Int
+from bayesdist.utils.checks import EITHER
+from bayesdist.utils.limits import SCORE_TESTS
 
 TRUNCATION = Family(
-    "truncation", "match again with a wider radius", "", "the residuals do not end abruptly"
+    "truncation",
+    "match again with a wider radius",
+    "",
+    "the residuals do not end abruptly",
+    group="matching",
+    cause="the match radius",
+)
+RADIUS = Family(
+    "match radius",
+    "",
+    "",
+    "the matches end where the stated match radius says",
+    group="matching",
+    cause="the match radius",
+    doubt=EITHER,
 )
 MIN_STARS = 50
 LARGEST_LEVERAGE = 0.5
@@ -29,7 +50,18 @@ MAX_FRACTION_BEYOND = 0.25  # of the expected number: with more, nothing ends at
 STARS_PER_PART = 150  # with errors alike, from which their scatter is measured
 MAX_PARTS = 12
 MIN_EXPECTED = 0.5  # expected matches whose absence says nothing
+MOST_TESTS = 100  # score tests of a run, at most
 BEYOND = (0, 3)  # stars that may lie beyond a radius: the edge need not be sharp
+INSIDE = 0.9  # of the stated radius: matches that end nearer to it are not said to end elsewhere
+CLEAR = 4.5  # errors beyond which a match is clearly false, if errors are not larger than quoted
+MIN_FALSE = 8
+SHARE = 0.9  # of the clearly false ones, that lie within what is called their end
+FAR = 1.5  # median of their squared distances beyond those of true ones, over the largest of these:
+# that of Student's t with four degrees of freedom is 0.4
+# Without nominal positions, of which residuals are measured from others: how far beyond the stated
+# radius they may lie, in radii, and which fraction of the false ones.
+NEAR = 1.25
+STRAY = 0.01
 NODES, WEIGHTS = np.polynomial.hermite_e.hermegauss(15)
 ANGLES = (np.arange(8) + 0.5) * np.pi / 16  # of a quarter of the circle
 
@@ -108,10 +140,72 @@ class _Radii:
         return float(np.sqrt(np.average(self.variance.mean(axis=0) * excess, weights=count)))
 
 
+@dataclass(frozen=True, eq=False)
+class _FalseMatches:
+    """Matches that are clearly false, by their distances from where they were looked for."""
+
+    square: Float  # (m,) squared distances, ascending
+    hidden2: float  # squared distance up to which true ones hide them
+    gaussian: bool  # whether the likelihood takes their distances for Gaussian
+
+    @classmethod
+    def of(
+        cls, distance: Float, residual: Float, sigma: Float, *, gaussian: bool
+    ) -> _FalseMatches | None:
+        """By distances (N,), sizes of the residuals (N,) and errors along an axis (N,).
+
+        None for fewer than `MIN_FALSE`.
+        """
+        clear = residual > CLEAR * sigma
+        if clear.sum() < MIN_FALSE:
+            return None
+        square = np.sort(distance[clear]) ** 2
+        return cls(square, min(float(np.median((CLEAR * sigma) ** 2)), square[-1] / 2), gaussian)
+
+    @property
+    def end2(self) -> float:
+        """Squared distance within which `SHARE` of them lie."""
+        return float(self.square[int(np.ceil(SHARE * len(self.square))) - 1])
+
+    @property
+    def numbers(self) -> tuple[int, int, float]:
+        """Numbers in the outer half of the area within the end, and beyond; where that begins."""
+        middle2 = (self.hidden2 + self.end2) / 2
+        beyond = int((self.square > self.end2).sum())
+        return int((self.square > middle2).sum()) - beyond, beyond, middle2
+
+    def expected(self, radius: float) -> float:
+        """Number beyond the end if they are even within a radius."""
+        outer, _, middle2 = self.numbers
+        return outer * (radius**2 - self.end2) / (self.end2 - middle2)
+
+    def p_value(self, radius: float) -> float:
+        """Probability of so few beyond the end if they are even within a radius.
+
+        At least that of their distances if these are Gaussian, or a long tail of those of the true
+        ones: they become few by themselves.
+        """
+        if self.end2 > (INSIDE * radius) ** 2 or self.end2 <= self.hidden2:
+            return 1.0
+        outer, beyond, middle2 = self.numbers
+        share = (radius**2 - self.end2) / (radius**2 - middle2)
+        even = float(special.bdtr(beyond, outer + beyond, share))
+        over = self.square.clip(self.hidden2) - self.hidden2
+        if not self.gaussian and np.median(over) > FAR * self.hidden2:
+            return even
+        # squares of Gaussian distances are exponential, those of other tails longer
+        largest = -np.expm1(-over[-1] / max(float(over.mean()), 1e-300))
+        return max(even, float(largest ** len(over)))
+
+
 def _weights(sample: ScoredSample) -> Float:
-    """Probabilities (N,) of true matches, without those whose residuals the fit has taken."""
+    """Probabilities (N,) of true matches, those of one star divided by their number.
+
+    They are 0 for residuals that the fit has taken.  Detections that share the error of one
+    reference position lie beyond a radius together, or not at all.
+    """
     leverage = np.broadcast_to(sample.leverage, sample.score.shape)
-    return np.asarray(sample.inlier * (leverage.max(axis=0) < LARGEST_LEVERAGE))
+    return np.asarray(sample.inlier * sample.share * (leverage.max(axis=0) < LARGEST_LEVERAGE))
 
 
 def _alike(variance: Float, inlier: Float) -> Int:
@@ -166,6 +260,130 @@ def truncation_test(sample: ScoredSample, match_radius: float | None) -> Outcome
         partial(_smallest, sigma, n, len(found)),
         sample.model.unit,
     )
+
+
+def radius_test(sample: ScoredSample) -> Outcome | None:
+    """Test whether the matches end at the match radius that is stated.
+
+    None without such a radius, and for less than `MIN_STARS` matches.
+    """
+    radius = sample.match_radius
+    if radius is None or len(sample) < MIN_STARS:
+        return None
+    if sample.from_nominal is None:
+        beyond = np.hypot(*sample.residual)
+        far = beyond[beyond > NEAR * radius]
+        false = float((1.0 - sample.inlier).sum())
+        p_value = float(special.gammainc(len(far), STRAY * false + 0.5)) if len(far) else 1.0
+        if p_value < SCORE_TESTS.value / MOST_TESTS:
+            return _beyond_radius(sample, radius, far, p_value)
+    return _ends_inside(sample, radius)
+
+
+def _ends_inside(sample: ScoredSample, radius: float) -> Outcome:
+    """Outcome of a test whose matches may end inside the stated radius."""
+    unit, n = sample.model.unit, len(sample)
+    residual, sigma = np.hypot(*sample.residual), np.sqrt(sample.variance.max(axis=0))
+    # by the median: false matches pass for larger errors if the area of the circle is wrong
+    ratio = float(np.median(residual / sigma)) / np.sqrt(2 * np.log(2))
+    distance, centre, columns = residual, "the solution", ", and give u_nominal and v_nominal"
+    if sample.from_nominal is not None:
+        distance, centre, columns = np.hypot(*sample.from_nominal), "nominal positions", ""
+    false = _FalseMatches.of(
+        distance,
+        residual,
+        sigma * min(ratio, 1.0),
+        gaussian=sample.mixture is not None and sample.mixture.kind == GAUSSIAN,
+    )
+    cut = _cut_by_circle(sample, distance)
+    p_false = 1.0 if false is None else false.p_value(radius)
+    p_value = min(1.0, 2 * min(p_false, cut.p_value))
+    largest = float(distance.max())
+    if false is not None and p_false <= cut.p_value:
+        end, expected = np.sqrt(false.end2), false.expected(radius)
+        beyond = false.numbers[1]
+        kind = "false"
+    else:
+        end, expected, beyond = cut.radius, cut.expected, cut.beyond
+        kind = "true"
+    if largest > INSIDE * radius:
+        largest = end
+    remedy = (
+        f"state outliers.match_radius = {_rounded_up(largest)}, or the radius that the matches "
+        f"were cut at{columns}"
+    )
+    present = (
+        f"the matches end far inside the stated match radius of {radius:.3g} {unit}: "
+        f"{expected:.3g} {kind} ones are expected beyond {end:.3g} {unit} from {centre}, and there "
+        f"are {beyond}"
+    )
+    size = end * np.sqrt(max(expected - beyond, 0.0) / n / 2) if p_value < 1 else 0.0
+    return _radius_outcome(replace(RADIUS, present=present, remedy=remedy), sample, p_value, size)
+
+
+def _cut_by_circle(sample: ScoredSample, distance: Float) -> _Deficit:
+    """True matches that are missing beyond the largest distances (N,) from nominal positions."""
+    unit = sample.model.unit
+    nothing = _Deficit(0.0, 0, float(distance.max()), unit, 0.0)
+    if sample.from_nominal is None or sample.match_radius is None:
+        return nothing
+    offset = np.hypot(*(sample.from_nominal - sample.residual))
+    variance = sample.variance.max(axis=0)
+    deficits = [nothing]
+    for k, end in _ends(distance):
+        if end > INSIDE * sample.match_radius:
+            continue
+        # of round Gaussians about the offsets
+        tail = 1.0 - special.chndtr(end**2 / variance, 2, offset**2 / variance)
+        total = float(sample.inlier @ tail)
+        # the logarithm of a tail goes with that of the variance by some half its square
+        relative = np.sqrt(1.0 / max(float(sample.inlier.sum()), 1.0))
+        slope = float(sample.inlier @ (tail * (end - offset).clip(0) ** 2 / variance)) / 2
+        spread = relative * slope / max(total, 1e-300)
+        deficits.append(_Deficit(total, k, end, unit, spread))
+    return min(deficits, key=lambda deficit: deficit.p_value)
+
+
+def _beyond_radius(sample: ScoredSample, radius: float, far: Float, p_value: float) -> Outcome:
+    """Outcome of a test that has found matches far beyond the stated radius."""
+    unit, n = sample.model.unit, len(sample)
+    largest = float(far.max())
+    present = (
+        f"{len(far)} of {n} residuals are larger than {NEAR:g} times the stated match radius of "
+        f"{radius:.3g} {unit}, up to {largest:.3g}"
+    )
+    remedy = (
+        "state as outliers.match_radius the radius that the matches were cut at, some "
+        f"{_rounded_up(largest)}, or leave out what lies beyond it; if the matches lie within the "
+        "radius of other positions, give these as u_nominal and v_nominal"
+    )
+    size = float(np.sqrt((far**2).sum() / (2 * n)))
+    return _radius_outcome(replace(RADIUS, present=present, remedy=remedy), sample, p_value, size)
+
+
+def _radius_outcome(family: Family, sample: ScoredSample, p_value: float, size: float) -> Outcome:
+    """Outcome whose size is the rms, along an axis, of the matches that are missing or astray."""
+    radius, n = float(sample.match_radius or 0.0), len(sample)
+
+    def smallest(level: float) -> float:
+        return float(radius * np.sqrt(min(-np.log(level) / n, 1.0) / 2))
+
+    return Outcome(
+        family,
+        chi_square_of(p_value, 1),
+        1,
+        None,
+        p_value,
+        float(size),
+        smallest,
+        sample.model.unit,
+    )
+
+
+def _rounded_up(radius: float) -> str:
+    """Three digits of a radius, not below it."""
+    step = 10.0 ** (np.floor(np.log10(radius)) - 2)
+    return f"{np.ceil(radius / step) * step:.3g}"
 
 
 def _in_sigmas(radii: _Radii) -> list[_Deficit]:

@@ -13,7 +13,11 @@ from bayesdist.diagnose.correlated.deviations import deviation_draws
 from bayesdist.diagnose.correlated.functions import MIN_SIDE, StructureFunctions
 from bayesdist.diagnose.correlated.noise import not_narrower
 from bayesdist.diagnose.correlated.priors import DiscrepancyPriors
-from bayesdist.diagnose.correlated.result import ChipStructure, Discrepancy
+from bayesdist.diagnose.correlated.result import (
+    ChipStructure,
+    Discrepancy,
+    structure_correlation,
+)
 from bayesdist.diagnose.correlated.structure import structure_posterior
 from bayesdist.diagnose.selfcal.eliminated import (
     Columns,
@@ -21,7 +25,7 @@ from bayesdist.diagnose.selfcal.eliminated import (
     eliminated,
     without_parameters,
 )
-from bayesdist.diagnose.selfcal.sandwich import sandwich
+from bayesdist.diagnose.selfcal.sandwich import squared_scores
 from bayesdist.diagnose.selfcal.scores import score_excess, scores_of_detections
 from bayesdist.infer.equations.scaled import one_thread
 from bayesdist.infer.selfcal.mode import SelfCalibrationMode
@@ -49,7 +53,7 @@ def selfcal_discrepancy(
     working = scores_of_detections(solution)
     flat = working.flattened(score_excess(solution, working))
     cov = solution.cov
-    noise, ratio = not_narrower(sandwich(solution, working), cov)
+    noise, ratio = not_narrower(squared_scores(solution, working).by_evidence, cov)
 
     some = EvenStars.of(solution)
     flat, working = flat.at(some.rows), working.at(some.rows)
@@ -67,10 +71,13 @@ def selfcal_discrepancy(
         solution, functions, (S[:m, :m], score[:m], taken[:, :m]), priors, rng
     )
     facts: dict[str, object] = {"structure": sizes, "unit": model.unit, "noise_ratio": ratio}
+    facts["structure_correlation"] = structure_correlation(model, found, theta)
     linear = None
     if deviations is not None:
         linear = deviation_draws(deviations, S[m:, m:], score[m:], taken[:, m:], priors, DRAWS, rng)
         facts |= linear.facts
+        if linear.outlying:
+            facts["exposures_outlying"] = [model.exposures[code] for code in linear.outlying]
     if model.frames != "affine" and not (linear and linear.scatter):
         facts["exposures_measured"] = False
     return Discrepancy(model, solution.theta, cov, noise, found, theta, linear, facts)
@@ -113,11 +120,12 @@ def _structure(
         structure=priors.structure * pixel,
         lengths=LENGTHS,
     )
-    drawn = posterior.draws(DRAWS, rng)
+    waves = {code: one.finer_waves(rng) for code, one in functions.items()}
+    drawn = posterior.draws(DRAWS, rng, [[w for w in waves.values() for _ in "uv"]])
     out, rows, known = dict[int, ChipStructure](), list[dict[str, object]](), []
     for k, (code, one) in enumerate(functions.items()):
         chip, pair = model.chips[code], drawn[2 * k : 2 * k + 2]
-        found = ChipStructure(one, one.finer_waves(rng), np.stack(pair, axis=1))
+        found = ChipStructure(one, waves[code], np.stack(pair, axis=1))
         rows += found.sizes(chip, posterior.length)
         out[chip.number] = found
         known += [axis[:, : one.n_known] for axis in pair]

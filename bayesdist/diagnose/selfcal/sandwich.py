@@ -4,22 +4,18 @@ from __future__ import annotations
 
 import numpy as np
 
+from bayesdist.diagnose.correlated.squares import MIN_FREE, SquaredScores
 from bayesdist.diagnose.selfcal.eliminated import Columns, Piece, absorbed_by_stars, pieces
 from bayesdist.diagnose.selfcal.scores import DetectionScores
 from bayesdist.infer.selfcal.mode import SelfCalibrationMode
 from bayesdist.utils.arrays import Float
 
-# A star that alone determines a parameter has no residual: its squared score is uninformative.
-MIN_FREE = 0.1
 
+def squared_scores(solution: SelfCalibrationMode, scores: DetectionScores) -> SquaredScores:
+    """Sums over the stars of products of their scores, and what is expected; 0 if fixed.
 
-def sandwich(solution: SelfCalibrationMode, scores: DetectionScores) -> Float:
-    """Covariance (D, D) of the parameters, valid for any errors of single stars; 0 for fixed ones.
-
-    The detections of a star share its position, so that their scores are added up.  Each sum is
-    divided by one minus the leverage of the star's detections (HC3 of MacKinnon and White 1985,
-    Journal of Econometrics 29, 305, with stars for observations): a jackknife over stars, to first
-    order.
+    The detections of a star share its position, so that their scores are added up.  The leverage is
+    that of the star's detections, per degree of freedom in excess of the star's own parameters.
     """
     p, free = solution.problem, solution.free
     columns = Columns(p, solution.theta)
@@ -27,7 +23,8 @@ def sandwich(solution: SelfCalibrationMode, scores: DetectionScores) -> Float:
     root[free] = np.linalg.inv(np.linalg.cholesky(solution.precision)).T
     inside = np.empty_like(root)
     inside[columns.order] = root
-    meat = np.array(solution.prior.precision)
+    unbiased, jackknife = np.zeros((2, columns.n_params, columns.n_params))
+    products = np.zeros(3)
     for piece in pieces(columns):
         here = piece.scores(scores)
         sums = absorbed_by_stars(columns, piece, here, solution.stars)
@@ -36,13 +33,26 @@ def sandwich(solution: SelfCalibrationMode, scores: DetectionScores) -> Float:
         whole = np.einsum("nab,naf,nbf->n", here.curvature, moved, moved, optimize=True)
         leverage = np.bincount(piece.star, whole, S)
         leverage -= np.sum((sums.rows @ inside) ** 2, axis=1).reshape(S, q).sum(axis=1)
-        # per degree of freedom of its detections, in excess of the star's own parameters
-        number = 2 * np.bincount(piece.star, here.curvature[:, 0, 0] > 0, S) - q
-        mean = np.clip(leverage / np.maximum(number, 1), 0.0, 1 - MIN_FREE)
-        psi = star_scores(columns, piece, here.gradient) / (1 - mean)[:, None]
-        meat += psi.T @ psi
-    cov = root @ root.T
-    return np.asarray(cov @ meat @ cov)
+        number = np.maximum(2 * np.bincount(piece.star, here.curvature[:, 0, 0] > 0, S) - q, 1)
+        mean = np.clip(leverage / number, 0.0, 1 - MIN_FREE)
+        psi = star_scores(columns, piece, here.gradient) / np.sqrt(1 - mean)[:, None]
+        unbiased += psi.T @ psi
+        square = np.sum((psi @ root) ** 2, axis=1)
+        # a star's expected squares are taken to be the same in all of its degrees of freedom
+        products += [square @ square, square @ mean, leverage @ mean]
+        psi /= np.sqrt(1 - mean)[:, None]
+        jackknife += psi.T @ psi
+    prior = np.array(solution.prior.precision)
+    expected = np.zeros_like(prior)
+    expected[np.ix_(free, free)] = solution.precision - prior[np.ix_(free, free)]
+    return SquaredScores(
+        root @ root.T,
+        expected,
+        prior,
+        unbiased,
+        jackknife,
+        (float(products[0]), float(products[1]), float(products[2])),
+    )
 
 
 def star_scores(columns: Columns, piece: Piece, gradient: Float) -> Float:

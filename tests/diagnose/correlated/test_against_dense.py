@@ -39,21 +39,38 @@ def test_the_information_is_that_of_all_stars(lone):
     np.testing.assert_allclose(information.score, J.T @ r / SIGMA**2, rtol=1e-7, atol=1e-5)
 
 
-def test_the_sandwich_is_hc3(lone):
-    """MacKinnon and White (1985), with the hat matrix written out."""
+def test_the_sandwich_is_hc3_and_its_weight_twice_that_of_ledoit_and_wolf(lone):
+    """With the hat matrix and every star's product of scores written out."""
     information, J, r = lone
     inverse = np.linalg.inv(J.T @ J)
     hat = np.einsum("nd,de,ne->n", J, inverse, J)
-    meat = J.T @ ((r / (1 - hat)) ** 2 * J.T).T
+    pairs = J.reshape(-1, 2, J.shape[1])
+    root = np.linalg.cholesky(inverse)
+
+    def products(power):
+        """Product (D, D) of the scores of each star, where the parameters have unit covariance."""
+        scores = np.einsum("nad,na->nd", pairs, (r / (1 - hat) ** power).reshape(-1, 2)) @ root
+        return scores[:, :, None] * scores[:, None, :]
+
     # both axes of a star have one membership: products of its two scores are in as well
-    pairs, own = (r / (1 - hat)).reshape(-1, 2), J.reshape(-1, 2, J.shape[1])
-    cross = np.einsum("nd,n,ne->de", own[:, 0], pairs[:, 0] * pairs[:, 1], own[:, 1])
-    meat = meat + cross + cross.T
-    expected = inverse @ meat @ inverse
+    jackknife, unbiased = products(1.0), products(0.5)
+    expected = root @ jackknife.sum(axis=0) @ root.T
+    squares = information.squared_scores()
     scale = np.sqrt(np.diag(expected))
-    found = information.sandwich()
     np.testing.assert_allclose(
-        found / np.outer(scale, scale), expected / np.outer(scale, scale), atol=1e-8
+        squares.sandwich() / np.outer(scale, scale), expected / np.outer(scale, scale), atol=1e-8
+    )
+    of_each = np.einsum("nad,nae->nde", pairs @ root, pairs @ root)
+    factor = np.trace(unbiased.sum(axis=0)) / np.trace(of_each.sum(axis=0))
+    assert squares.scale == pytest.approx(factor / SIGMA**2, rel=1e-8)
+    left = unbiased - factor * of_each
+    weight = np.clip(2 * (1 - np.sum(left**2) / np.sum(left.sum(axis=0) ** 2)), 0.0, 1.0)
+    assert squares.weight == pytest.approx(weight, abs=1e-8)
+    mixed = weight * jackknife.sum(axis=0) + (1 - weight) * factor * np.eye(len(root))
+    np.testing.assert_allclose(
+        squares.by_evidence / np.outer(scale, scale),
+        root @ mixed @ root.T / np.outer(scale, scale),
+        atol=1e-7,
     )
 
 

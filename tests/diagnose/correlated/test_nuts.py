@@ -8,10 +8,12 @@ import numpy as np
 import pytest
 from numpy.polynomial.legendre import legvander2d
 from scipy.stats import kurtosis
+from scipy.stats import t as student_t
 
 from bayesdist.diagnose.correlated import DiscrepancyPriors
 from bayesdist.diagnose.correlated.deviations import DeviationColumns, deviation_draws
 from bayesdist.diagnose.correlated.functions import StructureFunctions
+from bayesdist.diagnose.correlated.priors import STRUCTURE_DOF
 from bayesdist.diagnose.correlated.structure import LENGTHS, structure_posterior
 from tests.infer.by_nuts import needs_numpyro, nuts_draws
 from tests.reduced import only_in_full
@@ -108,15 +110,15 @@ def test_structure(found, capsys):
 
     grid = posterior.terms_amplitude
     low = 0.01 * float(grid[0])
-    high = max(3 * SIGMA, 10 * medians["structure"])
+    high = max(SIGMA, 10 * medians["structure"])
     decline = jnp.array(functions.decline())
     spectra = jnp.array(np.stack([np.sqrt(functions.spectrum(s)) for s in LENGTHS]))
     stars, poly, every, points = (jnp.array(z) for z in (data, P, B, at))
     centre, spread = (jnp.array(z) for z in (np.linalg.lstsq(P, data, rcond=None)[0].T, root))
 
-    def half_cauchy(t, median):
-        z = jnp.exp(t) / median
-        return jnp.log(z) - jnp.log1p(z**2)
+    def half_t(t, median):
+        z = jnp.exp(t) / median * student_t(STRUCTURE_DOF).ppf(0.75)
+        return jnp.log(z) - (STRUCTURE_DOF + 1) / 2 * jnp.log1p(z**2 / STRUCTURE_DOF)
 
     def density():
         flat = dist.ImproperUniform(dist.constraints.real, (), (2, len(POWERS)))
@@ -124,15 +126,15 @@ def test_structure(found, capsys):
         terms = numpyro.sample("terms", dist.Normal(0, 1).expand((2, T)))
         sines = numpyro.sample("sines", dist.Normal(0, 1).expand((2, m - T)))
         within = dist.Uniform(np.log(low), np.log(high))
-        of_terms = numpyro.sample("of_terms", dist.Uniform(np.log(low), np.log(3 * high)))
+        of_terms = numpyro.sample("of_terms", dist.Uniform(np.log(low), np.log(high)))
         a = jnp.stack([numpyro.sample(f"of_field_{k}", within) for k in "uv"])
         z_terms = jnp.exp(of_terms) * decline * terms
         base = stars.T - theta @ poly.T - z_terms @ every[:, :T].T
         inside = 1 - 0.5 * (jnp.exp(np.log(low) - a[0]) + jnp.exp(a[0] - np.log(high)))
         apart = jnp.log(0.5) - jnp.abs(a[0] - a[1])
         rms = 0.5 * jnp.log(0.5 * jnp.exp(2 * a).sum())
-        alike = jnp.log(0.8) + half_cauchy(a[0], medians["structure"]) + apart - jnp.log(inside)
-        unlike = jnp.log(0.2) + half_cauchy(rms, medians["structure"]) + apart
+        alike = jnp.log(0.8) + half_t(a[0], medians["structure"]) + apart - jnp.log(inside)
+        unlike = jnp.log(0.2) + half_t(rms, medians["structure"]) + apart
         logs, fields = [], []
         for prior, sizes in ((alike, a[jnp.array([0, 0])]), (unlike, a)):
             for spectrum in spectra:
@@ -140,7 +142,7 @@ def test_structure(found, capsys):
                 logs.append(prior - 0.5 * ((base - z @ every[:, T:].T) ** 2).sum() / SIGMA**2)
                 fields.append(jnp.concatenate([z_terms, z], axis=1) @ points.T)
         logs = jnp.stack(logs)
-        numpyro.factor("posterior", half_cauchy(of_terms, medians["higher_order"]))
+        numpyro.factor("posterior", half_t(of_terms, medians["higher_order"]))
         numpyro.factor("mixture", jax.scipy.special.logsumexp(logs))
         pick = numpyro.sample("pick", dist.Uniform())
         which = jnp.searchsorted(jnp.cumsum(jax.nn.softmax(logs)), pick)

@@ -10,7 +10,7 @@ import pytest
 from bayesdist.diagnose.correlated.deviations import deviation_columns
 from bayesdist.diagnose.correlated.functions import StructureFunctions
 from bayesdist.diagnose.selfcal.eliminated import Columns, eliminated, without_parameters
-from bayesdist.diagnose.selfcal.sandwich import sandwich
+from bayesdist.diagnose.selfcal.sandwich import squared_scores
 from bayesdist.diagnose.selfcal.scores import DetectionScores, scores_of_detections
 from bayesdist.infer.equations.priors import Prior
 from bayesdist.infer.selfcal.elimination import Mixture
@@ -183,7 +183,7 @@ def test_sandwich_is_a_jackknife_over_stars():
     )
     p, free = solution.problem, solution.free
     scores = scores_of_detections(solution)
-    found = sandwich(solution, scores)
+    found = squared_scores(solution, scores).sandwich()
     columns = Columns(p, solution.theta)
     A = eliminated(columns, scores, solution.stars)[0][np.ix_(free, free)]
     moved = np.zeros((p.n_stars, len(free)))

@@ -32,6 +32,7 @@ def load_matches(
                 where="data.not_finite",
                 do="write the table without them",
             )
+        options.pop("same_position", None)  # equal positions are looked for in memory alone
         return open_matches(path, **options)
     return read_matches(path, format=format, **options)
 
@@ -40,7 +41,7 @@ def reading_options(data: Data, chips: Sequence[ChipBlock]) -> dict[str, Any]:
     """Options of `load_matches` that a section [data] gives; chips may be named in tables."""
     names = (
         *("format", "columns", "unit", "sigma", "pixel_origin", "tangent_point"),
-        *("epoch", "catalogue_epoch", "not_finite"),
+        *("epoch", "catalogue_epoch", "not_finite", "same_position"),
     )
     numbers = {chip.name: chip.number for chip in chips}
     return {name: getattr(data, name) for name in names} | {"chips": numbers or None}

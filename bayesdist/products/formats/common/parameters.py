@@ -84,6 +84,10 @@ def parameters_hdu(calibration: Calibration, epoch: float | None = None) -> fits
         header[f"BDSIGU{k}"] = row.u, "standard deviation of u"
         header[f"BDSIGV{k}"] = row.v, "standard deviation of v"
         header[f"BDFROM{k}"] = printable(row.source)
+        if row.correlation:
+            # fractions of the variance, each with its length in pixels
+            words = " ".join(f"{part:g}@{length:g}" for part, length in row.correlation)
+            header[f"BDCORR{k}"] = words
     header.add_comment("u = sum VALUE P_I(X) P_J(Y), P Legendre, X = (2 x - (NX + 1)) / NX")
     return hdu
 
@@ -149,7 +153,9 @@ def _further(header: fits.Header) -> list[dict[str, Any]]:
     while f"BDNAME{len(out) + 1}" in header:
         k = len(out) + 1
         cards = {key: f"BD{name}{k}" for key, name in _FURTHER.items()}
-        out.append({key: header[card] for key, card in cards.items() if card in header})
+        row = {key: header[card] for key, card in cards.items() if card in header}
+        words = str(header.get(f"BDCORR{k}", "")).split()
+        out.append(row | {"correlation": [word.split("@") for word in words]})
     return out
 
 

@@ -1,0 +1,217 @@
+"""Reference stars that occur in several rows, recognised by their positions.
+
+Rows of one star share the error of its reference position.  Tables often lack a column that names
+the star; equal reference positions then tell which rows belong together.  Stars may also come in
+tight groups, such as the pinholes of one fiducial, whose positions share an error of the group.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
+
+from bayesdist.errors import InputError
+from bayesdist.utils.arrays import Float, Int
+from bayesdist.utils.numbers import count
+
+# what rows with equal reference positions are: option `same_position` of reading
+SAME_POSITION = ("one_star", "separate_stars")
+ROUNDING = 1e-9  # fraction of the field below which positions are equal
+# Linking length of tight groups, in units of the root of the area per star.  Of stars that are
+# distributed at random, 7 % have a neighbour within it.
+LINK = 0.15
+LARGEST_GROUP = 30  # stars: more are a crowded field, and no fiducial
+ISOLATION = 4.0  # least distance of a group from the next star, in units of its own extent
+MOST = 0.5  # fraction of the stars that must lie in groups
+MIN_STARS = 20  # below which groups cannot be told from chance
+
+
+def check_same_position(value: str) -> None:
+    """Raise InputError unless `value` is one of `SAME_POSITION`."""
+    if value not in SAME_POSITION:
+        raise InputError(
+            f"same_position is {value!r}",
+            where="data.same_position",
+            do=f"set it to {' or '.join(map(repr, SAME_POSITION))}",
+        )
+
+
+def position_codes(first: Float, second: Float) -> Int:
+    """Code (N,) of the distinct position of each row; positions within rounding are equal.
+
+    The codes count from 0 in ascending order of the positions, whatever the order of the rows.
+    """
+    # -0.0 and 0.0 are equal
+    distinct, code = np.unique((first + 0.0) + 1j * (second + 0.0), return_inverse=True)
+    at = np.column_stack([distinct.real, distinct.imag])
+    tolerance = ROUNDING * float(max(np.ptp(at, axis=0).max(), 1e-300))
+    pairs = cKDTree(at).query_pairs(tolerance, output_type="ndarray")
+    if not len(pairs):
+        return np.asarray(code)
+    _, merged = _linked(pairs, len(at))
+    return np.asarray(merged[code])
+
+
+def star_codes(first: Float, second: Float, same_position: str) -> tuple[Int | None, str]:
+    """Codes (N,) of stars by their reference positions, and a note on them.
+
+    None and an empty note if no position occurs twice.  With "separate_stars" each row has a code
+    of its own, so that nobody looks for equal positions again.
+    """
+    code = position_codes(first, second)
+    number = np.bincount(code)
+    repeated = number[number > 1]
+    if not repeated.size:
+        return None, ""
+    words = repeated_words(repeated)
+    if same_position == "separate_stars":
+        return np.arange(len(code)), f"{words}, and count as separate stars (data.same_position)"
+    return code, f"{words}: their matches count as those of one star (data.same_position)"
+
+
+def repeated_words(number: Int) -> str:
+    """Clause on reference positions that occur in several rows, given the number of each."""
+    low, high = int(number.min()), int(number.max())
+    times = f"{low}" if low == high else f"{low} to {high}"
+    one = len(number) == 1
+    verb = "position occurs" if one else "positions occur"
+    return f"{count(len(number))} reference {verb} {times} times" + ("" if one else " each")
+
+
+@dataclass(frozen=True, eq=False)
+class RepeatedDetections:
+    """Stars with several detections in one exposure, of which one at most can be right."""
+
+    stars: int  # reference stars with several detections in an exposure
+    rows: int  # their rows in these exposures
+    n_stars: int  # all reference stars
+    # True if there is one exposure, and most stars occur several times in it: rows of several
+    # exposures that no column tells apart
+    unlabelled: bool
+
+    @property
+    def sentence(self) -> str:
+        """What was found, and what to do about it."""
+        if self.unlabelled:
+            return (
+                f"{count(self.stars)} of {count(self.n_stars)} stars have several detections, and "
+                "no column tells exposures apart: name the column of the exposures (exposure in "
+                "data.columns); within one exposure all but one of them would be false matches"
+            )
+        return (
+            f"{count(self.stars)} of {count(self.n_stars)} stars have several detections in one "
+            f"exposure ({count(self.rows)} rows), of which at most one of each star can be right: "
+            "match one to one (bayesdist match, bayesdist.match), or keep the nearest of each star"
+        )
+
+
+def repeated_detections(
+    u: Float, v: Float, exposure: Int, star: Int | None
+) -> RepeatedDetections | None:
+    """Stars that occur several times in one exposure; None if there are none.
+
+    Rows of an exposure count as detections of one star if they have the same reference position,
+    and also the same code in `star` (N,) if there are codes.
+    """
+    position = position_codes(u, v)
+    # separate stars at one position, or parts of a group with one code
+    code = position if star is None else _joint(star, position)
+    cell = _joint(exposure, code)
+    number = np.bincount(cell)
+    several = number[cell] > 1
+    if not several.any():
+        return None
+    stars, n_stars = len(np.unique(code[several])), len(np.unique(code))
+    unlabelled = len(np.unique(exposure)) == 1 and 2 * stars > n_stars
+    return RepeatedDetections(stars, int(several.sum()), n_stars, unlabelled)
+
+
+@dataclass(frozen=True, eq=False)
+class TightGroups:
+    """Stars that lie in groups far tighter than the distances between the groups."""
+
+    code: Int  # (N,) group of each row; a star in no group is one by itself
+    groups: int  # number of groups with several stars
+    size: int  # median number of stars in these
+    extent: float  # median largest extent of a group, in the unit of u, v
+    apart: float  # median distance between neighbouring groups
+
+    def sentence(self, unit: str) -> str:
+        """What was found, and what to do about it."""
+        return (
+            f"the stars lie in {count(self.groups)} groups of {self.size} (extent "
+            f"{self.extent:.2g} {unit}, {self.apart:.2g} {unit} apart), and stars of a group are "
+            "taken to share an error: give a column star with the number of the group (the "
+            "fiducial), or of each star if their errors are independent"
+        )
+
+
+def tight_groups(u: Float, v: Float, star: Int | None = None) -> TightGroups | None:
+    """Tight groups of reference positions; None if most stars lie by themselves.
+
+    Rows with one code in `star` (N,) are one star at their mean position.
+    """
+    code = position_codes(u, v) if star is None else np.unique(star, return_inverse=True)[1]
+    number = np.bincount(code)
+    n = len(number)
+    if n < MIN_STARS:
+        return None
+    at = np.column_stack([np.bincount(code, z) / number for z in (u, v)])
+    area = float(np.prod(np.maximum(np.ptp(at, axis=0), 1e-300)))
+    link = LINK * np.sqrt(area / n)
+    tree = cKDTree(at)
+    near, _ = tree.query(at, k=2)
+    if (near[:, 1] <= link).mean() < MOST:
+        return None
+    # many pairs: a crowded field, whose groups would be larger than any fiducial
+    if tree.count_neighbors(tree, link) > n * LARGEST_GROUP:
+        return None
+    pairs = tree.query_pairs(link, output_type="ndarray")
+    n_groups, group = _linked(pairs, n)
+    size = np.bincount(group)
+    low, high = np.full((n_groups, 2), np.inf), np.full((n_groups, 2), -np.inf)
+    np.minimum.at(low, group, at)
+    np.maximum.at(high, group, at)
+    extent = np.hypot(*(high - low).T)
+    centre = np.column_stack([np.bincount(group, z) / size for z in at.T])
+    if n_groups < 2:
+        return None
+    apart = cKDTree(centre).query(centre, k=2)[0][:, 1]
+    # stars at one position have been told apart by their codes: their errors are independent
+    distinct = extent > ROUNDING * float(np.ptp(at, axis=0).max())
+    isolated = distinct & (size <= LARGEST_GROUP) & (apart > ISOLATION * extent)
+    if size[isolated].sum() < MOST * n:
+        return None
+    return TightGroups(
+        group[code],  # groups that are not isolated too, now that most are
+        int(isolated.sum()),
+        int(np.median(size[isolated])),
+        float(np.median(extent[isolated])),
+        float(np.median(apart[isolated])),
+    )
+
+
+def error_codes(u: Float, v: Float, star: Int | None) -> Int | None:
+    """Code (N,) of what shares an error of the reference: a star, or a tight group of stars.
+
+    None if each row is a star by itself.
+    """
+    groups = tight_groups(u, v, star)
+    return star if groups is None else groups.code
+
+
+def _joint(a: Int, b: Int) -> Int:
+    """Code (N,), from 0, of each pair of codes."""
+    keys = np.unique(a, return_inverse=True)[1] * (int(b.max(initial=0)) + 1) + b
+    return np.asarray(np.unique(keys, return_inverse=True)[1])
+
+
+def _linked(pairs: Sequence[Int] | Int, n: int) -> tuple[int, Int]:
+    """Number of connected components of n points, and the component of each."""
+    i, j = np.asarray(pairs).T
+    return connected_components(coo_array((np.ones(len(i)), (i, j)), shape=(n, n)), directed=False)

@@ -1,0 +1,403 @@
+"""Deviations of single exposures beyond linear terms: second order, and smooth fields.
+
+Terms of the second order of each exposure scatter with one size tau, as those of shift, rotation
+and scale do.  With the linear terms of the exposure free, and all higher terms of the polynomials
+in common, its information and score are small matrices, and the likelihood of tau is a sum over
+exposures.  What is smooth and of no low order has an amplitude and a correlation length, known from
+products of neighbouring stars within exposures (`exposure_products`).
+
+The fit follows the mean of both over the exposures.  Their size there is what counts in the mean
+calibration; a single exposure has its own in full.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import scipy.linalg
+
+from bayesdist.diagnose.correlated.exposure_products import (
+    LENGTHS,
+    SECOND_ORDER,
+    DetectionScores,
+    ExposureProducts,
+    exposure_products,
+    modes,
+)
+from bayesdist.diagnose.correlated.functions import FINE, StructureFunctions, legendre_products
+from bayesdist.diagnose.correlated.information import GroupCells, Information
+from bayesdist.diagnose.correlated.priors import (
+    DiscrepancyPriors,
+    log_half_t,
+    log_widths,
+)
+from bayesdist.infer.exposures.hierarchy import MOST_OUTLYING
+from bayesdist.infer.exposures.scatter import OUTLYING, OUTLYING_FRACTION
+from bayesdist.infer.stars.likelihood import Likelihood
+from bayesdist.infer.stars.stars import Stars
+from bayesdist.model import Chip, DistortionModel
+from bayesdist.model.basis import polynomial_terms
+from bayesdist.utils.arrays import Float, Int
+
+STEPS = 40  # of an amplitude
+ITERATIONS = 12  # of the scatter, to find the exposures that went wrong
+WIDE = 30.0  # times what the data resolve: as good as free
+RANGE = 10.0  # range of amplitudes about the prior's median and what the data resolve
+SHAPE = 0.3  # by which the correlation at a separation may differ from that of a Matern field
+SINES = 10  # along each side of a chip: finer ones move no polynomial
+QUADRATIC = polynomial_terms(SECOND_ORDER)[len(polynomial_terms(SECOND_ORDER - 1)) :]
+STARS_PER_TERM = 2  # of an exposure on a chip; with fewer its second order is not looked at
+
+
+@dataclass(frozen=True, eq=False)
+class ExposureFields:
+    """Draws of the size of deviations of single exposures, and of their effect on the fit."""
+
+    theta: Float  # error (n, D) of the parameters, which follow the mean of the exposures
+    # (n,) in the unit of u, v: scatter of each second-order term of unit mean square
+    second_order: Float
+    amplitude: Float  # (n,) rms of the smooth field on an axis
+    length: Float  # (n,) its correlation length in longer half sides of a chip
+    n_exposures: int
+
+    def facts(self, size: tuple[float, float]) -> dict[str, Any]:
+        """Median rms of both kinds over a chip, both axes together, for summaries.
+
+        `size` are the columns and rows of the chip. The field is without its terms up to second
+        order.
+        """
+        second = float(np.sqrt(2 * len(QUADRATIC)) * np.median(self.second_order))
+        by_length = np.array([modes(size, float(length)).left for length in LENGTHS])
+        left = by_length[np.searchsorted(LENGTHS, self.length)]
+        field = float(np.median(self.amplitude * np.sqrt(2 * left)))
+        length = float(np.average(self.length, weights=self.amplitude**2))
+        length_pix = length * max(size) / 2
+        return {"second_order": second, "field": field, "length_pix": length_pix}
+
+    def functions(self, chip: Chip) -> StructureFunctions:
+        """Sines of the field on a chip, without their part in terms up to second order."""
+        return StructureFunctions(SECOND_ORDER, chip.size, SINES)
+
+    def coefficients(self, chip: Chip, rng: np.random.Generator) -> Float:
+        """Coefficients (n, 2, m) of the functions of an exposure that is yet to come."""
+        functions, n = self.functions(chip), len(self.amplitude)
+        low = rng.standard_normal((n, 2, len(QUADRATIC))) * self.second_order[:, None, None]
+        lengths, of = np.unique(self.length, return_inverse=True)
+        root = np.sqrt([functions.spectrum(length) for length in lengths])
+        finer = np.sqrt([functions.finer(length) for length in lengths])
+        sines = rng.standard_normal((n, 2, functions.n_sines)) * root[of][:, None]
+        waves = rng.standard_normal((n, 2, 2 * FINE)) * finer[of][:, None, None]
+        field = np.concatenate([sines, waves], axis=2) * self.amplitude[:, None, None]
+        return np.concatenate([low, field], axis=2).astype(np.float32)
+
+    def evaluate(self, chip: Chip, waves: Float, X: Float, Y: Float) -> Float:
+        """Values (N, m) of these functions at scaled positions."""
+        functions = self.functions(chip)
+        known = functions.evaluate(X, Y)[:, functions.n_terms :]
+        finer = functions.evaluate_finer(waves, X, Y)
+        return np.concatenate([legendre_products(X, Y, QUADRATIC), known, finer], axis=1)
+
+
+def exposure_fields(
+    information: Information,
+    working: Information,
+    stars: DetectionScores | None,
+    priors: DiscrepancyPriors,
+    n: int,
+    rng: np.random.Generator,
+) -> ExposureFields | None:
+    """Posterior draws of deviations of single exposures beyond linear terms.
+
+    `information` has the excess of the scores, `working` is that of the likelihood of the solution,
+    and `stars` are all detections or some, with the exposure of each; None for no field.  None for
+    a single exposure.
+    """
+    model = working.model
+    groups = working.sums.groups
+    keys = np.column_stack([groups.exposure, groups.epoch])
+    n_exposures = len(np.unique(keys, axis=0))
+    if n_exposures < 2:
+        return None
+    pixel = model.pixel_size(working.theta)
+    chips = [_Terms.of(information, working, code) for code in range(len(model.chips))]
+    terms = [chip for chip in chips if chip is not None]
+    pull, tau = _second_order_draws(terms, priors.higher_order * pixel, model.n_params, n, rng)
+    sizes = [chip.size for chip in model.chips]
+    products = {} if stars is None else exposure_products(stars, sizes)
+    amplitude, length = np.zeros(n), np.full(n, LENGTHS[-1])
+    if products:
+        size = priors.structure * pixel
+        amplitude, length = _field_draws(list(products.values()), size, n, rng)
+        pull += _followed(working, amplitude, length, rng)
+    return ExposureFields(pull @ working.covariance, tau, amplitude, length, n_exposures)
+
+
+def detection_scores(
+    model: DistortionModel, stars: Stars, likelihood: Likelihood, exposure: Int, star: Int
+) -> DetectionScores:
+    """Scores of detections in the order of `stars`, along the axes of the polynomials.
+
+    `exposure` and `star` (N,) are their codes.
+    """
+    g_u, g_v, h_uu, h_uv, h_vv = likelihood.scores(stars)
+    g = np.stack([g_u, g_v], axis=1)
+    H = np.stack([h_uu, h_uv, h_uv, h_vv], axis=1).reshape(-1, 2, 2)
+    good = (h_uu > 0) & (h_vv > 0)
+    chip = np.full(len(g), -1)
+    for k, (code, frame_of) in enumerate(
+        zip(stars.groups.chip, stars.groups.exposure, strict=True)
+    ):
+        rows = slice(stars.starts[k], stars.starts[k + 1])
+        frame = np.asarray(model.frame(likelihood.theta, int(frame_of))[0])
+        g[rows] = g[rows] @ frame
+        H[rows] = frame.T @ H[rows] @ frame
+        chip[rows] = code
+    h = np.where(good[:, None], np.einsum("naa->na", H), 0.0)
+    return DetectionScores(stars.X, stars.Y, g, h, chip, exposure, star)
+
+
+@dataclass(frozen=True, eq=False)
+class _Terms:
+    """Terms of all exposures on one chip from the second order on, along both axes.
+
+    The first six are those of the second order, which deviate; all are free in common.
+    """
+
+    information: Float  # (E, t, t) with the linear terms of each exposure eliminated
+    score: Float  # (E, t)
+    # values (E, 6) and vectors (E, 6, 6): eigenvectors of the information of the second order
+    values: Float
+    vectors: Float
+    taken: Float  # (E, 6, D) information of a unit of each second-order term and the parameters
+    loose: Float  # (E,) variance of the terms of an exposure that went wrong, else 0
+
+    @classmethod
+    def of(cls, information: Information, working: Information, chip: int) -> _Terms | None:
+        """Terms on a chip (by code) of the exposures with enough stars; None if these are few."""
+        model, q = working.model, len(QUADRATIC)
+        every = polynomial_terms(max(model.order, SECOND_ORDER))
+        K = len(every)
+        degree = np.array([sum(powers) for powers in every])
+        linear, high = np.flatnonzero(degree < SECOND_ORDER), np.flatnonzero(degree >= SECOND_ORDER)
+        second, higher = high[:q], high[q:]  # terms are in the order of their degree
+        chosen = np.concatenate([second, K + second, higher, K + higher])
+        free = np.concatenate([linear, K + linear])
+        S, s, taken = [], [], []
+        for cells, plain in zip(information.groups(), working.groups(), strict=True):
+            if cells.chip != chip or cells.count.sum() < STARS_PER_TERM * (len(free) + 2 * q):
+                continue
+            phi = legendre_products(cells.X, cells.Y, every)
+            H = np.einsum("ba,cbd,de->cae", cells.frame, cells.curvature, cells.frame)
+            N = np.block([[phi.T @ (H[:, a, b, None] * phi) for b in (0, 1)] for a in (0, 1)])
+            r = (phi.T @ (cells.score @ cells.frame)).T.ravel()
+            gain = np.linalg.lstsq(N[np.ix_(free, free)], N[np.ix_(free, chosen)])[0]
+            left = N[np.ix_(chosen, chosen)] - N[np.ix_(chosen, free)] @ gain
+            S.append((left + left.T) / 2)
+            s.append(r[chosen] - gain.T @ r[free])
+            taken.append(_onto_parameters(plain, phi[:, second], model.n_params).T)
+        if len(S) < 2:
+            return None
+        every_S = np.stack(S)
+        values, vectors = np.linalg.eigh(every_S[:, : 2 * q, : 2 * q])
+        return cls(
+            every_S,
+            np.stack(s),
+            np.maximum(values, 0.0),
+            vectors,
+            np.stack(taken),
+            np.zeros(len(S)),
+        )
+
+    def given(self, tau: float) -> _GivenScatter:
+        """Posterior of all terms for a scatter."""
+        variance = np.where(self.loose > 0, self.loose, tau**2)[:, None]
+        width, q = variance / (1 + self.values * variance), self.values.shape[1]
+        inverse = (self.vectors * width[:, None]) @ self.vectors.mT
+        cross, score = self.information[:, :, :q], self.score[:, :q]
+        mean = np.einsum("eab,eb->ea", inverse, score)
+        M = (self.information - cross @ inverse @ cross.mT).sum(axis=0)
+        M += 1e-9 * np.trace(M) / len(M) * np.eye(len(M))
+        right = self.score.sum(axis=0) - np.einsum("etq,eq->t", cross, mean)
+        factor = scipy.linalg.cholesky(M, lower=True)
+        half = scipy.linalg.solve_triangular(factor, right, lower=True)
+        log = 0.5 * (np.sum(score * mean) - np.log1p(self.values * variance).sum() + half @ half)
+        log -= np.log(np.diag(factor)).sum()
+        return _GivenScatter(self, float(log), width, mean, inverse @ cross.mT, factor, half)
+
+
+@dataclass(frozen=True, eq=False)
+class _GivenScatter:
+    """Posterior of the second-order terms of all exposures for one scatter."""
+
+    of: _Terms
+    log_evidence: float
+    width: Float  # variances (E, 6) along the eigenvectors, given the common terms
+    mean: Float  # (E, 6) if the common terms are 0
+    follow: Float  # (E, 6, t) by which the mean falls with the common terms
+    factor: Float  # Cholesky factor (t, t) of the precision of the common terms
+    half: Float  # (t,) their score in its units
+
+    def squares(self) -> Float:
+        """Expected squares (E, 6) of the terms."""
+        common = scipy.linalg.solve_triangular(self.factor, self.half, trans=1, lower=True)
+        spread = scipy.linalg.solve_triangular(
+            self.factor, self.follow.reshape(-1, len(self.factor)).T, lower=True
+        )
+        mean = self.mean - self.follow @ common
+        own = np.einsum("eak,ek,eak->ea", self.of.vectors, self.width, self.of.vectors)
+        return np.asarray(mean**2 + own + (spread**2).sum(axis=0).reshape(mean.shape))
+
+    def draws(self, n: int, rng: np.random.Generator) -> Float:
+        """Draws (n, E, 6) of the terms."""
+        common = scipy.linalg.solve_triangular(
+            self.factor,
+            self.half[:, None] + rng.standard_normal((len(self.half), n)),
+            trans=1,
+            lower=True,
+        )
+        noise = rng.standard_normal((n, *self.width.shape)) * np.sqrt(self.width)
+        noise = np.einsum("eak,nek->nea", self.of.vectors, noise)
+        return np.asarray(self.mean - np.einsum("eqt,tn->neq", self.follow, common) + noise)
+
+
+def _onto_parameters(cells: GroupCells, values: Float, n_params: int) -> Float:
+    """Information (D, 2 m) of functions with values (C, m) along both axes of the polynomials."""
+    out = np.zeros((n_params, 2 * values.shape[1]))
+    turned = cells.curvature @ cells.frame
+    for axis in (0, 1):
+        part = slice(axis * values.shape[1], (axis + 1) * values.shape[1])
+        pulled = turned[:, :, axis, None] * values[:, None]
+        out[cells.columns, part] = cells.onto_parameters(pulled)
+    return out
+
+
+def _second_order_draws(
+    chips: Sequence[_Terms], median: float, n_params: int, n: int, rng: np.random.Generator
+) -> tuple[Float, Float]:
+    """Pull (n, D) of the second-order terms on the fit, and draws (n,) of their scatter.
+
+    The fit absorbs the terms: the truth lies on the other side.
+    """
+    pull, drawn = np.zeros((n, n_params)), np.zeros(n)
+    if not chips:
+        return pull, drawn
+    known = np.concatenate([terms.values.ravel() for terms in chips])
+    known = known[known > 1e-8 * known.max()]
+    resolved = float(np.median(known)) ** -0.5
+    chips = [_with_loose(terms, WIDE * resolved) for terms in chips]
+    largest = max(
+        float(np.sqrt(np.mean(terms.given(WIDE * resolved).squares()[terms.loose == 0])))
+        for terms in chips
+    )
+    grid = np.geomspace(
+        min(median, resolved) / RANGE, RANGE * max(median, resolved, largest), STEPS
+    )
+    log = np.array([sum(terms.given(tau).log_evidence for terms in chips) for tau in grid])
+    log += log_half_t(grid, median) + log_widths(grid)
+    weight = np.exp(log - log.max())
+    which = rng.permutation(np.repeat(np.arange(STEPS), rng.multinomial(n, weight / weight.sum())))
+    for k in np.unique(which):
+        rows = np.flatnonzero(which == k)
+        drawn[rows] = grid[k]
+        for terms in chips:
+            coefficients = terms.given(grid[k]).draws(len(rows), rng)
+            pull[rows] -= np.tensordot(coefficients, terms.taken, axes=2)
+    return pull, drawn
+
+
+def _with_loose(terms: _Terms, start: float) -> _Terms:
+    """Terms with the exposures that went wrong set aside, the worst first.
+
+    The odds are those of ten times the scatter of the others (`infer.exposures.scatter`). None
+    are set aside where they would be more than a fifth: then they are the rule.
+    """
+    E, q = terms.values.shape
+    loose = np.zeros(E)
+    while (loose > 0).sum() <= MOST_OUTLYING * E:
+        tight, tau = loose == 0, start
+        for _ in range(ITERATIONS):  # to the most probable scatter of the others
+            given = replace(terms, loose=loose).given(tau)
+            squares = given.squares()
+            tau = float(np.sqrt(np.mean(squares[tight])))
+        total, count = squares[tight].sum(), q * (tight.sum() - tight)
+        rest = (total - np.where(tight, squares.sum(axis=1), 0.0)) / np.maximum(count, 1)
+        common = scipy.linalg.solve_triangular(given.factor, given.half, trans=1, lower=True)
+        cross = terms.information[:, :, :q]
+        score = terms.score[:, :q] - np.einsum("etq,t->eq", cross, common)
+        along = np.einsum("eqk,eq->ek", terms.vectors, score) ** 2
+        evidence = []
+        for times in (1.0, OUTLYING):
+            variance = times**2 * rest[:, None]
+            fit = along * variance / (1 + terms.values * variance)
+            evidence.append(0.5 * (fit - np.log1p(terms.values * variance)).sum(axis=1))
+        odds = evidence[1] - evidence[0] + np.log(OUTLYING_FRACTION / (1 - OUTLYING_FRACTION))
+        odds[~tight] = -np.inf
+        worst = int(np.argmax(odds))
+        if odds[worst] <= 0:
+            return replace(terms, loose=loose)
+        loose[worst] = OUTLYING**2 * float(rest[worst])
+        own = along[worst] / np.maximum(terms.values[worst], 1e-300) ** 2
+        loose[worst] = max(loose[worst], float(np.mean(own[terms.values[worst] > 0])))
+    return terms
+
+
+def _field_draws(
+    chips: Sequence[ExposureProducts], median: float, n: int, rng: np.random.Generator
+) -> tuple[Float, Float]:
+    """Draws (n,) of amplitude and correlation length of the field, by the products of neighbours.
+
+    A field of few patches differs by chance from its mean square, in all bins alike.
+    """
+    fits = np.array([[chip.amplitude(length) for chip in chips] for length in LENGTHS])
+    resolved = float(np.sqrt(fits[..., 1].min()))
+    largest = float(np.sqrt(max(fits[..., 0].max(), 0.0)))
+    grid = np.geomspace(
+        min(median, resolved) / RANGE, RANGE * max(median, resolved, largest), STEPS
+    )
+    log = np.empty((len(LENGTHS), STEPS))
+    for k, length in enumerate(LENGTHS):
+        log[k] = sum(_log_likelihood(chip, grid, length) for chip in chips)
+    log += log_half_t(grid, median) + log_widths(grid)
+    weight = np.exp(log - log.max()).ravel()
+    counts = rng.multinomial(n, weight / weight.sum())
+    which = rng.permutation(np.repeat(np.arange(len(counts)), counts))
+    return grid[which % STEPS], LENGTHS[which // STEPS]
+
+
+def _log_likelihood(chip: ExposureProducts, amplitude: Float, length: float) -> Float:
+    """Log likelihood of amplitudes (n,) of a field of a correlation length."""
+    expected = amplitude[:, None] ** 2 * chip.expected(length)
+    left = chip.covariance - expected
+    variance = chip.variance + (SHAPE * expected) ** 2
+    by_chance = 2.0 / (chip.n_fields * modes(chip.size, length).patches)
+    # a matrix of rank 1 beside the diagonal
+    common = 1 + by_chance * (expected**2 / variance).sum(axis=1)
+    along = (left * expected / variance).sum(axis=1)
+    chi2 = (left**2 / variance).sum(axis=1) - by_chance * along**2 / common
+    return np.asarray(-0.5 * (chi2 + np.log(variance).sum(axis=1) + np.log(common)))
+
+
+def _followed(
+    working: Information, amplitude: Float, length: Float, rng: np.random.Generator
+) -> Float:
+    """Pull (n, D) of a field of each exposure on the parameters, drawn at random.
+
+    What the data say of the field of one exposure says nothing of the mean of all.
+    """
+    out = np.zeros((len(amplitude), working.model.n_params))
+    lengths, of = np.unique(length, return_inverse=True)
+    for cells in working.groups():
+        functions = StructureFunctions(SECOND_ORDER, working.model.chips[cells.chip].size, SINES)
+        sines = functions.evaluate(cells.X, cells.Y)[:, functions.n_terms :]
+        pulled = _onto_parameters(cells, sines, working.model.n_params)[cells.columns]
+        for k, one_length in enumerate(lengths):
+            rows = np.flatnonzero(of == k)
+            root = pulled * np.tile(np.sqrt(functions.spectrum(one_length)), 2)
+            square, turn = np.linalg.eigh(root @ root.T)
+            factor = turn * np.sqrt(np.maximum(square, 0.0))
+            z = rng.standard_normal((len(rows), len(cells.columns)))
+            out[np.ix_(rows, cells.columns)] += amplitude[rows, None] * (z @ factor.T)
+    return out

@@ -1,0 +1,193 @@
+"""Residuals that are lopsided or have two cores, and those that only scatter."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from bayesdist.diagnose import score_tests
+from bayesdist.diagnose.checks import score_checks, structure_checks
+from bayesdist.diagnose.residuals.misfit import Misfit
+from bayesdist.infer import OutlierMixture, Rejection, fit_linear
+from tests import seeds
+from tests.diagnose.support import assert_even, assert_no_smaller_than_chance
+
+from .shaped import (
+    SHAPE,
+    SIDE,
+    SIGMA,
+    examined,
+    gaussian,
+    halo,
+    matches_of,
+    model_of,
+    nominal_within,
+    scaled,
+    scene,
+    student,
+    student_by_axis,
+    tail,
+    true_map,
+    two_visits,
+    unequal,
+)
+
+pytestmark = pytest.mark.usefixtures("one_thread")
+
+# what displaces the stars, how many there are, and which test has to find it
+DISPLACED = {
+    "visits overlap": (two_visits(0.1, lambda X: np.where(X > 0.1, 0.6, 0.05)), 3000, SHAPE[0]),
+    "visits in turn": (two_visits(0.1, lambda X: 0.5 + 0.4 * X), 3000, SHAPE[0]),
+    "visits in part": (two_visits(0.2, lambda X: 0.1 + 0.12 * (1 + X)), 3000, SHAPE[0]),
+    "visits turned": (two_visits(0.0, lambda X: 0.5 + 0 * X, 0.2), 3000, SHAPE[2]),
+    "visits alike": (two_visits(0.1, lambda X: 0.5 + 0 * X), 3000, SHAPE[3]),
+    "one-sided tail": (tail(0.06, 0.3), 4000, SHAPE[0]),
+    "rare long tail": (tail(0.12, 0.3), 5000, SHAPE[0]),
+}
+
+
+@pytest.mark.parametrize("name", DISPLACED)
+def test_displaced_stars_are_found(name):
+    displaced, n, test = DISPLACED[name]
+    found = examined(scene(np.random.default_rng(1), n, displaced))
+    assert found[test].significant and found[test].p_value < 1e-17
+    assert found[test].group == "shape" and "without a label" in found[test].remedy
+
+
+def test_a_halo_of_false_matches_is_found_where_it_is():
+    rng = np.random.default_rng(4)
+    found = examined(scene(rng, 5000, halo(0.4)))["skewness of a patch"]
+    # some 300 stars lie in it: what is found by their signs alone is no less probable
+    assert found.significant and found.p_value < 1e-6
+    # a displacement of half the stars by 3 sigma at most, in 7 % of the field
+    assert 0 < found.size < 1.5 * SIGMA * np.sqrt(0.07)
+    middle = np.random.default_rng(4)
+    _x, _y = middle.uniform(0.5, SIDE + 0.5, (2, 5000))
+    gaussian(middle, 5000)
+    expected = middle.uniform(400, SIDE - 400, 2)
+    named = found.finding.split("pixel (")[1].split(")")[0].split(", ")
+    assert np.hypot(*(np.array(named, float) - expected)) < 300
+
+
+# noise, fraction of false matches, their circle, stars, order
+INSIDE = {
+    "few": (gaussian, 0.04, None, 200, 3),
+    "false": (gaussian, 0.35, None, 200, 3),
+    "false, even": (gaussian, 0.35, 1.0, 1000, 4),
+    "t4": (student, 0.0, None, 600, 3),
+    "t5 by axis": (student_by_axis, 0.2, None, 500, 5),
+    "unequal": (unequal, 0.04, None, 500, 3),
+    "order 7": (gaussian, 0.04, None, 500, 7),
+    "many": (student, 0.35, None, 20_000, 3),
+}
+
+
+def p_values(name: str, seed: int) -> dict[str, float]:
+    noise, false, radius, n, order = INSIDE[name]
+    rng = np.random.default_rng([3, seed, list(INSIDE).index(name)])
+    found = examined(scene(rng, n, noise=noise, false=false, radius=radius), order)
+    return {test: found[test].p_value for test in SHAPE}
+
+
+def test_probabilities_are_even_inside_the_family(full):
+    """Those of patches and of two cores are larger than chance, by construction."""
+    runs = dict.fromkeys(INSIDE, 300 if full else 3) | {"many": 60 if full else 0}
+    jobs = [(name, seed) for name, n in runs.items() for seed in range(n)]
+    found = seeds.over(p_values, jobs, lot=10) if full else [p_values(*job) for job in jobs]
+    for test in SHAPE:
+        p = np.array([values[test] for values in found])
+        assert_no_smaller_than_chance(test, p)
+        assert p.min() > 1e-3 / len(p)
+        if test in SHAPE[::2]:
+            assert_even(test, p)
+            if full:
+                assert stats.kstest(p, "uniform").pvalue > 1e-3
+
+
+@pytest.mark.parametrize("kind", ["corner", "axis", "rising"])
+def test_noise_that_is_symmetric_is_not_lopsided(kind):
+    """However much it differs over the field or between the axes."""
+    rng = np.random.default_rng(6)
+    x, y = rng.uniform(0.5, SIDE + 0.5, (2, 3000))
+    factor = {
+        "corner": np.where((x > 1500) & (y > 1500), 5.0, 1.0)[:, None],
+        "axis": np.array([1.0, 2.0]),
+        "rising": 2.0 + scaled(x)[:, None],
+    }[kind]
+    found = examined(matches_of(x, y, true_map(x, y) + SIGMA * factor * gaussian(rng, 3000)))
+    assert min(found[test].p_value for test in SHAPE) > 1e-3
+
+
+@pytest.mark.parametrize("order", [1, 2])
+def test_what_the_model_lacks_is_not_taken_for_a_shape(order):
+    """Terms of the next orders, of some pixels and of a hundredth of a pixel."""
+    rng = np.random.default_rng(7)
+    found = examined(scene(rng, 2000), order)
+    assert not any(test in found for test in SHAPE)
+    small = scene(rng, 2000, lambda _, x, y: 0.1 * scaled(x)[:, None] ** 4 * [[1.0, 1.0]])
+    found = examined(small, 3)
+    assert found["order 4"].significant and "raise model.order" in found["order 4"].remedy
+    assert min(found[test].p_value for test in SHAPE) > 1e-3
+
+
+def test_a_star_counts_once():
+    """Rows that stand three times with the code of their star say no more than once."""
+    rng = np.random.default_rng(8)
+    once = scene(rng, 800, tail(0.06, 0.3), false=0.0)
+    model = model_of(3)
+    three = matches_of(
+        # the same row thrice is refused
+        np.tile(once.x, 3) + 1e-6 * rng.standard_normal(2400),
+        np.tile(once.y, 3),
+        np.tile(np.stack([once.u, once.v], 1), (3, 1)),
+        star=np.tile(np.arange(800), 3),
+    )
+    found = []
+    for table in (once, three):
+        fit = fit_linear(table, model, rejection=Rejection(np.inf, None))
+        found.append({test.name: test for test in score_tests(table, fit)})
+    for name in SHAPE[:2]:
+        assert found[1][name].p_value == pytest.approx(found[0][name].p_value, rel=0.2)
+    assert found[0][SHAPE[0]].p_value < 1e-3
+
+
+def test_a_match_circle_that_is_known_is_no_skewness():
+    """About nominal positions that are off it cuts one side; the solution is right all the same."""
+    matches, n_cut = nominal_within(np.random.default_rng(9), 6000, 0.14, sigma=0.04)
+    assert n_cut > 150
+    mixture = OutlierMixture("uniform", match_radius=0.14)
+    found = examined(matches, 3, mixture, 0.14)
+    for name in SHAPE:
+        assert name not in found or found[name].p_value > 1e-3
+    blind = matches.with_columns(u_nominal=None, v_nominal=None)
+    found = examined(blind, 3, mixture, 0.14)
+    assert found["skewness by position"].significant
+    assert "u_nominal" in found["skewness by position"].remedy
+
+
+def test_what_displaced_stars_do_has_their_remedy():
+    found = examined(scene(np.random.default_rng(1), 3000, DISPLACED["visits overlap"][0]))
+    assert found["noise by position"].significant and found["noise by axis"].significant
+    correlated = SimpleNamespace(linear=None, structure=("a field",), structure_rms=1.0)
+    [check] = score_checks(list(found.values()), correlated)
+    assert check.doubt and "exposures or visits without a label" in check.sentence
+    for wrong in ("raise model.order", "errors that depend on position", "separate errors"):
+        assert wrong not in check.sentence
+    assert "which may come from the shape of the residuals" in check.sentence
+    misfit = Misfit(1e-9, "cells", 0.01, "pix")
+    [structure] = structure_checks([misfit], None, list(found.values()))
+    assert "it may come from residuals that are lopsided" in structure.sentence
+
+
+def test_noise_is_held_only_where_the_residuals_are_symmetric():
+    rng = np.random.default_rng(2)
+    x, y = rng.uniform(0.5, SIDE + 0.5, (2, 3000))
+    by_field = SIGMA * (2.0 + scaled(x)[:, None])
+    correlated = SimpleNamespace(linear=None, structure=(), structure_rms=None)
+    found = examined(matches_of(x, y, true_map(x, y) + by_field * gaussian(rng, 3000)))
+    [check] = score_checks(list(found.values()), correlated)
+    assert "Noise" in check.name or "noise" in check.name
+    assert not check.doubt and "errors that depend on position" in check.sentence
