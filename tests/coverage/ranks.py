@@ -48,6 +48,15 @@ FEW = 400  # draws of the likelihood
 MOST_SCATTER = 100.0  # in units of its prior median: scatters beyond are not looked for
 # what exposures have by themselves
 SCATTER, SECOND_ORDER, FIELDS = ("scatter of exposures", "second order", "fields of exposures")
+# grids of sizes begin at a fraction of the prior's median: smaller ones move no position
+ALIKE = 0.5
+MEDIANS = {
+    "higher orders": DiscrepancyPriors.higher_order,
+    "field": DiscrepancyPriors.structure,
+    SCATTER: DiscrepancyPriors.exposure,
+    SECOND_ORDER: DiscrepancyPriors.higher_order,
+    FIELDS: DiscrepancyPriors.structure,
+}
 ALL = slice(None)
 AT = [(k, k) for k in (0, 4, 8, 12, 16)]  # of the grid: a corner, the middle, the other corner
 EXACT = {
@@ -241,17 +250,27 @@ def ranks(seed: int, exposures: int = 1) -> dict[str, float]:
     ):
         out = _of_coefficients(results, drawn, seed) | _of_positions(results, drawn)
         kept = results.diagnostics.correlated
-        amplitudes = DrawnStructure.of_run(kept).amplitudes()
-        for name, true in drawn.left_out.amplitudes().items():
-            out[name] = rank(amplitudes[name], true)
+        said = DrawnStructure.of_run(kept).amplitudes()
         if drawn.sizes:
-            said = {
+            said |= {
                 SCATTER: kept.linear.scatter["shape"],
                 SECOND_ORDER: kept.fields.second_order,
                 FIELDS: kept.fields.amplitude,
             }
-            out |= {name: rank(draws, drawn.sizes[name]) for name, draws in said.items()}
-        return out
+        true, rng = drawn.left_out.amplitudes() | drawn.sizes, np.random.default_rng([34, seed])
+        return out | {
+            name: rank_of_size(draws, true[name], ALIKE * MEDIANS[name], rng)
+            for name, draws in said.items()
+        }
+
+
+def rank_of_size(draws: np.ndarray, true: float, floor: float, rng: np.random.Generator) -> float:
+    """Fraction of draws that are below the truth; all sizes up to a floor are alike.
+
+    Among its equals the truth has a random rank.
+    """
+    draws, true = np.maximum(draws, floor), max(float(true), floor)
+    return float(np.mean(draws < true) + rng.uniform() * np.mean(draws == true))
 
 
 def rank(draws: np.ndarray, true: Any) -> float:
