@@ -171,7 +171,7 @@ def test_a_match_circle_that_is_known_is_no_skewness():
 def test_what_displaced_stars_do_has_their_remedy():
     found = examined(scene(np.random.default_rng(1), 3000, DISPLACED["visits overlap"][0]))
     assert found["noise by position"].significant and found["noise by axis"].significant
-    correlated = SimpleNamespace(linear=None, structure=("a field",), structure_rms=1.0)
+    correlated = SimpleNamespace(facts={}, linear=None, structure=("a field",), structure_rms=1.0)
     [check] = score_checks(list(found.values()), correlated)
     assert check.doubt and "exposures or visits without a label" in check.sentence
     for wrong in ("raise model.order", "errors that depend on position", "separate errors"):
@@ -186,7 +186,7 @@ def test_noise_is_held_only_where_the_residuals_are_symmetric():
     rng = np.random.default_rng(2)
     x, y = rng.uniform(0.5, SIDE + 0.5, (2, 3000))
     by_field = SIGMA * (2.0 + scaled(x)[:, None])
-    correlated = SimpleNamespace(linear=None, structure=(), structure_rms=None)
+    correlated = SimpleNamespace(facts={}, linear=None, structure=(), structure_rms=None)
     found = examined(matches_of(x, y, true_map(x, y) + by_field * gaussian(rng, 3000)))
     [check] = score_checks(list(found.values()), correlated)
     assert "Noise" in check.name or "noise" in check.name
