@@ -23,6 +23,8 @@ REDUCED = {
     "charge_trails": 1,
     "catalogue_unlisted": 1,
     "drift_two_dates": 1,
+    "merged_visits_150": 1,
+    "second_order_005_single": 1,
 }
 SEEDS = 20
 

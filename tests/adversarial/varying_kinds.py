@@ -14,16 +14,11 @@ from .contamination_kinds import MIXED
 from .exposure_kinds import OF_EXPOSURES, deviating, in_frames, pointings
 from .truth import SIGMA, Map, Truth, kind, mapped, normal_noise, observed, order_config, pixels
 
-VARYING = (
-    "second order",
-    "second-order",
-    "between exposures",
-    "exposure to exposure",
-    "of its own",
-)
-OF_FIELDS = (*VARYING, "atmospher", "field of each exposure", "smooth field")
-ONE_EXPOSURE = (*OF_EXPOSURES, "exposure e", "one exposure", "deviates", "outlying")
+VARYING = ("second order", "second-order", "between exposures", "exposures differ in")
+OF_FIELDS = (*VARYING, "atmospher", "smooth field", "exposures deviate from each other")
+ONE_EXPOSURE = (*OF_EXPOSURES, "against the other exposures", "have other errors than")
 NO_HELP = ("raise model.order", "scale_mas", "depend on position", "are too small")
+COINCIDENT = ("coincid", "same star", "each star", "repeated", "several detections")
 EXPOSURES = 12
 
 varied = partial(kind, kindest=True, misleading=NO_HELP)
@@ -191,8 +186,8 @@ def two_visits(rng: np.random.Generator, n: int) -> Truth:
     return assessed(rng, stars, common, new, single=True, frames=frames)
 
 
-@kind("repeated_3", "coincid", "same star", "each star", "repeated", kindest=True, times=3)
-@kind("repeated_6", "coincid", "same star", "each star", "repeated", kindest=True, times=6)
+@kind("repeated_3", *COINCIDENT, kindest=True, times=3)
+@kind("repeated_6", *COINCIDENT, kindest=True, times=6)
 def repeated(rng: np.random.Generator, n: int, times: int) -> Truth:
     """Each star so many times, at nearly the same pixel, and without its name; all rows of a star
     have the error of the catalogue in common, which is as large as that of a centroid."""

@@ -2,16 +2,17 @@
 
 Jitter, share and scatter of false matches, higher orders, field and its length are drawn from their
 priors, the polynomial from anywhere, as its prior is flat; of exposures, too, the scatter of scale
-and shears.  If draws of the error are what the data leave open, the actual error has an even rank
-among them (Talts et al. 2018, arXiv:1804.06788).  Errors that are right one by one may be wrong
-together, and then the likelihood of the data has uneven ranks (Modrak et al. 2023,
-arXiv:2211.02383): it is among the quantities, and so are the amplitudes of what is left out.
+and shears, the second-order terms and the smooth fields that each has by itself.  If draws of the
+error are what the data leave open, the actual error has an even rank among them (Talts et al. 2018,
+arXiv:1804.06788).  Errors that are right one by one may be wrong together, and then the likelihood
+of the data has uneven ranks (Modrak et al. 2023, arXiv:2211.02383): it is among the quantities, and
+so are the amplitudes of what is left out.
 """
 
 from __future__ import annotations
 
 from contextlib import closing
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -24,10 +25,13 @@ from bayesdist.assess import Requirement
 from bayesdist.assess.domain import EvaluationDomain
 from bayesdist.assess.statistics import field_statistic
 from bayesdist.diagnose.correlated import Discrepancy, DiscrepancyPriors
+from bayesdist.diagnose.correlated.exposure_fields import ExposureFields
+from bayesdist.diagnose.correlated.exposure_products import LENGTHS as LENGTHS_OF
 from bayesdist.diagnose.correlated.functions import StructureFunctions
 from bayesdist.diagnose.correlated.priors import STRUCTURE_DOF
 from bayesdist.diagnose.correlated.structure import LENGTHS, UNLIKE
 from bayesdist.infer import OutlierMixture
+from bayesdist.model import Chip
 from bayesdist.model.grid import grid_pixels, mesh
 from tests.adversarial import fields
 from tests.adversarial.exposure_kinds import deviating, in_frames, pointings
@@ -41,7 +45,18 @@ ORDER, STARS = 3, 1500
 MOST = SIGMA  # the prior of amplitudes ends at the error of a star
 STATISTICS = ("rms", "p95", "max")
 FEW = 400  # draws of the likelihood
-MOST_SCATTER = 10.0  # in units of its prior median: scatters beyond are not looked for
+MOST_SCATTER = 100.0  # in units of its prior median: scatters beyond are not looked for
+# what exposures have by themselves
+SCATTER, SECOND_ORDER, FIELDS = ("scatter of exposures", "second order", "fields of exposures")
+# grids of sizes begin at a fraction of the prior's median: smaller ones move no position
+ALIKE = 0.5
+MEDIANS = {
+    "higher orders": DiscrepancyPriors.higher_order,
+    "field": DiscrepancyPriors.structure,
+    SCATTER: DiscrepancyPriors.exposure,
+    SECOND_ORDER: DiscrepancyPriors.higher_order,
+    FIELDS: DiscrepancyPriors.structure,
+}
 ALL = slice(None)
 AT = [(k, k) for k in (0, 4, 8, 12, 16)]  # of the grid: a corner, the middle, the other corner
 EXACT = {
@@ -144,15 +159,48 @@ class Drawn:
     left_out : DrawnStructure
     hyper : dict of str to float
         f, j and s_out.
-    scatter : float or None
-        Of scale and shears of the exposures; None of one exposure.
+    sizes : dict of str to float
+        Of what exposures have by themselves: scale and shears, second order, field; empty of one
+        exposure.
     """
 
     truth: Truth
     polynomial: fields.Field
     left_out: DrawnStructure
     hyper: dict[str, float]
-    scatter: float | None = None
+    sizes: dict[str, float] = field(default_factory=dict)
+
+
+def of_exposures(rng: np.random.Generator) -> dict[str, float]:
+    """Sizes of what exposures have by themselves, from their priors."""
+    priors = DiscrepancyPriors()
+    return {
+        SCATTER: half_t(rng, priors.exposure, MOST_SCATTER * priors.exposure, dof=1.0),
+        SECOND_ORDER: half_t(rng, priors.higher_order, MOST, dof=1.0),
+        FIELDS: half_t(rng, priors.structure, MOST, dof=1.0),
+    }
+
+
+def deviating_exposures(
+    rng: np.random.Generator,
+    uv: np.ndarray,
+    x: np.ndarray,
+    y: np.ndarray,
+    code: np.ndarray,
+    sizes: dict[str, float],
+) -> np.ndarray:
+    """Positions (N, 2) as exposures deviate from one another, by code (N,)."""
+    n = int(code.max()) + 1
+    out = deviating(uv, sizes[SCATTER] * rng.standard_normal((n, 3))[code])
+    second, amplitude, length = (
+        np.full(n, size) for size in (sizes[SECOND_ORDER], sizes[FIELDS], rng.choice(LENGTHS_OF))
+    )
+    beyond = ExposureFields(np.empty((n, 0)), second, amplitude, length, n)
+    chip = Chip(1, "", (fields.SIDE, fields.SIDE), (fields.MIDDLE, fields.MIDDLE))
+    waves = beyond.functions(chip).finer_waves(rng)
+    coefficients = beyond.coefficients(chip, rng)
+    here = beyond.evaluate(chip, waves, fields.scaled(x), fields.scaled(y))
+    return out + np.einsum("nam,nm->na", coefficients[code], here)
 
 
 def from_priors(seed: int, exposures: int = 1) -> Drawn:
@@ -164,13 +212,12 @@ def from_priors(seed: int, exposures: int = 1) -> Drawn:
     drawn = {k: float(v[0]) for k, v in hyper.values(draw_prior(hyper, 1, rng)).items()}
     x, y = pixels(rng, STARS)
     uv, false = true_map(x, y, None), rng.uniform(size=STARS) < drawn["f"]
-    scatter, frames, config, columns = None, {}, order_config(ORDER), {}
+    sizes, frames, config, columns = {}, {}, order_config(ORDER), {}
     if exposures > 1:
-        median = DiscrepancyPriors().exposure
-        scatter = half_t(rng, median, MOST_SCATTER * median, dof=1.0)
+        sizes = of_exposures(rng)
         frames, code = pointings(rng, exposures), np.arange(STARS) % exposures
         frames["e00"] = Frame((0.0, 0.0), 0.0)  # the polynomials are along its axes
-        uv = deviating(uv, scatter * rng.standard_normal((exposures, 3))[code])
+        uv = deviating_exposures(rng, uv, x, y, code, sizes)
         uv = in_frames(uv, code, frames)
         columns["exposure"] = np.array(list(frames))[code]
         config = order_config(ORDER, frames="shift_rotation")
@@ -180,7 +227,7 @@ def from_priors(seed: int, exposures: int = 1) -> Drawn:
     stars = {"x": x, "y": y, "u": uv[:, 0], "v": uv[:, 1], "sigma_u": quoted, "sigma_v": quoted}
     config["budget"] = [EXACT | {"unit": "pix"}]
     truth = Truth(stars | columns, true_map, config, frames=frames)
-    return Drawn(truth, polynomial, left_out, drawn, scatter)
+    return Drawn(truth, polynomial, left_out, drawn, sizes)
 
 
 def log_likelihood(residual: np.ndarray, f: Any, j: Any, s_out: Any) -> np.ndarray:
@@ -203,12 +250,27 @@ def ranks(seed: int, exposures: int = 1) -> dict[str, float]:
     ):
         out = _of_coefficients(results, drawn, seed) | _of_positions(results, drawn)
         kept = results.diagnostics.correlated
-        amplitudes = DrawnStructure.of_run(kept).amplitudes()
-        for name, true in drawn.left_out.amplitudes().items():
-            out[name] = rank(amplitudes[name], true)
-        if drawn.scatter is not None:
-            out["scatter of exposures"] = rank(kept.linear.scatter["shape"], drawn.scatter)
-        return out
+        said = DrawnStructure.of_run(kept).amplitudes()
+        if drawn.sizes:
+            said |= {
+                SCATTER: kept.linear.scatter["shape"],
+                SECOND_ORDER: kept.fields.second_order,
+                FIELDS: kept.fields.amplitude,
+            }
+        true, rng = drawn.left_out.amplitudes() | drawn.sizes, np.random.default_rng([34, seed])
+        return out | {
+            name: rank_of_size(draws, true[name], ALIKE * MEDIANS[name], rng)
+            for name, draws in said.items()
+        }
+
+
+def rank_of_size(draws: np.ndarray, true: float, floor: float, rng: np.random.Generator) -> float:
+    """Fraction of draws that are below the truth; all sizes up to a floor are alike.
+
+    Among its equals the truth has a random rank.
+    """
+    draws, true = np.maximum(draws, floor), max(float(true), floor)
+    return float(np.mean(draws < true) + rng.uniform() * np.mean(draws == true))
 
 
 def rank(draws: np.ndarray, true: Any) -> float:
@@ -227,8 +289,8 @@ def _of_coefficients(results: Results, drawn: Drawn, seed: int) -> dict[str, flo
     flat, rows = own.drawn_rows(n, rng)
     which = np.arange(n) % kept.n_draws
     theta = flat[rows] + kept.structure_theta[which]
-    if kept.linear is not None and drawn.scatter is not None:
-        theta = theta + kept.linear.theta[rng.integers(len(kept.linear.theta), size=n)]
+    for term in (kept.linear, kept.fields) if drawn.sizes else ():
+        theta = theta + term.theta[rng.integers(len(term.theta), size=n)]
     slices = [model.coefficient_slice(1, axis) for axis in (0, 1)]
     out = {}
     for axis, part in enumerate(slices):
@@ -236,7 +298,7 @@ def _of_coefficients(results: Results, drawn: Drawn, seed: int) -> dict[str, flo
             model.names[part], theta[:, part].T, true[axis], strict=True
         ):
             out[name] = rank(draws, actual)
-    if drawn.scatter is not None:
+    if drawn.sizes:
         return out
     hyper = {name: values.ravel()[rows] for name, values in own.hyper.items()}
     out |= {name: rank(draws, drawn.hyper[name]) for name, draws in hyper.items()}
