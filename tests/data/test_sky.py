@@ -200,8 +200,7 @@ def test_motions_of_exactly_zero_are_refused_in_tables_on_disk(tmp_path):
     t["pmra"][7] = t["pmdec"][7] = 0.0
     t.write(tmp_path / "gaia.parquet")
     with pytest.raises(InputError, match=r"row 8, column 'pmra': proper motion is exactly 0"):
-        stars = open_matches(tmp_path / "gaia.parquet", epoch=2004.0)
-        list(stars.batches())
+        open_matches(tmp_path / "gaia.parquet", epoch=2004.0)
 
 
 def test_photometry_beside_sky_positions_is_no_plane():
