@@ -520,7 +520,7 @@ class Run:
         if draws is None:
             return positions
         names = options.get("columns", ("x", "y"))
-        to_fits = 1.0 - options.get("pixel_origin", 1.0)
+        to_fits = 1.0 - positions.meta["pixel_origin"]
         x, y = (np.asarray(positions[name], float) + to_fits for name in names)
         chip = options.get("chip")
         if chip is None and "chip" in positions.colnames:

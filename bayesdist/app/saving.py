@@ -35,6 +35,7 @@ from bayesdist.diagnose.residuals.quoted import majority_sentence
 from bayesdist.files.atomic import made_folder, remove_leftovers
 from bayesdist.infer import LinearFit, Posterior, save_posterior
 from bayesdist.infer.posterior.memberships import memberships_of
+from bayesdist.infer.solution.geometry import geometries
 from bayesdist.infer.solution.skew import skew_of
 from bayesdist.infer.stars.stars import in_table_order, prepare
 from bayesdist.utils.checks import warnings_of
@@ -81,6 +82,10 @@ def _log_matches(data: FitData, config: Config) -> None:
         log.info("fit: %d rows were left out in reading: %s", count, reason)
     for text in doubts_on_stars(data.sample, data.model, config):
         log.warning("fit: WARNING: %s", text)
+    for chip in geometries(fit):
+        log.info("fit: chip %d: %s", chip.chip, chip.sentence)
+        for text in chip.warnings:
+            log.warning("fit: WARNING: %s", text)
     shift = epoch_shift(data.sample, fit)
     if shift is not None and shift.significant:
         log.warning("fit: WARNING: %s", shift.sentence)

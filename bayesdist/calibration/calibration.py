@@ -20,7 +20,7 @@ from bayesdist.calibration import hooks
 from bayesdist.calibration.chip_map import ChipMap, chip_of, sampling_of
 from bayesdist.calibration.further import FurtherError
 from bayesdist.calibration.inverse import ExplicitInverse
-from bayesdist.calibration.plane import Plane
+from bayesdist.calibration.plane import ARCSEC, Plane
 from bayesdist.errors import InputError
 from bayesdist.infer.solution.solution import Solution
 from bayesdist.infer.solution.transforms import at_exposure, without_frames
@@ -150,7 +150,7 @@ class Calibration:
             Name for messages and files.
         point : SkyCoord or tuple, optional
             Right ascension and declination (numbers in degrees) of (u, v) = (0, 0), if u increases
-            to the east and v to the north.
+            to the east and v to the north; by default the tangent point of the solution.
         detector, filter : str, optional
             Names that files state.
 
@@ -451,7 +451,7 @@ class Calibration:
         *,
         columns: Sequence[str] = ("x", "y"),
         centroids: Sequence[str] | None = None,
-        pixel_origin: float = 1.0,
+        pixel_origin: float | None = None,
         chip: int | None = None,
         epoch: Epoch | None = None,
         point: Direction | None = None,
@@ -468,8 +468,10 @@ class Calibration:
             Names of the columns with x and y.
         centroids : tuple of str, optional
             Names of the columns with the standard deviations of x and y, in pixels.
-        pixel_origin : float
-            Coordinate of the centre of the first pixel: 1 as in FITS, 0 as in photutils.
+        pixel_origin : float, optional
+            Coordinate of the centre of the first pixel: 1 as in FITS, 0 as in photutils.  By
+            default 0 for columns of programs that count from 0, as `Matches.from_table` knows them,
+            and otherwise 1.
         chip : int, optional
             Chip number of all stars, instead of a column.
         epoch : float, str, Time or Quantity, optional
@@ -485,8 +487,9 @@ class Calibration:
         QTable
             The table with `ra` and `dec`, their standard deviations `sigma_ra` (to the east, with
             cos(dec)) and `sigma_dec`, and the correlation `corr_ra_dec`.  ``meta["errors"]`` names
-            the errors that are included.  With `covariance`, ``meta["covariance"]`` is the matrix
-            (2 N, 2 N) of all stars in mas^2, east and north in turn.
+            the errors that are included, ``meta["pixel_origin"]`` is the origin.  With
+            `covariance`, ``meta["covariance"]`` is the matrix (2 N, 2 N) of all stars in mas^2,
+            east and north in turn.
 
         Raises
         ------
@@ -641,10 +644,12 @@ def calibration_of(
 ) -> Calibration:
     """Calibration of a fit or a posterior, without the frames of its exposures.
 
-    `scale` is the size of a corrected pixel and its source, by default 1 for u, v in pixels; an
-    unknown `plane` is free.
+    `scale` is the size of a corrected pixel and its source, by default 1 for u, v in pixels.  The
+    `plane` is by default that about the tangent point of the solution, and free without one.
     """
     bare = solution if solution.model.frames == "none" else without_frames(solution)
+    if plane is None and solution.tangent_point is not None and bare.model.unit in ARCSEC:
+        plane = Plane("sky", point=solution.tangent_point)
     if scale is None and bare.model.unit == "pix":
         scale = 1.0, "pixels of u, v"
     size, source = scale or (None, "")

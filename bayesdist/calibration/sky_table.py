@@ -14,6 +14,7 @@ from bayesdist.calibration.apply import on_chip
 from bayesdist.calibration.calibration import Calibration
 from bayesdist.calibration.sky_positions import sky_positions
 from bayesdist.data.reading.table import as_table
+from bayesdist.data.tables.names import origin_of
 from bayesdist.errors import InputError
 from bayesdist.utils.arrays import Float, Int
 from bayesdist.utils.quantities import Direction, Epoch, direction_in, year_of
@@ -30,7 +31,7 @@ def table_on_sky(
     *,
     columns: Sequence[str] = ("x", "y"),
     centroids: Sequence[str] | None = None,
-    pixel_origin: float = 1.0,
+    pixel_origin: float | None = None,
     chip: int | None = None,
     epoch: Epoch | None = None,
     point: Direction | None = None,
@@ -43,7 +44,7 @@ def table_on_sky(
     """
     rows = QTable(as_table(table, name))
     plain = Table(rows)
-    x, y = (position_column(plain, c, name) + (1.0 - pixel_origin) for c in columns)
+    x, y, origin, _ = pixel_columns(plain, columns, pixel_origin, name)
     sigma = None
     if centroids is not None:
         sigma_x, sigma_y = (position_column(plain, c, name) for c in centroids)
@@ -78,6 +79,7 @@ def table_on_sky(
         "calibration": calibration.name,
         "errors": [error for error, _ in errors_in(calibration, centroids)],
         "outside": outside,
+        "pixel_origin": origin,
     }
     if at.joint is not None:
         rows.meta[COVARIANCE] = at.joint
@@ -121,6 +123,22 @@ def position_column(table: Table, name: str, where: str) -> Float:
         n = np.count_nonzero(lost)
         log.warning("%s: WARNING: column %r has no finite value in %d rows", where, name, n)
     return np.where(lost, np.nan, values)
+
+
+def pixel_columns(
+    table: Table, names: Sequence[str], pixel_origin: float | None, where: str
+) -> tuple[Float, Float, float, str]:
+    """Pixels x and y (N,) as FITS counts them, the origin of the columns, and its reason.
+
+    The origin is `pixel_origin` if it is given.  Otherwise it is that of the program which writes
+    such columns, as for tables of matches, and 1 if nothing is known.
+    """
+    x, y = (position_column(table, name, where) for name in names)
+    if pixel_origin is not None:
+        origin, reason = float(pixel_origin), "as given"
+    else:
+        origin, reason = origin_of(names[0], table.colnames, table.meta)
+    return x + (1.0 - origin), y + (1.0 - origin), origin, reason or "as in FITS"
 
 
 def chip_numbers(

@@ -386,9 +386,10 @@ def catalog_from_table(
     found = {key: name for key, name in found.items() if key not in unread}
     notes: tuple[str, ...] = ()
     rows = np.arange(len(table))
-    if on_sky and len(table):
+    required = found if on_sky else {key: found[key] for key in _MOTIONS & found.keys()}
+    if required and len(table):
         stay, counts = without_missing(
-            table, found, source=source, reject=False, spared=_SPARED, motions=_MOTIONS
+            table, required, source=source, reject=False, spared=_SPARED, motions=_MOTIONS
         )
         table, rows = table[stay], rows[stay]
         notes = tuple(f"{n} stars are left out: {reason}" for reason, n in counts.items())

@@ -6,12 +6,16 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from astropy.table import Table
+from astropy.wcs import WCS
 
 from bayesdist.app.config import parse_config
 from bayesdist.app.kinds.matches.plausibility import doubts_on_stars, refuse_empty_segments
 from bayesdist.data import Matches
 from bayesdist.errors import ConfigError, InputError
 from bayesdist.model import Chip, DistortionModel, TimeDependence
+
+from .support import cli, write_job
 
 TEXT = """
 [data]
@@ -65,6 +69,47 @@ def test_a_scale_that_is_odd_is_said(rng, scale):
 def test_a_scale_that_cannot_be_meant(rng, scale):
     with pytest.raises(InputError, match=r"stars\.ecsv: u and v, in pix, span .* correct data"):
         doubts(stars(rng, scale))
+
+
+def job(folder, rng, hours=False, scale_mas=None, stretch=1.0):
+    """Configuration of a camera with 150 mas pixels, turned by 30 degrees, by its own sky."""
+    x, y = rng.uniform(1, 1000, 200), rng.uniform(1, 800, 200)
+    plane = WCS(naxis=2)
+    plane.wcs.ctype, plane.wcs.crval = ["RA---TAN", "DEC--TAN"], [202.5, 47.2]
+    c, s = 0.15 / 3600 * np.cos(np.radians(30)), 0.15 / 3600 * np.sin(np.radians(30))
+    plane.wcs.crpix, plane.wcs.cd = [500.5, 400.5], [[-c * stretch, s], [s * stretch, c]]
+    ra, dec = plane.all_pix2world(x, y, 1)
+    table = Table({"x": x, "y": y, "ra": ra / 15 if hours else ra, "dec": dec})
+    detector = {"name": "A", "size": (1000, 800)}
+    detector |= {} if scale_mas is None else {"scale_mas": scale_mas}
+    data = {"matches": "stars.ecsv", "sigma": 0.01}
+    return write_job(folder, table, data=data, detector=detector, budget=None)
+
+
+def test_right_ascensions_in_hours_are_named(rng, tmp_path):
+    done = cli("check", job(tmp_path / "hours", rng, hours=True))
+    assert done.code == 1 and "right ascensions in hours" in done.err
+    assert "multiply ra by 15" in done.err
+
+
+def test_a_stated_scale_that_is_not_that_of_the_fit_is_refused(rng, tmp_path):
+    done = cli("check", job(tmp_path / "wrong", rng, scale_mas=400.0))
+    assert done.code == 1 and "detector.scale_mas" in done.err
+    assert "given as 400 mas, and that of the fit is 150.0" in done.err
+
+
+def test_check_says_the_geometry(rng, tmp_path):
+    done = cli("check", job(tmp_path / "right", rng, scale_mas=150.5))
+    assert done.code == 0, done.err
+    said = next(line for line in done.out.splitlines() if line.startswith("geometry"))
+    assert "chip 1: scale 150.000 x 150.000 mas/px" in said and "parity -1" in said
+    assert "+y at 30.00 degrees" in said and "the pixel is" not in done.out
+
+
+def test_pixels_that_are_not_square_are_a_warning(rng, tmp_path):
+    done = cli("check", job(tmp_path / "oblong", rng, stretch=1.1))
+    assert done.code == 0, done.err
+    assert "WARNING      the pixel is 165.000 x 150.000 mas/px (chip 1)" in done.out
 
 
 def test_pixels_that_are_called_an_angle(rng):

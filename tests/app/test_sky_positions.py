@@ -181,6 +181,38 @@ def test_the_command_writes_what_python_gives(calibration, stars, tmp_path):
     assert done.code == 2 and "--sky" in done.err
 
 
+@pytest.mark.parametrize("names", [("xcentroid", "ycentroid"), ("x_init", "y_init"), ("x", "y")])
+def test_tables_of_photutils_count_from_zero_in_every_command(calibration, stars, tmp_path, names):
+    """The positions of the same pixels as FITS counts them, by Python and both forms of apply."""
+    for one in build("tpv", calibration, product_settings()["tpv"]()):
+        (tmp_path / one.file_name).write_bytes(one.content)
+    stars.write(tmp_path / "stars.csv")
+    from_zero = stars["chip",]
+    for name, key in zip(names, "xy", strict=True):
+        from_zero[name] = stars[key] - 1.0
+    if names == ("x", "y"):  # a name that says nothing, beside columns of sep
+        from_zero["tnpix"] = from_zero["xcpeak"] = 1
+    from_zero.write(tmp_path / "zero.csv")
+    expected = calibration.to_sky(stars)
+    sky = calibration.to_sky(from_zero, columns=names)
+    assert sky.meta["pixel_origin"] == 0 and expected.meta["pixel_origin"] == 1
+    np.testing.assert_allclose(sky["ra"].value, expected["ra"].value, rtol=1e-13)
+    given = calibration.to_sky(from_zero, columns=names, pixel_origin=1)
+    assert np.abs(given["dec"] - expected["dec"]).max() > 0.1 * units.arcsec
+    head = str(tmp_path / "tpv.head")
+    for options, added in ((("--sky",), "dec"), ((), "y_out")):
+        results = []
+        for table, columns in (("stars.csv", ("x", "y")), ("zero.csv", names)):
+            out = str(tmp_path / "out.ecsv")
+            done = cli("apply", head, str(tmp_path / table), "-o", out, "--force", *options,
+                       "--columns", *columns)  # fmt: skip
+            assert done.code == 0, done.err
+            origin = "1: as in FITS" if table == "stars.csv" else "0: "
+            assert f"the first pixel is {origin}" in done.out
+            results.append(Table.read(out)[added])
+        np.testing.assert_allclose(*results, rtol=1e-10)
+
+
 def test_planes_that_are_not_on_the_sky_are_refused(calibration, stars):
     for plane, message in (
         (Plane("free"), "where its plane touches the sky"),

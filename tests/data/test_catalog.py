@@ -74,6 +74,10 @@ def test_motions_on_the_sky_need_their_unit():
 
 def test_the_gaia_extract(data_dir):
     c = read_catalog(data_dir / "flystar" / "my_gaia.fits", unit="arcsec")
-    assert len(c) == 815 and np.all(c.epoch == 2015.5) and c.pm_u is not None
+    # stars with two parameters have no parallax, and 0 in the columns of motions and their errors
+    parallax = Table.read(data_dir / "flystar" / "my_gaia.fits")["parallax"]
+    assert len(c) == np.count_nonzero(~parallax.mask) == 506
+    assert np.all(c.epoch == 2015.5) and c.pm_u is not None
+    assert c.notes == ("309 stars are left out: proper motion of exactly 0",)
     with pytest.raises(InputError, match="has no unit"):
         read_catalog(data_dir / "flystar" / "my_gaia.fits")

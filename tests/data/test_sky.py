@@ -9,7 +9,7 @@ from astropy.coordinates import SkyCoord, get_body_barycentric
 from astropy.table import MaskedColumn, QTable, Table
 from astropy.time import Time
 
-from bayesdist.data import ReadOptions, read_catalog, tangent_plane
+from bayesdist.data import ReadOptions, open_matches, read_catalog, tangent_plane
 from bayesdist.errors import InputError
 from tests.data.tables import matches_from_table
 
@@ -154,6 +154,53 @@ def test_stars_without_motion_are_left_out_where_positions_move():
     assert len(read(t)) == 40
     t["parallax"][10] = np.nan  # a parallax that is not known is none
     assert len(read(t, epoch=2004.0)) == 36
+
+
+def test_motions_of_exactly_zero_are_missing_values(tmp_path, caplog):
+    """A third of a Gaia table filled with 0, as pandas and topcat write missing values."""
+    truth = catalogue()
+    t = truth.copy()
+    filled = np.arange(40) % 3 == 0
+    for name in ("pmra", "pmdec"):
+        t[name][filled] = 0.0
+    t["pmra"][1] = 0.0  # a zero on one axis may be measured
+    truth["pmra"][1] = 0.0
+    moved = read(t, epoch=2004.0)
+    assert moved.rejected == {"proper motion of exactly 0": 14} and len(moved) == 26
+    assert "gaia.csv: WARNING: 14 of 40 stars have pmra and pmdec of exactly 0" in caplog.text
+    expected = read(truth[~filled], epoch=2004.0)
+    np.testing.assert_allclose([moved.u, moved.v], [expected.u, expected.v], rtol=1e-12)
+    assert len(read(t)) == 40  # nothing moves, and nothing is lost
+    caplog.clear()
+    t.write(tmp_path / "gaia.csv")
+    found = read_catalog(tmp_path / "gaia.csv", tangent_point=POINT)
+    assert len(found) == 26 and found.notes == (
+        "14 stars are left out: proper motion of exactly 0",
+    )
+    assert "14 of 40 stars" in caplog.text
+    for name in ("pmra", "pmdec"):
+        t[name] = 0
+    with pytest.raises(InputError, match=r"proper motion of exactly 0 \(40 rows\).*columns"):
+        read(t, epoch=2004.0)
+
+
+def test_motions_of_exactly_zero_are_missing_values_on_a_plane(tmp_path):
+    t = Table({"u": [1.0, 2.0, 3.0], "v": [0.0, 1.0, 2.0], "pm_u": [0.1, 0.0, 0.0],
+               "pm_v": [0.1, 0.0, 0.2]})  # fmt: skip
+    t.write(tmp_path / "plane.csv")
+    found = read_catalog(tmp_path / "plane.csv", unit="pix", epoch=2010.0)
+    assert found.u.tolist() == [1.0, 3.0]
+
+
+def test_motions_of_exactly_zero_are_refused_in_tables_on_disk(tmp_path):
+    t = catalogue()
+    for name, unit in {"ra": "deg", "dec": "deg", "pmra": "mas / yr", "pmdec": "mas / yr"}.items():
+        t[name].unit = unit
+    t.remove_columns(["parallax", "parallax_error"])
+    t["pmra"][7] = t["pmdec"][7] = 0.0
+    t.write(tmp_path / "gaia.parquet")
+    with pytest.raises(InputError, match=r"row 8, column 'pmra': proper motion is exactly 0"):
+        open_matches(tmp_path / "gaia.parquet", epoch=2004.0)
 
 
 def test_photometry_beside_sky_positions_is_no_plane():

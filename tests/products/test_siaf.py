@@ -16,6 +16,7 @@ from bayesdist.errors import FormatError, InputError
 from bayesdist.products import registry
 from bayesdist.products.formats.common.content import Content
 from bayesdist.products.formats.common.document import Choice
+from bayesdist.products.formats.siaf.table import SiafTable
 
 from .v2v3 import files, imager, read, same_calibration, some_pixels, with_tables
 
@@ -330,9 +331,48 @@ def test_an_unknown_aperture_needs_a_size(calibration):
     )
     document = registry.recognized(Content("table.txt", text.encode()))
     assert "size of the detector is not known" in document.describe()
-    with pytest.raises(InputError, match="MADE_UP is not known here"):
+    with pytest.raises(InputError, match="MADE_UP is no full frame that is known here"):
         document.calibration()
     assert document.calibration(Choice(size=SIZE)).model.chips[0].size == SIZE
+
+
+def test_a_subarray_is_not_taken_for_the_full_frame(data_dir):
+    """Its size is asked for, and the positions are then those of pysiaf's own aperture."""
+    pytest.importorskip("pysiaf")
+    from .siaf_aperture import pysiaf_offline
+
+    document = registry.open_document(data_dir / "reports" / "siaf_NRCA5_SUB320.txt")
+    with pytest.raises(InputError, match=r"NRCA5_SUB320 is no full frame.*--size"):
+        document.calibration()
+    found = document.calibration(Choice(size=(320.0, 320.0)))
+    assert found.model.chips[0].size == (320.0, 320.0)
+    assert any("XSciRef, YSciRef are not stated" in note for note in found.notes)
+    aperture = pysiaf_offline().Siaf("NIRCam")["NRCA5_SUB320"]
+    x, y = some_pixels(found, 300)
+    theirs = np.stack(aperture.sci_to_idl(x, y))
+    assert np.hypot(*(found.forward(x, y, chip=1).T - theirs)).max() / 0.063 < LIMIT
+
+
+def test_full_frames_have_the_size_and_reference_pixel_of_pysiaf():
+    pytest.importorskip("pysiaf")
+    from .siaf_aperture import pysiaf_offline
+
+    module = pysiaf_offline()
+    names = {"NIRCam": "NRCA1_FULL NRCB5_FULL", "NIRISS": "NIS_CEN", "FGS": "FGS1_FULL FGS2_FULL",
+             "MIRI": "MIRIM_FULL", "Roman": "WFI01_FULL"}  # fmt: skip
+    for instrument, apertures in names.items():
+        siaf = module.Siaf(instrument)
+        for name in apertures.split():
+            table, known = SiafTable("t", name, (), {}), siaf[name]
+            assert table.size == (known.XSciSize, known.YSciSize), name
+            assert table.reference_pixel(table.size) == (known.XSciRef, known.YSciRef), name
+
+
+def test_a_size_that_is_not_that_of_the_aperture_is_refused(written):
+    document = registry.open_document(written[0])
+    assert document.calibration(Choice(size=SIZE)).model.chips[0].size == SIZE
+    with pytest.raises(InputError, match="has 2048 x 2048 pixels, and 320 x 320 are given"):
+        document.calibration(Choice(size=(320.0, 320.0)))
 
 
 def test_an_aperture_has_a_name(calibration):

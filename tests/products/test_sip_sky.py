@@ -8,7 +8,9 @@ from astropy.coordinates import SkyCoord
 from astropy.wcs import WCS
 from numpy.testing import assert_allclose
 
+import bayesdist as bd
 from bayesdist.errors import InputError
+from bayesdist.infer import load_fit, save_fit
 from bayesdist.products import lint_sip, read_sip, sip_from_solution, sip_header, write_sip
 
 from .support import StandIn, astropy_wcs, random_pixels, some_solution
@@ -143,3 +145,32 @@ def test_what_cannot_be_is_refused(unit, options, message) -> None:
     solution = some_solution(3, unit=unit, pixel=1.0 if unit == "pix" else PIXEL)
     with pytest.raises(InputError, match=message):
         sip_from_solution(solution, tangent_point=(20.0, 30.0), **options)
+
+
+def test_fit_posterior_and_their_files_know_the_tangent_point(tmp_path):
+    """Stars of a TAN header of astropy: the SIP headers of all of them give their positions."""
+    rng = np.random.default_rng(43)
+    truth = WCS(naxis=2)
+    truth.wcs.ctype, truth.wcs.crval = ["RA---TAN", "DEC--TAN"], [202.5, 47.2]
+    truth.wcs.crpix, truth.wcs.cd = [480.0, 510.0], [[-4e-5, 3e-6], [3e-6, 4e-5]]
+    x, y = rng.uniform(1, 1000, (2, 300))
+    sky = truth.pixel_to_world(x - 1, y - 1)
+    stars = bd.Matches.from_sky(x, y, sky, sigma=0.001)
+    fit = bd.fit_linear(stars, bd.build_model(stars, order=2, size=(1000, 1000)))
+    posterior = bd.sample(fit, stars, seed=1, target_ess=100)
+    save_fit(fit, tmp_path / "fit.nc")
+    bd.save_posterior(posterior, None, tmp_path / "posterior.nc")
+    solutions = (fit, posterior, load_fit(tmp_path / "fit.nc"),
+                 bd.load_posterior(tmp_path / "posterior.nc"))  # fmt: skip
+    for solution in solutions:
+        assert solution.tangent_point == stars.tangent_point
+        header = sip_header(sip_from_solution(solution))
+        found = WCS(header).all_pix2world(x, y, 1)
+        off = np.hypot((found[0] - sky.ra.deg) * np.cos(sky.dec.rad), found[1] - sky.dec.deg)
+        assert off.max() * 3600 < 1e-3  # as the quoted errors; there is no noise
+    plain = bd.Matches(x=x, y=y, u=stars.u, v=stars.v, sigma_u=stars.sigma_u,
+                       sigma_v=stars.sigma_v, unit="arcsec")  # fmt: skip
+    free = bd.fit_linear(plain, fit.model)
+    save_fit(free, tmp_path / "free.nc")
+    assert free.tangent_point is None and load_fit(tmp_path / "free.nc").tangent_point is None
+    assert sip_from_solution(free).crval == (0.0, 0.0)

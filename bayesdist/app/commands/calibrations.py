@@ -70,8 +70,7 @@ def inspect() -> None:
 @click.option(
     "--pixel-origin",
     type=click.Choice(["0", "1"]),
-    default="1",
-    help="With --sky: coordinate of the first pixel's centre.",
+    help="Coordinate of the first pixel's centre (default: that of the columns' program, or 1).",
 )
 @click.option(
     "--image", type=click.Path(), metavar="FLT", help="A calibrated image whose pixels these are."
@@ -86,14 +85,17 @@ def apply(file: str, table: str, output: str, **options: Any) -> None:
     x_out, y_out for the inverse.
     """
     own = {key: options.pop(key) for key in ("point", "centroids", "joint")}
-    origin = float(options.pop("pixel_origin"))
+    origin = options.pop("pixel_origin")
+    origin = None if origin is None else float(origin)
     if not options.pop("sky"):
         from bayesdist.app.commands.on_files.apply import apply_to_table
 
         given = next((key for key, value in own.items() if value), None)
-        if given is not None or origin != 1.0:
-            raise click.UsageError(f"--{given or 'pixel-origin'} goes with --sky.")
-        click.echo(apply_to_table(file, table, output, **options))
+        if given is not None:
+            raise click.UsageError(f"--{given} goes with --sky.")
+        if options["inverse"] and origin is not None:
+            raise click.UsageError("--pixel-origin does not go with --inverse.")
+        click.echo(apply_to_table(file, table, output, pixel_origin=origin, **options))
         return
     from bayesdist.app.commands.on_files.sky import sky_to_table
 

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from bayesdist.data.sky.earth import parallax_factors
 from bayesdist.data.sky.tangent import mean_direction
+from bayesdist.data.tables.checks import zero_motions
 from bayesdist.data.tables.column import Quantities, SourceColumn
 from bayesdist.errors import InputError
 from bayesdist.utils.arrays import Float
@@ -103,6 +104,14 @@ def reference_sky(
         key = "data.epoch" if epoch is None else "data.catalogue_epoch"
         note = f"proper motions are not used: {lacks} is not given ({key})"
         return ReferenceSky(ra, dec, sigma, motion, sigma_motion, (note,))
+    zero = zero_motions(quantities["pm_ra"].values, quantities["pm_dec"].values)
+    if zero.any():  # tables on disk, of which no row is left out in reading
+        raise quantities["pm_ra"].fail(
+            int(np.argmax(zero)),
+            f"proper motion is exactly 0 on both axes in {np.count_nonzero(zero)} rows, as where "
+            "missing values were filled",
+            do="write the table without these rows, or read it with read_matches",
+        )
     dt = epoch - start
     new_ra, new_dec = _moved(ra, dec, motion, start, epoch)
     factors, parallax = np.zeros((2, len(ra))), _optional(quantities, "parallax", "arcsec")

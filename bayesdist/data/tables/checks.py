@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable, Collection, Container, Mapping, Sequence
 from typing import Any
 
@@ -11,6 +12,10 @@ from numpy.typing import NDArray
 from bayesdist.errors import InputError
 from bayesdist.utils.arrays import Bool
 
+log = logging.getLogger("bayesdist")
+
+MOTION_KEYS = ("pm_ra", "pm_dec", "pm_u", "pm_v")  # of tables of matches, and of catalogues
+ZERO_MOTION = "proper motion of exactly 0"
 NOT_FINITE = ("refuse", "reject")
 # of a value, and of an error: the square of one over that of the other is still a number
 LARGEST, SMALLEST = 1e30, 1e-100
@@ -141,6 +146,22 @@ def absent(column: Any, *, not_finite: bool) -> Bool:
     return mask
 
 
+def zero_motions(first: Any, second: Any) -> Bool:
+    """Boolean mask (N,) of the stars whose proper motion is exactly 0 on both axes.
+
+    No measured motion is 0 to all digits on both axes; tables in which missing values were filled
+    have such rows.
+    """
+    zero = np.ones(len(first), bool)
+    for column in (first, second):
+        plain = getattr(column, "unmasked", column)
+        values = np.asarray(getattr(plain, "value", plain))
+        if values.ndim != 1 or values.dtype.kind not in "iuf":
+            return np.zeros(len(first), bool)  # texts are refused elsewhere
+        zero &= (values == 0) & ~absent(column, not_finite=False)
+    return zero
+
+
 def counted(reasons: Sequence[tuple[str, Bool]], n: int) -> tuple[Bool, dict[str, int]]:
     """Boolean mask of the n rows that stay, and how many others go, by their first reason."""
     stay, counts = np.ones(n, bool), dict[str, int]()
@@ -165,9 +186,19 @@ def without_missing(
 
     The others are counted by reason.  `reject` leaves out what is not finite, too; missing values
     of `spared` quantities do no harm; in `motions` NaN means that a star has none, as catalogues
-    write it.  No row left is an error.
+    write it, and so do proper motions of exactly 0 on both axes, with a warning.  No row left is an
+    error.
     """
     reasons = []
+    motion_names = [found[key] for key in MOTION_KEYS if key in found and key not in spared]
+    if len(motion_names) == 2:
+        zero = zero_motions(*(table[name] for name in motion_names))
+        if zero.any():
+            log.warning(
+                "%s: WARNING: %d of %d stars have %s and %s of exactly 0: taken as missing values",
+                *(source, np.count_nonzero(zero), len(table), *motion_names),
+            )
+        reasons.append((ZERO_MOTION, zero))
     for key, name in found.items():
         if key in spared:
             continue

@@ -118,7 +118,9 @@ _DAYS = frozenset(("mjd", "mjd_obs", "mjd-obs", "obs_mjd"))
 
 # names that only programs which count from 0 give
 _FROM_ZERO = {
-    **dict.fromkeys(("xcentroid", "x_centroid", "x_fit"), "photutils"),
+    **dict.fromkeys(("xcentroid", "x_centroid", "x_fit", "x_init"), "photutils"),
+    **dict.fromkeys(("xcentroid_win", "xcentroid_quad"), "photutils"),
+    **dict.fromkeys(("x_centroid_win", "x_centroid_quad"), "photutils"),
     **dict.fromkeys(("slot_centroid_x", "base_sdsscentroid_x"), "the LSST pipelines"),
 }
 # program, and columns that it writes with its x, y

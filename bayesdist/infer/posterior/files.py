@@ -224,7 +224,14 @@ def load_posterior(path: str | Path) -> Posterior:
             sampler=SamplerInfo(**info),
             certificate=_certificate(_tree(attrs["certificate"])),
             own_places=bool(attrs.get("own_places", False)),
+            tangent_point=_tangent_point(attrs),
         )
+
+
+def _tangent_point(attrs: Mapping[str, Any]) -> tuple[float, float] | None:
+    """RA and Dec of the plane of u, v; None if the file does not state them."""
+    point = _tree(attrs["tangent_point"]) if "tangent_point" in attrs else None
+    return None if point is None else (float(point[0]), float(point[1]))
 
 
 def _certificate(fields: dict[str, Any] | None) -> Certificate | None:
@@ -268,6 +275,7 @@ def save_fit(fit: LinearFit, path: str | Path) -> None:
             "clip_chi2_limit": fit.clip.chi2_limit,
             "clip_abs_limit": fit.clip.abs_limit,
             **{name: getattr(fit, name) for name in FIT_NUMBERS},
+            "tangent_point": json.dumps(fit.tangent_point),
         },
     )
     _write({"": data}, path)
@@ -299,6 +307,7 @@ def load_fit(path: str | Path) -> LinearFit:
                 float(attrs["clip_abs_limit"]),
             ),
             rejected=_tree(attrs["rejected"]),
+            tangent_point=_tangent_point(attrs),
             **{name: attrs[name].item() for name in FIT_NUMBERS},
         )
 

@@ -134,6 +134,8 @@ class Posterior(Solution):
     own_places : bool
         True if the stars' positions are unknowns of the solution, as in a self-calibration: the
         matches then have the positions of the mean, which are those of no other draw.
+    tangent_point : tuple of float, optional
+        RA and Dec in degrees of the plane of u, v: `LinearFit.tangent_point` of the fit.
     matches_digest : str
         `Matches.digest` of the stars; empty if it is not known, as in a file.
 
@@ -165,6 +167,7 @@ class Posterior(Solution):
     sampler: SamplerInfo
     certificate: Certificate | None = None
     own_places: bool = False
+    tangent_point: tuple[float, float] | None = field(default=None)
     matches_digest: str = ""
 
     def __repr__(self) -> str:
@@ -254,6 +257,7 @@ class Posterior(Solution):
                     "certificate": json.dumps(self.certificate and asdict(self.certificate)),
                     "n_parameters": len(names),
                     "own_places": int(self.own_places),
+                    "tangent_point": json.dumps(self.tangent_point),
                     **{name: getattr(self, name) for name in POSTERIOR_NUMBERS},
                 }
             ),

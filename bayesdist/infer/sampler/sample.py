@@ -177,6 +177,7 @@ def sample(
             convergence=chains.verdict,
             sampler=chains.info(seed, started, exact=exact),
             certificate=certificate,
+            tangent_point=fit.tangent_point,
             matches_digest=matches.digest() if isinstance(matches, Matches) else "",
         )
 

@@ -7,7 +7,7 @@ the corners.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
@@ -98,6 +98,8 @@ class LinearFit(Solution):
     dof : int
     condition : float
         Condition number of the normal matrix scaled to unit diagonal.
+    tangent_point : tuple of float, optional
+        RA and Dec in degrees of the plane of u, v: `Matches.tangent_point` of the stars.
 
     Examples
     --------
@@ -125,6 +127,7 @@ class LinearFit(Solution):
     chi2: float
     dof: int
     condition: float
+    tangent_point: tuple[float, float] | None = field(default=None)
 
     def __repr__(self) -> str:
         return (
@@ -304,7 +307,8 @@ def fit_linear(
     ((12,), (12, 12))
     """
     with opened(model, matches, compute) as shards:
-        return _fitted(shards, model, rejection, priors or GaussianPriors.none(model))
+        fit = _fitted(shards, model, rejection, priors or GaussianPriors.none(model))
+    return replace(fit, tangent_point=getattr(matches, "tangent_point", None))
 
 
 def _fitted(

@@ -39,6 +39,8 @@ class Solution(ABC):
         Of the sampler, where draws are those of a sampler.
     mixture : OutlierMixture or None
         Where false matches were modelled.
+    tangent_point : tuple of float or None
+        RA and Dec in degrees of (u, v) = (0, 0), if u increases to the east and v to the north.
     """
 
     if TYPE_CHECKING:  # read-only: fields of some subclasses, computed by others
@@ -58,8 +60,11 @@ class Solution(ABC):
         @property
         def mixture(self) -> OutlierMixture | None: ...
 
+        @property
+        def tangent_point(self) -> tuple[float, float] | None: ...
+
     else:
-        convergence = mixture = None
+        convergence = mixture = tangent_point = None
 
     @abstractmethod
     def draws(self, n: int, rng: np.random.Generator) -> Float:

@@ -14,6 +14,7 @@ from bayesdist.app.commands.on_files.position_table import (
     check_output,
     closing_lines,
     head_line,
+    origin_line,
     read_positions,
     write_positions,
 )
@@ -27,7 +28,7 @@ from bayesdist.calibration.apply import (
 )
 from bayesdist.calibration.calibration import Calibration
 from bayesdist.calibration.inverse import fitted_inverse
-from bayesdist.calibration.sky_table import chip_numbers, position_column
+from bayesdist.calibration.sky_table import chip_numbers, pixel_columns, position_column
 from bayesdist.errors import InputError
 from bayesdist.utils.arrays import Bool, Float, Int
 
@@ -43,6 +44,7 @@ def apply_to_table(
     method: str = "newton",
     order: int | None = None,
     columns: Sequence[str] | None = None,
+    pixel_origin: float | None = None,
     chip: int | None = None,
     filter: str | None = None,
     epoch: float | None = None,
@@ -58,7 +60,10 @@ def apply_to_table(
     """Take the positions of a table to the output frame, or `inverse` back to pixels, into a file.
 
     Positions are in `columns`, by default x, y (back: x_out, y_out), and the chip's number in a
-    column chip unless `chip` gives it.  `method` is one of METHODS: Newton's method on the forward
+    column chip unless `chip` gives it.  Pixels that are read count from `pixel_origin`, by default
+    from that of the program whose columns they are; those that are written count from 1.
+
+    `method` is one of METHODS: Newton's method on the forward
     polynomials, a polynomial fitted here, of an `order`, or the INVERSE rows of an IDCTAB; `epoch`
     is in decimal years; `origin` is the output pixel of the zero point, (0, 0) by default.  Filter,
     scale and size are as of `calibration_of_scale`; image, ltv and corner as of `images_of`.  What
@@ -75,7 +80,10 @@ def apply_to_table(
     a = Application(chips_of, frame, images)
     names = tuple(columns or (OUT if inverse else ("x", "y")))
     rows = read_positions(Path(table))
-    x, y = (position_column(rows, name, str(table)) for name in names)
+    if inverse:
+        x, y = (position_column(rows, name, str(table)) for name in names)
+    else:
+        x, y, first, reason = pixel_columns(rows, names, pixel_origin, str(table))
     what = found.name, str(table)
     if inverse:
         given = chip is not None or len(chips_of) == 1 or "chip" in rows.colnames
@@ -86,7 +94,7 @@ def apply_to_table(
         chips = chip_numbers(rows, chip, list(chips_of), *what)
         parts = {n: (chips == n, a.forward(x[chips == n], y[chips == n], chip=n)) for n in a.chips}
         at, added = _gathered(parts, x.size), OUT
-        lines = _frame_lines(a, source)
+        lines = [origin_line(first, reason), *_frame_lines(a, source)]
     add_positions(rows, at, added, str(table))
     rows.meta = {"calibration": found.name, "scale": pixel, "unit": found.unit}
     rows.meta |= {"origin": [ox, oy], "vafactor": vafactor}

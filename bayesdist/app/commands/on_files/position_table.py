@@ -43,6 +43,11 @@ def read_positions(path: Path) -> Table:
     return table
 
 
+def origin_line(origin: float, reason: str) -> str:
+    """Line on the coordinate of the centre of the first pixel."""
+    return f"  the first pixel is {origin:g}: {reason}"
+
+
 def add_positions(table: Table, at: Positions, names: tuple[str, str], where: str) -> None:
     """Add positions and their errors, and back on the detector the chip, as columns."""
     x, y = names

@@ -14,11 +14,12 @@ from bayesdist.app.commands.on_files.position_table import (
     check_output,
     closing_lines,
     head_line,
+    origin_line,
     read_positions,
     write_positions,
 )
 from bayesdist.calibration.calibration import Calibration
-from bayesdist.calibration.sky_table import COVARIANCE, errors_in, table_on_sky
+from bayesdist.calibration.sky_table import COVARIANCE, errors_in, pixel_columns, table_on_sky
 from bayesdist.errors import InputError
 from bayesdist.files.atomic import atomic_path
 from bayesdist.utils.arrays import Float
@@ -33,7 +34,7 @@ def sky_to_table(
     force: bool = False,
     columns: Sequence[str] | None = None,
     centroids: Sequence[str] | None = None,
-    pixel_origin: float = 1.0,
+    pixel_origin: float | None = None,
     chip: int | None = None,
     filter: str | None = None,
     epoch: float | None = None,
@@ -53,13 +54,16 @@ def sky_to_table(
             do="name a .fits file",
         )
     found = on_the_sky(Path(path), calibration_at(path, filter=filter, size=size))
+    positions = read_positions(Path(table))
+    names = columns or ("x", "y")
+    origin, reason = pixel_columns(positions, names, pixel_origin, str(table))[2:]
     rows = table_on_sky(
         found,
-        QTable(read_positions(Path(table))),
+        QTable(positions),
         name=str(table),
-        columns=columns or ("x", "y"),
+        columns=names,
         centroids=centroids,
-        pixel_origin=pixel_origin,
+        pixel_origin=origin,
         chip=chip,
         epoch=epoch,
         point=point,
@@ -71,7 +75,8 @@ def sky_to_table(
         write_positions(plain, output)
     else:
         _write_joint(plain, matrix, output)
-    return "\n".join(_lines(output, found, rows, epoch, centroids))
+    head, *lines = _lines(output, found, rows, epoch, centroids)
+    return "\n".join([head, origin_line(origin, reason), *lines])
 
 
 def _lines(

@@ -18,6 +18,7 @@ from bayesdist.app.store.rundir import RunDirectory
 from bayesdist.infer import Limits
 from bayesdist.infer.sampler.certified import PILOTS, has_second_stage
 from bayesdist.infer.sampler.move_schedule import expected_passes
+from bayesdist.infer.solution.geometry import geometries
 from bayesdist.utils.checks import warnings_of
 
 # measured on two cores of a server at orders 4 and 5; other machines differ by factors
@@ -72,10 +73,14 @@ def _lines(results: Results) -> Iterator[str]:
         f"linear fit   rms {number(fit.rms_u)}, {number(fit.rms_v)} {fit.unit}; "
         f"chi2/dof {number(fit.chi2 / max(fit.dof, 1))}; {fit.n_rejected} rows rejected"
     )
+    chips = geometries(fit)
+    for chip in chips:
+        yield f"geometry     chip {chip.chip}: {chip.sentence}"
     yield _cost(data, config)
     idle = idle_dates(config, config.requirements())
     for text in (
         *doubts_on_stars(data.sample, model, config),
+        *(text for chip in chips for text in chip.warnings),
         *warnings_of(results.checks),
         *([idle] if idle else []),
     ):

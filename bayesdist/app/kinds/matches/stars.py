@@ -40,6 +40,7 @@ from bayesdist.infer import (
     sample,
 )
 from bayesdist.infer.exposures.frame_choice import frames_that_help
+from bayesdist.infer.solution.geometry import geometries, refuse_geometry
 from bayesdist.infer.solution.linear import Rejection
 from bayesdist.model import DistortionModel
 from bayesdist.products.registry import read_calibration
@@ -108,12 +109,20 @@ def fit_stars(
         refuse_empty_segments(matched.stars.epoch, model.time)
     earlier = earlier_calibration(model, config, base)
     try:
-        return _fitted(matched.stars, model, config, reader, earlier)
+        fitted = _fitted(matched.stars, model, config, reader, earlier)
     except (DegenerateError, NotSettledError) as error:
         better = frames_that_help(matched.stars.sample(SAMPLE), model)
         if better is None:
             raise
         raise type(error)(error.cause, where=error.where, do=better.sentence) from error
+    refuse_geometry(
+        geometries(fitted.linear),
+        scale_mas=config.detector.scale_mas,
+        on_sky=matched.stars.tangent_point is not None,
+        where=", ".join(matched.stars.sources),
+    )
+    linear = replace(fitted.linear, tangent_point=matched.stars.tangent_point)
+    return replace(fitted, linear=linear)
 
 
 def _fitted(

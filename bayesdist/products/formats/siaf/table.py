@@ -40,11 +40,17 @@ SIDE = "siaf_covariance"  # first key of a side file
 AGREEMENT = 1e-6  # pixels: as far as table and side file may differ
 _STATED = re.compile(r"#\s*(XSciSize|YSciSize|XSciRef|YSciRef)\s*=\s*(\S+)")
 COVARIANCE = "The covariance of Sci2Idl is in"  # before the name of the side file, in our comments
-# Columns and rows of the full apertures, by the beginning of their names.
-_SIZES = {
-    "NRC": (2048.0, 2048.0), "NIS": (2048.0, 2048.0), "FGS": (2048.0, 2048.0),
-    "MIRIM": (1032.0, 1024.0), "WFI": (4088.0, 4088.0),
-}  # fmt: skip
+# Size (columns, rows) and reference pixel (XSciRef, YSciRef) of apertures of full frames in the
+# SIAF, by patterns of their whole names.  Subarrays and apertures of several detectors have their
+# own; that of the imager of MIRI is not in the middle.
+_FULL_FRAMES = {
+    r"NRC[AB][1-5]_FULL(_WEDGE_(BAR|RND))?|NIS_CEN(_OSS)?|FGS[12]_FULL(_OSS)?": (
+        (2048.0, 2048.0),
+        (1024.5, 1024.5),
+    ),
+    r"MIRIM_FULL": ((1032.0, 1024.0), (693.5, 512.5)),
+    r"WFI\d\d_FULL": ((4088.0, 4088.0), (2044.5, 2044.5)),
+}
 
 
 @dataclass(frozen=True)
@@ -78,12 +84,40 @@ class SiafTable:
         """Columns and rows, as stated, else by the name of the aperture."""
         if "XSciSize" in self.stated and "YSciSize" in self.stated:
             return self.stated["XSciSize"], self.stated["YSciSize"]
-        return next((s for start, s in _SIZES.items() if self.aperture.startswith(start)), None)
+        return None if self._full_frame is None else self._full_frame[0]
+
+    @property
+    def _full_frame(self) -> tuple[tuple[float, float], tuple[float, float]] | None:
+        """Size and reference pixel of an aperture of a full frame; None of any other."""
+        items = _FULL_FRAMES.items()
+        return next((facts for name, facts in items if re.fullmatch(name, self.aperture)), None)
+
+    @property
+    def states_reference(self) -> bool:
+        """True if the table, or the name of its aperture, gives the reference pixel."""
+        stated = {"XSciRef", "YSciRef"} <= self.stated.keys()
+        return stated or self._full_frame is not None
+
+    def of_size(self, size: tuple[float, float] | None) -> SiafTable:
+        """Table with the size that the user gives; refused where the file states another one."""
+        if size is None:
+            return self
+        known = self.size
+        if known is not None and tuple(known) != tuple(size):
+            raise InputError(
+                f"the image has {known[0]:g} x {known[1]:g} pixels, and {size[0]:g} x {size[1]:g} "
+                "are given",
+                where=self.name,
+                do="leave the size out, or give that of the aperture",
+            )
+        return replace(self, stated={**self.stated, "XSciSize": size[0], "YSciSize": size[1]})
 
     def reference_pixel(self, size: tuple[float, float]) -> tuple[float, float]:
-        """XSciRef and YSciRef, by default the middle of the detector."""
-        x = self.stated.get("XSciRef", (size[0] + 1) / 2)
-        return x, self.stated.get("YSciRef", (size[1] + 1) / 2)
+        """XSciRef and YSciRef: stated, or of the aperture, or else the middle of the image."""
+        x, y = (size[0] + 1) / 2, (size[1] + 1) / 2
+        if self._full_frame is not None:
+            x, y = self._full_frame[1]
+        return self.stated.get("XSciRef", x), self.stated.get("YSciRef", y)
 
     def terms(self, name: str) -> Coefficients:
         """Coefficients of one of NAMES by powers of x and y; of equal rows the last one counts."""
@@ -270,6 +304,7 @@ def siaf_calibration(table: SiafTable, _: str, choice: Choice) -> Calibration:
 
     MissingSizeError for a table of an unknown aperture without a size.
     """
+    table = table.of_size(choice.size)
     notes: tuple[str, ...] = ()
     inverse = table.inverse if table.rows else None
     if inverse is not None:
@@ -285,17 +320,20 @@ def siaf_calibration(table: SiafTable, _: str, choice: Choice) -> Calibration:
         notes = (f"the side file is {far:.2g} px from the table: without its covariance",)
     elif table.names_side_file:
         notes = (f"its covariance is in {side_name(table.name)}, which is not here",)
-    size = table.size or choice.size
+    size = table.size
     if size is None:
         raise MissingSizeError(
-            f"does not say how large the image is, and the aperture {table.aperture} is not known "
-            "here",
+            f"does not say how large the image is, and the aperture {table.aperture} is no full "
+            "frame that is known here",
             where=table.name,
-            do="compare it with a file that says",
+            do="give its size (--size XSciSize YSciSize), or write comments such as "
+            "'# XSciSize = 320' and '# XSciRef = 160.5' into the table",
         )
     if table.order < 1:
         raise InputError("has no linear terms", where=table.name, do="check its rows")
     x0, y0 = table.reference_pixel(size)
+    if not table.states_reference:
+        notes = (*notes, f"XSciRef, YSciRef are not stated: taken as {x0:g}, {y0:g}, the middle")
     one = fitted_map(
         lambda x, y: table.ideal(x - x0, y - y0),
         table.name,

@@ -6,6 +6,7 @@ import numpy as np
 
 from bayesdist.diagnose.residuals.rows import residual_statistics
 from bayesdist.diagnose.score.result import POWER
+from bayesdist.infer.solution.geometry import geometries
 from bayesdist.infer.solution.skew import skew_of
 from bayesdist.report.contents import REPORT
 from bayesdist.report.context import ReportInput
@@ -52,6 +53,7 @@ def fit_tables(r: ReportInput) -> tuple[TextTable, ...]:
         )
     return (
         listing(words.fit.capitalize(), pairs),
+        _geometry_table(r),
         *((_skew_table(r),) if r.setting("fit", "skew", False) else ()),
         TextTable(
             f"Residuals of the {words.rows} used [{scale.unit}]",
@@ -60,6 +62,35 @@ def fit_tables(r: ReportInput) -> tuple[TextTable, ...]:
             note=" ".join(notes),
             detail=True,
         ),
+    )
+
+
+def _geometry_table(r: ReportInput) -> TextTable:
+    """Table of the scales, orientation, parity and largest distortion of each chip."""
+    names = {chip.number: chip.name or str(chip.number) for chip in r.fit.model.chips}
+    rows = []
+    chips = geometries(r.fit)
+    for chip in chips:
+        x, y, _ = chip.scales
+        angle, apart = f"{chip.position_angle:.2f}", f"{90 + np.degrees(chip.skew):.3f}"
+        parity, distortion = f"{chip.parity:+d}", number(chip.distortion, 3)
+        rows.append((names[chip.chip], x, y, angle, apart, parity, distortion))
+    unit = chips[0].scales[2]
+    return TextTable(
+        "Geometry",
+        (
+            "Chip",
+            f"Scale along x [{unit}]",
+            f"Scale along y [{unit}]",
+            "Position angle of +y [°]",
+            "Angle from x to y [°]",
+            "Parity",
+            "Largest distortion [px]",
+        ),
+        tuple(rows),
+        note="Least squares, at the reference pixel, without drift and frames. The position angle "
+        "is from +v towards +u (on the sky: north through east); a parity of −1 is a mirror image. "
+        "The distortion is the deviation from the best linear map of the chip.",
     )
 
 

@@ -1,0 +1,177 @@
+"""Geometry of a chip as it was fitted: scales, orientation, parity, skew and distortion."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from bayesdist.errors import InputError
+from bayesdist.infer.solution.skew import skew_of
+from bayesdist.infer.solution.solution import Solution
+from bayesdist.model.grid import mesh
+from bayesdist.utils.numbers import number
+
+__all__ = ["Geometry", "geometry_of"]
+
+MAS = {"deg": 3.6e6, "arcsec": 1000.0, "mas": 1.0}  # in one unit of u, v
+GRID = 21  # positions per axis at which the distortion is evaluated
+LARGEST_ANISOTROPY = 0.05  # ratio of the scales of the two axes, less 1: square pixels on the sky
+LARGEST_SKEW = 0.1  # rad: ACS, with the strongest tilt of a focal plane in use, has 0.09
+LARGEST_DISTORTION = 0.05  # of half the diagonal of the chip
+LARGEST_SCALE_ERROR = 0.02  # of a stated pixel scale
+# Right ascensions in hours that are read as degrees shrink one direction of the sky by 15.
+HOURS = (12.0, 18.0)
+
+
+@dataclass(frozen=True)
+class Geometry:
+    """Linear part of the map of one chip, and its largest distortion.
+
+    Drift and the frames of exposures are left out.
+    """
+
+    chip: int
+    unit: str  # of u, v
+    scale_x: float  # units of u, v per pixel along x and y, at the reference pixel
+    scale_y: float
+    position_angle: float  # degrees from +v towards +u of the direction of +y
+    parity: int  # -1 if u, v is a mirror image of x, y, otherwise 1
+    skew: float  # radians: the angle from the image of x to that of y is 90 degrees plus this
+    stretch: float  # ratio of the largest to the smallest scale over all directions
+    mean_scale: float  # square root of the pixel's area in the best linear map of the chip
+    distortion: float  # pixels: largest deviation from the best linear map
+    half_diagonal: float  # pixels
+
+    @property
+    def anisotropy(self) -> float:
+        """Ratio of the larger to the smaller of the scales along x and y, less 1."""
+        low, high = sorted((self.scale_x, self.scale_y))
+        return high / low - 1.0
+
+    @property
+    def scales(self) -> tuple[str, str, str]:
+        """Scales along x and y as texts, and their unit."""
+        factor, unit = 1.0, f"{self.unit}/px"
+        if self.unit in MAS:
+            factor, unit = MAS[self.unit], "mas/px"
+        return number(factor * self.scale_x, 6), number(factor * self.scale_y, 6), unit
+
+    @property
+    def sentence(self) -> str:
+        """Scales, orientation, parity and largest distortion in one line."""
+        x, y, unit = self.scales
+        return (
+            f"scale {x} x {y} {unit}, +y at {self.position_angle:.2f} degrees from +v towards +u, "
+            f"parity {self.parity:+d}, largest distortion {number(self.distortion, 3)} px"
+        )
+
+    @property
+    def warnings(self) -> list[str]:
+        """Sentences about values that few detectors have."""
+        x, y, unit = self.scales
+        out = []
+        if self.anisotropy > LARGEST_ANISOTROPY:
+            out.append(
+                f"the pixel is {x} x {y} {unit} (chip {self.chip}): check the unit of both "
+                "positions, and that the columns are raw pixels"
+            )
+        if abs(self.skew) > LARGEST_SKEW:
+            out.append(
+                f"the axes of chip {self.chip} are {90 + np.degrees(self.skew):.1f} degrees apart: "
+                "check the columns of positions"
+            )
+        if self.distortion > LARGEST_DISTORTION * self.half_diagonal:
+            out.append(
+                f"the distortion of chip {self.chip} reaches {number(self.distortion, 3)} px, "
+                f"{100 * self.distortion / self.half_diagonal:.0f} % of half its diagonal: check "
+                "the tangent point and the columns of positions"
+            )
+        return out
+
+
+def geometry_of(solution: Solution, chip: int | None = None) -> Geometry:
+    """Geometry of a chip in a solution.
+
+    Parameters
+    ----------
+    solution : Solution
+    chip : int, optional
+        Chip number; the first chip by default.
+
+    Returns
+    -------
+    Geometry
+    """
+    model = solution.model
+    number_of_chip = model.chips[0].number if chip is None else chip
+    basis = model.basis(number_of_chip)
+    theta = np.asarray(solution.mean, float)
+    coefficients = np.stack(
+        [theta[model.coefficient_slice(number_of_chip, axis)] for axis in (0, 1)]
+    )
+    rows = basis.monomial_matrix[[basis.terms.index((1, 0)), basis.terms.index((0, 1))]]
+    linear = coefficients @ rows.T
+    size = basis.size
+    x, y = mesh(*(np.linspace(0.5, n + 0.5, GRID) for n in size))
+    plane = coefficients @ basis.evaluate(x, y).T
+    design = np.column_stack([np.ones_like(x), x - x.mean(), y - y.mean()])
+    best = np.linalg.lstsq(design, plane.T, rcond=None)[0]
+    mean_scale = float(np.sqrt(abs(np.linalg.det(best[1:]))))
+    deviation = np.hypot(*(plane - (design @ best).T)) / mean_scale
+    largest, smallest = np.linalg.svd(linear, compute_uv=False)
+    return Geometry(
+        chip=number_of_chip,
+        unit=model.unit,
+        scale_x=float(np.hypot(*linear[:, 0])),
+        scale_y=float(np.hypot(*linear[:, 1])),
+        position_angle=float(np.degrees(np.arctan2(linear[0, 1], linear[1, 1]))),
+        parity=-1 if np.linalg.det(linear) < 0 else 1,
+        skew=skew_of(solution, chip=number_of_chip).value,
+        stretch=float(largest / smallest),
+        mean_scale=mean_scale,
+        distortion=float(deviation.max()),
+        half_diagonal=float(np.hypot(*size) / 2),
+    )
+
+
+def geometries(solution: Solution) -> list[Geometry]:
+    """Geometry of every chip."""
+    return [geometry_of(solution, chip.number) for chip in solution.model.chips]
+
+
+def refuse_geometry(
+    chips: Sequence[Geometry], *, scale_mas: float | None, on_sky: bool, where: str
+) -> None:
+    """Refuse right ascensions in hours, and a stated pixel scale that is not that of the fit.
+
+    `on_sky` is True if u, v are on a tangent plane.  InputError with the way out.
+    """
+    first = chips[0]
+    if first.unit not in MAS:
+        return
+    x, y, unit = first.scales
+    if on_sky and HOURS[0] < first.stretch < HOURS[1]:
+        raise InputError(
+            f"the pixel is {x} x {y} {unit}: one direction of the sky is {first.stretch:.3g} times "
+            "the other, as where right ascensions in hours are read as degrees",
+            where=where,
+            do="multiply ra by 15, or give the column the unit hourangle",
+        )
+    if scale_mas is None:
+        return
+    factor = MAS[first.unit]
+    fitted = [
+        factor * value
+        for chip in chips
+        for value in (chip.mean_scale, np.sqrt(chip.scale_x * chip.scale_y * np.cos(chip.skew)))
+    ]
+    nearest = min(fitted, key=lambda value: abs(value / scale_mas - 1.0))
+    if abs(nearest / scale_mas - 1.0) > LARGEST_SCALE_ERROR:
+        raise InputError(
+            f"the pixel scale is given as {scale_mas:g} mas, and that of the fit is "
+            f"{number(fitted[0], 5)} mas",
+            where="detector.scale_mas",
+            do="correct it or leave it out, as u and v are angles; or correct data.unit",
+        )
