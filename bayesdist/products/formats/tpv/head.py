@@ -262,6 +262,13 @@ def _form(head: TpvHead, name: str) -> TangentForm:
             where=name,
             do="correct CTYPE",
         )
+    if (form.wcs.wcs.get_cdelt() != 1).any():
+        raise InputError(
+            "states its linear part other than by CD in degrees: programs disagree on the unit in "
+            "which PV are then applied (wcslib applies them before CDELT)",
+            where=name,
+            do="write CD in degrees, CUNIT 'deg' and no CDELT",
+        )
     return form
 
 
