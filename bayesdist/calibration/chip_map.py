@@ -323,6 +323,16 @@ def sampling_of(solution: Solution) -> tuple[float, tuple[str, ...]]:
     return float(convergence.ess_bulk_min), notes
 
 
+def refuse_order(order: int, name: str) -> None:
+    """Raise InputError for a polynomial of an order that only a misprint has."""
+    if order > MOST_ORDER:  # time and memory go with its fourth power
+        raise InputError(
+            f"the order of its polynomials is {order}, and at most {MOST_ORDER} is read",
+            where=name,
+            do="correct the file",
+        )
+
+
 def fitted_map(
     positions: Callable[[Float, Float], Float | tuple[Float, Float]],
     name: str,
@@ -340,12 +350,7 @@ def fitted_map(
     `order`; `monomial_cov` (2 K, 2 K) is of the coefficients of (x - xref)^i (y - yref)^j, u before
     v; other arguments as in `PolynomialBasis` and `ChipMap`.
     """
-    if order > MOST_ORDER:  # time and memory go with its fourth power
-        raise InputError(
-            f"the order of its polynomials is {order}, and at most {MOST_ORDER} is read",
-            where=name,
-            do="correct the file",
-        )
+    refuse_order(order, name)
     basis = PolynomialBasis(order, size, reference_pixel)
     # products of two terms have twice the order, for which so many nodes are exact
     x, y, weight = Chip(1, "", size, reference_pixel).quadrature(order + 1)

@@ -187,6 +187,9 @@ class Format:
         True if files that are built have the dependence of the calibration on time.
     needs_scale : callable
         From the settings to True if a file states angles, for which u and v in pixels need a scale.
+    refuse : callable, optional
+        For a format without calibrations: raises the InputError that says why this file has none;
+        returns if nothing more is known than that the format has none.
     """
 
     key: str
@@ -205,6 +208,7 @@ class Format:
     holds_tables: bool = False
     holds_time: bool = False
     needs_scale: Callable[[Any], bool] = lambda settings: False
+    refuse: Callable[[Any, str], None] | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -242,6 +246,8 @@ class Document:
             For a format that holds none, or whatever the format misses in the choice.
         """
         if self.format.calibration is None:
+            if self.format.refuse is not None:
+                self.format.refuse(self.holds, self.name)
             raise InputError(
                 f"is {self.format.title}, which holds no calibration by itself",
                 where=self.name,

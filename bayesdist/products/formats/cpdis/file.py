@@ -21,6 +21,7 @@ from bayesdist.calibration.chip_map import ChipMap, fitted_map
 from bayesdist.calibration.plane import ARCSEC, Plane
 from bayesdist.errors import FormatError, InputError
 from bayesdist.model import LookupTable
+from bayesdist.products.formats.common.celestial import TangentForm, refuse_singular, tangent_form
 from bayesdist.products.formats.common.content import Content, Hdu
 from bayesdist.products.formats.common.document import Choice, required_size
 from bayesdist.products.formats.common.parameters import (
@@ -131,9 +132,35 @@ class CpdisImage:
         """Columns and rows of the image."""
         return image_size(self.header)
 
+    @cached_property
+    def _form(self) -> tuple[TangentForm | None, str]:
+        refuse_singular(cd_matrix(self.header, self.where), self.where)
+        try:
+            return tangent_form(self.header, self.where), ""
+        except FormatError:
+            raise
+        except InputError as error:
+            return (
+                None,
+                f"{self.where} {error.cause}: u, v are on the plane of its projection, and "
+                "not on the sky",
+            )
+
+    @property
+    def form(self) -> TangentForm | None:
+        """Tangent form of the header; None if it has no celestial axes or another projection."""
+        return self._form[0]
+
+    @property
+    def note(self) -> str:
+        """Why there is no tangent form although the axes are celestial; empty if there is one."""
+        return self._form[1]
+
     @property
     def cd(self) -> Float:
-        """Degrees in a pixel (2, 2)."""
+        """Degrees of u and v in a pixel (2, 2)."""
+        if self.form is not None:
+            return np.asarray(self.form.turn @ self.form.cd)
         units = [str(self.header.get(f"CUNIT{k}", "deg")).strip() for k in (1, 2)]
         factors = [_DEGREES.get(unit, 1.0) for unit in units]
         return cd_matrix(self.header, self.where) * np.array(factors)[:, None]
@@ -142,11 +169,20 @@ class CpdisImage:
     def plane_of_sky(self) -> Plane:
         """Plane of the intermediate coordinates."""
         kind = str(self.header.get("BDPLANE", "")).strip()
-        types = [str(self.header.get(f"CTYPE{k}", "")) for k in (1, 2)]
-        tangent = types[0].startswith("RA") and all(t.endswith("TAN") for t in types)
-        if kind not in ("", "sky") or not tangent:
+        if kind not in ("", "sky") or self.form is None:
             return Plane(kind if kind not in ("", "sky") else "free")
-        return Plane("sky", point=(float(self.header["CRVAL1"]), float(self.header["CRVAL2"])))
+        return Plane("sky", point=self.form.point)
+
+    def check(self, opened: fits.HDUList | None, size: tuple[float, float]) -> None:
+        """Compare positions with those by astropy.wcs; InputError if they differ."""
+        if self.form is None:
+            return
+        table, cd, crpix = self.table(), self.cd, np.array(self.crpix)[:, None]
+
+        def positions(x: Float, y: Float) -> Float:
+            return np.asarray(cd @ (np.stack([x, y]) + table.evaluate(x, y).T - crpix))
+
+        self.form.check(positions, size, self.header, self.where, opened)
 
 
 @dataclass(frozen=True, eq=False)
@@ -198,8 +234,16 @@ def cpdis_calibration(file: CpdisFile, name: str, choice: Choice) -> Calibration
             "its images touch the sky at different points", where=name, do="give one by itself"
         )
     maps = {one.number: _linear(one, name, choice.size, unit, factor) for one in file.images}
+    for image in file.images:
+        image.check(file.content.opened, required_size(image.size, choice.size, name))
     tables = tuple(image.table() for image in file.images)
-    found = calibration_of_maps(maps, name, plane=first.plane_of_sky, before=tables)
+    found = calibration_of_maps(
+        maps,
+        name,
+        plane=first.plane_of_sky,
+        before=tables,
+        notes=tuple(image.note for image in file.images if image.note),
+    )
     hdu = stored_in(file.content)
     if hdu is None or choice.as_used:
         return found

@@ -8,24 +8,28 @@ from pathlib import Path
 import numpy as np
 
 from bayesdist.calibration.calibration import Calibration, calibration_of_maps
-from bayesdist.calibration.chip_map import fitted_map
+from bayesdist.calibration.chip_map import fitted_map, refuse_order
 from bayesdist.calibration.inverse import detector_grid
 from bayesdist.calibration.plane import ARCSEC, Plane
 from bayesdist.data.sky.tangent import sky_of_plane, tangent_plane
 from bayesdist.model import polynomial_terms
 from bayesdist.products.formats.common.cards import text_card
+from bayesdist.products.formats.common.celestial import refuse_singular, tangent_form
 from bayesdist.products.formats.common.document import PARAMETERS, Built, required_size
 from bayesdist.products.formats.common.parameters import (
     parameters_content,
     refuse_other,
 )
 from bayesdist.products.formats.sip.header import SIDE_FILE, SIP_ORDERS, SipHeader
+from bayesdist.products.formats.sip.write import sip_header
 from bayesdist.utils.arrays import Float
 
 NO_LINEAR_ERRORS = (
     "its errors are not stated: AE and BE are those of the non-linear terms alone, and a position "
     "errs by offset, scale and rotation, too; a file of parameters beside the header has them all"
 )
+
+NO_SKY = "CTYPE names no position on the sky: u, v are on a plane of unknown place, CD in degrees"
 
 
 def sip_calibration(
@@ -44,13 +48,21 @@ def sip_calibration(
     """
     found = required_size(sip.size, size, name)
     order = max(sip.order) if min(sip.order) >= SIP_ORDERS[0] else 1
-    linear = np.eye(2) if pixels else sip.cd * (1.0 if sip.linear_axes else 3600.0)
+    refuse_order(order, name)
+    header = sip_header(sip)
+    if not pixels:
+        refuse_singular(sip.cd, name)
+    form = None if pixels or sip.linear_axes else tangent_form(header, name)
+    cd = sip.cd if form is None else form.turn @ form.cd
+    linear = np.eye(2) if pixels else cd * (1.0 if sip.linear_axes else 3600.0)
 
     def positions(x: Float, y: Float) -> Float:
+        corrected = np.stack(sip.forward(x, y))
         if pixels:
-            return np.stack(sip.forward(x, y))
-        at = np.stack(sip.plane(x, y))
-        return at + np.array(sip.crval)[:, None] if sip.linear_axes else 3600.0 * at
+            return corrected
+        if sip.linear_axes:
+            return cd @ corrected + np.array(sip.crval)[:, None]
+        return 3600.0 * (cd @ corrected)
 
     one = fitted_map(
         positions,
@@ -63,9 +75,12 @@ def sip_calibration(
     )
     if sip.has_sigmas and not sip.has_linear_sigmas:
         notes = (*notes, NO_LINEAR_ERRORS)
-    plane = Plane("detector") if pixels else Plane("sky", point=sip.crval)
-    if sip.linear_axes:
-        plane = Plane()
+    plane = Plane("detector") if pixels else Plane()
+    if form is not None:
+        form.check(lambda x, y: positions(x, y) / 3600.0, found, header, name)
+        plane = Plane("sky", point=form.point)
+    elif not pixels and not sip.linear_axes:
+        notes = (*notes, NO_SKY)
     return calibration_of_maps(
         {1: one},
         name,

@@ -171,11 +171,14 @@ def _order(header: fits.Header, keyword: str, where: str) -> int:
 
 
 def cd_matrix(header: fits.Header, where: str) -> Float:
-    """CD matrix (2, 2), also of a header with PC and CDELT or CROTA2 (FITS 4.0, section 8.1)."""
+    """CD matrix (2, 2), also of a header with PC and CDELT or CROTA2 (FITS 4.0, section 8.1).
+
+    As for wcslib, CD replaces PC, and PC replaces CROTA2.
+    """
     if any(keyword in header for keyword in CD_KEYWORDS):
         return np.array([_number(header, k, where, 0.0) for k in CD_KEYWORDS]).reshape(2, 2)
     scale = np.array([_number(header, k, where, 1.0) for k in ("CDELT1", "CDELT2")])
-    if "CROTA2" in header:
+    if "CROTA2" in header and not any(keyword in header for keyword in LINEAR_KEYWORDS[:4]):
         angle = np.deg2rad(_number(header, "CROTA2", where))
         c, s = np.cos(angle), np.sin(angle)
         return np.array([[scale[0] * c, -scale[1] * s], [scale[0] * s, scale[1] * c]])

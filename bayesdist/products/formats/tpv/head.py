@@ -23,6 +23,7 @@ from bayesdist.calibration.inverse import detector_grid
 from bayesdist.calibration.plane import ARCSEC, Plane
 from bayesdist.errors import FormatError, InputError
 from bayesdist.model import polynomial_terms
+from bayesdist.products.formats.common.celestial import TangentForm, refuse_singular, tangent_form
 from bayesdist.products.formats.common.content import Content, readable
 from bayesdist.products.formats.common.document import Choice, required_size
 from bayesdist.products.formats.common.parameters import with_parameters
@@ -227,12 +228,13 @@ def tpv_calibration(file: TpvFile, name: str, choice: Choice) -> Calibration:
     """
     _check(file, name)
     maps, notes = {}, list[str]()
+    forms = {head.number: _form(head, name) for head in file.heads}
     order = max(_RADIAL_ORDER if head.radial else head.order for head in file.heads)
     header = file.heads[0].header
     unit = str(header.get("BDUNIT", "arcsec"))
     factor = 3600.0 / float(header.get("BDARCS", ARCSEC.get(unit, 1.0)))
     for head in file.heads:
-        one, worst = _map(head, name, order, choice.size, unit, factor)
+        one, worst = _map(head, name, order, choice.size, unit, factor, forms[head.number])
         maps[head.number] = one
         if head.radial:
             notes.append(
@@ -240,7 +242,7 @@ def tpv_calibration(file: TpvFile, name: str, choice: Choice) -> Calibration:
                 f"{order}, {worst:.2g} pix off at worst"
             )
     kind = str(header.get("BDPLANE", "sky"))
-    plane = Plane(kind, point=file.heads[0].crval if kind == "sky" else None)
+    plane = Plane(kind, point=forms[file.heads[0].number].point if kind == "sky" else None)
     found = calibration_of_maps(
         maps, name, plane=plane, numbered=all(h.numbered for h in file.heads), notes=tuple(notes)
     )
@@ -248,6 +250,26 @@ def tpv_calibration(file: TpvFile, name: str, choice: Choice) -> Calibration:
         return found
     beside = file.content if file.content.is_fits else file.content.beside(file.side_file)
     return with_parameters(found, beside, file.side_file)
+
+
+def _form(head: TpvHead, name: str) -> TangentForm:
+    """Tangent form of a header; FormatError if it has no celestial axes."""
+    refuse_singular(head.cd, name)
+    form = tangent_form(head.header, name)
+    if form is None:
+        raise FormatError(
+            f"has the axes {', '.join(head.ctype)}, which are no positions on the sky",
+            where=name,
+            do="correct CTYPE",
+        )
+    if (form.wcs.wcs.get_cdelt() != 1).any():
+        raise InputError(
+            "states its linear part other than by CD in degrees: programs disagree on the unit in "
+            "which PV are then applied (wcslib applies them before CDELT)",
+            where=name,
+            do="write CD in degrees, CUNIT 'deg' and no CDELT",
+        )
+    return form
 
 
 def _check(file: TpvFile, name: str) -> None:
@@ -279,15 +301,19 @@ def _map(
     given: tuple[float, float] | None,
     unit: str,
     factor: float,
+    form: TangentForm,
 ) -> tuple[ChipMap, float]:
     """Map of one chip in the unit, `factor` of them in a degree, and its miss in pixels."""
     size = required_size(head.size, given, name)
 
     def positions(x: Float, y: Float) -> Float:
-        return factor * np.stack(head.plane(x, y))
+        at = form.cd @ (np.stack([x, y]) - np.array(head.crpix)[:, None])
+        plane = np.stack([pv_value(axis, head.pv[axis], *at) for axis in (0, 1)])
+        return np.asarray(factor * (form.turn @ plane))
 
+    form.check(lambda x, y: positions(x, y) / factor, size, head.header, name)
     one = fitted_map(positions, name, order=order, size=size, reference_pixel=head.crpix, unit=unit)
     x, y = detector_grid(size, 65)
     far = np.hypot(*(one.at(x, y) - positions(x, y)))
-    worst = float(far.max() / np.sqrt(abs(np.linalg.det(factor * head.cd))))
+    worst = float(far.max() / np.sqrt(abs(np.linalg.det(factor * form.cd))))
     return one, 0.0 if worst < _EXACT else worst

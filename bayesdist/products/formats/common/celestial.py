@@ -1,0 +1,290 @@
+"""World coordinates of a FITS header, reduced to a tangent plane with north up.
+
+`astropy.wcs` interprets the header: projection, axis order, units, PC, CD or CROTA2, LONPOLE and
+celestial system.  A TAN projection is brought exactly to degrees with xi to the east and eta to the
+north, about a point of the equatorial system; every other projection is refused.  What a reader
+makes of the distortion is then compared with astropy.wcs on a grid of pixels.
+"""
+
+from __future__ import annotations
+
+import re
+import warnings
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from astropy.io import fits
+
+from bayesdist.calibration.inverse import detector_grid
+from bayesdist.data.sky.tangent import sky_of_plane
+from bayesdist.errors import FormatError, InputError
+from bayesdist.files.faults import reason_of
+from bayesdist.products.formats.common.cards import card_images, header_of, keyword_of
+from bayesdist.utils.arrays import Float
+
+if TYPE_CHECKING:
+    from astropy.wcs import WCS
+
+TOLERANCE_MAS = 0.01  # largest distance between positions read here and those by astropy.wcs
+_GRID = 17  # points of each axis at which these are compared
+# Look-up tables are passed on only where they are read; inverses do not change positions.
+_TABLES = re.compile(r"(D2IM\w*|CPDIS\d|CPERR\d|CQDIS\d|CQERR\d|DP\d|DQ\d)$")
+_INVERSE = re.compile(r"(AP|BP)_")
+_SAMPLE = (
+    "compute positions of a grid of pixels with astropy.wcs, write them as a table with columns x, "
+    "y, ra and dec, and fit that table"
+)
+_NAMES = {
+    "TNX": "a TNX of IRAF (TAN with a polynomial in WAT keywords)",
+    "ZPX": "a ZPX of IRAF (ZPN with a polynomial in WAT keywords)",
+    "DSS": "a plate solution of the Digitized Sky Survey (AMDX and AMDY keywords)",
+}
+_NO_AREA = "the linear terms make a pixel without an area"
+HELD_PROJECTIONS = ("TAN", "TPV")
+
+
+@dataclass(frozen=True, eq=False)
+class TangentForm:
+    """Linear part of a header, and the way from its coordinates to a tangent plane."""
+
+    wcs: WCS  # without look-up tables
+    cd: Float  # (2, 2), degrees in a pixel, along the axes of the header
+    native_turn: Float  # (2, 2), from these axes to east and north in the system of the header
+    system_turn: Float  # (2, 2), from east and north in that system to those of RA and Dec
+    native_point: tuple[float, float]  # longitude and latitude of the tangent point, degrees
+    point: tuple[float, float]  # RA and Dec of the tangent point, degrees
+
+    @property
+    def turn(self) -> Float:
+        """Matrix (2, 2) from the axes of the header to xi and eta."""
+        return np.asarray(self.system_turn @ self.native_turn)
+
+    def check(
+        self,
+        positions: Callable[[Float, Float], Float],
+        size: tuple[float, float],
+        header: fits.Header,
+        where: str,
+        opened: fits.HDUList | None = None,
+    ) -> None:
+        """Compare positions with those by astropy.wcs on a grid over the image.
+
+        Parameters
+        ----------
+        positions : callable
+            Returns xi and eta (2, N) in degrees of FITS 1-based pixels x and y (N,).
+        size : tuple of float
+            Columns and rows of the image.
+        header : Header
+        where : str
+            Name of the file, for errors.
+        opened : HDUList, optional
+            The file with the look-up tables of the header; without it these are left out.
+
+        Raises
+        ------
+        InputError
+            If they differ by more than 0.01 mas anywhere.
+        """
+        wcs = _wcs_of(
+            _without(header, _INVERSE, *([_TABLES] if opened is None else [])), where, opened
+        )
+        x, y = detector_grid(size, _GRID)
+        with np.errstate(all="ignore"), warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            world = np.asarray(wcs.all_pix2world(np.column_stack([x, y]), 1), float)
+        xi, eta = self.system_turn.T @ positions(x, y)
+        lon, lat = sky_of_plane(3600.0 * xi, 3600.0 * eta, self.native_point)
+        off = _separation(lon, lat, world[:, self.wcs.wcs.lng], world[:, self.wcs.wcs.lat])
+        pixel = 3.6e6 * float(np.sqrt(abs(np.linalg.det(self.cd))))
+        if not off.max() <= TOLERANCE_MAS:
+            raise InputError(
+                f"is read as positions up to {off.max() / pixel:.3g} pixels off those by "
+                "astropy.wcs, so its keywords mean something that is not held here",
+                where=where,
+                do=_SAMPLE,
+            )
+
+
+def tangent_form(header: fits.Header, where: str) -> TangentForm | None:
+    """Tangent form of the primary world coordinates of a header.
+
+    Parameters
+    ----------
+    header : Header
+        Cards of the header; its look-up tables are not looked at.
+    where : str
+        Name of the file, for errors.
+
+    Returns
+    -------
+    TangentForm or None
+        None if the header has no celestial axes.
+
+    Raises
+    ------
+    InputError
+        If the projection is not TAN, if the celestial system is neither equatorial nor galactic, or
+        if astropy.wcs cannot read the header.
+    FormatError
+        If CRVAL is no position, or the linear part is singular.
+    """
+    code = projection_code(header)
+    if code and code not in HELD_PROJECTIONS:
+        refuse_projection(code, where)
+    if str(header.get("CTYPE1", "")).startswith("RA") and not header.get("CUNIT1"):
+        _refuse_point(header.get("CRVAL1", 0.0), header.get("CRVAL2", 0.0), where)
+    wcs = _wcs_of(_without(header, _TABLES, _INVERSE), where)
+    w = wcs.wcs
+    if w.lng < 0 or w.lat < 0:
+        return None
+    if wcs.naxis != 2:
+        raise InputError(
+            f"has {wcs.naxis} axes, and only images of two celestial axes are held",
+            where=where,
+            do="write the header of the two celestial axes: astropy.wcs.WCS(header).celestial",
+        )
+    cd = np.asarray(w.get_cdelt()[:, None] * w.get_pc(), float)
+    angle = np.radians(w.lonpole - 180.0)
+    c, s = np.cos(angle), np.sin(angle)
+    # A native longitude phi is atan2(x, -y), and LONPOLE is that of the celestial pole.
+    native = np.array([[c, s], [-s, c]]) @ np.eye(2)[[w.lng, w.lat]]
+    lon, lat = float(w.crval[w.lng]), float(w.crval[w.lat])
+    _refuse_point(lon, lat, where)
+    system, point = _equatorial(w, lon, lat, where)
+    return TangentForm(wcs, cd, native, system, (lon, lat), point)
+
+
+def refuse_singular(cd: Float, where: str) -> None:
+    """Raise FormatError if the linear part (2, 2) of a header is singular.
+
+    wcslib takes a unit matrix for a row of zeros.
+    """
+    if np.linalg.det(cd) == 0:
+        raise FormatError(_NO_AREA, where=where, do="correct the header")
+
+
+def _refuse_point(lon: float, lat: float, where: str) -> None:
+    """Raise FormatError for degrees that are no position."""
+    if not (abs(lon) <= 360 and abs(lat) <= 90):
+        raise FormatError(
+            f"the plane touches the sky at ({lon:g}, {lat:g}) degrees: on no sphere",
+            where=where,
+            do="correct CRVAL or CUNIT",
+        )
+
+
+def projection_code(header: fits.Header) -> str:
+    """Three letters of the projection as CTYPE has it, DSS for a plate solution; else empty."""
+    types = [str(header.get(f"CTYPE{k}", "")).strip().upper() for k in (1, 2)]
+    for text in types:
+        match = re.match(r".{4}-(\w{3})(-|$)", text)
+        if match is not None:
+            return match[1]
+    return "DSS" if "AMDX1" in header and "PLTRAH" in header else ""
+
+
+def refuse_projection(code: str, where: str) -> None:
+    """Raise the InputError of a projection that is not held."""
+    name = _NAMES.get(code, f"{_article(code)} {code} projection")
+    raise InputError(f"is {name}, and bayesdist holds TAN alone", where=where, do=_SAMPLE)
+
+
+def _article(code: str) -> str:
+    """Indefinite article of a name that is spoken letter by letter or as a word."""
+    return "an" if code[0] in "AEIO" else "a"
+
+
+def _without(header: fits.Header, *patterns: re.Pattern[str]) -> fits.Header:
+    """Header without keywords that match one of the patterns."""
+    return header_of(
+        card
+        for card in card_images(header)
+        if not any(pattern.match(keyword_of(card)) for pattern in patterns)
+    )
+
+
+def _wcs_of(header: fits.Header, where: str, opened: fits.HDUList | None = None) -> WCS:
+    """World coordinates by astropy.wcs; InputError if it refuses the header."""
+    from astropy import log
+    from astropy.wcs import WCS, SingularMatrixError  # slow to import
+
+    before = log.level
+    log.setLevel("ERROR")  # astropy remarks on CTYPE without -SIP there
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            wcs = WCS(header, opened)
+            wcs.wcs.set()
+    except SingularMatrixError as error:
+        raise FormatError(_NO_AREA, where=where, do="correct the header") from error
+    except Exception as error:  # astropy.wcs raises all kinds on headers that it refuses
+        lines = [line for line in str(error).splitlines() if not line.startswith("ERROR")]
+        reason = lines[0].rstrip(".") if lines else reason_of(error)
+        raise InputError(
+            f"is a header that astropy.wcs cannot read ({reason})",
+            where=where,
+            do="correct the header",
+        ) from error
+    finally:
+        log.setLevel(before)
+    return wcs
+
+
+def _equatorial(w: object, lon: float, lat: float, where: str) -> tuple[Float, tuple[float, float]]:
+    """Rotation (2, 2) to RA and Dec, and RA and Dec of the tangent point."""
+    system = str(w.lngtyp).strip()  # type: ignore[attr-defined]
+    frame = str(w.radesys).strip().upper()  # type: ignore[attr-defined]
+    equinox = float(w.equinox)  # type: ignore[attr-defined]
+    if system == "RA":
+        if frame in ("", "ICRS") or (frame == "FK5" and equinox == 2000.0):
+            return np.eye(2), (lon, lat)
+        stated = f"{frame}{f' of equinox {equinox:g}' if np.isfinite(equinox) else ''}"
+        raise InputError(
+            f"has right ascension and declination of {stated}, and bayesdist holds those of ICRS",
+            where=where,
+            do=f"{_SAMPLE}; transform them with astropy.coordinates before",
+        )
+    if system == "GLON":
+        return _from_galactic(lon, lat)
+    names = {"ELON": "ecliptic", "HPLN": "helioprojective", "HGLN": "heliographic",
+             "SLON": "supergalactic", "TLON": "terrestrial"}  # fmt: skip
+    raise InputError(
+        f"has {names.get(system, 'celestial')} coordinates ({system}), and bayesdist holds right "
+        "ascension and declination",
+        where=where,
+        do=f"{_SAMPLE}; transform them with astropy.coordinates before",
+    )
+
+
+def _from_galactic(lon: float, lat: float) -> tuple[Float, tuple[float, float]]:
+    """Rotation of east and north from galactic to ICRS, and RA and Dec of a galactic position."""
+    from astropy.coordinates import CartesianRepresentation, Galactic, SkyCoord
+
+    axes = SkyCoord(Galactic(CartesianRepresentation(np.eye(3))))
+    matrix = np.asarray(axes.icrs.cartesian.xyz.value, float)  # columns are images of the axes
+    east, north, out = _basis(lon, lat)
+    x, y, z = matrix @ out
+    ra, dec = np.degrees(np.arctan2(y, x)) % 360.0, np.degrees(np.arctan2(z, np.hypot(x, y)))
+    new_east, new_north, _ = _basis(ra, dec)
+    turn = np.stack([new_east, new_north]) @ matrix @ np.stack([east, north], axis=1)
+    return turn, (float(ra), float(dec))
+
+
+def _basis(lon: float, lat: float) -> tuple[Float, Float, Float]:
+    """Unit vectors to the east, to the north and outwards at a position in degrees."""
+    a, d = np.radians(lon), np.radians(lat)
+    east = np.array([-np.sin(a), np.cos(a), 0.0])
+    north = np.array([-np.sin(d) * np.cos(a), -np.sin(d) * np.sin(a), np.cos(d)])
+    return east, north, np.array([np.cos(d) * np.cos(a), np.cos(d) * np.sin(a), np.sin(d)])
+
+
+def _separation(lon: Float, lat: Float, other_lon: Float, other_lat: Float) -> Float:
+    """Separations (N,) of positions in degrees, mas; NaN where one is not finite."""
+    a, d, b, e = (np.radians(v) for v in (lon, lat, other_lon, other_lat))
+    first = np.stack([np.cos(d) * np.cos(a), np.cos(d) * np.sin(a), np.sin(d)])
+    second = np.stack([np.cos(e) * np.cos(b), np.cos(e) * np.sin(b), np.sin(e)])
+    chord = np.sqrt(((first - second) ** 2).sum(axis=0))
+    return np.degrees(2.0 * np.arcsin(np.clip(chord / 2.0, 0.0, 1.0))) * 3.6e6
