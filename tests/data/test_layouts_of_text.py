@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from astropy.io import fits
 from astropy.table import Table
+from astropy.time import Time
 
 from bayesdist.data import ReadOptions, open_matches, read_matches
 from bayesdist.data.reading.columns import numbered
@@ -80,6 +81,53 @@ def test_several_chips_of_an_ldac_catalogue(tmp_path):
     fits.HDUList(hdus).writeto(tmp_path / "chips.ldac")
     m = read_matches(tmp_path / "chips.ldac", sigma=1.0, unit="pix")
     assert m.chip_numbers == (1, 2) and m.chip.tolist() == [0] * 6 + [1] * 6
+
+
+def ldac(path, tables, headers, *, in_cards):
+    """Write a FITS_LDAC catalogue; image headers as one string, or as an array of cards."""
+    hdus = [fits.PrimaryHDU()]
+    for table, header in zip(tables, headers, strict=True):
+        text = header.tostring()
+        shape = f"(80, {len(text) // 80})" if in_cards else None
+        row = [[text[k : k + 80] for k in range(0, len(text), 80)]] if in_cards else [text]
+        form = f"{len(text)}A"
+        column = fits.Column("Field Header Card", form, dim=shape, array=np.array(row))
+        hdus.append(fits.BinTableHDU.from_columns([column], name="LDAC_IMHEAD"))
+        hdus.append(fits.BinTableHDU(table.as_array(), name="LDAC_OBJECTS"))
+    fits.HDUList(hdus).writeto(path)
+
+
+@pytest.mark.parametrize("in_cards", [True, False])
+@pytest.mark.parametrize(
+    "date", [{"DATE-OBS": "2009-05-14T12:00:00"}, {"MJD-OBS": 54965.5}, {"MJD-OBS": 54965}]
+)
+def test_the_date_of_an_ldac_catalogue_moves_its_reference_stars(tmp_path, in_cards, date):
+    header = fits.Header({"SIMPLE": True, "OBJECT": "M 51", **date, "EXPTIME": 30.0})
+    ra, dec = 202.0 + 0.01 * stars()["x"] / 100, 0.001 * stars()["y"]
+    table = Table({"XWIN_IMAGE": stars()["x"], "YWIN_IMAGE": stars()["y"], "ra": ra, "dec": dec})
+    still = tmp_path / "still.ldac"
+    ldac(still, [table], [header], in_cards=in_cards)
+    for name, value in (("pmra", 0.0), ("pmdec", 1000.0), ("ref_epoch", 2016.0)):
+        table[name] = value
+    table["parallax"], table["ruwe"] = 1e-9, 1.0  # the Gaia archive's, so that units are its
+    moving = tmp_path / "moving.ldac"
+    ldac(moving, [table], [header], in_cards=in_cards)
+    options = {"sigma": 1.0, "tangent_point": (202.0, 0.0)}
+    shift = read_matches(moving, **options).v - read_matches(still, **options).v
+    year = Time("2009-05-14T12:00:00").decimalyear
+    # a day is 0.003 arcsec; the curvature of the sky is far less
+    np.testing.assert_allclose(shift, year - 2016.0, atol=0.003)
+
+
+def test_chips_of_an_ldac_catalogue_keep_their_dates(tmp_path):
+    days = 54965.25, 55330.25
+    tables = [Table({"XWIN_IMAGE": [1.0, 2, 3], "YWIN_IMAGE": [4.0, 9, 1], "u": [1.0, 2, 3],
+                     "v": [4.0, 9, 1]}) for _ in days]  # fmt: skip
+    headers = [fits.Header({"SIMPLE": True, "MJD-OBS": day}) for day in days]
+    ldac(tmp_path / "a.ldac", tables, headers, in_cards=True)
+    m = read_matches(tmp_path / "a.ldac", sigma=1.0, unit="pix")
+    years = Time(np.repeat(days, 3), format="mjd").decimalyear
+    np.testing.assert_allclose(m.epoch, years, atol=1e-5)
 
 
 def test_chips_by_name_keep_one_numbering(tmp_path):

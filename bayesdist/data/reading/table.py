@@ -238,7 +238,8 @@ def match_arguments(
 def own_epoch(header: Mapping[str, Any]) -> float | str | None:
     """Date of the exposure by its header: MJD-OBS as a decimal year, DATE-OBS as it stands."""
     upper = {str(key).upper(): value for key, value in header.items()}
-    if isinstance(upper.get("MJD-OBS"), float):
-        return float(Time(upper["MJD-OBS"], format="mjd", scale="tt").decimalyear)
+    day = upper.get("MJD-OBS")
+    if isinstance(day, int | float) and not isinstance(day, bool):
+        return float(Time(day, format="mjd", scale="tt").decimalyear)
     date = upper.get("DATE-OBS")
     return date if isinstance(date, str) and date.strip() else None
