@@ -22,7 +22,14 @@ from bayesdist.files.faults import naming_faults
 from bayesdist.files.fits import FITS_START, open_fits
 from bayesdist.files.parquet import parquet_table
 from bayesdist.files.regular import head_of, read_bytes, read_lines
-from bayesdist.files.text_tables import is_text_table, parse_text_table, refuse_cut_end
+from bayesdist.files.text_tables import (
+    is_text_table,
+    mark_of,
+    parse_text_table,
+    refuse_cut_end,
+    refuse_numbers_as_names,
+    with_decimal_points,
+)
 from bayesdist.files.unpacked import unpacked
 
 CARD_LENGTH = 80  # characters of a FITS card
@@ -68,7 +75,15 @@ def _read_text(path: Path) -> Table:
 
 
 def _read_separated(path: Path, *, mark: str, format: str) -> Table:
-    return Table.read(_whole_lines(path, mark), format=format, comment="#", guess=False)
+    """Table of a file that ends in .csv, whose cells may be separated by semicolons, or in .tsv."""
+    rows = (line for line in read_lines(path) if line.strip() and not line.startswith("#"))
+    names = next(rows, "")
+    if mark == "," and mark_of([names, next(rows, names)]) == ";":
+        mark = ";"
+    lines = _whole_lines(path, mark)
+    refuse_numbers_as_names(next(csv.reader([names], delimiter=mark), []), where=str(path))
+    lines = with_decimal_points(lines, mark, where=str(path))
+    return Table.read(lines, format=format, delimiter=mark, comment="#", guess=False)
 
 
 def _refuse_short_rows(lines: list[str], mark: str, path: Path) -> None:

@@ -38,6 +38,73 @@ def test_numbers_without_names_are_refused(tmp_path):
         read_matches(path, sigma=1.0, unit="pix")
 
 
+def test_numbers_in_the_first_line_of_a_csv_are_no_names(tmp_path):
+    rows = "".join(f"{r['x']},{r['y']},{r['u']},{r['v']}\n" for r in stars())
+    path = tmp_path / "stars.csv"
+    for text in (rows, "# x,y,u,v\n" + rows, rows.replace(",", ";"), rows.replace(".0", "")):
+        path.write_text(text)
+        with pytest.raises(InputError, match="no line with the names of its columns: the first"):
+            read_matches(path, sigma=1.0, unit="pix")
+    path.with_suffix(".tsv").write_text(rows.replace(",", "\t"))
+    with pytest.raises(InputError, match="no line with the names of its columns: the first"):
+        read_matches(path.with_suffix(".tsv"), sigma=1.0, unit="pix")
+    path.write_text("x,y,u,v,606,814\n1.5,2,3,4,5,6\n7,8,9,1,2,3\n")  # magnitudes by filter
+    assert read_matches(path, sigma=1.0, unit="pix").x.tolist() == [1.5, 7]
+
+
+def written(path, head, rows, mark, comma=False, end="\n"):
+    lines = [mark.join(f"{value:.2f}" for value in row) for row in rows]
+    lines = [line.replace(".", ",") for line in lines] if comma else lines
+    path.write_text(end.join([head, *lines, ""]), encoding="utf-8", newline="")
+    return path
+
+
+@pytest.mark.parametrize("end", ["\n", "\r\n"])
+@pytest.mark.parametrize(
+    ("name", "head", "mark", "comma"),
+    [
+        ("a.csv", "\ufeffx,y,u,v", ",", False),
+        ("a.csv", "x;y;u;v", ";", False),
+        ("a.csv", "x;y;u;v", ";", True),
+        ("a.tsv", "x\ty\tu\tv", "\t", True),
+        ("a.txt", "\ufeffx;y;u;v", ";", True),
+        ("a.txt", "x y u v", " ", True),
+        ("a.txt", "x y\tu v", " ", False),  # one tab among blanks
+        ("a.txt", "x\ty\tu\tv", "   ", False),
+        ("a.txt", "x y u v", "\t", False),
+    ],
+)
+def test_marks_of_text_tables(tmp_path, name, head, mark, comma, end):
+    rows = [[k + 0.25, 1000 * k + 0.5, -k - 0.75, 3.0 * k] for k in range(1, 6)]
+    m = read_matches(
+        written(tmp_path / name, head, rows, mark, comma, end), sigma=1.0, unit="arcsec"
+    )
+    np.testing.assert_array_equal(np.transpose([m.x, m.y, m.u, m.v]), rows)
+
+
+@pytest.mark.parametrize(
+    ("row", "why"),
+    [("1,234;2,345;3,5;4.5", "others points: 4.5"), ("1,234;2,345;3;4", "divide thousands")],
+)
+def test_commas_that_are_perhaps_not_decimal_are_refused(tmp_path, row, why):
+    path = tmp_path / "a.csv"
+    path.write_text(f"x;y;u;v\n{row}\n")
+    with pytest.raises(InputError, match=rf"a\.csv: some numbers have commas \(1,234\).*{why}"):
+        read_matches(path, sigma=1.0, unit="pix")
+
+
+@pytest.mark.parametrize(
+    ("x", "y", "mag"),
+    [("pixel_centroid_x", "pixel_centroid_y", "auto_mag"), ("x_psf", "y_psf", "mag_data")],
+)
+def test_names_of_sourcextractor_plus_plus_and_of_lists_of_psf_fits(x, y, mag):
+    table = stars(mag=np.arange(6.0))
+    table.rename_columns(("x", "y", "mag"), (x, y, mag))
+    m = matches_from_table(table, ReadOptions(unit="pix", sigma=1.0))
+    assert m.x.tolist() == stars()["x"].tolist() and m.mag.tolist() == list(range(6))
+    assert m.y.tolist() == stars()["y"].tolist()
+
+
 def test_a_truncated_ipac_table_is_refused(tmp_path):
     path = tmp_path / "stars.txt"
     stars().write(path, format="ascii.ipac")
