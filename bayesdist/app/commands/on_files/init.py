@@ -13,11 +13,11 @@ from bayesdist.app.commands.on_files.init_draft import draft_of
 from bayesdist.app.commands.on_files.init_guesses import (
     column_lines,
     detector_lines,
-    guessed_sigma,
     quoted,
 )
 from bayesdist.app.config import parse_config
 from bayesdist.app.config.data import data_sections
+from bayesdist.app.kinds.matches.plausibility import scatter_about_polynomials
 from bayesdist.app.kinds.matches.sources import load_matches, mission_template
 from bayesdist.app.store.output import refuse_existing
 from bayesdist.data import FORMATS, Matches
@@ -217,7 +217,7 @@ def _read(
     what = "GUESSED: the table carries neither errors nor magnitudes"
     if "flux" in taken:
         what += f" (not all {taken['flux']} are positive)"
-    found = guessed_sigma(table.sample(SAMPLE))
+    found = scatter_about_polynomials(table.sample(SAMPLE))
     if found is None:
         return table, line, f"{SIGMA}                    # {what}", False
     how = "the scatter about a polynomial"
