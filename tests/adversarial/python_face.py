@@ -13,6 +13,7 @@ from astropy.table import Table
 import bayesdist as bd
 from bayesdist.assess import Catalogue
 from bayesdist.assess.statistics import field_statistic
+from bayesdist.assess.terms.given import said_by_user
 from bayesdist.diagnose.diagnostics import Diagnostics, diagnose
 from bayesdist.model.grid import grid_pixels, mesh
 
@@ -84,9 +85,13 @@ def carried(truth: Truth, folder: Path, seed: int) -> Steps:
     options["exposure"] = config.get("assess", {}).get("exposure", "mean")
     rows = config.get("budget", [])
     if rows:
-        (row,) = rows
+        row, *others = rows
         sizes = row["sigma_u"], row["sigma_v"]
         options["catalogue"] = Catalogue(row["name"], sizes, row["unit"], row.get("source", ""))
+        options["terms"] = [
+            bd.UserTerm(**other | {"source": said_by_user(other.get("source", ""))})
+            for other in others
+        ]
     return Steps(
         truth, seed, matches, fit, posterior, diagnose(posterior, matches, rng=seed), options
     )

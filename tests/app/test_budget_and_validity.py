@@ -78,6 +78,7 @@ def test_the_budget_of_a_position_names_every_term_and_its_source(run):
         *("coefficients", "time dependence", "aberration", "catalogue", "proper motions"),
         *("unmodelled structure in coefficients", "unmodelled structure", "centroid", "total"),
         "unmodelled exposure-to-exposure variation",
+        "unmodelled fields of exposures in coefficients",
     }
     assert rows["aberration"][0] == pytest.approx(4e-6 * 256, rel=5 / np.sqrt(2 * 2000))
     # the scatter holds the catalogue: what is left is the centroid's, to some 5 % in bins of 60

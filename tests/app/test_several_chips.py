@@ -15,7 +15,12 @@ from astropy.wcs import WCS
 from bayesdist.app.results import results_of
 from bayesdist.app.store.rundir import RunDirectory
 from bayesdist.assess import area_map, uncertainty_map
-from bayesdist.assess.terms.correlated import DEVIATIONS, STRUCTURE, STRUCTURE_IN_FIT
+from bayesdist.assess.terms.correlated import (
+    DEVIATIONS,
+    FIELDS_IN_FIT,
+    STRUCTURE,
+    STRUCTURE_IN_FIT,
+)
 from bayesdist.diagnose.residuals.binned import binned_residuals
 from bayesdist.diagnose.residuals.misfit import misfit_of
 from bayesdist.infer import load_fit, load_posterior, residuals
@@ -211,7 +216,7 @@ def test_the_budget_is_that_of_the_draws(run, errors):
     """Sigma of the model at each point by hand; one set of draws for both chips."""
     table = Table.read(run / "budget.ecsv")
     terms = ["coefficients", "time dependence", "exposure frame", STRUCTURE_IN_FIT]
-    terms += [n for n in (DEVIATIONS,) if n in table["name"]] + [
+    terms += [n for n in (DEVIATIONS, FIELDS_IN_FIT) if n in table["name"]] + [
         STRUCTURE,
         "catalogue",
         "proper motions",

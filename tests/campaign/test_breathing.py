@@ -13,8 +13,9 @@ import pytest
 from bayesdist.infer.solution.transforms import reference_gauge, without_frames
 from tests.adversarial.campaign_kinds import chip_by_chip, drift
 from tests.adversarial.campaign_measure import assessed
-from tests.adversarial.campaign_truth import EPOCH0, TWO, Recipe, made
+from tests.adversarial.campaign_truth import EPOCH0, Recipe, made
 from tests.adversarial.exposure_kinds import BREATHING
+from tests.adversarial.truth import TWO
 from tests.app.support import summary_of
 from tests.reduced import only_in_full
 

@@ -73,7 +73,9 @@ class ExposureFields:
         by_length = np.array([modes(size, float(length)).left for length in LENGTHS])
         left = by_length[np.searchsorted(LENGTHS, self.length)]
         field = float(np.median(self.amplitude * np.sqrt(2 * left)))
-        length = float(np.average(self.length, weights=self.amplitude**2))
+        # without a field, as of very few stars, its length is that of the prior
+        weights = self.amplitude**2 if self.amplitude.any() else None
+        length = float(np.average(self.length, weights=weights))
         length_pix = length * max(size) / 2
         return {"second_order": second, "field": field, "length_pix": length_pix}
 

@@ -8,6 +8,7 @@ from bayesdist.data.matches import Matches
 from bayesdist.diagnose.score.exposure_fields import exposure_field_test
 from bayesdist.diagnose.score.exposures import exposure_tests
 from bayesdist.diagnose.score.gap import gap_test
+from bayesdist.diagnose.score.jumps import jump_test
 from bayesdist.diagnose.score.motions import motion_test
 from bayesdist.diagnose.score.noise import noise_tests
 from bayesdist.diagnose.score.pattern import pattern_test
@@ -66,6 +67,7 @@ def score_tests(
         *shape_tests(sample),
         *regressor_tests(projection),
         gap_test(projection),
+        jump_test(sample),
         motion_test(sample),
         *noise_tests(sample),
         *exposure_tests(projection, mean, priors),

@@ -1,0 +1,126 @@
+"""Test for jumps: residuals that differ on both sides of a column or a row of the detector.
+
+Amplifiers, stitched masks, strips of the field from another epoch or another list, and plates of a
+catalogue end at a line.  A polynomial bends to follow such a step, and a smooth field rounds it
+off; neither holds what is left of it, over much of the detector.
+
+At each of `EDGES` columns and rows of a chip, the score of a step is tested that is orthogonal to
+polynomials along its axis, up to `HIGHER` orders above the model's, by its sandwich covariance.
+The most significant edge counts, its p-value multiplied by the number of edges (Bonferroni).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.polynomial import legendre
+
+from bayesdist.diagnose.clusters import sums_over
+from bayesdist.diagnose.score.result import Family, Outcome, outcome, smallest_pattern
+from bayesdist.diagnose.score.sample import ScoredSample
+from bayesdist.diagnose.significance import chi_square_of, hotelling_p
+from bayesdist.utils.arrays import Float, Int
+
+JUMPS = Family(
+    "jumps",
+    "fit the parts on both sides separately, correct the offset between them, or fit a look-up "
+    "table; a higher order does not help",
+    "",
+    "the residuals do not jump at any column or row",
+    explained_by="orders",
+    denial="the jump does not explain it",
+    overruled_by=("matching", "shape"),
+)
+EDGES = 31  # columns, and as many rows, of each chip
+HIGHER = 2  # orders above the model's that are no jumps
+MIN_STARS_ON_A_SIDE = 60
+LARGEST_LEVERAGE = 0.5
+
+
+@dataclass(frozen=True, eq=False)
+class _Jump:
+    """Step at one column or row."""
+
+    p_value: float
+    chip: int  # code into the model's chips
+    axis: int  # 0 for a column (an edge at some x), 1 for a row
+    pixel: float  # where it is, in FITS pixels
+    step: Float  # (2,) along u and v as they are on the detector, in the unit of u and v
+    variance: Float  # (2,)
+
+
+def jump_test(sample: ScoredSample) -> Outcome | None:
+    """Test for jumps; None if no column or row has stars enough on both sides."""
+    jumps = list(_jumps(sample))
+    if not jumps:
+        return None
+    worst = min(jumps, key=lambda jump: jump.p_value)
+    p_value = min(1.0, worst.p_value * len(jumps))
+    chips = sample.model.chips
+    place = f"{'column' if worst.axis == 0 else 'row'} {worst.pixel:.0f}"
+    if len(chips) > 1:
+        place += f" of {chips[worst.chip].name}"
+    present = (
+        f"the residuals jump near {place} by {np.hypot(*worst.step):.2g} {sample.model.unit}, "
+        "as where amplifiers, stitched parts, or strips of another epoch or list meet"
+    )
+    noise = float(worst.variance.sum()) / 4
+    return outcome(
+        replace(JUMPS, present=present),
+        chi_square_of(p_value, 2),
+        2,
+        None,
+        p_value,
+        # half a step on each side
+        square=float((worst.step**2).sum()) / 4,
+        noise=noise,
+        unit=sample.model.unit,
+        smallest=lambda level: smallest_pattern(np.sqrt(noise), 2, None, level / len(jumps)),
+    )
+
+
+def _jumps(sample: ScoredSample) -> Iterator[_Jump]:
+    """Steps at all columns and rows of all chips with stars enough on both sides."""
+    leverage = np.broadcast_to(sample.leverage, sample.score.shape)
+    usable = sample.used & (leverage.max(axis=0) < LARGEST_LEVERAGE)
+    for code, chip in enumerate(sample.model.chips):
+        rows = np.flatnonzero(usable & (sample.chip == code))
+        if len(rows) < 2 * MIN_STARS_ON_A_SIDE:
+            continue
+        turn = sample.turn[rows]
+        star = np.unique(sample.star[rows], return_inverse=True)[1]
+        gradient = np.einsum("nji,jn->ni", turn, sample.whole_score[:, rows])
+        curvature = np.einsum("nji->n", turn**2) / 2 * sample.curvature[0::2, rows].mean(axis=0)
+        order = sample.model.order + HIGHER
+        for axis, scaled in enumerate((sample.X[rows], sample.Y[rows])):
+            smooth = legendre.legvander(scaled, order).T
+            inverse = np.linalg.inv((smooth * curvature) @ smooth.T)
+            for edge in np.linspace(-1.0, 1.0, EDGES + 2)[1:-1]:
+                beyond = scaled > edge
+                n = np.count_nonzero(beyond)
+                if min(n, len(rows) - n) < MIN_STARS_ON_A_SIDE:
+                    continue
+                step = beyond - ((beyond * curvature) @ smooth.T) @ inverse @ smooth
+                found = _jump(step, gradient, curvature, star)
+                if found is not None:
+                    pixel = 0.5 + (edge + 1) / 2 * chip.size[axis]
+                    yield _Jump(found[0], code, axis, pixel, *found[1:])
+
+
+def _jump(
+    step: Float, gradient: Float, curvature: Float, star: Int
+) -> tuple[float, Float, Float] | None:
+    """P-value of a step (n,), its size (2,) along both axes, and the variances (2,) of these.
+
+    `gradient` (n, 2) and `curvature` (n,): of the log-likelihood.  None if nothing is known of it.
+    """
+    by_star = sums_over(star, step[:, None] * gradient)
+    total, covariance = by_star.sum(axis=0), by_star.T @ by_star
+    information = float(curvature @ step**2)
+    if information <= 0 or np.linalg.det(covariance) <= 0:
+        return None
+    statistic = float(total @ np.linalg.solve(covariance, total))
+    p_value = hotelling_p(statistic, 2, len(by_star))
+    return p_value, total / information, np.diag(covariance) / information**2
