@@ -219,16 +219,17 @@ def _with_common_chips(tables: Mapping[Path, Table], options: ReadOptions) -> Re
 
 
 def _read_list(file: Path, name: str | None, options: ReadOptions) -> Matches:
-    options.refuse(str(file), "hst1pass", "columns", "pixel_origin", "tangent_point", "epoch")
+    names = "columns pixel_origin tangent_point epoch catalogue_epoch not_finite same_position"
+    options.refuse_fixed(str(file), "hst1pass", *names.split())
     if options.unit not in (None, "pix"):
-        options.refuse(str(file), "hst1pass", "unit")
+        options.refuse_fixed(str(file), "hst1pass", "unit")
     return read_hst1pass(file).matches(name=name)
 
 
 def _read_record(file: Path, options: ReadOptions) -> Matches:
     """Matches of a file that bayesdist wrote, which states all that the options could."""
-    names = "columns unit pixel_origin tangent_point epoch catalogue_epoch chips".split()
-    options.refuse(str(file), "bayesdist", *names)
+    names = "columns unit pixel_origin tangent_point epoch catalogue_epoch chips not_finite"
+    options.refuse_fixed(str(file), "bayesdist", *names.split(), "same_position")
     return read_written_matches(file)
 
 
@@ -239,9 +240,17 @@ def _read_corr(file: Path, table: Table, name: str | None, options: ReadOptions)
     Magnitudes are instrumental, -2.5 log10 FLUX, where all fluxes are positive; there are no
     errors.
     """
-    options.refuse(str(file), "astrometry.net", "columns", "pixel_origin")
+    options.refuse_fixed(str(file), "astrometry.net", "columns", "pixel_origin")
     if options.unit not in (None, "arcsec"):
-        options.refuse(str(file), "astrometry.net", "unit")
+        options.refuse_fixed(str(file), "astrometry.net", "unit")
+    options.refuse(
+        str(file),
+        "the format astrometry.net has no proper motions and would not use it",
+        "epoch",
+        "catalogue_epoch",
+        do="leave {} out, or set the format to 'table' and name the columns (columns = "
+        '{{x = "field_x", y = "field_y", ra = "index_ra", dec = "index_dec"}}, and pm_ra, pm_dec)',
+    )
     columns = _CORR | ({"flux": "FLUX"} if "FLUX" in table.colnames else {})
     options = replace(options, columns=columns, unit=None, sigma="by_magnitude")
     return Matches(

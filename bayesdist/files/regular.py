@@ -119,10 +119,11 @@ def read_up_to(stream: BinaryIO | io.BufferedIOBase, most: int, *, expected: int
 def read_text(path: PathLike, *, most: int | None = None) -> str:
     """Text of a file in UTF-8, with its line ends as they stand; errors as of `read_bytes`.
 
+    A byte order mark is left out.
     FormatError where it is no such text.
     """
     try:
-        return read_bytes(path, most=most).decode("utf-8")
+        return read_bytes(path, most=most).decode("utf-8-sig")
     except UnicodeDecodeError as error:
         raise FormatError(
             f"cannot be read (not UTF-8 text at byte {error.start + 1})",

@@ -22,9 +22,17 @@ from bayesdist.files.faults import naming_faults
 from bayesdist.files.fits import FITS_START, open_fits
 from bayesdist.files.parquet import parquet_table
 from bayesdist.files.regular import head_of, read_bytes, read_lines
-from bayesdist.files.text_tables import is_text_table, parse_text_table, refuse_cut_end
+from bayesdist.files.text_tables import (
+    is_text_table,
+    mark_of,
+    parse_text_table,
+    refuse_cut_end,
+    refuse_numbers_as_names,
+    with_decimal_points,
+)
 from bayesdist.files.unpacked import unpacked
 
+CARD_LENGTH = 80  # characters of a FITS card
 _COMMAS = re.compile(r"# delimiter: ['\"]?,")
 
 
@@ -67,7 +75,15 @@ def _read_text(path: Path) -> Table:
 
 
 def _read_separated(path: Path, *, mark: str, format: str) -> Table:
-    return Table.read(_whole_lines(path, mark), format=format, comment="#", guess=False)
+    """Table of a file that ends in .csv, whose cells may be separated by semicolons, or in .tsv."""
+    rows = (line for line in read_lines(path) if line.strip() and not line.startswith("#"))
+    names = next(rows, "")
+    if mark == "," and mark_of([names, next(rows, names)]) == ";":
+        mark = ";"
+    lines = _whole_lines(path, mark)
+    refuse_numbers_as_names(next(csv.reader([names], delimiter=mark), []), where=str(path))
+    lines = with_decimal_points(lines, mark, where=str(path))
+    return Table.read(lines, format=format, delimiter=mark, comment="#", guess=False)
 
 
 def _refuse_short_rows(lines: list[str], mark: str, path: Path) -> None:
@@ -150,22 +166,42 @@ def _read_fits(path: Path) -> Table:
 
 
 def _ldac(hdus: fits.HDUList, objects: list[fits.BinTableHDU]) -> Table:
-    """Objects of a FITS_LDAC catalogue, with the date of the image; several are chips."""
+    """Objects of a FITS_LDAC catalogue, with the date of the image; several are chips.
+
+    Each table of objects follows the header of its image.  Chips with different dates have these in
+    a column.
+    """
     tables = [Table.read(hdu, format="fits", mask_invalid=False) for hdu in objects]
-    heads = [hdu for hdu in hdus if hdu.name == "LDAC_IMHEAD"]
-    text = ""
-    if heads and heads[0].data is not None:
-        text = "".join(str(card) for card in np.ravel(heads[0].data.field(0)))
-    image = fits.Header.fromstring(text if len(text) % 80 == 0 else "")
+    images = [_image_header(hdu) for hdu in hdus if hdu.name == "LDAC_IMHEAD"]
     for number, table in enumerate(tables, 1):
         if len(tables) > 1 and "EXT_NUMBER" not in table.colnames:
             table["EXT_NUMBER"] = number
         table.meta = {}  # settings of SExtractor
-    out = vstack(tables, metadata_conflicts="silent") if len(tables) > 1 else tables[0]
+    dates: dict[str, object] = {}
     for key in ("MJD-OBS", "DATE-OBS"):
-        if key in image:
-            out.meta[key] = image[key]
+        values = [image[key] for image in images if key in image]
+        if values and len(set(values)) == 1:
+            dates[key] = values[0]
+        elif len(values) == len(tables):
+            for table, value in zip(tables, values, strict=True):
+                table[key] = value
+            break
+    out = vstack(tables, metadata_conflicts="silent") if len(tables) > 1 else tables[0]
+    out.meta.update(dates)
     return out
+
+
+def _image_header(hdu: fits.BinTableHDU) -> fits.Header:
+    """Header of the image that an LDAC_IMHEAD holds as text, in one string or one for each card.
+
+    Strings of a FITS table lose their trailing blanks when they are read, so that they are filled
+    up to whole cards again.
+    """
+    if hdu.data is None or not len(hdu.data):
+        return fits.Header()
+    texts = [str(text) for text in np.ravel(hdu.data.field(0))]
+    filled = (text.ljust(-len(text) % CARD_LENGTH + len(text)) for text in texts)
+    return fits.Header.fromstring("".join(filled))
 
 
 TABLE_SUFFIXES: dict[str, Callable[[Path], Table]] = {

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import csv
+import io
 import logging
 import re
 from collections.abc import Sequence
@@ -13,7 +15,10 @@ from bayesdist.errors import FormatError
 log = logging.getLogger("bayesdist")
 
 _NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eEdD][+-]?\d+)?|nan|inf", re.IGNORECASE)
-MARKS = {"ascii.csv": ",", "ascii.tab": "\t"}
+_DECIMAL_COMMA = re.compile(r"[+-]?\d*,\d+([eEdD][+-]?\d+)?")
+_DECIMAL_POINT = re.compile(r"[+-]?(\d+\.\d*|\.\d+)([eEdD][+-]?\d+)?")
+_MAY_BE_THOUSANDS = re.compile(r"[+-]?[1-9]\d{0,2},\d{3}")
+_MARKS = (",", ";", "\t", None)  # None: blanks
 ROWS_ABOVE, FEWEST_ABOVE = 20, 3  # that the last cell is held against
 _DAOPHOT = "DAOPHOT"  # the program's own lists, not the tables of IRAF's version
 _DAOPHOT_COLUMNS = {
@@ -42,13 +47,13 @@ def _kind(lines: Sequence[str]) -> str | None:
     if _SEXTRACTOR.match(first):
         return "ascii.sextractor"
     comments = [line.strip() for line in lines if line.strip().startswith("#")]
-    rows = [line.strip() for line in lines if line.strip() and not line.strip().startswith("#")]
+    rows = _rows_of(lines)
     if not rows:
         return None
-    mark = "," if "," in rows[0] else "\t" if "\t" in rows[0] else None
+    mark = mark_of(rows)
     cells = [cell.strip() for cell in rows[0].split(mark)]
     if not any(_NUMBER.fullmatch(cell) for cell in cells):
-        names = {",": "ascii.csv", "\t": "ascii.tab", None: "ascii.basic"}[mark]
+        names = {",": "ascii.csv", ";": "ascii.csv", "\t": "ascii.tab", None: "ascii.basic"}[mark]
         wide = len(rows) > 1 and len(rows[1].split(mark)) == len(cells)
         return names if wide and len(cells) >= 4 else None
     if comments and mark is None and len(comments[-1].lstrip("# ").split()) == len(cells):
@@ -56,12 +61,92 @@ def _kind(lines: Sequence[str]) -> str | None:
     return None
 
 
+def _rows_of(lines: Sequence[str]) -> list[str]:
+    """Lines that are neither empty nor a comment, without the blanks around them."""
+    return [line.strip() for line in lines if line.strip() and not line.strip().startswith("#")]
+
+
+def mark_of(rows: Sequence[str]) -> str | None:
+    """Mark between the cells of rows, the first of which has the names; None for blanks.
+
+    It divides the names and the first row of numbers into equally many cells; where no mark does,
+    it is the first that the names contain.
+    """
+    names = rows[0]
+    present = [mark for mark in _MARKS if mark is None or mark in names]
+    for mark in present:
+        width = len(names.split(mark))
+        if width > 1 and all(len(row.split(mark)) == width for row in rows[1:2]):
+            return mark
+    return present[0]
+
+
+def refuse_numbers_as_names(cells: Sequence[str], *, where: str) -> None:
+    """Refuse a table without names, whose first row of numbers would be taken for them.
+
+    Names may be numbers, as those of filters; half of them are not, and none has a fraction.
+    """
+    filled = [cell.strip() for cell in cells if cell.strip()]
+    numbers = [cell for cell in filled if _NUMBER.fullmatch(cell) or _DECIMAL_COMMA.fullmatch(cell)]
+    if 2 * len(numbers) >= max(len(filled), 1) or any(map(_DECIMAL_POINT.fullmatch, filled)):
+        raise FormatError(
+            f"has no line with the names of its columns: the first line has {len(numbers)} numbers "
+            f"({', '.join(filled[:3])}, ...)",
+            where=where,
+            do="write one above the numbers without a #, as x,y,ra,dec or x,y,u,v",
+        )
+
+
+def with_decimal_points(lines: list[str], mark: str | None, *, where: str) -> list[str]:
+    """Lines of a table, without their ends, in which numbers with decimal commas have points.
+
+    Cells are separated by `mark`, which is no comma.  Refused where some numbers have points, and
+    where the commas may divide thousands.
+    """
+    rows = _rows_of(lines)
+    if mark == "," or not any("," in line for line in rows[1:]):
+        return lines
+    cells = [cell.strip() for line in rows[1:] for cell in _cells(line, mark)]
+    with_comma = [cell for cell in cells if _DECIMAL_COMMA.fullmatch(cell)]
+    if not with_comma:
+        return lines
+    with_point = next((cell for cell in cells if _DECIMAL_POINT.fullmatch(cell)), None)
+    if with_point is not None or all(map(_MAY_BE_THOUSANDS.fullmatch, with_comma)):
+        also = "they may divide thousands" if with_point is None else f"others points: {with_point}"
+        raise FormatError(
+            f"some numbers have commas ({with_comma[0]}), and {also}",
+            where=where,
+            do="write all numbers with decimal points, without marks between thousands",
+        )
+    log.info("%s: the commas in its numbers are taken as decimal commas", where)
+    return [_pointed(line, mark) if "," in line else line for line in lines]
+
+
+def _cells(line: str, mark: str | None) -> list[str]:
+    return line.split() if mark is None else next(csv.reader([line], delimiter=mark), [])
+
+
+def _pointed(line: str, mark: str | None) -> str:
+    """Line with points in place of decimal commas."""
+    if line.lstrip().startswith("#"):
+        return line
+    cells = [
+        cell.replace(",", ".") if _DECIMAL_COMMA.fullmatch(cell.strip()) else cell
+        for cell in _cells(line, mark)
+    ]
+    if mark is None:
+        return " ".join(cells)
+    out = io.StringIO()
+    csv.writer(out, delimiter=mark, lineterminator="").writerow(cells)
+    return out.getvalue()
+
+
 def parse_text_table(lines: Sequence[str], *, where: str) -> Table:
     """Table of lines of text, with their ends; a row of an IPAC table that is cut short is refused.
 
     Known are an IPAC table, the ASCII_HEAD catalogue of SExtractor, a table of IRAF's daophot, a
     list of DAOPHOT II or ALLSTAR, and columns under a line of names, with "#" before it or not,
-    separated by blanks, commas or tabs.
+    separated by blanks, commas, semicolons or tabs.
     """
     ended = not lines or lines[-1].endswith(("\n", "\r"))
     whole, lines = lines, [line.rstrip("\r\n") for line in lines]
@@ -73,17 +158,24 @@ def parse_text_table(lines: Sequence[str], *, where: str) -> Table:
             do="write one above the numbers",
         )
     options: dict[str, object] = {}
+    separated = kind in ("ascii.csv", "ascii.tab", "ascii.basic")
+    mark = mark_of(_rows_of(lines)) if separated else None
     if kind == _DAOPHOT:
         return _daophot_list(lines, where)
     if kind == "ascii.ipac":
         _refuse_short_rows(lines, where, ended=ended)
     else:
-        refuse_cut_end(whole, MARKS.get(kind), where=where)
+        refuse_cut_end(whole, mark, where=where)
     if kind == "ascii.commented_header":
         heads = [k for k, line in enumerate(lines) if line.strip().startswith("#")]
         lines = [line for k, line in enumerate(lines) if k not in heads[:-1]]
-    elif kind in ("ascii.csv", "ascii.tab", "ascii.basic"):
+    elif separated:
+        lines = with_decimal_points(lines, mark, where=where)
         options["comment"] = "#"
+        if mark is None:
+            lines = [line.replace("\t", " ") for line in lines]
+        elif mark == ";":
+            options["delimiter"] = mark
     return Table.read(lines, format=kind, guess=False, **options)
 
 

@@ -11,7 +11,7 @@ from astropy.wcs import WCS
 
 from bayesdist.app.config import parse_config
 from bayesdist.app.kinds.matches.plausibility import doubts_on_stars, refuse_empty_segments
-from bayesdist.data import Matches
+from bayesdist.data import Matches, read_matches
 from bayesdist.errors import ConfigError, InputError
 from bayesdist.model import Chip, DistortionModel, TimeDependence
 
@@ -37,8 +37,9 @@ def config(data="", detector="", more=""):
 def stars(rng, scale=1.0, unit="pix", sigma=0.01, n=200, **columns):
     """Stars of a detector without distortion, whose pixels have a size."""
     x, y = rng.uniform(1, 1000, n), rng.uniform(1, 800, n)
+    u, v = scale * (np.array([x, y]) + rng.normal(0, 0.01, (2, n)))
     return Matches(
-        x=x, y=y, u=scale * x, v=scale * y, sigma_u=np.full(n, sigma), sigma_v=np.full(n, sigma),
+        x=x, y=y, u=u, v=v, sigma_u=np.full(n, sigma), sigma_v=np.full(n, sigma),
         unit=unit, sources=("stars.ecsv",), **columns,
     )  # fmt: skip
 
@@ -49,6 +50,30 @@ def model(unit="pix"):
 
 def doubts(found, **settings):
     return doubts_on_stars(found, model(found.unit), config(**settings))
+
+
+# -- positions made from the pixels ---------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("decimals", "named"), [(7, True), (5, False)])
+@pytest.mark.parametrize("quoted", [True, False])
+def test_positions_that_a_wcs_made_from_the_pixels_are_named(rng, decimals, named, quoted):
+    wcs = WCS(naxis=2)
+    wcs.wcs.ctype, wcs.wcs.crval, wcs.wcs.crpix = ["RA---TAN", "DEC--TAN"], [150, 30], [500, 400]
+    wcs.wcs.cdelt = [-4e-4, 4e-4]  # degrees, so that 7 decimals are 0.0001 px
+    x, y = rng.uniform(1, 1000, 200), rng.uniform(1, 800, 200)
+    ra, dec = wcs.all_pix2world(x, y, 1)
+    table = Table({"x": x, "y": y, "ra": np.round(ra, decimals), "dec": np.round(dec, decimals)})
+    table["mag"] = 12 + x / 100
+    texts = doubts(read_matches(table, sigma=0.05 if quoted else "by_magnitude"))
+    assert any("computed from the pixels by a WCS" in text for text in texts) == named
+
+
+def test_small_errors_that_are_quoted_are_believed(rng):
+    found = stars(rng, sigma=1e-4)
+    noise = rng.normal(0, 1e-4, (2, 200))
+    found = replace(found, u=found.x + noise[0], v=found.y + noise[1])
+    assert doubts(found) == []
 
 
 # -- scale ----------------------------------------------------------------------------------------

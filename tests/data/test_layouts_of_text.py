@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from astropy.io import fits
 from astropy.table import Table
+from astropy.time import Time
 
 from bayesdist.data import ReadOptions, open_matches, read_matches
 from bayesdist.data.reading.columns import numbered
@@ -35,6 +36,73 @@ def test_numbers_without_names_are_refused(tmp_path):
     path.write_text("1 2 3 4\n5 6 7 8\n")
     with pytest.raises(InputError, match="no line with the names of its columns; write one"):
         read_matches(path, sigma=1.0, unit="pix")
+
+
+def test_numbers_in_the_first_line_of_a_csv_are_no_names(tmp_path):
+    rows = "".join(f"{r['x']},{r['y']},{r['u']},{r['v']}\n" for r in stars())
+    path = tmp_path / "stars.csv"
+    for text in (rows, "# x,y,u,v\n" + rows, rows.replace(",", ";"), rows.replace(".0", "")):
+        path.write_text(text)
+        with pytest.raises(InputError, match="no line with the names of its columns: the first"):
+            read_matches(path, sigma=1.0, unit="pix")
+    path.with_suffix(".tsv").write_text(rows.replace(",", "\t"))
+    with pytest.raises(InputError, match="no line with the names of its columns: the first"):
+        read_matches(path.with_suffix(".tsv"), sigma=1.0, unit="pix")
+    path.write_text("x,y,u,v,606,814\n1.5,2,3,4,5,6\n7,8,9,1,2,3\n")  # magnitudes by filter
+    assert read_matches(path, sigma=1.0, unit="pix").x.tolist() == [1.5, 7]
+
+
+def written(path, head, rows, mark, comma=False, end="\n"):
+    lines = [mark.join(f"{value:.2f}" for value in row) for row in rows]
+    lines = [line.replace(".", ",") for line in lines] if comma else lines
+    path.write_text(end.join([head, *lines, ""]), encoding="utf-8", newline="")
+    return path
+
+
+@pytest.mark.parametrize("end", ["\n", "\r\n"])
+@pytest.mark.parametrize(
+    ("name", "head", "mark", "comma"),
+    [
+        ("a.csv", "\ufeffx,y,u,v", ",", False),
+        ("a.csv", "x;y;u;v", ";", False),
+        ("a.csv", "x;y;u;v", ";", True),
+        ("a.tsv", "x\ty\tu\tv", "\t", True),
+        ("a.txt", "\ufeffx;y;u;v", ";", True),
+        ("a.txt", "x y u v", " ", True),
+        ("a.txt", "x y\tu v", " ", False),  # one tab among blanks
+        ("a.txt", "x\ty\tu\tv", "   ", False),
+        ("a.txt", "x y u v", "\t", False),
+    ],
+)
+def test_marks_of_text_tables(tmp_path, name, head, mark, comma, end):
+    rows = [[k + 0.25, 1000 * k + 0.5, -k - 0.75, 3.0 * k] for k in range(1, 6)]
+    m = read_matches(
+        written(tmp_path / name, head, rows, mark, comma, end), sigma=1.0, unit="arcsec"
+    )
+    np.testing.assert_array_equal(np.transpose([m.x, m.y, m.u, m.v]), rows)
+
+
+@pytest.mark.parametrize(
+    ("row", "why"),
+    [("1,234;2,345;3,5;4.5", "others points: 4.5"), ("1,234;2,345;3;4", "divide thousands")],
+)
+def test_commas_that_are_perhaps_not_decimal_are_refused(tmp_path, row, why):
+    path = tmp_path / "a.csv"
+    path.write_text(f"x;y;u;v\n{row}\n")
+    with pytest.raises(InputError, match=rf"a\.csv: some numbers have commas \(1,234\).*{why}"):
+        read_matches(path, sigma=1.0, unit="pix")
+
+
+@pytest.mark.parametrize(
+    ("x", "y", "mag"),
+    [("pixel_centroid_x", "pixel_centroid_y", "auto_mag"), ("x_psf", "y_psf", "mag_data")],
+)
+def test_names_of_sourcextractor_plus_plus_and_of_lists_of_psf_fits(x, y, mag):
+    table = stars(mag=np.arange(6.0))
+    table.rename_columns(("x", "y", "mag"), (x, y, mag))
+    m = matches_from_table(table, ReadOptions(unit="pix", sigma=1.0))
+    assert m.x.tolist() == stars()["x"].tolist() and m.mag.tolist() == list(range(6))
+    assert m.y.tolist() == stars()["y"].tolist()
 
 
 def test_a_truncated_ipac_table_is_refused(tmp_path):
@@ -80,6 +148,53 @@ def test_several_chips_of_an_ldac_catalogue(tmp_path):
     fits.HDUList(hdus).writeto(tmp_path / "chips.ldac")
     m = read_matches(tmp_path / "chips.ldac", sigma=1.0, unit="pix")
     assert m.chip_numbers == (1, 2) and m.chip.tolist() == [0] * 6 + [1] * 6
+
+
+def ldac(path, tables, headers, *, in_cards):
+    """Write a FITS_LDAC catalogue; image headers as one string, or as an array of cards."""
+    hdus = [fits.PrimaryHDU()]
+    for table, header in zip(tables, headers, strict=True):
+        text = header.tostring()
+        shape = f"(80, {len(text) // 80})" if in_cards else None
+        row = [[text[k : k + 80] for k in range(0, len(text), 80)]] if in_cards else [text]
+        form = f"{len(text)}A"
+        column = fits.Column("Field Header Card", form, dim=shape, array=np.array(row))
+        hdus.append(fits.BinTableHDU.from_columns([column], name="LDAC_IMHEAD"))
+        hdus.append(fits.BinTableHDU(table.as_array(), name="LDAC_OBJECTS"))
+    fits.HDUList(hdus).writeto(path)
+
+
+@pytest.mark.parametrize("in_cards", [True, False])
+@pytest.mark.parametrize(
+    "date", [{"DATE-OBS": "2009-05-14T12:00:00"}, {"MJD-OBS": 54965.5}, {"MJD-OBS": 54965}]
+)
+def test_the_date_of_an_ldac_catalogue_moves_its_reference_stars(tmp_path, in_cards, date):
+    header = fits.Header({"SIMPLE": True, "OBJECT": "M 51", **date, "EXPTIME": 30.0})
+    ra, dec = 202.0 + 0.01 * stars()["x"] / 100, 0.001 * stars()["y"]
+    table = Table({"XWIN_IMAGE": stars()["x"], "YWIN_IMAGE": stars()["y"], "ra": ra, "dec": dec})
+    still = tmp_path / "still.ldac"
+    ldac(still, [table], [header], in_cards=in_cards)
+    for name, value in (("pmra", 0.0), ("pmdec", 1000.0), ("ref_epoch", 2016.0)):
+        table[name] = value
+    table["parallax"], table["ruwe"] = 1e-9, 1.0  # the Gaia archive's, so that units are its
+    moving = tmp_path / "moving.ldac"
+    ldac(moving, [table], [header], in_cards=in_cards)
+    options = {"sigma": 1.0, "tangent_point": (202.0, 0.0)}
+    shift = read_matches(moving, **options).v - read_matches(still, **options).v
+    year = Time("2009-05-14T12:00:00").decimalyear
+    # a day is 0.003 arcsec; the curvature of the sky is far less
+    np.testing.assert_allclose(shift, year - 2016.0, atol=0.003)
+
+
+def test_chips_of_an_ldac_catalogue_keep_their_dates(tmp_path):
+    days = 54965.25, 55330.25
+    tables = [Table({"XWIN_IMAGE": [1.0, 2, 3], "YWIN_IMAGE": [4.0, 9, 1], "u": [1.0, 2, 3],
+                     "v": [4.0, 9, 1]}) for _ in days]  # fmt: skip
+    headers = [fits.Header({"SIMPLE": True, "MJD-OBS": day}) for day in days]
+    ldac(tmp_path / "a.ldac", tables, headers, in_cards=True)
+    m = read_matches(tmp_path / "a.ldac", sigma=1.0, unit="pix")
+    years = Time(np.repeat(days, 3), format="mjd").decimalyear
+    np.testing.assert_allclose(m.epoch, years, atol=1e-5)
 
 
 def test_chips_by_name_keep_one_numbering(tmp_path):

@@ -10,6 +10,7 @@ from astropy.table import Table
 from astropy.wcs.utils import fit_wcs_from_points
 
 from bayesdist.data import input_files, open_matches, read_matches
+from bayesdist.data.formats.record import write_matches
 from bayesdist.errors import FormatError, InputError
 
 
@@ -221,3 +222,93 @@ def test_input_files_are_sorted_and_named(tmp_path):
     for name in ("b.csv", "a.csv"):
         (tmp_path / name).write_text("x")
     assert [p.name for p in input_files(str(tmp_path / "?.csv"))] == ["a.csv", "b.csv"]
+
+
+OPTIONS = {
+    "columns": {"mag": ""},
+    "unit": "mas",
+    "pixel_origin": 0,
+    "tangent_point": (10.001, 20.0),
+    "epoch": 2030.0,
+    "catalogue_epoch": 2000.0,
+    "not_finite": "reject",
+    "same_position": "separate_stars",
+}
+
+
+def star_table(columns, bad=False):
+    k = np.arange(1.0, 9)
+    values = {"x": 90 * k, "y": 50 * k + k**2, "u": k, "v": k**2, "ra": 10 + k / 1e3,
+              "dec": 20 + k**2 / 1e4, "mag": 12 + k}  # fmt: skip
+    for name in ("u", "v", "ra", "dec"):
+        values[name][1] = values[name][0]
+    if bad:
+        values["x"][3] = np.nan
+    names = columns if isinstance(columns, dict) else dict.fromkeys(columns)
+    table = Table({column or name: values[name] for name, column in names.items()})
+    table.meta = {}
+    return table
+
+
+def on_sky(bad=False, **more):
+    table = star_table(("x", "y", "ra", "dec", "mag"), bad)
+    for name, value in {
+        "pmra": 500.0,
+        "pmdec": -300.0,
+        "parallax": 1.0,
+        "ruwe": 1.0,
+        **more,
+    }.items():
+        table[name] = value
+    return table
+
+
+MOVING = {"epoch": 2020.0, "catalogue_epoch": 2016.0}
+CORR_NAMES = {"x": "field_x", "y": "field_y", "ra": "index_ra", "dec": "index_dec", "mag": "mag"}
+# file, table, options that it needs, and those that are refused
+READERS = {
+    "plane": ("a.fits", lambda bad: star_table(("x", "y", "u", "v", "mag"), bad),
+              {"unit": "arcsec"}, {"tangent_point", "catalogue_epoch"}),
+    "sky without motions": ("a.fits", lambda bad: star_table(("x", "y", "ra", "dec", "mag"), bad),
+                            {}, {"unit", "catalogue_epoch"}),
+    "sky": ("a.fits", on_sky, MOVING, {"unit"}),
+    "sky with its epoch": ("a.fits", lambda bad: on_sky(bad, ref_epoch=2016.0), {"epoch": 2020.0},
+                           {"unit", "catalogue_epoch"}),
+    "named stars": ("a.fits", lambda bad: on_sky(bad, star=np.arange(8)), MOVING,
+                    {"unit", "same_position"}),
+    "corr.fits": ("corr.fits", lambda bad: star_table(CORR_NAMES, bad), {},
+                  {"columns", "unit", "pixel_origin", "epoch", "catalogue_epoch"}),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("option", OPTIONS)
+@pytest.mark.parametrize("reader", READERS)
+def test_each_option_changes_what_is_read_or_is_refused(reader, option, tmp_path):
+    name, table, needed, refused = READERS[reader]
+    path, options = tmp_path / name, {"sigma": 0.1, **needed}
+    given = options | {option: OPTIONS[option]}
+    table(option == "not_finite").write(path)
+    if option in refused:
+        with pytest.raises(InputError, match=f"option '{option}'|unit|tangent point"):
+            read_matches(path, **given)
+        return
+    if option == "not_finite":
+        with pytest.raises(InputError, match="leave out 1 of 8 with data"):
+            read_matches(path, **options)
+        assert len(read_matches(path, **given)) == 7
+        return
+    before, after = vars(read_matches(path, **options)), vars(read_matches(path, **given))
+    assert after.keys() != before.keys() or any(
+        not np.array_equal(after[key], before[key]) for key in after
+    )
+
+
+@pytest.mark.parametrize("option", OPTIONS)
+def test_lists_and_saved_matches_refuse_options_that_they_fix(option, tmp_path, data_dir):
+    star_table(("x", "y", "u", "v")).write(tmp_path / "a.fits")
+    matches = read_matches(tmp_path / "a.fits", unit="pix", sigma=1.0)
+    write_matches(tmp_path / "matches.h5", matches)
+    files = tmp_path / "matches.h5", next((data_dir / "hst1pass_uvis").glob("*_flt.*"))
+    for path, format in zip(files, ("bayesdist", "hst1pass"), strict=True):
+        with pytest.raises(InputError, match=f"option '{option}' is given, but the format"):
+            read_matches(path, format=format, **{option: OPTIONS[option]})

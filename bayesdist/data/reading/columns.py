@@ -136,11 +136,37 @@ def columns_read(
 ) -> tuple[dict[str, str], ReadOptions, tuple[str, ...]]:
     """Column of each quantity, the options with the origin of the pixels, and notes about it."""
     found = needed_columns(names, options.columns, source=source, read_sigma=options.read_sigma)
+    _refuse_unused(options, found, source)
     if options.pixel_origin is not None:
         return found, options, ()
     origin, why = origin_of(found["x"], names, header)
     notes = (f"the first pixel is taken as {origin}: {why}",) if why else ()
     return found, replace(options, pixel_origin=origin), notes
+
+
+def _refuse_unused(options: ReadOptions, found: Mapping[str, str], source: str) -> None:
+    """Refuse options for which a table has no columns, or which its own columns replace."""
+    if "catalogue_epoch" in found:
+        options.refuse(
+            source,
+            f"column {found['catalogue_epoch']!r} has it",
+            "catalogue_epoch",
+            do='leave {} out, or the column (columns = {{catalogue_epoch = ""}})',
+        )
+    elif "pm_ra" not in found:
+        options.refuse(
+            source,
+            "no column of proper motions is read, and it serves them alone",
+            "catalogue_epoch",
+            do="leave {} out, or name the columns pm_ra and pm_dec",
+        )
+    if "star" in found:
+        options.refuse(
+            source,
+            f"column {found['star']!r} says which rows are of one star",
+            "same_position",
+            do='leave {} out, or the column (columns = {{star = ""}})',
+        )
 
 
 def match_columns(quantities: Quantities, options: ReadOptions) -> dict[str, Any]:

@@ -88,15 +88,35 @@ class ReadOptions:
         """True where errors come from columns."""
         return self.sigma == "columns"
 
-    def refuse(self, source: str, kind: str, *names: str) -> None:
-        """Refuse options that a format leaves no room for."""
+    def refuse(self, source: str, why: str, *names: str, do: str = "leave {} out") -> None:
+        """Refuse options that are set and would not be used.
+
+        Parameters
+        ----------
+        source : str
+            File or table, for the error.
+        why : str
+            Reason why they are not used.
+        *names : str
+            The options.
+        do : str, optional
+            What to do, in which {} stands for the option.
+
+        Raises
+        ------
+        InputError
+            If one of the options differs from its default.
+        """
         for name in names:
-            if getattr(self, name) is not None:
+            if getattr(self, name) != getattr(ReadOptions, name):
                 raise InputError(
-                    f"option {name!r} is given, but the format {kind} fixes it",
-                    where=source,
-                    do=f"leave {name!r} out or set the format to 'table'",
+                    f"option {name!r} is given, but {why}", where=source, do=do.format(repr(name))
                 )
+
+    def refuse_fixed(self, source: str, kind: str, *names: str) -> None:
+        """Refuse options that the format `kind` leaves no room for."""
+        why = f"the format {kind} fixes it"
+        self.refuse(source, why, *names, do="leave {} out or set the format to 'table'")
 
 
 def check_sigma(sigma: str | Number) -> None:

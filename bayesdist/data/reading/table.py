@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -22,6 +23,8 @@ from bayesdist.errors import InputError
 from bayesdist.files.parquet import arrow_table
 from bayesdist.utils.arrays import Float
 
+# how messages about values that `not_finite` leaves out begin
+NOT_FINITE_CAUSES = ("value is nan", "value is inf", "value is -inf")
 _MOTION = "mas / yr"
 _SPARED = frozenset((*SPARED, "colour", "flux"))  # optional: a star may lack them
 _KINDS = (
@@ -204,14 +207,15 @@ def match_arguments(
         options = replace(options, epoch=own_epoch(table.meta))
     dated = "catalogue_epoch" in found or options.catalogue_epoch is not None
     moves = "pm_ra" in found and dated and ("epoch" in found or options.epoch is not None)
-    stay, rejected = without_missing(
+    rows_with_values = partial(
+        without_missing,
         table,
         found,
         source=source,
-        reject=options.not_finite == "reject",
         spared=_SPARED | (frozenset() if moves else frozenset(MOTIONS)),
         motions=frozenset(MOTIONS),
     )
+    stay, rejected = rows_with_values(reject=options.not_finite == "reject")
     n, rows, place = len(table), np.flatnonzero(stay), row_number
     if rejected:
         table = table[stay]
@@ -220,7 +224,17 @@ def match_arguments(
             return row_number(int(rows[index]))
 
     quantities = Quantities(table, found, source, place)
-    out = match_columns(quantities, options)
+    try:
+        out = match_columns(quantities, options)
+    except InputError as error:
+        if not error.cause.startswith(NOT_FINITE_CAUSES):
+            raise
+        n_lost = int((stay & ~rows_with_values(reject=True)[0]).sum())
+        raise InputError(
+            error.cause,
+            where=error.where,
+            do=f'correct such rows, or leave out {n_lost} of {n} with data.not_finite = "reject"',
+        ) from error
     if identify and "star" not in out:
         # as in the catalogue: motions bring one star to another place in each exposure
         first, second = sky_columns(quantities) if "ra" in found else (out["u"], out["v"])
@@ -238,7 +252,8 @@ def match_arguments(
 def own_epoch(header: Mapping[str, Any]) -> float | str | None:
     """Date of the exposure by its header: MJD-OBS as a decimal year, DATE-OBS as it stands."""
     upper = {str(key).upper(): value for key, value in header.items()}
-    if isinstance(upper.get("MJD-OBS"), float):
-        return float(Time(upper["MJD-OBS"], format="mjd", scale="tt").decimalyear)
+    day = upper.get("MJD-OBS")
+    if isinstance(day, int | float) and not isinstance(day, bool):
+        return float(Time(day, format="mjd", scale="tt").decimalyear)
     date = upper.get("DATE-OBS")
     return date if isinstance(date, str) and date.strip() else None

@@ -27,11 +27,13 @@ ALIASES: dict[str, tuple[str, ...]] = {
     "x": (
         *BASIC["x"],
         *("xcentroid", "x_centroid", "x_fit", "xcenter", "slot_centroid_x"),
+        *("pixel_centroid_x", "x_psf"),
         *("base_sdsscentroid_x", "w1x", "w2x", "w3x", "w4x"),
     ),
     "y": (
         *BASIC["y"],
         *("ycentroid", "y_centroid", "y_fit", "ycenter", "slot_centroid_y"),
+        *("pixel_centroid_y", "y_psf"),
         *("base_sdsscentroid_y", "w1y", "w2y", "w3y", "w4y"),
     ),
     "u": ("u", "xi"),
@@ -68,11 +70,12 @@ ALIASES: dict[str, tuple[str, ...]] = {
     "filter": ("filter", "filt", "filter_name", "band"),
     "mag": (
         *(*BASIC["mag"], "mag_psf", "mag_auto", "mag_iso", "mag_best", "mag_fit"),
+        *("auto_mag", "mag_data"),
         *("phot_g_mean_mag", "gmag", "w1mpro"),
     ),
     "flux": (
         *("flux", "flux_psf", "flux_auto", "flux_fit", "kron_flux", "segment_flux"),
-        *("psfflux", "instflux", "slot_psfflux_instflux", "base_psfflux_instflux"),
+        *("auto_flux", "psfflux", "instflux", "slot_psfflux_instflux", "base_psfflux_instflux"),
         "aperture_sum",
     ),
     "colour": ("colour", "color", "bp_rp"),

@@ -13,6 +13,7 @@ from functools import cached_property
 import numpy as np
 
 from bayesdist.data.matches import Matches
+from bayesdist.data.tables.units import conversion
 from bayesdist.errors import DegenerateError, InputError
 from bayesdist.infer.equations.gauss_newton import (
     gauss_newton,
@@ -335,9 +336,11 @@ def _fitted(
     n_rejected = len(shards) - n_used
     if n_used * 2 + priors.n_informative < model.n_params or n_used < 0.05 * len(shards):
         raise DegenerateError(
-            f"{n_rejected} of {len(shards)} rows are beyond the rejection limits",
+            f"{n_rejected} of {len(shards)} rows are beyond the rejection limits: half of the "
+            f"residuals exceed {_median_residual(shards, theta, every, model.unit)}",
             where="fit",
-            do="check the match, the errors, and fit.clip_chi2 and fit.clip_abs",
+            do="check the match (another field, wrong pairs, or radians or hours in place of "
+            "degrees), the errors, and fit.clip_chi2 and fit.clip_abs",
         )
 
     theta = gauss_newton(second, theta, model, priors)
@@ -368,6 +371,19 @@ def _fitted(
         dof=2 * n_used - model.n_params + priors.n_informative,
         condition=space.condition,
     )
+
+
+def _median_residual(shards: Shards, theta: Float, every: int, unit: str) -> str:
+    """Median distance of stars from the fit, in arcsec or in pixels, as text."""
+    median = float(np.median(np.concatenate(shards.sum(_some_residuals, theta, every))))
+    if unit == "pix":
+        return f"{median:.3g} px"
+    return f"{median * conversion(unit, 'arcsec', where='fit'):.3g} arcsec"
+
+
+def _some_residuals(stars: Stars, theta: Float, every: int) -> tuple[Float, ...]:
+    """Distance of every n-th star from the fit."""
+    return (np.hypot(*stars.residuals(theta)[::every].T),)
 
 
 def _some_chi2(stars: Stars, theta: Float, every: int) -> tuple[Float, ...]:

@@ -13,16 +13,17 @@ from bayesdist.app.commands.on_files.init_draft import draft_of
 from bayesdist.app.commands.on_files.init_guesses import (
     column_lines,
     detector_lines,
-    guessed_sigma,
     quoted,
 )
 from bayesdist.app.config import parse_config
 from bayesdist.app.config.data import data_sections
+from bayesdist.app.kinds.matches.plausibility import scatter_about_polynomials
 from bayesdist.app.kinds.matches.sources import load_matches, mission_template
 from bayesdist.app.store.output import refuse_existing
 from bayesdist.data import FORMATS, Matches
 from bayesdist.data.formats.files import mission_formats
 from bayesdist.data.formats.layout import TableLayout, table_layout
+from bayesdist.data.reading.table import NOT_FINITE_CAUSES
 from bayesdist.errors import InputError
 from bayesdist.files.atomic import atomic_path
 
@@ -35,7 +36,6 @@ LIKE_PIXELS = (0.5, 2.0)
 DEGREES = 1e-3  # below it is the degree: pixels of more than 3.6 arcsec are rare
 MAS = 20.0
 
-_NOT_FINITE = ("value is nan", "value is inf", "value is -inf")
 
 _GUESSED_UNIT = "unit = {unit:22s}# GUESSED: the table does not say\n"
 
@@ -151,7 +151,7 @@ def _of_matches(
     try:
         table, unit_line, sigma, read_sigma = _read(matches, columns)
     except InputError as error:
-        if not error.cause.startswith(_NOT_FINITE):
+        if not error.cause.startswith(NOT_FINITE_CAUSES):
             raise
         table, unit_line, sigma, read_sigma = _read(matches, columns, not_finite="reject")
         not_finite = _REJECT
@@ -217,7 +217,7 @@ def _read(
     what = "GUESSED: the table carries neither errors nor magnitudes"
     if "flux" in taken:
         what += f" (not all {taken['flux']} are positive)"
-    found = guessed_sigma(table.sample(SAMPLE))
+    found = scatter_about_polynomials(table.sample(SAMPLE))
     if found is None:
         return table, line, f"{SIGMA}                    # {what}", False
     how = "the scatter about a polynomial"

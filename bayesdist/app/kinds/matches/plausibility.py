@@ -5,11 +5,13 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 import numpy as np
+from numpy.polynomial import legendre
 
 from bayesdist.app.config import Config
 from bayesdist.data import Matches
 from bayesdist.errors import InputError
 from bayesdist.model import DistortionModel, TimeDependence
+from bayesdist.model.basis import polynomial_terms
 from bayesdist.utils.arrays import Float
 
 OFF = 1e3  # factor on the scale by which u and v cannot be those of the detector
@@ -18,6 +20,13 @@ SMALLEST_ERROR = 1e-6  # pixels: no detector measures positions to that
 FEWEST = 10  # stars without which no scale can be told
 HALF_TURN = 180.0  # degrees: no plane of the sky reaches further
 IN_DEGREES = {"deg": 1.0, "arcsec": 1 / 3600, "mas": 1 / 3.6e6}
+MADE_FROM_PIXELS = 1e-3  # pixels: scatter below which positions were computed from the pixels
+FAR_BELOW = 0.1  # fraction of the quoted errors that such a scatter does not reach
+ORDER = 4
+ROUNDS = 20
+NORMAL = 1.4826022185056018  # 1 / (median of |z|, z standard normal)
+CLIP = 4.0  # robust standard deviations
+EACH = 4  # stars for each coefficient, at least
 YEARS = (1950.0, 2100.0)
 
 
@@ -34,6 +43,7 @@ def _doubts(stars: Matches, unit: str, scale_mas: float | None) -> Iterator[str]
         return
     yield from _doubts_on_scale(stars, scale, unit, scale_mas)
     yield from _doubts_on_errors(stars, scale)
+    yield from _doubts_on_scatter(stars, scale)
 
 
 def _scale(stars: Matches) -> float | None:
@@ -84,6 +94,24 @@ def _doubts_on_errors(stars: Matches, scale: float) -> Iterator[str]:
         yield f"the smallest of the quoted errors is {least:.2g} px: check such rows"
 
 
+def _doubts_on_scatter(stars: Matches, scale: float) -> Iterator[str]:
+    """A sentence on reference positions that are a function of the pixels."""
+    scatter = scatter_about_polynomials(stars)
+    if scatter is None:
+        return
+    in_pixels = scatter / scale
+    quoted = np.inf
+    if stars.has_sigma:
+        sigma = np.minimum(stars.column("sigma_u"), stars.column("sigma_v"))
+        quoted = float(np.median(sigma)) / scale
+    if in_pixels < min(MADE_FROM_PIXELS, FAR_BELOW * quoted):
+        yield (
+            f"the reference positions follow a polynomial of the pixels to {in_pixels:.1g} px, "
+            "which no detector reaches: they were probably computed from the pixels by a WCS, and "
+            "a fit only gives back that WCS; match the detections with a catalogue of their own"
+        )
+
+
 def _doubts_on_dates(epochs: Float, where: str) -> Iterator[str]:
     """Sentences on epochs that are hardly decimal years; InputError for those that are none."""
     first, last = float(np.min(epochs)), float(np.max(epochs))
@@ -114,3 +142,34 @@ def refuse_empty_segments(epochs: Float, time: TimeDependence | None) -> None:
                 where="model.tdd.breaks",
                 do=f"leave it out: the data are of {np.min(epochs):.2f} to {np.max(epochs):.2f}",
             )
+
+
+def scatter_about_polynomials(table: Matches) -> float | None:
+    """Robust scatter along an axis about polynomials on each chip of each exposure, two digits.
+
+    It is in the unit of u, v; None of too few stars, or without scatter.
+    """
+    i, j = np.array(polynomial_terms(ORDER)).T
+    groups = table.exposure * len(table.chip_numbers) + table.chip
+    residuals: list[Float] = []
+    for group in np.unique(groups):
+        rows = groups == group
+        if rows.sum() < EACH * len(i):
+            continue
+        X, Y = (2 * (z - z.min()) / max(np.ptp(z), 1.0) - 1 for z in (table.x[rows], table.y[rows]))
+        basis = legendre.legvander(X, ORDER)[:, i] * legendre.legvander(Y, ORDER)[:, j]
+        data = np.stack([table.u[rows], table.v[rows]], axis=-1)
+        used = np.ones(len(X), bool)
+        for _ in range(ROUNDS):
+            left = data - basis @ np.linalg.lstsq(basis[used], data[used])[0]
+            size = NORMAL * np.median(np.abs(left[used]))
+            now = (np.abs(left) <= CLIP * size).all(axis=1)
+            if (now == used).all() or now.sum() < 2 * len(i):
+                break
+            used = now
+        # what the fit has taken up is given back
+        residuals.append(left[used].ravel() * np.sqrt(used.sum() / (used.sum() - len(i))))
+    if not residuals:
+        return None
+    sigma = NORMAL * float(np.median(np.abs(np.concatenate(residuals))))
+    return float(f"{sigma:.2g}") if sigma > 0 else None
