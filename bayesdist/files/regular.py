@@ -119,11 +119,10 @@ def read_up_to(stream: BinaryIO | io.BufferedIOBase, most: int, *, expected: int
 def read_text(path: PathLike, *, most: int | None = None) -> str:
     """Text of a file in UTF-8, with its line ends as they stand; errors as of `read_bytes`.
 
-    A byte order mark is left out.
     FormatError where it is no such text.
     """
     try:
-        return read_bytes(path, most=most).decode("utf-8-sig")
+        return read_bytes(path, most=most).decode("utf-8")
     except UnicodeDecodeError as error:
         raise FormatError(
             f"cannot be read (not UTF-8 text at byte {error.start + 1})",
@@ -133,8 +132,11 @@ def read_text(path: PathLike, *, most: int | None = None) -> str:
 
 
 def read_lines(path: PathLike) -> list[str]:
-    """Lines of a text file, with their ends; errors as of `read_text`."""
-    return io.StringIO(read_text(path), newline="").readlines()
+    """Lines of a text file, with their ends and without a byte order mark.
+
+    Errors as of `read_text`.
+    """
+    return io.StringIO(read_text(path).removeprefix("\ufeff"), newline="").readlines()
 
 
 def head_of(path: PathLike, n: int = 4096) -> bytes:

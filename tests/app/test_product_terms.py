@@ -152,7 +152,7 @@ def test_axes_and_size_of_a_file_are_its_own_and_a_wave_is_not():
         for axis, k, half in ((0, (1, 0), 128.0), (1, (0, 1), 64.0)):
             at = model.basis(chip.number).terms.index(k)
             mean[model.coefficient_slice(chip.number, axis)][at] = half
-    solution = SimpleNamespace(model=model, mean=mean)
+    solution = SimpleNamespace(model=model, mean=mean, tangent_point=None)
     product = product_of(solution)
 
     def wave(x, y, chip, epoch):

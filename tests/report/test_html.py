@@ -364,7 +364,7 @@ def test_tables_of_two_chips_name_them():
 
 def test_the_residuals_of_a_table_are_those_of_its_chip():
     run = report_input(size=(4096.0, 2048.0), names=("WFC2", "WFC1"))
-    _, table = fit_tables(run)
+    table = next(t for t in fit_tables(run) if "Geometry" not in t.caption and len(t.rows) == 6)
     labels = [row[0] for row in table.rows]
     assert labels == [f"{c}, {a}" for c in ("all", "WFC2", "WFC1") for a in "uv"]
     t = run.stars.table

@@ -29,7 +29,9 @@ NO_LINEAR_ERRORS = (
     "errs by offset, scale and rotation, too; a file of parameters beside the header has them all"
 )
 
-NO_SKY = "CTYPE names no position on the sky: u, v are on a plane of unknown place, CD in degrees"
+NO_SKY = (
+    "CTYPE names no position on the sky: u, v are on a plane of unknown position, CD in degrees"
+)
 
 
 def sip_calibration(

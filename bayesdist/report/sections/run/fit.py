@@ -72,8 +72,9 @@ def _geometry_table(r: ReportInput) -> TextTable:
     chips = geometries(r.fit)
     for chip in chips:
         x, y, _ = chip.scales
-        angle, apart = f"{chip.position_angle:.2f}", f"{90 + np.degrees(chip.skew):.3f}"
-        parity, distortion = f"{chip.parity:+d}", number(chip.distortion, 3)
+        angle = f"{chip.position_angle:.2f}".replace("-", "−")
+        apart = f"{90 + np.degrees(chip.skew):.3f}"
+        parity, distortion = f"{chip.parity:+d}".replace("-", "−"), number(chip.distortion, 3)
         rows.append((names[chip.chip], x, y, angle, apart, parity, distortion))
     unit = chips[0].scales[2]
     return TextTable(
