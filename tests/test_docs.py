@@ -29,6 +29,7 @@ from bayesdist.mission import load_object
 from bayesdist.missions import wise
 
 from .docs_blocks import DOCS, blocks, run_notebook, run_page
+from .reduced import only_in_full
 from .sketches import sketched
 
 ROOT = DOCS.parent
@@ -161,6 +162,8 @@ def test_the_notebook_on_photutils_agrees_with_the_truth(tmp_path, monkeypatch):
     assert namespace["together"] < namespace["single"]
 
 
+@pytest.mark.slow
+@only_in_full("make docs runs it")
 def test_the_notebook_on_a_campaign_agrees_with_the_truth(tmp_path, monkeypatch):
     """The error of the non-linear distortion is as large as that of draws of the posterior."""
     monkeypatch.chdir(tmp_path)
@@ -169,6 +172,8 @@ def test_the_notebook_on_a_campaign_agrees_with_the_truth(tmp_path, monkeypatch)
     assert 0.5 * namespace["low"] < namespace["error"] < 1.5 * namespace["high"]
 
 
+@pytest.mark.slow
+@only_in_full("make docs runs it")
 def test_the_notebook_on_releases_tells_a_change_from_none(tmp_path, monkeypatch):
     """The release misses the requirement by the truth, and the new calibration meets it."""
     monkeypatch.chdir(tmp_path)

@@ -22,6 +22,7 @@ from tests.app.support import (
     summary_of,
     write_job,
 )
+from tests.reduced import case_in_full, only_in_full
 
 NAMED = {"u_nominal": "u_nominal", "v_nominal": "v_nominal"}
 RADIUS = 0.05
@@ -156,7 +157,9 @@ def written(matches, folder):
     return [folder / name for name in FILES]
 
 
-@pytest.mark.parametrize("sigma", ["columns", "by_magnitude"])
+@pytest.mark.parametrize(
+    "sigma", ["columns", case_in_full("by_magnitude", instead="errors in columns are read alike")]
+)
 def test_object_file_and_command_line_agree_to_the_bit(stated, tmp_path, sigma, no_report):
     run = calibrated(stated, sigma)
     assert run.posterior.mixture.match_radius == RADIUS
@@ -196,6 +199,8 @@ def test_a_radius_of_the_settings_wins_and_differences_are_reported(stated):
     assert not any("by the settings" in text for text in default.warnings)
 
 
+@pytest.mark.slow
+@only_in_full("bd.calibrate uses the radius by the same functions")
 def test_single_steps_use_the_radius_of_the_matches(stated):
     model = bd.build_model(stated, order=2, size=SIZE, reference_pixel=CENTRE)
     fit, posteriors = bd.fit_linear(stated, model), []

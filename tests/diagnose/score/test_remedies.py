@@ -10,6 +10,7 @@ import pytest
 import bayesdist as bd
 from bayesdist.assess.statistics import field_statistic
 from bayesdist.model.grid import grid_pixels, mesh
+from tests.reduced import only_in_full
 
 from .shaped import CHIP, SIDE, SIGMA, direction, matches_of, nominal_within, scene, tail, true_map
 
@@ -104,6 +105,7 @@ def test_blends_that_are_cut():
     Carried(matches.select(~blended)).assert_right(int((~blended).sum()))
 
 
+@only_in_full("the other remedies are followed in the same way")
 def test_a_match_radius_that_is_corrected():
     """Errors cover; structure in the mean residuals, which the circle cuts, is still doubted."""
     matches, _ = nominal_within(np.random.default_rng(3), 5000, 0.06, off=0.03, false=0.05)
