@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import MISSING, dataclass, field, fields, replace
-from functools import partial
+from functools import cached_property, partial
 from itertools import pairwise
 from typing import TYPE_CHECKING, Any, Protocol
 
@@ -21,9 +21,9 @@ from bayesdist.data.magnitude_errors import AddedErrors, MagnitudeErrors, no_mag
 from bayesdist.data.reading.options import ReadOptions, refuse_missing_errors
 from bayesdist.data.reading.sky_table import sky_table
 from bayesdist.data.reading.table import match_arguments
-from bayesdist.data.repeated_stars import check_same_position, star_codes
+from bayesdist.data.repeated_stars import check_same_position, error_codes, star_codes
 from bayesdist.errors import InputError
-from bayesdist.utils.arrays import Float
+from bayesdist.utils.arrays import Float, Int
 from bayesdist.utils.quantities import Direction, Epoch, Number, values_in
 
 if TYPE_CHECKING:
@@ -693,6 +693,14 @@ class Matches(MatchColumns):
         """
         given = {one.name: getattr(self, one.name) for one in fields(self) if one.init}
         return Matches.of_distinct_rows(**(given | changes))
+
+    @cached_property
+    def error_codes(self) -> Int | None:
+        """Code (N,) of the stars, or tight groups of stars, whose rows share a reference error.
+
+        None if each row is a star by itself.  The stars must be in memory.
+        """
+        return error_codes(self.u, self.v, self.star)
 
     def with_star_codes(self, same_position: str = "one_star") -> Matches:
         """These stars with codes by their reference positions.

@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 
 from bayesdist.data import MagnitudeErrors, Matches
-from bayesdist.data.repeated_stars import error_codes
 from bayesdist.diagnose.checks import (
     coverage_checks,
     exposure_checks,
@@ -460,7 +459,7 @@ def _misfits(
     `partitions` and `sums` are those of `residual_sums`, whose detections are taken as they are
     where stars have one each, or stay on disk.
     """
-    code = error_codes(stars.u, stars.v, stars.star) if stars.in_memory else None
+    code = stars.error_codes if stars.in_memory else None
     if code is None or len(distinct := np.unique(code)) == len(stars):
         return misfits_of(fit, partitions, sums)
     used = fit.n_used * len(distinct) / len(stars)

@@ -39,7 +39,7 @@ from bayesdist.data.reading.options import ReadOptions
 from bayesdist.data.reading.sky_table import SKY_COLUMN, icrs_of
 from bayesdist.data.reading.table import as_table, match_arguments, own_epoch, with_sky_columns
 from bayesdist.data.sky.positions import MOTIONS, SKY_QUANTITIES, reference_sky, sky_columns
-from bayesdist.data.sky.tangent import mean_direction, sky_of_plane, tangent_plane
+from bayesdist.data.sky.tangent import mean_direction, separation, sky_of_plane, tangent_plane
 from bayesdist.data.tables.checks import without_missing
 from bayesdist.data.tables.column import Quantities
 from bayesdist.data.tables.names import ALIASES, PAIRS, find_columns, origin_of
@@ -598,15 +598,6 @@ def _nearby(ra: Float, dec: Float, star_ra: Float, star_dec: Float) -> tuple[Int
         f"the catalogue around RA {there[0]:.4f}, Dec {there[1]:+.4f}, {_angle(apart)} away"
     )
     return np.flatnonzero(away <= (1.0 + _MARGIN) * size), place
-
-
-def separation(point: tuple[float, float], ra: Float, dec: Float) -> Float:
-    """Angles (N,) between a point and positions (N,), all in degrees (Vincenty's formula)."""
-    a0, d0, a, d = np.radians(point[0]), np.radians(point[1]), np.radians(ra), np.radians(dec)
-    cos_a, sin_a = np.cos(a - a0), np.sin(a - a0)
-    across = np.hypot(np.cos(d) * sin_a, np.cos(d0) * np.sin(d) - np.sin(d0) * np.cos(d) * cos_a)
-    along = np.sin(d0) * np.sin(d) + np.cos(d0) * np.cos(d) * cos_a
-    return np.asarray(np.degrees(np.arctan2(across, along)))
 
 
 def _angle(degrees: float) -> str:

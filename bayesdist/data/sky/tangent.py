@@ -190,6 +190,18 @@ def plane_axes(point: tuple[float, float]) -> Float:
     )
 
 
+def separation(point: tuple[ArrayLike, ArrayLike], ra: ArrayLike, dec: ArrayLike) -> Float:
+    """Angles (N,) between positions, all in degrees (Vincenty's formula).
+
+    `point` is one position, or the longitudes and latitudes (N,) of as many as `ra` and `dec`.
+    """
+    a0, d0, a, d = (np.radians(angle) for angle in (*point, ra, dec))
+    cos_a, sin_a = np.cos(a - a0), np.sin(a - a0)
+    across = np.hypot(np.cos(d) * sin_a, np.cos(d0) * np.sin(d) - np.sin(d0) * np.cos(d) * cos_a)
+    along = np.sin(d0) * np.sin(d) + np.cos(d0) * np.cos(d) * cos_a
+    return np.asarray(np.degrees(np.arctan2(across, along)))
+
+
 def sky_of_plane(xi: ArrayLike, eta: ArrayLike, point: tuple[float, float]) -> tuple[Float, Float]:
     """Right ascension in [0, 360) and declination, degrees, of points (arcsec) of a plane."""
     xi, eta = np.asarray(xi, float) / ARCSEC, np.asarray(eta, float) / ARCSEC

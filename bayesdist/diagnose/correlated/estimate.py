@@ -10,7 +10,6 @@ from operator import add
 import numpy as np
 
 from bayesdist.data.matches import Matches
-from bayesdist.data.repeated_stars import error_codes
 from bayesdist.diagnose.correlated.deviations import MAX_EXPOSURES, linear_deviations
 from bayesdist.diagnose.correlated.exposure_fields import detection_scores, exposure_fields
 from bayesdist.diagnose.correlated.exposure_time import correlated_hierarchy
@@ -115,7 +114,7 @@ def estimate_discrepancy(
     working = Information(model, mean, sums, parameter_priors or GaussianPriors.none(model))
     pixel = model.pixel_size(mean)
     repeated = None
-    code = None if stars is None else error_codes(stars.u, stars.v, stars.star)
+    code = None if stars is None else stars.error_codes
     if stars is not None and code is not None:
         repeated = shared_stars(stars, code, likelihood, model, priors.star * pixel)
     information = replace(working, excess=score_excess(working))
@@ -146,7 +145,7 @@ def estimate_discrepancy(
     detections = None
     if near_stars is not None and len(near_stars.exposure_names) > 1:
         prepared, order = prepare(model, near_stars)
-        shared = error_codes(near_stars.u, near_stars.v, near_stars.star)
+        shared = near_stars.error_codes
         codes = np.arange(len(order)) if shared is None else shared[order]
         detections = detection_scores(
             model, prepared, likelihood, near_stars.exposure[order], codes

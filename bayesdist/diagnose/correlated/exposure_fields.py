@@ -28,7 +28,11 @@ from bayesdist.diagnose.correlated.exposure_products import (
     modes,
 )
 from bayesdist.diagnose.correlated.functions import FINE, StructureFunctions, legendre_products
-from bayesdist.diagnose.correlated.information import GroupCells, Information
+from bayesdist.diagnose.correlated.information import (
+    GroupCells,
+    Information,
+    scores_on_chips,
+)
 from bayesdist.diagnose.correlated.priors import (
     DiscrepancyPriors,
     log_half_t,
@@ -144,20 +148,8 @@ def detection_scores(
 
     `exposure` and `star` (N,) are their codes.
     """
-    g_u, g_v, h_uu, h_uv, h_vv = likelihood.scores(stars)
-    g = np.stack([g_u, g_v], axis=1)
-    H = np.stack([h_uu, h_uv, h_uv, h_vv], axis=1).reshape(-1, 2, 2)
-    good = (h_uu > 0) & (h_vv > 0)
-    chip = np.full(len(g), -1)
-    for k, (code, frame_of) in enumerate(
-        zip(stars.groups.chip, stars.groups.exposure, strict=True)
-    ):
-        rows = slice(stars.starts[k], stars.starts[k + 1])
-        frame = np.asarray(model.frame(likelihood.theta, int(frame_of))[0])
-        g[rows] = g[rows] @ frame
-        H[rows] = frame.T @ H[rows] @ frame
-        chip[rows] = code
-    h = np.where(good[:, None], np.einsum("naa->na", H), 0.0)
+    g, H, chip = scores_on_chips(model, stars, likelihood)
+    h = np.einsum("naa->na", H)
     return DetectionScores(stars.X, stars.Y, g, h, chip, exposure, star)
 
 
@@ -294,20 +286,29 @@ def _second_order_draws(
         float(np.sqrt(np.mean(terms.given(WIDE * resolved).squares()[terms.loose == 0])))
         for terms in chips
     )
-    grid = np.geomspace(
-        min(median, resolved) / RANGE, RANGE * max(median, resolved, largest), STEPS
-    )
-    log = np.array([sum(terms.given(tau).log_evidence for terms in chips) for tau in grid])
-    log += log_half_t(grid, median) + log_widths(grid)
+    grid, log_prior = _amplitudes(median, resolved, largest)
+    given = [[terms.given(tau) for terms in chips] for tau in grid]
+    log = log_prior + np.array([sum(one.log_evidence for one in chip) for chip in given])
     weight = np.exp(log - log.max())
     which = rng.permutation(np.repeat(np.arange(STEPS), rng.multinomial(n, weight / weight.sum())))
     for k in np.unique(which):
         rows = np.flatnonzero(which == k)
         drawn[rows] = grid[k]
-        for terms in chips:
-            coefficients = terms.given(grid[k]).draws(len(rows), rng)
-            pull[rows] -= np.tensordot(coefficients, terms.taken, axes=2)
+        for posterior in given[k]:
+            coefficients = posterior.draws(len(rows), rng)
+            pull[rows] -= np.tensordot(coefficients, posterior.of.taken, axes=2)
     return pull, drawn
+
+
+def _amplitudes(median: float, resolved: float, largest: float) -> tuple[Float, Float]:
+    """Amplitudes (STEPS,), and the logarithm of their prior weights in a sum over them.
+
+    They reach beyond the prior's median, what the data resolve, and the largest that these suggest.
+    """
+    grid = np.geomspace(
+        min(median, resolved) / RANGE, RANGE * max(median, resolved, largest), STEPS
+    )
+    return grid, log_half_t(grid, median) + log_widths(grid)
 
 
 def _with_loose(terms: _Terms, start: float) -> _Terms:
@@ -356,13 +357,11 @@ def _field_draws(
     fits = np.array([[chip.amplitude(length) for chip in chips] for length in LENGTHS])
     resolved = float(np.sqrt(fits[..., 1].min()))
     largest = float(np.sqrt(max(fits[..., 0].max(), 0.0)))
-    grid = np.geomspace(
-        min(median, resolved) / RANGE, RANGE * max(median, resolved, largest), STEPS
-    )
+    grid, log_prior = _amplitudes(median, resolved, largest)
     log = np.empty((len(LENGTHS), STEPS))
     for k, length in enumerate(LENGTHS):
         log[k] = sum(_log_likelihood(chip, grid, length) for chip in chips)
-    log += log_half_t(grid, median) + log_widths(grid)
+    log += log_prior
     weight = np.exp(log - log.max()).ravel()
     counts = rng.multinomial(n, weight / weight.sum())
     which = rng.permutation(np.repeat(np.arange(len(counts)), counts))

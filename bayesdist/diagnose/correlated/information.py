@@ -199,6 +199,29 @@ class CellSums(Sums):
         return used, x[used] / n[used], y[used] / n[used]
 
 
+def scores_on_chips(
+    model: DistortionModel, stars: Stars, likelihood: Likelihood
+) -> tuple[Float, Float, Int]:
+    """Scores (N, 2) and curvatures (N, 2, 2) along the axes of the polynomials, and chips (N,).
+
+    The chip of each detection is a code, and -1 where the likelihood is not concave.
+    """
+    g_u, g_v, h_uu, h_uv, h_vv = likelihood.scores(stars)
+    g = np.stack([g_u, g_v], axis=1)
+    h = np.stack([h_uu, h_uv, h_uv, h_vv], axis=1).reshape(-1, 2, 2)
+    chip = np.full(len(g), -1)
+    for k, (code, exposure) in enumerate(
+        zip(stars.groups.chip, stars.groups.exposure, strict=True)
+    ):
+        rows = slice(stars.starts[k], stars.starts[k + 1])
+        frame = np.asarray(model.frame(likelihood.theta, int(exposure))[0])
+        g[rows] = g[rows] @ frame
+        h[rows] = frame.T @ h[rows] @ frame
+        chip[rows] = code
+    chip[~((h_uu > 0) & (h_vv > 0))] = -1
+    return g, h, chip
+
+
 def cells_per_side(n_groups: int) -> int:
     """Number of cells on each side of a chip for this number of groups."""
     return next(side for most, side in SIDES if n_groups <= most)

@@ -26,7 +26,7 @@ from scipy.spatial import cKDTree
 from scipy.special import j0
 
 from bayesdist.data.matches import Matches
-from bayesdist.data.repeated_stars import error_codes
+from bayesdist.diagnose.correlated.information import scores_on_chips
 from bayesdist.infer.stars.likelihood import Likelihood
 from bayesdist.infer.stars.stars import prepare
 from bayesdist.model import DistortionModel
@@ -157,22 +157,11 @@ def neighbour_scores(
 ) -> dict[int, NeighbourScores]:
     """Scores of neighbouring stars of each chip, by its code; arguments as `shared_variances`."""
     stars, order = prepare(model, table)
-    g_u, g_v, h_uu, h_uv, h_vv = likelihood.scores(stars)
-    shared = error_codes(table.u, table.v, table.star)
-    code = np.arange(len(order)) if shared is None else shared[order]
-    g = np.stack([g_u, g_v], axis=1)
-    h = np.stack([h_uu, h_uv, h_uv, h_vv], axis=1).reshape(-1, 2, 2)
-    good = (h_uu > 0) & (h_vv > 0)
-    chip = np.full(len(order), -1)
-    for k, (c, exposure) in enumerate(zip(stars.groups.chip, stars.groups.exposure, strict=True)):
-        rows = slice(stars.starts[k], stars.starts[k + 1])
-        frame = np.asarray(model.frame(likelihood.theta, int(exposure))[0])
-        g[rows] = g[rows] @ frame
-        h[rows] = frame.T @ h[rows] @ frame
-        chip[rows] = c
+    code = np.arange(len(order)) if table.error_codes is None else table.error_codes[order]
+    g, h, chip = scores_on_chips(model, stars, likelihood)
     out = {}
     for c, one in enumerate(model.chips):
-        here = np.flatnonzero((chip == c) & good)
+        here = np.flatnonzero(chip == c)
         expected = len(here) ** 2 * np.pi * EDGES[-1] ** 2 / (2 * one.size[0] * one.size[1])
         here = here[:: max(1, round(float(np.sqrt(expected / MAX_PAIRS))))]
         at = np.column_stack([stars.X[here] * one.size[0], stars.Y[here] * one.size[1]]) / 2

@@ -35,7 +35,10 @@ def exposure_field_test(sample: ScoredSample) -> Outcome | None:
     """Test of fields of single exposures; None where fewer than two exposures have enough stars."""
     if len({block.exposure for block in sample.blocks}) < 2:
         return None
-    chips = exposure_products(scores_of(sample), [chip.size for chip in sample.model.chips])
+    scores = DetectionScores(
+        sample.X, sample.Y, *sample.on_detector, sample.chip, sample.exposure, sample.star
+    )
+    chips = exposure_products(scores, [chip.size for chip in sample.model.chips])
     if not chips:
         return None
     tried = [_tried(list(chips.values()), length) for length in LENGTHS]
@@ -61,17 +64,6 @@ def exposure_field_test(sample: ScoredSample) -> Outcome | None:
         noise=0.0,
         unit=sample.model.unit,
         smallest=smallest,
-    )
-
-
-def scores_of(sample: ScoredSample) -> DetectionScores:
-    """Scores of the detections of a sample along the axes of the polynomials."""
-    uu, uv, vv = sample.curvature
-    H = np.stack([np.stack([uu, uv], -1), np.stack([uv, vv], -1)], -2)
-    curvature = np.einsum("nba,nbc,nca->na", sample.turn, H, sample.turn)
-    gradient = np.einsum("nba,bn->na", sample.turn, sample.whole_score)
-    return DetectionScores(
-        sample.X, sample.Y, gradient, curvature, sample.chip, sample.exposure, sample.star
     )
 
 

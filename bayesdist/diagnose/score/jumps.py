@@ -89,10 +89,9 @@ def _jumps(sample: ScoredSample) -> Iterator[_Jump]:
         rows = np.flatnonzero(usable & (sample.chip == code))
         if len(rows) < 2 * MIN_STARS_ON_A_SIDE:
             continue
-        turn = sample.turn[rows]
         star = np.unique(sample.star[rows], return_inverse=True)[1]
-        gradient = np.einsum("nji,jn->ni", turn, sample.whole_score[:, rows])
-        curvature = np.einsum("nji->n", turn**2) / 2 * sample.curvature[0::2, rows].mean(axis=0)
+        gradient, curvature = (values[rows] for values in sample.on_detector)
+        curvature = curvature.mean(axis=1)
         order = sample.model.order + HIGHER
         for axis, scaled in enumerate((sample.X[rows], sample.Y[rows])):
             smooth = legendre.legvander(scaled, order).T

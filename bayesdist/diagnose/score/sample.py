@@ -8,7 +8,6 @@ from functools import cached_property
 import numpy as np
 
 from bayesdist.data.matches import Matches
-from bayesdist.data.repeated_stars import error_codes
 from bayesdist.infer.kernel.mixture import Constants
 from bayesdist.infer.solution.solution import Solution, likelihood_of
 from bayesdist.infer.stars.likelihood import MixtureAt
@@ -105,6 +104,17 @@ class ScoredSample:
         number = np.bincount(self.star, self.used)
         return np.asarray(1.0 / np.maximum(number, 1.0)[self.star])
 
+    @cached_property
+    def on_detector(self) -> tuple[Float, Float]:
+        """Score and diagonal of the curvature (N, 2) each, along the axes of the polynomials.
+
+        The score is `whole_score`.
+        """
+        uu, uv, vv = self.curvature
+        matrix = np.stack([np.stack([uu, uv], -1), np.stack([uv, vv], -1)], -2)
+        score = np.einsum("nba,bn->na", self.turn, self.whole_score)
+        return score, np.einsum("nba,nbc,nca->na", self.turn, matrix, self.turn)
+
     def blocks_by(self, name: str) -> list[list[Block]]:
         """Blocks that have a code in common: 'exposure', 'frame_exposure'."""
         found: dict[int, list[Block]] = {}
@@ -139,7 +149,7 @@ def scored_sample(
     stars, order = prepare(solution.model, table.select(by_exposure))
     rows = by_exposure[order]
     columns = likelihood.scores(stars)
-    shared = error_codes(table.u, table.v, table.star)
+    shared = table.error_codes
     codes = np.arange(len(rows)) if shared is None else shared[rows]
     blocks = _blocks(stars, table.exposure[rows], likelihood.theta)
     turn = np.empty((len(rows), 2, 2))

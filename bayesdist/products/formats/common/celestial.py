@@ -18,7 +18,7 @@ import numpy as np
 from astropy.io import fits
 
 from bayesdist.calibration.inverse import detector_grid
-from bayesdist.data.sky.tangent import sky_of_plane
+from bayesdist.data.sky.tangent import plane_axes, separation, sky_of_plane
 from bayesdist.errors import FormatError, InputError
 from bayesdist.files.faults import reason_of
 from bayesdist.products.formats.common.cards import card_images, header_of, keyword_of
@@ -97,7 +97,8 @@ class TangentForm:
             world = np.asarray(wcs.all_pix2world(np.column_stack([x, y]), 1), float)
         xi, eta = self.system_turn.T @ positions(x, y)
         lon, lat = sky_of_plane(3600.0 * xi, 3600.0 * eta, self.native_point)
-        off = _separation(lon, lat, world[:, self.wcs.wcs.lng], world[:, self.wcs.wcs.lat])
+        by_astropy = world[:, self.wcs.wcs.lng], world[:, self.wcs.wcs.lat]
+        off = 3.6e6 * separation((lon, lat), *by_astropy)
         pixel = 3.6e6 * float(np.sqrt(abs(np.linalg.det(self.cd))))
         if not off.max() <= TOLERANCE_MAS:
             raise InputError(
@@ -265,26 +266,8 @@ def _from_galactic(lon: float, lat: float) -> tuple[Float, tuple[float, float]]:
 
     axes = SkyCoord(Galactic(CartesianRepresentation(np.eye(3))))
     matrix = np.asarray(axes.icrs.cartesian.xyz.value, float)  # columns are images of the axes
-    east, north, out = _basis(lon, lat)
-    x, y, z = matrix @ out
+    east, north, outwards = plane_axes((lon, lat))
+    x, y, z = matrix @ outwards
     ra, dec = np.degrees(np.arctan2(y, x)) % 360.0, np.degrees(np.arctan2(z, np.hypot(x, y)))
-    new_east, new_north, _ = _basis(ra, dec)
-    turn = np.stack([new_east, new_north]) @ matrix @ np.stack([east, north], axis=1)
+    turn = plane_axes((ra, dec))[:2] @ matrix @ np.stack([east, north], axis=1)
     return turn, (float(ra), float(dec))
-
-
-def _basis(lon: float, lat: float) -> tuple[Float, Float, Float]:
-    """Unit vectors to the east, to the north and outwards at a position in degrees."""
-    a, d = np.radians(lon), np.radians(lat)
-    east = np.array([-np.sin(a), np.cos(a), 0.0])
-    north = np.array([-np.sin(d) * np.cos(a), -np.sin(d) * np.sin(a), np.cos(d)])
-    return east, north, np.array([np.cos(d) * np.cos(a), np.cos(d) * np.sin(a), np.sin(d)])
-
-
-def _separation(lon: Float, lat: Float, other_lon: Float, other_lat: Float) -> Float:
-    """Separations (N,) of positions in degrees, mas; NaN where one is not finite."""
-    a, d, b, e = (np.radians(v) for v in (lon, lat, other_lon, other_lat))
-    first = np.stack([np.cos(d) * np.cos(a), np.cos(d) * np.sin(a), np.sin(d)])
-    second = np.stack([np.cos(e) * np.cos(b), np.cos(e) * np.sin(b), np.sin(e)])
-    chord = np.sqrt(((first - second) ** 2).sum(axis=0))
-    return np.degrees(2.0 * np.arcsin(np.clip(chord / 2.0, 0.0, 1.0))) * 3.6e6
