@@ -49,12 +49,11 @@ def _reading(path: Path) -> Iterator[None]:
         yield
 
 
-def _whole_lines(path: Path, mark: str) -> list[str]:
-    """Lines without their ends: as a list, for astropy takes a lone line for the name of a file.
+def _whole_lines(lines: list[str], mark: str, path: Path) -> list[str]:
+    """Lines of a file without their ends; a list, since astropy takes a lone line for a file name.
 
-    FormatError where the last one is cut.
+    FormatError if the last one is cut.
     """
-    lines = read_lines(path)
     if lines and lines[0].startswith("# %ECSV"):
         head = takewhile(lambda line: line.startswith("#"), lines)
         mark = "," if any(_COMMAS.match(line) for line in head) else " "
@@ -67,7 +66,7 @@ def _whole_lines(path: Path, mark: str) -> list[str]:
 def read_ecsv(path: Path) -> Table:
     """Table of an ECSV file; errors as of `read_table`."""
     with _reading(path):
-        return Table.read(_whole_lines(path, " "), format="ascii.ecsv")
+        return Table.read(_whole_lines(read_lines(path), " ", path), format="ascii.ecsv")
 
 
 def _read_text(path: Path) -> Table:
@@ -76,11 +75,12 @@ def _read_text(path: Path) -> Table:
 
 def _read_separated(path: Path, *, mark: str, format: str) -> Table:
     """Table of a file that ends in .csv, whose cells may be separated by semicolons, or in .tsv."""
-    rows = (line for line in read_lines(path) if line.strip() and not line.startswith("#"))
+    lines = read_lines(path)
+    rows = (line for line in lines if line.strip() and not line.startswith("#"))
     names = next(rows, "")
     if mark == "," and mark_of([names, next(rows, names)]) == ";":
         mark = ";"
-    lines = _whole_lines(path, mark)
+    lines = _whole_lines(lines, mark, path)
     refuse_numbers_as_names(next(csv.reader([names], delimiter=mark), []), where=str(path))
     lines = with_decimal_points(lines, mark, where=str(path))
     return Table.read(lines, format=format, delimiter=mark, comment="#", guess=False)
