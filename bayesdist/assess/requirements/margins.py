@@ -380,7 +380,8 @@ def _of_extremes(
     if doubts:
         texts = [*(check.sentence for check in doubts), reason]
         return replace(worse, verdict="undecided", reason="; ".join(texts))
-    return replace(worse, verdict="not shown", reason=f"{reason}; {worse.reason}")
+    reason += f"; in the least favourable form {worse.reason}"
+    return replace(worse, verdict="not shown", reason=reason)
 
 
 def _fraction(margin: Margin) -> str:
