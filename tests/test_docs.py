@@ -94,6 +94,8 @@ def test_the_tutorial_in_python_runs(tmp_path, monkeypatch):
     assert Path("w2-run/summary.json").is_file() and Path("w2.html").is_file()
 
 
+@pytest.mark.slow
+@only_in_full("tests/real has such a camera")
 def test_the_page_on_ground_based_cameras_runs(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     run_page(DOCS / "ground_based.md")
@@ -142,6 +144,8 @@ def test_the_pages_of_the_pipelines_run(page, tmp_path, monkeypatch):
     assert list(tmp_path.glob("**/*_distortion.asdf"))
 
 
+@pytest.mark.slow
+@only_in_full("the pages of these steps are run")
 def test_the_notebook_on_sip_headers_agrees_with_the_truth(tmp_path, monkeypatch):
     """Its header errs as much as stated: the rms of error / sigma of 30 joint errors is near 1."""
     monkeypatch.chdir(tmp_path)
@@ -152,6 +156,8 @@ def test_the_notebook_on_sip_headers_agrees_with_the_truth(tmp_path, monkeypatch
     assert 0.3 < np.sqrt((namespace["pulls"] ** 2).mean()) < 1.8
 
 
+@pytest.mark.slow
+@only_in_full("the pages of these steps are run")
 def test_the_notebook_on_photutils_agrees_with_the_truth(tmp_path, monkeypatch):
     """Errors of positions and of an angle are within what their covariance and draws say."""
     for package in ("photutils", "regions", "reproject"):

@@ -17,10 +17,7 @@ pytestmark = pytest.mark.slow
 # of all groups, what is quickly made and was called met most often before
 REDUCED = {
     "inside_1500": 1,
-    "one_order_more_3": 1,
     "smooth_270": 1,
-    "noise_corner": 1,
-    "charge_trails": 1,
     "catalogue_unlisted": 1,
     "drift_two_dates": 1,
     "merged_visits_150": 1,

@@ -11,6 +11,7 @@ from astropy.table import QTable
 from astropy.time import Time
 
 import bayesdist as bd
+from tests.reduced import only_in_full
 
 from .conftest import BUDGET, REQUIREMENTS
 from .support import CENTRE, SIZE, as_table, good, simulated, summary_of, write_job
@@ -131,6 +132,8 @@ def test_files_that_changed_since_are_not_those_of_the_run(finished, tmp_path):
     assert not (tmp_path / "run").exists()
 
 
+@pytest.mark.slow
+@only_in_full("tests/app/test_prior_calibration has earlier calibrations")
 def test_an_earlier_calibration_may_be_named_relatively(finished, tmp_path, monkeypatch):
     """The earlier run halves the errors of the same stars, and is found when the run is opened."""
     monkeypatch.chdir(finished.path.parent)
@@ -141,6 +144,8 @@ def test_an_earlier_calibration_may_be_named_relatively(finished, tmp_path, monk
         np.testing.assert_array_equal(run.posterior.theta, other.posterior.theta)
 
 
+@pytest.mark.slow
+@only_in_full("errors by magnitude are run")
 def test_stars_by_magnitude_are_found_without_being_asked():
     stars, _ = simulated(800, mag=np.linspace(12.0, 18.0, 800))
     bare = stars.with_columns(sigma_u=None, sigma_v=None)

@@ -141,6 +141,8 @@ def test_without_roll_angles_those_of_the_matches_do(campaign):
 # -- chips ----------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
+@only_in_full("tests/data has exposures with one chip")
 @pytest.mark.parametrize(
     ("name", "missing"),
     [
@@ -434,6 +436,8 @@ def test_a_catalogue_without_motions_is_said(campaign, names, words):
     assert any(words in text for text in campaign.matched()["warnings"])
 
 
+@pytest.mark.slow
+@only_in_full("tests/data has such a catalogue")
 def test_a_catalogue_without_motions_that_stars_outrun(campaign):
     """Over twelve years 0.01 px/yr are far more than centroids."""
     names = ["pm_u", "pm_v", "sigma_pm_u", "sigma_pm_v"]
@@ -510,6 +514,8 @@ def test_an_exposure_that_does_not_match_is_left_out_by_name(campaign, change):
     assert ONE not in rows["exposure"]
 
 
+@pytest.mark.slow
+@only_in_full("tests/data/test_campaign has too many")
 def test_more_than_a_fifth_of_the_exposures_is_too_many(campaign):
     campaign.lists(scattered, "f606w-002", "f606w-006")
     campaign.unmatched("f606w-002", "bring together", "1 more of 8")

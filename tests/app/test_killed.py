@@ -22,6 +22,7 @@ import xarray as xr
 from bayesdist.app.cli import main
 from tests.app.selfcal.support import list_table, small, write_selfcal
 from tests.app.support import edit, good
+from tests.reduced import case_in_full
 
 pytestmark = [pytest.mark.slow, pytest.mark.filterwarnings("ignore:.*fork")]
 
@@ -168,7 +169,14 @@ def _seconds(run: Path) -> dict[str, float]:
     return {name: one["wall_s"] for name, one in stages.items()}
 
 
-@pytest.mark.parametrize("kind", JOBS)
+@pytest.mark.parametrize(
+    "kind",
+    [
+        "matches",
+        case_in_full("campaign", instead="stages of matched stars are killed"),
+        case_in_full("selfcal", instead="stages of matched stars are killed"),
+    ],
+)
 def test_sigkill_changes_nothing(kind, tmp_path, full, capsys):
     """Killed within each stage, by turns, at a random moment of it.
 

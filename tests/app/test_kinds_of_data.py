@@ -76,6 +76,8 @@ def arcsec(tmp_path_factory):
     return folder, run, theta
 
 
+@pytest.mark.slow
+@only_in_full("tests/data reads each format")
 def test_formats_hold_the_same_data(arcsec):
     folder, run, _ = arcsec
     one = load_fit(run / "fit.nc")

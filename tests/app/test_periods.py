@@ -119,6 +119,8 @@ def inside(matches, period):
     return [g & (period == k) for k, g in enumerate(good_)]
 
 
+@pytest.mark.slow
+@only_in_full("tests/infer/compare has the rate of alarms")
 def test_no_change_is_said_where_there_is_none(quiet):
     run, matches, period = quiet
     found = summary_of(run)["periods"]
@@ -244,6 +246,8 @@ def test_runs_without_periods_have_no_such_section(finished):
     assert "periods" not in summary_of(finished.path)
 
 
+@pytest.mark.slow
+@only_in_full("a change of the polynomial is found")
 def test_a_pattern_that_no_polynomial_follows_is_found(tmp_path):
     matches, _ = dated(24_000, pattern=0.01)
     found = summary_of(assessed(tmp_path, matches))["periods"]

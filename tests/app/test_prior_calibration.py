@@ -19,7 +19,7 @@ from bayesdist.calibration.prior import prior_of_calibration
 from bayesdist.errors import InputError
 from bayesdist.infer import save_fit
 from bayesdist.infer.solution.linear import NO_REJECTION
-from tests.reduced import case_in_full
+from tests.reduced import case_in_full, only_in_full
 
 from .support import as_table, good, refused
 
@@ -138,6 +138,8 @@ def test_intervals_cover_as_they_say(full):
             assert abs(covered - level) < 4 * error
 
 
+@pytest.mark.slow
+@only_in_full("intervals with many draws cover")
 @pytest.mark.parametrize("n_stars", [case_in_full(10, instead="as many as before are run"), 200])
 def test_a_prior_of_few_draws_covers_at_least_as_it_says(n_stars, full):
     """Mean and covariance of four draws a parameter, the fewest that are taken: 68 and 95 %.

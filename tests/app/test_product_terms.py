@@ -23,6 +23,7 @@ from bayesdist.products.formats.sip.positions import sip_positions
 from bayesdist.products.registry import product_settings
 from tests.app.support import good, summary_of, write_job
 from tests.products.support import random_pixels, some_solution
+from tests.reduced import only_in_full
 
 SIZE, GRID, REFERENCE = (512, 256), (9, 5), (256.0, 128.0)
 DRIFT = 2e-5
@@ -226,6 +227,8 @@ PLACED = {
 }  # fmt: skip
 
 
+@pytest.mark.slow
+@only_in_full("tests/products has the inverse of each file")
 @pytest.mark.parametrize(
     ("key", "settings", "size"),
     [

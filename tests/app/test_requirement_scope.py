@@ -56,6 +56,8 @@ def validated(run, text, code):
     return json.loads((run / "summary.json").read_text())["margins"]
 
 
+@pytest.mark.slow
+@only_in_full("tests/assess has the scopes")
 def test_scopes_are_judged_and_kept(run, capsys):
     inner, pair, corner = validated(run, SCOPED, 4)
     assert [m["verdict"] for m in (inner, pair, corner)] == ["met", "missed", "met"]

@@ -206,6 +206,8 @@ def test_pairs_in_the_centre_say_nothing_of_the_corners(tmp_path):
 CIRCLE = {"model": "uniform", "match_radius": 3.0}
 
 
+@pytest.mark.slow
+@only_in_full("pairs in the centre alone are refused")
 @pytest.mark.usefixtures("no_report")
 @pytest.mark.parametrize(
     "outliers",
@@ -240,6 +242,8 @@ def test_false_pairs_of_another_shape_than_the_mixture_are_not_taken_for_true(tm
     assert {m["verdict"] for m in found["margins"]} == {"undecided"}
 
 
+@pytest.mark.slow
+@only_in_full("tests/app/test_rvb runs good pairs")
 @pytest.mark.usefixtures("no_report")
 def test_good_pairs_are_believed(tmp_path):
     found = believed(tmp_path, rvb_pairs(3000))

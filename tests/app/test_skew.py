@@ -23,6 +23,7 @@ from tests.app.support import (
     truth_of,
     write_job,
 )
+from tests.reduced import only_in_full
 from tests.report.runs import report_input
 
 FILES = ("coefficients.ecsv", "budget.ecsv", "margins.ecsv", "sip.hdr")
@@ -52,6 +53,8 @@ def pair(tmp_path_factory):
     return out
 
 
+@pytest.mark.slow
+@only_in_full("tests/infer/solution/test_skew has the angle")
 def test_it_is_the_angle_between_the_axes(pair):
     """Finite differences of positions; the error from draws of the fit's covariance."""
     _, run = pair

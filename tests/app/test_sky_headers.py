@@ -118,6 +118,8 @@ def test_positions_are_those_of_the_truth(crval, parity, tmp_path, rng) -> None:
     assert product["forward_rms"] < 1e-4 * PIXEL
 
 
+@pytest.mark.slow
+@only_in_full("SIP headers are compared")
 def test_headers_of_other_kinds_are_on_the_sky_of_the_truth(tmp_path, rng) -> None:
     """TPV and CPDIS by astropy.wcs; each has its own error, and the total with it."""
     truth = camera((83.8, -5.4), -1)

@@ -144,6 +144,8 @@ def test_errors_of_a_gap_hold_what_chips_share():
 # -- files ----------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
+@only_in_full("gaps of two runs are compared")
 def test_two_tables_with_another_gap(data_dir, tmp_path):
     """V2REF and V3REF of chip 1, which stwcs places it by: 0.02 and -0.01 arcsec more."""
     old = data_dir / "hst_reference" / "0461802ej_idc.fits"

@@ -22,6 +22,7 @@ from tests.benchmarks.plain import PlainDensity
 from tests.benchmarks.problem import simulated
 from tests.benchmarks.roofline import MIXTURE_OPS, Roofline
 from tests.benchmarks.scaling import exponent
+from tests.reduced import only_in_full
 
 AGREE = 5.0  # Monte-Carlo errors, the largest of nine parameters
 
@@ -46,6 +47,8 @@ def test_numpy_density_is_the_library_s_but_for_a_constant(order):
     assert (np.abs(apart - apart[0]) < room).all(), apart
 
 
+@pytest.mark.slow
+@only_in_full("tests/infer/test_nuts has this density")
 def test_jax_density_is_the_library_s_but_for_a_constant():
     pytest.importorskip("numpyro", reason="NumPyro (extra 'test') is not installed")
     import jax
@@ -239,6 +242,8 @@ def test_all_samplers_sample_one_posterior(quick):
     assert stock["density_difference"] < 1e-6
 
 
+@pytest.mark.slow
+@only_in_full("the table of benchmarks is tested")
 def test_only_the_parts_that_are_asked_for(tmp_path):
     program.main(["--quick", "--only", "linear", "--output", str(tmp_path)])
     bench = json.loads((tmp_path / "bench.json").read_text(encoding="utf-8"))

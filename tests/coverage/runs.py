@@ -17,7 +17,7 @@ from .ranks import ranks
 
 CAMPAIGNS = {True: 24, False: 1}  # of each kind, in full and reduced
 CALIBRATIONS, PILOTS = 200, 8  # in full alone
-TRUTHS = {True: 200, False: 3}  # from the priors
+TRUTHS = {True: 200, False: 2}  # from the priors
 EXPOSURES = 8  # of truths with several
 JUDGED = ("drift", "pattern")
 

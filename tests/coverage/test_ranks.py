@@ -11,7 +11,7 @@ from bayesdist.diagnose.correlated import DiscrepancyPriors
 from tests.adversarial import fields
 from tests.adversarial.truth import SIGMA
 from tests.infer.oracle import star_terms
-from tests.reduced import case_in_full
+from tests.reduced import case_in_full, only_in_full
 
 from .ranks import half_t, log_likelihood, structure
 from .runs import EXPOSURES, all_ranks
@@ -110,6 +110,7 @@ def test_ranks_that_are_not_even_are_seen(rng):
     assert 0.02 < np.mean(even) < 0.09
 
 
+@only_in_full("ranks have it among their quantities")
 def test_structure_has_the_size_of_its_prior(rng):
     """Half of the fields are smaller than the medians of the priors say together, or about so."""
     line = np.linspace(100, 1950, 12)

@@ -93,6 +93,8 @@ def test_motions_are_needed_where_stars_move(rng):
     assert moving.reports[1].rms < 0.05 < 1.5 < still.reports[1].rms
 
 
+@pytest.mark.slow
+@only_in_full("tests/app/campaign counts them")
 def test_completeness_and_false_matches_are_what_happens(rng):
     catalog, lists, log, truth, _ = campaign(rng, 4, stars=40_000, junk=0.5, seen=0.7)
     found = match_campaign(lists, log, catalog, start, radius=4.0)
@@ -239,6 +241,8 @@ def turned(one):
     return replace(one, x=np.where(one.chip == 1, 4097.0 - one.x, one.x))
 
 
+@pytest.mark.slow
+@only_in_full("exposures that lie elsewhere are found")
 def test_a_chip_that_lies_elsewhere_is_said(rng):
     catalog, lists, log, _, _ = campaign(rng, 5)
     found = match_campaign((turned(lists[0]), *lists[1:]), log, catalog, start)
@@ -249,6 +253,8 @@ def test_a_chip_that_lies_elsewhere_is_said(rng):
         match_campaign([turned(one) for one in lists], log, catalog, start)
 
 
+@pytest.mark.slow
+@only_in_full("tests/app/campaign has such exposures")
 def test_odd_exposures_are_named_and_others_are_not(rng):
     catalog, lists, log, _, _ = campaign(rng, 8, stars=8000)
     # the lists of this sky know no aberration

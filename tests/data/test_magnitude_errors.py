@@ -5,6 +5,7 @@ import pytest
 
 from bayesdist.data.magnitude_errors import estimate
 from bayesdist.errors import InputError
+from tests.reduced import only_in_full
 
 FAINT = np.linspace(-10.5, -6.2, 30)
 
@@ -37,12 +38,16 @@ def test_the_truth_comes_back_with_and_without_outliers(rng, outliers):
         assert np.std(r[0][mag < -9]) > 3 * truth(-9)
 
 
+@pytest.mark.slow
+@only_in_full("large samples are run")
 def test_small_samples_are_unbiased(rng):
     scatter = [estimate(np.zeros(40), *rng.normal(size=(2, 40))).sigma_u[0] for _ in range(4000)]
     # the clipping at 4 sigma and the median leave less than 1 %
     assert np.median(scatter) == pytest.approx(1.0, abs=0.012)
 
 
+@pytest.mark.slow
+@only_in_full("the errors are compared with the truth")
 def test_what_a_weighted_fit_takes_up_is_given_back(rng):
     # order 5 in x and y by itself, weights 1 / sigma^2: 42 parameters from 400 stars of two kinds
     n, p = 400, 21

@@ -136,6 +136,8 @@ def test_uniform_false_matches_have_uniform_probabilities():
     assert_calibrated(some)
 
 
+@pytest.mark.slow
+@only_in_full("stars that are held out are run")
 @pytest.mark.parametrize(
     "frames", [case_in_full("shift", instead="frames of all kinds are run"), "shift_rotation_scale"]
 )
@@ -342,6 +344,8 @@ def test_scores_are_derivatives_of_the_log_density(kind):
         np.testing.assert_allclose(found.free[:, 2], slope, atol=1e-6)
 
 
+@pytest.mark.slow
+@only_in_full("stars that are held out are run")
 def test_scores_of_the_spread_scatter_as_expected():
     """Without false matches w (q - 2) is 2 (t - 1), t exponential: moments 4 and 16."""
     (second, third), of_axis = SpreadMoments(MIXTURES["none"]).of(COV)

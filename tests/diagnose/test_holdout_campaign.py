@@ -52,6 +52,7 @@ def assert_calibrated(results) -> None:
     assert alarms <= binom.ppf(0.999, len(results), 0.05)
 
 
+@only_in_full("matched stars are run")
 @pytest.mark.slow
 def test_right_predictions_have_uniform_probabilities() -> None:
     assert_calibrated([judged(field(seed), aside(seed)) for seed in range(RUNS)])
@@ -142,6 +143,8 @@ def test_another_distortion_is_named_by_its_place() -> None:
     assert min(t.p_value for t in places) < 1e-6 < min(t.p_value for t in means)
 
 
+@pytest.mark.slow
+@only_in_full("a scale that is off is named")
 def test_displaced_pointings_are_no_misfit() -> None:
     """Where the telescope pointed, and its roll, are anything."""
     wrong = {"j004.shift_u": 500.0, "j004.shift_v": -300.0, "j004.rotation": 2.0}
@@ -149,6 +152,8 @@ def test_displaced_pointings_are_no_misfit() -> None:
     assert found.level == "pass" and found.n_left_out == 0
 
 
+@pytest.mark.slow
+@only_in_full("another distortion is named")
 def test_a_pattern_of_the_detector_shows_whatever_the_rolls() -> None:
     """Along the sky's axes exposures of many roll angles would average it away."""
 

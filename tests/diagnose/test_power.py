@@ -8,6 +8,7 @@ from scipy import stats
 
 from bayesdist.diagnose import score_tests
 from bayesdist.utils.limits import SCORE_TESTS
+from tests.reduced import only_in_full
 
 from .. import seeds
 from ..infer.patterned import moved
@@ -167,6 +168,8 @@ def drifting(rate: float, power: int):
     return pattern
 
 
+@pytest.mark.slow
+@only_in_full("tests/diagnose/test_time has drifts")
 def test_drift_and_its_curvature_are_found():
     still, moving = Scene(2000, 2, "shift", 12), Scene(2000, 2, "shift", 12, time=TIME)
     found = [still.with_pattern(k, drifting(0.01, 1)) for k in FEW]
@@ -294,6 +297,7 @@ def _is_found(case: str, seed: int) -> bool:
     return is_found(*SMALLEST[case], seed)
 
 
+@only_in_full("the smallest of others are run")
 @pytest.mark.slow
 def test_smallest_of_the_noise_is_found_nine_times_in_ten(full):
     """Parts of the data of unequal noise, of both signs."""

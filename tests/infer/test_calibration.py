@@ -26,6 +26,7 @@ def runs(full: bool) -> list[dict[str, np.ndarray]]:
     return over_seeds(coverage_of, 200 if full else 24)
 
 
+@only_in_full("tests/coverage has ranks of the same parameters")
 @pytest.mark.parametrize("level", LEVELS)
 @pytest.mark.parametrize("what", ["coefficients", "positions"])
 def test_intervals_cover(runs, level, what, capsys):

@@ -20,6 +20,7 @@ from bayesdist.diagnose.overlap import Alignment, align
 from bayesdist.missions.acs.simulate.tables import detector_tables, filter_tables
 from bayesdist.model.lookup import LookupTable, corrected
 from bayesdist.products.release import Period, write_release
+from tests.reduced import only_in_full
 
 from .acs_offline import Pointing, plane_matrix
 from .acs_offline import corrected as corrected_by_stwcs
@@ -169,6 +170,8 @@ def vectors(alignment: Alignment, sigma: np.ndarray, cells: int = 8):
     return np.stack(mean, axis=1), np.sqrt(2 / total[keep])
 
 
+@pytest.mark.slow
+@only_in_full("tests/products reads the files by stwcs")
 def test_new_files_leave_the_centroid_errors_only(aligned, field) -> None:
     """Each vector of the map is noise: chi2 of residuals and of cells, and no cell over 0.02 px."""
     _, sigma = field

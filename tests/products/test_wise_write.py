@@ -28,6 +28,7 @@ from bayesdist.products import (
     write_wise_meta,
 )
 from tests.app.support import cli, good, one_sentence, partly_run, summary_of, write_config
+from tests.reduced import only_in_full
 
 from .support import astropy_wcs, random_pixels, some_solution
 from .test_sip_wise import PRINTED, meta_data
@@ -256,6 +257,8 @@ def run(tmp_path_factory):
     return partly_run(folder / "run", config, "fit", "sample", "assess", "export")
 
 
+@pytest.mark.slow
+@only_in_full("tests/missions/wise/test_demo_files writes each format")
 def test_a_run_writes_its_band(run):
     [product] = summary_of(run)["products"]
     assert (product["path"], product["kind"]) == ("w4.meta", "WISE meta-data")

@@ -20,6 +20,7 @@ from bayesdist.products import (
     write_sip,
 )
 from bayesdist.products.formats.sip.rotate import pixel_matrix, rotated_sip
+from tests.reduced import only_in_full
 
 from ..products.support import StandIn, astropy_wcs, random_pixels
 from ..products.test_sip_rotate import moved_pixels
@@ -86,6 +87,8 @@ def test_written_headers_come_back_and_astropy_reads_them(sets, tmp_path, full) 
             assert_allclose(found, by_astropy(one, x, y), atol=EXACT, rtol=0)
 
 
+@pytest.mark.slow
+@only_in_full("tests/products/test_sip_rotate turns headers")
 def test_turned_headers_agree_with_astropy_at_turned_pixels(sets, full) -> None:
     """All sets, or one in twenty-five, each in one of the eight orientations; some in all."""
     x, y = random_pixels(SIZE, 50)

@@ -128,6 +128,8 @@ def test_the_error_of_the_held_tables_stays_in_the_budget(by_filter):
         assert (sigma > 0.9 * held).all() and (held > 0).all()
 
 
+@pytest.mark.slow
+@only_in_full("tables of a run are held")
 def test_a_d2imfile_serves_as_well(by_filter, release, runs):
     block = by_filter["F814W"].config.tables
     chips = by_filter["F814W"].config.chips()
@@ -374,6 +376,8 @@ def test_other_tables_of_the_detector(runs, tmp_path, monkeypatch):
     refused(tmp_path, runs["F606W"], other, words=["detector's tables", str(runs["F606W"])])
 
 
+@pytest.mark.slow
+@only_in_full("tests/app/test_run has one of matched stars")
 def test_a_run_that_has_not_converged(runs, tmp_path, monkeypatch):
     def doubtful(path):
         posterior = load_posterior(path)

@@ -20,6 +20,7 @@ from tests.app.selfcal.support import (
     write_selfcal,
 )
 from tests.app.support import cli, good, one_sentence
+from tests.reduced import only_in_full
 
 SIGMA = 0.3  # pixels, of a commanded offset
 
@@ -46,6 +47,8 @@ def offsets(truth, tmp_path_factory):
     return fitted(folder / "run", config), table
 
 
+@pytest.mark.slow
+@only_in_full("other references of the scale are run")
 def test_scale_and_rotation_from_offsets(truth, offsets):
     """The errors are those of a regression through the offsets: sigma over their lever arm."""
     results, table = offsets
@@ -108,6 +111,8 @@ def _pixel_of(model, theta):
     return np.sqrt(abs(np.linalg.det(linear)))
 
 
+@pytest.mark.slow
+@only_in_full("tests/infer/solution has the gauges")
 def test_relative_errors_are_the_same_in_every_gauge(free, offsets):
     """And absolute ones are not: that is what tells them apart."""
     maps = [
@@ -136,6 +141,8 @@ def test_a_free_direction_is_no_relative_error(free):
     assert uncertainty_map(wider, grid=(7, 7)).radius.min() > 10 * one.max()
 
 
+@pytest.mark.slow
+@only_in_full("other references of the scale are run")
 def test_the_scale_of_another_detector(truth, tmp_path):
     """The pixel is as large as was said, and as well known."""
     tie = {"mas": 1.001 * SCALE_MAS, "sigma": 3e-5, "detector": "WFC"}

@@ -10,7 +10,7 @@ import pytest
 from bayesdist.diagnose.correlated import estimate_discrepancy
 from bayesdist.infer import Rejection, build_model, fit_linear
 from tests.diagnose.correlated.skies import SIZE, matched
-from tests.reduced import case_in_full
+from tests.reduced import case_in_full, only_in_full
 
 EXPOSURES, SCATTER = 8, 3e-5
 
@@ -45,6 +45,8 @@ def test_the_scatter_of_the_scales_is_found(frames):
     assert SCATTER / 3 < np.median(found.scatter["shape"]) < 1.5 * SCATTER
 
 
+@pytest.mark.slow
+@only_in_full("errors of one exposure are those of the truth")
 @pytest.mark.parametrize(
     ("frames", "kinds"),
     [

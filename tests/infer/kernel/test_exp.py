@@ -18,6 +18,7 @@ from bayesdist.infer.kernel.blocks import BLOCK
 from bayesdist.infer.kernel.lanes import FAST, WIDTH, load, put
 from bayesdist.infer.kernel.mixture import log_of_product
 from bayesdist.infer.kernel.numeric import LOWEST, bits_of, exp_negative, from_bits, inverse_root
+from tests.reduced import only_in_full
 
 SUMS = FAST | {"reassoc"}
 
@@ -248,6 +249,8 @@ def test_inverse_root_is_within_two_units_of_the_last_digit():
     assert ulps(found, np.array([1.0 / math.sqrt(t) for t in x])).max() <= ULP
 
 
+@pytest.mark.slow
+@only_in_full("the processor that runs is tested")
 def test_inverse_root_of_a_processor_without_avx_512(tmp_path):
     """In a process that compiles for one: the test above, and that it is one."""
     test = f"{__file__}::{test_inverse_root_is_within_two_units_of_the_last_digit.__name__}"

@@ -244,6 +244,8 @@ def test_solution_and_stars_are_those_of_one_process(start, solution, compute):
         assert_close(one, other, root[:, :, None] * root[:, None])
 
 
+@pytest.mark.slow
+@only_in_full("the posterior is that of one process")
 @pytest.mark.parametrize("by_files", [False, True])
 def test_stars_are_those_of_one_process(compute, by_files, tmp_path):
     """Detections are grouped, solved and grouped again on the workers."""

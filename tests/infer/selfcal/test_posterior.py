@@ -156,6 +156,7 @@ def _solved():
     return simulated, solve(problem, simulated.theta, free, Prior.none(simulated.theta)), free
 
 
+@only_in_full("tests/infer/test_nuts has matched stars, and pulls are run")
 def test_draws_are_of_the_density():
     """Stars are drawn where their detections say, given each draw of all else."""
     import jax

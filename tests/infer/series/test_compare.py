@@ -37,6 +37,8 @@ def white(seed: int, slope: float = 0.0, n: int = 60) -> Series:
     return Series.of(epoch, values, 0.1, coefficients=("a", "b"))
 
 
+@pytest.mark.slow
+@only_in_full("a break is found where it is")
 def test_acs_before_and_after_sm4():
     """A line in each segment, and no simpler trend, as the report has it."""
     broken = [TrendModel(kind, (BREAK,)) for kind in ("step", "line+step", "lines")]
@@ -122,6 +124,7 @@ def false_claim(seed: int) -> tuple[str, bool, float]:
     return verdict.claim, is_line(verdict), float(np.abs(ratio).max())
 
 
+@only_in_full("serial correlation is seen")
 @pytest.mark.slow
 def test_an_irregular_drift_is_not_taken_for_a_line(full, capsys):
     """First-order processes without any trend: slopes of three sigma are common there."""

@@ -132,6 +132,8 @@ def test_with_frames_it_is_scipys_nonlinear_least_squares(frames):
     assert fit.chi2 == pytest.approx(2 * best.cost, rel=1e-9)
 
 
+@pytest.mark.slow
+@only_in_full("the covariance is that of numpy")
 def test_formal_covariance_describes_repeated_experiments(full):
     """Squared Mahalanobis distances to the truth, of 100 or 300 of them, are chi-square ones."""
     rng = np.random.default_rng(11)

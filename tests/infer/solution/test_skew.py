@@ -10,6 +10,7 @@ from scipy.optimize import least_squares
 from bayesdist.infer import fit_linear
 from bayesdist.infer.solution.skew import skew_of
 from bayesdist.model import DistortionModel
+from tests.reduced import only_in_full
 
 from ..support import CHIP, SIZE, UNCLIPPED, simulated
 
@@ -76,6 +77,8 @@ def test_the_free_skew_is_that_of_the_direct_fit(data):
     assert abs(skew.value - TRUE_SKEW) < 4 * skew.sigma
 
 
+@pytest.mark.slow
+@only_in_full("the angle is run")
 def test_where_the_axes_are_perpendicular_the_significance_is_normal():
     model = DistortionModel(2, (CHIP,))
     theta = np.zeros(model.n_params)

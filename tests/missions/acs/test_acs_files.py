@@ -15,6 +15,7 @@ from bayesdist.data.starlists import StarCuts, read_star_lists
 from bayesdist.errors import InputError
 from bayesdist.files.tables import read_table
 from bayesdist.missions.acs.simulate import read_acs, simulate_acs, write_acs
+from tests.reduced import only_in_full
 
 
 @pytest.fixture(scope="module")
@@ -106,6 +107,8 @@ def test_nothing_is_replaced_unasked_and_nothing_old_stays(tmp_path):
         write_acs(first, tmp_path / "file")
 
 
+@pytest.mark.slow
+@only_in_full("tests/app/campaign simulates by it")
 def test_the_command(tmp_path, capsys):
     arguments = ["simulate", "acs", "-o", str(tmp_path / "sim"), "--exposures", "3", "-q"]
     arguments += [

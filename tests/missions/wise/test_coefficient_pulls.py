@@ -12,6 +12,7 @@ from scipy.stats import binomtest, chi2, kstest, norm
 
 from bayesdist.missions.wise.published import WISE_BANDS
 from tests.infer.calibration import over_seeds
+from tests.reduced import only_in_full
 
 from .calibrations import with_pattern, without_pattern
 
@@ -31,6 +32,7 @@ def pulls(runs, band: str | None = None) -> np.ndarray:
     return np.array([r["pulls"] for r in runs if band in (None, r["band"])])
 
 
+@only_in_full("tests/infer/test_high_orders converges")
 def test_all_converge(runs):
     assert all(r["converged"] for r in runs)
 

@@ -15,6 +15,7 @@ from bayesdist.missions.wise.published import LONGEST_VECTORS, WISE_BANDS
 from bayesdist.missions.wise.simulate import wise_set
 from bayesdist.products import read_wise_meta, sip_from_solution, write_wise_meta
 from bayesdist.products.formats.common.coefficients import evaluate
+from tests.reduced import only_in_full
 
 from .calibrations import CLIP_ABS, matches_of, pairs_of
 
@@ -52,6 +53,8 @@ def calibrated(request):
     )
 
 
+@pytest.mark.slow
+@only_in_full("tests/products has the maxima")
 def test_longest_vectors(calibrated):
     """To 0.5 %; in a corner, the zeroth order suppressed."""
     band, fit = calibrated
