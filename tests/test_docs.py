@@ -94,8 +94,6 @@ def test_the_tutorial_in_python_runs(tmp_path, monkeypatch):
     assert Path("w2-run/summary.json").is_file() and Path("w2.html").is_file()
 
 
-@pytest.mark.slow
-@only_in_full("tests/real has such a camera")
 def test_the_page_on_ground_based_cameras_runs(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     run_page(DOCS / "ground_based.md")

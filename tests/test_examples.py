@@ -95,8 +95,6 @@ def test_every_example_is_run_here():
     assert {p.name for p in (ROOT / "examples").glob("*.py")} == tested
 
 
-@pytest.mark.slow
-@only_in_full("the examples of the command line are run")
 def test_the_python_example_finds_the_mixture_wider_than_the_formal_errors(tmp_path):
     """Formal errors know neither the jitter of 0.03 px nor the false matches."""
     out = printed("python_api.py", tmp_path)

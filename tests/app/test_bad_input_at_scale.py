@@ -213,7 +213,7 @@ def test_a_part_that_is_damaged_while_it_is_read(job, tmp_path, monkeypatch):
 
 
 @pytest.mark.slow
-@only_in_full("parts that vanish earlier are run")
+@only_in_full("parts that are damaged meanwhile are run")
 def test_a_part_that_vanishes_before_it_is_written_about(job, tmp_path, monkeypatch):
     """When what is said of each star is written: the draws stay, and the stage can be repeated."""
     from tests.app.support import cli, good

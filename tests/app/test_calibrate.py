@@ -132,8 +132,6 @@ def test_files_that_changed_since_are_not_those_of_the_run(finished, tmp_path):
     assert not (tmp_path / "run").exists()
 
 
-@pytest.mark.slow
-@only_in_full("tests/app/test_prior_calibration has earlier calibrations")
 def test_an_earlier_calibration_may_be_named_relatively(finished, tmp_path, monkeypatch):
     """The earlier run halves the errors of the same stars, and is found when the run is opened."""
     monkeypatch.chdir(finished.path.parent)
@@ -145,7 +143,7 @@ def test_an_earlier_calibration_may_be_named_relatively(finished, tmp_path, monk
 
 
 @pytest.mark.slow
-@only_in_full("errors by magnitude are run")
+@only_in_full("tests/app/test_kinds_of_data has errors by magnitude")
 def test_stars_by_magnitude_are_found_without_being_asked():
     stars, _ = simulated(800, mag=np.linspace(12.0, 18.0, 800))
     bare = stars.with_columns(sigma_u=None, sigma_v=None)

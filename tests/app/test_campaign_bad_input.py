@@ -141,8 +141,6 @@ def test_without_roll_angles_those_of_the_matches_do(campaign):
 # -- chips ----------------------------------------------------------------------------------------
 
 
-@pytest.mark.slow
-@only_in_full("tests/data has exposures with one chip")
 @pytest.mark.parametrize(
     ("name", "missing"),
     [
@@ -437,7 +435,7 @@ def test_a_catalogue_without_motions_is_said(campaign, names, words):
 
 
 @pytest.mark.slow
-@only_in_full("tests/data has such a catalogue")
+@only_in_full("tests/data/test_campaign has stars that move")
 def test_a_catalogue_without_motions_that_stars_outrun(campaign):
     """Over twelve years 0.01 px/yr are far more than centroids."""
     names = ["pm_u", "pm_v", "sigma_pm_u", "sigma_pm_v"]

@@ -174,8 +174,6 @@ def test_an_exposure_that_went_wrong_is_named(run, folder, tmp_path, monkeypatch
     assert found.level == "fail" and f"exposure {name}, held out whole" in found.verdict
 
 
-@pytest.mark.slow
-@only_in_full("exposures that are held out confirm it")
 def test_later_exposures_confirm_the_release(run, later, tmp_path) -> None:
     result = good("monitor", run, later, "-o", tmp_path / "out")
     assert result.out.startswith("The released solution still describes the new matches")

@@ -31,7 +31,7 @@ from tests.app.support import (
     summary_of,
     write_config,
 )
-from tests.reduced import case_in_full, only_in_full
+from tests.reduced import case_in_full
 
 SIDE, PIXEL = 1024, 0.05  # pixels, arcsec
 MIDDLE = (SIDE + 1) / 2
@@ -304,8 +304,6 @@ def test_both_parities_match_and_agree_with_the_truth(tmp_path, parity):
     assert 1e-4 < stats.chi2.sf(value, free) < 1 - 1e-4
 
 
-@pytest.mark.slow
-@only_in_full("both parities are found")
 def test_a_parity_that_is_given_is_the_only_one(tmp_path):
     config = write(tmp_path / "in", 1, parity="direct")
     found = summary_of(staged(config, "match"))["matching"]
@@ -314,8 +312,6 @@ def test_a_parity_that_is_given_is_the_only_one(tmp_path):
     unmatched(config, "its mirror image does match", "campaign.parity = 'direct'")
 
 
-@pytest.mark.slow
-@only_in_full("tests/data/test_campaign has a wrong field")
 def test_another_field_is_refused_in_both_parities(tmp_path):
     def elsewhere(table):
         rng = np.random.default_rng(5)

@@ -18,7 +18,6 @@ from bayesdist.model import Chip, DistortionModel, TimeDependence
 from bayesdist.products import idctab_from_solution, write_idctab
 from bayesdist.simulate import simulate_matches
 from tests.app.support import cli, good, one_sentence, refused
-from tests.reduced import only_in_full
 
 SIZE = (512, 256)
 
@@ -79,8 +78,6 @@ def test_sip_headers_against_astropy(tmp_path) -> None:
     assert summary["chi2"] is None and summary["significance_of"] == "none"
 
 
-@pytest.mark.slow
-@only_in_full("tests/assess compares calibrations")
 def test_a_run_with_itself_and_with_its_own_products(finished, tmp_path) -> None:
     out = good("compare", finished.path, finished.path / "posterior.nc").out
     assert out.startswith("The calibrations agree to rounding.")

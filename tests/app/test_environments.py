@@ -172,8 +172,6 @@ def test_a_run_is_the_same_where_an_i_has_no_dot(job, usual, tmp_path):
     as_usual(tmp_path / "run", usual)
 
 
-@pytest.mark.slow
-@only_in_full("all surroundings at once have such a mask")
 def test_files_of_a_run_are_for_its_user_alone_if_that_is_wanted(usual, tmp_path):
     """And for others to read where that is: temporary files are made for their owner only."""
     run = shutil.copytree(usual, tmp_path / "run")
@@ -236,8 +234,6 @@ class ReadOnly:
             pytest.skip(f"no folder can be mounted read-only here ({tried.stderr.strip()})")
 
 
-@pytest.mark.slow
-@only_in_full("all surroundings at once are run")
 def test_a_run_in_a_read_only_folder_can_be_read(job, usual, tmp_path):
     """What only reads works; what would write says so and does nothing."""
     run = shutil.copytree(usual, tmp_path / "run")

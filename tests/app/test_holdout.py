@@ -84,8 +84,6 @@ def test_stages_by_themselves_set_the_same_stars_aside(run, tmp_path):
     assert (folder / "holdout.ecsv").read_bytes() == (whole / "holdout.ecsv").read_bytes()
 
 
-@pytest.mark.slow
-@only_in_full("tests/diagnose draws them from the seed")
 def test_a_resumed_run_sets_the_same_stars_aside(run, tmp_path):
     config, whole = run
     folder = partly_run(tmp_path / "run", config, "fit")

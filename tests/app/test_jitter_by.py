@@ -67,8 +67,6 @@ def split(tmp_path_factory):
     return config, folder / "run", result.err
 
 
-@pytest.mark.slow
-@only_in_full("tests/coverage has one scale for both axes")
 def test_both_axes_cover_as_predicted(split):
     summary = summary_of(split[1])
     assert summary["sampler"]["converged"] and summary["holdout"]["level"] == "pass"

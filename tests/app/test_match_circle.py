@@ -22,7 +22,7 @@ from tests.app.support import (
     summary_of,
     write_job,
 )
-from tests.reduced import only_in_full
+from tests.reduced import case_in_full, only_in_full
 
 NAMED = {"u_nominal": "u_nominal", "v_nominal": "v_nominal"}
 RADIUS = 0.05
@@ -157,9 +157,9 @@ def written(matches, folder):
     return [folder / name for name in FILES]
 
 
-@pytest.mark.slow
-@only_in_full("tests/app/test_calibrate compares such runs")
-@pytest.mark.parametrize("sigma", ["columns", "by_magnitude"])
+@pytest.mark.parametrize(
+    "sigma", ["columns", case_in_full("by_magnitude", instead="errors in columns are read alike")]
+)
 def test_object_file_and_command_line_agree_to_the_bit(stated, tmp_path, sigma, no_report):
     run = calibrated(stated, sigma)
     assert run.posterior.mixture.match_radius == RADIUS
@@ -180,8 +180,6 @@ def test_object_file_and_command_line_agree_to_the_bit(stated, tmp_path, sigma, 
     assert ("match_circle" in summary_of(tmp_path / "run")["outliers"]) == (sigma == "columns")
 
 
-@pytest.mark.slow
-@only_in_full("tests/app/test_calibrate compares such runs")
 def test_a_saved_run_is_calibrated_again_with_the_same_result(stated, tmp_path):
     run = calibrated(stated)
     folder = run.save(tmp_path / "run")

@@ -246,8 +246,6 @@ def test_runs_without_periods_have_no_such_section(finished):
     assert "periods" not in summary_of(finished.path)
 
 
-@pytest.mark.slow
-@only_in_full("a change of the polynomial is found")
 def test_a_pattern_that_no_polynomial_follows_is_found(tmp_path):
     matches, _ = dated(24_000, pattern=0.01)
     found = summary_of(assessed(tmp_path, matches))["periods"]

@@ -228,7 +228,7 @@ PLACED = {
 
 
 @pytest.mark.slow
-@only_in_full("tests/products has the inverse of each file")
+@only_in_full("the inverse row of one file is run")
 @pytest.mark.parametrize(
     ("key", "settings", "size"),
     [

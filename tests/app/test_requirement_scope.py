@@ -57,7 +57,7 @@ def validated(run, text, code):
 
 
 @pytest.mark.slow
-@only_in_full("tests/assess has the scopes")
+@only_in_full("tests/assess/test_requirement_scope has the scopes")
 def test_scopes_are_judged_and_kept(run, capsys):
     inner, pair, corner = validated(run, SCOPED, 4)
     assert [m["verdict"] for m in (inner, pair, corner)] == ["met", "missed", "met"]

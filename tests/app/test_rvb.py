@@ -60,8 +60,6 @@ def test_a_run_of_one_band_out_of_two(tmp_path):
     assert "done before" in good("run", config, "-o", tmp_path / "run", "--resume").err
 
 
-@pytest.mark.slow
-@only_in_full("tests/data selects pairs on disk")
 @pytest.mark.usefixtures("no_report", "on_disk")
 def test_on_disk_the_pairs_are_selected_once(tmp_path, monkeypatch):
     table = vstack([rvb_pairs(), rvb_pairs(300, "W1", seed=2)])

@@ -206,8 +206,6 @@ def test_pairs_in_the_centre_say_nothing_of_the_corners(tmp_path):
 CIRCLE = {"model": "uniform", "match_radius": 3.0}
 
 
-@pytest.mark.slow
-@only_in_full("pairs in the centre alone are refused")
 @pytest.mark.usefixtures("no_report")
 @pytest.mark.parametrize(
     "outliers",

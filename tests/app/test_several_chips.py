@@ -39,7 +39,6 @@ from tests.app.support import (
     write_config,
     write_job,
 )
-from tests.reduced import only_in_full
 
 pytestmark = pytest.mark.usefixtures("figures_made")
 
@@ -305,8 +304,6 @@ def test_structure_is_looked_for_on_each_chip(run):
     assert not found["significant"]  # the model is right
 
 
-@pytest.mark.slow
-@only_in_full("tests/diagnose has structure on chips")
 def test_structure_on_the_second_chip_is_named(tmp_path):
     table = stars()
     high = (table["chip"] == 1) & (np.abs(table["x"] - 3000) < 300)

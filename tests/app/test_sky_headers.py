@@ -119,7 +119,7 @@ def test_positions_are_those_of_the_truth(crval, parity, tmp_path, rng) -> None:
 
 
 @pytest.mark.slow
-@only_in_full("SIP headers are compared")
+@only_in_full("tests/products/test_write_calibration compares them with astropy")
 def test_headers_of_other_kinds_are_on_the_sky_of_the_truth(tmp_path, rng) -> None:
     """TPV and CPDIS by astropy.wcs; each has its own error, and the total with it."""
     truth = camera((83.8, -5.4), -1)

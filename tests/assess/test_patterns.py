@@ -29,7 +29,7 @@ from bayesdist.simulate.patterns import (
 )
 from tests.dithered_fields import simulate_dithers, smooth_distortion
 from tests.infer.selfcal.fields import aligned
-from tests.reduced import case_in_full, only_in_full
+from tests.reduced import case_in_full
 
 SIZE = (1024.0, 1024.0)
 CHIP = Chip(1, "C", SIZE, (512.0, 512.0))
@@ -66,8 +66,6 @@ def _deviation(model, truth, free, rng):
     return solved[: len(free)]
 
 
-@pytest.mark.slow
-@only_in_full("tests/infer/selfcal has pulls")
 @pytest.mark.parametrize(
     "rolls",
     [
@@ -101,7 +99,6 @@ def test_expected_covariance_is_the_scatter_of_solutions(rolls, full, capsys):
     assert (ratio > np.sqrt(z[0] / times)).all() and (ratio < np.sqrt(z[1] / times)).all()
 
 
-@only_in_full("patterns without them are run")
 @pytest.mark.slow
 def test_false_detections_cost_what_is_expected(full, capsys):
     """Campaigns with 5 % false detections, by the whole self-calibration."""

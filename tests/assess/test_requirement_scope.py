@@ -14,7 +14,7 @@ from bayesdist.data import MagnitudeErrors
 from bayesdist.diagnose.significance import clopper_pearson
 from bayesdist.errors import InputError
 from bayesdist.model import Chip, DistortionModel, TimeDependence
-from tests.reduced import case_in_full, only_in_full
+from tests.reduced import case_in_full
 
 from .by_draws import margins_by_draws
 
@@ -97,8 +97,6 @@ def test_a_common_offset_is_no_relative_error(solution_of):
     assert margin_of(solution, Requirement("r", "max", 1e-6), terms=terms).probability_met == 0.0
 
 
-@pytest.mark.slow
-@only_in_full("other scopes are run")
 @pytest.mark.parametrize("statistic", ["max", case_in_full("u_max", instead="max is judged")])
 def test_the_largest_relative_error_of_a_scale_is_that_from_edge_to_edge(solution_of, statistic):
     solution = with_sigma(solution_of, FLAT, u_1_0=S)

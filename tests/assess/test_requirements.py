@@ -13,7 +13,7 @@ from bayesdist.errors import InputError
 from bayesdist.infer.posterior.checks import scatter_too_small
 from bayesdist.model import Chip, DistortionModel
 from bayesdist.utils.checks import EITHER, LARGER, Check
-from tests.reduced import case_in_full, only_in_full
+from tests.reduced import case_in_full
 
 from .by_draws import margins_by_draws
 
@@ -75,8 +75,6 @@ N = 201
 RANKS = {"p50": 101, "p90": 181, "p95": 191, "p99": 199, "max": 201}
 
 
-@pytest.mark.slow
-@only_in_full("the statistics have closed forms")
 @pytest.mark.parametrize(
     "axis", ["", *(case_in_full(axis, instead="both axes are judged") for axis in ("u_", "v_"))]
 )
@@ -379,8 +377,6 @@ def catalogue(name: str, sigma: float) -> UserTerm:
     return UserTerm(name, "systematic", sigma, sigma, "pix", varies=True)
 
 
-@pytest.mark.slow
-@only_in_full("one term is run")
 def test_two_terms_that_vary_are_two_fields(exact):
     """In quadrature, as one of their common size: limits between the two decide alike."""
     limits = [Requirement(f"{limit}", "rms", limit) for limit in (0.012, 0.016, 0.02, 0.024)]

@@ -36,8 +36,6 @@ def evenly(n, rng):
     return np.repeat(NUMBERS, n), rng.uniform(1, 4096, 2 * n), rng.uniform(1, 2048, 2 * n)
 
 
-@pytest.mark.slow
-@only_in_full("the terms have their closed forms")
 @threadpool_limits.wrap(limits=1, user_api="blas")
 def test_the_budget_is_the_scatter_over_catalogues(full):
     """From the beginning, many times: catalogue, motions, centroids, fit, positions on a grid."""

@@ -241,8 +241,6 @@ def turned(one):
     return replace(one, x=np.where(one.chip == 1, 4097.0 - one.x, one.x))
 
 
-@pytest.mark.slow
-@only_in_full("exposures that lie elsewhere are found")
 def test_a_chip_that_lies_elsewhere_is_said(rng):
     catalog, lists, log, _, _ = campaign(rng, 5)
     found = match_campaign((turned(lists[0]), *lists[1:]), log, catalog, start)
@@ -253,8 +251,6 @@ def test_a_chip_that_lies_elsewhere_is_said(rng):
         match_campaign([turned(one) for one in lists], log, catalog, start)
 
 
-@pytest.mark.slow
-@only_in_full("tests/app/campaign has such exposures")
 def test_odd_exposures_are_named_and_others_are_not(rng):
     catalog, lists, log, _, _ = campaign(rng, 8, stars=8000)
     # the lists of this sky know no aberration

@@ -47,7 +47,7 @@ def test_small_samples_are_unbiased(rng):
 
 
 @pytest.mark.slow
-@only_in_full("the errors are compared with the truth")
+@only_in_full("the truth comes back from large samples")
 def test_what_a_weighted_fit_takes_up_is_given_back(rng):
     # order 5 in x and y by itself, weights 1 / sigma^2: 42 parameters from 400 stars of two kinds
     n, p = 400, 21

@@ -15,7 +15,6 @@ from bayesdist.data import (
     read_matchup,
 )
 from bayesdist.errors import InputError
-from tests.reduced import only_in_full
 
 SHIFT = np.array([137.3, -55.1])
 
@@ -64,8 +63,6 @@ def test_the_rate_of_false_matches_is_what_happens(rng):
     assert hits > 100
 
 
-@pytest.mark.slow
-@only_in_full("fewer are matched")
 def test_a_million_detections_in_seconds(rng, full):
     """Or a fifth of them in a fifth of the time."""
     n = 1_000_000 if full else 200_000

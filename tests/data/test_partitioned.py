@@ -280,8 +280,6 @@ def test_the_origin_and_units(rng, tmp_path, monkeypatch):
         open_matches(path, unit="pix", tangent_point=(1.0, 1.0))
 
 
-@pytest.mark.slow
-@only_in_full("tests/data reads epochs of one file")
 def test_epochs_in_all_their_forms(rng, tmp_path, monkeypatch):
     days = np.datetime64("2003-02-01") + rng.integers(0, 4000, 300)
     forms = {

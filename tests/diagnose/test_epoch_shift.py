@@ -100,8 +100,6 @@ def test_dates_of_lists_of_hst_follow_from_gaia(data_dir, day, epoch):
     assert abs(one.years - (epoch - 2015.5)) < 0.25
 
 
-@pytest.mark.slow
-@only_in_full("test_sizes has the rate of alarms")
 def test_right_epochs_are_left_alone():
     assert not any(found(stars(0.0, seed)).significant for seed in range(40))
 

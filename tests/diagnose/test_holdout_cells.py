@@ -5,14 +5,12 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-import pytest
 from scipy.stats import binom, kstest
 
 from bayesdist.data import Matches
 from bayesdist.diagnose.holdout.predictive import Predictive
 from bayesdist.diagnose.holdout.validation import holdout_validation
 from bayesdist.model import Chip, DistortionModel, LookupTable
-from tests.reduced import only_in_full
 
 SIZE, CELL = (1000.0, 800.0), (25.0, 25.0)
 OWN, LOCAL = 0.02, 0.006
@@ -54,8 +52,6 @@ def test_stars_that_are_taken_for_independent_would_be_alarms() -> None:
         assert holdout_validation(alone, held(seed)).p_value < 1e-6
 
 
-@pytest.mark.slow
-@only_in_full("cells of the usual size raise none")
 def test_few_large_cells_raise_no_alarm_about_distributions() -> None:
     """63 cells, fewer than three for each bin of probabilities: what a run of 900 stars has."""
     side, local = (120.0, 120.0), 0.002

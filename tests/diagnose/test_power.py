@@ -168,8 +168,6 @@ def drifting(rate: float, power: int):
     return pattern
 
 
-@pytest.mark.slow
-@only_in_full("tests/diagnose/test_time has drifts")
 def test_drift_and_its_curvature_are_found():
     still, moving = Scene(2000, 2, "shift", 12), Scene(2000, 2, "shift", 12, time=TIME)
     found = [still.with_pattern(k, drifting(0.01, 1)) for k in FEW]

@@ -7,7 +7,7 @@ import pytest
 
 from bayesdist.diagnose import score_tests
 from bayesdist.infer import Rejection, fit_linear
-from tests.reduced import case_in_full, only_in_full
+from tests.reduced import case_in_full
 
 from ..infer.support import residual_of
 from .support import SIGMA, Scene, by_name, student, unequal
@@ -102,8 +102,6 @@ def test_a_radius_far_beyond_the_true_matches_cuts_false_ones_only():
     assert found.p_value > 0.05
 
 
-@pytest.mark.slow
-@only_in_full("cuts are recognised")
 def test_smallest_is_what_is_just_found():
     """A cut that takes a little more than that is found, one that takes a third of it is not."""
     scene = Scene(4000, 2)

@@ -11,7 +11,7 @@ from scipy import stats
 from bayesdist.diagnose.score.gap import visit_codes
 from bayesdist.model import TimeDependence
 from bayesdist.utils.limits import SCORE_TESTS
-from tests.reduced import case_in_full, only_in_full
+from tests.reduced import case_in_full
 
 from .. import seeds
 from .dated import DRIFT, Dated
@@ -65,16 +65,12 @@ def test_a_drift_that_is_fitted_is_no_finding():
     assert free.of_time(0)["gap"].p_value > 1e-3
 
 
-@pytest.mark.slow
-@only_in_full("a gap that opens is found")
 def test_a_gap_that_is_restless_does_not_drift():
     """Exposures deviate by as much as a drift would move in three years: that is noise here."""
     p = np.array([RESTLESS.of_time(k)["gap"].p_value for k in range(12)])
     assert p.min() > 1e-3 and 0.2 < p.mean() < 0.8
 
 
-@pytest.mark.slow
-@only_in_full("drifts are found")
 def test_stars_that_move_are_found():
     """A fifth of them, by as much in a year as an exposure's error."""
     found = [Dated(moving=0.2, speed=0.02).tests(k) for k in FEW]
@@ -115,7 +111,6 @@ def probabilities(name: str, seed: int) -> dict[str, float]:
     return {key: one.p_value for key, one in NULL[name].of_time(seed).items()}
 
 
-@only_in_full("test_sizes has them")
 @pytest.mark.slow
 def test_probabilities_are_even(full):
     """Where nothing drifts and nothing moves: of 1 % at most 1 %, and evenly."""

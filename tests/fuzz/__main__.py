@@ -17,7 +17,7 @@ from tests.fuzz.mutation import MUTATIONS
 from tests.fuzz.verdicts import table_of, tried
 
 BEGUN = 1000  # cases, from which on runs are begun for them
-FEW = 100  # cases: with fewer, one of those that failed once is tried for each mutation
+SHORT = 100  # cases: with fewer, one of those that failed once is tried for each mutation
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -34,7 +34,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         made = inputs(Path(folder), begun=given.cases >= BEGUN or bool(given.only))
         known = [one for one in made if given.only in f"{one.kind} {one.name}"]
         cases = kept()
-        if given.cases < FEW and not given.kept:
+        if given.cases < SHORT and not given.kept:
             cases = list({case.mutation: case for case in cases}.values())
         if not given.kept:
             cases += drawn(known, given.cases, given.seed)

@@ -11,7 +11,6 @@ from bayesdist.errors import InputError
 from bayesdist.infer.solution.linear import NO_REJECTION
 from bayesdist.products.formats.common.document import BuildOptions
 from bayesdist.products.registry import build, product_settings, read_calibration
-from tests.reduced import only_in_full
 
 ORDER = 12
 CHIP = bd.Chip(1, "MICADO", (2048.0, 2048.0), (1024.5, 1024.5))
@@ -55,8 +54,6 @@ def test_the_fit_is_that_of_least_squares(stars, fit):
         np.testing.assert_allclose(fit.sigma[part], sigma, rtol=1e-6)
 
 
-@pytest.mark.slow
-@only_in_full("lower orders are sampled")
 def test_the_posterior_holds(stars, fit):
     """With jitter and false matches in the model: near the fit, errors as they should be."""
     _, matches, theta = stars

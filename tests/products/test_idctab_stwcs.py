@@ -10,7 +10,7 @@ import pytest
 from numpy.testing import assert_allclose
 
 from bayesdist.products import IdcTab, idctab_from_solution, write_idctab
-from tests.reduced import case_in_full, only_in_full
+from tests.reduced import case_in_full
 
 from .stwcs_offline import archived_sky, gnomonic, separation_mas, sky
 from .support import F606W, wfc_solution
@@ -65,8 +65,6 @@ def test_same_sky_as_the_original(real, data_dir, tmp_path, pixels, date, filter
         assert separation_mas(ours[chip], original[chip]).max() < 0.01
 
 
-@pytest.mark.slow
-@only_in_full("real files are compared")
 def test_the_comparison_would_see_a_small_change(real, tmp_path, pixels) -> None:
     """facts: a change of CX22 by 2e-9 moves the sky by 8.38 mas."""
     solution = wfc_solution(real)

@@ -20,7 +20,7 @@ from bayesdist.products import IdcTab, idctab_from_solution, read_idctab, write_
 from bayesdist.products.formats.lookup.d2im import read_d2im, write_d2im
 from bayesdist.products.formats.lookup.file import LookupFile, write_lookup_file
 from bayesdist.products.formats.lookup.npol import read_npol, write_npol
-from tests.reduced import case_in_full, only_in_full
+from tests.reduced import case_in_full
 
 from .stwcs_offline import gnomonic, separation_mas, sky, solutions
 from .support import F606W, wfc_solution
@@ -88,8 +88,6 @@ def farthest_mas(theirs, idctab, pixels, tables, date=None) -> float:
     return worst
 
 
-@pytest.mark.slow
-@only_in_full("the detector table alone is exact")
 @pytest.mark.parametrize("date", DATES)
 def test_detector_and_filter_tables_together(tmp_path, idctab, pixels, date) -> None:
     path, tab = idctab

@@ -16,7 +16,6 @@ from bayesdist.missions.acs.simulate import acs_solution
 from bayesdist.model import DistortionModel, TimeDependence
 from bayesdist.products import IdcTab, idctab_from_solution, read_idctab
 from bayesdist.products.formats.idctab.drift import storable
-from tests.reduced import only_in_full
 
 from .support import (
     F606W,
@@ -149,8 +148,6 @@ def test_derivatives_are_those_of_the_fit(truth) -> None:
             assert_allclose((up - down) / 2e-3, expected, rtol=1e-5, atol=1e-9)
 
 
-@pytest.mark.slow
-@only_in_full("the reference is that of stwcs")
 def test_error_of_the_reference_is_what_its_terms_scatter_by(truth) -> None:
     """Maps whose terms are all wrong by the same amount: the stated covariance covers."""
     n, sigma = 80, 4e-3

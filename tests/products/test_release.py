@@ -22,7 +22,7 @@ from bayesdist.products import idctab_from_solution, lint_idctab, read_idctab
 from bayesdist.products.formats.idctab.drift import storable
 from bayesdist.products.formats.idctab.hst import combination_of
 from bayesdist.products.release import Period, Release, write_release
-from tests.reduced import case_in_full, only_in_full
+from tests.reduced import case_in_full
 
 from .acs_offline import Pointing, to_sky
 from .acs_offline import corrected as corrected_by_stwcs
@@ -224,8 +224,6 @@ def test_inverse_rows_lead_back(tab, chip, filter) -> None:
     assert stated < 0.01
 
 
-@pytest.mark.slow
-@only_in_full("sigmas of forward rows are run")
 def test_sigma_of_inverse_rows(solutions, orientation) -> None:
     """Against inverses fitted anew after small steps of the solution."""
     turned = turned_by(solutions["F606W"], orientation)
@@ -248,8 +246,6 @@ def test_sigma_of_inverse_rows(solutions, orientation) -> None:
     assert np.median(np.abs(found / stated - 1)) < 0.05
 
 
-@pytest.mark.slow
-@only_in_full("one filter is run")
 def test_covariance_over_filters_by_steps(solutions) -> None:
     """COVAR of both filters and chips, from steps of all that it comes from.
 

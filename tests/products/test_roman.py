@@ -13,7 +13,6 @@ from numpy.testing import assert_allclose
 
 from bayesdist.errors import FormatError, InputError
 from bayesdist.products import registry
-from tests.reduced import only_in_full
 
 from .v2v3 import (
     ANGLE,
@@ -69,8 +68,6 @@ def changed(plain):
 # -- read back ------------------------------------------------------------------------------------
 
 
-@pytest.mark.slow
-@only_in_full("tests/products reads tables back")
 def test_tables_are_constant_beyond_their_nodes_and_inverted(tabulated):
     """By astropy alone: pixels outside the outermost nodes too, and back to where they were."""
     calibration, built = tabulated

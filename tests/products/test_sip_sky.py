@@ -12,7 +12,6 @@ import bayesdist as bd
 from bayesdist.errors import InputError
 from bayesdist.infer import load_fit, save_fit
 from bayesdist.products import lint_sip, read_sip, sip_from_solution, sip_header, write_sip
-from tests.reduced import only_in_full
 
 from .support import StandIn, astropy_wcs, random_pixels, some_solution
 
@@ -107,8 +106,6 @@ def test_a_pole_as_crval_is_turned_as_it_should() -> None:
         assert worst(solution, sip, (ra, 89.99)) < 2e-5 * PIXEL
 
 
-@pytest.mark.slow
-@only_in_full("sigmas in pixels are those of draws")
 def test_sigmas_are_those_of_draws_on_the_sky(full: bool) -> None:
     solution = some_solution(3, unit="mas", pixel=100.0, angle=0.1, offset=(3e6, 2e6))
     point = {"tangent_point": (150.0, 30.0)}

@@ -65,8 +65,6 @@ def test_stars_that_the_catalogue_repeats_are_named(data_dir) -> None:
         bd.read_matches(path, columns=columns, unit="arcsec", sigma=SIGMA)
 
 
-@pytest.mark.slow
-@only_in_full("the twin's fraction is found")
 def test_the_posterior_s_false_pairs_are_as_many_as_geometry_implies(real) -> None:
     count, error = false_by_density(real.radius("mixture"))
     assert real.n_false > 0.5 * len(real.outlier)

@@ -28,7 +28,7 @@ from bayesdist.report.plots.posterior import (
 from bayesdist.report.plots.residuals import MixtureCurve
 from bayesdist.report.sections.run.data import _density
 from bayesdist.report.sections.run.residuals import _histograms
-from tests.reduced import case_in_full, only_in_full
+from tests.reduced import case_in_full
 
 from .plots import figures_of
 from .runs import SIZE, report_input
@@ -138,8 +138,6 @@ def _drawn_lengths(quiver):
     return np.array(out)
 
 
-@pytest.mark.slow
-@only_in_full("other figures have keys")
 @pytest.mark.parametrize(
     ("unit", "size"), [("pix", (1016.0, 1016.0)), ("arcsec", (4096.0, 2048.0))]
 )

@@ -12,7 +12,6 @@ from bayesdist.diagnose.residuals.binned import binned_residuals
 from bayesdist.report.figures.arrows import CHANCE, significant_cells
 from bayesdist.report.plots.residuals import MixtureCurve
 from bayesdist.report.sections.run.posterior import outlier_table
-from tests.reduced import only_in_full
 
 
 def test_counts_add_up_to_the_stars():
@@ -39,8 +38,6 @@ def test_the_table_says_what_its_errors_hold_for(converged, model, said):
     assert ("of this shape" in note) == (said is not None)
 
 
-@pytest.mark.slow
-@only_in_full("few errors are run")
 def test_many_errors_in_few_steps_are_the_sum_over_stars():
     sigma = np.random.default_rng(2).lognormal(-3.0, 0.7, 20_000)
     edges = np.linspace(-0.3, 0.3, 61)

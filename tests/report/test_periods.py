@@ -19,7 +19,6 @@ from bayesdist.report.figures.commands import order_comparison
 from bayesdist.report.figures.style import INK, PALE
 from bayesdist.report.run_report import render_report
 from bayesdist.report.sections.run.periods import period_tables
-from tests.reduced import only_in_full
 
 from .plots import plot_of
 from .runs import report_input
@@ -55,8 +54,6 @@ def designed(x, y):
     return np.stack([X**i * Y**j for i, j in MODEL.basis().terms], axis=1)
 
 
-@pytest.mark.slow
-@only_in_full("the numbers of the page are compared")
 def test_vectors_are_the_difference_of_the_two_models(found, pairs):
     """Dark where both axes together are beyond 2 sigma, by the covariance of two separate fits."""
     cov = 0

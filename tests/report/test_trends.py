@@ -9,7 +9,6 @@ import pytest
 
 from bayesdist.infer.stars.stars import prepare
 from bayesdist.report.plots.trends import means_in_bins
-from tests.reduced import only_in_full
 
 from .plots import plot_of
 from .runs import report_input
@@ -93,8 +92,6 @@ def test_coverage_counts_the_stars_that_are_probably_true(converged):
     assert image.get_array().sum() == true.sum() < len(converged.stars)
 
 
-@pytest.mark.slow
-@only_in_full("the numbers of the page are compared")
 def test_pixel_scale_is_the_root_of_the_area():
     run = report_input(unit="arcsec", scale=0.05)
     plot = plot_of(run, "pixel_scale")

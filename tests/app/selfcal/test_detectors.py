@@ -28,7 +28,6 @@ from tests.app.selfcal.support import (
 )
 from tests.app.support import refused
 from tests.infer.selfcal.fields import SIZE, chips, field
-from tests.reduced import only_in_full
 
 EPOCHS = np.linspace(2002.0, 2006.0, 8)
 RA, DEC = 17.5, -72.0
@@ -122,8 +121,6 @@ def _again(truth, theta):
     return replace(truth, detections=replace(d, x=x, y=y).select(inside))
 
 
-@pytest.mark.slow
-@only_in_full("tests/infer/selfcal has motions")
 def test_motions_of_stars_that_do_not_move(tmp_path):
     """Proper motions come out as zero, by their errors, but for a motion of the whole sky.
 
@@ -156,8 +153,6 @@ def test_motions_of_stars_that_do_not_move(tmp_path):
     assert "pm_u" in Table.read(_stars(results)).colnames
 
 
-@pytest.mark.slow
-@only_in_full("tests/infer/selfcal has parallaxes")
 def test_parallaxes(tmp_path):
     """They come out as they are, by their errors, but for one that all stars have."""
     truth, rng = small(disturbed=0.0), np.random.default_rng(8)

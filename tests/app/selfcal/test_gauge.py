@@ -112,7 +112,7 @@ def _pixel_of(model, theta):
 
 
 @pytest.mark.slow
-@only_in_full("tests/infer/solution has the gauges")
+@only_in_full("tests/infer/selfcal/test_expected has every gauge")
 def test_relative_errors_are_the_same_in_every_gauge(free, offsets):
     """And absolute ones are not: that is what tells them apart."""
     maps = [

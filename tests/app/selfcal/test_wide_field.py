@@ -10,7 +10,7 @@ from bayesdist.diagnose.selfcal.score import selfcal_score_tests
 from tests.app.selfcal.support import fitted, write_selfcal
 from tests.app.support import good
 from tests.infer.selfcal.wide import ARCSEC, MIDDLE, N, observed, on, tangent_plane
-from tests.reduced import case_in_full, only_in_full
+from tests.reduced import case_in_full
 
 SEED = 5
 
@@ -30,8 +30,6 @@ def _config(folder, scale_mas, **more):
     )
 
 
-@pytest.mark.slow
-@only_in_full("tests/infer/selfcal/test_tangent has the planes")
 @pytest.mark.parametrize(
     "scale_mas",
     [1000 * ARCSEC, case_in_full(None, instead="pixels of known size are run")],

@@ -46,7 +46,7 @@ def test_the_scatter_of_the_scales_is_found(frames):
 
 
 @pytest.mark.slow
-@only_in_full("errors of one exposure are those of the truth")
+@only_in_full("tests/diagnose/test_exposure_fields has the errors of one exposure")
 @pytest.mark.parametrize(
     ("frames", "kinds"),
     [

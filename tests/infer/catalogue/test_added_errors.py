@@ -75,8 +75,6 @@ def test_equal_errors_give_the_unbiased_variance():
     np.testing.assert_allclose(found.variance[0], true, rtol=2e-3)
 
 
-@pytest.mark.slow
-@only_in_full("equal axes are run")
 def test_the_restricted_likelihood_is_unbiased_on_average(full):
     """60 stars, 15 parameters: without what the fit takes up variances would be 25 % too small."""
     n = 40 if full else 15

@@ -115,8 +115,6 @@ def test_from_the_first_date_on_the_scan_is_the_test_itself() -> None:
     assert date.gain[0] == pytest.approx(change.test.chi2, rel=1e-3)
 
 
-@pytest.mark.slow
-@only_in_full("monitoring has no change with other catalogues")
 def test_a_catalogue_that_both_sides_share_is_no_change(full) -> None:
     """All exposures see the same stars in the same places, whose errors are twice the centroids'.
 

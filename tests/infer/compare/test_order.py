@@ -18,7 +18,6 @@ from bayesdist.infer.stars.stars import prepare
 from bayesdist.missions.wise.simulate import wise_solution
 from bayesdist.model import Chip, DistortionModel
 from bayesdist.simulate import simulate_matches
-from tests.reduced import only_in_full
 
 from ..support import CHIP, SIZE, TWO_CHIPS, UNCLIPPED, legendre_design, simulated, truth_of
 
@@ -153,7 +152,6 @@ def assert_error_is_the_scatter(gain):
     assert abs(np.log(quoted / scatter)) < 0.05 + 4 / np.sqrt(2 * len(gain))
 
 
-@only_in_full("the lower order is run")
 @pytest.mark.slow
 @pytest.mark.parametrize("size", [1.0, 6.0])
 def test_error_of_a_gain_where_the_higher_order_is_true(full, size):
@@ -244,8 +242,6 @@ def test_files_give_what_memory_gives(wise, tmp_path):
     assert on_disk.n_used == in_memory.n_used
 
 
-@pytest.mark.slow
-@only_in_full("the order that is true is found")
 def test_structure_that_no_order_describes_is_named():
     """A pattern of 5 x 5 blocks, as the partition of WISE's point-spread functions leaves."""
     model, theta = wise_solution("W2")

@@ -21,7 +21,6 @@ from bayesdist.infer.equations.scaled import chi_square
 from bayesdist.infer.stars.stars import prepare
 from bayesdist.model import DistortionModel, TimeDependence
 from tests.infer.support import CHIP, SIZE, TWO_CHIPS, UNCLIPPED, legendre_design, simulated
-from tests.reduced import only_in_full
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -228,8 +227,6 @@ def test_monomial_coefficients_are_those_of_pixel_offsets(rng):
     assert legendre.names == MODEL.names and ((legendre.p_value > 0) & (legendre.p_value < 1)).all()
 
 
-@pytest.mark.slow
-@only_in_full("monitoring has uniform ones")
 def test_probabilities_are_uniform_where_nothing_changes(full):
     """Of each coefficient, of the field, of the largest difference, of all periods together."""
     n, found = 1000 if full else 120, []

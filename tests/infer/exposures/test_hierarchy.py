@@ -149,8 +149,6 @@ def test_draws_of_tau_are_its_posterior(full):
         np.testing.assert_allclose(scatter.mode()[0], x[np.argmax(density)], atol=0.02)
 
 
-@pytest.mark.slow
-@only_in_full("kinds that are told apart are run")
 def test_kinds_that_are_hard_to_tell_apart_are_sampled_by_a_chain(monkeypatch):
     """Of two kinds only the sum is known well: against the density on a mesh of both."""
     rng, n = np.random.default_rng(5), 8

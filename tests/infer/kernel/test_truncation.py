@@ -357,8 +357,6 @@ def test_least_squares_does_not_mislead_the_search(cut):
     assert chi2.sf(at @ np.linalg.solve(cov, at), len(theta)) > 1e-3
 
 
-@pytest.mark.slow
-@only_in_full("one chip is covered")
 def test_several_chips_and_frames(rng):
     """Sampled as any other run is, with a local block for each exposure."""
     model, all_stars, truth = simulated(

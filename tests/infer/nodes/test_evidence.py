@@ -24,7 +24,7 @@ from tests.infer.nodes.support import (
     projector,
 )
 from tests.infer.support import legendre_design
-from tests.reduced import case_in_full, only_in_full
+from tests.reduced import case_in_full
 
 NOISE = 0.03
 
@@ -122,8 +122,6 @@ def test_hyperparameters_come_back(rng):
     assert 5.9 < sum(pulls) < 45.3
 
 
-@pytest.mark.slow
-@only_in_full("hyperparameters come back")
 @pytest.mark.parametrize(
     "nu",
     [

@@ -205,8 +205,6 @@ def test_rounds_move_less_and_less(rng):
     assert not short.converged
 
 
-@pytest.mark.slow
-@only_in_full("one chip is run")
 def test_two_chips_and_turned_exposures(rng):
     """Frames of any roll, and a unit that is no pixel: tables stay in pixels of the detector."""
     model = DistortionModel(
@@ -254,8 +252,6 @@ def test_two_chips_and_turned_exposures(rng):
     assert sigma_uv.max() < 0.05 * NOISE
 
 
-@pytest.mark.slow
-@only_in_full("tests/infer has false matches")
 @pytest.mark.parametrize("method", ["field", case_in_full("binned", instead="fields are run")])
 def test_false_matches_are_found_and_do_not_pull(rng, method):
     model = DistortionModel(ORDER, (CHIP,))

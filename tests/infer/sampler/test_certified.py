@@ -14,7 +14,6 @@ from bayesdist.infer.density.grid import build_proposal
 from bayesdist.infer.sampler.certified import AFFORDABLE, run_certified
 from bayesdist.infer.sampler.chains import Settings
 from bayesdist.products.formats.common.cards import convergence_cards
-from tests.reduced import only_in_full
 
 from ..support import simulated, target_of
 
@@ -43,8 +42,6 @@ def runs(problem):
     return made
 
 
-@pytest.mark.slow
-@only_in_full("test_known_densities has the moments")
 @pytest.mark.parametrize("kind", ["delayed", "approximate"])
 def test_moments_are_those_of_the_exact_chains(runs, kind):
     a, b = runs["exact"], runs[kind]

@@ -224,8 +224,6 @@ def test_a_second_mode_is_found_out_and_sampled():
     assert found.passes == target.points
 
 
-@pytest.mark.slow
-@only_in_full("a flaw of the proposal is run")
 def test_tails_that_a_gaussian_misses():
     target = FakeTarget(student(3.0, 2), 2)
     found = run_chains(target, gaussian_proposal(np.zeros(2), np.eye(2)), settings(FEW))

@@ -17,7 +17,7 @@ from bayesdist.infer import (
     sample,
 )
 from bayesdist.model import TimeDependence
-from tests.reduced import case_in_full, only_in_full
+from tests.reduced import case_in_full
 
 from ..oracle import JitterOracle
 from ..support import UNCLIPPED, simulated, table
@@ -314,8 +314,6 @@ def test_the_total_of_steps_counts_over_resumed_runs(small, whole, tmp_path):
     assert_same(resumed(small, tmp_path, max_steps=100), first)
 
 
-@pytest.mark.slow
-@only_in_full("a run that is interrupted goes on")
 @pytest.mark.parametrize(
     ("first", "then"), [(60, 200), case_in_full(200, 60, instead="it is made longer")]
 )

@@ -245,7 +245,7 @@ def test_solution_and_stars_are_those_of_one_process(start, solution, compute):
 
 
 @pytest.mark.slow
-@only_in_full("the posterior is that of one process")
+@only_in_full("solution and stars are those of one process")
 @pytest.mark.parametrize("by_files", [False, True])
 def test_stars_are_those_of_one_process(compute, by_files, tmp_path):
     """Detections are grouped, solved and grouped again on the workers."""

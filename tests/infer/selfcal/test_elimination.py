@@ -16,7 +16,7 @@ from bayesdist.infer.selfcal.problem import Problem
 from bayesdist.model import TimeDependence
 from bayesdist.simulate.dithers import pixels_of
 from tests.infer.selfcal.fields import field, problem_of
-from tests.reduced import case_in_full, only_in_full
+from tests.reduced import case_in_full
 
 NO_FALSE = Mixture(0.0, 1e-300)
 
@@ -183,8 +183,6 @@ def test_star_integral():
     assert np.abs(exact).max() < 0.01
 
 
-@pytest.mark.slow
-@only_in_full("stars of two are run")
 @pytest.mark.parametrize("n", [3, case_in_full(8, instead="stars of three are run")])
 def test_a_detection_that_goes_away_from_its_star(n, full):
     """From 5 to 11 errors off: modes come and go, and the integral over the place follows.

@@ -124,7 +124,6 @@ def false_claim(seed: int) -> tuple[str, bool, float]:
     return verdict.claim, is_line(verdict), float(np.abs(ratio).max())
 
 
-@only_in_full("serial correlation is seen")
 @pytest.mark.slow
 def test_an_irregular_drift_is_not_taken_for_a_line(full, capsys):
     """First-order processes without any trend: slopes of three sigma are common there."""

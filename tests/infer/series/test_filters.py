@@ -37,8 +37,6 @@ def test_a_common_drift():
     np.testing.assert_allclose(other - first, [offsets["F814W"].value], rtol=1e-6)
 
 
-@pytest.mark.slow
-@only_in_full("tests/app/campaign has two filters")
 def test_a_drift_of_its_own():
     own = np.array([0.0, -1.2e-5, 0.0])
     truth = campaign(12, filters=FILTERS, slopes={"F814W": own})

@@ -78,7 +78,7 @@ def test_the_free_skew_is_that_of_the_direct_fit(data):
 
 
 @pytest.mark.slow
-@only_in_full("the angle is run")
+@only_in_full("the free skew is compared with a direct fit")
 def test_where_the_axes_are_perpendicular_the_significance_is_normal():
     model = DistortionModel(2, (CHIP,))
     theta = np.zeros(model.n_params)

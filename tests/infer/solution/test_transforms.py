@@ -18,7 +18,6 @@ from bayesdist.infer.solution.transforms import (
     without_frames,
 )
 from bayesdist.model import Chip, DistortionModel, TimeDependence
-from tests.reduced import only_in_full
 
 from ..small_campaign import seen_by
 
@@ -225,8 +224,6 @@ def test_draws_are_turned_one_by_one_and_have_the_covariance():
     assert p > 1e-3
 
 
-@pytest.mark.slow
-@only_in_full("tests/infer/selfcal has gauges")
 def test_errors_of_the_gauge_are_those_of_the_draws():
     source = acs()
     gauge = reference_gauge(source, 1).gauge

@@ -194,8 +194,6 @@ def test_table_in_memory_by_files(problem, compute, by_threads, tmp_path):
     assert not list(tmp_path.iterdir())
 
 
-@pytest.mark.slow
-@only_in_full("a table in memory is run")
 def test_table_on_disk_by_a_relative_path(problem, compute, by_threads, tmp_path, monkeypatch):
     """The workers stand in another folder than we do."""
     model, matches = problem

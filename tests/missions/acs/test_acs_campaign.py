@@ -388,8 +388,6 @@ def test_scatter_of_the_exposures_gives_the_published_sigma():
     assert np.mean(corr) > 0.9  # mostly common to both chips
 
 
-@pytest.mark.slow
-@only_in_full("the scatter is that of the ISR")
 def test_outlying_exposures_deviate_more():
     frames = simulate_acs(n_exposures=110, n_stars=200, outlying=0.2).truth.frames
     size = np.abs(frames.shared[:, 0, 0])

@@ -8,7 +8,6 @@ import pytest
 from bayesdist.errors import InputError
 from bayesdist.missions.acs.simulate import ACS_FILTERS, acs_solution
 from bayesdist.missions.acs.simulate.tables import detector_tables, filter_tables
-from tests.reduced import only_in_full
 
 # Tables 1-3: chip, RDATE: (alpha, beta)
 A_2 = {
@@ -158,8 +157,6 @@ def test_no_polynomial_of_order_5_follows_the_tables(tables):
         np.testing.assert_allclose(design @ found, 0.0, atol=1e-13)
 
 
-@pytest.mark.slow
-@only_in_full("a fit with tables is run")
 def test_a_fit_without_tables_finds_the_same_polynomial(tables):
     """What the tables do to u and v of evenly spread stars leaves the linear terms as they are.
 

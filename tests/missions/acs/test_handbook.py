@@ -16,7 +16,6 @@ from bayesdist.products import idctab_from_solution, read_idctab, write_idctab
 from bayesdist.products.formats.idctab.calibration import idctab_calibration
 from bayesdist.simulate import simulate_matches
 from tests.app.support import begin_stagewise, cli, good, one_sentence, refused, write_job
-from tests.reduced import only_in_full
 
 SIZE = (512.0, 256.0)
 
@@ -164,8 +163,6 @@ def test_figures_and_numbers_of_a_table(idctab, tmp_path):
     assert numbers["published"][0] == "82" and numbers["unit"][0] == "output pix"
 
 
-@pytest.mark.slow
-@only_in_full("the numbers of the handbook are compared")
 def test_a_run_is_shown_with_its_residuals(idctab, tmp_path):
     run = begin_stagewise(tmp_path / "run", write_job(tmp_path / "job"), "fit")
     result = good("hst", "handbook", run, "-o", tmp_path / "book", "--detector", "hrc")

@@ -341,8 +341,6 @@ def test_a_folder_in_use_is_refused(compared):
     )
 
 
-@pytest.mark.slow
-@only_in_full("bands of WISE are run")
 def test_bands_of_another_instrument_have_no_word_of_wise(tmp_path):
     """And where its stars are no longer those of the run, it is refused."""
     detector = {"name": "blue", "size": SIZE, "scale_mas": 50.0}

@@ -21,7 +21,7 @@ from bayesdist.missions.wise.simulate.bringup import simulate_unpaired
 from bayesdist.missions.wise.simulate.optical import optical_model, write_optical_model
 from bayesdist.model import Chip, DistortionModel
 from tests.app.support import good, refused
-from tests.reduced import case_in_full, only_in_full
+from tests.reduced import case_in_full
 
 STARTS = {
     "nothing": None,
@@ -94,8 +94,6 @@ def ups(scene):
     }
 
 
-@pytest.mark.slow
-@only_in_full("the command gives the pairs of the function")
 @pytest.mark.parametrize("name", STARTS)
 def test_every_start_ends_at_the_truth(scene, ups, name):
     """With all of the detector covered, and coefficients right within their errors."""

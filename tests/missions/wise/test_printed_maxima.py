@@ -54,7 +54,7 @@ def calibrated(request):
 
 
 @pytest.mark.slow
-@only_in_full("tests/products has the maxima")
+@only_in_full("tests/products/test_sip_wise has the longest vector")
 def test_longest_vectors(calibrated):
     """To 0.5 %; in a corner, the zeroth order suppressed."""
     band, fit = calibrated

@@ -12,7 +12,7 @@ from bayesdist.errors import DegenerateError, InputError
 from bayesdist.missions.wise.assess.residual_correlation import residual_correlation
 from bayesdist.missions.wise.assess.residual_structure import residual_partition
 from bayesdist.model.basis import polynomial_terms
-from tests.reduced import case_in_full, only_in_full
+from tests.reduced import case_in_full
 
 SIDE = 1016.0
 
@@ -149,8 +149,6 @@ def test_a_planted_partition_is_found_with_its_number_and_size(n, k, tilts):
         assert low < off < high
 
 
-@pytest.mark.slow
-@only_in_full("a planted partition is found")
 def test_exact_means_do_not_split_blocks_further():
     """Ten and fifteen blocks hold the five, but their freedom is not needed."""
     rng = np.random.default_rng(16)
@@ -194,8 +192,6 @@ def test_gains_are_those_of_two_least_squares_fits():
     assert found.gain[k] == pytest.approx(gain, rel=1e-9)
 
 
-@pytest.mark.slow
-@only_in_full("noise has no correlation")
 def test_noise_holds_no_partition(full):
     """P-values over all k tried are uniform, with bins that differ and a fitted polynomial."""
     rng = np.random.default_rng(8)
@@ -215,8 +211,6 @@ def test_noise_holds_no_partition(full):
     assert kstest(p, "uniform").pvalue > 1e-3
 
 
-@pytest.mark.slow
-@only_in_full("noise holds none")
 def test_smooth_structure_is_no_partition():
     rng = np.random.default_rng(9)
     n = 31

@@ -19,7 +19,6 @@ from bayesdist.missions.wise.assess.histograms import band_sums
 from bayesdist.missions.wise.assess.tables import residual_tables
 from bayesdist.missions.wise.published import RESIDUAL_SIGMAS, WISE_ARCSEC, WISE_BANDS
 from bayesdist.missions.wise.simulate import wise_set
-from tests.reduced import only_in_full
 
 from .calibrations import matches_of, pairs_of
 
@@ -117,8 +116,6 @@ def test_noise_of_table_5_1_is_sigma_over_root_n(plain, plain_tables, band, axis
     assert abs(row.variance) < 4.5 * row.variance_error
 
 
-@pytest.mark.slow
-@only_in_full("the noise of one band is run")
 def test_noise_of_two_bands_adds_in_table_5_2(plain, plain_tables):
     for label, row in plain_tables["5-2"].items():
         later, earlier = label.partition("/")[0].split("-")
@@ -189,8 +186,6 @@ def test_the_pattern_moves_no_coefficient(plain, patterned, band):
 # -- periods --------------------------------------------------------------------------------------
 
 
-@pytest.mark.slow
-@only_in_full("tables of one period are run")
 def test_periods_of_table_c_1_differ_by_noise_alone():
     """45 x 45 bins, five periods; the structure is the same in each of them and in all together."""
     one, pairs, fit, _ = calibrated("W1", True, bins=45, pairs=400_000)
