@@ -130,6 +130,8 @@ SHORT = {
     "sampler": {"target_ess": 100, "target_rhat": 1.05},
     "assess": {"grid": (5, 5), "draws": 100},
 }
+# a jitter would be sampled alike, and takes most of the time (tests/app/test_calibrate.py)
+NO_JITTER = {"outliers": {"jitter": 0.0}}
 FILES = ("stars.ecsv", "stars.parquet", "matches.h5")
 
 
@@ -142,9 +144,10 @@ def stated():
 
 
 def calibrated(stars, sigma=None, outliers="gaussian"):
+    settings = SHORT | NO_JITTER if isinstance(outliers, str) else SHORT
     return bd.calibrate(
         stars, order=2, size=SIZE, reference_pixel=CENTRE, name="A", sigma=sigma,
-        outliers=outliers, settings=SHORT,
+        outliers=outliers, settings=settings,
     )  # fmt: skip
 
 
@@ -172,7 +175,7 @@ def test_object_file_and_command_line_agree_to_the_bit(stated, tmp_path, sigma, 
             assert other.warnings == run.warnings
     config = write_job(
         tmp_path / "job", stated.to_table(), data={"matches": str(paths[0]), "sigma": sigma},
-        budget=[], **SHORT,
+        budget=[], **SHORT, **NO_JITTER,
     )  # fmt: skip
     good("run", config, "-o", tmp_path / "run")
     with bd.open_run(tmp_path / "run") as other:
@@ -190,11 +193,13 @@ def test_a_saved_run_is_calibrated_again_with_the_same_result(stated, tmp_path):
 
 
 def test_a_radius_of_the_settings_wins_and_differences_are_reported(stated):
-    wider = calibrated(stated, outliers=bd.OutlierMixture(match_radius=2 * RADIUS * u.pix))
+    wider = calibrated(
+        stated, outliers=bd.OutlierMixture(match_radius=2 * RADIUS * u.pix, jitter=0.0)
+    )
     assert wider.posterior.mixture.match_radius == 2 * RADIUS
     [warning] = [text for text in wider.warnings if "by the settings" in text]
     assert "0.1 pix" in warning and "0.05 pix by the matches" in warning
-    default = calibrated(stated, outliers=bd.OutlierMixture())
+    default = calibrated(stated, outliers=bd.OutlierMixture(jitter=0.0))
     assert default.posterior.mixture.match_radius == RADIUS
     assert not any("by the settings" in text for text in default.warnings)
 
