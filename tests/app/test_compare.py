@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from astropy.coordinates import SkyCoord
 from astropy.io import fits
 from astropy.table import Table
 from astropy.wcs import WCS
@@ -76,6 +77,26 @@ def test_sip_headers_against_astropy(tmp_path) -> None:
     assert summary["linear"]["mirrored"] is True
     assert summary["linear"]["rotation_rad"] == pytest.approx(np.angle(turn[1]), abs=1e-8)
     assert summary["chi2"] is None and summary["significance_of"] == "none"
+
+
+def test_the_sky_of_two_headers_is_compared_as_astropy_has_it(tmp_path) -> None:
+    """The same distortion at another CRVAL: 0.02 degrees apart, and no agreement."""
+    first = sip_header(tmp_path / "a.hdr", A, B)
+    header = fits.Header.fromtextfile(first)
+    header["CRVAL2"] += 0.02
+    header.totextfile(tmp_path / "b.hdr", endcard=True)
+    out = good("compare", first, tmp_path / "b.hdr", "-o", tmp_path / "out").out
+    x, y = np.meshgrid(np.linspace(0.5, SIZE[0] + 0.5, 65), np.linspace(0.5, SIZE[1] + 0.5, 65))
+    a = WCS(fits.Header.fromtextfile(first)).all_pix2world(x, y, 1)
+    b = WCS(header).all_pix2world(x, y, 1)
+    far = SkyCoord(*a, unit="deg").separation(SkyCoord(*b, unit="deg")).arcsec
+    [chip] = json.loads((tmp_path / "out" / "comparison.json").read_text())["chips"]
+    assert chip["sky"]["largest_arcsec"] == pytest.approx(far.max(), rel=1e-4)
+    assert chip["sky"]["largest_pix"] == pytest.approx(far.max() / 0.05, rel=0.01)
+    assert "and not on the sky" in out.splitlines()[0]
+    assert "on the sky A and B are 72 arcsec" in out.splitlines()[1]
+    same = good("compare", first, first).out
+    assert same.startswith("The calibrations agree to rounding.\non the sky A and B have the same")
 
 
 def test_a_run_with_itself_and_with_its_own_products(finished, tmp_path) -> None:

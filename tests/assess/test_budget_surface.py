@@ -1,13 +1,17 @@
 """Second moments say of every place and epoch what the budget of single places says."""
 
+from dataclasses import dataclass
+
 import numpy as np
 import pytest
 
 from bayesdist.assess.budget.budget import place_budget
 from bayesdist.assess.budget.surface import JOINT, budget_surface
 from bayesdist.assess.model import error_model
+from bayesdist.assess.terms.forms import Polynomials, Row
 from bayesdist.assess.terms.parameters import ScaleError
 from bayesdist.errors import InputError
+from bayesdist.infer.solution.solution import Solution
 from bayesdist.model import Chip, DistortionModel, TimeDependence
 from bayesdist.model.grid import grid_pixels, mesh
 from tests.budgets import detector_budget
@@ -42,10 +46,10 @@ def variance(surface, part, chip, x, y, epoch, origin=None):
     span = [s for s in surface.spans if not s.nodes or epoch >= s.nodes[0]][-1]
     moments = span.moments[chip][part]
     weights = np.ones(1)
-    if len(moments) == 3:
+    if len(moments) > 1:
         t = np.array(span.nodes)
         weights = np.array(
-            [np.prod((epoch - np.delete(t, k)) / (t[k] - np.delete(t, k))) for k in range(3)]
+            [np.prod((epoch - np.delete(t, k)) / (t[k] - np.delete(t, k))) for k in range(len(t))]
         )
     phi = surface.model.basis(chip).evaluate(x, y)
     if origin is not None:
@@ -100,6 +104,47 @@ def test_alignment_hardly_depends_on_the_drift(solution_of):
     truth = place_budget(errors, [10.0], [90.0], chip=1, epoch=2004.1).total
     found = variance(surface, JOINT, 1, [10.0], [90.0], 2004.1)
     assert found[0] == pytest.approx([truth.u[0] ** 2, truth.v[0] ** 2], rel=1e-3)
+
+
+@dataclass(frozen=True)
+class Curvature:
+    """A drift that is curved in time: u_1_0 of chip 1 errs by the square of the years."""
+
+    solution: Solution
+    rows: tuple[Row, ...] = (Row("curvature"),)
+
+    def draw(self, n, rng):
+        model, size = self.solution.model, 1e-4 * rng.standard_normal(n)
+
+        def more(epoch, chip):
+            out = np.zeros((n, 2, model.n_terms))
+            out[:, 0, 1] = size * (epoch - 2009.0) ** 2
+            return out
+
+        mean = np.asarray(self.solution.mean)
+        theta = np.tile(mean[: model.n_global], (n, 1))
+        return Polynomials(self.rows[0], model, mean, theta, more=more)
+
+
+@pytest.mark.parametrize("place", [False, True])
+def test_a_curved_drift_has_its_budget_at_any_epoch(solution_of, place):
+    """Variances of the fourth degree: three epochs gave negative ones between them."""
+    solution, _, _ = drawn(solution_of, time=TimeDependence((("u", 1, 0),), (2005.0,)))
+    term = Curvature(solution)
+    errors = error_model(solution, terms=(term,)).drawn(300, np.random.default_rng(2))
+    surface = budget_surface(errors, GRID, epoch=2010.3, years=(2002.0, 2020.0))
+    assert 2010.3 in surface.spans[0].nodes
+    x, y = np.array([3.0, 190.0]), np.array([10.0, 95.0])
+    for epoch in (2003.0, 2009.0, 2010.3, 2014.7, 2019.0):
+        truth = place_budget(errors, x, y, chip=1, epoch=epoch, relative=place)
+        for row in truth.every:
+            part = JOINT if row.name == "total" else row.name
+            at = (x[1:], y[1:]) if place else (x, y)
+            origin = (x[:1], y[:1]) if place else None
+            found = variance(surface, part, 1, *at, epoch, origin=origin)
+            largest = np.abs(surface.spans[0].moments[1][part]).max()
+            assert found.min() > -1e-12 * largest
+            np.testing.assert_allclose(found[:, 0], row.u**2, rtol=1e-6, atol=1e-11 * largest)
 
 
 @pytest.mark.parametrize("years", [None, (2010.0, 2010.0)])

@@ -218,8 +218,9 @@ def test_other_equatorial_systems_are_refused(tmp_path, radesys, equinox):
         bd.read_calibration(_write(header, "SIP", tmp_path))
 
 
-def test_a_plate_of_the_digitized_sky_survey_is_named(tmp_path):
-    header = fits.Header({"NAXIS": 2, "NAXIS1": 100, "NAXIS2": 100, "CRVAL1": 1.0, "CRVAL2": 2.0,
+@pytest.mark.parametrize("more", [{}, {"CRVAL1": 1.0, "CRVAL2": 2.0}])
+def test_a_plate_of_the_digitized_sky_survey_is_named(tmp_path, more):
+    header = fits.Header({"NAXIS": 2, "NAXIS1": 100, "NAXIS2": 100, **more,
                           "PLTRAH": 1, "AMDX1": 67.0, "AMDY1": 67.0})  # fmt: skip
     with pytest.raises(InputError, match="Digitized Sky Survey"):
         bd.read_calibration(_write(header, "", tmp_path))

@@ -129,6 +129,11 @@ def apply(file: str, table: str, output: str, **options: Any) -> None:
 @epoch
 @click.option("--scale", type=float, metavar="S", help="Size of a pixel, arcsec.")
 @image_size
+@click.option(
+    "--sample",
+    is_flag=True,
+    help="FILE is a header of any projection: sample it through astropy.wcs and fit a polynomial.",
+)
 @force
 def convert() -> None:
     """Write a calibration in another format, and report what is lost.

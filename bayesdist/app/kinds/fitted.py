@@ -47,6 +47,8 @@ class SelfCalibrated:
     # where what is known beside the detections does not go with them, as sentences
     contradictions: tuple[str, ...] = ()
     references: ReferenceCatalog | None = None  # stars that a catalogue has, too
+    # where the plane of the stars touches the sky, in u and v; None if the sky is taken as flat
+    contact: tuple[float, float] | None = None
 
     def save(self, folder: Path) -> None:
         """Write the files of a run's folder that belong to it."""

@@ -1,9 +1,10 @@
 """The error budget everywhere and at all times, small enough to be carried along in a page.
 
-Every part of the model's error is a polynomial of the pixel whose coefficients are, within one
-segment of the drift, linear in time.  So its second moments say all: the variance at any pixel, or
-of the difference of two, is a quadratic form of them, and they are quadratic in time, which three
-epochs fix.
+Every part of the model's error is a polynomial of the pixel.  So its second moments say all: the
+variance at any pixel, or of the difference of two, is a quadratic form of them.  Within one segment
+of the drift they are polynomials of time: quadratic where the coefficients are linear in time,
+which three epochs fix, and of the fourth degree where the drift has a curvature.  More epochs are
+used until the moments at other epochs follow.
 """
 
 from __future__ import annotations
@@ -31,6 +32,9 @@ from bayesdist.model import DistortionModel
 from bayesdist.utils.arrays import Float
 
 JOINT = "model"  # all errors of parameters together
+NUMBERS_OF_NODES = (3, 5, 9, 17)  # in one segment of the drift: the first that is good enough
+PROBES = (0.07, 0.31, 0.82)  # parts of a segment where the interpolation is compared
+FOLLOWED = 1e-6  # largest difference there, relative to the largest moment
 CONSTANT = 1e-9  # moments that change less, relative to the largest, do not depend on time
 
 
@@ -38,7 +42,8 @@ CONSTANT = 1e-9  # moments that change less, relative to the largest, do not dep
 class BudgetSpan:
     """Years within one segment of the drift."""
 
-    # first, middle and last epoch, decimal years; empty for a model without time dependence
+    # epochs from the first to the last one, decimal years, between which the moments follow
+    # Lagrange's polynomial; empty for a model without time dependence
     nodes: tuple[float, ...]
     # (n, 2, K, K), by chip number and part: mean products of the Legendre coefficients of the error
     # in u and in v, at each of the nodes; n = 1 for a part that does not depend on time.  The joint
@@ -88,9 +93,11 @@ def budget_surface(
     model with time dependence and no years, or years that do not rise.
     """
     model = errors.solution.model
-    nodes = _nodes(model, years)
-    if epoch is None and nodes[0]:
-        epoch = nodes[0][0]
+    ends = _ends(model, years)
+    if epoch is None and ends[0]:
+        epoch = ends[0][0]
+    spans = tuple(_span(errors, one, epoch) for one in ends)
+    nodes = [one.nodes for one in spans]
     domain = EvaluationDomain.of_chips(model, grid, epoch=epoch)
     parts, local, constant, products = [], list[GridRow](), [], list[GridRow]()
     for draws, one in zip(errors.draws, errors.at(domain), strict=True):
@@ -109,7 +116,7 @@ def budget_surface(
         model=model,
         epoch=epoch,
         grid=grid,
-        spans=tuple(BudgetSpan(n, _moments(errors, n)) for n in nodes),
+        spans=spans,
         parts=tuple(parts),
         local=tuple(local),
         constant=tuple(constant),
@@ -124,9 +131,10 @@ def _shifts(draws: Known, domain: EvaluationDomain, nodes: Sequence[float]) -> d
     return {chip: _short(np.stack([one[rows] for one in moved])) for chip, rows in domain.by_chip()}
 
 
-def _nodes(
+def _ends(
     model: DistortionModel, years: tuple[float, float] | None
 ) -> tuple[tuple[float, ...], ...]:
+    """First and last epoch of each segment of the drift; empty without time dependence."""
     if model.time is None:
         return ((),)
     if years is None or not years[0] < years[1]:
@@ -137,8 +145,58 @@ def _nodes(
     for start, stop in pairwise(edges):
         # a break belongs to what begins there
         end = stop if stop == last else float(np.nextafter(stop, start))
-        out.append((start, 0.5 * (start + end), end))
+        out.append((start, end))
     return tuple(out)
+
+
+def _span(errors: DrawnErrors, ends: Sequence[float], epoch: float | None) -> BudgetSpan:
+    """Moments of one segment of the drift, at as many epochs as they need."""
+    if not ends:
+        return BudgetSpan((), _moments(errors, ()))
+    start, end = ends
+    probes = tuple(start + part * (end - start) for part in PROBES)
+    truth = _moments(errors, probes)
+    for n in NUMBERS_OF_NODES:
+        nodes = _nodes(start, end, n, epoch)
+        span = BudgetSpan(nodes, _moments(errors, nodes))
+        if _follows(span, probes, truth):
+            break
+    return span
+
+
+def _nodes(start: float, end: float, n: int, epoch: float | None) -> tuple[float, ...]:
+    """Chebyshev's extrema in a segment, one of them moved to the epoch that is quoted."""
+    at = 0.5 * (start + end) - 0.5 * (end - start) * np.cos(np.pi * np.arange(n) / (n - 1))
+    at[0], at[-1] = start, end
+    if epoch is not None and start < epoch < end:
+        nearest = 1 + int(np.argmin(np.abs(at[1:-1] - epoch)))
+        before, after = at[nearest - 1], at[nearest + 1]
+        room = 0.25 * min(after - at[nearest], at[nearest] - before)
+        # nodes close to each other would amplify rounding
+        if before + room < epoch < after - room:
+            at[nearest] = epoch
+    return tuple(float(t) for t in at)
+
+
+def lagrange_weights(nodes: Sequence[float], epoch: float) -> Float:
+    """Weights (n,) of the nodes at an epoch."""
+    t = np.asarray(nodes, float)
+    factors = [np.prod((epoch - np.delete(t, k)) / (t[k] - np.delete(t, k))) for k in range(len(t))]
+    return np.array(factors)
+
+
+def _follows(span: BudgetSpan, probes: Sequence[float], truth: dict[int, dict[str, Float]]) -> bool:
+    """True if the interpolated moments are those at the probes."""
+    for chip, parts in span.moments.items():
+        for part, at_nodes in parts.items():
+            limit = FOLLOWED * np.abs(at_nodes).max()
+            for k, epoch in enumerate(probes):
+                asked = truth[chip][part]
+                weights = lagrange_weights(span.nodes, epoch) if len(at_nodes) > 1 else np.ones(1)
+                found = np.tensordot(weights, at_nodes, 1)
+                if np.abs(found - asked[k if len(asked) > 1 else 0]).max() > limit:
+                    return False
+    return True
 
 
 def _moments(errors: DrawnErrors, nodes: Sequence[float]) -> dict[int, dict[str, Float]]:

@@ -35,7 +35,7 @@ WEAK_PIX = 0.1  # error at the detector's edge above which a direction counts as
 FAR = 3.0  # times the final error: information no better than this does not fix a direction
 EXPLAINED = 1e-2  # fraction of a free direction that its names may leave out
 SAME_ROLL = np.radians(0.1)
-TIE = 1e-6  # relative difference of pivots that are equal
+TIE = 0.02  # relative preference for each earlier one of nearly equal parameters
 MIN_PIVOT = 0.02
 HIDDEN = 1e-5  # of a property that lies along undetermined directions: it is free
 

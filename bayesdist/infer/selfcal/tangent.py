@@ -23,23 +23,30 @@ STEPS = 3  # of Newton's method, each of which leaves a hundredth or less
 
 @dataclass(frozen=True, eq=False)
 class TangentPlane:
-    """Plane of u and v, common to all exposures."""
+    """Plane of u and v, common to all exposures.
+
+    The plane of an exposure touches the sky where the reference pixel of the first chip points, so
+    that the distortion does not depend on the detections or on which exposure is the first one.
+    """
 
     unit_arcsec: float  # size of the unit of u and v
-    # point of contact with the sky, in u and v; the origin of the frames by default
+    # point of contact of the common plane with the sky, in u and v; by default the mean of those
+    # of the exposures
     point: tuple[float, float] | None = None
 
-    def displacements(self, model: DistortionModel, theta: Float, flat: Float, e: int) -> Float:
-        """Displacements (N, 2) from positions of an exposure to this plane.
+    def contact(self, contacts: Float) -> Float:
+        """Point of contact (2,) of the common plane, given those (E, 2) of the exposures."""
+        return contacts.mean(axis=0) if self.point is None else np.asarray(self.point, float)
 
-        `theta`: (D,). `flat` (N, 2): positions by the frame of the exposure: exact at the origin of
-        the frames, which is where the exposure's own plane touches the sky. `e`: code of the
-        exposure. Result: (N, 2).
+    def displacements(self, flat: Float, touches: Float, contact: Float) -> Float:
+        """Displacements (N, 2) from positions on the plane of an exposure to the common plane.
+
+        `flat` (N, 2): positions by the frame of the exposure, which are exact at its point of
+        contact `touches` (2,). `contact` (2,): that of the common plane. Result: (N, 2), in the
+        unit of u and v.
         """
         radian = ARCSEC / self.unit_arcsec
-        o = np.asarray(model.origin)
-        touches = o + model.frame(theta, e)[1]
-        p = (touches - (o if self.point is None else np.asarray(self.point))) / radian
+        p = (touches - contact) / radian
         q = (flat - touches) / radian
         c = 1.0 / np.sqrt(1.0 + p @ p)
         s = c * p
@@ -55,10 +62,12 @@ class TangentPlane:
         at the pixels that the frames alone map to the position on this plane.
         """
         flat = places_of(model, detections, theta)
+        contacts = contacts_of(model, theta, detections.epoch)
+        contact = self.contact(contacts)
         moved = np.empty_like(flat)
-        for e in range(len(detections.exposure_names)):
+        for e, touches in enumerate(contacts):
             here = detections.exposure == e
-            moved[here] = self.displacements(model, theta, flat[here], e)
+            moved[here] = self.displacements(flat[here], touches, contact)
         aim, out = flat + moved, detections
         slopes = model.slopes(theta, detections.x, detections.y, **_where(model, detections))
         back = np.linalg.inv(slopes)
@@ -66,6 +75,17 @@ class TangentPlane:
             step = np.einsum("nab,nb->na", back, aim - places_of(model, out, theta))
             out = replace(out, x=out.x + step[:, 0], y=out.y + step[:, 1])
         return out
+
+
+def contacts_of(model: DistortionModel, theta: Float, epoch: Float | None = None) -> Float:
+    """Positions (E, 2) of the first chip's reference pixel, where the exposures touch the sky.
+
+    `epoch` (E,): dates of the exposures, which a model with a drift needs.
+    """
+    E, chip = len(model.exposures), model.chips[0]
+    x, y = (np.full(E, z) for z in chip.reference_pixel)
+    when = None if model.time is None else epoch
+    return model.predict(theta, x, y, exposure=np.arange(E), chip=chip.number, epoch=when)
 
 
 def places_of(

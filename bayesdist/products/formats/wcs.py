@@ -14,7 +14,8 @@ from bayesdist.products.formats.sip.format import describe_wcs
 
 
 def _parse(content: Content) -> Content | None:
-    return content if any(holds_wcs(hdu.header) for hdu in content.hdus) else None
+    headers = [hdu.header for hdu in content.hdus]
+    return content if any(holds_wcs(one) or projection_code(one) for one in headers) else None
 
 
 def _refuse(content: Content, name: str) -> None:

@@ -19,6 +19,7 @@ from bayesdist.utils.arrays import Float
 from bayesdist.utils.numbers import ladder
 
 MOMENT_DIGITS = 7  # quadratic forms of them cancel in part
+CURVED_DIGITS = 9  # of moments at more than three epochs, which differ by orders of magnitude
 MAP_DIGITS = 5
 MOST_POINTS = 65  # of a map on the longer side: a pointer cannot separate more of them
 _COLORS = 12
@@ -115,7 +116,8 @@ def _triangles(moments: Float) -> list[list[list[float | None]]]:
     K = moments.shape[-1]
     i, j = np.triu_indices(K)
     values = moments[..., i, j] * np.where(i == j, 1.0, 2.0)
-    return [[_short(v, MOMENT_DIGITS) for v in node] for node in values]
+    digits = MOMENT_DIGITS if len(moments) <= 3 else CURVED_DIGITS
+    return [[_short(v, digits) for v in node] for node in values]
 
 
 def _row(row: Row) -> dict[str, Any]:

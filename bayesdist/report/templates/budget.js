@@ -1,6 +1,6 @@
 "use strict";
 // The budget at a position, between two, or over the detector, at any epoch and magnitude.  The
-// variance of each part of the model is a quadratic form of its moments; these are quadratic in time.
+// variance of each part of the model is a quadratic form of its moments; these are polynomials of time.
 
 class Budget {
   constructor(data) {

@@ -56,6 +56,15 @@ def test_tangent_planes_are_taken_to_one_by_the_size_of_a_pixel(tmp_path, scale_
         assert "tangent planes taken to one" in told
         assert most / 4 < moved < most
         assert not test.significant
+        # the stars' plane touches the sky in the middle of all pointings, whichever is first
+        at = results.run.summary["selfcal"]["tangent_plane"]
+        assert at["pixel"] == [MIDDLE, MIDDLE]
+        solution = results.fitted.linear
+        middle = solution.model.predict(solution.mean, MIDDLE, MIDDLE, exposure=0)
+        [contact] = first.wcs_pix2world([np.array(at["contact"]) - np.ravel(middle)], 1)
+        off = on(tangent_plane(*contact, scale=ARCSEC), pointings).mean(axis=0)
+        assert np.hypot(*off) < 0.003 * offset
+        assert f"at pixel ({MIDDLE:g}, {MIDDLE:g}) of chip" in results.fitted.gauge_words
         # what the stages after the match read
         raw, kept = results.inputs.detections, results.matched.detections
         assert np.hypot(kept.x - raw.x, kept.y - raw.y).max() == pytest.approx(moved)

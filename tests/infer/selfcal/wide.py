@@ -37,16 +37,23 @@ def camera(bends, x, y):
     return np.stack(linear, axis=-1) + (bends @ terms).T
 
 
-def observed(seed):
-    """Detections with true star numbers, pointings on the sky, and the bends of the camera."""
+def observed(seed, *, arcsec=ARCSEC, step_deg=STEP_DEG, n_stars=3000, n_exposures=E):
+    """Detections with true star numbers, pointings on the sky, and the bends of the camera.
+
+    `arcsec`: of a pixel. The sky has stars up to half a field beyond the largest step.
+    """
+    half = step_deg + 0.6 * N * arcsec / 3600
     rng = np.random.default_rng(seed)
-    bends, rolls = 4.0 * rng.standard_normal((2, 7)), np.radians(np.resize([0, 60, 130], E))
+    bends, rolls = (
+        4.0 * rng.standard_normal((2, 7)),
+        np.radians(np.resize([0, 60, 130], n_exposures)),
+    )
     wide = np.array([1 / np.cos(np.radians(DEC)), 1.0])
-    pointings = [RA, DEC] + STEP_DEG * wide * rng.uniform(-1, 1, (E, 2))
-    sky = [RA, DEC] + wide * rng.uniform(-0.33, 0.33, (3000, 2))
+    pointings = [RA, DEC] + step_deg * wide * rng.uniform(-1, 1, (n_exposures, 2))
+    sky = [RA, DEC] + wide * rng.uniform(-half, half, (n_stars, 2))
     found = []
     for e, (at, roll) in enumerate(zip(pointings, rolls, strict=True)):
-        plane = on(tangent_plane(*at, roll, ARCSEC), sky)
+        plane = on(tangent_plane(*at, roll, arcsec), sky)
         near = np.flatnonzero((np.abs(plane) < 0.52 * N).all(axis=1))
         plane = plane[near]
         x, y = plane.T + MIDDLE
@@ -58,6 +65,6 @@ def observed(seed):
         seen = (z[inside] + SIGMA * rng.standard_normal(n) for z in (x, y))
         found.append((*seen, np.full(n, e), near[inside]))
     x, y, exposure, star = (np.concatenate(parts) for parts in zip(*found, strict=True))
-    names = tuple(f"e{e}" for e in range(E))
+    names = tuple(f"e{e}" for e in range(n_exposures))
     detections = Detections(x, y, exposure, names, sigma=np.full(len(x), SIGMA), star=star)
     return detections, pointings, rolls, bends

@@ -26,6 +26,7 @@ from bayesdist.products.formats.common.document import (
     FormatSettings,
 )
 from bayesdist.products.registry import format_of, open_document
+from bayesdist.products.sampled import SampledCalibration, sampled_calibration
 from bayesdist.products.writing import (
     built_for,
     places_of,
@@ -37,6 +38,7 @@ from bayesdist.products.writing import (
 from bayesdist.utils.arrays import Float
 
 _GRID = 65  # points of each axis over which the loss is measured
+BAD_PIX = 0.1  # pixels: a sampled polynomial that is further off is warned of
 _ROUNDING = 1e-6  # pixels: what is less is called none
 
 
@@ -52,6 +54,7 @@ def convert(
     epoch: float | None = None,
     scale: float | None = None,
     size: tuple[float, float] | None = None,
+    sample: bool = False,
     force: bool = False,
 ) -> str:
     """Write the calibration of a file or a run in another format, and say what was lost.
@@ -61,12 +64,17 @@ def convert(
     format makes one; by default the present folder.  `order` is of the polynomial where another one
     than that of the calibration is wanted; look-up tables go into it where the format has none.
     `scale` is arcseconds in a pixel, by default as the run says.  `filter`, `epoch` and `size` are
-    as of `calibration_at`.
+    as of `calibration_at`.  With `sample` the file is a header of any projection, which is sampled
+    through astropy.wcs and followed by a polynomial of `order`, by default one that is good enough.
     What is to be printed is returned.  InputError for what the format cannot hold, or files that
     are there without `force`.
     """
     target = format_of(to)
-    found = on_the_sky(Path(path), calibration_at(path, filter=filter, size=size))
+    sampled = _sampled(path, order, size, chip=chip, filter=filter, epoch=epoch) if sample else None
+    if sampled is None:
+        found = on_the_sky(Path(path), calibration_at(path, filter=filter, size=size))
+    else:
+        found, order = sampled.calibration, None
     settings = _settings(to, options)
     source = found if chip is None else found.only(chip, epoch)
     at = None
@@ -86,6 +94,10 @@ def convert(
     write_built(built, places)
     held = [p for p, one in zip(places, built, strict=True) if one.kind != PARAMETERS]
     lines = [f"{', '.join(str(p) for p in places)}: by {source.name}"]
+    if sampled is not None:
+        lines.append(f"  {sampled.sentence}")
+        if sampled.largest_pix > BAD_PIX:
+            lines.append("  warning: no polynomial follows this header well; do not use it blindly")
     back = _read_back(held, filter, made.model.chips[0].size)
     lines += [f"  {note}" for note in (*source.notes, *notes)]
     if source.errors == "none":
@@ -94,6 +106,24 @@ def convert(
     used = _read_back(held, filter, made.model.chips[0].size, as_used=True)
     lines += [f"  {line}" for line in _losses(source, back, used, at, scale)]
     return "\n".join(lines)
+
+
+def _sampled(
+    path: str | Path, order: int | None, size: tuple[float, float] | None, **others: object
+) -> SampledCalibration:
+    """Header that is sampled; options that such a header has no use for are refused."""
+    given = next((name for name, value in others.items() if value is not None), None)
+    if given is not None:
+        raise InputError(
+            "a header that is sampled has one chip, no filter and no dates",
+            where=f"--{given}",
+            do="leave it out",
+        )
+    if Path(path).is_dir():
+        raise InputError(
+            "is a folder, and --sample is for headers", where=str(path), do="leave --sample out"
+        )
+    return sampled_calibration(path, order=order, size=size)
 
 
 def _settings(to: str, options: Sequence[str]) -> FormatSettings:

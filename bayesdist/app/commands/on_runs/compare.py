@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from astropy.table import Table, vstack
 
-from bayesdist.app.calibrations import calibration_at, run_of
+from bayesdist.app.calibrations import calibration_at, on_the_sky, run_of
 from bayesdist.app.store.keys import attributes
 from bayesdist.app.store.output import record_folder, write_table
 from bayesdist.assess.comparison.compare import (
@@ -24,17 +25,55 @@ from bayesdist.assess.comparison.gap import (
     gap_difference,
     pair_of_chips,
 )
-from bayesdist.assess.comparison.sentences import comparison_lines, gap_lines, gap_verdict, verdict
+from bayesdist.assess.comparison.sentences import (
+    IDENTICAL,
+    comparison_lines,
+    gap_lines,
+    gap_verdict,
+    verdict,
+)
 from bayesdist.calibration.calibration import Calibration
-from bayesdist.errors import InputError
+from bayesdist.calibration.inverse import detector_grid
+from bayesdist.calibration.plane import ARCSEC
+from bayesdist.data.sky.tangent import separation, sky_of_plane
+from bayesdist.errors import InputError, required
 from bayesdist.model.grid import DEFAULT_GRID
 from bayesdist.products.formats.common.document import MissingSizeError
 from bayesdist.report.drawing import save_figures
 from bayesdist.report.figures.commands import difference_vectors
 
 
+@dataclass(frozen=True)
+class SkyDifference:
+    """Distances on the sky between the positions of one chip by two calibrations."""
+
+    largest_arcsec: float
+    rms_arcsec: float
+    largest_pix: float
+
+    @property
+    def sentence(self) -> str:
+        """Line of the text below the verdict."""
+        if self.largest_pix < IDENTICAL_SKY:
+            return "on the sky A and B have the same positions"
+        return (
+            f"on the sky A and B are {self.largest_arcsec:.3g} arcsec ({self.largest_pix:.3g} pix) "
+            f"apart at most, {self.rms_arcsec:.3g} arcsec rms: shift, rotation and scale count here"
+        )
+
+
+IDENTICAL_SKY = 1e-6  # pixels
+SAME_SHAPE = (
+    "The calibrations agree to rounding after shift, rotation and scale, and not on the sky."
+)
+
+
 def write_comparison(
-    output: Path, found: Sequence[Comparison], gaps: Sequence[GapDifference], command: str
+    output: Path,
+    found: Sequence[Comparison],
+    gaps: Sequence[GapDifference],
+    command: str,
+    sky: Sequence[SkyDifference | None],
 ) -> None:
     """Write tables, summary and figure of chips and the gaps between them into a new folder."""
     with record_folder(output, "comparison.json", command) as (folder, record):
@@ -43,7 +82,10 @@ def write_comparison(
         if gaps:
             write_table(gap_table(gaps), folder / "gap.ecsv")
         save_figures({"difference": difference_vectors(found)}, folder / "figures")
-        record["chips"] = [comparison_summary(one) for one in found]
+        record["chips"] = [
+            comparison_summary(one) | {"sky": None if far is None else asdict(far)}
+            for one, far in zip(found, sky, strict=True)
+        ]
         record["gaps"] = [_gap_summary(one) for one in gaps]
 
 
@@ -104,6 +146,7 @@ def joined(found: Sequence[Comparison], table_of: Any) -> Table:
     return vstack(tables, metadata_conflicts="silent")
 
 
+SKY_GRID = 65  # points of each axis where positions on the sky are compared
 SEED = 20150206  # of the noise fields: the same comparison gives the same numbers
 
 
@@ -136,15 +179,37 @@ def compare_files(
     nx, ny = grid
     found = [compare(maps[0][n], maps[1][m], rng=rng, grid=(nx, ny), keep=keep) for n, m in numbers]
     gaps = _gaps(both, epoch, [n for n, m in numbers if n == m])
+    laid = on_the_sky(Path(a), both[0]), on_the_sky(Path(b), both[1])
+    sky = [_sky_difference(laid, pair, epoch) for pair in numbers]
     if output is not None:
-        write_comparison(Path(output), found, gaps, command)
+        write_comparison(Path(output), found, gaps, command, sky)
     runs = [run_of(Path(one)) for one in (a, b)]
     scales = [None if run is None else run.config.detector.scale_mas for run in runs]
     homes = [
         Path(one).resolve() if run is None else run.path.resolve()
         for one, run in zip((a, b), runs, strict=True)
     ]
-    return _text(found, gaps, scales[0] or scales[1], related=homes[0] == homes[1])
+    return _text(found, gaps, scales[0] or scales[1], sky, related=homes[0] == homes[1])
+
+
+def _sky_difference(
+    both: tuple[Calibration, Calibration], pair: tuple[int, int], epoch: float | None
+) -> SkyDifference | None:
+    """Distances on the sky over a grid of one chip; None unless both calibrations lie there."""
+    if any(one.plane.point is None or one.unit not in ARCSEC for one in both):
+        return None
+    x, y = detector_grid(both[0].model.chips[both[0].numbers.index(pair[0])].size, SKY_GRID)
+    places = []
+    for one, number in zip(both, pair, strict=True):
+        date = epoch if one.model.time is not None else None
+        at = one.forward(x, y, chip=number, epoch=date) * ARCSEC[one.unit]
+        point = required(one.plane.point, "does not lie on the sky")
+        places.append(sky_of_plane(at[:, 0], at[:, 1], point))
+    far = 3600.0 * separation(places[0], *places[1])
+    linear = both[0].chip(pair[0], epoch if both[0].model.time is not None else None).linear
+    pixel = ARCSEC[both[0].unit] * float(np.sqrt(abs(np.linalg.det(linear))))
+    rms = float(np.sqrt(np.mean(far**2)))
+    return SkyDifference(float(far.max()), rms, float(far.max()) / pixel)
 
 
 def _read(
@@ -219,14 +284,22 @@ def _text(
     found: Sequence[Comparison],
     gaps: Sequence[GapDifference],
     scale: float | None,
+    sky: Sequence[SkyDifference | None],
     *,
     related: bool,
 ) -> str:
     lines = []
-    for one in found:
+    for one, far in zip(found, sky, strict=True):
         if len(found) > 1:
             lines.append(f"chip {one.a.chip}, by itself:")
-        lines += [verdict(one, scale), *comparison_lines(one)]
+        apart = far is not None and far.largest_pix > IDENTICAL_SKY
+        if apart and one.largest < IDENTICAL:
+            lines.append(SAME_SHAPE)
+        else:
+            lines.append(verdict(one, scale))
+        if far is not None:
+            lines.append(far.sentence)
+        lines += comparison_lines(one)
     for gap in gaps:
         lines += [gap_verdict(gap), *gap_lines(gap)]
     if related and any(one.errors_of == "both" for one in found):

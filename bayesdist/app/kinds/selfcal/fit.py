@@ -88,16 +88,18 @@ def solved_of(
     )
     gauge = gauge_of(problem, theta, known(theta), solution)
     fixed, places = fixed_by(gauge, solution, known), solution.stars
+    contact = inputs.contact(model, matched.theta)
     return SelfCalibrated(
         solution,
         gauge,
         fixed,
-        gauge_words(gauge, fixed, model),
+        gauge_words(gauge, fixed, model, contact),
         gauge_table(gauge, fixed, model),
         matches_of(problem, places, matched.detections, inputs, matched.unused),
         arrays,
         tuple(known.contradictions(theta)),
         inputs.catalog,
+        contact,
     )
 
 

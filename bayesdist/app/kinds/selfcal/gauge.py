@@ -89,8 +89,16 @@ def gauge_summary(
     }
 
 
-def gauge_words(gauge: Gauge, fixed: Mapping[str, str], model: DistortionModel) -> str:
-    """In which gauge a product stands, in one sentence."""
+def gauge_words(
+    gauge: Gauge,
+    fixed: Mapping[str, str],
+    model: DistortionModel,
+    contact: tuple[float, float] | None = None,
+) -> str:
+    """In which gauge a product stands, and where its planes touch the sky.
+
+    `contact`: point in u and v where the stars' plane touches the sky; None if the sky is flat.
+    """
     by: dict[str, list[str]] = {}
     for d in gauge.directions:
         if d.free or d.weak:
@@ -98,4 +106,16 @@ def gauge_words(gauge: Gauge, fixed: Mapping[str, str], model: DistortionModel) 
     parts = [f"{', '.join(names)} by {what}" for what, names in by.items()]
     held = ", ".join(model.names[k] for k in gauge.held)
     text = "Gauge of a self-calibration: " + ("; ".join(parts) or "all is known from detections")
-    return text + (f"; held: {held}." if held else ".")
+    text += f"; held: {held}." if held else "."
+    return text if contact is None else f"{text} {_contact_words(model, contact)}"
+
+
+def _contact_words(model: DistortionModel, contact: tuple[float, float]) -> str:
+    """Points where the planes of exposures and stars touch the sky."""
+    chip = model.chips[0]
+    x, y = (f"{z:.10g}" for z in chip.reference_pixel)
+    u, v = (f"{z:.10g}" for z in contact)
+    return (
+        f"The tangent plane of each exposure touches the sky at pixel ({x}, {y}) of chip "
+        f"{chip.number}, that of the stars at u = {u}, v = {v} {model.unit}."
+    )

@@ -22,7 +22,7 @@ from bayesdist.data.sky.earth import parallax_factors
 from bayesdist.errors import InputError
 from bayesdist.infer.selfcal import ReferenceStars
 from bayesdist.infer.selfcal.problem import Problem, prepare
-from bayesdist.infer.selfcal.tangent import TangentPlane
+from bayesdist.infer.selfcal.tangent import TangentPlane, contacts_of
 from bayesdist.model import DistortionModel
 from bayesdist.utils.arrays import Float
 
@@ -63,11 +63,18 @@ class Inputs:
 
     @property
     def tangent_plane(self) -> TangentPlane | None:
-        """Tangent plane of the reference stars, or of the first exposure; None without a scale."""
+        """Plane of the reference stars, or of the middle of all pointings; None without a scale."""
         if self.unit_arcsec is None:
             return None
         point = None if self.config.gauge.reference is None else (0.0, 0.0)
         return TangentPlane(self.unit_arcsec, point)
+
+    def contact(self, model: DistortionModel, theta: Float) -> tuple[float, float] | None:
+        """Point in u and v where the stars' plane touches the sky; None if the sky is flat."""
+        if self.tangent_plane is None:
+            return None
+        u, v = self.tangent_plane.contact(contacts_of(model, theta, self.detections.epoch))
+        return float(u), float(v)
 
     @cached_property
     def parallax_factors(self) -> Float | None:

@@ -49,10 +49,10 @@ def match_dithers(inputs: Inputs) -> SelfcalMatched:
         facts["n_exposures"],
         facts["n_ambiguous"],
     )
+    s = found.mode
     if inputs.tangent_plane is not None:
         moved = facts["tangent_planes_pix"]
         log.info("match: detections moved by up to %.2g pix onto one tangent plane", moved)
-    s = found.mode
     return selfcal_matched(
         inputs,
         found.detections,
@@ -198,6 +198,7 @@ def matching_facts(found: SelfCalibration, inputs: Inputs) -> dict[str, Any]:
         "n_chains": friends.n_chains,
         "iterations": found.iterations,
         "match_radius": p.match_radius,
+        "tangent_plane": tangent_plane_facts(found, inputs),
         "tangent_planes_pix": float(np.hypot(d.x - raw.x, d.y - raw.y).max()),
         "detections": {
             "read": inputs.n_read,
@@ -207,6 +208,21 @@ def matching_facts(found: SelfCalibration, inputs: Inputs) -> dict[str, Any]:
         },
         "per_star": {"median": float(np.median(p.counts)), "most": int(p.counts.max())},
         "warnings": warnings,
+    }
+
+
+def tangent_plane_facts(found: SelfCalibration, inputs: Inputs) -> dict[str, Any] | None:
+    """Where exposures and stars touch the sky, for summary.json; None if the sky is flat."""
+    model = found.mode.problem.model
+    contact = inputs.contact(model, found.mode.theta)
+    if contact is None:
+        return None
+    chip = model.chips[0]
+    return {
+        "chip": chip.number,
+        "pixel": [float(z) for z in chip.reference_pixel],
+        "contact": list(contact),
+        "unit": model.unit,
     }
 
 

@@ -47,6 +47,8 @@ def write_stars(
     found = star_catalogue(solution, cov, compute=compute)
     table = star_table(solution, found, solved.matches.mag, references)
     table.meta |= notes
+    if solved.contact is not None:
+        table.meta["contact"] = list(solved.contact)
     write_table(table, folder / "stars.ecsv")
     path = folder / "stars.parquet"
     path.unlink(missing_ok=True)

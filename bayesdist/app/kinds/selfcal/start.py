@@ -76,6 +76,10 @@ def started(
             onto, on = turned, [turned(plane) for plane in on]
             frames = mutual_frames(on, mags, names, source="selfcal.lists")
     middles = np.stack([plane.mean(axis=0) for plane in on])
+    # frames turn about the point where the planes of the exposures touch the sky
+    (x, y), number = chips[0].reference_pixel, chips[0].number
+    origin = start(np.array([x]), np.array([y]), number)
+    u, v = (origin if onto is None else onto(origin))[0]
     model = DistortionModel(
         config.model.order,
         chips,
@@ -83,7 +87,7 @@ def started(
         time=config.time(),
         frames=block.frames,
         exposures=d.exposure_names,
-        origin=(float(middles[0, 0]), float(middles[0, 1])),
+        origin=(float(u), float(v)),
     )
     coefficients = fitted_polynomials(start, chips, model.order, onto)
     return model, start_parameters(model, coefficients, frames, middles)

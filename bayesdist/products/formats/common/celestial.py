@@ -33,8 +33,7 @@ _GRID = 17  # points of each axis at which these are compared
 _TABLES = re.compile(r"(D2IM\w*|CPDIS\d|CPERR\d|CQDIS\d|CQERR\d|DP\d|DQ\d)$")
 _INVERSE = re.compile(r"(AP|BP)_")
 _SAMPLE = (
-    "compute positions of a grid of pixels with astropy.wcs, write them as a table with columns x, "
-    "y, ra and dec, and fit that table"
+    "sample it through astropy.wcs and fit a polynomial: `bayesdist convert FILE --sample --to sip`"
 )
 _NAMES = {
     "TNX": "a TNX of IRAF (TAN with a polynomial in WAT keywords)",
@@ -88,7 +87,7 @@ class TangentForm:
         InputError
             If they differ by more than 0.01 mas anywhere.
         """
-        wcs = _wcs_of(
+        wcs = wcs_of(
             _without(header, _INVERSE, *([_TABLES] if opened is None else [])), where, opened
         )
         x, y = detector_grid(size, _GRID)
@@ -137,7 +136,7 @@ def tangent_form(header: fits.Header, where: str) -> TangentForm | None:
         refuse_projection(code, where)
     if str(header.get("CTYPE1", "")).startswith("RA") and not header.get("CUNIT1"):
         _refuse_point(header.get("CRVAL1", 0.0), header.get("CRVAL2", 0.0), where)
-    wcs = _wcs_of(_without(header, _TABLES, _INVERSE), where)
+    wcs = wcs_of(_without(header, _TABLES, _INVERSE), where)
     w = wcs.wcs
     if w.lng < 0 or w.lat < 0:
         return None
@@ -207,7 +206,7 @@ def _without(header: fits.Header, *patterns: re.Pattern[str]) -> fits.Header:
     )
 
 
-def _wcs_of(header: fits.Header, where: str, opened: fits.HDUList | None = None) -> WCS:
+def wcs_of(header: fits.Header, where: str, opened: fits.HDUList | None = None) -> WCS:
     """World coordinates by astropy.wcs; InputError if it refuses the header."""
     from astropy import log
     from astropy.wcs import WCS, SingularMatrixError  # slow to import
@@ -246,7 +245,7 @@ def _equatorial(w: object, lon: float, lat: float, where: str) -> tuple[Float, t
         raise InputError(
             f"has right ascension and declination of {stated}, and bayesdist holds those of ICRS",
             where=where,
-            do=f"{_SAMPLE}; transform them with astropy.coordinates before",
+            do=_SAMPLE,
         )
     if system == "GLON":
         return _from_galactic(lon, lat)
@@ -256,7 +255,7 @@ def _equatorial(w: object, lon: float, lat: float, where: str) -> tuple[Float, t
         f"has {names.get(system, 'celestial')} coordinates ({system}), and bayesdist holds right "
         "ascension and declination",
         where=where,
-        do=f"{_SAMPLE}; transform them with astropy.coordinates before",
+        do=_SAMPLE,
     )
 
 
