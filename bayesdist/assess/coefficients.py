@@ -20,8 +20,8 @@ def coefficient_table(fit: LinearFit, posterior: Posterior | None = None) -> Tab
     Returns one row for each parameter and, behind them, one for each polynomial coefficient in
     monomial form: coefficient of (x - xref)^i (y - yref)^j.  Columns: name, chip, axis, i, j, form
     ('legendre', 'monomial', 'tdd' or 'frame'), lsq_value and lsq_sigma of least squares; with a
-    posterior also mean, sd, lo68, hi68, lo95, hi95, rhat, ess_bulk (of the sampled, that is the Legendre
-    form); unit.
+    posterior also mean, sd, lo68, hi68, lo95, hi95, rhat, ess_bulk (of the sampled, that is the
+    Legendre form); unit.
     """
     model = fit.model
     sampled = None if posterior is None else posterior.flat

@@ -35,6 +35,7 @@ class TextTable:
     leading: int = 0  # first rows that are printed; 0: all
     stacked: tuple[int, ...] = ()  # first columns of a row's block on a narrow screen; empty: none
     grouped: bool = False  # True where the first column is the heading of rows
+    folded: bool = False  # True where it is shown when a reader asks for it
     number: int = 0  # by which the page calls it; 0 where tables are not numbered
 
     @property
