@@ -41,11 +41,34 @@ RENAMED = {
     "order": "select-order",
 }
 EPILOG = (
-    "Exit codes: 0 success, 1 bad input, 2 wrong usage, 3 not converged under --strict, "
-    "4 a requirement missed, 5 one not shown, 6 one undecided, "
-    "65 input nested too deep, 70 a defect of bayesdist, 71 too little memory, "
-    "74 refused by the system, 130 interrupted."
+    "Exit codes: 0 all went well; 1 the input is wrong, and the message says what to mend; 2 the "
+    "command was not understood; 3 the sampler did not converge and --strict was given; 4 a "
+    "requirement is missed; 5 none is missed, but one is neither shown to be met nor missed; 6 one "
+    "cannot be judged because something is in doubt; 65 the input is nested too deep; 70 a bug of "
+    "bayesdist: please report it; 71 the memory is too small; 74 a file cannot be read or written; "
+    "130 interrupted by the user."
 )
+
+
+EXAMPLES = {
+    "init": "init camera.toml --matches stars.csv --size 2048 2048",
+    "check": "check camera.toml",
+    "run": "run camera.toml -o camera-run",
+    "stage": "stage report camera-run --pdf",
+    "report": "report camera-run other-run -o reports.html",
+    "requirements": "requirements camera-run --requirements limits.toml",
+    "budget": "budget camera-run --at 100 100 --to 1900 1900",
+    "plan": "plan camera-run",
+    "plan-dither": "plan-dither patterns.toml",
+    "select-order": "select-order camera.toml --orders 2 6",
+    "monitor": "monitor camera-run new_stars.csv",
+    "compare": "compare camera-run old.hdr",
+    "inspect": "inspect camera.hdr",
+    "apply": "apply camera.hdr stars.csv -o sky.ecsv --sky",
+    "convert": "convert camera.hdr --to tpv -o camera-tpv.hdr",
+    "release": "release camera-run -o release",
+    "docs": "docs method",
+}
 
 
 def _renamed(name: str, new: str) -> RenamedError:
@@ -63,6 +86,8 @@ class _Root(LazyGroup):
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
         found = super().get_command(ctx, cmd_name)
         if found is not None:
+            if cmd_name in EXAMPLES:
+                found.epilog = f"Example: bayesdist {EXAMPLES[cmd_name]}"
             return found
         if cmd_name in RENAMED:
             raise _renamed(cmd_name, RENAMED[cmd_name])

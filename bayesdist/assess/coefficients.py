@@ -19,9 +19,9 @@ def coefficient_table(fit: LinearFit, posterior: Posterior | None = None) -> Tab
 
     Returns one row for each parameter and, behind them, one for each polynomial coefficient in
     monomial form: coefficient of (x - xref)^i (y - yref)^j.  Columns: name, chip, axis, i, j, form
-    ('legendre', 'monomial', 'tdd' or 'frame'), value and sigma of least squares; with a posterior
-    also mean, sd, lo68, hi68, lo95, hi95, rhat, ess_bulk (of the sampled, that is the Legendre
-    form); unit.
+    ('legendre', 'monomial', 'tdd' or 'frame'), lsq_value and lsq_sigma of least squares; with a
+    posterior also mean, sd, lo68, hi68, lo95, hi95, rhat, ess_bulk (of the sampled, that is the
+    Legendre form); unit.
     """
     model = fit.model
     sampled = None if posterior is None else posterior.flat
@@ -66,7 +66,7 @@ def coefficient_table(fit: LinearFit, posterior: Posterior | None = None) -> Tab
 
 def _columns(value: Float, sigma: Float, draws: Float | None) -> dict[str, Float]:
     """Columns of some rows, by name: with draws (n, rows) also what is known of these."""
-    columns = {"value": value, "sigma": sigma}
+    columns = {"lsq_value": value, "lsq_sigma": sigma}
     if draws is not None:
         tails = {"lo68": 0.16, "hi68": 0.84, "lo95": 0.025, "hi95": 0.975}
         quantiles = np.quantile(draws, list(tails.values()), axis=0)

@@ -121,8 +121,8 @@ class ReportInput:
     """Results of a run, as the report shows them.
 
     Columns of `coefficients`, Legendre coefficients and all other parameters: name, chip, axis, i,
-    j, value, sigma (least squares), mean, sd, lo68, hi68, lo95, hi95, rhat, ess_bulk, unit; those
-    of the posterior may be missing or masked.
+    j, lsq_value, lsq_sigma (least squares), mean, sd, lo68, hi68, lo95, hi95, rhat, ess_bulk, unit;
+    those of the posterior may be missing or masked.
     """
 
     name: str  # of the calibration: the title

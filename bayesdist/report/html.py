@@ -125,7 +125,9 @@ def budget_rows(budget: ErrorBudget, *, scale_mas: float | None = None) -> list[
         }
         if scale_mas is not None and budget.unit == "pix":
             row["As an angle"] = with_mas(size * scale_mas, "mas", None, like=sizes[-1] * scale_mas)
-        row["Known to"] = MISSING if error is None or not radial > 0 else percent(error / radial, 2)
+        row["Relative uncertainty"] = (
+            MISSING if error is None or not radial > 0 else percent(error / radial, 2)
+        )
         rows.append(row)
     return rows
 

@@ -7,7 +7,8 @@ import functools
 import hashlib
 import re
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from itertools import count
 from typing import Any
 
 import jinja2
@@ -34,6 +35,7 @@ class Picture:
     width: float  # inches, at which its letters have the size they were set in
     words: Drawing  # title, text and text alternative
     printed: bool = True  # True where it is on paper
+    number: int = 0  # by which the page calls it; 0 where figures are not numbered
 
     @property
     def place(self) -> str:
@@ -57,6 +59,30 @@ class Part:
     parts: tuple[Part, ...] = ()  # sections within it
     empty: str = ""  # text in place of tables; empty where there are some
     printed: bool = True  # True where it is on paper
+    on_top: tuple[Picture, ...] = ()  # its pictures that stand on top of the page
+
+
+def numbered(
+    top: Sequence[Picture], parts: Sequence[Part]
+) -> tuple[tuple[Picture, ...], tuple[Part, ...]]:
+    """Pictures on top of a page, and its sections, with figures and tables numbered in order.
+
+    The numbers are the same on the screen and on paper, which leaves some out.
+    """
+    figures, tables = count(1), count(1)
+    top = tuple(replace(picture, number=next(figures)) for picture in top)
+    by_name = {picture.name: picture for picture in top}
+
+    def in_order(part: Part) -> Part:
+        return replace(
+            part,
+            tables=tuple(replace(table, number=next(tables)) for table in part.tables),
+            pictures=tuple(replace(p, number=next(figures)) for p in part.pictures),
+            parts=tuple(in_order(inner) for inner in part.parts),
+            on_top=tuple(by_name[p.name] for p in part.on_top),
+        )
+
+    return top, tuple(in_order(part) for part in parts)
 
 
 def parts_of(registry: Registry, results: Any, drawings: Mapping[str, Drawing]) -> tuple[Part, ...]:

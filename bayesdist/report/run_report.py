@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,9 +14,9 @@ from markupsafe import Markup
 from bayesdist.files.atomic import atomic_path
 from bayesdist.report.context import ReportInput
 from bayesdist.report.drawing import Drawing, draw_all
-from bayesdist.report.page import Part, parts_of, template
+from bayesdist.report.page import Part, Picture, numbered, parts_of, template
 from bayesdist.report.sections import REPORT
-from bayesdist.report.sections.run.status import verdict
+from bayesdist.report.sections.run.status import facts_line, verdict
 from bayesdist.report.texttable import moment
 
 _PROVISIONAL = (
@@ -23,6 +24,7 @@ _PROVISIONAL = (
     " on its draws and may be wrong by more than their stated errors. Sample longer, or look at the"
     " reasons, before anything is used."
 )
+STRIP = ("margins", "uncertainty_radius", "distortion")  # figures on top of the page
 _FOOTER = (
     "u and v are the reference axes; x runs to the right and y up, in FITS"
     " pixels (centre of the first pixel = 1)."
@@ -51,7 +53,7 @@ def render_report(r: ReportInput, drawings: Mapping[str, Drawing]) -> str:
     """
     data = {item.name: _embedded(item.made(r)) for item in REPORT.items(r, "data")}
     return template("report.html.jinja").render(
-        **_contents(r, drawings),
+        **_with_strip(_contents(r, drawings)),
         trace=f"{r.name} · {_maker(r)}",
         budget_words=_BUDGET_WORDS,
         print_words=f"{_PRINT_WORDS} {_FOOTER}",
@@ -86,6 +88,21 @@ def write_report(
             temporary.write_text(text, encoding="utf-8")
 
 
+def _with_strip(contents: dict[str, Any]) -> dict[str, Any]:
+    """Contents with the figures of `STRIP` on top instead of in their sections, all numbered."""
+    top: dict[str, Picture] = {}
+
+    def without(part: Part) -> Part:
+        on_top = tuple(p for p in part.pictures if p.name in STRIP)
+        top.update({p.name: p for p in on_top})
+        others = tuple(p for p in part.pictures if p.name not in STRIP)
+        return replace(part, pictures=others, on_top=on_top)
+
+    parts = [contents["status"], *(without(part) for part in contents["parts"])]
+    strip, (status, *others) = numbered([top[name] for name in STRIP if name in top], parts)
+    return contents | {"strip": strip, "status": status, "parts": others}
+
+
 def _contents(r: ReportInput, drawings: Mapping[str, Drawing]) -> dict[str, Any]:
     """Content of both forms of the report."""
     parts = parts_of(REPORT, r, drawings)
@@ -99,6 +116,7 @@ def _contents(r: ReportInput, drawings: Mapping[str, Drawing]) -> dict[str, Any]
         "footer": f"Made by {_maker(r)}. {_FOOTER}",
         "chips": _chips(r),
         "verdict": verdict(r),
+        "facts": facts_line(r),
     }
 
 

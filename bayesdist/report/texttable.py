@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import groupby
 from pathlib import PurePath
 from typing import Any
@@ -35,6 +35,8 @@ class TextTable:
     leading: int = 0  # first rows that are printed; 0: all
     stacked: tuple[int, ...] = ()  # first columns of a row's block on a narrow screen; empty: none
     grouped: bool = False  # True where the first column is the heading of rows
+    folded: bool = False  # True where it is shown when a reader asks for it
+    number: int = 0  # by which the page calls it; 0 where tables are not numbered
 
     @property
     def of_checks(self) -> bool:
@@ -48,6 +50,17 @@ class TextTable:
             return (("", self.rows),)
         by_heading = groupby(self.rows, key=lambda row: row[0])
         return tuple((name, tuple(row[1:] for row in rows)) for name, rows in by_heading)
+
+    @property
+    def open(self) -> TextTable:
+        """Rows of checks that are not passed."""
+        return replace(self, rows=tuple(row for row in self.rows if Level("pass") not in row))
+
+    @property
+    def passed(self) -> TextTable:
+        """Rows of checks that are passed."""
+        rows = tuple(row for row in self.rows if Level("pass") in row)
+        return replace(self, caption="Criteria that pass", rows=rows)
 
     @property
     def is_small(self) -> bool:

@@ -187,7 +187,7 @@ def coefficient_table(fit: LinearFit, posterior: Posterior | None) -> Table:
     t["name"] = [q.name for q in p]
     t["chip"], t["i"], t["j"] = ([getattr(q, k) for q in p] for k in ("chip", "i", "j"))
     t["axis"] = [q.axis for q in p]
-    t["value"], t["sigma"] = fit.mean, fit.sigma
+    t["lsq_value"], t["lsq_sigma"] = fit.mean, fit.sigma
     if posterior is not None:
         sd = np.sqrt(np.diag(posterior.cov))
         t["mean"], t["sd"] = posterior.mean, sd

@@ -437,10 +437,10 @@ def test_small_ratios_are_shown_by_the_million(run):
     name = next(n for n in units if "shift" in n)
     bare = run.coefficients.copy()
     k = list(bare["name"]).index(name)
-    for column in ("value", "sigma", "mean", "sd", "lo68", "hi68", "lo95", "hi95"):
+    for column in ("lsq_value", "lsq_sigma", "mean", "sd", "lo68", "hi68", "lo95", "hi95"):
         bare[column][k] *= 1e-7
     bare["unit"][k] = ""
-    value, sigma = bare["value"][k], bare["sigma"][k]
+    value, sigma = bare["lsq_value"][k], bare["lsq_sigma"][k]
     (table,) = [
         t
         for t in coefficient_tables(replace(run, coefficients=bare))

@@ -15,8 +15,8 @@ from matplotlib.quiver import Quiver
 from bayesdist.assess import VectorMap
 from bayesdist.errors import InputError
 from bayesdist.report.drawing import save_figures
-from bayesdist.report.figures.arrows import Arrows, cross_map, square_cells
-from bayesdist.report.figures.fields import contour_levels
+from bayesdist.report.figures.arrows import Arrows, cross_map, sparse_step, square_cells
+from bayesdist.report.figures.fields import contour_levels, error_levels
 from bayesdist.report.figures.mosaic import Mosaic
 from bayesdist.report.figures.panels import ChipPanels
 from bayesdist.report.figures.style import figure_style, nice_below
@@ -431,3 +431,23 @@ def test_levels_of_values_that_differ_by_far_are_1_2_5_10(low, high):
     assert set(np.round(leading, 6)) <= {1.0, 2.0, 5.0}
     even = np.diff(contour_levels([low, 10 * low]))
     np.testing.assert_allclose(even, even[0])
+
+
+@pytest.mark.parametrize(("low", "high"), [(2e-3, 1.1e-2), (1e-4, 3e-4), (3e-6, 0.4), (1.0, 1.6)])
+def test_levels_of_errors_are_logarithmic_and_many(low, high):
+    levels = error_levels([low, high])
+    assert levels[0] <= low and levels[-1] >= high
+    assert ((levels > low) & (levels < high)).sum() >= 7
+    steps = np.log(levels[1:] / levels[:-1])
+    assert steps.min() > 0 and steps.max() < 2.5 * steps.min()
+
+
+@pytest.mark.parametrize("n", [5, 13, 17, 33, 65])
+def test_at_most_thirteen_crosses_stand_on_an_axis(converged, n):
+    x = np.linspace(1.0, 1016.0, n)
+    values = np.ones((n, n))
+    m = replace(converged.chips[0].formal_map, x=x, y=x, sigma_u=values, sigma_v=values)
+    rows, columns = square_cells(m.x, m.y, sparse_step([m]))
+    shown = x[columns]
+    assert len(x[rows]) == len(shown) <= 13
+    assert shown[0] == 1.0 and shown[-1] == 1016.0  # corners, where errors are largest

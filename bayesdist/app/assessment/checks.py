@@ -52,8 +52,9 @@ def _kind_checks(data: FitData, series: Mapping[str, Any] | None) -> tuple[Check
             "Constraints": solved.contradictions,
             "Detections": matched.warnings,
         }
+        settled = set(solved.gauge.settled)  # by the choice of a gauge: no fault of the data
         return tuple(
-            Check("Gauge", name, level="warn", sentence=text)
+            Check("Gauge", name, level="note" if text in settled else "warn", sentence=text)
             for name, texts in named.items()
             for text in texts
         )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from difflib import get_close_matches
 from functools import wraps
 from typing import Any
 
@@ -27,6 +28,21 @@ class LazyGroup(click.Group):
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
         """Command of a name, loaded; None for an unknown one."""
         return self.load(self._lazy[cmd_name]) if cmd_name in self._lazy else None
+
+    def resolve_command(
+        self, ctx: click.Context, args: list[str]
+    ) -> tuple[str | None, click.Command | None, list[str]]:
+        """Command of the arguments; a name that is unknown is answered with similar ones."""
+        try:
+            return super().resolve_command(ctx, args)
+        except click.UsageError as error:
+            similar = get_close_matches(args[0], self.list_commands(ctx), n=2)
+            if not similar or "Did you mean" in error.format_message():
+                raise
+            said = " or ".join(repr(name) for name in similar)
+            raise click.UsageError(
+                f"No such command {args[0]!r}. Did you mean {said}?", ctx
+            ) from None
 
     @staticmethod
     def load(target: str) -> click.Command:

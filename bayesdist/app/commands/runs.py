@@ -56,7 +56,12 @@ def check() -> None:
 @command()
 @click.argument("config", metavar="CONFIG.toml", type=click.Path())
 @click.option(
-    "-o", "--output", type=click.Path(), required=True, metavar="RUN", help="Folder of the run."
+    "-o",
+    "--output",
+    type=click.Path(),
+    metavar="RUN",
+    show_default="CONFIG-run",
+    help="Folder of the run.",
 )
 @click.option("--resume", is_flag=True, help="Resume an interrupted run.")
 @click.option("--force", is_flag=True, help="Replace an existing run.")
@@ -69,7 +74,7 @@ def check() -> None:
     help="Seed of the random numbers.",
 )
 @click.pass_obj
-def run(line: str, config: str, output: str, **options: Any) -> None:
+def run(line: str, config: str, output: str | None, **options: Any) -> None:
     """Calibrate: match, fit, sample, diagnose, evaluate, export, report."""
     if options["resume"] and options["force"]:
         raise click.UsageError("--resume and --force exclude each other.")
@@ -77,7 +82,8 @@ def run(line: str, config: str, output: str, **options: Any) -> None:
     from bayesdist.app.store.rundir import RunDirectory
     from bayesdist.app.tables.margins import results_text
 
-    path = whole_job(config, output, command=line, **options)
+    folder = f"{Path(config).with_suffix('')}-run" if output is None else output
+    path = whole_job(config, folder, command=line, **options)
     click.echo(results_text(RunDirectory(path)))  # its input was checked when it began
 
 
@@ -109,7 +115,7 @@ def stage(name: str, run: str, strict: bool, pdf: bool) -> None:
     type=click.Path(),
     required=True,
     metavar="REQ.toml",
-    help="File of [[requirement]] blocks.",
+    help="File of [[requirement]] blocks, which may be a whole configuration.",
 )
 def requirements(run: str, requirements: str) -> int:
     """Judge a run by requirements; exit with 0 if all are met.

@@ -106,9 +106,13 @@ def config_of_record(settings: Mapping[str, Any], where: str) -> Config:
 
 
 def load_requirements(path: str | Path) -> tuple[Requirement, ...]:
-    """Read a file of ``[[requirement]]`` blocks."""
+    """Read the ``[[requirement]]`` blocks of a file, which may be a whole configuration."""
     text, begin = load_text(path), "give it [[requirement]] blocks"
-    blocks = validated(_RequirementFile, text, str(path), begin=begin).requirement
+    settings = _settings(text, str(path), begin=begin)
+    if "requirement" in settings and settings.keys() & {"data", "detector", "model"}:
+        settings = {"requirement": settings["requirement"]}
+    kind = _RequirementFile
+    blocks = _validated(TypeAdapter(kind), kind, settings, str(path)).requirement
     with _as_config_errors(str(path)):
         return tuple(Requirement(**r.model_dump()) for r in blocks)
 

@@ -20,6 +20,8 @@ if TYPE_CHECKING:
 
 TOTAL = "total"
 TOGETHER = "all terms but products, combined by draws"
+MODEL = "model, jointly"
+JOINTLY = "errors of the parameters, combined by draws"
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,6 +41,7 @@ class BudgetTerm:
     relative_error: float | None = None
     # the same by chip number, where that differs; `relative_error` is that of the first chip
     by_chip: Mapping[int, float | None] = field(default_factory=dict)
+    of_parameters: bool = False  # True for errors of the model's parameters, which are correlated
 
     @property
     def radial(self) -> Float:
@@ -218,6 +221,27 @@ class ErrorBudget:
         return self.total.radial
 
     @property
+    def model(self) -> BudgetTerm | None:
+        """Errors of the model's parameters jointly; None if fewer than two terms are of them.
+
+        The parts are correlated: this is what they leave of the total, beside independent terms,
+        and may be smaller than any of them.
+        """
+        parts = [t for t in self.terms if t.of_parameters]
+        if len(parts) < 2:
+            return None
+        others = [t for t in self.terms if not t.of_parameters]
+        u, v = (
+            np.sqrt(
+                np.maximum(
+                    getattr(self.total, axis) ** 2 - sum(getattr(t, axis) ** 2 for t in others), 0.0
+                )
+            )
+            for axis in "uv"
+        )
+        return replace(parts[0], name=MODEL, u=u, v=v, source=JOINTLY)
+
+    @property
     def dominant(self) -> Int:
         """Index into `terms` of the one with the largest radial error, (P,)."""
         return np.argmax([t.radial for t in self.terms], axis=0)
@@ -323,7 +347,9 @@ def budget_of(errors: DrawnErrors, domain: EvaluationDomain) -> ErrorBudget:
             known = {c: part.relative_error(c, monte_carlo) for c in domain.chips}
             u, v = np.sqrt(square).T
             first = known[domain.chips[0]]
-            found = BudgetTerm(row.name, row.kind, u, v, row.source, first, known)
+            found = BudgetTerm(
+                row.name, row.kind, u, v, row.source, first, known, part.of_parameters
+            )
             if row.kind == PRODUCT:
                 products.append(found)
             else:

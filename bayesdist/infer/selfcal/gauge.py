@@ -37,6 +37,14 @@ EXPLAINED = 1e-2  # fraction of a free direction that its names may leave out
 SAME_ROLL = np.radians(0.1)
 TIE = 0.02  # relative preference for each earlier one of nearly equal parameters
 MIN_PIVOT = 0.02
+# beginnings of the sentences on what is free whatever the data are
+SETTLED = (
+    "scale: not determined",
+    "rotation on the sky: free",
+    "zero point on the sky: free",
+    "the zero point on the sky is free",
+    "motions are relative",
+)
 HIDDEN = 1e-5  # of a property that lies along undetermined directions: it is free
 
 
@@ -111,6 +119,15 @@ class Gauge:
     def free_names(self) -> tuple[str, ...]:
         """Names of the properties that detections leave free."""
         return tuple(one.name for one in self.directions if one.free)
+
+    @property
+    def settled(self) -> tuple[str, ...]:
+        """Those of `sentences` on what no detection can determine and the gauge fixes.
+
+        Scale, rotation and zero point on the sky are free without a catalogue, and common motions
+        with them: the gauge is a choice, and nothing is wrong with the data.
+        """
+        return tuple(text for text in self.sentences if text.startswith(SETTLED))
 
     @property
     def sentences(self) -> tuple[str, ...]:

@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from bayesdist.assess import UncertaintyMap, VectorMap
     from bayesdist.diagnose.residuals.binned import BinnedResiduals
 
+MOST_CROSSES = 13  # of errors along each axis: more hide each other
 CHANCE = 0.0455  # probability that noise alone puts one axis beyond 2 sigma
 
 # -- grids ----------------------------------------------------------------------------------------
@@ -51,6 +52,22 @@ def square_cells(x: Float, y: Float, every: int = 1) -> tuple[slice, slice]:
         fitting = [s for s in (stride * every, stride, 1) if (len(a) - 1) % s == 0]
         out.append(slice(None, None, fitting[0]))
     return out[0], out[1]
+
+
+def sparse_step(maps: Sequence[UncertaintyMap], most: int = MOST_CROSSES) -> int:
+    """Smallest further step of `square_cells` that leaves at most so many points on each axis.
+
+    1 if no step that includes both ends of the grids does.
+    """
+    for every in range(1, max(len(m.x) + len(m.y) for m in maps)):
+        cells = [square_cells(m.x, m.y, every) for m in maps]
+        points = [
+            (len(m.y[rows]), len(m.x[columns]))
+            for m, (rows, columns) in zip(maps, cells, strict=True)
+        ]
+        if max(map(max, points)) <= most:
+            return every
+    return 1
 
 
 def significant_cells(binned: BinnedResiduals) -> Bool:

@@ -21,6 +21,14 @@ from bayesdist.report.figures.style import COLORBAR, INK, SEQUENTIAL, figure_sty
 from bayesdist.utils.arrays import Float
 
 EMPTY = "#D9DEE3"  # of a cell without a value
+NARROW = 1.5  # factor between errors, below which even levels show them as well
+MANTISSAS = (  # of logarithmic levels, 3 to 40 in a decade
+    (1.0, 2.0, 5.0),
+    (1.0, 1.5, 2.0, 3.0, 5.0, 7.0),
+    (1.0, 1.25, 1.6, 2.0, 2.5, 3.2, 4.0, 5.0, 6.3, 8.0),
+    tuple(np.round(10 ** (np.arange(20) / 20), 2)),
+    tuple(np.round(10 ** (np.arange(40) / 40), 2)),
+)
 FAR = 15.0  # factor between values, from which on even steps would show the largest alone
 
 
@@ -46,6 +54,24 @@ def contour_levels(values: ArrayLike, n: int = 10) -> Float:
         low, high = low - pad, high + pad
     locator = MaxNLocator(n, steps=[1, 2, 2.5, 5, 10])
     return np.asarray(locator.tick_values(low, high), float)
+
+
+def error_levels(values: ArrayLike, least: int = 7) -> Float:
+    """Round levels of errors, in equal steps of their logarithm as far as round numbers are.
+
+    At least `least` of them lie among the values.  Even levels if values are not positive, or
+    differ by less than a factor of 1.5.
+    """
+    low, high = float(np.min(values)), float(np.max(values))
+    if not (low > 0 and high >= NARROW * low):
+        return contour_levels(values)
+    decades = 10.0 ** np.arange(np.floor(np.log10(low)), np.ceil(np.log10(high)) + 1)
+    for mantissas in MANTISSAS:
+        levels = np.outer(decades, mantissas).ravel()
+        if ((levels > low) & (levels < high)).sum() >= least:
+            break
+    first, last = (levels <= low).sum() - 1, (levels < high).sum()
+    return levels[max(int(first), 0) : int(last) + 1]
 
 
 @figure_style()

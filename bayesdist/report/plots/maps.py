@@ -18,7 +18,7 @@ from bayesdist.report.figures.arrows import (
     draw_key,
     magnification_of,
 )
-from bayesdist.report.figures.fields import Grid, contour_levels, draw_grid
+from bayesdist.report.figures.fields import Grid, draw_grid, error_levels
 from bayesdist.report.figures.panels import chip_axes
 from bayesdist.report.figures.style import COLORBAR, nice_below
 from bayesdist.report.plots.axes import add_colorbar, axes_of, scale_of, set_title
@@ -106,7 +106,7 @@ def plot_map(
     chip_axes(ax, size)
     scale = scale_of(m.unit, float(m.per_axis.max()), scale_mas)
     grid = Grid(m.x, m.y, m.per_axis * scale.factor, m.position_of_max)
-    shown = contour_levels(grid.values) if levels is None else np.asarray(levels) * scale.factor
+    shown = error_levels(grid.values) if levels is None else np.asarray(levels) * scale.factor
     drawn = draw_grid(ax, grid, levels=shown)
     label = f"per axis (1 σ) [{scale.unit}]"
     if colorbar is True:

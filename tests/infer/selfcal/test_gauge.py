@@ -48,6 +48,9 @@ def test_free_directions_by_roll(rolls, free, n_chips):
     assert np.linalg.eigvalsh(H / np.outer(scale, scale))[0] > 1e-8
     told = " ".join(gauge.sentences)
     assert ("one roll angle" in told) == (free >= SKEW)
+    # what is free in any self-calibration is no finding about these data
+    findings = [text for text in gauge.sentences if text not in gauge.settled]
+    assert len(findings) == (free >= SKEW)
 
 
 def test_a_decision_of_other_detections_is_made_anew_where_it_fixes_too_little():

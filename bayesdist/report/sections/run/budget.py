@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from typing import Any
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from matplotlib.colors import BoundaryNorm, ListedColormap
@@ -33,34 +34,65 @@ from bayesdist.utils.numbers import (
     with_mas,
 )
 
+if TYPE_CHECKING:
+    from bayesdist.assess.budget.budget import BudgetTerm, ErrorBudget
+
 AS_ABOVE = "as above"  # of the rows of single chips
 _LETTERS = 31  # of a label beside another one, over a narrow figure
 _MOST_PANELS = 3  # chips whose bars are shown with those of the detector
 
 
 @REPORT.table("budget", needs=("budget",))
-def budget_table(r: ReportInput) -> TextTable:
-    """Table of the error budget, the total last."""
+def budget_table(r: ReportInput) -> tuple[TextTable, ...]:
+    """Table of the error budget, the total last; correlated parts of the model are folded."""
     budget = needed(r.budget)
+    if budget.model is None:
+        return (_table(r, budget, budget),)
+    parts = {term.name for term in budget.terms if term.of_parameters}
+    jointly = replace(budget, terms=_jointly(budget))
+    alone = replace(budget, terms=tuple(t for t in budget.terms if t.name in parts), products=())
+    folded = _table(r, budget, alone, names=parts)
+    return (
+        _table(r, budget, jointly),
+        replace(
+            folded,
+            caption="Parts of the model: their errors are correlated and enter the total jointly",
+            note="",
+            folded=True,
+            detail=True,
+        ),
+    )
+
+
+def _jointly(budget: ErrorBudget) -> tuple[BudgetTerm, ...]:
+    """Terms of a budget with those of the model's parameters as one, which comes first."""
+    return (needed(budget.model), *(t for t in budget.terms if not t.of_parameters))
+
+
+def _table(
+    r: ReportInput, budget: ErrorBudget, shown: ErrorBudget, names: Collection[str] = ()
+) -> TextTable:
+    """Table of some terms of a budget; `names`: of those that are shown, all if it is empty."""
     unit, mas = budget.unit, r.scale_mas
-    names = {str(c.chip.number): c.chip.name for c in r.chips} | {"all": "all"}
-    rows = budget.rows_by_chip() if r.several else budget.rows()
+    chips = {str(c.chip.number): c.chip.name for c in r.chips} | {"all": "all"}
+    rows = shown.rows_by_chip() if r.several else shown.rows()
+    rows = [row for row in rows if not names or row["name"] in names]
     typical = row_per_axis(budget.rows()[-1])
     scale = length_scale(unit, typical)
     out = [
         (
             str(row["name"]),
-            *((names[str(row["chip"])],) if r.several else ()),
+            *((chips[str(row["chip"])],) if r.several else ()),
             str(row["kind"]),
             AS_ABOVE if str(row.get("chip", "all")) != "all" else str(row["source"]) or MISSING,
             *(r.marked(text) for text in _sizes(row, scale, mas, typical)),
-            _known_to(row),
+            _relative_uncertainty(row),
         )
         for row in rows
     ]
     of_chip = ("Chip",) if r.several else ()
     lengths = [f"{name} [{scale.unit}]" for name in ("u", "v", "Per axis", "CE68", "CE95")]
-    heads = ("Term", *of_chip, "Kind", "Source", *lengths, "Known to")
+    heads = ("Term", *of_chip, "Kind", "Source", *lengths, "Relative uncertainty")
     epoch = budget.epoch
     when = "" if epoch is None else f" at epoch {epoch:.2f}"
     return TextTable(
@@ -68,7 +100,9 @@ def budget_table(r: ReportInput) -> TextTable:
         heads,
         tuple(out),
         words=tuple(range(len(heads) - 6)),
-        leading=len(budget.rows()),  # rows of all chips together
+        leading=len(
+            [row for row in shown.rows() if not names or row["name"] in names]
+        ),  # rows of all chips together
         stacked=(heads.index(lengths[2]),),
         note="Per axis: rms of u and v; CE68, CE95: circles that hold 68 and 95 % of errors of that"
         " size, if Gaussian. The parts of the model are correlated and enter the total jointly, by"
@@ -90,7 +124,7 @@ def _sizes(
     return tuple(sizes)
 
 
-def _known_to(row: Mapping[str, Any]) -> str:
+def _relative_uncertainty(row: Mapping[str, Any]) -> str:
     """Words on how well a term is known itself."""
     error, size = row["radial_error"], float(row["radial"])
     if error is None or not size > 0:

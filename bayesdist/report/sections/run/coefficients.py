@@ -99,7 +99,7 @@ def _held_note(r: ReportInput, names: list[str]) -> str:
 def _readable(row: Any) -> tuple[float, str]:
     """Factor and unit in which a parameter is shown: small ratios and angles by the million."""
     unit = str(row["unit"] or "")
-    largest = max(abs(float(row["value"])), float(row["sigma"]))
+    largest = max(abs(float(row["lsq_value"])), float(row["lsq_sigma"]))
     return (1e6, "10⁻⁶") if not unit and largest < _SMALL else (1.0, unit or "none")
 
 
@@ -115,7 +115,7 @@ def _parameter_table(
     out = []
     for row in rows:
         factor, unit = _readable(row) if with_unit else (1.0, "")
-        sigma, sd = cell(row, "sigma", factor), cell(row, "sd", factor)
+        sigma, sd = cell(row, "lsq_sigma", factor), cell(row, "sd", factor)
         ratio = None
         if number(sigma) != MISSING and number(sd) != MISSING and float(sigma) > 0:
             ratio = float(sd) / float(sigma)
@@ -129,7 +129,7 @@ def _parameter_table(
         out.append(
             {
                 "Name": str(row["name"]),
-                "Least squares": rounded(cell(row, "value", factor), sigma),
+                "Least squares": rounded(cell(row, "lsq_value", factor), sigma),
                 "Formal σ": number(sigma, 2),
                 **{key: r.marked(text) for key, text in sampled.items()},
                 "R-hat": number(cell(row, "rhat"), 4),

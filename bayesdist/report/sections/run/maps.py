@@ -14,9 +14,10 @@ from bayesdist.report.figures.arrows import (
     Arrows,
     cross_map,
     crosses_magnification,
+    sparse_step,
     vector_map,
 )
-from bayesdist.report.figures.fields import Grid, contour_levels, scalar_map
+from bayesdist.report.figures.fields import Grid, contour_levels, error_levels, scalar_map
 from bayesdist.report.figures.panels import ChipPanels
 from bayesdist.report.figures.style import nice_below
 from bayesdist.report.plots.maps import BORDER, distortion_magnification
@@ -76,7 +77,7 @@ def uncertainty_radius(r: ReportInput) -> Plot:
             panels.title(k, f"{kind}: {number(g.values.min())} to {number(g.values.max())}", ", ")
             for (k, kind), g in zip(kinds, grids, strict=True)
         ],
-        levels=contour_levels(np.concatenate([g.values.ravel() for g in grids])),
+        levels=error_levels(np.concatenate([g.values.ravel() for g in grids])),
         label=f"per axis (1 σ) [{scale.unit}]",
     )
     figure = panels.figure
@@ -169,7 +170,7 @@ def formal_uncertainty(r: ReportInput) -> Plot:
     maps = [m for c in r.chips for m in c.maps]
     largest = max(m.radius_max for m in maps)
     widest = max(max(m.sigma_u_max, m.sigma_v_max) for m in maps)
-    every = 2 if r.several else 1  # panels of several chips are small
+    every = max(sparse_step(maps), 2 if r.several else 1)  # panels of several chips are small
     M = crosses_magnification(maps, every)
     panels = ChipPanels(r.mosaic, len(r.chips[0].maps))
     panels.frame(M * widest + BORDER * r.mosaic.longest_side)

@@ -18,7 +18,7 @@ from bayesdist.report.contents import REPORT
 from bayesdist.report.context import ReportInput, needed
 from bayesdist.report.texttable import TextTable, check_cells
 from bayesdist.utils.checks import GROUPS, LEVELS, Check, doubts_of, warnings_of, worst
-from bayesdist.utils.numbers import counted, rounded, with_mas
+from bayesdist.utils.numbers import count, counted, rounded, with_mas
 
 if TYPE_CHECKING:
     from bayesdist.assess import Margin
@@ -89,6 +89,18 @@ def _began(r: ReportInput) -> float | None:
 _OWN_CLAUSE = ("Requirements", "Validity")  # of the headline
 _UNSAMPLED = "least squares only, no posterior was sampled"
 _NAMED = 2  # rows of the status table that the headline names
+# groups of the status table by their importance for a reader; the others follow as in GROUPS
+_FIRST = ("Requirements", "Validity", "Assumptions", "Errors", "Held-out truth", "Fit")
+_ORDER = (*_FIRST, *sorted(set(GROUPS) - set(_FIRST), key=("Score tests", *GROUPS).index))
+
+
+@dataclass(frozen=True)
+class RequirementLine:
+    """Verdict on one requirement as a line on top of the report."""
+
+    level: str  # 'pass', 'warn' or 'fail'
+    verdict: str  # in capitals: 'MET'
+    text: str  # 'p95 0.0131 pix (36.0 mas), limit 0.03 pix, P > 0.9992'
 
 
 @dataclass(frozen=True)
@@ -98,12 +110,13 @@ class Verdict:
     level: str
     headline: str
     sentences: tuple[str, ...]
+    requirements: tuple[RequirementLine, ...] = ()
 
 
 def status_checks(r: ReportInput) -> dict[str, tuple[Check, ...]]:
     """Criteria by subject; empty groups are left out.
 
-    They stand in the order of `bayesdist.utils.checks.GROUPS`.
+    Requirements come first, then what they rest on, then how the numbers were made.
     """
     groups = {
         **{name: tuple(c for c in r.checks if c.group == name) for name in GROUPS},
@@ -116,7 +129,7 @@ def status_checks(r: ReportInput) -> dict[str, tuple[Check, ...]]:
             if c.level != "note"
         ),
     }
-    return {name: checks for name, checks in groups.items() if checks}
+    return {name: groups[name] for name in _ORDER if groups[name]}
 
 
 @REPORT.table("status")
@@ -161,13 +174,15 @@ def verdict(r: ReportInput) -> Verdict:
     The headline says what is worst first, for which epoch, and until when it holds.
     """
     groups = status_checks(r)
-    numbers = (_margin_sentence(r), _accuracy_sentence(r))
+    lines = requirement_lines(r)
+    numbers = (*(() if lines else ("No requirement was stated.",)), _accuracy_sentence(r))
     if r.provisional:
         reasons = needed(r.posterior).convergence.reasons
         why = f"Why: {'; '.join(reasons) or 'no reason was recorded'}."
         remarks = warnings_of(c for c in r.checks if c.name != "Converged")  # it says the same
         sentences = (why, *(f"{text}." for text in remarks), *numbers)
-        return Verdict("fail", "NOT CONVERGED: do not rely on these numbers", sentences)
+        headline = "NOT CONVERGED: do not rely on these numbers"
+        return Verdict("fail", headline, sentences, lines)
     sentences = (*(f"{text}." for text in r.warnings), *numbers)
     clauses = [(worst(groups.get("Requirements", ())), _requirements_clause(r))]
     own: tuple[str, ...] = _OWN_CLAUSE
@@ -184,7 +199,7 @@ def verdict(r: ReportInput) -> Verdict:
     clauses.sort(key=lambda one: (one[1] == _UNSAMPLED, LEVELS.index(one[0])), reverse=True)
     level = max((level for level, _ in clauses), key=LEVELS.index)
     headline = "; ".join(text for _, text in clauses)
-    return Verdict(level, headline[:1].upper() + headline[1:], sentences)
+    return Verdict(level, headline[:1].upper() + headline[1:], sentences, lines)
 
 
 def _requirements_clause(r: ReportInput) -> str:
@@ -217,18 +232,42 @@ def _rows_clause(names: Sequence[str], verb: str) -> str:
     return f"{len(names)} criteria {verb[:-1]} ({named})"
 
 
-def _margin_sentence(r: ReportInput) -> str:
-    if not r.margins:
-        return "No requirement was stated."
-    by_verdict: dict[str, list[str]] = {}
+def requirement_lines(r: ReportInput) -> tuple[RequirementLine, ...]:
+    """Value, limit and probability of each requirement, in the unit of its limit."""
+    lines = []
     for m in r.margins:
-        by_verdict.setdefault(m.verdict, []).append(m.requirement.name)
-    parts = [
-        f"{len(by_verdict[v])} {v} ({', '.join(by_verdict[v])})"
-        for v in VERDICT_LEVELS
-        if v in by_verdict
+        value = f"{rounded(m.value, (m.interval[1] - m.interval[0]) / 4)}\u202f{m.unit}"
+        if m.unit == "pix" and r.scale_mas is not None:
+            value += f" ({with_mas(m.value * r.scale_mas, 'mas', None)})"
+        met = counted(m.probability_met, m.mc_error, m.n_effective)
+        probability = f"P {met}" if met[:1] in "<>" else f"P = {met}"
+        text = (
+            f"{m.requirement.name}: {m.requirement.statistic} {value},"
+            f" limit {m.requirement.limit:g}\u202f{m.unit}, {probability}"
+        )
+        lines.append(RequirementLine(VERDICT_LEVELS[m.verdict], m.verdict.upper(), text))
+    return tuple(lines)
+
+
+def facts_line(r: ReportInput) -> str:
+    """Stars, exposures, dates, instrument, filter and version, as far as they are known."""
+    table, n = r.stars.table, int(np.count_nonzero(r.exposures.n))
+    facts = [
+        f"{count(r.fit.n_used)} of {count(r.stars.n_total)} {r.words.rows} used",
+        f"{count(n)} exposure{'' if n == 1 else 's'}",
     ]
-    return f"Requirements: {'; '.join(parts)}."
+    if table.epoch is not None and table.epoch.size:
+        first, last = f"{np.min(table.epoch):.2f}", f"{np.max(table.epoch):.2f}"
+        facts.append(first if first == last else f"{first} to {last}")
+    parts = (str(r.setting("detector", key, "")) for key in ("mission", "instrument", "name"))
+    facts.append(" ".join(dict.fromkeys(part for part in parts if part)))
+    filters = [name for name in table.filter_names if name] or [
+        str(r.setting("detector", "filter", "") or "")
+    ]
+    facts.append(", ".join(filters))
+    version = str(r.provenance.get("versions", {}).get("bayesdist", ""))
+    facts.append(f"bayesdist {version}" if version else "")
+    return " · ".join(fact for fact in facts if fact)
 
 
 def _accuracy_sentence(r: ReportInput) -> str:
