@@ -58,7 +58,8 @@ class PlannedKind:
         rows = np.isin(truth.stars["exposure"], names)
         stars = {name: column[rows] for name, column in truth.stars.items()}
         need = {"name": "r", "statistic": "p95", "limit": self.limit, "probability": ASKED}
-        config: dict[str, Any] = truth.config | {"requirement": [need]}
+        assess = truth.config.get("assess", {}) | {"grid": [9, 9], "draws": 1000}
+        config: dict[str, Any] = truth.config | {"requirement": [need], "assess": assess}
         frames = {name: frame for name, frame in truth.frames.items() if name in names}
         return replace(truth, stars=stars, config=config, frames=frames)
 

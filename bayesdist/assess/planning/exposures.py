@@ -117,7 +117,7 @@ def _need(
         numbers = range(enough // 2 + 1, enough + 1)
         return numbers[bisect_left(numbers, probability, key=reached)]
 
-    n = fewest(asked) if reached(MOST) >= asked else None
+    n = fewest(asked)
     high = min(asked + PROBABILITY_ERROR, (1 + asked) / 2)
     interval = fewest(asked - PROBABILITY_ERROR), None if n is None else fewest(high)
     return Need(

@@ -41,7 +41,7 @@ from bayesdist.diagnose.correlated.exposure_fields import QUADRATIC
 from bayesdist.errors import required
 from bayesdist.infer.equations.scaled import one_thread
 from bayesdist.infer.solution.solution import Solution
-from bayesdist.utils.arrays import Float, Int
+from bayesdist.utils.arrays import Bool, Float, Int
 
 TRUTHS = 60
 DRAWS = 250  # of the error model that each truth leads to
@@ -142,19 +142,37 @@ class Futures:
     pixel_scale: float | None
     seed: int
 
-    @one_thread
-    def met(self, information: Float, n: int) -> Float:
-        """Whether the requirement is met with n more exposures: 1 or 0 for each truth (TRUTHS,).
+    def probability(self, information: Float) -> Callable[[int], float]:
+        """Probability that the requirement is met with n more exposures, as a function of n.
 
-        `information` (d, d) is that of one exposure.  Truths are the same for any number.
+        `information` (d, d) is that of one exposure.  Truths are the same for any n, and one that
+        leads to a requirement that is met is not looked at again with more exposures, nor one that
+        leads to a missed requirement with fewer.
+        """
+        met_with, missed_with = np.full(TRUTHS, np.inf), np.zeros(TRUTHS)
+
+        def of(n: int) -> float:
+            open_ones = np.flatnonzero((missed_with < n) & (n < met_with))
+            met = self.met(information, n, open_ones)
+            met_with[open_ones[met]] = n
+            missed_with[open_ones[~met]] = n
+            return float(np.mean(met_with <= n))
+
+        return of
+
+    @one_thread
+    def met(self, information: Float, n: int, truths: Int) -> Bool:
+        """Boolean mask (t,) of the truths that lead to a requirement met with n more exposures.
+
+        `information` (d, d) is that of one exposure, `truths` (t,) are numbers below `TRUTHS`.
         """
         solution = replace(self.errors.solution, solution=self.solution(n * information))
         solution = replace(solution, without=None, catalogue=())
         drawn = solution.draw(DRAWS, np.random.default_rng([self.seed, 1]))
         coefficients = [self._evaluated(drawn, place.positions) for place in self._places]
         rho = n / self.data.n_exposures
-        reached = np.array([self._probability(coefficients, rho, n, k) for k in range(TRUTHS)])
-        return (reached >= self.requirement.probability).astype(float)
+        reached = [self._probability(coefficients, rho, n, int(k)) for k in truths]
+        return np.array(reached) >= self.requirement.probability
 
     def _probability(self, coefficients: Sequence[Float], rho: float, n: int, truth: int) -> float:
         """Probability of meeting the limit that a run would state for a truth."""

@@ -106,14 +106,16 @@ def needs_of(
             information = solved.mode.distortion_information / _n_exposures(results)
             schedules = [Schedule("dithered like these", information)]
         futures = future(requirement)
+        probability = {one.name: futures.probability(one.information) for one in schedules}
 
-        def met(schedule: Schedule, n: int, futures: Futures = futures) -> float:
-            return float(futures.met(schedule.information, n).mean())
+        def met(
+            one: Schedule, n: int, by_name: dict[str, Callable[[int], float]] = probability
+        ) -> float:
+            return by_name[one.name](n)
 
         asked = requirement.probability
-        out.append(
-            (requirement, exposures_needed(schedules, met, asked, now=now[requirement.name]))
-        )
+        needs = exposures_needed(schedules, met, asked, now=now[requirement.name])
+        out.append((requirement, needs))
     return out
 
 
