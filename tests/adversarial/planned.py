@@ -14,7 +14,7 @@ from bayesdist.app.commands.on_runs.plan import needs_of
 
 from . import exposure_kinds, fields, selfcal_kinds
 from .measure import assessed
-from .truth import Truth, mapped
+from .truth import Truth, mapped, observed, order_config, pixels
 
 ASKED = 0.8  # probability of each requirement, and that the run then meets it
 MOST = 100  # exposures of a truth, of which a run has some
@@ -104,4 +104,21 @@ KINDS = {
     "matched": PlannedKind(matched, exposures=6, limit=0.022),
     "single": PlannedKind(single, exposures=6, limit=0.08),
     "self-calibration": PlannedKind(self_calibrated, exposures=5, limit=0.0055),
+}
+
+
+def of_800_stars(rng: np.random.Generator, n: int) -> Truth:
+    """Exposures of 800 matched stars of what is fitted."""
+    true_map = mapped(fields.distortion(rng))
+    x, y = pixels(rng, 800 * n)
+    names = np.array([f"e{k:02d}" for k in range(n)])[np.arange(len(x)) % n]
+    return Truth(
+        observed(rng, x, y, true_map(x, y, None), exposure=names), true_map, order_config(3)
+    )
+
+
+# met with 24 more exposures; a plan that changes the coefficients alone says that none will do
+FEW = {
+    "one exposure": PlannedKind(of_800_stars, exposures=1, limit=0.003),
+    "six exposures": PlannedKind(matched, exposures=6, limit=0.025),
 }
