@@ -37,11 +37,9 @@ from bayesdist.assess.evaluation import (
     validity_of,
 )
 from bayesdist.assess.model import ErrorModel
-from bayesdist.assess.requirements.margins import judge
 from bayesdist.assess.requirements.validity import ValidityPeriod
 from bayesdist.diagnose.diagnostics import Diagnostics
 from bayesdist.infer import LinearFit, Posterior, load_posterior
-from bayesdist.infer.solution.solution import Solution
 from bayesdist.utils.checks import Check, in_order
 
 T = TypeVar("T")
@@ -265,24 +263,3 @@ def validity_periods_of(
     """Until when requirements are met by a run, where something depends on time."""
     given = results.errors, results.diagnostics, requirements, results.settings
     return validity_of(*given, assessment_rng(results.config))
-
-
-def probability_met(
-    results: Results, requirement: Requirement, candidate: Solution, n_draws: int
-) -> float:
-    """Probability that a requirement would be met by another solution in place of the run's.
-
-    The same random numbers serve every candidate.
-    """
-    errors, settings = results.errors, results.settings
-    errors = replace(errors, solution=replace(errors.solution, solution=candidate))
-    rng = assessment_rng(results.config)
-    [margin] = judge(
-        drawn_errors(errors, results.diagnostics, settings, rng, n=n_draws),
-        [requirement],
-        grid=settings.grid,
-        epoch=settings.epoch,
-        pixel_scale=settings.pixel_scale(errors),
-        adaptive=False,
-    )
-    return margin.probability_met

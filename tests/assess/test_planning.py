@@ -4,9 +4,21 @@ import numpy as np
 from scipy import stats
 
 from bayesdist.assess import Requirement, UserTerm, check_requirements
+from bayesdist.assess.model import error_model
 from bayesdist.assess.planning.exposures import MOST, Schedule, exposures_needed
+from bayesdist.assess.planning.futures import (
+    TRUTHS,
+    Data,
+    Futures,
+    Scattering,
+    with_more_data,
+)
 from bayesdist.infer import fit_linear
-from bayesdist.infer.compare.planning import exposure_content, exposure_information
+from bayesdist.infer.compare.planning import (
+    exposure_content,
+    exposure_information,
+    with_information,
+)
 from tests.infer.compare.test_planning import SIGMA, model_of, stars
 
 
@@ -36,6 +48,16 @@ def schedule_of(matches, fit, n_exposures):
     return Schedule("again", exposure_information(fit, content, None))
 
 
+def needed(fit, schedule, probability_met, asked):
+    """Need of a schedule whose exposures make the covariance of a fit smaller."""
+
+    def reached(one, n):
+        return probability_met(with_information(fit, n * one.information))
+
+    [found] = exposures_needed([schedule], reached, asked, now=probability_met(fit))
+    return found
+
+
 def test_as_many_exposures_as_were_planned_meet_the_requirement():
     """The plan is made with two exposures; fits of two and as many more as it says are judged."""
     matches, fit = fitted(2, seed=1)
@@ -44,7 +66,7 @@ def test_as_many_exposures_as_were_planned_meet_the_requirement():
     )[0]
     asked = 0.9
     need = Requirement("r", "p95", 0.5 * float(np.quantile(now.draws, asked)), probability=asked)
-    [found] = exposures_needed(fit, [schedule_of(matches, fit, 2)], judge(need), need.probability)
+    found = needed(fit, schedule_of(matches, fit, 2), judge(need), need.probability)
     # errors half as large take four times the data: six more than the two
     assert found.exposures in (5, 6, 7)
     assert "more exposures" in found.sentence
@@ -57,9 +79,7 @@ def test_as_many_exposures_as_were_planned_meet_the_requirement():
 
 def test_what_is_met_needs_nothing_more():
     matches, fit = fitted(2, seed=1)
-    [found] = exposures_needed(
-        fit, [schedule_of(matches, fit, 2)], judge(Requirement("r", "max", 1.0)), 0.95
-    )
+    found = needed(fit, schedule_of(matches, fit, 2), judge(Requirement("r", "max", 1.0)), 0.95)
     assert found.exposures == 0
     assert "met as it is" in found.sentence
 
@@ -68,15 +88,15 @@ def test_no_number_of_exposures_makes_the_catalogue_better():
     matches, fit = fitted(2, seed=1)
     term = [UserTerm("catalogue", "systematic", SIGMA, SIGMA)]
     limit = SIGMA * stats.rayleigh.ppf(0.5)
-    [found] = exposures_needed(
+    found = needed(
         fit,
-        [schedule_of(matches, fit, 2)],
+        schedule_of(matches, fit, 2),
         judge(Requirement("r", "max", limit), terms=term),
         0.95,
     )
     assert found.exposures is None
     assert found.probability < 0.6
-    assert f"{MOST} exposures" in found.sentence
+    assert f"{MOST} more exposures" in found.sentence
 
 
 def test_the_number_is_the_smallest():
@@ -90,5 +110,74 @@ def test_the_number_is_the_smallest():
         def small_enough(solution, limit=limit):
             return float(np.sqrt(solution.cov[0, 0]) <= limit)
 
-        [found] = exposures_needed(fit, [schedule], small_enough, 0.5)
+        found = needed(fit, schedule, small_enough, 0.5)
         assert found.exposures == n
+        assert found.interval == (n, n)  # of a step
+
+
+def futures_of(fit, requirement, *, terms=(), n_stars=1500.0):
+    """Runs with more exposures than the two of a fit, of whose stars all is known."""
+    return Futures(
+        error_model(fit, terms),
+        requirement,
+        Data(2, n_stars / SIGMA**2, n_stars),
+        lambda information: with_information(fit, information),
+        (9, 5),
+        None,
+        None,
+        seed=5,
+    )
+
+
+def test_without_other_errors_the_future_is_that_of_the_covariance():
+    """Errors half as large take four times the data; far fewer miss, and far more meet."""
+    matches, fit = fitted(2, seed=1)
+    asked = 0.9
+    now = check_requirements(
+        fit, [Requirement("r", "p95", 1.0)], grid=(9, 5), rng=np.random.default_rng(1)
+    )[0]
+    need = Requirement("r", "p95", 0.5 * float(np.quantile(now.draws, asked)), probability=asked)
+    futures, information = futures_of(fit, need), schedule_of(matches, fit, 2).information
+    assert futures.met(information, 3, np.arange(TRUTHS)).mean() < 0.1
+    assert futures.met(information, 12, np.arange(TRUTHS)).mean() > 0.9
+
+
+def test_a_stated_catalogue_is_the_same_in_all_futures():
+    matches, fit = fitted(2, seed=1)
+    need = Requirement("r", "max", SIGMA * stats.rayleigh.ppf(0.5))
+    term = UserTerm("catalogue", "systematic", SIGMA, SIGMA)
+    futures = futures_of(fit, need, terms=[term])
+    assert futures.probability(schedule_of(matches, fit, 2).information)(MOST) == 0
+
+
+def test_the_posterior_of_normal_data_is_found_with_more_of_them():
+    """A mean with a flat prior: the variance of its posterior, and of the mean of that."""
+    rng, n, rho = np.random.default_rng(3), 4000, 3.0
+    today = 2.0 + 0.5 * rng.standard_normal(n)
+    means = []
+    for truth, noise in rng.integers(n, size=(n, 2)):
+        after = with_more_data(today, rho, truth, noise)
+        means.append(after.mean())
+    # four times the data; the spread is that of 4000 numbers, to 1.1 %
+    np.testing.assert_allclose(after.std(), 0.25, rtol=0.045)
+    # what one posterior loses in variance its mean has: the law of total variance
+    np.testing.assert_allclose(np.var(means), 0.25 - 0.0625, rtol=0.09)
+    np.testing.assert_allclose(np.mean(means), 2.0, atol=4 * 0.5 / np.sqrt(n))
+
+
+def test_scatters_follow_from_deviations_as_bayes_theorem_has_it():
+    """By the inverse gamma posterior of a variance whose prior is flat in the logarithm."""
+    rng = np.random.default_rng(4)
+    variance = np.geomspace(1e-2, 1e2, 6001)
+    scattering = Scattering(None, None, variance[:, None])
+    data = Data(2, 1e12, 100.0)  # deviations are measured without error
+    means = []
+    truth = len(variance) // 2  # of variance 1
+    for _ in range(150):
+        rows = scattering.chosen(40, data, truth, rng)
+        # degrees of freedom times the inverse variance is chi-square, of mean 40 / the mean square
+        precision = 1 / variance[rows]
+        means.append(precision.mean())
+        assert abs(precision.std() / precision.mean() / np.sqrt(2 / 40) - 1) < 0.1
+    # the mean of 40 / chi-square of 40 is 40 / 38, its scatter 0.25
+    assert abs(np.mean(means) - 40 / 38) < 4 * 0.25 / np.sqrt(150)

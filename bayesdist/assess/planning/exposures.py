@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 from bisect import bisect_left
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from functools import cache
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 
-from bayesdist.infer.compare.planning import with_information
-from bayesdist.infer.solution.solution import Solution
 from bayesdist.utils.arrays import Float
 
 MOST = 4096  # exposures beyond which more are no plan
+# The probability is right to so much, as simulated exposures show (docs/validation.md): the range
+# of the answer is that of the numbers whose probability differs by no more.
+PROBABILITY_ERROR = 0.10
 
 
 @dataclass(frozen=True, eq=False)
@@ -25,61 +25,101 @@ class Schedule:
 
 @dataclass(frozen=True)
 class Need:
-    """Number of exposures that a schedule takes."""
+    """Number of exposures that a schedule takes.
+
+    Parameters
+    ----------
+    schedule : str
+        Its name.
+    exposures : int or None
+        Fewest with which the requirement is met with the probability asked for; None where `MOST`
+        are not enough.
+    probability : float
+        That the requirement is met with so many; with `MOST` where they are not enough.
+    interval : tuple of (int or None)
+        Fewest exposures for a probability lower and higher by `PROBABILITY_ERROR`; half way to 1
+        where it would be nearer to it.  None where `MOST` are not enough.
+    by_number : mapping of int to float
+        Probability that the requirement is met, by the number of exposures, ascending.
+    """
 
     schedule: str
-    exposures: int | None  # fewest that meet the requirement; None where even very many would not
-    probability: float  # of meeting the limit, with so many; with very many where none suffice
+    exposures: int | None
+    probability: float
+    interval: tuple[int | None, int | None] = (0, 0)
+    by_number: Mapping[int, float] = field(default_factory=dict)
 
     @property
     def sentence(self) -> str:
         """The need in words."""
+        if self.exposures == 0:
+            return f"{self.schedule}: met as it is (probability {self.probability:.3g})"
         if self.exposures is None:
             return (
-                f"{self.schedule}: {MOST} exposures would still miss the limit (probability "
-                f"{self.probability:.3g}): what more data do not make smaller is too large"
+                f"{self.schedule}: with {MOST} more exposures the probability of meeting the limit "
+                f"is {self.probability:.3g}: what more data do not make smaller is too large"
             )
-        if not self.exposures:
-            return f"{self.schedule}: met as it is (probability {self.probability:.3g})"
+        low, high = self.interval
+        upper = f"more than {MOST}" if high is None else str(high)
         return (
             f"{self.schedule}: {self.exposures} more "
-            f"{'exposure' if self.exposures == 1 else 'exposures'} (probability then "
-            f"{self.probability:.3g})"
+            f"{'exposure' if self.exposures == 1 else 'exposures'}, range {low} to {upper} "
+            f"(probability then {self.probability:.3g})"
         )
+
+    @property
+    def table(self) -> str:
+        """Probabilities of the numbers that were tried, in words; empty where it is met now."""
+        return ", ".join(f"{n}: {p:.2f}" for n, p in self.by_number.items())
 
 
 def exposures_needed(
-    solution: Solution,
     schedules: Sequence[Schedule],
-    probability_met: Callable[[Solution], float],
+    probability_met: Callable[[Schedule, int], float],
     asked: float,
+    *,
+    now: float,
 ) -> tuple[Need, ...]:
     """The fewest exposures of each schedule with which a requirement is met.
 
-    `solution`: as it is now. `probability_met`: probability of meeting the requirement with a
-    solution; with the same random numbers each time, so that it rises with the number of exposures.
+    Parameters
+    ----------
+    schedules : sequence of Schedule
+    probability_met : callable
+        Probability that the requirement is met with so many more exposures of a schedule; with the
+        same random numbers each time, so that it rises with the number of exposures.
+    asked : float
+        Probability to be reached.
+    now : float
+        Probability that the limit is met as it is.
     """
-    now = probability_met(solution)
     if now >= asked:
         return tuple(Need(one.name, 0, now) for one in schedules)
-    return tuple(_need(solution, one, probability_met, asked) for one in schedules)
+    return tuple(_need(one, probability_met, asked) for one in schedules)
 
 
 def _need(
-    solution: Solution,
-    schedule: Schedule,
-    probability_met: Callable[[Solution], float],
-    asked: float,
+    schedule: Schedule, probability_met: Callable[[Schedule, int], float], asked: float
 ) -> Need:
-    @cache
-    def reached(n: int) -> float:
-        return probability_met(with_information(solution, n * schedule.information))
+    known = dict[int, float]()
 
-    if reached(MOST) < asked:
-        return Need(schedule.name, None, reached(MOST))
-    enough = 1
-    while reached(enough) < asked:  # doubling: most needs are small
-        enough *= 2
-    numbers = range(enough // 2 + 1, enough + 1)
-    n = numbers[bisect_left(numbers, asked, key=reached)]
-    return Need(schedule.name, n, reached(n))
+    def reached(n: int) -> float:
+        if n not in known:
+            known[n] = probability_met(schedule, n)
+        return known[n]
+
+    def fewest(probability: float) -> int | None:
+        enough = 1
+        while reached(enough) < probability:  # doubling: most needs are small
+            if enough == MOST:
+                return None
+            enough *= 2
+        numbers = range(enough // 2 + 1, enough + 1)
+        return numbers[bisect_left(numbers, probability, key=reached)]
+
+    n = fewest(asked)
+    high = min(asked + PROBABILITY_ERROR, (1 + asked) / 2)
+    interval = fewest(asked - PROBABILITY_ERROR), None if n is None else fewest(high)
+    return Need(
+        schedule.name, n, reached(MOST if n is None else n), interval, dict(sorted(known.items()))
+    )

@@ -99,14 +99,21 @@ class Deviations:
 
     def draw(self, n: int, rng: np.random.Generator) -> Polynomials:
         """Draws in random order, as they have nothing to do with other terms."""
+        linear = required(self.discrepancy.linear, "no deviations of exposures were estimated")
+        rows = rng.integers(len(linear.theta), size=n)
+        return self.of_rows(rows, int(rng.integers(2**63)) if self.single else None)
+
+    def of_rows(self, rows: Int, seed: int | None) -> Polynomials:
+        """Draws (n,) of the posterior by their numbers, with new deviations of single exposures.
+
+        `seed` is that of these deviations; None for none of them.
+        """
         found = self.discrepancy
         linear = required(found.linear, "no deviations of exposures were estimated")
-        rows = rng.integers(len(linear.theta), size=n)
         theta = _moved(found, linear.theta[rows], self.frames)
-        seed = int(rng.integers(2**63)) if self.single else None
         more = partial(_bending, linear, np.asarray(found.mean, float), rows, seed)
         pools = [Pool(rows, len(linear.theta))]
-        if self.single:  # their deviations are new in each set of draws
+        if seed is not None:  # their deviations are new in each set of draws
             pools.append(Pool(rows, len(linear.theta), renewed=True))
         return Polynomials(
             self.rows[0],
@@ -139,9 +146,17 @@ class FieldsOfExposures:
 
     def draw(self, n: int, rng: np.random.Generator) -> ErrorDraws:
         """Draws in random order, as they have nothing to do with other terms."""
-        found = self.discrepancy
+        fields = required(self.discrepancy.fields, "no fields of exposures were estimated")
+        return self.of_rows(rng.integers(len(fields.theta), size=n), rng)
+
+    def of_rows(self, rows: Int, rng: np.random.Generator) -> ErrorDraws:
+        """Effect on the parameters of draws (n,) by their numbers.
+
+        With `single`, fields of single exposures beside, of the posterior's draws in their order.
+        """
+        found, n = self.discrepancy, len(rows)
         fields = required(found.fields, "no fields of exposures were estimated")
-        theta = _moved(found, fields.theta[rng.integers(len(fields.theta), size=n)], self.frames)
+        theta = _moved(found, fields.theta[rows], self.frames)
         fit = Polynomials(self.rows[0], found.model, found.mean, theta, frames=self.frames)
         if not self.single:
             return fit

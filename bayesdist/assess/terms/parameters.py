@@ -24,7 +24,7 @@ from bayesdist.infer.catalogue.star_errors import StarCovariance
 from bayesdist.infer.solution.solution import Solution
 from bayesdist.mission import load_object, missions
 from bayesdist.model import DistortionModel
-from bayesdist.utils.arrays import Float
+from bayesdist.utils.arrays import Float, Int
 
 CATALOGUE = "reference catalogue (shared stars)"
 MOTIONS = "proper motions (shared stars)"
@@ -184,17 +184,20 @@ class ExposureVariation:
 
     def draw(self, n: int, rng: np.random.Generator) -> ErrorDraws:
         """Draws of deviations, each from a normal distribution with a scatter of its own."""
+        return self.of_rows(rng.integers(len(self.tau), size=n), rng)
+
+    def of_rows(self, rows: Int, rng: np.random.Generator) -> ErrorDraws:
+        """Draws (n,) of deviations, whose scatters are draws by their numbers."""
         known = self.model.free_frame_names(self._exposure)
         first = self.model.frame_slice(self._exposure).start
         at = [first + known.index(kind) for kind in self.kinds]
         mean = np.array(self.mean, float)
         mean[at] = 0.0
-        theta = np.tile(mean, (n, 1))
-        rows = rng.integers(len(self.tau), size=n)
+        theta = np.tile(mean, (len(rows), 1))
         tau = self.tau[rows]
         theta[:, at] = tau * rng.standard_normal(tau.shape)
         pools = (Pool(rows, len(self.tau)),)
         own = Polynomials(self.rows[0], self.model, mean, theta, self._exposure, pools=pools)
         if self.aberration is None:
             return own
-        return Together((own, self.aberration.draw(n, rng)))
+        return Together((own, self.aberration.draw(len(rows), rng)))

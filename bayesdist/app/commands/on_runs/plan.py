@@ -2,22 +2,31 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
-from bayesdist.app.results import Results, open_results, probability_met
+from bayesdist.app.assessment.error_terms import assessment_rng
+from bayesdist.app.results import Results, open_results
 from bayesdist.app.store.rundir import RunDirectory
 from bayesdist.app.tables.margins import judged_requirements
-from bayesdist.assess.planning.exposures import Schedule, exposures_needed
+from bayesdist.assess.evaluation import with_measured_centroids
+from bayesdist.assess.model import with_diagnosed_errors, with_shared_stars
+from bayesdist.assess.planning.exposures import Need, Schedule, exposures_needed
+from bayesdist.assess.planning.futures import Data, Futures
 from bayesdist.assess.requirements.requirement import Requirement
 from bayesdist.errors import InputError
-from bayesdist.infer.compare.planning import ExposureContent, exposure_content, exposure_information
+from bayesdist.infer.compare.planning import (
+    ExposureContent,
+    exposure_content,
+    exposure_information,
+    with_information,
+)
 from bayesdist.infer.solution.solution import Solution
 from bayesdist.utils.arrays import Float
 
-DRAWS = 1000
 LATER = 4  # dates that stand for exposures spread evenly
 
 
@@ -34,7 +43,7 @@ def plan(run: str | Path, *, name: str | None = None, epochs: Sequence[float] = 
         )
     with open_results(RunDirectory.open(run)) as results:
         results.run.require("plan", ("fit", "sample", "diagnose", "evaluate"))
-        solved = results.fitted.solved
+        content, solved = _content(results), results.fitted.solved
         if solved is not None and epochs:
             raise InputError(
                 "is a run of a self-calibration, whose exposures count as those at hand with their "
@@ -42,32 +51,72 @@ def plan(run: str | Path, *, name: str | None = None, epochs: Sequence[float] = 
                 where=str(run),
                 do="leave --epochs out",
             )
-        requirements = judged_requirements(results.run)
-        chosen = [r for r in requirements if name is None or r.name == name]
-        if not chosen:
-            known = ", ".join(repr(r.name) for r in requirements)
-            raise InputError(
-                f"has no requirement {name!r}" if known else "has no requirements",
-                where=str(run),
-                do=f"name one of {known}" if known else "judge some with 'bayesdist requirements'",
-            )
+        needs = needs_of(results, name=name, epochs=epochs)
+    if solved is None:
+        lines = [f"An exposure is taken to hold {content.n_stars:.0f} matched stars as these do."]
+    else:
+        n = len(solved.mode.problem.model.exposures)
+        lines = [f"Exposures are taken to be dithered as these {n} are, over the same stars."]
+    for requirement, several in needs:
+        lines.append("")
+        lines.append(f"{requirement.name} (probability {requirement.probability:g} asked for)")
+        for need in several:
+            lines.append(f"  {need.sentence}")
+            if need.by_number:
+                lines.append(f"    probability by number of exposures: {need.table}")
+    return "\n".join(lines)
+
+
+def needs_of(
+    results: Results, *, name: str | None = None, epochs: Sequence[float] = ()
+) -> list[tuple[Requirement, tuple[Need, ...]]]:
+    """How many exposures of each schedule each requirement of a run takes.
+
+    Parameters
+    ----------
+    results : Results
+        Of a run that was evaluated.
+    name : str, optional
+        Of one requirement; all by default.
+    epochs : sequence of float
+        Dates of further exposures, decimal years.
+
+    Raises
+    ------
+    InputError
+        If there is no such requirement.
+    """
+    requirements = judged_requirements(results.run)
+    chosen = [r for r in requirements if name is None or r.name == name]
+    if not chosen:
+        known = ", ".join(repr(r.name) for r in requirements)
+        raise InputError(
+            f"has no requirement {name!r}" if known else "has no requirements",
+            where=str(results.run.path),
+            do=f"name one of {known}" if known else "judge some with 'bayesdist requirements'",
+        )
+    now = {row["name"]: row["probability_met"] for row in results.run.summary["margins"]}
+    content, solved = _content(results), results.fitted.solved
+    future, out = _futures(results, content), []
+    for requirement in chosen:
         if solved is None:
-            content = _content(results)
-            lines = [
-                f"An exposure is taken to hold {content.n_stars:.0f} matched stars as these do."
-            ]
-            schedules = [_schedules(results, one, content, epochs) for one in chosen]
+            schedules = _schedules(results, requirement, content, epochs)
         else:
-            # an exposure by itself says nothing: as many as these, over other stars, say as much
-            n = len(solved.mode.problem.model.exposures)
-            lines = [
-                f"Exposures are taken to be dithered as these {n} are, over as many other stars."
-            ]
-            information = solved.mode.distortion_information / n
-            schedules = [[Schedule("dithered like these", information)]] * len(chosen)
-        for requirement, several in zip(chosen, schedules, strict=True):
-            lines += ["", *_lines(results, requirement, several)]
-        return "\n".join(lines)
+            # an exposure by itself says nothing: as many as these say as much
+            information = solved.mode.distortion_information / _n_exposures(results)
+            schedules = [Schedule("dithered like these", information)]
+        futures = future(requirement)
+        probability = {one.name: futures.probability(one.information) for one in schedules}
+
+        def met(
+            one: Schedule, n: int, by_name: dict[str, Callable[[int], float]] = probability
+        ) -> float:
+            return by_name[one.name](n)
+
+        asked = requirement.probability
+        needs = exposures_needed(schedules, met, asked, now=now[requirement.name])
+        out.append((requirement, needs))
+    return out
 
 
 def _content(results: Results) -> ExposureContent:
@@ -83,7 +132,7 @@ def _content(results: Results) -> ExposureContent:
         stars.table,
         true[:, None] / (sigma**2 + jitter**2),
         n_total=stars.n_total,
-        n_exposures=max(len(results.data.placed.exposure_names), 1),
+        n_exposures=_n_exposures(results),
     )
 
 
@@ -108,13 +157,44 @@ def _schedules(
     return found
 
 
-def _lines(results: Results, requirement: Requirement, schedules: Sequence[Schedule]) -> list[str]:
-    """How many exposures of each schedule a requirement takes."""
+def _futures(results: Results, content: ExposureContent) -> Callable[[Requirement], Futures]:
+    """Runs with more exposures, for any requirement."""
+    settings, errors = results.settings, results.errors
+    errors = with_measured_centroids(errors, results.diagnostics, settings)
+    diagnostics = results.diagnostics
+    hierarchy = results.fitted.linear if results.fitted.scatter is not None else None
+    # what the errors of the catalogue's stars do, further exposures of these do not make smaller
+    independent = with_diagnosed_errors(
+        results.posterior, replace(diagnostics, catalogue=None), hierarchy, noise_alone=True
+    )
 
-    def met(candidate: Solution) -> float:
-        return probability_met(results, requirement, candidate, DRAWS)
+    def solution(information: Float) -> Solution:
+        more = with_information(independent, information)
+        if diagnostics.catalogue is None or hierarchy is None:
+            return more
+        return with_shared_stars(more, hierarchy, diagnostics.catalogue)
 
-    found = exposures_needed(results.solution, schedules, met, requirement.probability)
-    return [f"{requirement.name} (probability {requirement.probability:g} asked for)"] + [
-        f"  {need.sentence}" for need in found
-    ]
+    weight = np.mean([np.sum([m[axis, 0, 0] for m in content.moments.values()]) for axis in (0, 1)])
+    seed = int(assessment_rng(results.config).integers(2**63))
+
+    def of(requirement: Requirement) -> Futures:
+        return Futures(
+            errors,
+            requirement,
+            Data(_n_exposures(results), float(weight), content.n_stars),
+            solution,
+            settings.grid,
+            settings.epoch,
+            settings.pixel_scale(errors),
+            seed,
+        )
+
+    return of
+
+
+def _n_exposures(results: Results) -> int:
+    """Number of exposures of the run."""
+    solved = results.fitted.solved
+    if solved is not None:
+        return len(solved.mode.problem.model.exposures)
+    return max(len(results.data.placed.exposure_names), 1)
