@@ -81,7 +81,6 @@ EDGES = Family(
     "leave out the margins of the detector, or fit a look-up table",
     "the residuals rise towards the edges of the detector",
     "the residuals do not rise towards the edges of the detector",
-    overruled_by=("matching", "shape"),
 )
 PIXEL_PHASE = Family(
     "pixel phase",
@@ -122,7 +121,6 @@ def order_family(total: int, order: int) -> Family:
         group="orders",
         held_by="structure",
         denial="the missing order does not explain it",
-        overruled_by=("matching", "shape"),
     )
 
 
