@@ -31,6 +31,7 @@ class Cause:
 CAUSES: dict[str, Cause] = {
     "matching": Cause("the match radius", ("shape", *OF_FIELD, *OF_NOISE)),
     "shape": Cause("the shape of the residuals", (*OF_FIELD, *OF_NOISE, "noise by magnitude")),
+    "cut-off positions": Cause("positions that were cut off", OF_FIELD),
     # a cause only if it explains more than deviations of single exposures do: see `is_pointing`
     "pointing": Cause(
         "the curved sky",
