@@ -135,7 +135,7 @@ def _centres(curvature: float, extent: Float) -> tuple[Float, Float]:
 
 def _frequencies(curvature: float, extent: Float) -> Bool:
     """Boolean mask of the frequencies of `fft2` whose centre is not too far away."""
-    return np.hypot(*_centres(curvature, extent)) <= FARTHEST
+    return np.asarray(np.hypot(*_centres(curvature, extent)) <= FARTHEST)
 
 
 def _candidates(chip: _Chip, curvature: float, allowed: Bool) -> Iterator[_Rings]:
@@ -166,7 +166,7 @@ def _candidates(chip: _Chip, curvature: float, allowed: Bool) -> Iterator[_Rings
 def _binned(cell: Int, values: Complex) -> Complex:
     """Sums (BINS, BINS) of values (N,) in cells."""
     real, imaginary = (np.bincount(cell, part, BINS**2) for part in (values.real, values.imag))
-    return (real + 1j * imaginary).reshape(BINS, BINS)
+    return np.asarray((real + 1j * imaginary).reshape(BINS, BINS))
 
 
 def _by_star(star: Int, values: Complex) -> Complex:
