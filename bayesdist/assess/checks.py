@@ -53,7 +53,7 @@ def assumption_checks(
     """
     return (
         *sampling_checks(posterior),
-        *diagnostics.input_checks,
+        *diagnostics.checks_of_input,
         *catalogue_checks(catalogue_stated),
         *time_checks(time, diagnostics.dates, motions_stated),
     )

@@ -18,6 +18,7 @@ from bayesdist.diagnose.checks import (
     outlying_checks,
     score_checks,
     structure_checks,
+    with_causes,
 )
 from bayesdist.diagnose.correlated import Discrepancy, DiscrepancyPriors, estimate_discrepancy
 from bayesdist.diagnose.holdout.validation import HoldoutValidation
@@ -34,7 +35,7 @@ from bayesdist.diagnose.residuals.misfit import (
     partitions_for,
     worst_misfit,
 )
-from bayesdist.diagnose.residuals.quoted import majority_sentence
+from bayesdist.diagnose.residuals.quoted import explained_by_false_matches, majority_sentence
 from bayesdist.diagnose.residuals.sample import (
     SAMPLE,
     StarSample,
@@ -148,7 +149,7 @@ class Diagnostics:
     overlap: OverlapTest | None = None
 
     def __repr__(self) -> str:
-        warnings = warnings_of((*self.input_checks, *self.checks))
+        warnings = warnings_of((*self.checks_of_input, *self.checks))
         significant = sum(test.significant for test in self.score_tests)
         n_tests = len(self.score_tests)
         tests = f"{significant} of {n_tests} tests of the residuals found something"
@@ -173,6 +174,20 @@ class Diagnostics:
     def shown(self) -> tuple[BinnedSums, ...]:
         """Sums of residuals that diagrams of their means show, one for each chip."""
         return tuple(self.sums.binned[c, bins[SHOWN]] for c, bins in self.partitions.items())
+
+    @property
+    def checks_of_input(self) -> tuple[Check, ...]:
+        """Checks of the fit and its matching, in the light of what the tests have found."""
+        findings = [
+            test.name for test in self.score_tests if test.significant and test.held_by != "noise"
+        ]
+        if any(misfit.significant for misfit in self.misfits):
+            findings.append("structure in the residuals")
+        if self.correlated is not None and self.correlated.facts.get("exposures_outlying"):
+            findings.append("exposures that deviate far more than the others")
+        if self.majority:
+            findings.append("more false than true pairs")
+        return with_causes(self.input_checks, findings)
 
     @property
     def checks(self) -> tuple[Check, ...]:
@@ -398,6 +413,7 @@ def diagnose_fit(
         reference_sigma=sigma,
         match_radius=match_radius,
         in_circle=in_circle,
+        false_matches=explained_by_false_matches(posterior, sigma),
         majority=majority,
         error_scale=error_scale,
         matched_before=matched_before,

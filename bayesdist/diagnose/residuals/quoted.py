@@ -13,9 +13,15 @@ from bayesdist.infer.posterior import Posterior
 from bayesdist.infer.solution.linear import LinearFit
 from bayesdist.infer.stars.stars import prepare
 from bayesdist.utils.distributions import chi2_ppf
-from bayesdist.utils.limits import FALSE_MAJORITY, QUOTED_ERRORS, WIDENED_ERRORS
+from bayesdist.utils.limits import (
+    CHI2_TOO_LARGE,
+    FALSE_MAJORITY,
+    QUOTED_ERRORS,
+    WIDENED_ERRORS,
+)
 
 LOW_QUANTILE = 0.1  # of the matches
+FALSE_FRACTION = 0.02  # of false matches, beyond which they widen the residuals of least squares
 
 
 def error_scale(fit: LinearFit, table: Matches) -> float:
@@ -45,6 +51,18 @@ def error_scale_sentence(factor: float, sigma: float, unit: str, *, by_magnitude
         f"the residuals scatter {factor:.3g} times as widely as the quoted errors say (median "
         f"{sigma / factor:.3g} {unit}), and all errors were multiplied by that: {do}"
     )
+
+
+def explained_by_false_matches(posterior: Posterior | None, quoted: float) -> bool:
+    """True if a posterior finds false matches, and quoted errors of the others that are right.
+
+    `quoted`: usual quoted error of one axis, in the unit of u and v.
+    """
+    if posterior is None or not {"f", "j"} <= set(posterior.hyper) or quoted <= 0:
+        return False
+    jitter = float(np.sqrt(np.mean(posterior.hyper["j"] ** 2)))
+    right = 1.0 + (jitter / quoted) ** 2 <= CHI2_TOO_LARGE.value
+    return right and float(posterior.hyper["f"].mean()) > FALSE_FRACTION
 
 
 def majority_sentence(

@@ -31,7 +31,6 @@ JUMPS = Family(
     "the residuals do not jump at any column or row",
     explained_by="orders",
     denial="the jump does not explain it",
-    overruled_by=("matching", "shape"),
 )
 EDGES = 31  # columns, and as many rows, of each chip
 HIGHER = 2  # orders above the model's that are no jumps

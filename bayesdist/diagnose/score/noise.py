@@ -28,7 +28,6 @@ BY_POSITION = Family(
     "the noise is described equally well from cell to cell",
     held_by="noise",
     explained_by="orders",
-    overruled_by=("matching", "shape"),
 )
 BY_MAGNITUDE = Family(
     "noise by magnitude",
@@ -50,7 +49,6 @@ BY_AXIS = Family(
     "along the other axis, beside its errors",
     "the noise is described equally well along u and v",
     held_by="noise",
-    overruled_by=("matching", "shape"),
 )
 LARGEST_LEVERAGE = 0.5
 STARS_PER_PART = 40  # of a part of the data; smaller ones are joined

@@ -51,7 +51,7 @@ def pattern_test(sample: ScoredSample) -> Outcome | None:
             trials += int(allowed.sum())
             for j, i in walks.candidates(lengths):
                 steps = walks.steps(axis, i, j)
-                tail = _log_tail(steps, float(lengths[j, i]))
+                tail = log_tail_of_walk(steps, float(lengths[j, i]))
                 if tail < log_tail:
                     log_tail, at = tail, (i, j, chip, axis)
                     power = float(lengths[j, i] ** 2 / (steps**2).sum())
@@ -140,7 +140,7 @@ def _walks(sample: ScoredSample) -> dict[int, _Walks]:
     return out
 
 
-def _log_tail(steps: Float, length: float) -> float:
+def log_tail_of_walk(steps: Float, length: float) -> float:
     """Log probability that a plane walk of steps (N,) in directions of chance gets beyond a length.
 
     By the saddle point of its cumulants K(t) = sum log I_0(t steps): exact for many small steps,

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from itertools import pairwise
 
 import numpy as np
 
@@ -25,6 +26,11 @@ HIGHER = 2  # orders above the model's that are tested
 OUTSIDE = 0.5  # per cent of the values at either end that are moved to the others
 MIN_AT_EDGES = 200  # detections: some in each margin
 MIN_OF_PHASES = 200  # detections: some at each phase of a pixel
+FEWEST_DIGITS = 5  # decimals of a pixel, from which on digits that are missing displace nothing
+WHOLE = 1e-6  # of the last digit, by which a number with few digits differs from its rounded value
+# fractions of the detections: those with few digits, and the others, are at least so many
+MIN_CUT_OFF = 0.05
+BY_CHANCE = 0.3  # most that end in 0 by chance, of those with one digit more; a tenth on average
 NEAR_EDGE = 0.05  # of half a side, over which what is at an edge falls off
 SHORTEST = 0.1  # years over which a drift is looked for
 # of the information of a direction, left by the parameters: below, it is theirs
@@ -81,13 +87,18 @@ EDGES = Family(
     "leave out the margins of the detector, or fit a look-up table",
     "the residuals rise towards the edges of the detector",
     "the residuals do not rise towards the edges of the detector",
-    overruled_by=("matching", "shape"),
 )
 PIXEL_PHASE = Family(
     "pixel phase",
     "correct the centroids for it, as an effective point-spread function does",
     "the residuals go with the position of the stars within their pixel",
     "the residuals do not go with the position of the stars within their pixel",
+)
+CUT_OFF = Family(
+    "cut-off positions",
+    "give all positions with all of their digits, or add half a step to those that were cut off",
+    "stars whose positions have few digits are displaced from the others",
+    "stars whose positions have few digits are not displaced from the others",
 )
 MAGNITUDE_IN_TIME = Family(
     "magnitude in time",
@@ -122,7 +133,6 @@ def order_family(total: int, order: int) -> Family:
         group="orders",
         held_by="structure",
         denial="the missing order does not explain it",
-        overruled_by=("matching", "shape"),
     )
 
 
@@ -154,7 +164,28 @@ def questions(sample: ScoredSample) -> Iterator[Question]:
         yield Question(EDGES, edges, adjusted_for="orders")
     if len(sample) >= MIN_OF_PHASES:
         yield Question(PIXEL_PHASE, tuple(Products(CONSTANT, wave) for wave in _phases(sample)))
+    if cut_off := tuple(Products(CONSTANT, few - few.mean()) for few in _few_digits(sample)):
+        yield Question(CUT_OFF, cut_off)
     yield from _of_time(sample)
+
+
+def _few_digits(sample: ScoredSample) -> Iterator[Float]:
+    """Indicators (N,) of the detections whose columns, or rows, have fewer digits than others.
+
+    There is at most one for each axis: none if all have the same number of digits.
+    """
+    size = np.array([chip.size for chip in sample.model.chips])[sample.chip]
+    for scaled, pixels in zip((sample.X, sample.Y), size.T, strict=True):
+        position = 0.5 + (scaled + 1.0) / 2 * pixels
+        few = []
+        for digits in range(FEWEST_DIGITS + 1):
+            shifted = position * 10.0**digits
+            few.append(np.abs(shifted - np.round(shifted)) < WHOLE)
+        for fewer, more in pairwise(few):
+            share = fewer.mean()
+            if MIN_CUT_OFF <= share <= 1 - MIN_CUT_OFF and share > BY_CHANCE * more.mean():
+                yield fewer.astype(float)
+                break
 
 
 def _phases(sample: ScoredSample) -> Iterator[Float]:

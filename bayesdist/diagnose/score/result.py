@@ -10,6 +10,7 @@ from typing import Literal
 import numpy as np
 from scipy import special
 
+from bayesdist.diagnose.score.causes import CAUSES, cause_of, is_pointing
 from bayesdist.diagnose.significance import holm
 from bayesdist.utils.checks import LARGER
 from bayesdist.utils.distributions import chi2_isf, f_isf
@@ -38,10 +39,6 @@ class Family:
     held_by: HeldBy = ""
     explained_by: str = ""  # name or group of a finding that this one may come from
     denial: str = ""  # clause that denies it, for findings that it may explain
-    cause: str = ""  # name of the finding, as a cause of others that it overrules
-    # groups of findings that account for this one, the first of them first: it has their remedy
-    # where they are there, and its own would not help
-    overruled_by: tuple[str, ...] = ()
     doubt: str = LARGER  # what the finding does to verdicts, as of `Check`
 
 
@@ -152,11 +149,14 @@ def corrected(outcomes: Sequence[Outcome]) -> tuple[ScoreTest, ...]:
     """
     significant = holm([one.p_value for one in outcomes]) <= SCORE_TESTS.value
     # of a group the last finding has the remedy of all: a higher order holds the lower ones
-    by_group = {
-        one.family.group or one.name: one.family
+    by_name = {
+        name: one.family
         for one, found in zip(outcomes, significant, strict=True)
         if found
+        for name in (one.name, one.family.group)
+        if name
     }
+    causes = _causes(by_name, outcomes)
     out = []
     for one, found in zip(outcomes, significant, strict=True):
         family, remedy = one.family, one.family.remedy
@@ -164,11 +164,10 @@ def corrected(outcomes: Sequence[Outcome]) -> tuple[ScoreTest, ...]:
         smallest = one.smallest(SCORE_TESTS.value / len(outcomes))
         finding = f"{family.absent} ({smallest:.2g} {one.unit} rms would have been found)"
         if found:
-            cause = _cause(family, by_group)
-            remedy = cause.remedy
-            explanation = _explanation(one, outcomes)
-            if cause.group != family.group:
-                explanation = f", which may come from {cause.cause}"
+            cause = cause_of((family.name, family.group), causes)
+            remedy, explanation = _remedy(family, causes), _explanation(one, outcomes)
+            if cause:
+                explanation = f", which may come from {CAUSES[cause].words}"
             size = f"{one.size:.2g} {one.unit} rms, {p_words(one.p_value)}"
             finding = f"{family.present}{explanation} ({size})"
         out.append(
@@ -192,15 +191,29 @@ def corrected(outcomes: Sequence[Outcome]) -> tuple[ScoreTest, ...]:
     return tuple(out)
 
 
-def _cause(family: Family, significant: Mapping[str, Family]) -> Family:
-    """Family whose remedy a finding has: of its own group, or of what accounts for the finding.
+def _causes(significant: Mapping[str, Family], outcomes: Sequence[Outcome]) -> dict[str, Family]:
+    """Families that have found something and may be causes, by their names and groups.
 
-    `significant`: the last family of each group that has found something.
+    `significant`: all that have found something.
     """
-    for group in family.overruled_by:
-        if group in significant:
-            return _cause(significant[group], significant)
-    return significant[family.group or family.name]
+    by_name = {one.name: (one.statistic, one.dof) for one in outcomes}
+    singles = ("second order of exposures", "exposures")
+    single = [by_name[name] for name in singles if name in significant]
+    if "pointing" not in significant or all(is_pointing(by_name["pointing"], s) for s in single):
+        return dict(significant)
+    return {name: family for name, family in significant.items() if name != "pointing"}
+
+
+def _remedy(family: Family, causes: Mapping[str, Family]) -> str:
+    """Remedy of a finding: that of its cause if there is one, else that of its group.
+
+    `causes`: families of other findings by their names, and the last one of each group by that of
+    the group.
+    """
+    cause = cause_of((family.name, family.group), causes)
+    if cause:
+        return _remedy(causes[cause], causes)
+    return causes.get(family.group or family.name, family).remedy
 
 
 def _explanation(one: Outcome, outcomes: Sequence[Outcome]) -> str:

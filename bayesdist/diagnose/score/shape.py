@@ -47,8 +47,6 @@ SKEWNESS = Family(
     "field",
     "the residuals are not lopsided in ways that differ over the field",
     group=GROUP,
-    cause="the shape of the residuals",
-    overruled_by=("matching",),
 )
 PATCH = replace(
     SKEWNESS,

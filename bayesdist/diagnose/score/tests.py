@@ -16,6 +16,7 @@ from bayesdist.diagnose.score.projection import projection_of
 from bayesdist.diagnose.score.regressor_tests import regressor_tests
 from bayesdist.diagnose.score.regressors import functions_for
 from bayesdist.diagnose.score.result import ScoreTest, corrected
+from bayesdist.diagnose.score.rings import ring_test
 from bayesdist.diagnose.score.sample import scored_sample
 from bayesdist.diagnose.score.shape import shape_tests
 from bayesdist.diagnose.score.truncation import radius_test, truncation_test
@@ -73,5 +74,6 @@ def score_tests(
         *exposure_tests(projection, mean, priors),
         exposure_field_test(sample),
         pattern_test(sample),
+        ring_test(sample),
     ]
     return corrected([one for one in found if one is not None])

@@ -33,7 +33,6 @@ TRUNCATION = Family(
     "",
     "the residuals do not end abruptly",
     group="matching",
-    cause="the match radius",
 )
 RADIUS = Family(
     "match radius",
@@ -41,7 +40,6 @@ RADIUS = Family(
     "",
     "the matches end where the stated match radius says",
     group="matching",
-    cause="the match radius",
     doubt=EITHER,
 )
 MIN_STARS = 50

@@ -24,6 +24,8 @@ from bayesdist.utils.limits import (
 from bayesdist.utils.numbers import count, number, percent
 
 FIT, SAMPLING = "Fit", "Sampling"
+CHI_SQUARE = "Chi-square per degree of freedom, quoted errors"
+RESIDUALS_TOO_LARGE = "they are too small, which the jitter takes up, or the model does not fit"
 
 
 def scatter_too_small(total: float, dof: float) -> bool:
@@ -36,22 +38,25 @@ def fit_checks(
     fit: LinearFit,
     *,
     in_circle: bool = False,
+    false_matches: bool = False,
     things: str = "stars",
     chooser: str = "least-squares fit",
 ) -> tuple[Check, ...]:
     """Checks of chi-square, of the rows left out and of the condition of a fit.
 
-    `in_circle` if the likelihood accounts for the circles that stars were matched in; `things` are
-    what is fitted, one row each, and `chooser` leaves out rows that are far off.
+    `in_circle` if the likelihood accounts for the circles that stars were matched in;
+    `false_matches` if a posterior explains residuals that are too large by false matches, with
+    quoted errors that are right; `things` are what is fitted, one row each, and `chooser` leaves
+    out rows that are far off.
     """
     ratio = fit.chi2 / fit.dof if fit.dof > 0 else float("nan")
     left_out = fit.n_rejected / fit.n_rows
     small = scatter_too_small(fit.chi2, fit.dof)
-    sentence = _of_chi2(fit, small, in_circle)
+    sentence = _of_chi2(fit, small, in_circle=in_circle, false_matches=false_matches)
     return (
         Check(
             FIT,
-            "Chi-square per degree of freedom, quoted errors",
+            CHI_SQUARE,
             number(ratio),
             f"{CHI2_TOO_SMALL.value:g} to {CHI2_TOO_LARGE.value:g}",
             level_of(not small and CHI2_TOO_LARGE.met_by(ratio), "warn"),
@@ -75,7 +80,7 @@ def fit_checks(
     )
 
 
-def _of_chi2(fit: LinearFit, small: bool, in_circle: bool) -> str:
+def _of_chi2(fit: LinearFit, small: bool, *, in_circle: bool, false_matches: bool) -> str:
     """Sentence on a chi-square that is not about one; empty where it is."""
     ratio = fit.chi2 / max(fit.dof, 1)
     if small and in_circle:
@@ -89,10 +94,16 @@ def _of_chi2(fit: LinearFit, small: bool, in_circle: bool) -> str:
             f"chi-square per degree of freedom is {ratio:.2g}: the match radius has cut the "
             "residuals, or the quoted errors are too large, and with them all uncertainties"
         )
+    if ratio > CHI2_TOO_LARGE.value and false_matches:
+        return (
+            f"chi-square per degree of freedom of least squares is {ratio:.3g}: the rejection "
+            "limits have kept false matches; the posterior accounts for them, with the quoted "
+            "errors of the others as they are"
+        )
     if ratio > CHI2_TOO_LARGE.value:
         return (
-            f"chi-square per degree of freedom is {ratio:.3g} with the quoted errors: they are too "
-            "small, which the jitter takes up, or the model does not fit"
+            f"chi-square per degree of freedom is {ratio:.3g} with the quoted errors: "
+            f"{RESIDUALS_TOO_LARGE}"
         )
     return ""
 

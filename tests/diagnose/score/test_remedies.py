@@ -1,4 +1,4 @@
-"""What the tests of shape and match radius advise is done, and the run after it is right."""
+"""What findings advise is done, and the run after it is right."""
 
 from __future__ import annotations
 
@@ -10,9 +10,22 @@ import pytest
 import bayesdist as bd
 from bayesdist.assess.statistics import field_statistic
 from bayesdist.model.grid import grid_pixels, mesh
-from tests.reduced import only_in_full
+from tests.reduced import case_in_full, only_in_full
 
-from .shaped import CHIP, SIDE, SIGMA, direction, matches_of, nominal_within, scene, tail, true_map
+from .shaped import (
+    CHIP,
+    SIDE,
+    SIGMA,
+    direction,
+    examined,
+    gaussian,
+    matches_of,
+    nominal_within,
+    scaled,
+    scene,
+    tail,
+    true_map,
+)
 
 pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("one_thread")]
 
@@ -23,8 +36,12 @@ WRONG = ("raise model.order", "scale_mas", "too small", "depend on position")
 class Carried:
     """A posterior with its diagnostics, and its actual errors in an exposure."""
 
-    def __init__(self, matches, outliers=None, frames="none", exposure=None):
-        model = bd.build_model(matches, order=3, size=(SIDE, SIDE), name=CHIP.name, frames=frames)
+    def __init__(
+        self, matches, outliers=None, frames="none", exposure=None, order=3, truth=true_map
+    ):
+        model = bd.build_model(
+            matches, order=order, size=(SIDE, SIDE), name=CHIP.name, frames=frames
+        )
         fit = bd.fit_linear(matches, model)
         self.posterior = bd.sample(fit, matches, outliers=outliers, seed=1, target_ess=400)
         self.diagnostics = bd.diagnose(self.posterior, matches, fit=fit, rng=1)
@@ -33,7 +50,7 @@ class Carried:
         if exposure is not None:
             code = np.full(x.size, model.exposures.index(exposure))
         predicted = model.predict(self.posterior.mean, x, y, exposure=code)
-        self.error = np.asarray(predicted) - true_map(x, y)
+        self.error = np.asarray(predicted) - truth(x, y)
 
     @property
     def p95(self) -> float:
@@ -115,3 +132,144 @@ def test_a_match_radius_that_is_corrected():
     after = Carried(matches, bd.OutlierMixture("uniform", match_radius=radius))
     after.assert_covers(4000)
     assert "match radius" not in after.advice() and "lopsided" not in after.advice()
+
+
+N = 2400
+
+
+def stars(seed: int, n: int = N):
+    """Generator, pixels and true positions of stars."""
+    rng = np.random.default_rng([42, seed])
+    x, y = rng.uniform(0.5, SIDE + 0.5, (2, n))
+    return rng, x, y, true_map(x, y)
+
+
+def advice_of(matches, name: str) -> str:
+    """Remedy of a test that has found something."""
+    test = examined(matches)[name]
+    assert test.significant
+    return test.remedy
+
+
+def raised_order() -> Carried:
+    """A term of fourth order, 0.05 px at the edges."""
+
+    def truth(x, y):
+        return true_map(x, y) + 0.05 * np.stack(
+            [scaled(x) ** 4, scaled(x) ** 2 * scaled(y) ** 2], 1
+        )
+
+    rng, x, y, _ = stars(1)
+    matches = matches_of(x, y, truth(x, y) + SIGMA * gaussian(rng, N))
+    order = int(re.fullmatch(r"raise model.order to (\d+)", advice_of(matches, "order 4"))[1])
+    return Carried(matches, order=order, truth=truth)
+
+
+def errors_by_position() -> Carried:
+    """Noise that rises threefold over the columns, quoted as if it were the same."""
+    rng, x, y, uv = stars(2)
+    sigma = SIGMA * (1 + (1 + scaled(x)))
+    uv = uv + sigma[:, None] * gaussian(rng, N)
+    matches = matches_of(x, y, uv, float(np.median(sigma)))
+    assert advice_of(matches, "noise by position") == "give errors that depend on position"
+    return Carried(matches.with_errors((sigma, sigma.copy())))
+
+
+def errors_of_axes() -> Carried:
+    """Noise of v that is twice that of u."""
+    rng, x, y, uv = stars(3)
+    sigma = SIGMA * np.array([1.0, 2.0])
+    matches = matches_of(x, y, uv + sigma * gaussian(rng, N), float(sigma.mean()))
+    assert advice_of(matches, "noise by axis") == "give separate errors sigma_u and sigma_v"
+    return Carried(matches.with_errors(tuple(np.full(N, one) for one in sigma)))
+
+
+def cut_faint_stars() -> Carried:
+    """Charge trails that displace faint stars far from the amplifier."""
+    rng, x, y, uv = stars(4)
+    mag = rng.uniform(16, 20, N)
+    trail = 0.03 * np.maximum(mag - 18, 0) * (1 + scaled(y))
+    uv = uv + SIGMA * gaussian(rng, N) + trail[:, None] * [0.0, 1.0]
+    matches = matches_of(x, y, uv, mag=mag)
+    assert "cut the faint stars" in advice_of(matches, "magnitude")
+    return Carried(matches.select(mag < 18))
+
+
+def corrected_centroids() -> Carried:
+    """Centroids that are drawn to the middle of their pixel along x."""
+    rng, x, y, uv = stars(5)
+    matches = matches_of(x + 0.03 * np.sin(2 * np.pi * x), y, uv + SIGMA * gaussian(rng, N))
+    assert "correct the centroids" in advice_of(matches, "pixel phase")
+    corrected = matches.x
+    for _ in range(20):  # as an effective point-spread function would measure them
+        corrected = matches.x - 0.03 * np.sin(2 * np.pi * corrected)
+    return Carried(matches.with_columns(x=corrected))
+
+
+def calibrated_one_by_one() -> Carried:
+    """Second-order terms that differ between four exposures."""
+    rng, x, y, uv = stars(6, 4 * N)
+    exposure = np.arange(4 * N) % 4
+    terms = 0.03 * rng.standard_normal((4, 3, 2))
+
+    def moved(code, x, y):
+        X, Y = scaled(x), scaled(y)
+        return np.einsum("kn,nka->na", [X * X, X * Y, Y * Y], terms[code])
+
+    uv = uv + moved(exposure, x, y) + SIGMA * gaussian(rng, 4 * N)
+    matches = matches_of(x, y, uv, exposure=exposure, exposure_names=tuple("abcd"))
+    assert "exposures one by one" in advice_of(matches, "second order of exposures")
+    first = exposure == 0
+    alone = matches_of(x[first], y[first], uv[first])
+
+    def truth(x, y):
+        return true_map(x, y) + moved(np.zeros(len(x), np.int64), x, y)
+
+    return Carried(alone, truth=truth)
+
+
+def left_out_exposure() -> Carried:
+    """One of six exposures is turned by 0.01 degrees."""
+    rng, x, y, uv = stars(7)
+    exposure = np.arange(N) % 6
+    turned = (np.deg2rad(0.01) * SIDE / 2) * np.stack([-scaled(y), scaled(x)], 1)
+    uv = uv + (exposure == 4)[:, None] * turned + SIGMA * gaussian(rng, N)
+    names = tuple("abcdef")
+    matches = matches_of(x, y, uv, exposure=exposure, exposure_names=names)
+    before = Carried(matches)
+    [check] = [one for one in before.diagnostics.checks if "deviate far more" in one.name]
+    assert "leave out what went wrong" in check.sentence
+    wrong = check.sentence.split(" lie ")[0].split(", ")
+    assert wrong == ["e"]
+    assert not any(word in repr(before.diagnostics) for word in WRONG)
+    good = exposure != names.index(*wrong)
+    codes = np.searchsorted(np.delete(np.arange(6), 4), exposure[good])
+    labels = tuple(one for one in names if one not in wrong)
+    return Carried(matches_of(x[good], y[good], uv[good], exposure=codes, exposure_names=labels))
+
+
+LIKE_OTHERS = "the other remedies are followed in the same way"
+
+
+@pytest.mark.parametrize(
+    "followed",
+    [
+        raised_order,
+        calibrated_one_by_one,
+        *(
+            case_in_full(one, instead=LIKE_OTHERS)
+            for one in (
+                errors_by_position,
+                errors_of_axes,
+                cut_faint_stars,
+                corrected_centroids,
+                left_out_exposure,
+            )
+        ),
+    ],
+)
+def test_advice_that_is_followed_helps(followed):
+    """The finding is gone, as all others, the errors cover, and limits are met."""
+    after = followed()
+    assert [test.name for test in after.diagnostics.score_tests if test.significant] == []
+    after.assert_right(len(after.diagnostics.sample.table))
