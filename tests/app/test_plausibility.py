@@ -52,6 +52,15 @@ def doubts(found, **settings):
     return doubts_on_stars(found, model(found.unit), config(**settings))
 
 
+# -- too few stars ---------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("n", "named"), [(8, True), (9, False)])
+def test_fewer_than_three_stars_for_each_term_are_named(rng, n, named):
+    said = doubts(stars(rng, n=n))  # order 1: three terms on each axis
+    assert any(f"{n} stars for 3 terms on each axis" in text for text in said) == named
+
+
 # -- positions made from the pixels ---------------------------------------------------------------
 
 
