@@ -68,6 +68,20 @@ class Geometry:
         )
 
     @property
+    def mirrored(self) -> str:
+        """Sentence about a chip that shows the sky mirrored; empty if it does not.
+
+        It holds if u, v are a tangent plane, on which u increases to the east.
+        """
+        if self.parity < 0:
+            return ""
+        return (
+            f"chip {self.chip} shows the sky mirrored (east is to the right where north is up): "
+            "right if the optics mirror it, otherwise x and y are swapped or one of them is "
+            "counted from the wrong side"
+        )
+
+    @property
     def warnings(self) -> list[str]:
         """Sentences about values that few detectors have."""
         x, y, unit = self.scales

@@ -79,6 +79,8 @@ def _lines(results: Results) -> Iterator[str]:
     chips = geometries(fit)
     for chip in chips:
         yield f"geometry     chip {chip.chip}: {chip.sentence}"
+        if matches.tangent_point is not None and chip.mirrored:
+            yield f"geometry     {chip.mirrored}"
     yield _cost(data, config)
     idle = idle_dates(config, config.requirements())
     for text in (

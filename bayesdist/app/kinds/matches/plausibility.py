@@ -36,9 +36,7 @@ def doubts_on_stars(stars: Matches, model: DistortionModel, config: Config) -> l
     return list(_doubts(stars, model, config.detector.scale_mas))
 
 
-def _doubts(
-    stars: Matches, model: DistortionModel, scale_mas: float | None
-) -> Iterator[str]:
+def _doubts(stars: Matches, model: DistortionModel, scale_mas: float | None) -> Iterator[str]:
     unit = model.unit
     if stars.epoch is not None:
         yield from _doubts_on_dates(stars.epoch, ", ".join(stars.sources))
@@ -79,6 +77,16 @@ def _doubts_on_scale(
     where = ", ".join(stars.sources)
     if unit in IN_DEGREES:
         reach = float(max(np.ptp(stars.u), np.ptp(stars.v))) * IN_DEGREES[unit]
+        if reach > HALF_TURN and stars.tangent_point is not None:
+            width = 2 * np.degrees(np.arctan(np.radians(reach / 2)))
+            raise InputError(
+                f"the field is some {width:.0f} degrees wide, and on the tangent plane of ra and "
+                f"dec it would span {reach:.4g} degrees, which no polynomial follows",
+                where=where,
+                do="fit the field in parts, each with data.tangent_point at its centre, or give u "
+                "and v of a projection for wide fields, such as ARC or ZEA; check ra and dec if "
+                "the field is narrower",
+            )
         if reach > HALF_TURN:
             raise InputError(
                 f"u and v span {reach:.4g} degrees if they are in {unit}",
