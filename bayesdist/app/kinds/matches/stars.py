@@ -122,7 +122,7 @@ def fit_stars(
     refuse_geometry(
         geometries(fitted.linear),
         scale_mas=config.detector.scale_mas,
-        on_sky=matched.stars.tangent_point is not None,
+        tangent_point=matched.stars.tangent_point,
         where=", ".join(matched.stars.sources),
     )
     linear = replace(fitted.linear, tangent_point=matched.stars.tangent_point)
