@@ -27,7 +27,15 @@ from bayesdist.infer.solution.transforms import at_exposure, without_frames
 from bayesdist.mission import load_object
 from bayesdist.model import Chip, DistortionModel, LookupTable, TimeDependence, corrected
 from bayesdist.utils.arrays import Float
-from bayesdist.utils.quantities import Direction, Epoch, Number, direction_in, year_of
+from bayesdist.utils.quantities import (
+    Direction,
+    Epoch,
+    Number,
+    Random,
+    direction_in,
+    generator_of,
+    year_of,
+)
 
 if TYPE_CHECKING:
     from astropy.modeling import Model
@@ -628,9 +636,10 @@ class GaussianSolution(Solution):
     mean: Float
     cov: Float
 
-    def draws(self, n: int, rng: np.random.Generator) -> Float:
+    def draws(self, n: int, rng: Random) -> Float:
         """Parameter vectors, shape (n, D)."""
-        return rng.multivariate_normal(self.mean, self.cov, size=n, method="eigh")
+        generator = generator_of(rng)
+        return generator.multivariate_normal(self.mean, self.cov, size=n, method="eigh")
 
 
 def calibration_of(

@@ -23,6 +23,7 @@ from bayesdist.model import DistortionModel, PolynomialBasis
 from bayesdist.model.grid import DEFAULT_GRID, grid_pixels, mesh
 from bayesdist.model.similarity import turned, turned_model
 from bayesdist.utils.arrays import Complex, Float
+from bayesdist.utils.quantities import Random, generator_of
 
 
 def lay_on(
@@ -180,16 +181,17 @@ class _Oriented(DerivedSolution):
     source: Solution
     orientation: Orientation
 
-    def draws(self, n: int, rng: np.random.Generator) -> Float:
+    def draws(self, n: int, rng: Random) -> Float:
         """Parameter vectors, shape (n, D)."""
+        generator = generator_of(rng)
         o = self.orientation
-        theta = np.asarray(self.source.draws(n, rng), float)
+        theta = np.asarray(self.source.draws(n, generator), float)
         if self.source is o.base:
             moved = (theta - np.asarray(o.base.mean)) @ o.derivative.T
             spread = o.reference_cov
         else:
             moved, spread = np.zeros((n, 4)), o.cov
-        moved = moved + rng.multivariate_normal(np.zeros(4), spread, size=n, method="eigh")
+        moved = moved + generator.multivariate_normal(np.zeros(4), spread, size=n, method="eigh")
         turn = o.scale * np.exp(moved[:, 2] + 1j * (o.angle + moved[:, 3]))
         shift = complex(*o.shift) + moved[:, 0] + 1j * moved[:, 1]
         return turned(self.source.model, theta, turn, shift)

@@ -240,7 +240,8 @@ def _read_corr(file: Path, table: Table, name: str | None, options: ReadOptions)
     Magnitudes are instrumental, -2.5 log10 FLUX, where all fluxes are positive; there are no
     errors.
     """
-    options.refuse_fixed(str(file), "astrometry.net", "columns", "pixel_origin")
+    fixed = ["columns"] if options.pixel_origin == 1 else ["columns", "pixel_origin"]
+    options.refuse_fixed(str(file), "astrometry.net", *fixed)
     if options.unit not in (None, "arcsec"):
         options.refuse_fixed(str(file), "astrometry.net", "unit")
     options.refuse(

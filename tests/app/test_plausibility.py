@@ -52,6 +52,15 @@ def doubts(found, **settings):
     return doubts_on_stars(found, model(found.unit), config(**settings))
 
 
+# -- too few stars ---------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("n", "named"), [(8, True), (9, False)])
+def test_fewer_than_three_stars_for_each_term_are_named(rng, n, named):
+    said = doubts(stars(rng, n=n))  # order 1: three terms on each axis
+    assert any(f"{n} stars for 3 terms on each axis" in text for text in said) == named
+
+
 # -- positions made from the pixels ---------------------------------------------------------------
 
 
@@ -111,6 +120,21 @@ def job(folder, rng, hours=False, scale_mas=None, stretch=1.0):
     return write_job(folder, table, data=data, detector=detector, budget=None)
 
 
+def test_a_field_too_wide_for_a_tangent_plane_is_named(rng):
+    """120 degrees: tan(60 degrees) = 1.73 rad on either side of the tangent point."""
+    angle = np.radians(np.linspace(-60, 60, 50))
+    u, v = np.degrees(np.tan(angle)), np.degrees(np.tan(rng.permutation(angle))) / 2
+    x, y = rng.uniform(1, 1000, 50), rng.uniform(1, 800, 50)
+    table = Matches(
+        x=x, y=y, u=u, v=v, unit="deg", sources=("stars.ecsv",), tangent_point=(10.0, 20.0)
+    )
+    with pytest.raises(InputError, match=r"some 120 degrees wide.*198\.5 degrees.*in parts"):
+        doubts(table)
+    own = replace(table, tangent_point=None)
+    with pytest.raises(InputError, match=r"span 198\.5 degrees if they are in deg; correct data"):
+        doubts(own)
+
+
 def test_right_ascensions_in_hours_are_named(rng, tmp_path):
     done = cli("check", job(tmp_path / "hours", rng, hours=True))
     assert done.code == 1 and "right ascensions in hours" in done.err
@@ -129,6 +153,28 @@ def test_check_says_the_geometry(rng, tmp_path):
     said = next(line for line in done.out.splitlines() if line.startswith("geometry"))
     assert "chip 1: scale 150.000 x 150.000 mas/px" in said and "parity -1" in said
     assert "+y at 30.00 degrees" in said and "the pixel is" not in done.out
+
+
+@pytest.mark.parametrize("mirrored", [True, False])
+def test_mirrored_pixels_are_named(rng, tmp_path, mirrored):
+    path = job(tmp_path / "parity", rng)
+    if mirrored:
+        table = Table.read(path.parent / "stars.ecsv")
+        table["x"] = 1001 - table["x"]
+        table.write(path.parent / "stars.ecsv", overwrite=True)
+    said = cli("check", path)
+    assert said.code == 0, said.err
+    assert ("chip 1 shows the sky mirrored" in said.out) == mirrored
+
+
+def test_swapped_pixels_are_named(rng, tmp_path):
+    path = job(tmp_path / "swapped", rng)
+    table = Table.read(path.parent / "stars.ecsv")
+    table["x"], table["y"] = table["y"].copy(), table["x"].copy()
+    table.write(path.parent / "stars.ecsv", overwrite=True)
+    said = cli("check", path)
+    assert said.code == 1
+    assert "if x and y, or the size, are swapped" in said.err
 
 
 def test_pixels_that_are_not_square_are_a_warning(rng, tmp_path):

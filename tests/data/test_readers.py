@@ -200,6 +200,8 @@ def test_astrometry_net_has_no_errors_of_its_own(data_dir):
         read_matches(path, sigma=1, pixel_origin=0)
     with pytest.raises(InputError, match="option 'unit' is given"):
         read_matches(path, sigma=1, unit="pix")
+    # the origin that the format has may be stated
+    assert (read_matches(path, sigma=1, pixel_origin=1).x == read_matches(path, sigma=1).x).all()
     # as any other table, by its columns
     columns = {"x": "field_x", "y": "field_y", "ra": "index_ra", "dec": "index_dec"}
     t = read_matches(path, columns=columns, sigma=1)

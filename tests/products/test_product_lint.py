@@ -11,6 +11,7 @@ from astropy.io import fits
 from bayesdist.products import (
     IdcTab,
     SipHeader,
+    describe,
     lint_idctab,
     lint_sip,
     read_idctab,
@@ -61,6 +62,41 @@ def test_a_good_header_is_clean() -> None:
 def test_each_defect_of_a_header_is_found(change, level: str, message: str) -> None:
     sip = good()
     assert message in said(lint_sip(replace(sip, **change(sip))), level)
+
+
+def test_a_radial_lens_is_not_taken_for_copied_coefficients() -> None:
+    """k r^2 (x, y) + m r^4 (x, y), expanded: equal coefficients by construction."""
+    k, m, sip = 3.1e-9, -2.3e-16, good()
+    a = {(3, 0): k, (1, 2): k, (5, 0): m, (3, 2): 2 * m, (1, 4): m}
+    radial = replace(sip, order=(5, 5), a=a, b={(j, i): c for (i, j), c in a.items()})
+    assert "A_3_0" not in said(lint_sip(radial), "warning")
+    # a coefficient that was copied in a file of another lens is found as before
+    copied = replace(radial, a={**a, (3, 0): 1.1 * k}, b={**radial.b, (0, 3): 1.2 * k})
+    assert "A_1_2, B_2_1: the same value" in said(lint_sip(copied), "warning")
+
+
+HEADER = {
+    "CTYPE1": "RA---TAN-SIP", "CTYPE2": "DEC--TAN-SIP", "CRPIX1": 500.5, "CRPIX2": 400.5,
+    "CRVAL1": 10.0, "CRVAL2": 20.0, "CD1_1": -1e-5, "CD1_2": 0.0, "CD2_1": 0.0, "CD2_2": 1e-5,
+    "NAXIS1": 1000, "NAXIS2": 800,
+}  # fmt: skip
+SIP_CARDS = {"A_ORDER": 2, "B_ORDER": 2, "A_2_0": 1e-6, "B_0_2": 2e-6}
+
+
+@pytest.mark.parametrize(
+    ("cards", "words"),
+    [
+        ({}, "ends in -SIP, but there are no coefficients"),
+        (SIP_CARDS | {"NDRIZIM": 4}, "the image was drizzled"),
+    ],
+)
+def test_headers_whose_distortion_is_elsewhere_are_named(tmp_path, cards, words) -> None:
+    path = tmp_path / "camera.hdr"
+    fits.Header((HEADER | cards).items()).totextfile(path)
+    assert words in " ".join(describe(path).split())
+    sound = tmp_path / "sound.hdr"
+    fits.Header((HEADER | SIP_CARDS).items()).totextfile(sound)
+    assert words not in " ".join(describe(sound).split())
 
 
 def test_a_size_can_be_told() -> None:

@@ -235,6 +235,13 @@ def exchanged_columns(first):
     return edit
 
 
+def shifted(rows):
+    """Rows whose Idl2SciX takes every position three pixels too far."""
+    return [
+        [*r[:6], repr(float(r[6]) + 3), *r[7:]] if int(r[2]) + int(r[3]) == 0 else r for r in rows
+    ]
+
+
 def scaled(columns, factor):
     def edit(rows):
         return [
@@ -255,6 +262,7 @@ def scaled(columns, factor):
         (scaled((2, 3), 0.0), "error", "Idl2SciX, Idl2SciY", "the inverse is missing"),
         (scaled((1,), -1.0), "error", "Sci2IdlX, Sci2IdlY", "parity"),
         (scaled((0, 1), 1 / 3600), "error", "Sci2IdlX, Sci2IdlY", "arcsec (in degrees: 0.065"),
+        (shifted, "error", "Idl2SciX, Idl2SciY", "the constant terms are off by 3 and "),
         (scaled((2,), 1.001), "error", "Idl2SciX, Idl2SciY", "miss the inverse of Sci2Idl"),
         (lambda rows: rows[:5] + rows[6:], "error", "22", "there is no row"),
         (lambda rows: [*rows, rows[3]], "error", "20", "more than one row"),

@@ -63,8 +63,8 @@ def mutual_frames(
         raise InputError(
             f"the exposures fall into {len(groups)} groups without stars in common: {listed}",
             where=source,
-            do="add exposures between them, calibrate each group by itself, or give a start by "
-            "which their stars agree",
+            do="add exposures between them, calibrate each group by itself, or name an "
+            "initial_distortion with which their stars agree",
         )
     found = groups[0]
     E = len(planes)

@@ -41,6 +41,7 @@ from bayesdist.infer.stars.shards import Shards
 from bayesdist.model import DistortionModel
 from bayesdist.utils.arrays import Bool, Float, Int
 from bayesdist.utils.distributions import f_sf
+from bayesdist.utils.quantities import Random, generator_of
 
 SCALE = 1e-4  # of the prior on tau: variation of the scale by velocity aberration in a year
 # A focal plane that breathes moves its chips too: then the gap's deviations repeat those of scale
@@ -143,15 +144,18 @@ class HierarchicalFit(Solution):
         return np.asarray(self.fit.cov + spread.T @ spread / len(spread))
 
     @one_thread
-    def draws(self, n: int, rng: np.random.Generator) -> Float:
+    def draws(self, n: int, rng: Random) -> Float:
         """Parameter vectors (n, D), each drawn given a tau of its own."""
-        which = np.sort(rng.integers(len(self.tau_draws), size=n))
-        theta = rng.standard_normal((n, len(self.fit.mean)))
+        generator = generator_of(rng)
+        which = np.sort(generator.integers(len(self.tau_draws), size=n))
+        theta = generator.standard_normal((n, len(self.fit.mean)))
         for t in np.unique(which):
             rows = which == t
             mean, factor = self.scatter.posterior(self.tau_draws[t])
             theta[rows] = mean + factor.colour(theta[rows])
-        return np.asarray(rng.permutation(self.settling.draws(theta, self.tau_draws[which], rng)))
+        return np.asarray(
+            generator.permutation(self.settling.draws(theta, self.tau_draws[which], generator))
+        )
 
 
 def _root_mean_square(tau: Float) -> Float:

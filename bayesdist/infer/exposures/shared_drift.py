@@ -18,6 +18,7 @@ from bayesdist.infer.solution.transforms import reference_gauge, without_frames
 from bayesdist.model import DistortionModel
 from bayesdist.model.similarity import turned, turned_model
 from bayesdist.utils.arrays import Float
+from bayesdist.utils.quantities import Random, generator_of
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,10 +33,11 @@ class SharedDrift(DerivedSolution):
     gain: Float  # change of the polynomials with the drift (n_polynomial, n_tdd)
     matrix: Float  # from the reference in its gauge to this drift (n_tdd, D')
 
-    def draws(self, n: int, rng: np.random.Generator) -> Float:
+    def draws(self, n: int, rng: Random) -> Float:
         """Parameter vectors (n, D): draws of the source with draws of the reference's drift."""
-        theta = np.array(self.source.draws(n, rng), float)
-        drift = np.asarray(self.reference.draws(n, rng), float) @ self.matrix.T
+        generator = generator_of(rng)
+        theta = np.array(self.source.draws(n, generator), float)
+        drift = np.asarray(self.reference.draws(n, generator), float) @ self.matrix.T
         k = self.model.n_polynomial
         theta[:, :k] += (drift - theta[:, k:]) @ self.gain.T
         theta[:, k:] = drift

@@ -32,8 +32,10 @@ from bayesdist.infer.density.proposal import Proposal
 from bayesdist.infer.density.target import Density
 from bayesdist.infer.posterior import SamplerInfo
 from bayesdist.infer.sampler.checkpoints import Block, Walkers
+from bayesdist.infer.sampler.heartbeat import Heartbeat
 from bayesdist.infer.sampler.move_schedule import (
     EFFICIENT,
+    JUDGED_AFTER,
     Plan,
     StepRange,
     block_schedule,
@@ -41,6 +43,7 @@ from bayesdist.infer.sampler.move_schedule import (
     first_check,
     has_mixed,
     is_hopeless,
+    is_too_slow,
     mixing_steps,
     next_check,
     pilot_steps,
@@ -178,7 +181,7 @@ class _History:
         )
 
 
-def run_chains(target: Density, proposal: Proposal, settings: Settings) -> Chains:
+def run_chains(density: Density, proposal: Proposal, settings: Settings) -> Chains:
     """Sample until the targets are met or the steps are used up.
 
     DegenerateError when hardly a proposal falls inside the support; InputError for checkpoints that
@@ -187,6 +190,7 @@ def run_chains(target: Density, proposal: Proposal, settings: Settings) -> Chain
     from bayesdist.infer.sampler.ensembles import Ensembles  # emcee takes a second to import
 
     s, E = settings, len(settings.seeds)
+    target = Heartbeat(density, s.n_stars)
     W = s.walkers or walkers_for(s.n_stars)
     n = W * (pilot_steps(E, W) + 1)
     pilot = pilot_batch(target, proposal, s.seeds, n, s.folder, s.fingerprint)
@@ -200,6 +204,7 @@ def run_chains(target: Density, proposal: Proposal, settings: Settings) -> Chain
     whitening = Whitening.of(target, proposal, pilot.psi[inside])
 
     def start(plan: Plan) -> Ensembles:
+        target.method = plan.method
         return Ensembles(target, proposal, pilot, whitening, plan, s.seeds, s.folder, s.fingerprint)
 
     quality, passes, steps = quality_of(pilot.log_weights), pilot.n_evaluated, 0
@@ -237,6 +242,20 @@ def _given_up(chains: Chains) -> Chains:
     )
     log.warning("sample: %s", reason)
     return replace(chains, verdict=replace(v, converged=False, reasons=(reason, *v.reasons)))
+
+
+def _too_slow(verdict: Convergence, steps: int, max_steps: int) -> Convergence:
+    """Verdict that says why sampling ended before the last step."""
+    v = verdict
+    draws = min(v.ess_bulk_min, v.ess_tail_min)
+    reason = (
+        f"sampling was given up after {steps} steps with {draws:.0f} effective draws of "
+        f"{v.limits.ess:g}: at this rate sampler.max_steps = {max_steps} would not be enough; "
+        "lower model.order, add stars where there are none, give the coefficients priors, or "
+        "raise sampler.max_steps"
+    )
+    log.warning("sample: %s", reason)
+    return replace(v, converged=False, reasons=(reason, *v.reasons))
 
 
 def _drawn_ahead(
@@ -311,12 +330,17 @@ def _state_dependent(
         made = total * (history.rows - warmup)
         # at the same step for any targets, as a resumed run may have others
         trial = not plan.coupled and span.begin < begin + mixed <= span.end
-        if made < max(wanted, total * LEAST_ROWS) and not last and not trial:
+        quarter = begin + JUDGED_AFTER * (s.max_steps - begin)
+        judged = trial or span.begin < quarter <= span.end
+        if made < max(wanted, total * LEAST_ROWS) and not last and not judged:
             continue
         verdict = _verdict(
-            target, history, warmup, quality, s.limits, () if last or trial else worst
+            target, history, warmup, quality, s.limits, () if last or judged else worst
         )
         if verdict.converged or last:
+            break
+        if is_too_slow(verdict, span.end - begin, s.max_steps - begin):
+            verdict = _too_slow(verdict, span.end, s.max_steps)
             break
         ess = min(verdict.ess_bulk_min, verdict.ess_tail_min)
         hopeless = is_hopeless(len(target.names), s.n_stars, len(s.seeds))

@@ -30,6 +30,8 @@ MANY = 50
 # evaluations of one star, about a minute's: beyond them differential evolution of many parameters
 # is not begun
 MOST_WORK = 600 * WORTH
+JUDGED_AFTER = 0.25  # fraction of the steps after which the rate of effective draws is judged
+TOO_SLOW = 5.0  # factor by which that rate may be too low
 PROBATION = 2048  # proposals below which k scatters too much (by about 0.2 at 512) to reject one
 
 
@@ -118,6 +120,17 @@ def is_hopeless(n_params: int, n_stars: int, ensembles: int) -> bool:
     steps = 2 * DRAWS_PER_WALKER.value * 3 * n_params
     work = ensembles * 2 * (n_params + 1) * steps * n_stars
     return n_params > MANY and work > MOST_WORK
+
+
+def is_too_slow(verdict: Convergence, made: int, most: int) -> bool:
+    """True if the targets are far out of reach within `most` steps, judged after `made` steps.
+
+    The rate of effective draws rises while walkers forget their start. It is therefore judged after
+    a quarter of the steps, and only a rate five times too low ends a run: what may still converge
+    goes on.
+    """
+    ess = min(verdict.ess_bulk_min, verdict.ess_tail_min)
+    return made >= most * JUDGED_AFTER and ess * most / made < verdict.limits.ess / TOO_SLOW
 
 
 # -- independence: sizes --------------------------------------------------------------------------

@@ -19,6 +19,7 @@ from bayesdist.infer.selfcal.sky_moves import gauge_free_matrix
 from bayesdist.infer.solution.solution import Solution
 from bayesdist.model import DistortionModel
 from bayesdist.utils.arrays import Float
+from bayesdist.utils.quantities import Random, generator_of
 
 BOUNDED = 1e-3  # fraction of a free direction that the others may leave unexplained
 NONE_FALSE = Mixture(jitter=0.0, fraction=1e-300)
@@ -34,9 +35,10 @@ class ExpectedSolution(Solution):
     gauge: Gauge
     problem: Problem  # detections that would be used, sorted by star
 
-    def draws(self, n: int, rng: np.random.Generator) -> Float:
+    def draws(self, n: int, rng: Random) -> Float:
         """Parameter vectors (n, D)."""
-        return np.asarray(rng.multivariate_normal(self.mean, self.cov, n, method="eigh"))
+        generator = generator_of(rng)
+        return np.asarray(generator.multivariate_normal(self.mean, self.cov, n, method="eigh"))
 
     def up_to(self, directions: Float) -> Float:
         """Covariance (D, D) without the errors along directions (D, d), as of `gauge_free_matrix`.

@@ -21,6 +21,7 @@ LARGEST_ANISOTROPY = 0.05  # ratio of the scales of the two axes, less 1: square
 LARGEST_SKEW = 0.1  # rad: ACS, with the strongest tilt of a focal plane in use, has 0.09
 LARGEST_DISTORTION = 0.05  # of half the diagonal of the chip
 LARGEST_SCALE_ERROR = 0.02  # of a stated pixel scale
+RADIANS = 0.01  # relative distance from the stretch of radians within which they are named
 # Right ascensions in hours that are read as degrees shrink one direction of the sky by 15.
 HOURS = (12.0, 18.0)
 
@@ -65,6 +66,20 @@ class Geometry:
         return (
             f"scale {x} x {y} {unit}, +y at {self.position_angle:.2f} degrees from +v towards +u, "
             f"parity {self.parity:+d}, largest distortion {number(self.distortion, 3)} px"
+        )
+
+    @property
+    def mirrored(self) -> str:
+        """Sentence about a chip that shows the sky mirrored; empty if it does not.
+
+        It holds if u, v are a tangent plane, on which u increases to the east.
+        """
+        if self.parity < 0:
+            return ""
+        return (
+            f"chip {self.chip} shows the sky mirrored (east is to the right where north is up): "
+            "right if the optics mirror it, otherwise x and y are swapped or one of them is "
+            "counted from the wrong side"
         )
 
     @property
@@ -141,18 +156,41 @@ def geometries(solution: Solution) -> list[Geometry]:
     return [geometry_of(solution, chip.number) for chip in solution.model.chips]
 
 
-def refuse_geometry(
-    chips: Sequence[Geometry], *, scale_mas: float | None, on_sky: bool, where: str
-) -> None:
-    """Refuse right ascensions in hours, and a stated pixel scale that is not that of the fit.
+def _in_radians(stretch: float, ra: float, dec: float) -> bool:
+    """True if square pixels would be stretched as they are by radians that are read as degrees.
 
-    `on_sky` is True if u, v are on a tangent plane.  InputError with the way out.
+    Near the equator of degrees the factor cos(dec) of the east-west direction is missing.
+    """
+    possible = 0 <= ra <= 2 * np.pi and abs(dec) < np.pi / 2
+    missing = np.cos(np.radians(dec)) / np.cos(dec) if possible else 1.0
+    return bool(missing > 1 + LARGEST_ANISOTROPY and abs(stretch / missing - 1.0) < RADIANS)
+
+
+def refuse_geometry(
+    chips: Sequence[Geometry],
+    *,
+    scale_mas: float | None,
+    tangent_point: tuple[float, float] | None,
+    where: str,
+) -> None:
+    """Refuse right ascensions in hours, radians, and a stated pixel scale that the fit contradicts.
+
+    `tangent_point` is RA and Dec in degrees, None if u, v are on no tangent plane.  InputError with
+    the way out.
     """
     first = chips[0]
     if first.unit not in MAS:
         return
     x, y, unit = first.scales
-    if on_sky and HOURS[0] < first.stretch < HOURS[1]:
+    if tangent_point is not None and _in_radians(first.stretch, *tangent_point):
+        raise InputError(
+            f"the pixel is {x} x {y} {unit}, and the field lies at ra {tangent_point[0]:.4g}, dec "
+            f"{tangent_point[1]:.4g}: square pixels have this shape if both are in radians and are "
+            "read as degrees",
+            where=where,
+            do="convert ra and dec to degrees, or give the columns the unit rad",
+        )
+    if tangent_point is not None and HOURS[0] < first.stretch < HOURS[1]:
         raise InputError(
             f"the pixel is {x} x {y} {unit}: one direction of the sky is {first.stretch:.3g} times "
             "the other, as where right ascensions in hours are read as degrees",

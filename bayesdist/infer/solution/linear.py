@@ -32,7 +32,7 @@ from bayesdist.infer.stars.stars import Stars, in_table_order, prepare
 from bayesdist.model import Chip, DistortionModel, TimeDependence
 from bayesdist.utils.arguments import takes
 from bayesdist.utils.arrays import Bool, Float
-from bayesdist.utils.quantities import value_in, values_in
+from bayesdist.utils.quantities import Random, generator_of, value_in, values_in
 
 MEDIAN_STARS = 1_000_000  # largest number of stars whose median is taken
 MEDIAN_CHI2_2 = 2 * np.log(2)  # median of chi-square with two degrees of freedom
@@ -161,17 +161,17 @@ class LinearFit(Solution):
     def _root(self) -> Float:
         return scaled_cholesky(self.cov)  # parameters fixed by a gauge have no error
 
-    def draws(self, n: int, rng: np.random.Generator) -> Float:
+    def draws(self, n: int, rng: Random) -> Float:
         """Parameter vectors (n, D) from the Gaussian with this mean and covariance.
 
         Parameters
         ----------
         n : int
             How many.
-        rng : numpy.random.Generator
-            Source of the random numbers.
+        rng : int or numpy.random.Generator
+            Seed, or source of the random numbers.
         """
-        return self.mean + rng.standard_normal((n, len(self.mean))) @ self._root.T
+        return self.mean + generator_of(rng).standard_normal((n, len(self.mean))) @ self._root.T
 
     def mapped(self, matrix: Float) -> LinearFit:
         """Fit whose deviations from the mean are mapped by a matrix (D, D).

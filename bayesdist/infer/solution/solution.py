@@ -12,6 +12,7 @@ import numpy as np
 from bayesdist.errors import InputError
 from bayesdist.model import DistortionModel
 from bayesdist.utils.arrays import Bool, Float, Int
+from bayesdist.utils.quantities import Random
 
 if TYPE_CHECKING:  # a file is inspected without what they import
     from bayesdist.data.matches import Matches
@@ -67,20 +68,20 @@ class Solution(ABC):
         convergence = mixture = tangent_point = None
 
     @abstractmethod
-    def draws(self, n: int, rng: np.random.Generator) -> Float:
+    def draws(self, n: int, rng: Random) -> Float:
         """Random draws of the parameters.
 
         Parameters
         ----------
         n : int
-        rng : numpy.random.Generator
+        rng : int or numpy.random.Generator
 
         Returns
         -------
         ndarray, shape (n, D)
         """
 
-    def drawn_rows(self, n: int, rng: np.random.Generator) -> tuple[Float, Int]:
+    def drawn_rows(self, n: int, rng: Random) -> tuple[Float, Int]:
         """Parameter vectors (m, D), and the rows (n,) among them that `draws` gives."""
         return np.asarray(self.draws(n, rng), float), np.arange(n)
 
@@ -218,7 +219,7 @@ class TransformedSolution(DerivedSolution):
     source: Solution
     transform: Callable[[Float], Float]
 
-    def draws(self, n: int, rng: np.random.Generator) -> Float:
+    def draws(self, n: int, rng: Random) -> Float:
         """Parameter vectors, shape (n, D): draws of the source, each transformed."""
         return self.transform(np.asarray(self.source.draws(n, rng), float))
 

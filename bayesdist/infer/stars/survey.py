@@ -106,6 +106,8 @@ def survey(stars: Stars, matches: Matches, every: int) -> Survey:
                 f"row {matches.row[k] + 1}{file} lies at pixel ({matches.x[k]:.2f}, "
                 f"{matches.y[k]:.2f}), outside the {chip.size[0]:g} x {chip.size[1]:g} detector"
             )
+            if bool(((x <= chip.size[1] + 0.5) & (y <= chip.size[0] + 0.5)).all()):
+                sentence += " (all rows would lie inside if x and y, or the size, are swapped)"
         a, b = x / chip.size[0], y / chip.size[1]
         sums = np.array([a.sum(), b.sum(), a @ a, a @ b, b @ b])
         chips.append(ChipSurvey(len(x), _hull(np.column_stack([x, y])), sums, sentence))

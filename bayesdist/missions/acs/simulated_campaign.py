@@ -17,6 +17,7 @@ from bayesdist.missions.acs.simulate import AcsCampaign, acs_solution, simulate_
 from bayesdist.model import DistortionModel
 from bayesdist.products import IdcTab, idctab_from_solution, write_idctab
 from bayesdist.utils.arrays import Float
+from bayesdist.utils.quantities import Random
 
 START = "start_idc.fits"
 REFERENCE = "F606W"  # the filter of the detector's tables and of the drift
@@ -191,7 +192,7 @@ class _Exact(Solution):
     def cov(self) -> Float:
         return np.zeros((len(self.mean), len(self.mean)))
 
-    def draws(self, n: int, rng: np.random.Generator) -> Float:
+    def draws(self, n: int, rng: Random) -> Float:
         return np.tile(self.mean, (n, 1))
 
 

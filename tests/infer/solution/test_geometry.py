@@ -73,13 +73,15 @@ def test_the_largest_distortion_is_in_pixels():
 def test_right_ascensions_in_hours_are_refused_at_any_roll(angle):
     hours = np.diag([1 / 15, 1.0]) @ turned(angle, 0.43, 0.43)
     with pytest.raises(InputError, match=r"are read as degrees.*multiply ra by 15"):
-        refuse_geometry([geometry_of(solution(hours))], scale_mas=None, on_sky=True, where="t")
+        refuse_geometry(
+            [geometry_of(solution(hours))], scale_mas=None, tangent_point=(202.5, 47.2), where="t"
+        )
 
 
 def test_a_stated_scale_is_that_of_the_fit():
     chips = [geometry_of(solution(turned(30.0)))]
     with pytest.raises(InputError, match=r"scale_mas: .*given as 400 mas.*fit is 150\.00 mas"):
-        refuse_geometry(chips, scale_mas=400.0, on_sky=True, where="t")
-    refuse_geometry(chips, scale_mas=151.0, on_sky=True, where="t")
+        refuse_geometry(chips, scale_mas=400.0, tangent_point=(202.5, 47.2), where="t")
+    refuse_geometry(chips, scale_mas=151.0, tangent_point=(202.5, 47.2), where="t")
     pixels = [geometry_of(solution(turned(30.0, 1.0, 1.0), unit="pix"))]
-    refuse_geometry(pixels, scale_mas=400.0, on_sky=False, where="t")
+    refuse_geometry(pixels, scale_mas=400.0, tangent_point=None, where="t")

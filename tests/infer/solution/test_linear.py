@@ -460,3 +460,12 @@ def test_high_orders_on_a_round_field(radius, frames):
             predicted = model.predict(fit.mean, x, y)
             for data, found in zip((u, v), predicted.T, strict=True):
                 assert np.abs(found - data.mean() - Q @ (Q.T @ (data - data.mean()))).max() < 1e-6
+
+
+def test_draws_take_a_seed_as_well_as_a_generator():
+    model, matches, _ = simulated(7, 100, order=1)
+    fit = fit_linear(matches, model)
+    by_seed, by_generator = fit.draws(5, 1), fit.draws(5, np.random.default_rng(1))
+    np.testing.assert_array_equal(by_seed, by_generator)
+    with pytest.raises(InputError, match="whole number"):
+        fit.draws(5, "one")

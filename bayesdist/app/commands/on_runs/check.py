@@ -18,6 +18,7 @@ from bayesdist.app.store.rundir import RunDirectory
 from bayesdist.infer import Limits
 from bayesdist.infer.sampler.certified import PILOTS, has_second_stage
 from bayesdist.infer.sampler.move_schedule import expected_passes
+from bayesdist.infer.sampler.prediction import predict_sampling
 from bayesdist.infer.solution.geometry import geometries
 from bayesdist.utils.checks import warnings_of
 
@@ -28,6 +29,8 @@ IN_CIRCLE = 80.0  # times as much for a star that was matched in a circle about 
 EXPANSIONS = 40  # in the search for the proposal
 OVERHEAD_S = 6e-5  # of emcee and the proposal, for each walker and step
 FIXED_S = 1.0  # diagnostics and files
+# stars and parameters up to which the run's own pilot is tried, in some ten seconds
+MOST_STARS, MOST_PARAMS = 200_000, 200
 
 
 def check(path: str | Path) -> str:
@@ -76,6 +79,8 @@ def _lines(results: Results) -> Iterator[str]:
     chips = geometries(fit)
     for chip in chips:
         yield f"geometry     chip {chip.chip}: {chip.sentence}"
+        if matches.tangent_point is not None and chip.mirrored:
+            yield f"geometry     {chip.mirrored}"
     yield _cost(data, config)
     idle = idle_dates(config, config.requirements())
     for text in (
@@ -88,20 +93,46 @@ def _lines(results: Results) -> Iterator[str]:
 
 
 def _cost(data: FitData, config: Config) -> str:
-    """Expected passes and seconds, from the numbers of stars and parameters."""
+    """Expected passes and seconds, or why they cannot be known before sampling."""
     sampler, n = config.sampler, len(data.shards)
     limits = Limits(sampler.target_ess, sampler.target_rhat)
-    n_params = data.model.n_params + len(config.mixture(data.matched.stars.match_radius).hyper)
-    passes, how = expected_passes(n_params, n, limits, sampler.ensembles), ""
+    mixture = config.mixture(data.matched.stars.match_radius)
+    n_params = data.model.n_params + len(mixture.hyper)
+    dear = IN_CIRCLE if in_circle(data.matched.stars, config) else 1.0
+    per_pass = dear * STAR_S * n
+    over = f"over {n} stars, {number(1e3 * per_pass, 2)} ms each"
+    search = dear * EXPANSIONS * EXPANSION_S * n + FIXED_S
+    passes, how, provided = expected_passes(n_params, n, limits, sampler.ensembles), "", ""
     if sampler.method == "certified":
         exact = has_second_stage(sampler.second_stage, passes, n)
         passes = PILOTS + (passes if exact else 0)
         how = "certified, with an exact second stage; " if exact else "certified, approximate; "
-    dear = IN_CIRCLE if in_circle(data.matched.stars, config) else 1.0
-    per_pass = dear * STAR_S * n
-    total = dear * EXPANSIONS * EXPANSION_S * n + passes * (per_pass + OVERHEAD_S) + FIXED_S
+        provided = " if the posterior is close to normal, which was not examined"
+    elif dear * n > MOST_STARS or n_params > MOST_PARAMS:
+        provided = " if the posterior is close to normal, which was not examined"
+    else:
+        found = predict_sampling(
+            data.fit,
+            data.shards,
+            outliers=mixture,
+            priors=data.fitted.priors,
+            seed=sampler.seed,
+            ensembles=sampler.ensembles,
+            walkers=sampler.walkers,
+            limits=limits,
+            max_steps=sampler.max_steps,
+        )
+        if found.passes is None:
+            most = number(search + found.most_passes * (per_pass + OVERHEAD_S), 2)
+            return (
+                f"cost         cannot be known before sampling {over}: the posterior is far from "
+                f"normal (importance efficiency {number(found.quality.efficiency, 2)}, Pareto k "
+                f"{number(found.quality.k, 2)}); sampler.max_steps ends it after "
+                f"{found.most_passes} passes, about {most} s"
+            )
+        passes = found.passes
+    total = search + passes * (per_pass + OVERHEAD_S)
     return (
-        f"cost         {how}about {passes} passes over {n} stars, "
-        f"{number(1e3 * per_pass, 2)} ms each: "
-        f"{number(total, 2)} s to the posterior if it is well behaved"
+        f"cost         {how}about {passes} passes {over}: "
+        f"{number(total, 2)} s to the posterior{provided}"
     )

@@ -22,6 +22,7 @@ HALF_TURN = 180.0  # degrees: no plane of the sky reaches further
 IN_DEGREES = {"deg": 1.0, "arcsec": 1 / 3600, "mas": 1 / 3.6e6}
 MADE_FROM_PIXELS = 1e-3  # pixels: scatter below which positions were computed from the pixels
 FAR_BELOW = 0.1  # fraction of the quoted errors that such a scatter does not reach
+STARS_PER_TERM = 3  # stars for each term and axis, below which residuals hardly show the errors
 ORDER = 4
 ROUNDS = 20
 NORMAL = 1.4826022185056018  # 1 / (median of |z|, z standard normal)
@@ -32,18 +33,35 @@ YEARS = (1950.0, 2100.0)
 
 def doubts_on_stars(stars: Matches, model: DistortionModel, config: Config) -> list[str]:
     """Sentences on what is odd about matched stars, by all of them or a sample, in memory."""
-    return list(_doubts(stars, model.unit, config.detector.scale_mas))
+    return list(_doubts(stars, model, config.detector.scale_mas))
 
 
-def _doubts(stars: Matches, unit: str, scale_mas: float | None) -> Iterator[str]:
+def _doubts(stars: Matches, model: DistortionModel, scale_mas: float | None) -> Iterator[str]:
+    unit = model.unit
     if stars.epoch is not None:
         yield from _doubts_on_dates(stars.epoch, ", ".join(stars.sources))
+    yield from doubts_on_numbers(stars, model)
     scale = _scale(stars)
     if len(stars) < FEWEST or scale is None:
         return
     yield from _doubts_on_scale(stars, scale, unit, scale_mas)
     yield from _doubts_on_errors(stars, scale)
     yield from _doubts_on_scatter(stars, scale)
+
+
+def doubts_on_numbers(stars: Matches, model: DistortionModel) -> Iterator[str]:
+    """Sentences on chips with fewer than three stars for each polynomial term of an axis."""
+    n_terms = len(polynomial_terms(model.order))
+    needed = STARS_PER_TERM * n_terms
+    counts = dict(zip(stars.chip_numbers, np.bincount(stars.chip), strict=False))
+    for chip in model.chips:
+        n_stars = int(counts.get(chip.number, 0))
+        if n_stars < needed:
+            yield (
+                f"chip {chip.name} has {n_stars} stars for {n_terms} terms on each axis (order "
+                f"{model.order}), and {needed} or more are advisable: the posterior may be far "
+                "from normal and sampling slow; lower model.order, or add stars"
+            )
 
 
 def _scale(stars: Matches) -> float | None:
@@ -59,6 +77,16 @@ def _doubts_on_scale(
     where = ", ".join(stars.sources)
     if unit in IN_DEGREES:
         reach = float(max(np.ptp(stars.u), np.ptp(stars.v))) * IN_DEGREES[unit]
+        if reach > HALF_TURN and stars.tangent_point is not None:
+            width = 2 * np.degrees(np.arctan(np.radians(reach / 2)))
+            raise InputError(
+                f"the field is some {width:.0f} degrees wide, and on the tangent plane of ra and "
+                f"dec it would span {reach:.4g} degrees, which no polynomial follows",
+                where=where,
+                do="fit the field in parts, each with data.tangent_point at its centre, or give u "
+                "and v of a projection for wide fields, such as ARC or ZEA; check ra and dec if "
+                "the field is narrower",
+            )
         if reach > HALF_TURN:
             raise InputError(
                 f"u and v span {reach:.4g} degrees if they are in {unit}",

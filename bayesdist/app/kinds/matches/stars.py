@@ -17,7 +17,11 @@ from bayesdist.app.kinds.fit_data import FitData, StarReader
 from bayesdist.app.kinds.fitted import FIT, Fitted, converged_posterior
 from bayesdist.app.kinds.matched import Matched, set_aside
 from bayesdist.app.kinds.matches.added_errors import compared_errors, in_circle
-from bayesdist.app.kinds.matches.plausibility import doubts_on_stars, refuse_empty_segments
+from bayesdist.app.kinds.matches.plausibility import (
+    doubts_on_numbers,
+    doubts_on_stars,
+    refuse_empty_segments,
+)
 from bayesdist.app.kinds.matches.sources import check_chips, read_configured
 from bayesdist.app.store.rundir import RunDirectory
 from bayesdist.app.tables.result_files import load_diagnostics
@@ -118,7 +122,7 @@ def fit_stars(
     refuse_geometry(
         geometries(fitted.linear),
         scale_mas=config.detector.scale_mas,
-        on_sky=matched.stars.tangent_point is not None,
+        tangent_point=matched.stars.tangent_point,
         where=", ".join(matched.stars.sources),
     )
     linear = replace(fitted.linear, tangent_point=matched.stars.tangent_point)
@@ -198,6 +202,8 @@ def sample_stars(
     progress: Callable[[int, int], None] | None = None,
 ) -> Posterior:
     """The posterior of a fit; of exposures that were fitted jointly with the chips averaged."""
+    for text in doubts_on_numbers(data.sample, data.model):
+        log.warning("sample: %s", text)
     posterior = sample(
         data.fit,
         data.shards,

@@ -19,7 +19,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping
-from math import comb
+from math import comb, isclose
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -156,3 +156,27 @@ def _candidates(low: Float, high: Float) -> tuple[Float, Float]:
     x = [gx.ravel(), ex, ex, np.full(ey.size, low[0]), np.full(ey.size, high[0])]
     y = [gy.ravel(), np.full(ex.size, low[1]), np.full(ex.size, high[1]), ey, ey]
     return np.concatenate(x), np.concatenate(y)
+
+
+def radial_orders(
+    x: Mapping[tuple[int, int], float], y: Mapping[tuple[int, int], float]
+) -> frozenset[int]:
+    """Orders n at which distortion along the radius gives coefficients of one value.
+
+    Distortion k r^(n-1) (x, y), n odd, has k binomial((n-1)/2, j) x^(n-2j) y^2j along x, and the
+    same with x and y exchanged along y. Further terms of that order may be present.
+    """
+    orders = {i + j for i, j in x} | {i + j for i, j in y}
+    out = set()
+    for n in orders:
+        k = x.get((n, 0), 0.0)
+        if n < 3 or n % 2 == 0 or k == 0:
+            continue
+        half = (n - 1) // 2
+        wanted = [comb(half, j) * k for j in range(half + 1)]
+        along_x = [x.get((n - 2 * j, 2 * j), 0.0) for j in range(half + 1)]
+        along_y = [y.get((2 * j, n - 2 * j), 0.0) for j in range(half + 1)]
+        both = [*along_x, *along_y]
+        if all(isclose(a, b, rel_tol=1e-9) for a, b in zip(both, 2 * wanted, strict=True)):
+            out.add(n)
+    return frozenset(out)

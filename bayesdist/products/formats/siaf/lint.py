@@ -105,6 +105,16 @@ def _inverse(table: SiafTable) -> Iterator[Finding]:
             f"(closure {closure:.3g} px)",
         )  # fmt: skip
         return
+    residual = table.closure_residuals()
+    if residual is not None:
+        shift = residual.mean(axis=1)
+        without = float(np.hypot(*(residual - shift[:, None])).max())
+        if without < closure / 10:
+            yield Finding(
+                "error", where, f"the constant terms are off by {shift[0]:.4g} and {shift[1]:.4g} "
+                f"px (closure {closure:.3g} px, without this shift {without:.2g} px)",
+            )  # fmt: skip
+            return
     if closure > _CLOSURE_BAD:
         yield Finding(
             "error", where, f"they miss the inverse of Sci2Idl by up to {closure:.3g} px: a "

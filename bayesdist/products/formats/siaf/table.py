@@ -146,13 +146,18 @@ class SiafTable:
 
     def closure(self) -> float | None:
         """Largest distance of pixels from where Sci2Idl and Idl2Sci take them; None if unknown."""
+        residual = self.closure_residuals()
+        return None if residual is None else float(np.hypot(*residual).max())
+
+    def closure_residuals(self) -> Float | None:
+        """Differences (2, N) in pixels after Sci2Idl and Idl2Sci on a grid; None if unknown."""
         size = self.size
         if size is None or self.inverse is None:
             return None
         x, y = detector_grid(size)
         x0, y0 = self.reference_pixel(size)
         back = self.inverse.pixels(*self.ideal(x - x0, y - y0))
-        return float(np.hypot(back[0] - x, back[1] - y).max())
+        return np.stack([back[0] - x, back[1] - y])
 
 
 # -- reading --------------------------------------------------------------------------------------

@@ -6,7 +6,7 @@ from dataclasses import replace
 from decimal import Decimal
 from typing import Any
 
-from bayesdist.products.formats.common.coefficients import sip_keyword
+from bayesdist.products.formats.common.coefficients import radial_orders, sip_keyword
 from bayesdist.products.formats.common.document import repeated_values
 from bayesdist.products.formats.sip.header import SIP_ORDERS, SipHeader
 
@@ -41,12 +41,21 @@ def values_by_keyword(sip: SipHeader) -> dict[str, float]:
 
 
 def repeated_names(sip: SipHeader) -> list[tuple[str, ...]]:
-    """Groups of keywords with one value, within A and B and within AP and BP."""
+    """Groups of keywords with one value, within A and B and within AP and BP.
+
+    Values that are equal because the distortion is radial are left out.
+    """
     out = []
+    terms = {prefix: values for prefix, _, values in families(sip)}
     for both in (("A", "B"), ("AP", "BP")):
-        out += repeated_values(
+        radial = radial_orders(*(terms.get(prefix, {}) for prefix in both))
+        groups = repeated_values(
             {k: c for k, c in values_by_keyword(sip).items() if k.split("_")[0] in both}
         )
+        for group in groups:
+            orders = {sum(powers_of(name)) for name in group}
+            if len(orders) > 1 or not orders <= radial:
+                out.append(group)
     return out
 
 

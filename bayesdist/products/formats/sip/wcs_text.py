@@ -31,6 +31,8 @@ _WCS = re.compile(
     r"(A|B|AP|BP)_(ORDER|\d_\d)$|(CPDIS|CPERR|D2IMDIS|D2IMERR)\d$|(DP|DQ|D2IM)\d$|(LON|LAT)POLE"
 )
 
+# keywords that drizzling adds to the image that it makes
+_DRIZZLED = ("NDRIZIM", "D001DATA", "D001SCAL", "D001PIXF")
 _TABLE_HDUS = ("D2IMARR", "WCSDVARR")
 _TABLES = ("CPDIS1", "CPDIS2", "D2IMDIS1", "D2IMDIS2", "AXISCORR")
 
@@ -71,6 +73,19 @@ def _extent(header: fits.Header) -> tuple[str, str]:
     return "size", str(image_size(header))
 
 
+def _left_over(header: fits.Header) -> Iterator[Finding]:
+    """Finding on SIP coefficients in the header of a drizzled image, which has no distortion."""
+    drizzled = [key for key in _DRIZZLED if key in header]
+    if drizzled:
+        yield Finding(
+            "warning",
+            "A_ORDER, B_ORDER",
+            f"SIP coefficients beside {drizzled[0]}: the image was drizzled, which removes the "
+            "distortion, and the coefficients of an input image may be left over: they are "
+            "applied here; delete them if so",
+        )
+
+
 def _truncated(file: Content) -> Iterator[Finding]:
     last = file.hdus[-1]
     where = f"HDU {last.number}"
@@ -102,10 +117,17 @@ def _hdu_lines(
         sip = parsed(header, name)
         text.lines += sip_lines(sip, name)
         terms = coefficient_lines(sip)
-        text.findings += lint_sip(sip)
+        text.findings += [*lint_sip(sip), *_left_over(header)]
     else:
         extent = "unknown" if size is None else f"{size[0]} x {size[1]} px"
         text.lines.append(f"{name}: WCS, image size {extent}")
+        if any(str(value).endswith("-SIP") for value in header["CTYPE*"].values()):
+            text.add_finding(
+                "warning",
+                "CTYPE",
+                "ends in -SIP, but there are no coefficients (A_ORDER, B_ORDER): positions are "
+                "those of the linear part, and the distortion may be lost",
+            )
     if others:
         text.lines.append(f"  same in   {', '.join(_label(other) for other in others)}")
     if hdu.state == "none":
