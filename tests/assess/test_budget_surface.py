@@ -1,20 +1,16 @@
 """Second moments say of every place and epoch what the budget of single places says."""
 
-from dataclasses import dataclass
-
 import numpy as np
 import pytest
 
 from bayesdist.assess.budget.budget import place_budget
 from bayesdist.assess.budget.surface import JOINT, budget_surface
 from bayesdist.assess.model import error_model
-from bayesdist.assess.terms.forms import Polynomials, Row
 from bayesdist.assess.terms.parameters import ScaleError
 from bayesdist.errors import InputError
-from bayesdist.infer.solution.solution import Solution
 from bayesdist.model import Chip, DistortionModel, TimeDependence
 from bayesdist.model.grid import grid_pixels, mesh
-from tests.budgets import detector_budget
+from tests.budgets import Curvature, detector_budget
 
 SIZE = (201.0, 101.0)
 CHIPS = tuple(Chip(k, f"WFC{k}", SIZE, (101.0, 51.0)) for k in (1, 2))
@@ -106,31 +102,11 @@ def test_alignment_hardly_depends_on_the_drift(solution_of):
     assert found[0] == pytest.approx([truth.u[0] ** 2, truth.v[0] ** 2], rel=1e-3)
 
 
-@dataclass(frozen=True)
-class Curvature:
-    """A drift that is curved in time: u_1_0 of chip 1 errs by the square of the years."""
-
-    solution: Solution
-    rows: tuple[Row, ...] = (Row("curvature"),)
-
-    def draw(self, n, rng):
-        model, size = self.solution.model, 1e-4 * rng.standard_normal(n)
-
-        def more(epoch, chip):
-            out = np.zeros((n, 2, model.n_terms))
-            out[:, 0, 1] = size * (epoch - 2009.0) ** 2
-            return out
-
-        mean = np.asarray(self.solution.mean)
-        theta = np.tile(mean[: model.n_global], (n, 1))
-        return Polynomials(self.rows[0], model, mean, theta, more=more)
-
-
 @pytest.mark.parametrize("place", [False, True])
 def test_a_curved_drift_has_its_budget_at_any_epoch(solution_of, place):
     """Variances of the fourth degree: three epochs gave negative ones between them."""
     solution, _, _ = drawn(solution_of, time=TimeDependence((("u", 1, 0),), (2005.0,)))
-    term = Curvature(solution)
+    term = Curvature(solution, 1e-4)
     errors = error_model(solution, terms=(term,)).drawn(300, np.random.default_rng(2))
     surface = budget_surface(errors, GRID, epoch=2010.3, years=(2002.0, 2020.0))
     assert 2010.3 in surface.spans[0].nodes

@@ -13,8 +13,9 @@ import numpy as np
 import pytest
 
 from bayesdist.assess import UserTerm
-from bayesdist.assess.budget.budget import place_budget
+from bayesdist.assess.budget.budget import budget_of, place_budget
 from bayesdist.assess.budget.surface import budget_surface
+from bayesdist.assess.domain import EvaluationDomain
 from bayesdist.assess.model import error_model
 from bayesdist.assess.terms.forms import PRODUCT, Known, Row
 from bayesdist.assess.terms.given import Centroids
@@ -22,7 +23,7 @@ from bayesdist.assess.terms.local import LocalErrors
 from bayesdist.assess.terms.parameters import ScaleError
 from bayesdist.data.magnitude_errors import estimate
 from bayesdist.report.run_report import write_report
-from tests.budgets import detector_budget
+from tests.budgets import Curvature, detector_budget
 
 from .plots import drawings_of, plots_of
 from .runs import TERMS, report_input
@@ -39,6 +40,7 @@ def asked():
     local = {c.chip.number: rng.uniform(0.001, 0.01, (*GRID[::-1], 2)) for c in run.chips}
     terms = (
         ScaleError("aberration", "scale", 2e-6, solution, "a paper"),
+        Curvature(solution, 1e-4),
         LocalErrors.on_grid("look-up tables", local, solution.model),
         *TERMS,
         UserTerm("background", "random", 0.003, 0.006),
@@ -166,6 +168,23 @@ def test_a_position_is_that_of_the_assessment(asked, opened, chip, x, y, epoch, 
     assert slider(opened) == pytest.approx(epoch, abs=0.026)  # the slider's steps
     found = shown(opened)
     assert [t.name for t in truth.every if t.name not in found] == []
+    for term in truth.every:
+        values = (term.u[0], term.v[0], term.radial[0] / np.sqrt(2))
+        assert all(map(agree, found[term.name], values)), (term.name, found[term.name], values)
+
+
+@pytest.mark.parametrize("epoch", [2009.5, 2010.3, 2012.0, 2016.4, 2020.5])
+def test_the_rms_and_a_difference_at_any_epoch_are_those_of_the_assessment(asked, opened, epoch):
+    put(opened, mode="rms", epoch=epoch, mag="")
+    at = EvaluationDomain.of_chips(asked.run.solution.model, GRID, epoch=slider(opened))
+    found = shown(opened)
+    for row in budget_of(asked.errors, at).rows():
+        if row["name"] in found:
+            assert all(map(agree, found[row["name"]], _sizes(row))), (row, found[row["name"]])
+    put(opened, mode="two", chip=0, ax=100, ay=200, bx=3000.5, by=1500)
+    pixels = [100.0, 3000.5], [200.0, 1500.0]
+    truth = place_budget(asked.errors, *pixels, chip=1, epoch=slider(opened), relative=True)
+    found = shown(opened)
     for term in truth.every:
         values = (term.u[0], term.v[0], term.radial[0] / np.sqrt(2))
         assert all(map(agree, found[term.name], values)), (term.name, found[term.name], values)
