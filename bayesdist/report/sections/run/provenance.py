@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import hashlib
+import json
+import re
 from collections.abc import Mapping
 from typing import Any
 
@@ -12,6 +15,7 @@ from bayesdist.report.context import ReportInput
 from bayesdist.report.texttable import Level, TextTable, check_cells, listing, moment, short_paths
 from bayesdist.utils.numbers import MISSING, count, number, percent
 
+_BLANK = "_" * 24  # to be filled in on paper
 _DETAILS = ("stages", "timings", "versions")  # the margin of each page names our version
 _PRINTED = {"inputs": 4}  # rows on paper
 
@@ -35,6 +39,36 @@ def product_table(r: ReportInput) -> TextTable:
             rows.append((", ".join(files), MISSING, *cells))
     heads = ("File", "Format", "Check", "Found", "Limit", "Status")
     return TextTable("Files written", heads, tuple(rows), words=tuple(range(6)), stacked=(3, 4))
+
+
+@REPORT.table("provenance")
+def document_tables(r: ReportInput) -> tuple[TextTable, ...]:
+    """Tables by which a copy is identified and released: document id, hash, signatures."""
+    digest = config_hash(r)
+    document = {"Document id": document_id(r), "SHA-256 of the resolved configuration": digest}
+    rows = tuple((role, _BLANK, _BLANK, _BLANK) for role in ("Prepared", "Reviewed", "Approved"))
+    heads = ("Role", "Name", "Date", "Signature")
+    return (
+        listing("Document", document),
+        TextTable("Sign-off", heads, rows, words=tuple(range(len(heads)))),
+    )
+
+
+def config_hash(r: ReportInput) -> str:
+    """SHA-256 of the resolved configuration, whatever the order of its keys."""
+    text = json.dumps(r.config, sort_keys=True, default=str)
+    return hashlib.sha256(text.encode("utf-8")).hexdigest()
+
+
+def document_id(r: ReportInput) -> str:
+    """Name of the calibration, day of the run, and eight digits of configuration and start.
+
+    Another run has another id, and a report that is drawn again has that of its run.
+    """
+    began = str(r.provenance.get("created", ""))
+    digest = hashlib.sha256(f"{config_hash(r)} {began}".encode()).hexdigest()[:8]
+    name = re.sub(r"[^A-Za-z0-9]+", "-", r.name).strip("-") or "calibration"
+    return "-".join(part for part in (name, began[:10].replace("-", ""), digest) if part)
 
 
 @REPORT.table("provenance")

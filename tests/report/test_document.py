@@ -1,0 +1,38 @@
+"""Identity of a report: document id, hash of the configuration, and lines to sign."""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import replace
+
+from lxml import html as lxml_html
+
+from bayesdist.report.run_report import render_report
+from bayesdist.report.sections.run.provenance import config_hash, document_id
+
+
+def test_the_hash_is_that_of_the_configuration_whatever_the_order_of_keys(converged):
+    run = replace(converged, config={"b": 1, "a": {"d": 2.5, "c": None}})
+    text = '{"a": {"c": null, "d": 2.5}, "b": 1}'
+    assert config_hash(run) == hashlib.sha256(text.encode()).hexdigest()
+    assert config_hash(replace(run, config={"a": {"c": None, "d": 2.5}, "b": 1})) == config_hash(
+        run
+    )
+
+
+def test_a_document_is_known_by_its_run(converged):
+    began = {"created": "2026-11-22T10:58:32+00:00"}
+    run = replace(converged, name="WFC3 / UVIS", config={"a": 1}, provenance=began)
+    first = document_id(run)
+    assert first.startswith("WFC3-UVIS-20261122-")
+    assert document_id(replace(run)) == first  # drawn again
+    later = replace(run, provenance={"created": "2026-11-22T10:58:33+00:00"})
+    assert len({first, document_id(later), document_id(replace(run, config={"a": 2}))}) == 3
+
+
+def test_the_report_has_its_id_and_lines_to_sign(converged):
+    tree = lxml_html.fromstring(render_report(converged, {}))
+    (section,) = tree.xpath("//section[@id='provenance']")
+    assert document_id(converged) in section.text_content()
+    signed = section.xpath(".//table[caption='Sign-off']//tbody//th")
+    assert [cell.text_content() for cell in signed] == ["Prepared", "Reviewed", "Approved"]
