@@ -41,7 +41,7 @@ class PlannedKind:
     exposures : int
         That a run has before the plan is made.
     limit : float
-        Pixels, of p95: fixed before any run was made.
+        Pixels, of p95: chosen with seeds 1 and 2, and fixed before the seeds of the test were run.
     """
 
     make: Callable[[np.random.Generator, int], Truth]
@@ -117,7 +117,7 @@ def of_800_stars(rng: np.random.Generator, n: int) -> Truth:
     )
 
 
-# met with 24 more exposures; a plan that changes the coefficients alone says that none will do
+# like runs for which a plan that changed the coefficients alone found no number of exposures
 FEW = {
     "one exposure": PlannedKind(of_800_stars, exposures=1, limit=0.003),
     "six exposures": PlannedKind(matched, exposures=6, limit=0.025),
