@@ -155,12 +155,24 @@ def _candidates(chip: _Chip, curvature: float, allowed: Bool) -> Iterator[_Rings
         # the product of two probabilities is that of a sum of two exponentials
         log_q, total = 0.0, 0.0
         for score in chip.score:
-            steps = np.abs(_by_star(chip.star, score * wave))
-            length = float(np.abs((score * wave).sum()))
-            total += length**2 / float((steps**2).sum())
-            log_q += min(log_tail_of_walk(steps[steps > 0], length), 0.0)
+            steps = _by_star(chip.star, score * wave)
+            sizes = np.abs(steps)
+            total += float(np.abs(steps.sum()) ** 2 / (sizes**2).sum())
+            log_q += min(log_tail_of_walk(sizes[sizes > 0], _even_length(steps)), 0.0)
         log_q = max(log_q, LEAST_LOG)
         yield _Rings(log_q + np.log1p(-log_q), total, chip, curvature, centre)
+
+
+def _even_length(steps: Complex) -> float:
+    """Length of a walk of steps (N,) whose signs are of chance, if its scatter had no direction.
+
+    Few stars have phases that are not spread evenly over the circle, the more so where the best of
+    many centres is taken: the walk then gets farther along one direction than along the other.
+    """
+    plane = np.stack([steps.real, steps.imag])
+    covariance, total = plane @ plane.T, plane.sum(axis=1)
+    square = 0.5 * np.trace(covariance) * (total @ np.linalg.pinv(covariance) @ total)
+    return float(np.sqrt(square))
 
 
 def _binned(cell: Int, values: Complex) -> Complex:
