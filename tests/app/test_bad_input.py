@@ -526,7 +526,6 @@ def test_simulate_and_demo_refuse(tmp_path):
     [
         [],
         ["rnu", "c.toml"],
-        ["run", "c.toml"],
         ["run", "c.toml", "-o", "r", "--resume", "--force"],
         ["run", "c.toml", "-o", "r", "--seed", "-1"],
         ["run", "c.toml", "-o", "r", "--seed", "one"],

@@ -24,11 +24,11 @@ from .test_results import outcome
 pytestmark = pytest.mark.usefixtures("one_thread")
 
 NULL = dict(scenes_of_null())
-# by construction: those that look at several radii, lengths or columns; one that asks two tests to
+# by construction: those that look at several radii, lengths, columns or centres; one that asks two tests to
 # agree (edges alone, and edges beside the orders); one that counts overlapping patches as if they
 # were apart; and one whose statistic is positive for all noise that is a mixture of Gaussians
 CONSERVATIVE = {"truncation", "edges", "fields of exposures", "jumps"}
-CONSERVATIVE |= {"skewness of a patch", "two cores"}
+CONSERVATIVE |= {"skewness of a patch", "two cores", "rings"}
 
 
 def p_values(name: str, seed: int) -> tuple[dict[str, float], bool]:
