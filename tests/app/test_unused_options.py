@@ -53,6 +53,63 @@ UNUSED = [
 ]
 
 
+HEADER = """\
+CTYPE1  = 'RA---TAN-SIP'
+CTYPE2  = 'DEC--TAN-SIP'
+CRPIX1  =                512.5
+CRPIX2  =                512.5
+CRVAL1  =                150.0
+CRVAL2  =                  2.0
+CD1_1   =              -1.4E-5
+CD2_2   =               1.4E-5
+A_ORDER =                    2
+B_ORDER =                    2
+A_2_0   =               1.0E-6
+B_0_2   =               1.0E-6
+IMAGEW  =                 1024
+IMAGEH  =                 1024
+END
+"""
+# command on a SIP header that states its size, option for which this file has no use
+OF_FILES = [
+    (f"{command} {option}", sentence)
+    for command in (
+        "apply a.hdr t.csv -o o.ecsv",
+        "apply a.hdr t.csv -o o.ecsv --sky",
+        "convert a.hdr --to tpv -o b.hdr",
+        "compare a.hdr a.hdr",
+        "hst pam a.hdr -o o.fits",
+        "hst handbook a.hdr -o d",
+    )
+    for option, sentence in (
+        ("--epoch 2020", "does not depend on time"),
+        ("--filter F606W", "whose filter is not chosen"),
+        ("--size 9 9", "states a size of 1024 x 1024 pixels, and 9 x 9 are given"),
+    )
+    if not (command.startswith("hst") and "size" in option)
+]
+
+
+@pytest.fixture(scope="module")
+def header_folder(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("header")
+    (folder / "a.hdr").write_text(HEADER, encoding="ascii")
+    (folder / "t.csv").write_text("x,y\n1,1\n500,500\n", encoding="ascii")
+    return folder
+
+
+@pytest.mark.parametrize(("words", "sentence"), OF_FILES)
+def test_an_option_that_the_file_has_no_use_for_is_refused(
+    words, sentence, header_folder, monkeypatch
+):
+    monkeypatch.chdir(header_folder)
+    before = sorted(header_folder.iterdir())
+    result = cli(*words.split())
+    assert result.code == 1 and "a.hdr" in result.err
+    assert sentence in result.err and "on the command line) out" in result.err
+    assert sorted(header_folder.iterdir()) == before
+
+
 def leaves(group: click.Group, words: str = "") -> Iterator[tuple[str, click.Command]]:
     """Words and command of every command of a group."""
     context = click.Context(group)
