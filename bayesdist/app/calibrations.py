@@ -20,6 +20,7 @@ from bayesdist.files.documents import read_json_as
 from bayesdist.infer import LinearFit, load_fit, load_posterior
 from bayesdist.infer.solution.solution import Solution
 from bayesdist.products import registry
+from bayesdist.products.formats.common.document import Choice
 
 __all__ = ["read_calibration"]
 
@@ -85,9 +86,61 @@ def calibration_at(
     if not path.exists():
         raise InputError("there is no such file", where=str(path), do="check the name")
     solution = solution_at(path)
-    if solution is None:
-        return registry.read_calibration(path, filter=filter, size=size)
-    return _calibration_of_run(solution, path)
+    if solution is not None:
+        _refuse_unused((), "a run", path, filter, size)
+        return _calibration_of_run(solution, path)
+    document = registry.open_document(path)
+    if document.format.calibration is not None:
+        _refuse_unused(document.format.asks, document.format.title, path, filter, size)
+    found = document.calibration(Choice(filter, size))
+    sizes = [tuple(map(float, chip.size)) for chip in found.model.chips]
+    if size is not None and tuple(map(float, size)) not in sizes:
+        stated = " and ".join(dict.fromkeys(f"{nx:g} x {ny:g}" for nx, ny in sizes))
+        raise InputError(
+            f"states a size of {stated} pixels, and {size[0]:g} x {size[1]:g} are given",
+            where=str(path),
+            do="leave the size (--size on the command line) out",
+        )
+    return found
+
+
+def asks_of(path: Path) -> tuple[str, ...]:
+    """Arguments of `calibration_at` that the file uses: "filter", "size"; a run uses none."""
+    if path.is_dir() or path.suffix == ".nc" or not path.exists():
+        return ()
+    return registry.open_document(path).format.asks
+
+
+def _refuse_unused(
+    asks: tuple[str, ...],
+    title: str,
+    path: Path,
+    filter: str | None,
+    size: tuple[float, float] | None,
+) -> None:
+    """Refuse a filter or a size that a file of this kind does not use."""
+    reasons = {"filter": "whose filter is not chosen", "size": "which states its own size"}
+    for name, value in (("filter", filter), ("size", size)):
+        if value is not None and name not in asks:
+            raise InputError(
+                f"is {title}, {reasons[name]}",
+                where=str(path),
+                do=f"leave the {name} (--{name} on the command line) out",
+            )
+
+
+def refuse_unused_date(epoch: float | None, *calibrations: Calibration) -> None:
+    """Refuse a date if none of the calibrations depends on time.
+
+    A file that drifts and has no date of reference refuses a date by itself.
+    """
+    if epoch is None or any(one.model.time is not None or one.no_date for one in calibrations):
+        return
+    raise InputError(
+        "does not depend on time",
+        where=" and ".join(dict.fromkeys(one.name for one in calibrations)),
+        do="leave the date (--epoch on the command line) out",
+    )
 
 
 def _calibration_of_run(solution: Solution, path: Path) -> Calibration:

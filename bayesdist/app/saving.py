@@ -25,7 +25,7 @@ from bayesdist.app.results import Results
 from bayesdist.app.store.keys import attributes
 from bayesdist.app.store.output import provenance_notes, write_table
 from bayesdist.app.store.rundir import part_files
-from bayesdist.app.store.summary import Sampler
+from bayesdist.app.store.summary import GeometryRow, Sampler
 from bayesdist.app.tables.result_files import write_diagnostics, write_evaluation
 from bayesdist.data import Matches
 from bayesdist.data.storage.write import write_columns
@@ -57,6 +57,7 @@ def save_fit(results: Results) -> None:
     fitted.save(results.run.path)
     results.run.summarise(**fit_sections(fitted, data.placed, skew=config.fit.skew))
     log_fit(data.fit, results.kind.rows)
+    _log_geometry(data.fit)
     if results.kind.begins_with == "fit":
         _log_matches(data, config)
         return
@@ -73,6 +74,14 @@ def save_fit(results: Results) -> None:
         log.info("fit: scatter of the exposures %s", sizes)
 
 
+def _log_geometry(fit: LinearFit) -> None:
+    """Lines of the log on scales, orientation, parity and distortion of each chip."""
+    for chip in geometries(fit):
+        log.info("fit: chip %d: %s", chip.chip, chip.sentence)
+        for text in chip.warnings:
+            log.warning("fit: WARNING: %s", text)
+
+
 def _log_matches(data: FitData, config: Config) -> None:
     """Lines of the log on stars that were matched before."""
     matches, fit = data.placed, data.fit
@@ -82,10 +91,6 @@ def _log_matches(data: FitData, config: Config) -> None:
         log.info("fit: %d rows were left out in reading: %s", count, reason)
     for text in doubts_on_stars(data.sample, data.model, config):
         log.warning("fit: WARNING: %s", text)
-    for chip in geometries(fit):
-        log.info("fit: chip %d: %s", chip.chip, chip.sentence)
-        for text in chip.warnings:
-            log.warning("fit: WARNING: %s", text)
     shift = epoch_shift(data.sample, fit)
     if shift is not None and shift.significant:
         log.warning("fit: WARNING: %s", shift.sentence)
@@ -209,6 +214,7 @@ def fit_sections(fitted: Fitted, stars: Matches, *, skew: bool = False) -> dict[
             "order": fit.model.order,
             **attributes(fit, "chi2 dof rms_u rms_v unit condition"),
             "n_parameters": fit.model.n_params,
+            "geometry": [GeometryRow.row(chip) for chip in geometries(fit)],
             **optional,
         },
         **fitted.facts,

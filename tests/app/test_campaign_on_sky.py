@@ -56,6 +56,15 @@ def bent(x, y, left=0.0):
     )
 
 
+def largest_distortion():
+    """Largest deviation of `bent` from its best linear map over the chip, pixels."""
+    x, y = (a.ravel() for a in np.meshgrid(*[np.linspace(0.5, SIDE + 0.5, 21)] * 2))
+    design = np.column_stack([np.ones_like(x), x, y])
+    plane = np.column_stack(bent(x, y))
+    best = np.linalg.lstsq(design, plane, rcond=None)[0]
+    return np.hypot(*(plane - design @ best).T).max() / np.sqrt(abs(np.linalg.det(best[1:])))
+
+
 def header(direction, roll, parity, factor):
     """The WCS of an exposure; parity -1 as the sky is seen, with east to the left of north."""
     wcs = WCS(naxis=2)
@@ -289,7 +298,9 @@ BOTH = pytest.mark.parametrize(
 def test_both_parities_match_and_agree_with_the_truth(tmp_path, parity):
     """A normal detector needs no word; one of the other parity than ACS/WFC is doubted."""
     config = write(tmp_path / "in", parity)
-    assert "the middle of the exposures" in good("check", config).out
+    said = good("check", config).out
+    assert "the middle of the exposures" in said
+    assert "geometry     chip 1 of campaign.initial_distortion: scale 50.0" in said
     run = staged(config, "match", "fit")
     found = summary_of(run)["matching"]
     assert found["parity"] == ("mirrored" if parity < 0 else "direct")
@@ -300,6 +311,12 @@ def test_both_parities_match_and_agree_with_the_truth(tmp_path, parity):
     # motions over seven years and parallaxes are many times the errors
     pulls = pulls_of_pairs(run, parity)
     assert np.mean(pulls**2) == pytest.approx(1.0, abs=4 * np.sqrt(2 * len(DATES) / pulls.size))
+    [shape] = summary_of(run)["fit"]["geometry"]
+    assert shape["unit"] == "arcsec" and shape["parity"] == 1  # u is as the detector sees it
+    # the mean frame of the exposures leaves the axes of the truth, which are perpendicular
+    assert (shape["scale_x"], shape["scale_y"]) == pytest.approx((PIXEL, PIXEL), rel=1e-3)
+    assert shape["skew"] == pytest.approx(0.0, abs=1e-3)
+    assert shape["distortion"] == pytest.approx(largest_distortion(), rel=0.01)
     value, free = off_truth(run)
     assert 1e-4 < stats.chi2.sf(value, free) < 1 - 1e-4
 

@@ -213,6 +213,22 @@ def test_the_summary_is_as_its_schema_has_it(finished):
     assert found.misfit.power == 1.0 and found.budget[-1].name == "total"
 
 
+def test_the_geometry_is_in_the_summary_the_terminal_and_the_log(finished):
+    [row] = summary_of(finished.path)["fit"]["geometry"]
+    x, y = np.array([600.5, 500.5, 500.5]), np.array([400.5, 500.5, 400.5])
+    model = finished.truth.model
+    at = model.predict(finished.truth.theta, x, y)
+    along_x, along_y = at[0] - at[2], at[1] - at[2]
+    scales = np.hypot(*along_x) / 100, np.hypot(*along_y) / 100
+    assert (row["scale_x"], row["scale_y"]) == pytest.approx(scales, rel=1e-3)
+    angle = np.degrees(np.arctan2(along_y[0], along_y[1]))
+    assert row["position_angle"] == pytest.approx(angle, abs=0.1)
+    assert row["parity"] == np.sign(along_x[0] * along_y[1] - along_x[1] * along_y[0])
+    said = f"chip 1: {row['sentence']}"
+    assert said in finished.result.out.splitlines()
+    assert said in (finished.path / "bayesdist.log").read_text(encoding="utf-8")
+
+
 def test_the_summary_counts_what_there_is(finished, posterior, matches):
     s = summary_of(finished.path)
     assert s["data"]["n_rows"] == 400

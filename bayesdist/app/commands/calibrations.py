@@ -9,6 +9,7 @@ import click
 from bayesdist.app.commands.options import (
     ON_FILES,
     ON_RUNS,
+    Unused,
     command,
     epoch,
     filter_name,
@@ -25,7 +26,29 @@ def inspect() -> None:
     """Describe a product, a posterior or a run, and report its faults."""
 
 
-@command()
+@command(
+    unused=[
+        Unused(
+            "inverse method order scale origin vafactor image ltv corner",
+            "with --sky",
+            lambda o: o["sky"],
+            "leave --sky out",
+        ),
+        Unused("point centroids joint", "without --sky", lambda o: not o["sky"], "add --sky"),
+        Unused(
+            "pixel_origin",
+            "with --inverse, which writes pixels that count from 1",
+            lambda o: o["inverse"],
+        ),
+        Unused("method", "without --inverse", lambda o: not o["inverse"], "add --inverse"),
+        Unused(
+            "order",
+            "without --inverse --method polynomial",
+            lambda o: not (o["inverse"] and o["method"] == "polynomial"),
+            "add both",
+        ),
+    ]
+)
 @click.argument("file", metavar="FILE", type=click.Path())
 @click.argument("table", metavar="TABLE", type=click.Path())
 @filter_name
@@ -90,21 +113,12 @@ def apply(file: str, table: str, output: str, **options: Any) -> None:
     if not options.pop("sky"):
         from bayesdist.app.commands.on_files.apply import apply_to_table
 
-        given = next((key for key, value in own.items() if value), None)
-        if given is not None:
-            raise click.UsageError(f"--{given} goes with --sky.")
-        if options["inverse"] and origin is not None:
-            raise click.UsageError("--pixel-origin does not go with --inverse.")
         click.echo(apply_to_table(file, table, output, pixel_origin=origin, **options))
         return
     from bayesdist.app.commands.on_files.sky import sky_to_table
 
     shared = ("columns", "chip", "filter", "epoch", "size", "force")
     kept = {key: options.pop(key) for key in shared}
-    plain = {"method": "newton", "vafactor": 1.0}
-    other = next((k for k, v in options.items() if v and v != plain.get(k)), None)
-    if other is not None:
-        raise click.UsageError(f"--{other} does not go with --sky.")
     click.echo(sky_to_table(file, table, output, pixel_origin=origin, **own, **kept))
 
 

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from difflib import get_close_matches
 from functools import wraps
 from typing import Any
@@ -89,14 +90,64 @@ class _ColumnNames(click.ParamType):
         return {key.strip(): name.strip() for key, _, name in pairs}
 
 
+@dataclass(frozen=True)
+class Unused:
+    """Options that a command does not use in one of its modes, and refuses there.
+
+    Attributes
+    ----------
+    names : str
+        Parameter names of the options, separated by blanks.
+    mode : str
+        The mode in words, as "without --inverse".
+    holds : callable
+        From the values of all options, by parameter name, to True if the command is in this mode.
+    do : str
+        What to do instead of leaving the option out; empty if there is nothing else.
+    """
+
+    names: str
+    mode: str
+    holds: Callable[[Mapping[str, Any]], bool]
+    do: str = ""
+
+    def refuse(self, context: click.Context) -> None:
+        """Raise click.UsageError if one of the options was given on the command line."""
+        if not self.holds(context.params):
+            return
+        for parameter in context.command.params:
+            name = parameter.name or ""
+            if name not in self.names.split():
+                continue
+            if context.get_parameter_source(name) is click.core.ParameterSource.COMMANDLINE:
+                instead = f", or {self.do}" if self.do else ""
+                raise click.UsageError(
+                    f"{parameter.opts[-1]} is not used {self.mode}: leave it out{instead}.", context
+                )
+
+
+class _Command(click.Command):
+    """A command that refuses options which it does not use in the mode that is asked for."""
+
+    unused: tuple[Unused, ...] = ()
+    calls: str = ""  # as of `command`
+
+    def invoke(self, ctx: click.Context) -> Any:
+        """Run the command, unless an option would be ignored."""
+        for one in self.unused:
+            one.refuse(ctx)
+        return super().invoke(ctx)
+
+
 def command(
-    calls: str = "", *, recorded: bool = False, **settings: Any
+    calls: str = "", *, recorded: bool = False, unused: Sequence[Unused] = (), **settings: Any
 ) -> Callable[[Callable[..., int | None]], click.Command]:
     """Decorator of a command, which takes --quiet.
 
     `calls`: as "module:function", what the command does: it is loaded when that runs, takes the
     options (and the command line, to be `recorded`), and returns what is printed.  Without it the
-    decorated function does all by itself, and returns the exit code.
+    decorated function does all by itself, and returns the exit code.  `unused`: options that are
+    refused in some modes.
     """
     quiet = click.option(
         "-q",
@@ -114,7 +165,9 @@ def command(
                 options["command"] = click.get_current_context().obj
             click.echo(load_object(calls)(**options))
 
-        return click.command(**settings)(quiet(calling if calls else function))
+        made = click.command(cls=_Command, **settings)(quiet(calling if calls else function))
+        made.unused, made.calls = tuple(unused), calls
+        return made
 
     return decorated
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import click
 
-from bayesdist.app.commands.options import ON_RUNS, CommaList, command, force
+from bayesdist.app.commands.options import ON_RUNS, CommaList, Unused, command, force
 
 
 @command(calls=f"{ON_RUNS}.plan:plan")
@@ -38,7 +38,18 @@ def plan_dither() -> None:
     """Compare dither patterns for a self-calibration, without data."""
 
 
-@command(calls=f"{ON_RUNS}.order:order", name="select-order")
+@command(
+    calls=f"{ON_RUNS}.order:order",
+    name="select-order",
+    unused=[
+        Unused(
+            "force",
+            "without an output file",
+            lambda o: o["output"] is None and o["figure"] is None,
+            "add -o or --figure",
+        )
+    ],
+)
 @click.argument("path", metavar="CONFIG.toml", type=click.Path())
 @click.option(
     "--orders",

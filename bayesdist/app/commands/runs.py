@@ -7,7 +7,7 @@ from typing import Any
 
 import click
 
-from bayesdist.app.commands.options import ON_RUNS, column_names, command, force
+from bayesdist.app.commands.options import ON_RUNS, Unused, column_names, command, force
 
 STAGES = ("match", "fit", "sample", "diagnose", "evaluate", "assess", "export", "report")
 
@@ -87,7 +87,12 @@ def run(line: str, config: str, output: str | None, **options: Any) -> None:
     click.echo(results_text(RunDirectory(path)))  # its input was checked when it began
 
 
-@command()
+@command(
+    unused=[
+        Unused("strict", "by stages other than 'sample'", lambda o: o["name"] != "sample"),
+        Unused("pdf", "by stages other than 'report'", lambda o: o["name"] != "report"),
+    ]
+)
 @click.argument("name", metavar=f"[{'|'.join(STAGES)}]", type=click.Choice(STAGES))
 @click.argument("run", metavar="RUN", type=click.Path())
 @click.option("--strict", is_flag=True, help="For sample: exit with 3 unless converged.")
@@ -99,10 +104,6 @@ def stage(name: str, run: str, strict: bool, pdf: bool) -> None:
     resumed from its checkpoints; diagnose: tests of the residuals; evaluate: maps, budget,
     margins; assess: diagnose and evaluate; export: files for pipelines; report: report.html.
     """
-    if strict and name != "sample":
-        raise click.UsageError("--strict is an option of the stage 'sample'.")
-    if pdf and name != "report":
-        raise click.UsageError("--pdf is an option of the stage 'report'.")
     from bayesdist.app.stages import continue_stage
 
     continue_stage(run, name, strict=strict, pdf=pdf)

@@ -230,6 +230,20 @@ class AddedErrors(Part):
         return rows
 
 
+class GeometryRow(Part):
+    """Linear part of the map of a chip in the least-squares fit, and its largest distortion."""
+
+    chip: int
+    unit: str = Field(description="of u and v")
+    scale_x: Number = Field(description="units of u and v per pixel along x")
+    scale_y: Number = Field(description="units of u and v per pixel along y")
+    position_angle: Number = Field(description="degrees from +v towards +u of +y")
+    parity: Literal[-1, 1] = Field(description="-1 if u, v is a mirror image of x, y")
+    skew: Number = Field(description="radians: angle from x to y, less 90 degrees")
+    distortion: Number = Field(description="pixels: largest deviation from the best linear map")
+    sentence: str
+
+
 class Fit(Part):
     """The least-squares fit."""
 
@@ -243,6 +257,7 @@ class Fit(Part):
     n_parameters: int
     error_scale: Number = Field(1.0, description="factor on the quoted errors")
     added_errors: AddedErrors | None = None
+    geometry: list[GeometryRow] = Field([], description="of each chip")
 
 
 class Outliers(Part):

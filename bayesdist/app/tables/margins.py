@@ -67,7 +67,7 @@ def requirement_of(row: Mapping[str, Any]) -> Requirement:
 
 
 def results_text(run: RunDirectory) -> str:
-    """Budget, margins, verdict of the sampler, and where the report is."""
+    """Geometry, budget, margins, verdict of the sampler, and where the report is."""
     summary = run.summary
     c = summary["sampler"]
     state = (
@@ -76,6 +76,9 @@ def results_text(run: RunDirectory) -> str:
         else f"NOT CONVERGED: everything here is provisional ({'; '.join(c['reasons'])})"
     )
     parts = [
+        "Geometry of the least-squares fit",
+        *(f"chip {row['chip']}: {row['sentence']}" for row in summary["fit"]["geometry"]),
+        "",
         f"Error budget (rms over the detector, 1 sigma, {summary['fit']['unit']})",
         table_text([_budget_row(row) for row in summary["budget"]], 3),
         "",

@@ -8,6 +8,7 @@ import click
 
 from bayesdist.app.commands.options import (
     CommaList,
+    Unused,
     command,
     epoch,
     filter_name,
@@ -68,7 +69,17 @@ def pam(file: str, output: str, **options: Any) -> None:
     click.echo(write_area_maps(file, output, **options))
 
 
-@command(name="acs")
+@command(
+    name="acs",
+    unused=[
+        Unused(
+            "secondary_exposures",
+            "with a single filter",
+            lambda o: len(o["filters"]) < 2,
+            "name several --filters",
+        )
+    ],
+)
 @new_folder
 @seed
 @force

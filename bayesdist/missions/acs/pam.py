@@ -38,7 +38,7 @@ def write_area_maps(
             do="choose a name that ends in .fits",
         )
     refuse_existing(output, force)
-    found = calibration_of_scale(path, filter=filter, scale=scale)
+    found = calibration_of_scale(path, filter=filter, scale=scale, epoch=epoch)
     chips, (pixel, source) = found.in_frame(epoch), found.pixel(epoch)
     images = images_of(found, image=image)
     numbers = list(images or chips)

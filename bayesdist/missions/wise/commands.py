@@ -9,6 +9,7 @@ import click
 
 from bayesdist.app.commands.options import (
     CommaList,
+    Unused,
     column_names,
     command,
     force,
@@ -26,6 +27,9 @@ def _number(
 
 _optical_rotation = _number(
     "--rotation", metavar="DEG", help="Rotation of the optical model, degrees."
+)
+_rotation_of_nothing = Unused(
+    "rotation", "without an optical model", lambda o: not o["optical"], "add --optical"
 )
 
 
@@ -53,7 +57,7 @@ def demo(line: str, output: str, format: str | None, force: bool) -> None:
     click.echo(simulated_and_run(output, format=format, force=force, command=line))
 
 
-@command()
+@command(unused=[_rotation_of_nothing])
 @click.argument("runs", nargs=-1, required=True, metavar="RUN...", type=click.Path())
 @new_folder
 @click.option(
@@ -96,7 +100,7 @@ def bands(
     click.echo(text)
 
 
-@command(name="bring-up")
+@command(name="bring-up", unused=[_rotation_of_nothing])
 @click.argument("detections", metavar="DETECTIONS", type=click.Path())
 @click.argument("reference", metavar="REFERENCE", type=click.Path())
 @new_folder
@@ -156,7 +160,9 @@ def _pairs(function: Callable[..., None]) -> Callable[..., None]:
     return function
 
 
-@command()
+@command(
+    unused=[Unused("dx dy rotation scale_x scale_y", "with --fit", lambda o: o["fit"])],
+)
 @_pairs
 @_number("--dx", help="Shift along x, pixels.")
 @_number("--dy", help="Shift along y, pixels.")
@@ -197,7 +203,22 @@ rvb.add_command(transform)
 rvb.add_command(rereference)
 
 
-@command(name="wise")
+def _one_table(options: Mapping[str, Any]) -> bool:
+    """True if one small table is asked for."""
+    return any(options[name] is not None for name in ("stars", "band", "fraction"))
+
+
+@command(
+    name="wise",
+    unused=[
+        Unused(
+            "bands pairs false_fraction partition_pattern",
+            "for one small table (--stars, --band or --fraction)",
+            _one_table,
+            "leave these out",
+        )
+    ],
+)
 @new_folder
 @seed
 @force

@@ -225,4 +225,7 @@ def _change(own: int, basis: PolynomialBasis) -> Float:
     return np.kron(np.eye(2), np.stack(columns, axis=1))
 
 
-FORMAT = Format("gbdes", "model parameters of gbdes", 35, _parse, _describe, _lint, _calibration)
+FORMAT = Format(
+    "gbdes", "model parameters of gbdes", 35, _parse, _describe, _lint, _calibration,
+    asks=("filter", "size"),
+)  # fmt: skip

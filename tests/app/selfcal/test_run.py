@@ -154,7 +154,33 @@ def test_check_names_the_free_directions_and_writes_nothing(one_roll):
     assert "skew_plus: held by convention" in out
     assert "6 directions are free, 6 of them held by convention" in out
     assert "One roll angle" in out
+    [row] = summary_of(one_roll.path)["fit"]["geometry"]
+    assert f"geometry     chip 1: {row['sentence']}" in out.splitlines()
     assert snapshot(one_roll.config.parent) == before
+
+
+def largest_deviation(plane, x, y):
+    """Largest deviation of positions from their best linear map of x, y, in pixels."""
+    design = np.column_stack([np.ones_like(x), x, y])
+    best = np.linalg.lstsq(design, plane, rcond=None)[0]
+    pixel = np.sqrt(abs(np.linalg.det(best[1:])))
+    return np.hypot(*(plane - design @ best).T).max() / pixel
+
+
+@pytest.mark.parametrize("name", ["three_rolls", "one_roll"])
+def test_the_geometry_is_that_of_the_truth(name, request):
+    finished = request.getfixturevalue(name)
+    truth = finished.truth
+    x, y = (a.ravel() for a in np.meshgrid(*[np.linspace(0.5, 1024.5, 21)] * 2))
+    plane = truth.model.predict(truth.theta, x, y, exposure=np.zeros(len(x), np.int64))
+    [row] = summary_of(finished.path)["fit"]["geometry"]
+    assert row["distortion"] == pytest.approx(largest_deviation(plane, x, y), rel=0.02)
+    # scale and rotation are free, and held as those of the pixels
+    assert (row["scale_x"], row["scale_y"]) == pytest.approx((1.0, 1.0), abs=0.01)
+    assert row["parity"] == 1 and row["position_angle"] == pytest.approx(0.0, abs=0.5)
+    said = f"chip 1: {row['sentence']}"
+    assert said in finished.result.out.splitlines()
+    assert said in (finished.path / "bayesdist.log").read_text(encoding="utf-8")
 
 
 def test_every_product_names_the_gauge(three_rolls):

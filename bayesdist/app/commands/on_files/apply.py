@@ -71,7 +71,7 @@ def apply_to_table(
     """
     output = Path(output)
     check_output(output, force)
-    found = calibration_of_scale(path, filter=filter, scale=scale, size=size)
+    found = calibration_of_scale(path, filter=filter, scale=scale, size=size, epoch=epoch)
     chips_of = found.in_frame(epoch)
     pixel, source = found.pixel(epoch)
     ox, oy = origin or (0.0, 0.0)

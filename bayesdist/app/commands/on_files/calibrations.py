@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from bayesdist.app.calibrations import calibration_at
+from bayesdist.app.calibrations import calibration_at, refuse_unused_date
 from bayesdist.calibration.calibration import Calibration
 from bayesdist.calibration.subarray import Subarray, subarray_at_corner, subarrays_of_image
 from bayesdist.errors import InputError
@@ -20,12 +20,15 @@ def calibration_of_scale(
     filter: str | None = None,
     scale: float | None = None,
     size: tuple[float, float] | None = None,
+    epoch: float | None = None,
 ) -> Calibration:
     """Calibration of a file or a run, as `calibration_at` gives it.
 
     `scale` is the size of a corrected pixel in the unit of u and v, by default that of the file.
+    InputError for an `epoch` (decimal years) if it does not depend on time.
     """
     calibration = calibration_at(path, filter=filter, size=size)
+    refuse_unused_date(epoch, calibration)
     if scale is None:
         return calibration
     if not (np.isfinite(scale) and scale > 0):

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from bayesdist.app.calibrations import calibration_at, on_the_sky
+from bayesdist.app.calibrations import calibration_at, on_the_sky, refuse_unused_date
 from bayesdist.app.screen import number as digits
 from bayesdist.app.store.output import refuse_existing
 from bayesdist.calibration.calibration import Calibration
@@ -73,6 +73,7 @@ def convert(
     sampled = _sampled(path, order, size, chip=chip, filter=filter, epoch=epoch) if sample else None
     if sampled is None:
         found = on_the_sky(Path(path), calibration_at(path, filter=filter, size=size))
+        refuse_unused_date(epoch, found)
     else:
         found, order = sampled.calibration, None
     settings = _settings(to, options)

@@ -129,6 +129,12 @@ def init(
     refuse_existing(path, force)
     relative = quoted(os.path.relpath(Path(matches), path.resolve().parent))
     own = mission_template(matches) if columns is None else None
+    if own is not None and size is not None:
+        raise InputError(
+            "is of a kind whose detector is known, with its size",
+            where=str(matches),
+            do="leave --size out, and change the size in the configuration if it is another one",
+        )
     draft = draft_of(path, matches, relative, columns, size) if own is None else None
     if draft is not None:
         text, outcome = draft

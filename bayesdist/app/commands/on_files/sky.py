@@ -9,7 +9,7 @@ import numpy as np
 from astropy.io import fits
 from astropy.table import QTable, Table
 
-from bayesdist.app.calibrations import calibration_at, on_the_sky
+from bayesdist.app.calibrations import calibration_at, on_the_sky, refuse_unused_date
 from bayesdist.app.commands.on_files.position_table import (
     check_output,
     closing_lines,
@@ -54,6 +54,7 @@ def sky_to_table(
             do="name a .fits file",
         )
     found = on_the_sky(Path(path), calibration_at(path, filter=filter, size=size))
+    refuse_unused_date(epoch, found)
     positions = read_positions(Path(table))
     names = columns or ("x", "y")
     origin, reason = pixel_columns(positions, names, pixel_origin, str(table))[2:]

@@ -10,7 +10,13 @@ from typing import Any
 import numpy as np
 from astropy.table import Table, vstack
 
-from bayesdist.app.calibrations import calibration_at, on_the_sky, run_of
+from bayesdist.app.calibrations import (
+    asks_of,
+    calibration_at,
+    on_the_sky,
+    refuse_unused_date,
+    run_of,
+)
 from bayesdist.app.store.keys import attributes
 from bayesdist.app.store.output import record_folder, write_table
 from bayesdist.assess.comparison.compare import (
@@ -173,6 +179,7 @@ def compare_files(
     """
     first, _, second = (filter or "").partition(":")
     both = _read((Path(a), Path(b)), (first or None, second or first or None), size)
+    refuse_unused_date(epoch, *both)
     maps = [one.by_chip(epoch) for one in both]
     numbers = _common(both, chip)
     rng = np.random.default_rng(SEED)
@@ -218,15 +225,22 @@ def _read(
     size: tuple[float, float] | None,
 ) -> tuple[Calibration, Calibration]:
     """Both calibrations; a header that does not say its size has the given, or the other's."""
+    asked = [asks_of(path) for path in paths]
+    for k, other in ((0, 1), (1, 0)):  # what one of them uses is no mistake of the other
+        if "filter" not in asked[k] and "filter" in asked[other]:
+            filters = (None, filters[1]) if k == 0 else (filters[0], None)
     sizes: list[tuple[float, float] | None] = [size, size]
     for k, other in ((0, 1), (1, 0)):
+        if "size" not in asked[k] and "size" in asked[other]:
+            sizes[k] = None
+    for k, other in ((0, 1), (1, 0)):
         try:
-            calibration_at(paths[k], filter=filters[k], size=size)
+            calibration_at(paths[k], filter=filters[k], size=sizes[k])
         except MissingSizeError:
             sizes[k] = calibration_at(paths[other], filter=filters[other]).model.chips[0].size
     a, b = (
-        calibration_at(path, filter=one, size=size)
-        for path, one, size in zip(paths, filters, sizes, strict=True)
+        calibration_at(path, filter=one, size=its)
+        for path, one, its in zip(paths, filters, sizes, strict=True)
     )
     return a, b
 

@@ -51,6 +51,12 @@ def plan(run: str | Path, *, name: str | None = None, epochs: Sequence[float] = 
                 where=str(run),
                 do="leave --epochs out",
             )
+        if epochs and results.solution.model.time is None:
+            raise InputError(
+                "does not depend on time, so that the dates of further exposures do not matter",
+                where=str(run),
+                do="leave --epochs out",
+            )
         needs = needs_of(results, name=name, epochs=epochs)
     if solved is None:
         lines = [f"An exposure is taken to hold {content.n_stars:.0f} matched stars as these do."]

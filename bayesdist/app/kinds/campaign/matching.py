@@ -17,7 +17,12 @@ from bayesdist.app.kinds.campaign.input_validation import (
 )
 from bayesdist.app.kinds.campaign.inputs import Inputs, parities_of
 from bayesdist.app.kinds.campaign.matched import CampaignMatched, matched_campaign
-from bayesdist.app.kinds.star_lists import StarLists, positions_by_chip, start_of
+from bayesdist.app.kinds.star_lists import (
+    StarLists,
+    known_calibration,
+    positions_by_chip,
+    start_of,
+)
 from bayesdist.data import (
     Detections,
     ExposureLog,
@@ -27,6 +32,7 @@ from bayesdist.data import (
 )
 from bayesdist.data.matching.campaign import CampaignMatches
 from bayesdist.errors import InputError
+from bayesdist.infer.solution.geometry import geometry_of
 from bayesdist.model import Chip
 from bayesdist.products import read_idctab
 
@@ -186,6 +192,12 @@ def campaign_lines(inputs: Inputs) -> Iterator[str]:
         yield f"segments     {', '.join(str(k) for k in counts)} exposures"
     chips = ", ".join(chip.name for chip in config.chips())
     yield f"model        order {config.model.order}, chips {chips}, tables: {config.tables.method}"
+    known = known_calibration(
+        inputs.base / config.campaign.initial_distortion, config.campaign.filter
+    )
+    for number in sorted({chip.number for chip in config.chips()} & set(known.numbers)):
+        sentence = geometry_of(known.solution, number).sentence
+        yield f"geometry     chip {number} of campaign.initial_distortion: {sentence}"
     for number, names in _without(inputs).items():
         yield f"chip {number}       no detections that pass the cuts in {', '.join(names)}"
     warnings, unknown = input_warnings(inputs), np.count_nonzero(np.isnan(rolls))

@@ -22,6 +22,7 @@ from bayesdist.infer.selfcal.elimination import memberships
 from bayesdist.infer.selfcal.gauge import NamedDirection
 from bayesdist.infer.selfcal.pieces import one_cluster
 from bayesdist.infer.selfcal.tangent import places_of
+from bayesdist.infer.solution.geometry import geometries
 from bayesdist.model import DistortionModel
 from bayesdist.utils.arrays import Bool, Float, Int
 
@@ -279,6 +280,9 @@ def selfcal_lines(inputs: Inputs) -> Iterator[str]:
     error = float(np.sqrt(np.median(s.problem.var) + s.mixture.jitter**2))
     yield f"errors       {number(error)} pix at the median, {number(s.mixture.fraction)} false"
     yield f"model        order {model.order}, frames '{model.frames}', {model.n_params} parameters"
+    chips = geometries(s.solution)
+    for chip in chips:
+        yield f"geometry     chip {chip.chip}: {chip.sentence}"
     n, held = gauge.null.shape[1], gauge.open.shape[1]
     yield f"null space   {n} directions are free, {held} of them held by convention"
     for one in gauge.directions:
@@ -286,7 +290,8 @@ def selfcal_lines(inputs: Inputs) -> Iterator[str]:
             yield f"             {_state_words(one, fixed[one.name])}"
     for sigma, k in gauge.weakest:
         yield f"nearly free  {number(sigma)} pix at the edge, led by {model.names[int(k)]}"
-    for text in (*gauge.sentences, *summary["warnings"]):
+    doubtful = [text for chip in chips for text in chip.warnings]
+    for text in (*gauge.sentences, *summary["warnings"], *doubtful):
         yield f"WARNING      {text[0].upper() + text[1:]}"
 
 

@@ -50,7 +50,7 @@ def handbook(
             where="--magnification",
             do="give a positive number",
         )
-    found = calibration_of_scale(path, filter=filter, scale=scale)
+    found = calibration_of_scale(path, filter=filter, scale=scale, epoch=epoch)
     pixel, _ = found.pixel(epoch)
     if detector is None and found.instrument == "ACS":
         detector = found.detector

@@ -224,5 +224,5 @@ def _describe(file: AstFile) -> list[str]:
 
 FORMAT = Format(
     "ast", "an AST mapping", 34, ast_of, _describe, lint_ast, ast_calibration, Settings, build,
-    needs_scale=lambda settings: True,
+    needs_scale=lambda settings: True, asks=("size",),
 )  # fmt: skip

@@ -187,6 +187,8 @@ class Format:
         True if files that are built have the dependence of the calibration on time.
     needs_scale : callable
         From the settings to True if a file states angles, for which u and v in pixels need a scale.
+    asks : tuple of str
+        Fields of `Choice` that `calibration` uses: "filter", "size".
     refuse : callable, optional
         For a format without calibrations: raises the InputError that says why this file has none;
         returns if nothing more is known than that the format has none.
@@ -208,6 +210,7 @@ class Format:
     holds_tables: bool = False
     holds_time: bool = False
     needs_scale: Callable[[Any], bool] = lambda settings: False
+    asks: tuple[str, ...] = ()
     refuse: Callable[[Any, str], None] | None = None
 
 

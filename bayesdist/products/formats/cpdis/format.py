@@ -189,4 +189,5 @@ def _describe(file: CpdisFile) -> list[str]:
 FORMAT = Format(
     "cpdis", "an image with CPDIS look-up tables", 33, cpdis_of, _describe, lint_cpdis,
     cpdis_calibration, Settings, build, holds_tables=True, needs_scale=lambda settings: True,
+    asks=("size",),
 )  # fmt: skip

@@ -163,4 +163,5 @@ FORMAT = Format(
     _build,
     highest_order=HIGHEST,
     holds_time=True,
+    asks=("filter",),
 )

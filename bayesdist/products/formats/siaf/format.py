@@ -237,4 +237,5 @@ FORMAT = Format(
     build,
     _read_back,
     highest_order=HIGHEST,
+    asks=("size",),
 )

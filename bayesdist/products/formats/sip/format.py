@@ -137,4 +137,5 @@ FORMAT = Format(
     sip_read_back,
     highest_order=SIP_ORDERS[1],
     needs_scale=lambda settings: settings.axes == "sky",
+    asks=("size",),
 )

@@ -158,5 +158,5 @@ def _describe(file: TpvFile) -> list[str]:
 
 FORMAT = Format(
     "tpv", "TPV headers", 31, tpv_of, _describe, lint_tpv, tpv_calibration, Settings, build,
-    highest_order=HIGHEST, needs_scale=lambda settings: True,
+    highest_order=HIGHEST, needs_scale=lambda settings: True, asks=("size",),
 )  # fmt: skip

@@ -143,4 +143,5 @@ FORMAT = Format(
     _build,
     _read_back,
     highest_order=SIP_ORDERS[1],
+    asks=("filter",),
 )

@@ -64,6 +64,7 @@ class Observatory(Generic[Settings]):
             self._build,
             self._read_back,
             holds_tables=True,
+            asks=("size",),
         )
 
     def _parse(self, content: Content) -> DistortionFile | None:
