@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import replace
 from pathlib import Path
 
@@ -311,8 +312,16 @@ def test_a_calibration_is_shown_in_one_line(calibration, text):
 def test_what_other_programs_will_make_of_a_file_is_warned_of_once(tmp_path):
     """The warning is that of the caller's line."""
     with pytest.warns(BayesdistWarning) as caught:
-        IN_PIXELS.write("sip", tmp_path / "camera.hdr", scale_mas=50)
+        IN_PIXELS.write("sip", tmp_path / "camera.hdr", scale_mas=50, crval=(10.0, 20.0))
     texts = [str(one.message) for one in caught]
     assert len(texts) == len(set(texts)) and all("camera.hdr: " in text for text in texts)
-    assert any("CRVAL is a placeholder" in text for text in texts)
+    assert any("u is taken for east" in text for text in texts)
     assert {one.filename for one in caught} == {__file__}
+
+
+def test_a_placeholder_of_the_sky_position_is_a_note_and_no_warning(tmp_path, caplog):
+    with warnings.catch_warnings(), caplog.at_level("INFO", logger="bayesdist"):
+        warnings.simplefilter("error")
+        IN_PIXELS.write("sip", tmp_path / "camera.hdr", scale_mas=50)
+    assert any("CRVAL is a placeholder" in text for text in caplog.messages)
+    assert "CRVAL is a placeholder" in (tmp_path / "camera.hdr").read_text()
