@@ -20,6 +20,7 @@ from bayesdist.formats import describe, lint, list_formats
 from bayesdist.products.formats.common.document import Choice
 from bayesdist.products.registry import open_document, product_settings
 
+from ..docs_blocks import DOCS, run_page
 from .support import PIXEL, StandIn, on_sky, some_covariance, some_solution, wfc_model
 from .test_formats import SETTINGS, calibration_for
 
@@ -325,3 +326,14 @@ def test_a_placeholder_of_the_sky_position_is_a_note_and_no_warning(tmp_path, ca
         IN_PIXELS.write("sip", tmp_path / "camera.hdr", scale_mas=50)
     assert any("CRVAL is a placeholder" in text for text in caplog.messages)
     assert "CRVAL is a placeholder" in (tmp_path / "camera.hdr").read_text()
+
+
+def test_the_lines_of_the_quickstart_read_the_sky_from_a_header(tmp_path, monkeypatch):
+    calibration = on_sky(4)
+    (tmp_path / "camera-run").mkdir()
+    calibration.write("sip", tmp_path / "camera-run" / "sip.hdr")
+    monkeypatch.chdir(tmp_path)
+    found = run_page(DOCS / "quickstart.md", languages={"python"})["wcs"].pixel_to_world(99, 99)
+    ours = calibration.to_sky({"x": np.array([100.0]), "y": np.array([100.0])})
+    apart = found.separation(SkyCoord(ours["ra"], ours["dec"])).to_value("arcsec").max()
+    assert apart < 1e-4
