@@ -128,6 +128,14 @@ def test_the_page_on_plots_runs(tmp_path, monkeypatch):
     assert set(listed) <= shown
 
 
+def test_the_quickstart_has_the_configuration_and_commands_of_the_readme():
+    """Those of the README are run, see `test_the_quickstart_of_the_readme_runs`."""
+    quickstart = blocks(DOCS / "quickstart.md")
+    assert [b for b in quickstart if b[0] != "python"] == [
+        b for b in blocks(ROOT / "README.md") if b[0] in ("toml", "console")
+    ]
+
+
 def test_the_page_on_wcs_runs(tmp_path, monkeypatch):
     for program in ("gwcs", "photutils", "regions", "reproject"):
         pytest.importorskip(program)
@@ -214,6 +222,7 @@ def test_every_block_that_could_run_is_run():
     tutorials = {p.name for p in DOCS.glob("tutorial_*.md")}
     others = {"posterior_file.md", "new_instrument.md", "ground_based.md", "jwst.md", "roman.md"}
     others |= {"files.md", "plots.md", "positions.md", "wcs.md", "your_table.md"}
+    others |= {"quickstart.md"}  # its configuration and commands are the README's
     assert run == tutorials | others
 
 
@@ -406,7 +415,10 @@ def test_names_and_files_of_the_code_are_there(page):
 
 def test_the_reference_names_all_that_is_public():
     api = (DOCS / "api.md").read_text(encoding="utf-8")
-    listed = {n.rpartition(".")[2] for n in re.findall(r"^   ~(bayesdist[\w.]+)$", api, re.M)}
+    names = re.findall(r"^   ~(bayesdist[\w.]+)$", api, re.MULTILINE)
+    listed = {n.rpartition(".")[2] for n in names}
+    for module, _, name in (n.rpartition(".") for n in names):
+        assert hasattr(import_module(module), name), f"{module} does not offer {name}"
     public = {*bd.__all__, *formats.__all__, *wise.__all__}
     assert listed == public - {"__version__", "MISSION"}
     modules = re.findall(r"^   (bayesdist[\w.]+)$", api, re.MULTILINE)

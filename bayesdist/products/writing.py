@@ -7,6 +7,7 @@ tables.
 
 from __future__ import annotations
 
+import logging
 import os
 import warnings
 from collections.abc import Mapping, Sequence
@@ -31,6 +32,8 @@ from bayesdist.products.formats.common.document import (
 from bayesdist.products.registry import build, format_of, product_settings
 from bayesdist.utils.arrays import Float
 from bayesdist.utils.quantities import Epoch, Number, value_in, year_of
+
+log = logging.getLogger("bayesdist")
 
 CALLER = 3  # frames from here to whoever calls `Calibration.write`
 LONGEST_NAME = 40  # characters of a file name from which names in headers are made: a card has 68
@@ -90,6 +93,8 @@ def write_calibration(
     remarks = (*notes, *(w for one in built for w in one.warnings))
     for text in dict.fromkeys(remarks):
         warnings.warn(f"{places[-1]}: {text}", BayesdistWarning, stacklevel=CALLER)
+    for text in dict.fromkeys(note for one in built for note in one.notes):
+        log.info("%s: %s", places[-1], text)
     return places
 
 

@@ -182,7 +182,7 @@ REPORT = Registry(
             empty="Nothing was sampled: the fit rejects outliers by its limits and does not model"
             " them.",
         ),
-        Section("coefficients", "Coefficients", printed=False),
+        Section("coefficients", "Coefficients"),
         Section("maps", "Distortion and its uncertainty over the detector"),
         Section("periods", "Time variation"),
         Section("budget", "Error budget", empty="No error budget was made."),

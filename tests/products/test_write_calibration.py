@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import replace
 from pathlib import Path
 
@@ -19,6 +20,7 @@ from bayesdist.formats import describe, lint, list_formats
 from bayesdist.products.formats.common.document import Choice
 from bayesdist.products.registry import open_document, product_settings
 
+from ..docs_blocks import DOCS, run_page
 from .support import PIXEL, StandIn, on_sky, some_covariance, some_solution, wfc_model
 from .test_formats import SETTINGS, calibration_for
 
@@ -311,8 +313,27 @@ def test_a_calibration_is_shown_in_one_line(calibration, text):
 def test_what_other_programs_will_make_of_a_file_is_warned_of_once(tmp_path):
     """The warning is that of the caller's line."""
     with pytest.warns(BayesdistWarning) as caught:
-        IN_PIXELS.write("sip", tmp_path / "camera.hdr", scale_mas=50)
+        IN_PIXELS.write("sip", tmp_path / "camera.hdr", scale_mas=50, crval=(10.0, 20.0))
     texts = [str(one.message) for one in caught]
     assert len(texts) == len(set(texts)) and all("camera.hdr: " in text for text in texts)
-    assert any("CRVAL is a placeholder" in text for text in texts)
+    assert any("u is taken for east" in text for text in texts)
     assert {one.filename for one in caught} == {__file__}
+
+
+def test_a_placeholder_of_the_sky_position_is_a_note_and_no_warning(tmp_path, caplog):
+    with warnings.catch_warnings(), caplog.at_level("INFO", logger="bayesdist"):
+        warnings.simplefilter("error")
+        IN_PIXELS.write("sip", tmp_path / "camera.hdr", scale_mas=50)
+    assert any("CRVAL is a placeholder" in text for text in caplog.messages)
+    assert "CRVAL is a placeholder" in (tmp_path / "camera.hdr").read_text()
+
+
+def test_the_lines_of_the_quickstart_read_the_sky_from_a_header(tmp_path, monkeypatch):
+    calibration = on_sky(4)
+    (tmp_path / "camera-run").mkdir()
+    calibration.write("sip", tmp_path / "camera-run" / "sip.hdr")
+    monkeypatch.chdir(tmp_path)
+    found = run_page(DOCS / "quickstart.md", languages={"python"})["wcs"].pixel_to_world(99, 99)
+    ours = calibration.to_sky({"x": np.array([100.0]), "y": np.array([100.0])})
+    apart = found.separation(SkyCoord(ours["ra"], ours["dec"])).to_value("arcsec").max()
+    assert apart < 1e-4

@@ -9,6 +9,7 @@ import pytest
 from lxml import html as lxml_html
 
 from bayesdist.assess.budget.budget import BudgetTerm
+from bayesdist.report.contents import REPORT
 from bayesdist.report.run_report import render_report
 from bayesdist.report.sections.run.budget import budget_table
 
@@ -55,3 +56,13 @@ def test_a_single_part_of_the_model_is_a_row_as_it_is(anti_correlated):
     (table,) = budget_table(replace(anti_correlated, budget=budget))
     assert [row[0] for row in table.rows] == ["fast", "catalogue", "total"]
     assert table.columns[-1] == "Relative uncertainty"
+
+
+@pytest.mark.parametrize("several", [True, False])
+def test_the_map_of_the_dominant_term_is_left_out_where_one_term_dominates(converged, several):
+    budget = converged.budget
+    assert np.count_nonzero(budget.share) > 1
+    if not several:
+        budget = replace(budget, terms=(budget.terms[int(budget.share.argmax())],))
+    items = REPORT.items(replace(converged, budget=budget), "figure")
+    assert ("budget_dominating" in [item.name for item in items]) == several

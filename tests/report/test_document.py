@@ -36,3 +36,18 @@ def test_the_report_has_its_id_and_lines_to_sign(converged):
     assert document_id(converged) in section.text_content()
     signed = section.xpath(".//table[caption='Sign-off']//tbody//th")
     assert [cell.text_content() for cell in signed] == ["Prepared", "Reviewed", "Approved"]
+
+
+def test_legendre_coefficients_are_printed_and_no_others(converged):
+    tree = lxml_html.fromstring(render_report(converged, {}))
+    (section,) = tree.xpath("//section[@id='coefficients']")
+    assert "detail" not in (section.get("class") or "").split()
+    folded = section.xpath("./details")
+    printed = [one for one in folded if "detail" not in one.get("class").split()]
+    assert len(folded) > 1 and len(printed) == 1
+    rows = printed[0].xpath(".//tbody/tr")
+    names = [n for n in converged.fit.model.names if n not in converged.held]
+    assert {row.xpath("string(./th)") for row in rows} <= set(names)
+    polynomial = [p.name for p in converged.fit.model.parameters if p.kind == "polynomial"]
+    assert [row.xpath("string(./th)") for row in rows] == [n for n in polynomial if n in names]
+    assert not [row for row in rows if "screen" in (row.get("class") or "").split()]

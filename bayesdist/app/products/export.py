@@ -90,6 +90,9 @@ def export(
             for warning in (*built.warnings, *left_out):
                 log.warning("export: WARNING: %s: %s", path.name, warning)
                 findings.append(f"warning: {warning}")
+            for note in built.notes:
+                log.info("export: %s: %s", path.name, note)
+                findings.append(f"note: {note}")
             products.append(entry | dict(built.summary) | {"findings": findings})
     for one in products:
         _compare(one, budget)

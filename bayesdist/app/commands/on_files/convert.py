@@ -104,6 +104,7 @@ def convert(
     if source.errors == "none":
         lines.append("  note: it states no errors, and neither do the new files")
     lines += [f"  warning: {w}" for w in dict.fromkeys(w for one in built for w in one.warnings)]
+    lines += [f"  note: {n}" for n in dict.fromkeys(n for one in built for n in one.notes)]
     used = _read_back(held, filter, made.model.chips[0].size, as_used=True)
     lines += [f"  {line}" for line in _losses(source, back, used, at, scale)]
     return "\n".join(lines)

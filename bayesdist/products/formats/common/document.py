@@ -149,6 +149,7 @@ class Built:
     chip: int | None = None  # of a file of one chip
     summary: Mapping[str, Any] = field(default_factory=dict)  # further entries of summary.json
     warnings: tuple[str, ...] = ()  # on what programs will make of it, for the terminal
+    notes: tuple[str, ...] = ()  # good to know, such as what the settings cause
 
 
 @dataclass(frozen=True)

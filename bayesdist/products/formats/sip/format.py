@@ -93,25 +93,24 @@ def _build(
             out.append(beside)
         summary = {"closure_pix": sip.closure, "a_dmax": sip.a_dmax, "b_dmax": sip.b_dmax}
         text = sip_text(sip).encode("ascii")
-        out.append(Built(name, "SIP", text, sip, number, summary, _warnings(sip, calibration)))
+        warnings, notes = _warnings(sip, calibration), _notes(sip, calibration)
+        out.append(Built(name, "SIP", text, sip, number, summary, warnings, notes))
     return tuple(out)
+
+
+def _notes(sip: SipHeader, calibration: Calibration) -> tuple[str, ...]:
+    """Note on CRVAL where the sky position is neither known nor given in the settings."""
+    if not _sky_is_assumed(sip, calibration) or sip.crval != (0.0, 0.0):
+        return ()
+    remedy = f"set products.sip.crval{_or_linear(calibration)}"
+    return (f"CRVAL is a placeholder, and {_axes(sip)}: {remedy}",)
 
 
 def _warnings(sip: SipHeader, calibration: Calibration) -> tuple[str, ...]:
     """Warnings on what programs will make of a header that the solution does not say."""
     out = []
-    if not sip.linear_axes and calibration.plane.point is None:
-        placeholder = sip.crval == (0.0, 0.0)
-        mirrored = (
-            ", which makes the image a mirror of the sky" if np.linalg.det(sip.cd) > 0 else ""
-        )
-        other = ", or set axes = 'linear'" if calibration.unit == "pix" else ""
-        before, remedy = (
-            ("CRVAL is a placeholder, and ", "set products.sip.crval")
-            if placeholder
-            else ("", "check that they are")
-        )
-        out.append(f"{before}u is taken for east and v for north{mirrored}: {remedy}{other}")
+    if _sky_is_assumed(sip, calibration) and sip.crval != (0.0, 0.0):
+        out.append(f"{_axes(sip)}: check that they are{_or_linear(calibration)}")
     low = {k: c for terms in (sip.a, sip.b) for k, c in terms.items() if sum(k) < 2 and c}
     if low:
         out.append(
@@ -122,6 +121,22 @@ def _warnings(sip: SipHeader, calibration: Calibration) -> tuple[str, ...]:
             "drop"
         )
     return tuple(out)
+
+
+def _sky_is_assumed(sip: SipHeader, calibration: Calibration) -> bool:
+    """True if the header has sky axes although the solution does not say where the sky is."""
+    return not sip.linear_axes and calibration.plane.point is None
+
+
+def _axes(sip: SipHeader) -> str:
+    """Sky directions that the header assumes for u and v, as a clause."""
+    mirrored = ", which makes the image a mirror of the sky" if np.linalg.det(sip.cd) > 0 else ""
+    return f"u is taken for east and v for north{mirrored}"
+
+
+def _or_linear(calibration: Calibration) -> str:
+    """Second remedy, which exists for u and v in pixels."""
+    return ", or set axes = 'linear'" if calibration.unit == "pix" else ""
 
 
 FORMAT = Format(

@@ -14,13 +14,17 @@ from bayesdist.report.texttable import MAX_ROWS, TextTable, further, tabulated
 from bayesdist.utils.numbers import MISSING, interval, number, rounded
 
 _ON_SCREEN = ("68 %", "95 %", "R-hat", "ESS")
+MAX_PRINTED = 240  # Legendre coefficients on paper: two pages
 _WIDER = 1.05  # than the sampled one: an error that rounding or few draws do not explain
 _SMALL = 1e-3  # below it a number without a unit is shown in 10^-6
 
 
 @REPORT.table("coefficients")
 def coefficient_tables(r: ReportInput) -> tuple[TextTable, ...]:
-    """Tables of Legendre coefficients, of time dependence and frames, of monomial coefficients."""
+    """Tables of Legendre coefficients, of time dependence and frames, of monomial coefficients.
+
+    All are folded on the screen; the Legendre coefficients are printed.
+    """
     kinds = {p.name: p.kind for p in r.fit.model.parameters}
     rows = list(r.coefficients)
     mark, held = gauge_mark(r), r.held
@@ -37,7 +41,7 @@ def coefficient_tables(r: ReportInput) -> tuple[TextTable, ...]:
         with_unit=False,
     )
     notes = gauge_note(r), _common_note(r), _held_note(r, fixed)
-    out = [replace(legendre, note=_notes(*notes))]
+    out = [replace(legendre, note=_notes(*notes), leading=MAX_PRINTED, folded=True)]
     if others:
         table = _parameter_table(
             r,
@@ -46,7 +50,7 @@ def coefficient_tables(r: ReportInput) -> tuple[TextTable, ...]:
             with_unit=True,
         )
         note = _notes(_held_note(r, fixed_others), further(len(others)))
-        out.append(replace(table, note=note, detail=True))
+        out.append(replace(table, note=note, detail=True, folded=True))
     out += [_monomial_table(r, chip.number) for chip in r.fit.model.chips]
     return tuple(out)
 
@@ -179,4 +183,5 @@ def _monomial_table(r: ReportInput, chip: int) -> TextTable:
             gauge,
         ),
         detail=True,
+        folded=True,
     )
