@@ -159,6 +159,6 @@ def test_a_wide_plane_on_no_sky_is_not_written_as_tan(fit, tmp_path, scale, line
     np.testing.assert_allclose(found.forward(x, y, chip=1), expected, atol=1e-4)
     [back] = read_back("sip", files, calibration, BuildOptions())
     np.testing.assert_allclose(back.forward(x, y, 1, None), expected, atol=1e-4)
+    product = product_settings()["sip"](axes="linear", crval=(1.0, 2.0))
     with pytest.raises(InputError, match="have one"):
-        product = product_settings()["sip"](axes="linear", crval=(1.0, 2.0))
         build("sip", calibration, product, BuildOptions())

@@ -123,7 +123,7 @@ def sip_from_solution(
         tangent_point = calibration.plane.point
     model = calibration.model
     _check_options(model, linear, epoch, scale_arcsec, tangent_point, origin)
-    in_frame = _is_in_frame(axes, model, tangent_point, crval)
+    in_frame = _is_in_frame(axes, tangent_point, crval)
     number = calibration.numbers[0] if chip is None else chip
     one = calibration.chip(number, epoch, origin="stated")
     poly = one.monomials()
@@ -241,7 +241,6 @@ def _check_options(
 
 def _is_in_frame(
     axes: str,
-    model: DistortionModel,
     tangent_point: tuple[float, float] | None,
     crval: tuple[float, float] | None,
 ) -> bool:

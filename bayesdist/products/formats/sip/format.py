@@ -35,7 +35,6 @@ from bayesdist.products.formats.sip.positions import sip_read_back
 from bayesdist.products.formats.sip.read import holds_sip, sip_of
 from bayesdist.products.formats.sip.write import sip_text
 
-
 # Pixels by which other projections may differ from TAN in a header whose u, v are on no sky.
 MAX_DEPARTURE = 0.1
 
