@@ -86,8 +86,8 @@ def stated_names(terms: Sequence[ErrorTerm]) -> tuple[str, ...]:
 
 
 def _sizes(
-    sizes: Sequence[Number], unit: str | None, what: str, where: str
-) -> tuple[tuple[float, ...], str | None]:
+    sizes: Sequence[Number], unit: str, what: str, where: str
+) -> tuple[tuple[float, ...], str]:
     """Standard deviations with their unit: `unit` of plain numbers, else that of the Quantities."""
     units = [unit_name(size, what, where=where) for size in sizes]
     if None in units and any(units):
@@ -151,12 +151,14 @@ class UserTerm:
         require_known(self.kind, TERM_KINDS, "kind", where=where)
         if self.unit is not None:
             require_known(self.unit, UNITS, "unit", where=where)
-        (sigma_u, sigma_v), unit = _sizes((self.sigma_u, self.sigma_v), self.unit, "sigma", where)
+        (sigma_u, sigma_v), unit = _sizes(
+            (self.sigma_u, self.sigma_v), self.unit or "", "sigma", where
+        )
         varies = names_catalogue(self.name) if self.varies is None else self.varies
         for name, value in (
             ("sigma_u", sigma_u),
             ("sigma_v", sigma_v),
-            ("unit", unit),
+            ("unit", unit or None),
             ("varies", varies),
         ):
             object.__setattr__(self, name, value)
