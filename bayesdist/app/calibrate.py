@@ -197,7 +197,7 @@ def calibrate(
         "holdout": None
         if isinstance(held_out, int | float) and held_out == 0
         else {"fraction": held_out},
-        "budget": _budget(catalogue, terms),
+        "budget": _budget(catalogue, terms, None if stars is None else stars.unit),
         "requirement": [_requirement_block(one) for one in as_requirements(requirements)],
     }
     text = tomli_w.dumps(_merged(configured, settings))
@@ -348,8 +348,10 @@ def _outliers(outliers: OutlierMixture | str, unit: str | None) -> Settings:
     return section | {"jitter": "fit" if jitter is None else jitter}
 
 
-def _budget(catalogue: Catalogue | None, terms: Sequence[UserTerm]) -> list[Settings]:
-    """[[budget]] rows of the errors that the user states."""
+def _budget(
+    catalogue: Catalogue | None, terms: Sequence[UserTerm], unit: str | None
+) -> list[Settings]:
+    """[[budget]] rows of the errors that the user states; `unit` is that of u, v if it is known."""
     require_catalogue(catalogue)
     rows = [] if catalogue is None else [catalogue.budget_row()]
     if isinstance(terms, UserTerm):
@@ -364,7 +366,14 @@ def _budget(catalogue: Catalogue | None, terms: Sequence[UserTerm]) -> list[Sett
                 do="give bayesdist.UserTerm, or use bayesdist.error_budget for terms of your own",
             )
         names = "name kind sigma_u sigma_v unit source included_in_scatter".split()
-        rows.append({key: getattr(term, key) for key in names})
+        row = {key: getattr(term, key) for key in names} | {"unit": term.unit or unit}
+        if row["unit"] is None:
+            raise InputError(
+                f"the unit of {term.name!r} is not stated, and the matches have not been read",
+                where="terms",
+                do='give UserTerm a unit, such as unit="arcsec"',
+            )
+        rows.append(row)
     return rows
 
 

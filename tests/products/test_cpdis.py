@@ -243,6 +243,20 @@ def test_planted_faults_are_found(tmp_path, fault):
     assert len(found) == 1 and registry.describe(wrong)
 
 
+def test_a_header_without_a_sky_is_not_wider_than_it(tmp_path):
+    """One unit per pixel and no CTYPE: tables on pixels, which are no 300 degrees of the sky."""
+    path = tmp_path / "plane.fits"
+    with fits.open(of_others(tmp_path)) as hdus:
+        header = hdus["SCI"].header
+        for keyword in [key for key in header if key[:5] in ("CTYPE", "CUNIT") or key[-1] == "A"]:
+            del header[keyword]
+        header.update(CDELT1=1.0, CDELT2=1.0, CRVAL1=0.0, CRVAL2=0.0)
+        hdus.writeto(path)
+    findings = registry.lint(path)
+    assert not [f for f in findings if f.level == "error"], findings
+    assert [f.level for f in findings if f.where == "CTYPE"] == ["note"]
+
+
 def test_bad_files_get_a_sentence(tmp_path):
     right = of_others(tmp_path)
     for k, (change, message) in enumerate(

@@ -128,3 +128,39 @@ def test_parameters_beside_a_header_have_the_covariance(fit, tmp_path):
     found = read_calibration(tmp_path / "sip.hdr")
     assert found.errors == "none" and "which is not here" in found.notes[-1]
     assert "its errors are not stated: AE and BE" in found.notes[0]
+
+
+@pytest.mark.parametrize(("scale", "linear"), [(120.0, True), (1.0, False)])
+def test_a_wide_plane_on_no_sky_is_not_written_as_tan(fit, tmp_path, scale, linear):
+    """30 degrees of u, v in arcsec: ARC and TAN differ by r - atan r; a small field is TAN."""
+    chip = bd.Chip(1, "camera", (900.0, 700.0), (450.5, 350.5))
+    model = bd.DistortionModel(3, (chip,), "arcsec")
+    mean = np.array(fit.mean)
+    terms = np.arange(mean.size) % model.n_terms
+    mean[terms == 0] = 0.0
+    for axis, values in enumerate([(450.0, 0.0), (0.0, 350.0)]):
+        mean[axis * model.n_terms + 1 : axis * model.n_terms + 3] = values
+    solution = GaussianSolution(model, scale * mean, scale**2 * fit.cov)
+    calibration = Calibration("run", solution, Plane())
+    files = build("sip", calibration, product_settings()["sip"](), BuildOptions())
+    for one in files:
+        (tmp_path / one.file_name).write_bytes(one.content)
+    path = tmp_path / files[-1].file_name
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", FITSFixedWarning)
+        wcs = WCS(fits.Header.fromtextfile(path))
+    assert wcs.has_celestial is not linear
+    assert any("tangent plane is worth" in text for text in files[-1].warnings) is linear
+    if not linear:
+        return
+    x, y = np.random.default_rng(2).uniform(1, 700, (2, 50))
+    expected = calibration.forward(x, y, chip=1)  # arcsec
+    np.testing.assert_allclose(np.stack(wcs.all_pix2world(x, y, 1), axis=-1), expected, atol=1e-4)
+    found = read_calibration(path)
+    assert found.unit == "arcsec"
+    np.testing.assert_allclose(found.forward(x, y, chip=1), expected, atol=1e-4)
+    [back] = read_back("sip", files, calibration, BuildOptions())
+    np.testing.assert_allclose(back.forward(x, y, 1, None), expected, atol=1e-4)
+    product = product_settings()["sip"](axes="linear", crval=(1.0, 2.0))
+    with pytest.raises(InputError, match="have one"):
+        build("sip", calibration, product, BuildOptions())

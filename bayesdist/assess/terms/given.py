@@ -97,7 +97,8 @@ def _sizes(
             do="give Quantities for both, or numbers in `unit`",
         )
     named = unit if units[0] is None else units[0]
-    return tuple(value_in(size, named, what, where=where) for size in sizes), named
+    # a plain number is the same in any unit
+    return tuple(value_in(size, named or "pix", what, where=where) for size in sizes), named
 
 
 @dataclass(frozen=True)
@@ -111,8 +112,8 @@ class UserTerm:
         'random': independent at every position; 'systematic': one offset shared by the whole field.
     sigma_u, sigma_v : float or Quantity
         Standard deviation of each axis; stored as numbers.
-    unit : str
-        'pix', 'arcsec', 'mas' or 'deg'; of Quantities it is their own.
+    unit : str, optional
+        'pix', 'arcsec', 'mas' or 'deg'; that of the model by default, and of Quantities their own.
     source : str
         Where the number comes from: 'given by the user', or a publication.
     varies : bool, optional
@@ -140,7 +141,7 @@ class UserTerm:
     kind: str
     sigma_u: float
     sigma_v: float
-    unit: str = "pix"
+    unit: str | None = None
     source: str = GIVEN
     varies: bool | None = None
     included_in_scatter: bool = False
@@ -148,13 +149,16 @@ class UserTerm:
     def __post_init__(self) -> None:
         where = f"budget term {self.name!r}"
         require_known(self.kind, TERM_KINDS, "kind", where=where)
-        require_known(self.unit, UNITS, "unit", where=where)
-        (sigma_u, sigma_v), unit = _sizes((self.sigma_u, self.sigma_v), self.unit, "sigma", where)
+        if self.unit is not None:
+            require_known(self.unit, UNITS, "unit", where=where)
+        (sigma_u, sigma_v), unit = _sizes(
+            (self.sigma_u, self.sigma_v), self.unit or "", "sigma", where
+        )
         varies = names_catalogue(self.name) if self.varies is None else self.varies
         for name, value in (
             ("sigma_u", sigma_u),
             ("sigma_v", sigma_v),
-            ("unit", unit),
+            ("unit", unit or None),
             ("varies", varies),
         ):
             object.__setattr__(self, name, value)
@@ -171,16 +175,16 @@ class UserTerm:
                 )
 
     def sigma(self, unit: str, pixel_scale: float | None = None) -> tuple[float, float]:
-        """(sigma_u, sigma_v) in a unit; `pixel_scale` in mas as in `units.convert`."""
+        """(sigma_u, sigma_v) in the unit of a model; `pixel_scale` in mas as in `units.convert`."""
         where = f"budget term {self.name!r}"
         su, sv = (
-            convert(s, self.unit, unit, pixel_scale, where=where)
+            convert(s, self.unit or unit, unit, pixel_scale, where=where)
             for s in (self.sigma_u, self.sigma_v)
         )
         return float(su), float(sv)
 
     def in_unit(self, unit: str, pixel_scale: float | None = None) -> UserTerm:
-        """Term with its standard deviations in another unit.
+        """Term with its standard deviations in the unit of a model.
 
         Parameters
         ----------

@@ -137,10 +137,13 @@ def prepare(model: DistortionModel, matches: Matches) -> tuple[Stars, Int]:
 def errors_of(matches: Matches) -> tuple[Float, Float]:
     """Errors (N,) on u and v of matches; InputError when the table has none."""
     if matches.sigma_u is None or matches.sigma_v is None:
-        raise InputError(
-            "the matches carry no errors",
-            do="give sigma columns, a number, or sigma = 'by_magnitude'",
-        )
+        do = "give sigma columns, a number, or sigma = 'by_magnitude'"
+        if matches.has_mag:  # as matches that were read with sigma = 'by_magnitude'
+            do = (
+                "estimate them from the residuals by magnitude with bayesdist.fit_by_magnitude or "
+                "bayesdist.calibrate, or give sigma columns or a number"
+            )
+        raise InputError("the matches carry no errors", do=do)
     return matches.sigma_u, matches.sigma_v
 
 

@@ -142,6 +142,13 @@ def _linear(image: CpdisImage) -> Iterator[Finding]:
     det = float(np.linalg.det(image.cd))
     if det == 0:
         yield Finding("error", "CD", "is singular")
+    elif "-" not in str(image.header.get("CTYPE1", "")):  # as in RA---TAN
+        yield Finding(
+            "note",
+            "CTYPE",
+            "names no position on the sky: u, v are on a plane of unknown position, and CD is in "
+            "degrees unless CUNIT says otherwise",
+        )
     elif image.size is not None and np.sqrt(abs(det)) * max(image.size) > _WIDE:
         yield Finding("error", "CD", "makes the image wider than the sky: check its unit")
     elif det * _HANDED.get(str(image.header.get("CTYPE1", ""))[:4], 0) < 0:

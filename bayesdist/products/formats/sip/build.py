@@ -74,8 +74,8 @@ def sip_from_solution(
         constant and linear terms too, relative to u = x and v = y in pixels, as the WISE pipeline
         has it (WSDC D-T033, Appendix B); CRVAL stands for `origin`.
     axes : {'sky', 'linear'}
-        'linear', of u, v in pixels: CTYPE is no projection, CD is in pixels and CRVAL the (u, v) of
-        CRPIX, so that a program gives u, v and no sky.
+        'linear', of u, v without a position on the sky: CTYPE is no projection, CD is in the unit
+        of u, v per pixel and CRVAL the (u, v) of CRPIX, so that a program gives u, v and no sky.
     crval : tuple of float, optional
         Sky position that the header states, degrees.  With `tangent_point` that of the reference
         pixel by default, and CRPIX is the pixel of any other one that is given; where the solution
@@ -123,7 +123,7 @@ def sip_from_solution(
         tangent_point = calibration.plane.point
     model = calibration.model
     _check_options(model, linear, epoch, scale_arcsec, tangent_point, origin)
-    in_frame = _is_in_frame(axes, model, tangent_point, crval)
+    in_frame = _is_in_frame(axes, tangent_point, crval)
     number = calibration.numbers[0] if chip is None else chip
     one = calibration.chip(number, epoch, origin="stated")
     poly = one.monomials()
@@ -159,8 +159,9 @@ def sip_from_solution(
         number,
         linear,
         epoch if model.time is not None else None,
-        "" if in_frame else model.unit,
+        model.unit,
         scale_arcsec,
+        in_frame=in_frame,
     )
     if not in_frame:
         cards += _sky_cards(tangent_point, crval)
@@ -240,20 +241,19 @@ def _check_options(
 
 def _is_in_frame(
     axes: str,
-    model: DistortionModel,
     tangent_point: tuple[float, float] | None,
     crval: tuple[float, float] | None,
 ) -> bool:
-    """True for linear axes, after a check that u, v are pixels of a frame."""
+    """True for linear axes, after a check that u, v have no position on the sky."""
     if axes not in ("sky", "linear"):
         raise InputError(
             f"axes is {axes!r}", where="products.sip.axes", do="choose 'sky' or 'linear'"
         )
     if axes == "sky":
         return False
-    if model.unit != "pix" or tangent_point is not None or crval is not None:
+    if tangent_point is not None or crval is not None:
         raise InputError(
-            "linear axes are those of u, v in pixels, and these are on the sky",
+            "linear axes are those of u, v without a position on the sky, and these have one",
             where="products.sip.axes",
             do="leave axes out, or crval",
         )
@@ -330,8 +330,11 @@ def _cards(
     epoch: float | None,
     unit: str,
     scale_arcsec: float | None,
+    *,
+    in_frame: bool,
 ) -> tuple[str, ...]:
-    """Cards of values that are no fields of a SipHeader; the unit is empty for linear axes."""
+    """Cards of values that are no fields of a SipHeader; `in_frame`: the axes are linear."""
+    axes_unit = {"pix": "pixel"}.get(unit, unit) if in_frame else "deg"
     what = {
         "cd": "CD holds the linear terms; A and B begin at order 2.",
         "sip": "CD is a pure scale; A and B hold constant and linear terms.",
@@ -341,12 +344,12 @@ def _cards(
         text_card("COMMENT", what),
         text_card("COMMENT", "A_p_q multiplies u^p v^q; AE_p_q and BE_p_q are 1-sigma errors."),
     ]
-    if unit == "pix" and scale_arcsec is None:
+    if unit == "pix" and scale_arcsec is None and not in_frame:
         cards.append(text_card("COMMENT", "The scale of CD is nominal: 1 arcsec per pixel."))
     cards += [
         number_card("WCSAXES", 2, "number of axes"),
-        text_card("CUNIT1", "deg" if unit else "pixel"),
-        text_card("CUNIT2", "deg" if unit else "pixel"),
+        text_card("CUNIT1", axes_unit),
+        text_card("CUNIT2", axes_unit),
         number_card("BDCHIP", chip, "chip number"),
     ]
     if epoch is not None:

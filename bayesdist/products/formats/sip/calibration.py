@@ -72,7 +72,7 @@ def sip_calibration(
         order=order,
         size=found,
         reference_pixel=sip.crpix,
-        unit="pix" if pixels or sip.linear_axes else "arcsec",
+        unit="pix" if pixels else sip.axes_unit if sip.linear_axes else "arcsec",
         monomial_cov=_variances(sip, linear, order),
     )
     if sip.has_sigmas and not sip.has_linear_sigmas:

@@ -9,6 +9,8 @@ import numpy as np
 from pydantic import Field
 
 from bayesdist.calibration.calibration import Calibration
+from bayesdist.calibration.inverse import detector_grid
+from bayesdist.calibration.plane import ARCSEC
 from bayesdist.products.formats.common.cards import header_of
 from bayesdist.products.formats.common.content import Content
 from bayesdist.products.formats.common.document import (
@@ -33,13 +35,16 @@ from bayesdist.products.formats.sip.positions import sip_read_back
 from bayesdist.products.formats.sip.read import holds_sip, sip_of
 from bayesdist.products.formats.sip.write import sip_text
 
+# Pixels by which other projections may differ from TAN in a header whose u, v are on no sky.
+MAX_DEPARTURE = 0.1
+
 
 class Settings(FormatSettings):
     """Configuration of a SIP header."""
 
     inverse_order: Annotated[int, Field(ge=2, le=9)] | None = None
     linear: Literal["cd", "sip"] = "cd"
-    axes: Literal["sky", "linear"] = "sky"
+    axes: Literal["sky", "linear"] | None = None  # sky, but of wide planes that have none
     crval: tuple[float, float] | None = None
     parameters: bool = True  # whether a file with the covariance is written beside
 
@@ -76,6 +81,8 @@ def _build(
 ) -> tuple[Built, ...]:
     """Headers, one for each chip."""
     out = []
+    departure = _projection_matters(calibration, settings, options)
+    axes = settings.axes or ("linear" if departure else "sky")
     for number in calibration.numbers:
         sip = sip_from_solution(
             calibration,
@@ -83,7 +90,8 @@ def _build(
             epoch=options.epoch,
             scale_arcsec=options.scale_arcsec,
             notes=calibration.remarks,
-            **settings.model_dump(exclude={"parameters"}),
+            axes=axes,
+            **settings.model_dump(exclude={"parameters", "axes"}),
         )
         several = len(calibration.numbers) > 1
         name = options.named(f"sip_{number}.hdr" if several else "sip.hdr", several=several)
@@ -93,7 +101,8 @@ def _build(
             out.append(beside)
         summary = {"closure_pix": sip.closure, "a_dmax": sip.a_dmax, "b_dmax": sip.b_dmax}
         text = sip_text(sip).encode("ascii")
-        warnings, notes = _warnings(sip, calibration), _notes(sip, calibration)
+        warnings = (*departure, *_warnings(sip, calibration))
+        notes = _notes(sip, calibration)
         out.append(Built(name, "SIP", text, sip, number, summary, warnings, notes))
     return tuple(out)
 
@@ -104,6 +113,38 @@ def _notes(sip: SipHeader, calibration: Calibration) -> tuple[str, ...]:
         return ()
     remedy = f"set products.sip.crval{_or_linear(calibration)}"
     return (f"CRVAL is a placeholder, and {_axes(sip)}: {remedy}",)
+
+
+def _projection_matters(
+    calibration: Calibration, settings: Settings, options: BuildOptions
+) -> tuple[str, ...]:
+    """Warning that angular u, v may be in another projection than TAN; empty if it hardly matters.
+
+    In a small field all projections about one point agree.  A distance r in radians differs
+    between a tangent plane and one that keeps angles (ARC) by r - atan r.
+    """
+    stated = settings.axes is not None or settings.crval is not None
+    if calibration.unit == "pix" or stated or calibration.plane.point is not None:
+        return ()
+    if calibration.model.time is not None and options.epoch is None:
+        return ()  # refused with its reason where the header is made
+    worst = 0.0
+    for one in calibration.at(options.epoch, origin="stated").values():
+        poly = one.monomials()
+        x, y = detector_grid(one.basis.size, 3)
+        offsets = np.stack([x, y]) - np.array(one.basis.reference_pixel)[:, None]
+        arcsec = ARCSEC[calibration.unit] * (poly.linear @ offsets)
+        radians = np.radians(np.hypot(*arcsec) / 3600.0)
+        pixel = np.sqrt(abs(np.linalg.det(poly.linear))) * ARCSEC[calibration.unit]
+        departure = np.degrees(radians - np.arctan(radians)).max() * 3600.0 / pixel
+        worst = max(worst, float(departure))
+    if worst <= MAX_DEPARTURE:
+        return ()
+    return (
+        "the axes are linear: where u, v lie on the sky is not stated, and whether they are a "
+        f"tangent plane is worth {worst:.2g} px in so wide a field. If they are one, set "
+        "products.sip.crval or axes = 'sky'",
+    )
 
 
 def _warnings(sip: SipHeader, calibration: Calibration) -> tuple[str, ...]:
@@ -151,6 +192,6 @@ FORMAT = Format(
     _build,
     sip_read_back,
     highest_order=SIP_ORDERS[1],
-    needs_scale=lambda settings: settings.axes == "sky",
+    needs_scale=lambda settings: settings.axes != "linear",
     asks=("size",),
 )

@@ -25,7 +25,7 @@ Terms = Mapping[tuple[int, int], float]
 SIDE_FILE = "BDPARAM"  # keyword with the name of the file that has the covariance
 # Programs ignore lower orders, and a keyword has room for one digit.
 SIP_ORDERS = (2, 9)
-LINEAR_AXES = ("U", "V")  # CTYPE of a frame of pixels, which no program takes for a sky
+LINEAR_AXES = ("U", "V")  # CTYPE of a plane of the user, which no program takes for a sky
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,8 +99,13 @@ class SipHeader:
 
     @property
     def linear_axes(self) -> bool:
-        """True for positions in a frame of pixels: `cd` is in these, and CRVAL is their (u, v)."""
+        """True for (u, v) on no sky: `cd` is in `axes_unit` per pixel, and CRVAL is a (u, v)."""
         return self.ctype == LINEAR_AXES
+
+    @property
+    def axes_unit(self) -> str:
+        """Unit of (u, v) of a header with linear axes: that of BDUNIT, or the pixel."""
+        return self.unit or "pix"
 
     @property
     def has_sigmas(self) -> bool:

@@ -85,7 +85,7 @@ def _frame(sip: SipHeader) -> Iterator[Finding]:
         yield Finding("error", "CD", "the matrix is singular: no pixel has a position on the sky")
     elif sip.linear_axes:
         yield Finding(
-            "note", "CTYPE", "positions are u, v in a frame of pixels, and not the sky; astropy "
+            "note", "CTYPE", "positions are u, v on a plane of their own, and not the sky; astropy "
             "applies A and B, and remarks that CTYPE does not end in -SIP",
         )  # fmt: skip
         return

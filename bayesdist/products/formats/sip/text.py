@@ -14,7 +14,8 @@ from bayesdist.products.formats.sip.header import SIP_ORDERS, SipHeader, worst_c
 def sip_lines(sip: SipHeader, name: str) -> list[str]:
     """Lines of text on a header, but for its coefficients."""
     size = "unknown" if sip.size is None else f"{sip.size[0]} x {sip.size[1]} px"
-    scale, unit, place = np.sqrt(abs(np.linalg.det(sip.cd))), "px", "px"
+    scale = np.sqrt(abs(np.linalg.det(sip.cd)))
+    unit = place = {"pix": "px"}.get(sip.axes_unit, sip.axes_unit)
     if not sip.linear_axes:
         scale, unit, place = 3600 * scale, "arcsec", "deg"
     lines = [

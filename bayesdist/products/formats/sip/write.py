@@ -122,7 +122,7 @@ def _keywords(sip: SipHeader) -> dict[str, tuple[float | int | str, str]]:
     out: dict[str, tuple[float | int | str, str]] = {}
     unit, axes = "deg", "tangent plane with SIP"
     if sip.linear_axes:
-        unit, axes = "pix", "frame of pixels, with SIP"
+        unit, axes = sip.axes_unit, "plane of u and v, with SIP"
     for axis in (1, 2):
         out[f"CTYPE{axis}"] = sip.ctype[axis - 1], axes
     for axis in (1, 2):
