@@ -136,7 +136,7 @@ def test_a_plan_says_what_more_exposures_do_not_make_smaller(run):
     cli("requirements", run, "--requirements", req, "-q")
     text = good("plan", run, "--epochs", "2009,2013,2020").out
     # a bend of the drift is no smaller for more exposures of one date
-    still = "4096 exposures would still miss the limit"
+    still = "with 4096 more exposures the probability of meeting the limit is 0"
     assert f"at 2020.00: {still}" in text and f"at 2013.00: {still}" in text
     assert "what more data do not make smaller is too large" in text
     assert "evenly from 2012.00 to 2025.00" in text

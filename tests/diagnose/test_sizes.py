@@ -24,9 +24,10 @@ from .test_results import outcome
 pytestmark = pytest.mark.usefixtures("one_thread")
 
 NULL = dict(scenes_of_null())
-# by construction: those that look at several radii, lengths, columns or centres; one that asks two tests to
-# agree (edges alone, and edges beside the orders); one that counts overlapping patches as if they
-# were apart; and one whose statistic is positive for all noise that is a mixture of Gaussians
+# by construction: those that look at several radii, lengths, columns or centres; one that asks two
+# tests to agree (edges alone, and edges beside the orders); one that counts overlapping patches as
+# if they were apart; and one whose statistic is positive for all noise that is a mixture of
+# Gaussians
 CONSERVATIVE = {"truncation", "edges", "fields of exposures", "jumps"}
 CONSERVATIVE |= {"skewness of a patch", "two cores", "rings"}
 

@@ -21,6 +21,7 @@ class Schedule:
     name: str
     # (d, d), of one exposure about polynomials and drift, on average over the dates of the schedule
     information: Float
+    single_date: bool = False  # True if all further exposures have one date
 
 
 @dataclass(frozen=True)

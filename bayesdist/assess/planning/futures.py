@@ -9,7 +9,8 @@ and further ones would have, and the requirement is judged by it:
   data, the draws are m + rho / (1 + rho) (t - m) + sqrt(rho) / (1 + rho) (e - m) + (z - m) /
   sqrt(1 + rho), where the truth t and the noise e are themselves draws.  This is the posterior of a
   linear Gaussian model, and it keeps the law of total variance for any other.  Where nothing is
-  seen, the prior of the size is nearly flat in its logarithm, and all sizes shrink alike.
+  seen, the prior of the size is nearly flat in its logarithm, and all sizes shrink alike.  Several
+  exposures of one date do not show how a drift bends, and leave its curvature as it is.
 - scatter of exposures: its draws are weighted by the likelihood of deviations that are drawn with
   the scatter of the truth.  Their effect on the mean of the exposures falls as its root; the
   deviation of a single exposure does not.
@@ -89,6 +90,7 @@ class Scattering:
     whole: ErrorDraws | None
     # (DRAWS, d), variances of the deviations of an exposure: mean squares of displacements
     variances: Float
+    bends: bool = False  # True if the term has the curvature of the drift, too
 
     def chosen(self, n: int, data: Data, truth: int, rng: np.random.Generator) -> Int:
         """Draws (DRAWS,) that n more exposures make probable if one of them is the truth.
@@ -142,18 +144,21 @@ class Futures:
     pixel_scale: float | None
     seed: int
 
-    def probability(self, information: Float) -> Callable[[int], float]:
+    def probability(
+        self, information: Float, *, single_date: bool = False
+    ) -> Callable[[int], float]:
         """Probability that the requirement is met with n more exposures, as a function of n.
 
-        `information` (d, d) is that of one exposure.  Truths are the same for any n, and one that
-        leads to a requirement that is met is not looked at again with more exposures, nor one that
-        leads to a missed requirement with fewer.
+        `information` (d, d) is that of one exposure. `single_date` is True if all further exposures
+        have one date, and False if they follow the drift as those at hand do.  Truths are the same
+        for any n, and one that leads to a requirement that is met is not looked at again with more
+        exposures, nor one that leads to a missed requirement with fewer.
         """
         met_with, missed_with = np.full(TRUTHS, np.inf), np.zeros(TRUTHS)
 
         def of(n: int) -> float:
             open_ones = np.flatnonzero((missed_with < n) & (n < met_with))
-            met = self.met(information, n, open_ones)
+            met = self.met(information, n, open_ones, single_date=single_date)
             met_with[open_ones[met]] = n
             missed_with[open_ones[~met]] = n
             return float(np.mean(met_with <= n))
@@ -161,7 +166,7 @@ class Futures:
         return of
 
     @one_thread
-    def met(self, information: Float, n: int, truths: Int) -> Bool:
+    def met(self, information: Float, n: int, truths: Int, *, single_date: bool = False) -> Bool:
         """Boolean mask (t,) of the truths that lead to a requirement met with n more exposures.
 
         `information` (d, d) is that of one exposure, `truths` (t,) are numbers below `TRUTHS`.
@@ -170,12 +175,18 @@ class Futures:
         solution = replace(solution, without=None, catalogue=())
         drawn = solution.draw(DRAWS, np.random.default_rng([self.seed, 1]))
         coefficients = [self._evaluated(drawn, place.positions) for place in self._places]
-        rho = n / self.data.n_exposures
-        reached = [self._probability(coefficients, rho, n, int(k)) for k in truths]
+        reached = [
+            self._probability(coefficients, n, int(k), single_date=single_date) for k in truths
+        ]
         return np.array(reached) >= self.requirement.probability
 
-    def _probability(self, coefficients: Sequence[Float], rho: float, n: int, truth: int) -> float:
+    def _probability(
+        self, coefficients: Sequence[Float], n: int, truth: int, *, single_date: bool
+    ) -> float:
         """Probability of meeting the limit that a run would state for a truth."""
+        rho = n / self.data.n_exposures
+        of_bends = 0.0 if single_date else rho
+        rhos = [of_bends if bends else rho for bends in self._bends]
         rng = np.random.default_rng([self.seed, 2, truth])
         true, noise = rng.integers(DRAWS, size=2)
         # the scatter of the stars is known as well as they are many
@@ -185,10 +196,13 @@ class Futures:
         values = []
         for place, of_solution in zip(self._places, coefficients, strict=True):
             error = width * of_solution
-            for z in place.resolved:
-                error += with_more_data(z, rho, true, noise)
-            for (in_mean, own), rows in zip(place.scattering, chosen, strict=True):
-                error += in_mean[rows] / np.sqrt(1 + rho) + own[rows]
+            for z, more in zip(place.resolved, rhos, strict=True):
+                error += with_more_data(z, more, true, noise)
+            for one, (in_mean, own), rows in zip(
+                self._scattering, place.scattering, chosen, strict=True
+            ):
+                more = of_bends if one.bends else rho
+                error += in_mean[rows] / np.sqrt(1 + more) + own[rows]
             values.append([place.values(error + r) / place.limit for r in place.unchanged])
         worst = np.max(values, axis=0)  # (ways, DRAWS), over the epochs
         return float(np.mean(worst <= 1.0, axis=1).min())
@@ -205,8 +219,13 @@ class Futures:
         return [
             draws
             for term, draws in zip(self._drawn.terms, self._drawn.draws, strict=True)
-            if isinstance(term, CHANGING) and not _scatters(term)
+            if _is_resolved(term)
         ]
+
+    @cached_property
+    def _bends(self) -> list[bool]:
+        """True for each of the resolved terms that is the curvature of the drift."""
+        return [isinstance(t, Deviations) for t in self._drawn.terms if _is_resolved(t)]
 
     @cached_property
     def _scattering(self) -> list[Scattering]:
@@ -298,6 +317,11 @@ def _some(domain: EvaluationDomain, seed: int) -> tuple[EvaluationDomain, Int | 
     return chosen, pairs
 
 
+def _is_resolved(term: ErrorTerm) -> bool:
+    """True for a term that data determine as they do coefficients: structure and curvature."""
+    return isinstance(term, CHANGING) and not _scatters(term)
+
+
 def _scatters(term: ErrorTerm) -> bool:
     """True for a term whose size is that of a scatter of exposures."""
     if isinstance(term, Deviations):
@@ -321,7 +345,10 @@ def _scattering(term: ErrorTerm, rng: np.random.Generator) -> Scattering:
             for kind, name in ((kind, SCATTERS[kind]) for kind in linear.kinds)
             for _ in LINEAR.get(kind, "uv")
         ]
-        return Scattering(in_mean, whole, np.stack(variances, axis=1)[rows])
+        # what the mean of the exposures leaves of their scatter is not told from a bend here
+        return Scattering(
+            in_mean, whole, np.stack(variances, axis=1)[rows], bool(np.isfinite(linear.epoch))
+        )
     if isinstance(term, FieldsOfExposures):
         fields = required(term.discrepancy.fields, "no fields of exposures were estimated")
         rows = np.arange(DRAWS) % len(fields.theta)

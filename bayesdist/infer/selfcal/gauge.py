@@ -35,7 +35,7 @@ WEAK_PIX = 0.1  # error at the detector's edge above which a direction counts as
 FAR = 3.0  # times the final error: information no better than this does not fix a direction
 EXPLAINED = 1e-2  # fraction of a free direction that its names may leave out
 SAME_ROLL = np.radians(0.1)
-TIE = 0.02  # relative preference for each earlier one of nearly equal parameters
+TIE = 0.02  # relative preference for the first of nearly equal parameters over the last
 MIN_PIVOT = 0.02
 # beginnings of the sentences on what is free whatever the data are
 SETTLED = (
@@ -321,7 +321,7 @@ def _pivots(model: DistortionModel, null: Float) -> Int:
         if left.shape[1] == 0:
             break
         # u and v have equal shares in a rotation: the first is taken, and rounding does not choose
-        tilt = 1.0 - TIE * np.arange(len(rows))
+        tilt = 1.0 - TIE * np.arange(len(rows)) / len(rows)
         _, R, order = qr(left[rows].T * tilt, pivoting=True, mode="economic")
         size = np.abs(np.diag(R))
         take = rows[order[: int((size > MIN_PIVOT).sum())]]

@@ -208,7 +208,7 @@ def test_parallaxes_need_a_place_on_the_sky(tmp_path):
 def _on_the_sky(places: np.ndarray) -> Table:
     """Pixels along east and north of the field's centre as a catalogue."""
     plane = WCS(naxis=2)
-    plane.wcs.ctype, plane.wcs.crval, plane.wcs.crpix = ["RA---TAN", "DEC--TAN"], [RA, DEC], [0, 0]
+    plane.wcs.ctype, plane.wcs.crval, plane.wcs.crpix = ["RA---TAN", "DEC--TAN"], [RA, DEC], [1, 1]
     ra, dec = plane.wcs_pix2world(places * SCALE_MAS / 3.6e6, 0).T
     error = np.full(len(ra), 0.5)
     columns = {"ra": ra, "dec": dec, "ra_error": error, "dec_error": error}

@@ -112,7 +112,10 @@ def needs_of(
             information = solved.mode.distortion_information / _n_exposures(results)
             schedules = [Schedule("dithered like these", information)]
         futures = future(requirement)
-        probability = {one.name: futures.probability(one.information) for one in schedules}
+        probability = {
+            one.name: futures.probability(one.information, single_date=one.single_date)
+            for one in schedules
+        }
 
         def met(
             one: Schedule, n: int, by_name: dict[str, Callable[[int], float]] = probability
@@ -155,7 +158,10 @@ def _schedules(
         return [Schedule("at any date", worth(None))]
     wanted = requirement.epoch or (requirement.epochs or [epoch])[-1]
     last = float(np.max(results.diagnostics.sample.table.column("epoch")))
-    found = [Schedule(f"at {date:.2f}", worth(date)) for date in dict.fromkeys([*epochs, wanted])]
+    found = [
+        Schedule(f"at {date:.2f}", worth(date), single_date=True)
+        for date in dict.fromkeys([*epochs, wanted])
+    ]
     if wanted > last:
         spread = [worth(float(date)) for date in np.linspace(last, wanted, LATER + 1)[1:]]
         name = f"evenly from {last:.2f} to {wanted:.2f}"
