@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gc
+import logging
 import os
 from collections.abc import Iterator
 from pathlib import Path
@@ -39,6 +40,12 @@ def rng() -> np.random.Generator:
 def full() -> bool:
     """Whether the statistical suites run at full size (BAYESDIST_FULL=1) or reduced."""
     return FULL
+
+
+@pytest.fixture(autouse=True)
+def captured_log() -> None:
+    """The package's log reaches `caplog`, also after a command line that an earlier test ran."""
+    logging.getLogger("bayesdist").propagate = True
 
 
 @pytest.fixture(scope="session", autouse=True)
