@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING, overload
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -13,6 +14,9 @@ from bayesdist.infer.equations.scaled import recolouring, scaled_cholesky, scale
 from bayesdist.infer.solution.solution import Solution
 from bayesdist.model import DistortionModel
 from bayesdist.utils.arrays import Float
+
+if TYPE_CHECKING:
+    from bayesdist.infer.posterior import Posterior
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,6 +88,10 @@ def exposure_information(
     return H[:n, :n] - cross @ np.linalg.solve(local * np.outer(scale, scale), cross.T)
 
 
+@overload
+def with_information(solution: Posterior, information: Float) -> Posterior: ...
+@overload
+def with_information(solution: Solution, information: Float) -> Solution: ...
 def with_information(solution: Solution, information: Float) -> Solution:
     """Solution with the additional information (d, d) about polynomials and drift.
 

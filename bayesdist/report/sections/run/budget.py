@@ -174,7 +174,9 @@ def budget_terms(r: ReportInput) -> Plot:
     )
 
 
-@REPORT.figure("budget", needs=("budget",), when=lambda r: np.count_nonzero(r.budget.share) > 1)
+@REPORT.figure(
+    "budget", needs=("budget",), when=lambda r: int(np.count_nonzero(r.budget.share)) > 1
+)
 def budget_dominating(r: ReportInput) -> Plot:
     """Map of the term that contributes most at each position, if it is not the same everywhere."""
     budget = needed(r.budget)
