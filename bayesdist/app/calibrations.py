@@ -14,13 +14,15 @@ from bayesdist.app.results import open_results
 from bayesdist.app.store.rundir import RunDirectory
 from bayesdist.app.store.summary import Summary
 from bayesdist.calibration.calibration import Calibration, calibration_of
-from bayesdist.calibration.plane import Plane
-from bayesdist.errors import InputError
+from bayesdist.calibration.plane import ARCSEC, Plane
+from bayesdist.data.sky.tangent import sky_of_plane
+from bayesdist.errors import InputError, required
 from bayesdist.files.documents import read_json_as
 from bayesdist.infer import LinearFit, load_fit, load_posterior
 from bayesdist.infer.solution.solution import Solution
 from bayesdist.products import registry
 from bayesdist.products.formats.common.document import Choice
+from bayesdist.utils.arrays import Float
 
 __all__ = ["read_calibration"]
 
@@ -213,6 +215,13 @@ def on_the_sky(path: Path, found: Calibration) -> Calibration:
     if point is None or found.plane.kind != "free":
         return found
     return replace(found, plane=Plane("sky", point=(point[0], point[1])))
+
+
+def positions_on_the_sky(found: Calibration, at: Float) -> tuple[Float, Float]:
+    """RA and Dec (N,) in degrees of positions (N, 2) in u and v of a calibration on the sky."""
+    point = required(found.plane.point, "does not lie on the sky")
+    xi, eta = (at * ARCSEC[found.unit]).T
+    return sky_of_plane(xi, eta, point)
 
 
 def run_of(path: Path) -> RunDirectory | None:

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from bayesdist.app.commands.on_runs.plan import needs_of
+from bayesdist.app.commands.on_runs.plan import content_of, needs_of
 
 from . import exposure_kinds, fields, selfcal_kinds
 from .measure import assessed
@@ -68,7 +68,7 @@ class PlannedKind:
         truth = self.truth(seed)
         with TemporaryDirectory() as folder:
             results = assessed(self.asking(truth, self.exposures), Path(folder), seed)
-            [(_, [need])] = needs_of(results)
+            [(_, [need])] = needs_of(results, content_of(results))
         if need.exposures == 0:
             return None
         n = min(need.exposures or MOST, MOST - self.exposures)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from bayesdist.app.commands.on_runs.plan import needs_of
+from bayesdist.app.commands.on_runs.plan import content_of, needs_of
 from tests.reduced import case_in_full, only_in_full
 
 from .measure import assessed
@@ -28,7 +28,7 @@ def test_what_few_exposures_leave_open_more_of_them_decide(name, full, tmp_path)
     results = assessed(kind.asking(truth, kind.exposures), tmp_path / "now", 1)
     [margin] = results.run.summary["margins"]
     assert margin["probability_met"] < ASKED
-    [(_, [need])] = needs_of(results)
+    [(_, [need])] = needs_of(results, content_of(results))
     assert need.exposures is not None and need.exposures <= 2 * MORE
     assert need.by_number[need.exposures] == need.probability >= ASKED
     if full:

@@ -51,8 +51,8 @@ def schedule_of(matches, fit, n_exposures):
 def needed(fit, schedule, probability_met, asked):
     """Need of a schedule whose exposures make the covariance of a fit smaller."""
 
-    def reached(one, n):
-        return probability_met(with_information(fit, n * one.information))
+    def reached(one):
+        return lambda n: probability_met(with_information(fit, n * one.information))
 
     [found] = exposures_needed([schedule], reached, asked, now=probability_met(fit))
     return found
@@ -137,9 +137,9 @@ def test_without_other_errors_the_future_is_that_of_the_covariance():
         fit, [Requirement("r", "p95", 1.0)], grid=(9, 5), rng=np.random.default_rng(1)
     )[0]
     need = Requirement("r", "p95", 0.5 * float(np.quantile(now.draws, asked)), probability=asked)
-    futures, information = futures_of(fit, need), schedule_of(matches, fit, 2).information
-    assert futures.met(information, 3, np.arange(TRUTHS)).mean() < 0.1
-    assert futures.met(information, 12, np.arange(TRUTHS)).mean() > 0.9
+    futures, schedule = futures_of(fit, need), schedule_of(matches, fit, 2)
+    assert futures.met(schedule, 3, np.arange(TRUTHS)).mean() < 0.1
+    assert futures.met(schedule, 12, np.arange(TRUTHS)).mean() > 0.9
 
 
 def test_a_stated_catalogue_is_the_same_in_all_futures():
@@ -147,7 +147,7 @@ def test_a_stated_catalogue_is_the_same_in_all_futures():
     need = Requirement("r", "max", SIGMA * stats.rayleigh.ppf(0.5))
     term = UserTerm("catalogue", "systematic", SIGMA, SIGMA)
     futures = futures_of(fit, need, terms=[term])
-    assert futures.probability(schedule_of(matches, fit, 2).information)(MOST) == 0
+    assert futures.probability(schedule_of(matches, fit, 2))(MOST) == 0
 
 
 def test_the_posterior_of_normal_data_is_found_with_more_of_them():

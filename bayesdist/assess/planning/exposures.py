@@ -76,7 +76,7 @@ class Need:
 
 def exposures_needed(
     schedules: Sequence[Schedule],
-    probability_met: Callable[[Schedule, int], float],
+    probability_of: Callable[[Schedule], Callable[[int], float]],
     asked: float,
     *,
     now: float,
@@ -86,9 +86,9 @@ def exposures_needed(
     Parameters
     ----------
     schedules : sequence of Schedule
-    probability_met : callable
-        Probability that the requirement is met with so many more exposures of a schedule; with the
-        same random numbers each time, so that it rises with the number of exposures.
+    probability_of : callable
+        From a schedule to the probability that the requirement is met with so many more exposures
+        of it; with the same random numbers each time, so that it rises with their number.
     asked : float
         Probability to be reached.
     now : float
@@ -96,17 +96,15 @@ def exposures_needed(
     """
     if now >= asked:
         return tuple(Need(one.name, 0, now) for one in schedules)
-    return tuple(_need(one, probability_met, asked) for one in schedules)
+    return tuple(_need(one.name, probability_of(one), asked) for one in schedules)
 
 
-def _need(
-    schedule: Schedule, probability_met: Callable[[Schedule, int], float], asked: float
-) -> Need:
+def _need(name: str, probability_met: Callable[[int], float], asked: float) -> Need:
     known = dict[int, float]()
 
     def reached(n: int) -> float:
         if n not in known:
-            known[n] = probability_met(schedule, n)
+            known[n] = probability_met(n)
         return known[n]
 
     def fewest(probability: float) -> int | None:
@@ -121,6 +119,4 @@ def _need(
     n = fewest(asked)
     high = min(asked + PROBABILITY_ERROR, (1 + asked) / 2)
     interval = fewest(asked - PROBABILITY_ERROR), None if n is None else fewest(high)
-    return Need(
-        schedule.name, n, reached(MOST if n is None else n), interval, dict(sorted(known.items()))
-    )
+    return Need(name, n, reached(MOST if n is None else n), interval, dict(sorted(known.items())))

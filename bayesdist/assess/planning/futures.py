@@ -29,6 +29,7 @@ from scipy.special import chdtri
 from bayesdist.assess.domain import EvaluationDomain
 from bayesdist.assess.drawn import DrawnErrors
 from bayesdist.assess.model import ErrorModel
+from bayesdist.assess.planning.exposures import Schedule
 from bayesdist.assess.requirements.margins import domains_of
 from bayesdist.assess.requirements.requirement import Requirement
 from bayesdist.assess.statistics import extent, of_sizes, sizes
@@ -144,21 +145,17 @@ class Futures:
     pixel_scale: float | None
     seed: int
 
-    def probability(
-        self, information: Float, *, single_date: bool = False
-    ) -> Callable[[int], float]:
+    def probability(self, schedule: Schedule) -> Callable[[int], float]:
         """Probability that the requirement is met with n more exposures, as a function of n.
 
-        `information` (d, d) is that of one exposure. `single_date` is True if all further exposures
-        have one date, and False if they follow the drift as those at hand do.  Truths are the same
-        for any n, and one that leads to a requirement that is met is not looked at again with more
-        exposures, nor one that leads to a missed requirement with fewer.
+        Truths are the same for any n, and one that leads to a requirement that is met is not looked
+        at again with more exposures, nor one that leads to a missed requirement with fewer.
         """
         met_with, missed_with = np.full(TRUTHS, np.inf), np.zeros(TRUTHS)
 
         def of(n: int) -> float:
             open_ones = np.flatnonzero((missed_with < n) & (n < met_with))
-            met = self.met(information, n, open_ones, single_date=single_date)
+            met = self.met(schedule, n, open_ones)
             met_with[open_ones[met]] = n
             missed_with[open_ones[~met]] = n
             return float(np.mean(met_with <= n))
@@ -166,17 +163,19 @@ class Futures:
         return of
 
     @one_thread
-    def met(self, information: Float, n: int, truths: Int, *, single_date: bool = False) -> Bool:
+    def met(self, schedule: Schedule, n: int, truths: Int) -> Bool:
         """Boolean mask (t,) of the truths that lead to a requirement met with n more exposures.
 
-        `information` (d, d) is that of one exposure, `truths` (t,) are numbers below `TRUTHS`.
+        `truths` (t,) are numbers below `TRUTHS`.
         """
-        solution = replace(self.errors.solution, solution=self.solution(n * information))
+        more = self.solution(n * schedule.information)
+        solution = replace(self.errors.solution, solution=more)
         solution = replace(solution, without=None, catalogue=())
         drawn = solution.draw(DRAWS, np.random.default_rng([self.seed, 1]))
         coefficients = [self._evaluated(drawn, place.positions) for place in self._places]
         reached = [
-            self._probability(coefficients, n, int(k), single_date=single_date) for k in truths
+            self._probability(coefficients, n, int(k), single_date=schedule.single_date)
+            for k in truths
         ]
         return np.array(reached) >= self.requirement.probability
 

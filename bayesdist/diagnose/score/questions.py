@@ -169,17 +169,21 @@ def questions(sample: ScoredSample) -> Iterator[Question]:
     yield from _of_time(sample)
 
 
+def _from_edge(sample: ScoredSample) -> Float:
+    """Distance (2, N) of each detection from the edge of the first column and row, in pixels."""
+    size = np.array([chip.size for chip in sample.model.chips])[sample.chip]
+    return np.stack([sample.X + 1.0, sample.Y + 1.0]) / 2 * size.T
+
+
 def _few_digits(sample: ScoredSample) -> Iterator[Float]:
     """Indicators (N,) of the detections whose columns, or rows, have fewer digits than others.
 
     There is at most one for each axis: none if all have the same number of digits.
     """
-    size = np.array([chip.size for chip in sample.model.chips])[sample.chip]
-    for scaled, pixels in zip((sample.X, sample.Y), size.T, strict=True):
-        position = 0.5 + (scaled + 1.0) / 2 * pixels
+    for distance in _from_edge(sample):
         few = []
         for digits in range(FEWEST_DIGITS + 1):
-            shifted = position * 10.0**digits
+            shifted = (distance + 0.5) * 10.0**digits
             few.append(np.abs(shifted - np.round(shifted)) < WHOLE)
         for fewer, more in pairwise(few):
             share = fewer.mean()
@@ -193,9 +197,8 @@ def _phases(sample: ScoredSample) -> Iterator[Float]:
 
     A wave of one pixel is too short for the test of repeating patterns, and looks like noise.
     """
-    size = np.array([chip.size for chip in sample.model.chips])[sample.chip]
-    for scaled, pixels in zip((sample.X, sample.Y), size.T, strict=True):
-        phase = np.pi * (scaled + 1.0) * pixels  # 2 pi per pixel, 0 at the edge of the first one
+    for distance in _from_edge(sample):
+        phase = 2 * np.pi * distance
         for wave in (np.sin(phase), np.cos(phase)):
             yield wave - wave.mean()
 

@@ -112,9 +112,7 @@ def ring_test(sample: ScoredSample) -> Outcome | None:
 
 def _chips(sample: ScoredSample) -> Iterator[_Chip]:
     """Scores of each chip."""
-    score = np.empty_like(sample.whole_score)
-    for block in sample.blocks:
-        score[:, block.rows] = block.frame.T @ sample.whole_score[:, block.rows]
+    score = sample.on_detector[0].T
     cell = cell_index(sample.X, sample.Y, (BINS, BINS))
     for code, chip in enumerate(sample.model.chips):
         rows = np.flatnonzero(sample.used & (sample.chip == code))

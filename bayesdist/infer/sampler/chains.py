@@ -191,9 +191,7 @@ def run_chains(density: Density, proposal: Proposal, settings: Settings) -> Chai
 
     s, E = settings, len(settings.seeds)
     target = Heartbeat(density, s.n_stars)
-    W = s.walkers or walkers_for(s.n_stars)
-    n = W * (pilot_steps(E, W) + 1)
-    pilot = pilot_batch(target, proposal, s.seeds, n, s.folder, s.fingerprint)
+    pilot = pilot_of(target, proposal, s)
     inside = np.isfinite(pilot.log_prob)
     if inside.sum() < 2:
         raise DegenerateError(
@@ -208,12 +206,12 @@ def run_chains(density: Density, proposal: Proposal, settings: Settings) -> Chai
         return Ensembles(target, proposal, pilot, whitening, plan, s.seeds, s.folder, s.fingerprint)
 
     quality, passes, steps = quality_of(pilot.log_weights), pilot.n_evaluated, 0
-    plan = _plan(target, quality, s)
+    plan = plan_of(target, quality, s)
     if plan.independent:
         chains, quality, passes, steps = _drawn_ahead(target, start(plan), s, passes)
         if chains is not None:
             return chains
-        plan = _plan(target, quality, s)
+        plan = plan_of(target, quality, s)
     if not plan.coupled:
         moved, mixes = _state_dependent(target, start(plan), s, quality, passes, steps)
         if mixes:
@@ -225,7 +223,15 @@ def run_chains(density: Density, proposal: Proposal, settings: Settings) -> Chai
     return _state_dependent(target, start(plan), s, quality, passes, steps)[0]
 
 
-def _plan(target: Density, quality: Quality, s: Settings) -> Plan:
+def pilot_of(target: Density, proposal: Proposal, s: Settings) -> ProposalBatch:
+    """First batch of proposals of a run with these settings; see `pilot_batch`."""
+    walkers = s.walkers or walkers_for(s.n_stars)
+    n = walkers * (pilot_steps(len(s.seeds), walkers) + 1)
+    return pilot_batch(target, proposal, s.seeds, n, s.folder, s.fingerprint)
+
+
+def plan_of(target: Density, quality: Quality, s: Settings) -> Plan:
+    """Moves for a posterior of which the proposal is known to have this quality."""
     q, n_proposals = quality, len(quality.log_weights) + quality.n_outside
     return plan_moves(q.efficiency, q.k, len(target.names), s.n_stars, s.walkers, n_proposals)
 
@@ -240,8 +246,7 @@ def _given_up(chains: Chains) -> Chains:
         f"(importance efficiency {v.importance_efficiency:.2g}, Pareto k {v.pareto_k:.2g}); lower "
         "model.order, or give the coefficients priors"
     )
-    log.warning("sample: %s", reason)
-    return replace(chains, verdict=replace(v, converged=False, reasons=(reason, *v.reasons)))
+    return replace(chains, verdict=_not_converged(v, reason))
 
 
 def _too_slow(verdict: Convergence, steps: int, max_steps: int) -> Convergence:
@@ -254,8 +259,13 @@ def _too_slow(verdict: Convergence, steps: int, max_steps: int) -> Convergence:
         "lower model.order, add stars where there are none, give the coefficients priors, or "
         "raise sampler.max_steps"
     )
+    return _not_converged(v, reason)
+
+
+def _not_converged(verdict: Convergence, reason: str) -> Convergence:
+    """Verdict of sampling that is given up for a reason, which is logged."""
     log.warning("sample: %s", reason)
-    return replace(v, converged=False, reasons=(reason, *v.reasons))
+    return replace(verdict, converged=False, reasons=(reason, *verdict.reasons))
 
 
 def _drawn_ahead(
@@ -284,7 +294,7 @@ def _drawn_ahead(
         # judged at each block for any targets: a resumed run may have others
         quality = quality_of(np.concatenate(weights, axis=1))
         last = span.end == s.max_steps
-        if not _plan(target, quality, s).independent and not last:
+        if not plan_of(target, quality, s).independent and not last:
             return None, quality, passes, span.end
         dropped = min(warmup, history.rows // 2)
         made = total * (history.rows - dropped)

@@ -11,15 +11,8 @@ from bayesdist.infer.density.proposal import Proposal
 from bayesdist.infer.density.target import Density, Target
 from bayesdist.infer.equations.priors import GaussianPriors
 from bayesdist.infer.equations.scaled import one_thread
-from bayesdist.infer.sampler.chains import Settings, ensemble_seeds
-from bayesdist.infer.sampler.move_schedule import (
-    Plan,
-    expected_passes,
-    pilot_steps,
-    plan_moves,
-    walkers_for,
-)
-from bayesdist.infer.sampler.proposal_batch import pilot_batch
+from bayesdist.infer.sampler.chains import Settings, ensemble_seeds, pilot_of, plan_of
+from bayesdist.infer.sampler.move_schedule import Plan, expected_passes
 from bayesdist.infer.solution.linear import LinearFit
 from bayesdist.infer.stars.mixture import OutlierMixture
 from bayesdist.infer.stars.shards import Shards
@@ -49,16 +42,12 @@ def predict(target: Density, proposal: Proposal, settings: Settings) -> Predicti
     start depends on the shape of the posterior.
     """
     s, ensembles = settings, len(settings.seeds)
-    walkers = s.walkers or walkers_for(s.n_stars)
-    n = walkers * (pilot_steps(ensembles, walkers) + 1)
-    pilot = pilot_batch(target, proposal, s.seeds, n)
-    quality = quality_of(pilot.log_weights)
-    n_params, n_proposals = len(target.names), pilot.log_weights.size
-    plan = plan_moves(quality.efficiency, quality.k, n_params, s.n_stars, s.walkers, n_proposals)
+    quality = quality_of(pilot_of(target, proposal, s).log_weights)
+    plan = plan_of(target, quality, s)
     sure = quality.efficiency > SURE_EFFICIENCY and quality.k < PARETO_K.value - K_MARGIN
     passes = None
     if plan.independent and sure:
-        passes = expected_passes(n_params, s.n_stars, s.limits, ensembles)
+        passes = expected_passes(len(target.names), s.n_stars, s.limits, ensembles)
     most = ensembles * plan.walkers * s.max_steps
     return Prediction(plan, quality, passes, most)
 

@@ -37,14 +37,6 @@ EXPLAINED = 1e-2  # fraction of a free direction that its names may leave out
 SAME_ROLL = np.radians(0.1)
 TIE = 0.02  # relative preference for the first of nearly equal parameters over the last
 MIN_PIVOT = 0.02
-# beginnings of the sentences on what is free whatever the data are
-SETTLED = (
-    "scale: not determined",
-    "rotation on the sky: free",
-    "zero point on the sky: free",
-    "the zero point on the sky is free",
-    "motions are relative",
-)
 HIDDEN = 1e-5  # of a property that lies along undetermined directions: it is free
 
 
@@ -121,59 +113,70 @@ class Gauge:
         return tuple(one.name for one in self.directions if one.free)
 
     @property
+    def sentences(self) -> tuple[str, ...]:
+        """Sentences on each undetermined property, its reason and its constraint."""
+        return tuple(text for text, _ in self._remarks)
+
+    @property
     def settled(self) -> tuple[str, ...]:
         """Those of `sentences` on what no detection can determine and the gauge fixes.
 
         Scale, rotation and zero point on the sky are free without a catalogue, and common motions
         with them: the gauge is a choice, and nothing is wrong with the data.
         """
-        return tuple(text for text in self.sentences if text.startswith(SETTLED))
+        return tuple(text for text, is_settled in self._remarks if is_settled)
 
     @property
-    def sentences(self) -> tuple[str, ...]:
-        """Sentences on each undetermined property, its reason and its constraint."""
-        out, free = list[str](), set(self.free_names)
+    def _remarks(self) -> list[tuple[str, bool]]:
+        """Each of `sentences`, and True if it is `settled`."""
+        out, free = list[tuple[str, bool]](), set(self.free_names)
         # the degeneracy with a skew of the sky is reported at once
         skew = {"skew_plus", "skew_cross"}
         named = set(POINTS) | (skew if skew & set(self.whole) else set())
         if skew <= named and skew <= free and self.spread < SAME_ROLL:
-            out.append(
+            text = (
                 f"one roll angle (they differ by {np.degrees(self.spread):.2g} deg at most, half "
                 "turns apart): a linear skew of the distortion cannot be told from one of the sky"
             )
+            out.append((text, False))
         elif skew <= named:
-            out.append("a linear skew of the distortion cannot be told from one of the sky")
+            text = "a linear skew of the distortion cannot be told from one of the sky"
+            out.append((text, False))
         for one in self.directions:
             if one.free and one.name == "scale":
-                out.append(f"scale: not determined by the detections; {_fixed(one)}")
+                out.append((f"scale: not determined by the detections; {_fixed(one)}", True))
             elif one.free and one.name == "rotation":
-                out.append(f"rotation on the sky: free; {_fixed(one)}")
+                out.append((f"rotation on the sky: free; {_fixed(one)}", True))
             elif one.free and one.name not in named:
-                out.append(f"{one.name}: not determined by the detections; {_fixed(one)}")
+                out.append((f"{one.name}: not determined by the detections; {_fixed(one)}", False))
             elif one.weak and not one.free:
-                out.append(
+                text = (
                     f"{one.name}: nearly free, {one.sigma:.2g} {one.unit} from the detections alone"
                     f" ({one.sigma * one.edge_pix:.2g} pix at the edge); {_fixed(one)}"
                 )
+                out.append((text, False))
         if set(POINTS) <= free:
             points = [one for one in self.directions if one.name in POINTS]
             worst = max(points, key=lambda one: one.sigma_fixed)
-            out.append(
+            text = (
                 f"zero point on the sky: free; {_fixed(worst)}"
                 if np.isfinite(worst.sigma_fixed)
                 else "the zero point on the sky is free: only relative positions are known"
             )
+            out.append((text, True))
         if self.rates:
-            out.append(
+            text = (
                 f"motions are relative: {', '.join(self.rates)} of the whole sky cannot be told "
                 "from what the exposures did"
             )
+            out.append((text, True))
         if self.unnamed:
-            out.append(
+            text = (
                 "also free: combinations in which " + ", ".join(self.unnamed) + " stand out; "
                 "dither more, or give priors"
             )
-        return tuple(out)
+            out.append((text, False))
+        return out
 
 
 def _fixed(one: NamedDirection) -> str:

@@ -9,14 +9,18 @@ from typing import Any
 
 import numpy as np
 
-from bayesdist.app.calibrations import calibration_at, on_the_sky, refuse_unused_date
+from bayesdist.app.calibrations import (
+    calibration_at,
+    on_the_sky,
+    positions_on_the_sky,
+    refuse_unused_date,
+)
 from bayesdist.app.screen import number as digits
 from bayesdist.app.store.output import refuse_existing
 from bayesdist.calibration.calibration import Calibration
 from bayesdist.calibration.inverse import detector_grid
 from bayesdist.calibration.plane import ARCSEC
-from bayesdist.data.sky.tangent import sky_of_plane
-from bayesdist.errors import InputError, required
+from bayesdist.errors import InputError
 from bayesdist.files.atomic import made_folder
 from bayesdist.files.documents import toml_of
 from bayesdist.products.formats.common.document import (
@@ -221,7 +225,9 @@ def _difference(
         drifts = epoch if one.model.time is not None else None
         b = one.forward(x, y, chip=its, epoch=drifts)
         if sky:
-            a, b = (_on_sky(c, p) for c, p in ((source, a), (one, b)))
+            a, b = (
+                np.stack(positions_on_the_sky(c, p), axis=-1) for c, p in ((source, a), (one, b))
+            )
         here.append(a)
         there.append(b)
         pixels.append(float(np.sqrt(abs(np.linalg.det(source.chip(number, epoch).linear)))))
@@ -257,12 +263,6 @@ def _pairs(source: Calibration, back: Sequence[Calibration]) -> list[tuple[int, 
         return [(n, one, one.numbers[0]) for n, one in zip(source.numbers, back, strict=True)]
     [one] = back
     return [(n, one, n if n in one.numbers else one.numbers[0]) for n in source.numbers]
-
-
-def _on_sky(one: Calibration, at: Float) -> Float:
-    point = required(one.plane.point, "does not lie on the sky")
-    xi, eta = (at * ARCSEC[one.unit]).T
-    return np.stack(sky_of_plane(xi, eta, point), axis=-1)
 
 
 def _after_similarity(a: Float, b: Float) -> Float:

@@ -14,6 +14,7 @@ from bayesdist.app.calibrations import (
     asks_of,
     calibration_at,
     on_the_sky,
+    positions_on_the_sky,
     refuse_unused_date,
     run_of,
 )
@@ -41,8 +42,8 @@ from bayesdist.assess.comparison.sentences import (
 from bayesdist.calibration.calibration import Calibration
 from bayesdist.calibration.inverse import detector_grid
 from bayesdist.calibration.plane import ARCSEC
-from bayesdist.data.sky.tangent import separation, sky_of_plane
-from bayesdist.errors import InputError, required
+from bayesdist.data.sky.tangent import separation
+from bayesdist.errors import InputError
 from bayesdist.model.grid import DEFAULT_GRID
 from bayesdist.products.formats.common.document import MissingSizeError
 from bayesdist.report.drawing import save_figures
@@ -209,9 +210,8 @@ def _sky_difference(
     places = []
     for one, number in zip(both, pair, strict=True):
         date = epoch if one.model.time is not None else None
-        at = one.forward(x, y, chip=number, epoch=date) * ARCSEC[one.unit]
-        point = required(one.plane.point, "does not lie on the sky")
-        places.append(sky_of_plane(at[:, 0], at[:, 1], point))
+        at = one.forward(x, y, chip=number, epoch=date)
+        places.append(positions_on_the_sky(one, at))
     far = 3600.0 * separation(places[0], *places[1])
     linear = both[0].chip(pair[0], epoch if both[0].model.time is not None else None).linear
     pixel = ARCSEC[both[0].unit] * float(np.sqrt(abs(np.linalg.det(linear))))
@@ -226,21 +226,21 @@ def _read(
 ) -> tuple[Calibration, Calibration]:
     """Both calibrations; a header that does not say its size has the given, or the other's."""
     asked = [asks_of(path) for path in paths]
+    chosen: list[str | None] = list(filters)
+    sizes: list[tuple[float, float] | None] = [size, size]
     for k, other in ((0, 1), (1, 0)):  # what one of them uses is no mistake of the other
         if "filter" not in asked[k] and "filter" in asked[other]:
-            filters = (None, filters[1]) if k == 0 else (filters[0], None)
-    sizes: list[tuple[float, float] | None] = [size, size]
-    for k, other in ((0, 1), (1, 0)):
+            chosen[k] = None
         if "size" not in asked[k] and "size" in asked[other]:
             sizes[k] = None
     for k, other in ((0, 1), (1, 0)):
         try:
-            calibration_at(paths[k], filter=filters[k], size=sizes[k])
+            calibration_at(paths[k], filter=chosen[k], size=sizes[k])
         except MissingSizeError:
-            sizes[k] = calibration_at(paths[other], filter=filters[other]).model.chips[0].size
+            sizes[k] = calibration_at(paths[other], filter=chosen[other]).model.chips[0].size
     a, b = (
         calibration_at(path, filter=one, size=its)
-        for path, one, its in zip(paths, filters, sizes, strict=True)
+        for path, one, its in zip(paths, chosen, sizes, strict=True)
     )
     return a, b
 

@@ -43,7 +43,7 @@ def plan(run: str | Path, *, name: str | None = None, epochs: Sequence[float] = 
         )
     with open_results(RunDirectory.open(run)) as results:
         results.run.require("plan", ("fit", "sample", "diagnose", "evaluate"))
-        content, solved = _content(results), results.fitted.solved
+        solved = results.fitted.solved
         if solved is not None and epochs:
             raise InputError(
                 "is a run of a self-calibration, whose exposures count as those at hand with their "
@@ -57,7 +57,8 @@ def plan(run: str | Path, *, name: str | None = None, epochs: Sequence[float] = 
                 where=str(run),
                 do="leave --epochs out",
             )
-        needs = needs_of(results, name=name, epochs=epochs)
+        content = content_of(results)
+        needs = needs_of(results, content, name=name, epochs=epochs)
     if solved is None:
         lines = [f"An exposure is taken to hold {content.n_stars:.0f} matched stars as these do."]
     else:
@@ -74,7 +75,11 @@ def plan(run: str | Path, *, name: str | None = None, epochs: Sequence[float] = 
 
 
 def needs_of(
-    results: Results, *, name: str | None = None, epochs: Sequence[float] = ()
+    results: Results,
+    content: ExposureContent,
+    *,
+    name: str | None = None,
+    epochs: Sequence[float] = (),
 ) -> list[tuple[Requirement, tuple[Need, ...]]]:
     """How many exposures of each schedule each requirement of a run takes.
 
@@ -82,6 +87,8 @@ def needs_of(
     ----------
     results : Results
         Of a run that was evaluated.
+    content : ExposureContent
+        The average exposure of the run, as of `content_of`.
     name : str, optional
         Of one requirement; all by default.
     epochs : sequence of float
@@ -102,8 +109,7 @@ def needs_of(
             do=f"name one of {known}" if known else "judge some with 'bayesdist requirements'",
         )
     now = {row["name"]: row["probability_met"] for row in results.run.summary["margins"]}
-    content, solved = _content(results), results.fitted.solved
-    future, out = _futures(results, content), []
+    solved, future, out = results.fitted.solved, _futures(results, content), []
     for requirement in chosen:
         if solved is None:
             schedules = _schedules(results, requirement, content, epochs)
@@ -111,24 +117,17 @@ def needs_of(
             # an exposure by itself says nothing: as many as these say as much
             information = solved.mode.distortion_information / _n_exposures(results)
             schedules = [Schedule("dithered like these", information)]
-        futures = future(requirement)
-        probability = {
-            one.name: futures.probability(one.information, single_date=one.single_date)
-            for one in schedules
-        }
-
-        def met(
-            one: Schedule, n: int, by_name: dict[str, Callable[[int], float]] = probability
-        ) -> float:
-            return by_name[one.name](n)
-
-        asked = requirement.probability
-        needs = exposures_needed(schedules, met, asked, now=now[requirement.name])
+        needs = exposures_needed(
+            schedules,
+            future(requirement).probability,
+            requirement.probability,
+            now=now[requirement.name],
+        )
         out.append((requirement, needs))
     return out
 
 
-def _content(results: Results) -> ExposureContent:
+def content_of(results: Results) -> ExposureContent:
     """The average exposure of the run."""
     stars = results.diagnostics.sample
     jitter = float(np.mean(results.posterior.hyper.get("j", [0.0])))

@@ -75,8 +75,10 @@ def _table(
     """Table of some terms of a budget; `names`: of those that are shown, all if it is empty."""
     unit, mas = budget.unit, r.scale_mas
     chips = {str(c.chip.number): c.chip.name for c in r.chips} | {"all": "all"}
-    rows = shown.rows_by_chip() if r.several else shown.rows()
-    rows = [row for row in rows if not names or row["name"] in names]
+    together = [row for row in shown.rows() if not names or row["name"] in names]
+    rows = together
+    if r.several:
+        rows = [row for row in shown.rows_by_chip() if not names or row["name"] in names]
     typical = row_per_axis(budget.rows()[-1])
     scale = length_scale(unit, typical)
     out = [
@@ -100,9 +102,7 @@ def _table(
         heads,
         tuple(out),
         words=tuple(range(len(heads) - 6)),
-        leading=len(
-            [row for row in shown.rows() if not names or row["name"] in names]
-        ),  # rows of all chips together
+        leading=len(together),  # rows of all chips together
         stacked=(heads.index(lengths[2]),),
         note="Per axis: rms of u and v; CE68, CE95: circles that hold 68 and 95 % of errors of that"
         " size, if Gaussian. The parts of the model are correlated and enter the total jointly, by"
