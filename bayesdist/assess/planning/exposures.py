@@ -9,8 +9,8 @@ from dataclasses import dataclass, field
 from bayesdist.utils.arrays import Float
 
 MOST = 4096  # exposures beyond which more are no plan
-# The probability is right to so much, as simulated exposures show (docs/validation.md): the range
-# of the answer is that of the numbers whose probability differs by no more.
+# The range of the answer is that of the numbers whose probability differs by no more. Simulated
+# exposures show larger differences, on the side of caution (docs/validation.md).
 PROBABILITY_ERROR = 0.10
 
 
