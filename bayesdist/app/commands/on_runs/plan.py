@@ -109,16 +109,10 @@ def needs_of(
             do=f"name one of {known}" if known else "judge some with 'bayesdist requirements'",
         )
     now = {row["name"]: row["probability_met"] for row in results.run.summary["margins"]}
-    solved, future, out = results.fitted.solved, _futures(results, content), []
+    future, out = futures_of(results, content), []
     for requirement in chosen:
-        if solved is None:
-            schedules = _schedules(results, requirement, content, epochs)
-        else:
-            # an exposure by itself says nothing: as many as these say as much
-            information = solved.mode.distortion_information / _n_exposures(results)
-            schedules = [Schedule("dithered like these", information)]
         needs = exposures_needed(
-            schedules,
+            schedules_of(results, requirement, content, epochs),
             future(requirement).probability,
             requirement.probability,
             now=now[requirement.name],
@@ -144,11 +138,18 @@ def content_of(results: Results) -> ExposureContent:
     )
 
 
-def _schedules(
-    results: Results, requirement: Requirement, content: ExposureContent, epochs: Sequence[float]
+def schedules_of(
+    results: Results,
+    requirement: Requirement,
+    content: ExposureContent,
+    epochs: Sequence[float] = (),
 ) -> list[Schedule]:
     """Single exposures at dates that matter to a requirement, or at any."""
-    solution, epoch = results.solution, results.epoch
+    solution, epoch, solved = results.solution, results.epoch, results.fitted.solved
+    if solved is not None:
+        # an exposure by itself says nothing: as many as these say as much
+        information = solved.mode.distortion_information / _n_exposures(results)
+        return [Schedule("dithered like these", information)]
 
     def worth(date: float | None) -> Float:
         return exposure_information(solution, content, date)
@@ -168,7 +169,7 @@ def _schedules(
     return found
 
 
-def _futures(results: Results, content: ExposureContent) -> Callable[[Requirement], Futures]:
+def futures_of(results: Results, content: ExposureContent) -> Callable[[Requirement], Futures]:
     """Runs with more exposures, for any requirement."""
     settings, errors = results.settings, results.errors
     errors = with_measured_centroids(errors, results.diagnostics, settings)
