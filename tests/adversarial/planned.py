@@ -130,11 +130,18 @@ def single(rng: np.random.Generator, n: int) -> Truth:
 
 
 def self_calibrated(rng: np.random.Generator, n: int) -> Truth:
-    """Detections of the same stars in exposures that are dithered and rolled, and breathe."""
+    """Detections of the same stars in exposures that are dithered and rolled, and breathe.
+
+    They are in random order: the later ones are dithered as the first ones are.
+    """
     true_map = mapped(selfcal_kinds.small_distortion(rng), structure(rng, 1e-4, 2e-3))
     scatter = scattering(log_uniform(rng, 3e-7, 1e-5))
     n_detections = selfcal_kinds.IN_EXPOSURE * n
-    return selfcal_kinds.dithered(rng, n_detections, true_map, deviations=scatter)
+    truth = selfcal_kinds.dithered(rng, n_detections, true_map, deviations=scatter)
+    names = rng.permutation(list(truth.frames)).tolist()
+    rows = np.concatenate([np.flatnonzero(truth.stars["exposure"] == name) for name in names])
+    stars = {name: column[rows] for name, column in truth.stars.items()}
+    return replace(truth, stars=stars, frames={name: truth.frames[name] for name in names})
 
 
 KINDS = {

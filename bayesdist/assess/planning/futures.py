@@ -4,7 +4,8 @@ What more data would show is not known, but today's posterior says how probable 
 drawn from it; for each of them the error model is predicted that a run with the exposures at hand
 and further ones would have, and the requirement is judged by it:
 
-- coefficients: their information is that of all exposures.
+- coefficients: their information is that of all exposures.  In a self-calibration each star takes
+  up one of its detections: further exposures of the same stars say more than those at hand.
 - structure and curvature of the drift, posterior draws z about a mean m: with rho times today's
   data, the draws are m + rho / (1 + rho) (t - m) + sqrt(rho) / (1 + rho) (e - m) + (z - m) /
   sqrt(1 + rho), where the truth t and the noise e are themselves draws.  This is the posterior of a
@@ -64,11 +65,15 @@ class Data:
         u and v.
     n_stars : float
         Stars in an average exposure.
+    gain : float
+        Information of a further exposure about the distortion, relative to the average one at hand:
+        of the same stars in a self-calibration it is larger, as these take up detections once.
     """
 
     n_exposures: int
     weight: float
     n_stars: float
+    gain: float = 1.0
 
 
 def with_more_data(z: Float, rho: float, truth: int, noise: int) -> Float:
@@ -168,7 +173,7 @@ class Futures:
 
         `truths` (t,) are numbers below `TRUTHS`.
         """
-        more = self.solution(n * schedule.information)
+        more = self.solution(schedule.of(n))
         solution = replace(self.errors.solution, solution=more)
         solution = replace(solution, without=None, catalogue=())
         drawn = solution.draw(DRAWS, np.random.default_rng([self.seed, 1]))
@@ -185,7 +190,7 @@ class Futures:
         """Probability of meeting the limit that a run would state for a truth."""
         rho = n / self.data.n_exposures
         of_bends = 0.0 if single_date else rho
-        rhos = [of_bends if bends else rho for bends in self._bends]
+        rhos = [of_bends if bends else self.data.gain * rho for bends in self._bends]
         rng = np.random.default_rng([self.seed, 2, truth])
         true, noise = rng.integers(DRAWS, size=2)
         # the scatter of the stars is known as well as they are many

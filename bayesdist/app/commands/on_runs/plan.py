@@ -14,6 +14,7 @@ from bayesdist.app.store.rundir import RunDirectory
 from bayesdist.app.tables.margins import judged_requirements
 from bayesdist.assess.evaluation import with_measured_centroids
 from bayesdist.assess.model import with_diagnosed_errors, with_shared_stars
+from bayesdist.assess.planning.dithers import FurtherDithers
 from bayesdist.assess.planning.exposures import Need, Schedule, exposures_needed
 from bayesdist.assess.planning.futures import Data, Futures
 from bayesdist.assess.requirements.requirement import Requirement
@@ -147,9 +148,11 @@ def schedules_of(
     """Single exposures at dates that matter to a requirement, or at any."""
     solution, epoch, solved = results.solution, results.epoch, results.fitted.solved
     if solved is not None:
-        # an exposure by itself says nothing: as many as these say as much
-        information = solved.mode.distortion_information / _n_exposures(results)
-        return [Schedule("dithered like these", information)]
+        # an exposure by itself says nothing: of stars that were seen before it does
+        information = solved.mode.gain * solved.mode.distortion_information / _n_exposures(results)
+        further = FurtherDithers.of(solved.mode, results.config.sampler.seed)
+        together = None if further is None else further.information
+        return [Schedule("dithered like these", information, together=together)]
 
     def worth(date: float | None) -> Float:
         return exposure_information(solution, content, date)
@@ -186,6 +189,8 @@ def futures_of(results: Results, content: ExposureContent) -> Callable[[Requirem
             return more
         return with_shared_stars(more, hierarchy, diagnostics.catalogue)
 
+    solved = results.fitted.solved
+    gain = 1.0 if solved is None else solved.mode.gain
     weight = np.mean([np.sum([m[axis, 0, 0] for m in content.moments.values()]) for axis in (0, 1)])
     seed = int(assessment_rng(results.config).integers(2**63))
 
@@ -193,7 +198,7 @@ def futures_of(results: Results, content: ExposureContent) -> Callable[[Requirem
         return Futures(
             errors,
             requirement,
-            Data(_n_exposures(results), float(weight), content.n_stars),
+            Data(_n_exposures(results), float(weight), content.n_stars, gain),
             solution,
             settings.grid,
             settings.epoch,
