@@ -24,7 +24,7 @@ from bayesdist.infer.selfcal.expected import (
     expected_solution,
 )
 from bayesdist.infer.selfcal.gauge import SAME_ROLL
-from bayesdist.infer.selfcal.mode import SelfCalibrationMode, of_distortion
+from bayesdist.infer.selfcal.mode import SelfCalibrationMode, of_first
 from bayesdist.infer.selfcal.prior import (
     frame_prior,
     pointing_prior,
@@ -344,11 +344,12 @@ def nearly_free(found: PlannedPattern) -> str:
 
 @dataclass(frozen=True, eq=False)
 class FurtherDithers:
-    """Information of further exposures of a self-calibration about its distortion.
+    """Information of further exposures about the parameters of a self-calibration.
 
     It is more than the number of exposures times that of one of those at hand: stars that were seen
     before lie where they lie, others are seen for a second time, and pointings that lie farther
-    apart tell what small offsets leave nearly free.  So it is computed, for further exposures with
+    apart tell what small offsets leave nearly free.  By stars that are better known the frames of
+    the exposures at hand are, too.  So it is computed, for further exposures with
     offsets and rolls as those at hand have, over a field of stars that is as dense.
     """
 
@@ -385,7 +386,7 @@ class FurtherDithers:
         return cls(mode, np.concatenate([offsets, more]), rolls, seed)
 
     def information(self, n: int) -> Float:
-        """Information (d, d) of n further exposures; beyond `MOST_FURTHER` it is linear in n."""
+        """Information (D, D) of n further exposures; beyond `MOST_FURTHER` it is linear in n."""
         number, values = self._known
         above = min(max(int(np.searchsorted(number, n)), 1), len(number) - 1)
         low, high = number[above - 1], number[above]
@@ -400,7 +401,8 @@ class FurtherDithers:
         seen = stars_on_detector(model, theta, sky)
         expected = [self._expected(seen, E + int(n)) for n in number]
         # of as many detections as there are, with their errors
-        scale = np.trace(mode.distortion_information) / np.trace(expected[0])
+        D = mode.problem.model.n_params
+        scale = np.trace(of_first(mode.expansion.curvature, mode.free, D)) / np.trace(expected[0])
         return number, [scale * (one - expected[0]) for one in expected]
 
     @cached_property
@@ -424,14 +426,13 @@ class FurtherDithers:
         return model, theta, low + rng.uniform(size=(count, 2)) * (high - low)
 
     def _expected(self, seen: tuple[Float, Float, Int, Int, Int], n: int) -> Float:
-        """Information (d, d) of the first n exposures by the stars that they have seen."""
+        """Information (D, D) of the first n exposures by the stars that they have seen."""
         whole, theta, _ = self._field
         model = replace(whole, exposures=whole.exposures[:n])
         x, y, exposure, chip, star = (column[seen[2] < n] for column in seen)
         sigma = np.full(len(x), self.mode.error)
         detections = Detections(x, y, exposure, model.exposures, chip, sigma=sigma, star=star)
         curvature = expected_curvature(model, theta[: model.n_params], detections)
-        # what the gauge holds at present
-        d = model.n_distortion
-        free = np.concatenate([self.mode.free[self.mode.free < d], np.arange(d, model.n_params)])
-        return of_distortion(curvature, free, d)
+        # the gauge holds what it holds at present
+        D = self.mode.problem.model.n_params
+        return of_first(curvature, np.append(self.mode.free, np.arange(D, model.n_params)), D)

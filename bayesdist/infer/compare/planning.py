@@ -95,14 +95,15 @@ def with_information(solution: Solution, information: Float) -> Solution: ...
 def with_information(solution: Solution, information: Float) -> Solution:
     """Solution with the additional information (d, d) about polynomials and drift.
 
-    Frames of the existing exposures change as far as they are correlated with these.  InputError
-    for information of another number of parameters.
+    Frames of the existing exposures change as far as they are correlated with these, unless the
+    information is about all parameters.  InputError for information of another number of
+    parameters.
     """
-    n = solution.model.n_distortion
-    if information.shape != (n, n):
+    n, known = len(information), (solution.model.n_distortion, solution.model.n_params)
+    if information.shape != (n, n) or n not in known:
         raise InputError(
-            f"the information is of shape {information.shape} for {n} parameters",
-            do="give that of the polynomials and their drift",
+            f"the information is of shape {information.shape} for {known[0]} parameters",
+            do="give that of the polynomials and their drift, or of all parameters",
         )
     cov = np.asarray(solution.cov, float)
     # (C^-1 + H)^-1 without inverting C, which may be nearly singular

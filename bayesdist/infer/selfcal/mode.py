@@ -78,7 +78,7 @@ class SelfCalibrationMode:
 
         Stars and frames are eliminated.
         """
-        return of_distortion(self.expansion.curvature, self.free, self.problem.model.n_distortion)
+        return of_first(self.expansion.curvature, self.free, self.problem.model.n_distortion)
 
     @property
     def gain(self) -> float:
@@ -137,15 +137,15 @@ class SelfCalibrationMode:
         )
 
 
-def of_distortion(curvature: Float, free: Int, n: int) -> Float:
-    """Information (n, n) about the first n parameters, frames eliminated; zero for fixed ones.
+def of_first(curvature: Float, free: Int, n: int) -> Float:
+    """Information (n, n) about the first n parameters, later ones eliminated; zero for fixed ones.
 
     `curvature` (D, D) is that of all parameters, and `free` (F,) are those that are fitted.
     """
-    own, frames = free[free < n], free[free >= n]
+    own, later = free[free < n], free[free >= n]
     left = curvature[np.ix_(own, own)]
-    if frames.size:
-        local, cross = curvature[np.ix_(frames, frames)], curvature[np.ix_(own, frames)]
+    if later.size:
+        local, cross = curvature[np.ix_(later, later)], curvature[np.ix_(own, later)]
         scale = 1.0 / np.sqrt(np.diag(local))
         half = cross * scale
         left = left - half @ np.linalg.solve(local * np.outer(scale, scale), half.T)
