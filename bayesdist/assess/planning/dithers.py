@@ -46,6 +46,7 @@ SKEWS = ("skew_plus", "skew_cross")
 MOST = 4  # parameters that are named
 MOST_FURTHER = 64  # exposures whose information is computed: a power of 2
 MOST_DETECTIONS = 15_000  # of all of these
+WAYS = 5  # in which they may be dithered
 SMOOTHING = 0.5  # of the scatter of offsets, by which further ones differ from those at hand
 
 
@@ -358,33 +359,6 @@ class FurtherDithers:
     rolls: Float  # (E + MOST_FURTHER,) in radians
     seed: int
 
-    @classmethod
-    def of(cls, mode: SelfCalibrationMode, seed: int) -> FurtherDithers | None:
-        """Further exposures that are drawn from those at hand.
-
-        None for stars that move or are known beforehand, and for distortions that depend on time.
-        """
-        problem = mode.problem
-        model, E = problem.model, len(problem.model.exposures)
-        if model.time is not None or problem.n_star > 2 or problem.priors.informed.any():
-            return None
-        frames = np.zeros((E, 3))
-        for e in range(1, E):
-            of_exposure = mode.theta[model.frame_slice(e)]
-            known = dict(zip(model.free_frame_names(e), of_exposure, strict=True))
-            frames[e] = [known.get(name, 0.0) for name in ("shift_u", "shift_v", "rotation")]
-        rng = np.random.default_rng([seed, 6])
-        which, roll = rng.integers(E, size=(2, MOST_FURTHER))
-        # a smoothed bootstrap that has the variance of the offsets
-        offsets, middle = frames[:, :2], frames[:, :2].mean(axis=0)
-        scatter = np.cov(offsets.T)
-        root = np.linalg.cholesky(scatter + 1e-9 * np.trace(scatter) * np.eye(2))
-        own = np.sqrt(E / (E - 1)) * (offsets[which] - middle)
-        own += SMOOTHING * rng.standard_normal((MOST_FURTHER, 2)) @ root.T
-        more = middle + own / np.sqrt(1 + SMOOTHING**2)
-        rolls = np.concatenate([frames[:, 2], frames[roll, 2]])
-        return cls(mode, np.concatenate([offsets, more]), rolls, seed)
-
     def information(self, n: int) -> Float:
         """Information (D, D) of n further exposures; beyond `MOST_FURTHER` it is linear in n."""
         number, values = self._known
@@ -436,3 +410,36 @@ class FurtherDithers:
         # the gauge holds what it holds at present
         D = self.mode.problem.model.n_params
         return of_first(curvature, np.append(self.mode.free, np.arange(D, model.n_params)), D)
+
+
+def further_dithers(mode: SelfCalibrationMode, seed: int) -> list[FurtherDithers]:
+    """Several ways in which further exposures of a self-calibration may be dithered.
+
+    Offsets and rolls are drawn from those at hand with weights that are drawn as well (Bayesian
+    bootstrap: Rubin 1981, Annals of Statistics 9, 130), and offsets are smoothed.  The list is
+    empty for stars that move or are known beforehand, and for distortions that depend on time.
+    """
+    problem = mode.problem
+    model, E = problem.model, len(problem.model.exposures)
+    if model.time is not None or problem.n_star > 2 or problem.priors.informed.any():
+        return []
+    frames = np.zeros((E, 3))
+    for e in range(1, E):
+        of_exposure = mode.theta[model.frame_slice(e)]
+        known = dict(zip(model.free_frame_names(e), of_exposure, strict=True))
+        frames[e] = [known.get(name, 0.0) for name in ("shift_u", "shift_v", "rotation")]
+    offsets, rolls = frames[:, :2], frames[:, 2]
+    middle, scatter = offsets.mean(axis=0), np.cov(offsets.T)
+    root = np.linalg.cholesky(scatter + 1e-9 * np.trace(scatter) * np.eye(2))
+    rng, out = np.random.default_rng([seed, 6]), []
+    for k in range(WAYS):
+        which, turned = (
+            rng.choice(E, size=MOST_FURTHER, p=rng.dirichlet(np.ones(E))) for _ in range(2)
+        )
+        # so that the offsets have the variance of those at hand
+        more = np.sqrt(E / (E - 1)) * (offsets[which] - middle)
+        more += SMOOTHING * rng.standard_normal((MOST_FURTHER, 2)) @ root.T
+        more = middle + more / np.sqrt(1 + SMOOTHING**2)
+        every = np.concatenate([offsets, more]), np.concatenate([rolls, rolls[turned]])
+        out.append(FurtherDithers(mode, *every, seed + k))
+    return out

@@ -23,12 +23,13 @@ class Schedule:
     # (d, d), of one exposure about polynomials and drift, on average over the dates of the schedule
     information: Float
     single_date: bool = False  # True if all further exposures have one date
-    # information (d, d) of a number of exposures, where it is not their number times that of one
-    together: Callable[[int], Float] | None = None
+    # possible information (d, d) of a number of exposures, where it is not their number times that
+    # of one
+    together: Sequence[Callable[[int], Float]] = ()
 
-    def of(self, n: int) -> Float:
-        """Information (d, d) of n exposures."""
-        return n * self.information if self.together is None else self.together(n)
+    def of(self, n: int) -> list[Float]:
+        """Information (d, d) of n exposures: values that are equally probable."""
+        return [one(n) for one in self.together] or [n * self.information]
 
 
 @dataclass(frozen=True)

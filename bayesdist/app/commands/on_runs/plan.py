@@ -14,7 +14,7 @@ from bayesdist.app.store.rundir import RunDirectory
 from bayesdist.app.tables.margins import judged_requirements
 from bayesdist.assess.evaluation import with_measured_centroids
 from bayesdist.assess.model import with_diagnosed_errors, with_shared_stars
-from bayesdist.assess.planning.dithers import FurtherDithers
+from bayesdist.assess.planning.dithers import further_dithers
 from bayesdist.assess.planning.exposures import Need, Schedule, exposures_needed
 from bayesdist.assess.planning.futures import Data, Futures
 from bayesdist.assess.requirements.requirement import Requirement
@@ -150,8 +150,8 @@ def schedules_of(
     if solved is not None:
         # an exposure by itself says nothing: of stars that were seen before it does
         information = solved.mode.gain * solved.mode.distortion_information / _n_exposures(results)
-        further = FurtherDithers.of(solved.mode, results.config.sampler.seed)
-        together = None if further is None else further.information
+        further = further_dithers(solved.mode, results.config.sampler.seed)
+        together = [one.information for one in further]
         return [Schedule("dithered like these", information, together=together)]
 
     def worth(date: float | None) -> Float:
