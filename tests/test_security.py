@@ -19,13 +19,13 @@ RUNNERS = {
     "joblib": {"load"},
     "dill": {"load", "loads"},
     "cloudpickle": {"load", "loads"},
-    "yaml": {"load", "unsafe_load", "full_load"},
+    "yaml": {"load", "load_all", "unsafe_load", "unsafe_load_all", "full_load", "full_load_all"},
     "os": {"system", "popen"},
     "pd": {"read_pickle"},
     "pandas": {"read_pickle"},
 }
 NAMES = set[str]().union(*RUNNERS.values())
-MODULES = {"marshal", "shelve", "joblib", "dill", "cloudpickle", "yaml"}
+MODULES = {"marshal", "shelve", "joblib", "dill", "cloudpickle"}
 
 
 def _dangers(source: str) -> Iterator[str]:
@@ -65,7 +65,8 @@ def test_that_the_search_finds_what_it_looks_for():
         "from pickle import loads",
         "np.load(p, allow_pickle=True)",
         "eval(text)",
-        "import yaml",
+        "yaml.load(text, Loader=yaml.Loader)",
+        "from yaml import full_load",
         "subprocess.run(text, shell=True)",
         "os.system(text)",
     ):
