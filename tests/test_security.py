@@ -193,8 +193,12 @@ def _hostile_json(path: Path) -> None:
 HOSTILE: dict[str, Callable[[Path], None]] = {
     **dict.fromkeys(("a.vot", "local.vot", "doctype.xml"), _hostile_votable),
     **dict.fromkeys(("a.csv", "a.ecsv"), _hostile_text),
-    **{"yaml.ecsv": _hostile_yaml, "a.parquet": _hostile_parquet, "a.fits": _hostile_fits},
-    **{"a.hdr": _hostile_cards, "a.json": _hostile_json, "a.toml": _hostile_json},
+    "yaml.ecsv": _hostile_yaml,
+    "a.parquet": _hostile_parquet,
+    "a.fits": _hostile_fits,
+    "a.hdr": _hostile_cards,
+    "a.json": _hostile_json,
+    "a.toml": _hostile_json,
     **dict.fromkeys(("a.h5", "a.nc"), _hostile_hdf5),
     **dict.fromkeys(("a.asdf", "local.asdf"), _hostile_asdf),
 }

@@ -32,10 +32,29 @@ def json_of(text: str, where: str, *, do: str = "restore it, or write it again")
 def toml_of(text: str, where: str) -> dict[str, Any]:
     """Tree of a TOML text."""
     do = "correct it there"
+    if _longest_key(text) > DEEPEST:  # tomllib takes time and memory by the square of its parts
+        raise FormatError(f"has a key of more than {DEEPEST} parts", where=where, do=do)
     try:
         return _not_too_deep(tomllib.loads(text), where, do)
     except (ValueError, RecursionError) as error:
         raise FormatError(f"is not valid TOML ({_reason(error)})", where=where, do=do) from error
+
+
+_KEY_PART = re.compile(r"""(?:[\w-]++|"[^"\n]*+"|'[^'\n]*+')[ \t]*+(\.[ \t]*+)?""")
+
+
+def _longest_key(text: str) -> int:
+    """Parts of the longest dotted key, or of what looks like one, on lines with many points."""
+    longest = 0
+    for line in text.splitlines():
+        if line.count(".") < DEEPEST:
+            continue
+        end, n = -1, 0
+        for part in _KEY_PART.finditer(line):
+            n = n + 1 if part.start() == end else 1
+            end = part.end() if part[1] else -1
+            longest = max(longest, n)
+    return longest
 
 
 def read_json(path: Path, *, do: str = "restore it, or write it again") -> Any:

@@ -171,6 +171,18 @@ def test_brackets_within_each_other(depth):
         toml_of(f"x = {'[' * depth}{']' * depth}", "a.toml")
 
 
+@pytest.mark.parametrize("part", ["a", '"a b"', "'a.b'", "a "])
+@pytest.mark.parametrize("line", ["{} = 1", "[{}]", "[[{}]]", "x = {{{} = 1}}"])
+def test_keys_of_many_parts(part, line):
+    assert toml_of(line.format(".".join(3 * [part])), "a.toml")
+    with pytest.raises(FormatError, match=f"has a key of more than {DEEPEST} parts"):
+        toml_of(line.format(".".join(100_000 * [part])), "a.toml")
+
+
+def test_many_numbers_on_a_line_are_no_key():
+    assert toml_of("x = [" + 200 * "1.5, " + "]", "a.toml") == {"x": 200 * [1.5]}
+
+
 def test_a_number_of_a_hundred_thousand_digits():
     for read, text in ((json_of, "9" * 100_000), (toml_of, "x = " + "9" * 100_000)):
         with pytest.raises(FormatError, match="a whole number has thousands of digits"):
