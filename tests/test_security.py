@@ -7,7 +7,7 @@ import json
 import sys
 import urllib.request
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 import h5py
@@ -206,7 +206,7 @@ HOSTILE: dict[str, Callable[[Path], None]] = {
 
 def test_that_what_is_opened_elsewhere_is_heard():
     with heard() as events:
-        with pytest.raises(OSError, match="."):
+        with suppress(OSError):  # there is no such server
             urllib.request.urlopen(AWAY)
         Path("/etc/passwd").read_bytes()
     assert {"urllib.Request", "socket.connect", "open"} <= {event.split()[0] for event in events}
