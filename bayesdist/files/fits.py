@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-import math
 import re
 import warnings
 
@@ -27,8 +26,11 @@ def open_fits(raw: bytes, budget: Budget) -> fits.HDUList:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of other programs' cards
         _refuse_unfounded(raw, budget)
-    # from memory: after a failure astropy leaves a file of its own open
-    return fits.open(io.BytesIO(raw), memmap=False, lazy_load_hdus=False)
+    # from memory: after a failure astropy leaves a file of its own open; compressed images stay
+    # the tables that they are, whose tiles are not decompressed
+    return fits.open(
+        io.BytesIO(raw), memmap=False, lazy_load_hdus=False, disable_image_compression=True
+    )
 
 
 def _refuse_unfounded(raw: bytes, budget: Budget) -> None:
@@ -56,22 +58,17 @@ def _refuse_unfounded(raw: bytes, budget: Budget) -> None:
                 where=where,
                 do="it is truncated or damaged: fetch or write it again",
             )
-        refuse_larger(header, budget)
+        refuse_many_rows(header, budget)
         at, number = begin + padded(size), number + 1
         budget.refuse_parts(number, "HDUs")
         clock()
 
 
-def refuse_larger(header: fits.Header, budget: Budget) -> None:
-    """Refuse a table of rows without bytes, and a compressed image beyond the budget."""
+def refuse_many_rows(header: fits.Header, budget: Budget) -> None:
+    """Refuse a table of too many rows, which may have no bytes."""
     rows = header.get("NAXIS2", 0)
     if header.get("XTENSION", "") in ("TABLE", "BINTABLE") and isinstance(rows, int):
         budget.refuse_rows(rows)
-    sides = header.get("ZNAXIS", 0)
-    if isinstance(sides, int) and 0 < sides <= MOST:
-        image = [header.get(f"ZNAXIS{k + 1}", 0) for k in range(sides)]
-        numbers = [n for n in (header.get("ZBITPIX", 8), *image) if isinstance(n, int)]
-        budget.refuse_content(abs(math.prod(numbers)) // 8)
 
 
 def refuse_long_arrays(hdu: fits.BinTableHDU, budget: Budget) -> None:

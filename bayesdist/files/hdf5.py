@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import math
 import os
+import zlib
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -16,9 +17,10 @@ from numpy.typing import NDArray
 
 from bayesdist.errors import FormatError, InputError
 from bayesdist.files.atomic import atomic_path
-from bayesdist.files.budget import LIMITS, Budget, Limits
+from bayesdist.files.budget import DAMAGED, LIMITS, Budget, Limits
 from bayesdist.files.faults import restoring
 from bayesdist.files.regular import opened
+from bayesdist.utils.memory import size_text
 
 if TYPE_CHECKING:
     import h5py
@@ -86,6 +88,11 @@ def _checked(path: Path, limits: Limits = LIMITS) -> Iterator[h5py.File]:
         yield file
 
 
+_DEFLATE, _DEFLATE_RATIO = 1, 1032  # code of gzip in HDF5, and what zlib reaches at most
+_COMPRESSORS = {_DEFLATE, 4, 32000}  # szip and lzf, which hold no more than a hundred times as much
+_FILTERS = {2, 3, 5, 6}  # shuffle, fletcher32, nbit and scale-offset, of which sizes follow
+
+
 class _Announced:
     """Bytes of arrays as a file announces them, each as often as a path leads to it.
 
@@ -120,6 +127,7 @@ class _Announced:
         if isinstance(one, h5py.Group):
             return self.bytes_of(one, depth + 1)
         if isinstance(one, h5py.Dataset) and not one.external and not one.is_virtual:
+            self._refuse_inflated(one)
             # a chunk is read whole, also where the array is smaller
             n = max(int(one.size or 0), math.prod(one.chunks or (0,)))
             return n * one.dtype.itemsize
@@ -130,6 +138,37 @@ class _Announced:
                 do="restore it, or make it again",
             )
         return 0
+
+    def _refuse_inflated(self, array: h5py.Dataset) -> None:
+        """Refuse chunks of gzip that hold more than a chunk: HDF5 reads them to their end."""
+        pipeline = array.id.get_create_plist()
+        filters = [pipeline.get_filter(k)[0] for k in range(pipeline.get_nfilters())]
+        compressors = [code for code in filters if code not in _FILTERS]
+        if len(compressors) > 1 or not set(compressors) <= _COMPRESSORS:
+            raise FormatError(
+                "has an array whose compression is not read",
+                where=self._budget.where,
+                do="write it with gzip, lzf, szip or none",
+            )
+        if _DEFLATE not in compressors:
+            return
+        large = list[tuple[int, ...]]()
+
+        def note(chunk: Any) -> None:
+            if _DEFLATE_RATIO * chunk.size > self._budget.content:
+                large.append(chunk.chunk_offset)
+
+        array.id.chunk_iter(note)
+        room = math.prod(array.chunks) * array.dtype.itemsize
+        for offset in large:
+            self._clock()
+            _, raw = array.id.read_direct_chunk(offset)
+            if len(zlib.decompressobj().decompress(raw, room + 1)) > room:
+                raise FormatError(
+                    f"has a chunk of {size_text(room)} that holds more",
+                    where=self._budget.where,
+                    do=DAMAGED,
+                )
 
 
 # -- arrays of our own, each file with the fingerprint of what it belongs to -----------------------

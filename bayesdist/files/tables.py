@@ -161,7 +161,11 @@ def _says_number(cell: str) -> bool:
 def _read_fits(path: Path, limits: Limits) -> Table:
     raw, budget = read_unpacked(path, limits)
     with open_fits(raw, budget) as hdus:
-        tables = [hdu for hdu in hdus if isinstance(hdu, fits.BinTableHDU | fits.TableHDU)]
+        tables = [
+            hdu
+            for hdu in hdus
+            if isinstance(hdu, fits.BinTableHDU | fits.TableHDU) and "ZIMAGE" not in hdu.header
+        ]
         objects = [hdu for hdu in tables if hdu.name == "LDAC_OBJECTS"]
         for hdu in objects or tables[:1]:
             if isinstance(hdu, fits.BinTableHDU):

@@ -34,7 +34,7 @@ from bayesdist.files.fits import (
     data_size,
     open_fits,
     padded,
-    refuse_larger,
+    refuse_many_rows,
 )
 from bayesdist.files.unpacked import read_unpacked
 from bayesdist.products.formats.common.cards import card_images, header_of
@@ -264,7 +264,7 @@ def _walked(raw: bytes, budget: Budget) -> Iterable[Hdu]:
         begin = at + padded(after - at)
         header = header_of(cards)
         size = data_size(header)
-        refuse_larger(header, budget)
+        refuse_many_rows(header, budget)
         state, at = "whole", begin + padded(size or 0)
         if size is None or begin + size > len(raw):
             follows = raw[begin : begin + 9] == HDU_STARTS[1]
