@@ -25,6 +25,7 @@ from bayesdist.files.fits import open_fits
 from bayesdist.files.hdf5 import hdf5_arrays, netcdf_groups
 from bayesdist.files.tables import TABLE_SUFFIXES, read_table
 from bayesdist.files.unpacked import CODECS, read_unpacked, unpacked
+from bayesdist.products.formats.common.content import Content
 
 N = 2000
 SMALL = Limits(content=10_000, content_per_byte=2)
@@ -375,6 +376,12 @@ def test_arrays_of_fits_that_share_one_place(tmp_path):
     (tmp_path / "a.fits").write_bytes(raw)
     with pytest.raises(FormatError, match="announces 8 MB"):
         read_table(tmp_path / "a.fits", Limits(content=10**6))
+    # read as a product, whose budget is not given
+    assert len(Content("a.fits", bytes(raw)).hdus[1].rows) == 1000
+    for k in range(1000):
+        raw[first + 8 * k : first + 8 * k + 4] = (25_000).to_bytes(4)
+    with pytest.raises(FormatError, match="announces 200 MB"):
+        Content("a.fits", bytes(raw)).hdus[1].rows  # noqa: B018
 
 
 # -- VOTables -------------------------------------------------------------------------------------

@@ -34,6 +34,7 @@ from bayesdist.files.fits import (
     data_size,
     open_fits,
     padded,
+    refuse_long_arrays,
     refuse_many_rows,
 )
 from bayesdist.files.unpacked import read_unpacked
@@ -83,7 +84,11 @@ class Hdu:
         if self.header.get("XTENSION", "").strip() != "BINTABLE":
             raise FormatError(f"HDU {self.name!r} is no binary table")
         try:
-            table = fits.BinTableHDU.fromstring(self.to_bytes()).data
+            hdu = fits.BinTableHDU.fromstring(self.to_bytes())
+            refuse_long_arrays(hdu, Budget(f"HDU {self.name!r}", len(self.data)))
+            table = hdu.data
+        except FormatError:
+            raise
         except Exception as error:  # astropy raises all kinds on cards that no file should have
             raise FormatError(
                 f"HDU {self.name!r} cannot be read ({reason_of(error)})",
