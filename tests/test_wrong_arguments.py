@@ -54,6 +54,21 @@ def test_calibrate_names_the_argument(stars, name, kind):
         assert name.rstrip("s") in text
 
 
+@pytest.mark.parametrize(
+    ("arguments", "remedy"),
+    [
+        ({"size": 1000}, "as in size=(2048, 1024)"),
+        ({"size": "1000x1000"}, "as in size=(2048, 1024)"),
+        ({"size": (1000, 1000), "reference_pixel": 500}, "as in reference_pixel=("),
+        ({"size": (1000, 1000), "sigma": np.full(100, 0.1)}, "as columns sigma_u and sigma_v"),
+        ({"size": (1000, 1000), "sigma": 5 * u.mas}, "divide sigma by the size of a pixel"),
+    ],
+    ids=str,
+)
+def test_the_remedy_is_in_terms_of_python(stars, arguments, remedy):
+    assert remedy in refusal(bd.calibrate, matches=stars, order=1, **arguments)
+
+
 @pytest.mark.parametrize("kind", WRONG)
 def test_matches_that_are_none(kind):
     refusal(bd.calibrate, matches=WRONG[kind], order=1, size=(1000, 1000))
@@ -94,3 +109,4 @@ def test_objects_of_other_types(stars, kind):
     for function, arguments, name in cases:
         text = refusal(function, **arguments)
         assert text.startswith(f"{function.__name__}: {name} is a")
+        assert ("Matches.from_table" in text) == (name == "matches")

@@ -289,6 +289,12 @@ def _stars(matches: Any, sigma: Any, options: Mapping[str, Any]) -> tuple[Matche
         matches = matches.with_star_codes(**options)
     if sigma is None:
         sigma = "by_magnitude" if matches.has_mag and not matches.has_sigma else "columns"
+    elif np.ndim(sigma):
+        raise InputError(
+            f"sigma has {np.size(sigma)} values",
+            where=WHERE,
+            do="give one number, or the errors of each star as columns sigma_u and sigma_v",
+        )
     elif not isinstance(sigma, str):
         sigma = value_in(sigma, matches.unit, "sigma")
     check_sigma(sigma)
@@ -308,6 +314,12 @@ def _in(value: Any, unit: str, what: str) -> float | None:
 
 def _pixels(pair: Any, what: str) -> Any:
     """Pair of numbers without a unit; pixels are the only one."""
+    if pair is not None and (isinstance(pair, str) or np.shape(pair) != (2,)):
+        raise InputError(
+            f"{what} is {pair!r}",
+            where=WHERE,
+            do=f"give two numbers of pixels along x and y, as in {what}=(2048, 1024)",
+        )
     has_unit = hasattr(pair, "unit")
     if isinstance(pair, list | tuple):
         has_unit = any(hasattr(value, "unit") for value in pair)

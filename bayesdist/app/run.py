@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self, TypeAlias
 
 import numpy as np
+from astropy.table import Table
 
 from bayesdist.app.products.made_files import with_facts_of_run
 from bayesdist.app.python_terms import in_python_terms, python_terms
@@ -29,6 +30,7 @@ from bayesdist.assess.requirements.verdict import VERDICT_LEVELS
 from bayesdist.calibration.calibration import Calibration, calibration_of_exposure
 from bayesdist.calibration.chip_map import chosen_chip
 from bayesdist.calibration.sky_distribution import sky_distribution
+from bayesdist.calibration.sky_table import pixel_columns, position_column
 from bayesdist.data import Matches
 from bayesdist.diagnose.diagnostics import Diagnostics
 from bayesdist.errors import InputError
@@ -44,7 +46,7 @@ from bayesdist.report.html import (
 )
 from bayesdist.utils.checks import warnings_of
 from bayesdist.utils.numbers import number, with_mas
-from bayesdist.utils.quantities import Random, year_of
+from bayesdist.utils.quantities import Random, values_in, whole_number, year_of
 
 if TYPE_CHECKING:
     from astropy.coordinates import SkyCoord
@@ -369,10 +371,11 @@ class Run:
 
     def _date(self, exposure: str | None, epoch: Any) -> float | None:
         """Decimal year of a calibration; None if the model does not depend on time."""
+        date = None if epoch is None else year_of(epoch)
         if self.model.time is None:
             return None
-        if epoch is not None:
-            return year_of(epoch)
+        if date is not None:
+            return date
         stars = self.results.data.sample
         if exposure in stars.exposure_names and stars.epoch is not None:
             rows = stars.exposure == stars.exposure_names.index(exposure)
@@ -434,6 +437,8 @@ class Run:
             ("Converged", state if self.converged else f"NO: {'; '.join(convergence.reasons)}"),
             ("Largest uncertainty per axis", with_mas(largest, fit.unit, scale_mas)),
         ]
+        if self.results.fitted.errors.by_magnitude is not None:
+            facts.insert(1, ("Errors", "estimated from the residuals by magnitude"))
         if self.folder is not None:
             facts.append(("Folder", str(self.folder)))
         not_shown = [
@@ -516,12 +521,17 @@ class Run:
         """
         if self.model.time is not None:
             options = {"epoch": self.results.epoch} | options
+        if draws is not None:
+            draws = whole_number(draws, "draws", least=2, where="to_sky")
         positions = self.calibration.to_sky(table, **options)
         if draws is None:
             return positions
-        names = options.get("columns", ("x", "y"))
-        to_fits = 1.0 - positions.meta["pixel_origin"]
-        x, y = (np.asarray(positions[name], float) + to_fits for name in names)
+        rows = Table(positions)
+        origin = positions.meta["pixel_origin"]
+        x, y, _, _ = pixel_columns(rows, options.get("columns"), origin, "table")
+        centroids = options.get("centroids")
+        if centroids is not None:
+            centroids = tuple(position_column(rows, name, "table") for name in centroids)
         chip = options.get("chip")
         if chip is None and "chip" in positions.colnames:
             chip = np.asarray(positions["chip"])
@@ -534,6 +544,7 @@ class Run:
             chip=chip,
             epoch=options.get("epoch"),
             point=options.get("point"),
+            centroids=centroids,
         )
 
     # -- files ------------------------------------------------------------------------------------
@@ -753,7 +764,7 @@ def as_requirements(requirements: Requirement | Sequence[Requirement]) -> list[R
 def _pairs(positions: Positions, name: str) -> list[tuple[float, float]]:
     """Positions (x, y) as a list; one position alone becomes a list of one."""
     try:
-        pairs = np.atleast_2d(np.asarray(positions, float))
+        pairs = np.atleast_2d(np.asarray(_without_unit(positions, name), float))
     except (TypeError, ValueError):
         pairs = np.zeros((0, 0))
     if pairs.ndim != 2 or pairs.shape[1] != 2:
@@ -761,3 +772,13 @@ def _pairs(positions: Positions, name: str) -> list[tuple[float, float]]:
             f"{name} is {positions!r}", where="budget", do="give (x, y), or a list of such pairs"
         )
     return [(float(x), float(y)) for x, y in pairs]
+
+
+def _without_unit(positions: Any, name: str) -> Any:
+    """Positions as plain numbers; those with a unit other than the pixel are refused."""
+    several = isinstance(positions, list | tuple)
+    if several and not any(hasattr(value, "to_value") for value in positions):
+        return [_without_unit(value, name) for value in positions]
+    if several or hasattr(positions, "to_value"):
+        return values_in(positions, "pix", name, where="budget")
+    return positions

@@ -457,7 +457,7 @@ class Calibration:
         self,
         table: Any,
         *,
-        columns: Sequence[str] = ("x", "y"),
+        columns: Sequence[str] | None = None,
         centroids: Sequence[str] | None = None,
         pixel_origin: float | None = None,
         chip: int | None = None,
@@ -472,8 +472,9 @@ class Calibration:
         table : table
             Pixels of stars, in whatever `Matches.from_table` takes, with a column chip if the
             detector has several chips.
-        columns : tuple of str
-            Names of the columns with x and y.
+        columns : tuple of str, optional
+            Names of the columns with x and y; by default they are found by the names that
+            `Matches.from_table` knows.
         centroids : tuple of str, optional
             Names of the columns with the standard deviations of x and y, in pixels.
         pixel_origin : float, optional

@@ -9,6 +9,8 @@ from typing import ParamSpec, TypeVar
 
 from bayesdist.errors import InputError
 
+_OF_A_TABLE = "; bayesdist.Matches.from_table makes it of a table"
+
 P = ParamSpec("P")
 R = TypeVar("R")
 
@@ -41,7 +43,8 @@ def takes(**kinds: type | tuple[type, ...]) -> Callable[[Callable[P, R]], Callab
                 raise InputError(
                     f"{name} is a {type(value).__name__}",
                     where=function.__name__,
-                    do=f"give a {' or '.join(one.__name__ for one in several)}",
+                    do=f"give a {' or '.join(one.__name__ for one in several)}"
+                    + (_OF_A_TABLE if several[0].__name__ == "Matches" else ""),
                 )
             return function(*args, **kwargs)
 
