@@ -725,7 +725,20 @@ def run(
 
     Examples
     --------
-    >>> run = bd.run("config.toml", "run")  # doctest: +SKIP
+    >>> from pathlib import Path
+    >>> chip = bd.Chip(1, "camera", (2048, 2048), (1024.5, 1024.5))
+    >>> model = bd.DistortionModel(1, (chip,), "pix")
+    >>> truth, rng = [0, 1000, 0, 0, 0, 1000], np.random.default_rng(1)
+    >>> stars, _ = bd.simulate_matches(model, truth, 500, sigma=0.01, rng=rng)
+    >>> stars.to_table().write("stars.ecsv")
+    >>> config = '''
+    ... data = {matches = "stars.ecsv"}
+    ... detector = {size = [2048, 2048]}
+    ... model = {order = 1}
+    ... '''
+    >>> n = Path("camera.toml").write_text(config)
+    >>> bd.run("camera.toml", "camera-run", report=False).model.order
+    1
     """
     if (Path(folder) / "run.json").exists() and not (resume or overwrite):
         raise InputError(
