@@ -22,12 +22,13 @@ from bayesdist.app.pipeline import diagnose, sample
 from bayesdist.app.python_terms import in_python_terms
 from bayesdist.app.rehearsal import rehearse
 from bayesdist.app.results import Results
-from bayesdist.app.run import Run, as_requirements
+from bayesdist.app.run import Run
 from bayesdist.app.run_folder import MATCHES_FILE
 from bayesdist.app.screen import progress_bar
 from bayesdist.app.stages import evaluated
 from bayesdist.app.store.rundir import RunDirectory
 from bayesdist.assess import Requirement, UserTerm
+from bayesdist.assess.requirements.requirement import as_requirements
 from bayesdist.assess.terms.given import Catalogue, require_catalogue
 from bayesdist.data import Matches, ReadOptions
 from bayesdist.data.reading.options import check_sigma

@@ -26,6 +26,7 @@ from bayesdist.assess import ErrorBudget, Margin, Requirement, UncertaintyMap
 from bayesdist.assess.budget.budget import budget_of, place_budget
 from bayesdist.assess.drawn import DrawnErrors
 from bayesdist.assess.evaluation import Evaluation, position_map
+from bayesdist.assess.requirements.requirement import as_requirements
 from bayesdist.assess.requirements.verdict import VERDICT_LEVELS
 from bayesdist.calibration.calibration import Calibration, calibration_of_exposure
 from bayesdist.calibration.chip_map import chosen_chip
@@ -46,7 +47,7 @@ from bayesdist.report.html import (
 )
 from bayesdist.utils.checks import warnings_of
 from bayesdist.utils.numbers import number, with_mas
-from bayesdist.utils.quantities import Random, values_in, whole_number, year_of
+from bayesdist.utils.quantities import Number, Random, value_in, values_in, whole_number, year_of
 
 if TYPE_CHECKING:
     from astropy.coordinates import SkyCoord
@@ -179,7 +180,7 @@ class Run:
         to: Positions | None = None,
         chip: int | None = None,
         epoch: Any = None,
-        magnitude: float | None = None,
+        magnitude: Number | None = None,
     ) -> ErrorBudget:
         """Error budget over the detector, of some positions, or of separations.
 
@@ -194,7 +195,7 @@ class Run:
             Number of the chip, needed with `at` if there are several.
         epoch : float or Time, optional
             Decimal years; that of the evaluation by default.
-        magnitude : float, optional
+        magnitude : float or Quantity, optional
             Magnitude of the star: the error of its centroid is then a term.
 
         Returns
@@ -211,6 +212,8 @@ class Run:
             raise InputError(
                 "a separation is measured from one position", where="budget", do="give at=(x, y)"
             )
+        if magnitude is not None:
+            magnitude = value_in(magnitude, "mag", "magnitude", where="budget")
         date = None if epoch is None else year_of(epoch)
         if at is None:
             if date is None and magnitude is None:
@@ -751,27 +754,6 @@ def run(
             Path(config), Path(folder), resume=resume, force=overwrite, seed=seed, report=report
         )
     )
-
-
-def as_requirements(requirements: Requirement | Sequence[Requirement]) -> list[Requirement]:
-    """Requirements as a list; one requirement alone becomes a list of one.
-
-    Raises
-    ------
-    InputError
-        If one of them is something else.
-    """
-    several: list[Any] = [requirements]
-    if isinstance(requirements, list | tuple):
-        several = list(requirements)
-    for requirement in several:
-        if not isinstance(requirement, Requirement):
-            raise InputError(
-                f"{requirement!r} is no requirement",
-                where="requirements",
-                do="give bayesdist.Requirement(name, statistic, limit)",
-            )
-    return several
 
 
 def _pairs(positions: Positions, name: str) -> list[tuple[float, float]]:

@@ -166,6 +166,12 @@ class Calibration:
         -------
         Calibration
         """
+        if not isinstance(solution, Solution):
+            raise InputError(
+                f"solution is a {type(solution).__name__}",
+                where="from_solution",
+                do="give a Posterior or LinearFit",
+            )
         plane = None if point is None else Plane("sky", point=direction_in(point, "point"))
         return calibration_of(solution, name, plane=plane, detector=detector, filter=filter)
 
