@@ -52,7 +52,7 @@ MISSING_TERMS = (
 )
 
 
-@takes(solution=Solution, diagnostics=Diagnostics)
+@takes(solution=Solution)
 @one_thread
 def error_budget(
     solution: Solution,
@@ -141,7 +141,7 @@ def error_budget(
     return replace(budget, notes=tuple(notes))
 
 
-@takes(solution=Solution, diagnostics=Diagnostics)
+@takes(solution=Solution)
 @one_thread
 def check_requirements(
     solution: Solution,
