@@ -131,4 +131,4 @@ def _is_term(term: Any) -> bool:
     """True for an axis and two powers."""
     if not (isinstance(term, tuple | list) and len(term) == 3 and term[0] in AXES):
         return False
-    return all(isinstance(power, Integral) and power >= 0 for power in term[1:])
+    return all(isinstance(power, Integral) and int(power) >= 0 for power in term[1:])

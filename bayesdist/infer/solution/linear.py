@@ -70,7 +70,7 @@ class Rejection:
             object.__setattr__(self, "clip_abs", limit)
         for name in ("clip_chi2", "clip_abs", "radial_weight"):
             limit = getattr(self, name)
-            if limit is not None and not (isinstance(limit, Real) and limit > 0):
+            if limit is not None and not (isinstance(limit, Real) and float(limit) > 0):
                 raise InputError(
                     f"{name} is {limit!r}", where="Rejection", do="give a positive number"
                 )
