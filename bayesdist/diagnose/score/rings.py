@@ -11,6 +11,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.fft import fft2
 
 from bayesdist.diagnose.score.pattern import log_tail_of_walk
@@ -174,7 +175,7 @@ def _even_length(steps: Complex) -> float:
     return float(np.sqrt(square))
 
 
-def _binned(cell: Int, values: Complex) -> Complex:
+def _binned(cell: Int, values: Complex) -> NDArray[np.complex64]:
     """Sums (BINS, BINS) of values (N,) in cells."""
     sums = np.empty(BINS**2, np.complex64)  # candidates alone: their sums are computed again
     sums.real, sums.imag = (np.bincount(cell, part, BINS**2) for part in (values.real, values.imag))
