@@ -133,8 +133,14 @@ def _decompressed(raw: bytes, kind: str, budget: Budget) -> bytes:
 
 def _lz4_pieces(raw: bytes, budget: Budget) -> Iterator[bytes]:
     """Pieces of a block of lz4, each after its length, and after the size that it has then."""
-    import lz4.block
-
+    try:
+        import lz4.block
+    except ImportError:
+        raise FormatError(
+            "has blocks that are compressed by lz4, which is not installed",
+            where=budget.where,
+            do="install the package lz4, or write the file with zlib or without compression",
+        ) from None
     at = total = 0
     while at < len(raw):
         (n,) = struct.unpack_from(">I", raw, at)

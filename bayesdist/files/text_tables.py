@@ -171,9 +171,9 @@ def parse_text_table(lines: Sequence[str], budget: Budget) -> Table:
     if kind == "ascii.ecsv":
         refuse_multiplied_header(lines, budget)
     rows = _rows_of(lines)
-    heads = sum(1 for line in lines if line.startswith("#")) if kind == "ascii.sextractor" else 0
+    named = sum(1 for line in lines if line.startswith("#")) if kind == "ascii.sextractor" else 0
     widths = [len(row.split(mark)) for row in rows[:1] for mark in (None, ",", ";", "|")]
-    budget.refuse_columns(max([heads, *widths]))
+    budget.refuse_columns(max([named, *widths]))
     options: dict[str, object] = {}
     separated = kind in ("ascii.csv", "ascii.tab", "ascii.basic")
     mark = mark_of(rows) if separated else None
