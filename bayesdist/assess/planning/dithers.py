@@ -415,13 +415,13 @@ class FurtherDithers:
 def further_dithers(mode: SelfCalibrationMode, seed: int) -> list[FurtherDithers]:
     """Several ways in which further exposures of a self-calibration may be dithered.
 
-    Offsets and rolls are drawn from those at hand with weights that are drawn as well (Bayesian
-    bootstrap: Rubin 1981, Annals of Statistics 9, 130), and offsets are smoothed.  The list is
-    empty for stars that move or are known beforehand, and for distortions that depend on time.
+    Offsets are those at hand at random, smoothed without a change of their variance, and rolls are
+    those at hand in turn.  The list is empty for fewer than three exposures, for stars that move or
+    are known beforehand, and for distortions that depend on time.
     """
     problem = mode.problem
     model, E = problem.model, len(problem.model.exposures)
-    if model.time is not None or problem.n_star > 2 or problem.priors.informed.any():
+    if E < 3 or model.time is not None or problem.n_star > 2 or problem.priors.informed.any():
         return []
     frames = np.zeros((E, 3))
     for e in range(1, E):
@@ -430,16 +430,14 @@ def further_dithers(mode: SelfCalibrationMode, seed: int) -> list[FurtherDithers
         frames[e] = [known.get(name, 0.0) for name in ("shift_u", "shift_v", "rotation")]
     offsets, rolls = frames[:, :2], frames[:, 2]
     middle, scatter = offsets.mean(axis=0), np.cov(offsets.T)
-    root = np.linalg.cholesky(scatter + 1e-9 * np.trace(scatter) * np.eye(2))
+    # rolls alone, or dithers along a line, have no scatter in some direction
+    root = np.linalg.cholesky(scatter + 1e-9 * (np.trace(scatter) + 1e-300) * np.eye(2))
     rng, out = np.random.default_rng([seed, 6]), []
     for k in range(WAYS):
-        which, turned = (
-            rng.choice(E, size=MOST_FURTHER, p=rng.dirichlet(np.ones(E))) for _ in range(2)
-        )
-        # so that the offsets have the variance of those at hand
-        more = np.sqrt(E / (E - 1)) * (offsets[which] - middle)
+        more = np.sqrt(E / (E - 1)) * (offsets[rng.integers(E, size=MOST_FURTHER)] - middle)
         more += SMOOTHING * rng.standard_normal((MOST_FURTHER, 2)) @ root.T
         more = middle + more / np.sqrt(1 + SMOOTHING**2)
-        every = np.concatenate([offsets, more]), np.concatenate([rolls, rolls[turned]])
+        turned = np.resize(rng.permutation(rolls), MOST_FURTHER)
+        every = np.concatenate([offsets, more]), np.concatenate([rolls, turned])
         out.append(FurtherDithers(mode, *every, seed + k))
     return out
