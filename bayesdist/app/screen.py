@@ -10,9 +10,10 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from numbers import Integral, Real
 from pathlib import Path
-from typing import Any
+from typing import Any, TextIO
 
 from bayesdist.errors import InputError
+from bayesdist.files.regular import descriptor_for_writing
 
 log = logging.getLogger("bayesdist")
 FORMAT = "%(asctime)s %(levelname)-7s %(message)s"
@@ -52,6 +53,11 @@ class _QuietHandler(logging.FileHandler):
     def handleError(self, record: logging.LogRecord) -> None:  # noqa: N802  logging's own name
         """Pass over it."""
 
+    def _open(self) -> TextIO:
+        """File to be appended to; a link that others may have laid there is not followed."""
+        held = descriptor_for_writing(self.baseFilename, os.O_APPEND)
+        return os.fdopen(held, self.mode, encoding=self.encoding)
+
 
 @contextmanager
 def log_file(path: Path) -> Iterator[None]:
@@ -60,7 +66,9 @@ def log_file(path: Path) -> Iterator[None]:
         handler = _QuietHandler(path, encoding="utf-8")
     except OSError as error:
         raise InputError(
-            f"cannot be written ({error.strerror})", where=str(path), do="check its permissions"
+            f"cannot be written ({error.strerror})",
+            where=str(path),
+            do="check its permissions",
         ) from error
     handler.setFormatter(logging.Formatter(FORMAT))
     log.addHandler(handler)

@@ -13,7 +13,7 @@ from bayesdist.app.store.record import FileMark, Record
 from bayesdist.app.store.rundir import RunDirectory
 from bayesdist.errors import InputError
 from bayesdist.files.atomic import path_within
-from tests.app.support import cli, good, refused, write_config
+from tests.app.support import cli, good, refused, snapshot, write_config
 from tests.reduced import case_in_full
 
 pytestmark = pytest.mark.usefixtures("no_report")
@@ -162,6 +162,35 @@ def test_a_link_does_not_lead_to_files_of_others(project, tmp_path):
     with pytest.raises(InputError, match="outside of its folder"):
         path_within(run, "linked/x.txt", where="", links=True)
     assert (other / "x.txt").exists()
+
+
+@pytest.mark.parametrize("name", ["bayesdist.log", ".bayesdist.lock", "figures"])
+def test_nothing_is_written_through_a_link(project, tmp_path, name):
+    """A run that others made may hold links in place of what is written in place."""
+    run, other = project / "run", tmp_path / "precious"
+    if name == "figures":
+        shutil.rmtree(run / name)
+        other.mkdir()
+        (other / "corner.svg").write_text("precious", encoding="utf-8")
+    else:
+        (run / name).unlink(missing_ok=True)
+        other.write_text("precious", encoding="utf-8")
+    (run / name).symlink_to(other)
+    before = snapshot(other) if other.is_dir() else other.read_text(encoding="utf-8")
+    (run / "report.html").unlink()
+    result = cli("stage", "report", run)
+    assert result.code == 1, result.err
+    assert "symbolic link" in result.err or "outside of its folder" in result.err
+    assert "Traceback" not in result.err
+    assert before == (snapshot(other) if other.is_dir() else other.read_text(encoding="utf-8"))
+
+
+@pytest.mark.parametrize("name", ["bayesdist.log", ".bayesdist.lock"])
+def test_a_pipe_in_place_of_a_file_is_not_waited_for(project, name):
+    (project / "run" / name).unlink(missing_ok=True)
+    os.mkfifo(project / "run" / name)
+    result = cli("stage", "report", project / "run")
+    assert result.code == 1 and "a pipe" in result.err
 
 
 def test_matches_of_a_folder_above_are_as_the_user_wants_them(finished, tmp_path):
