@@ -19,6 +19,7 @@ from bayesdist.errors import InputError
 from bayesdist.files.atomic import atomic_path
 from bayesdist.files.tables import read_table
 from bayesdist.utils.arrays import Float
+from bayesdist.utils.text import ascii_of, refuse_control_characters
 
 _NUMBERS = ("exptime", "vafactor", "pa_v3", "ra", "dec")
 _SLOWEST = 2e-4  # |VAFACTOR - 1| of anything in orbit about the Earth stays below 1.4e-4
@@ -74,6 +75,7 @@ class Exposure:
     def __post_init__(self) -> None:
         if not self.name:
             raise InputError("an exposure has no name", do="name it")
+        refuse_control_characters((self.name, self.filter), f"exposure {self.name!r:.60}")
         for key in ("epoch", *_NUMBERS):
             value = getattr(self, key)
             if value is not None and not np.isfinite(value):
@@ -336,7 +338,8 @@ def write_exposures(log: ExposureLog, path: str | os.PathLike[str]) -> None:
     Raises
     ------
     InputError
-        For another extension, or when the file cannot be written.
+        For another extension, names that are not ASCII in a FITS table, or when the file cannot be
+        written.
     """
     path = Path(path)
     if path.suffix.lower() not in _FORMATS:
@@ -344,6 +347,14 @@ def write_exposures(log: ExposureLog, path: str | os.PathLike[str]) -> None:
             f"extension {path.suffix!r} is not one of a log",
             where=str(path),
             do=f"choose one of {', '.join(_FORMATS)}",
+        )
+    texts = (text for one in log for text in (one.name, one.filter))
+    other = next((text for text in texts if ascii_of(text) != text), None)
+    if path.suffix.lower() == ".fits" and other is not None:  # lists are found by these names
+        raise InputError(
+            f"the name {other!r} is not ASCII, which FITS tables hold alone",
+            where=str(path),
+            do="write .ecsv or .csv",
         )
     table = Table()
     for one in fields(Exposure):

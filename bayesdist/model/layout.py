@@ -16,6 +16,7 @@ from bayesdist.model.frames import CHIP_DEVIATIONS, FRAME_KINDS, RIGID, frame_na
 from bayesdist.model.timedep import AXES, TimeDependence
 from bayesdist.utils.arrays import Float, Int
 from bayesdist.utils.quantities import values_in
+from bayesdist.utils.text import refuse_control_characters
 
 GAUGES = ("first", "held")
 
@@ -47,6 +48,7 @@ class Chip:
     reference_pixel: tuple[float, float]
 
     def __post_init__(self) -> None:
+        refuse_control_characters([self.name], f"chip {self.number}")
         for name in ("size", "reference_pixel"):
             pair = getattr(self, name)
             if hasattr(pair, "unit") or any(hasattr(one, "unit") for one in pair):

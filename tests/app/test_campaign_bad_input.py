@@ -610,3 +610,25 @@ def test_a_damaged_campaign_is_calibrated_and_says_so(campaign, monkeypatch):
     assert "No detection on chip 2" in warnings and "f606w-006" in warnings
     assert summary_of(run)["data"]["n_exposures"] == 7
     assert len(summary_of(run)["products"]) >= 2
+
+
+# -- files that could not be written ---------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "words"),
+    [
+        ('name = "acs_wfc"', f'name = "{"a" * 240}"', ["cannot be the name of a file", "release"]),
+        ('name = "acs_wfc"', 'name = "acs"\ninstrument = "WFC3"', ["WFC3/WFC", "ACS/WFC"]),
+        ("[products.release]", "[products.stdgdc]\n[products.release]", ["STDGDC", "chips 2, 1"]),
+        ('name = "WFC2"', 'name = "W\\u0000"', ["chip[1].name", "U+0000"]),
+    ],
+)
+def test_files_are_made_on_trial_before_stars_are_matched(campaign, old, new, words):
+    campaign.replaced(old, new).refused(*words)
+
+
+def test_names_in_other_scripts_are_no_fault(campaign):
+    campaign.replaced('name = "WFC2"', 'name = "Détecteur 检测器"')
+    campaign.replaced("[products.release]", "[products.tpv]\n[products.cpdis]\n[products.release]")
+    good("check", campaign.path / CONFIG)

@@ -19,6 +19,7 @@ from bayesdist.data.tables.units import conversion, unit_of
 from bayesdist.errors import InputError
 from bayesdist.utils.arrays import Float, Int
 from bayesdist.utils.quantities import YEARS
+from bayesdist.utils.text import refuse_control_characters
 
 log = logging.getLogger("bayesdist")
 
@@ -221,6 +222,7 @@ class SourceColumn:
         else:
             codes, found = encoded(values)
         names = [_text(v) for v in found]
+        refuse_control_characters(names, self.where)
         again, unique = encoded(np.array(names))  # 'a' and 'a ' are one name
         return again[codes], unique
 
