@@ -23,14 +23,17 @@ from bayesdist.files.fits import FITS_START, open_fits
 from bayesdist.files.parquet import parquet_table
 from bayesdist.files.regular import head_of, read_bytes, read_lines
 from bayesdist.files.text_tables import (
+    MAYBE_FOREIGN_BYTES,
     is_text_table,
     mark_of,
     parse_text_table,
     refuse_cut_end,
+    refuse_foreign_numbers,
     refuse_numbers_as_names,
     with_decimal_points,
 )
 from bayesdist.files.unpacked import unpacked
+from bayesdist.utils.text import number_of
 
 CARD_LENGTH = 80  # characters of a FITS card
 _COMMAS = re.compile(r"# delimiter: ['\"]?,")
@@ -63,10 +66,18 @@ def _whole_lines(lines: list[str], mark: str, path: Path) -> list[str]:
     return bare
 
 
+def _is_comment(line: str) -> bool:
+    return line.startswith("#")
+
+
 def read_ecsv(path: Path) -> Table:
     """Table of an ECSV file; errors as of `read_table`."""
     with _reading(path):
-        return Table.read(_whole_lines(read_lines(path), " ", path), format="ascii.ecsv")
+        lines = _whole_lines(read_lines(path), " ", path)
+        table = Table.read(lines, format="ascii.ecsv")
+        mark = "," if any(map(_COMMAS.match, takewhile(_is_comment, lines))) else " "
+        refuse_foreign_numbers(table, lines, mark, where=str(path))
+        return table
 
 
 def _read_text(path: Path) -> Table:
@@ -83,7 +94,9 @@ def _read_separated(path: Path, *, mark: str, format: str) -> Table:
     lines = _whole_lines(lines, mark, path)
     refuse_numbers_as_names(next(csv.reader([names], delimiter=mark), []), where=str(path))
     lines = with_decimal_points(lines, mark, where=str(path))
-    return Table.read(lines, format=format, delimiter=mark, comment="#", guess=False)
+    table = Table.read(lines, format=format, delimiter=mark, comment="#", guess=False)
+    refuse_foreign_numbers(table, lines, mark, where=str(path))
+    return table
 
 
 def _refuse_short_rows(lines: list[str], mark: str, path: Path) -> None:
@@ -112,7 +125,7 @@ def _read_votable(path: Path) -> Table:
                 do="fetch or write it again",
             )
     table = Table.read(io.BytesIO(raw), format="votable")
-    if any(np.ma.is_masked(table[name]) for name in table.colnames):
+    if MAYBE_FOREIGN_BYTES.search(raw) or any(np.ma.is_masked(table[n]) for n in table.colnames):
         _refuse_unreadable_cells(raw, path)
     return table
 
@@ -147,7 +160,7 @@ def _refuse_unreadable_cells(raw: bytes, path: Path) -> None:
 
 def _says_number(cell: str) -> bool:
     try:
-        float(cell)
+        number_of(cell)
     except ValueError:
         return cell.strip().lower() in _NO_NUMBER
     return True

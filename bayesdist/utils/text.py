@@ -9,6 +9,9 @@ from collections.abc import Iterable
 from bayesdist.errors import InputError
 
 _LETTER = re.compile(r"(LATIN|GREEK) (SMALL|CAPITAL) LETTER (\w+)( WITH .*)?")
+_NUMBER = re.compile(
+    r"[+-]?(([0-9]+\.?[0-9]*|\.[0-9]+)(e[+-]?[0-9]+)?|nan|inf|infinity)", re.IGNORECASE | re.ASCII
+)
 _PRINTABLE = re.compile(r"[ -~]*")
 # control characters and the separators of lines and paragraphs
 _CONTROLS = re.compile(r"[\x00-\x1f\x7f-\x9f\u2028\u2029\ud800-\udfff]")
@@ -52,6 +55,18 @@ def _substitute(character: str) -> str:
     if script == "LATIN":
         name = name if len(name) <= 2 else "?"  # as AE; others have names, as ETH
     return name.lower() if case == "SMALL" else name if script == "LATIN" else name.capitalize()
+
+
+def number_of(text: str) -> float:
+    """Number of a text in ASCII decimals, "nan", "inf" or "infinity"; blanks around it may be.
+
+    ValueError for any other text.  Python's `float` takes "1_00" and digits of other scripts for
+    100, and C takes "0x64" for it: no format of tables does.
+    """
+    plain = text.strip(" \t\r\n")
+    if _NUMBER.fullmatch(plain) is None:
+        raise ValueError(f"{text[:40]!r} is no number")
+    return float(plain)
 
 
 def refuse_control_characters(texts: Iterable[str], where: str) -> None:
