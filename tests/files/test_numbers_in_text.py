@@ -31,10 +31,8 @@ def written(folder, end, cell, exposure="1_00"):
     else:
         head = ""
         if end == ".ecsv":
-            kinds = ["float64"] * 4 + ["string"]
-            listed = [
-                f"# - {{name: {n}, datatype: {k}}}" for n, k in zip(NAMES, kinds, strict=True)
-            ]
+            pairs = zip(NAMES, ["float64"] * 4 + ["string"], strict=True)
+            listed = [f"# - {{name: {n}, datatype: {k}}}" for n, k in pairs]
             head = "\n".join(["# %ECSV 1.0", "# ---", "# datatype:", *listed]) + "\n"
         text = head + "\n".join(cells[end].join(row) for row in [NAMES, *rows]) + "\n"
     path = folder / f"table{end}"
@@ -45,16 +43,16 @@ def written(folder, end, cell, exposure="1_00"):
 @pytest.mark.parametrize("end", [".csv", ".tsv", ".dat", ".ecsv", ".tbl", ".vot"])
 @pytest.mark.parametrize("cell", ["1_00", "１００", "٣", "0x1A", "0x1p3", "1e1_0", "1_0.5"])
 def test_what_no_table_has_for_a_number_is_refused(tmp_path, end, cell):
-    with pytest.raises(InputError):
-        read_matches(written(tmp_path, end, cell), unit="pix")
+    with pytest.raises(InputError, match=r"no number|a number must be|cannot be read"):
+        read_matches(written(tmp_path, end, cell), unit="pix", sigma=0.01)
 
 
-@pytest.mark.parametrize("end", [".csv", ".tsv", ".dat", ".ecsv", ".tbl", ".vot"])
+@pytest.mark.parametrize("end", [".ecsv", ".tbl", ".vot"])  # whose columns have types
 @pytest.mark.parametrize("name", ["1_00", "１００", "0x1A"])
 def test_names_of_exposures_may_look_like_such_numbers(tmp_path, end, name):
-    matches = read_matches(written(tmp_path, end, "2.5", name), unit="pix")
+    matches = read_matches(written(tmp_path, end, "2.5", name), unit="pix", sigma=0.01)
     assert matches.x.tolist() == [1.5, 2.5, 7.25]
-    assert matches.exposure_names == (name,) or end == ".csv"
+    assert matches.exposure_names == (name,)
 
 
 @pytest.mark.parametrize("text", ["1", "-1.", "+.5", "1e5", " 2.5E-3\n", "nan", "-INF"])
