@@ -24,6 +24,13 @@ from bayesdist.utils.text import ascii_of, refuse_control_characters
 _NUMBERS = ("exptime", "vafactor", "pa_v3", "ra", "dec")
 _SLOWEST = 2e-4  # |VAFACTOR - 1| of anything in orbit about the Earth stays below 1.4e-4
 _UNITS = {"epoch": "yr", "exptime": "s", "pa_v3": "deg", "ra": "deg", "dec": "deg"}
+# plausible values: angles in other units and numbers of another meaning are beyond
+_RANGES = {
+    "exptime": (0.0, 1e7),
+    "pa_v3": (-360.0, 720.0),
+    "ra": (-180.0, 360.0),
+    "dec": (-90.0, 90.0),
+}
 _FORMATS = {".ecsv": "ascii.ecsv", ".csv": "ascii.csv", ".fits": "fits"}
 _ALIASES: dict[str, tuple[str, ...]] = {
     "exposure": ("exposure", "name", "rootname"),
@@ -60,7 +67,8 @@ class Exposure:
     Raises
     ------
     InputError
-        For an empty name, numbers that are not finite, or a factor that no orbit brings about.
+        For an empty name, numbers that are not finite or beyond all that exposures have, or a
+        factor that no orbit brings about.
     """
 
     name: str
@@ -83,6 +91,17 @@ class Exposure:
                     f"{key} is {value}, and must be finite",
                     where=f"exposure {self.name}",
                     do="correct it or leave it out",
+                )
+            if (
+                value is not None
+                and key in _RANGES
+                and not _RANGES[key][0] <= value <= _RANGES[key][1]
+            ):
+                low, high = _RANGES[key]
+                raise InputError(
+                    f"{key} is {value:g}, and must be between {low:g} and {high:g}",
+                    where=f"exposure {self.name}",
+                    do=f"give it in {_UNITS[key]}, or leave it out",
                 )
         if self.vafactor is not None and abs(self.vafactor - 1.0) > _SLOWEST:
             raise InputError(

@@ -394,6 +394,24 @@ def test_a_list_with_nan(campaign, column):
     campaign.refused(f"{ONE}.parquet", "row 5", f"'{column}'")
 
 
+def test_a_list_that_was_appended_to_itself(campaign):
+    campaign.lists(lambda t: vstack([t, t]), "f606w-003").refused("f606w-003", "repeats row 1")
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [("exptime", 1e300), ("exptime", -1.0), ("pa_v3", 1e30), ("ra", 1e300), ("dec", 91.0)],
+)
+def test_numbers_of_a_log_that_no_exposure_has(campaign, name, value):
+    campaign.log(setting(name, 2, value)).refused("exposures.ecsv, row 2", name)
+
+
+@pytest.mark.parametrize("name", ["exptime", "ra", "dec", "pa_v3"])
+def test_numbers_that_a_log_lacks_in_some_rows_are_said(campaign, name):
+    text = campaign.log(setting(name, 2, np.nan)).check()
+    assert f"{name} is missing of 1 of 8 exposures" in text.lower()
+
+
 def test_one_exposure_in_two_lists(campaign):
     (campaign.path / "more").mkdir()
     shutil.copy(campaign.path / "lists" / f"{ONE}.parquet", campaign.path / "more")
