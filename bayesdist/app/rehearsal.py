@@ -66,7 +66,12 @@ def _rehearse_evaluation(data: FitData, config: Config, n_draws: int) -> None:
     budget_of(drawn, settings.domain(errors))
     # without a posterior centroids have no errors yet
     has_mag = data.placed.has_mag
-    requirements = [_of_any_star(r, has_mag=has_mag) for r in config.requirements()]
+    # one of each form: others differ in what nothing is refused for
+    forms = {
+        replace(r, name="any", limit=1.0, probability=0.5): _of_any_star(r, has_mag=has_mag)
+        for r in reversed(config.requirements())
+    }
+    requirements = list(reversed(forms.values()))
     judge(
         drawn,
         requirements,
