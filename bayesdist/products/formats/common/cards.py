@@ -15,6 +15,7 @@ from bayesdist.model import LookupTable
 from bayesdist.utils.arrays import Float
 from bayesdist.utils.text import ascii_of
 
+LONGEST_KEYWORD = 8  # characters; longer ones are of ESO's convention HIERARCH
 _UNPRINTABLE = re.compile(r"[^ -~]")
 # Without one of these nothing ties pixels to a world.
 _NEEDED = re.compile(r"(CTYPE|CRVAL)\d+[A-Z]?$|A_ORDER$|(T?CTYP|TCTY|TCRVL|TCRV)\d+[A-Z]?$")
@@ -129,7 +130,21 @@ def set_text(header: fits.Header, keyword: str, value: str, comment: str = "") -
 
     All text goes into headers by this function or `text_card`: astropy refuses other characters.
     """
-    header[keyword] = ascii_of(value), comment
+    set_value(header, keyword, ascii_of(value), comment)
+
+
+def set_value(
+    header: fits.Header, keyword: str, value: str | float | bool, comment: str = ""
+) -> None:
+    """Set a keyword; a new one goes to the end of the header.
+
+    astropy itself puts it before the comments, in a time that grows with the number of cards.
+    """
+    if keyword in header:
+        header[keyword] = value, comment
+        return
+    name = keyword if len(keyword) <= LONGEST_KEYWORD else f"HIERARCH {keyword}"
+    header.append(fits.Card(name, value, comment), end=True)
 
 
 def append_cards(hdu: fits.hdu.base._BaseHDU, cards: Iterable[str]) -> None:

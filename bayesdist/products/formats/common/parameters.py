@@ -27,7 +27,7 @@ from bayesdist.calibration.inverse import detector_grid
 from bayesdist.calibration.plane import Plane
 from bayesdist.errors import FormatError
 from bayesdist.model import Chip, DistortionModel
-from bayesdist.products.formats.common.cards import named_in, set_text
+from bayesdist.products.formats.common.cards import named_in, set_text, set_value
 from bayesdist.products.formats.common.content import Content, Hdu, fits_bytes
 
 EXTENSION = "BDPARAM"
@@ -81,8 +81,8 @@ def parameters_hdu(calibration: Calibration, epoch: float | None = None) -> fits
     for k, row in enumerate(calibration.further, start=1):
         set_text(header, f"BDNAME{k}", row.name)
         set_text(header, f"BDKIND{k}", row.kind)
-        header[f"BDSIGU{k}"] = row.u, "standard deviation of u"
-        header[f"BDSIGV{k}"] = row.v, "standard deviation of v"
+        set_value(header, f"BDSIGU{k}", row.u, "standard deviation of u")
+        set_value(header, f"BDSIGV{k}", row.v, "standard deviation of v")
         set_text(header, f"BDFROM{k}", row.source)
         if row.correlation:
             # fractions of the variance, each with its length in pixels
