@@ -4,16 +4,21 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import shutil
 from pathlib import Path
 
+import numpy as np
 import pytest
+from astropy.io.fits import FITSDiff
 
 from bayesdist.app.store.record import FileMark, Record
 from bayesdist.app.store.rundir import RunDirectory
 from bayesdist.errors import InputError
 from bayesdist.files.atomic import path_within
-from tests.app.support import cli, good, refused, snapshot, write_config
+from bayesdist.files.hdf5 import netcdf_groups
+from bayesdist.infer import load_fit
+from tests.app.support import EXACT, cli, good, refused, snapshot, write_config, write_job
 from tests.reduced import case_in_full
 
 pytestmark = pytest.mark.usefixtures("no_report")
@@ -216,3 +221,44 @@ def test_products_have_names_and_no_folders(tmp_path, finished):
         with pytest.raises(ValueError, match="name"):
             ReleaseBlock(reference="r", name="x", period=[period | given])
     assert ReleaseBlock(reference="r", name="v1.0-b", period=[period]).name == "v1.0-b"
+
+
+TIMED = {"bayesdist.log", "run.json", "summary.json"}  # with dates and durations
+# these, hashes of files that have them, and where the input was
+TIMES = re.compile(
+    r'\d{4}-\d\d-\d\d[T ]\d\d:\d\d:\d\d[^ "]*|"(wall_s|size|mtime_ns?|base)": [^,}\n]+'
+    r"|\d+(\.\d+)? s\b|[0-9a-f]{64}"
+)
+
+
+def test_runs_in_two_folders_are_the_same_but_for_dates_and_durations(tmp_path, monkeypatch):
+    runs = []
+    for name in ("one", "two/deeper"):
+        folder = write_job(tmp_path / name, budget=[EXACT], products={"sip": {}, "parameters": {}})
+        monkeypatch.chdir(folder.parent)
+        good("run", "config.toml", "-o", "run", "-q")
+        runs.append(folder.parent / "run")
+    first, second = (snapshot(run) for run in runs)
+    assert first.keys() == second.keys()
+    other = {name for name in first if first[name] != second[name]}
+    assert other <= TIMED | {"posterior.nc", "maps.fits"}
+    for name in TIMED:
+        texts = [TIMES.sub("", (run / name).read_text(encoding="utf-8")) for run in runs]
+        assert str(tmp_path) not in texts[0] and texts[0] == texts[1], name
+    groups = [netcdf_groups(run / "posterior.nc") for run in runs]
+    for name, group in groups[0].items():
+        same = groups[1][name]
+        assert all(np.array_equal(group.arrays[k], same.arrays[k]) for k in group.arrays)
+        texts = [{k: TIMES.sub("", str(v)) for k, v in g.attrs.items()} for g in (group, same)]
+        differ = {k for k in texts[0] if texts[0][k] != texts[1][k]}
+        assert differ <= {"wall_s"}, name
+    maps = [str(run / "maps.fits") for run in runs]
+    diff = FITSDiff(*maps, ignore_keywords=["CHECKSUM"], ignore_comments=["DATASUM"])
+    assert diff.identical, diff.report()
+
+
+def test_inspect_describes_the_fit_of_a_run(finished):
+    text = good("inspect", finished.path / "fit.nc").out
+    fit = load_fit(finished.path / "fit.nc")
+    assert "linear fit" in text and f"{fit.n_used} stars" in text
+    assert all(name in text for name in fit.model.names)
