@@ -16,6 +16,8 @@ from bayesdist.errors import InputError
 from bayesdist.files.regular import descriptor_for_writing
 
 log = logging.getLogger("bayesdist")
+# they write tracebacks of lost connections above the sentence that says so; Dask sets their levels
+DASK_LOGS = ("distributed.client", "distributed.core", "distributed.comm.tcp", "distributed.utils")
 FORMAT = "%(asctime)s %(levelname)-7s %(message)s"
 
 
@@ -45,6 +47,13 @@ def start_logging(*, quiet: bool) -> None:
     handler.setFormatter(logging.Formatter("%(message)s"))
     handler.setLevel(logging.WARNING if quiet else logging.INFO)
     log.addHandler(handler)
+    for name in DASK_LOGS:
+        logging.getLogger(name).addFilter(_nothing)
+
+
+def _nothing(_: logging.LogRecord) -> bool:
+    """Pass no record; a function of its own, so that it is added to a logger only once."""
+    return False
 
 
 class _QuietHandler(logging.FileHandler):
