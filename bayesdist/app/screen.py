@@ -8,9 +8,10 @@ import os
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
+from io import FileIO, TextIOWrapper
 from numbers import Integral, Real
 from pathlib import Path
-from typing import Any, TextIO
+from typing import Any
 
 from bayesdist.errors import InputError
 from bayesdist.files.regular import descriptor_for_writing
@@ -62,10 +63,10 @@ class _QuietHandler(logging.FileHandler):
     def handleError(self, record: logging.LogRecord) -> None:  # noqa: N802  logging's own name
         """Pass over it."""
 
-    def _open(self) -> TextIO:
-        """File to be appended to; a link that others may have laid there is not followed."""
-        held = descriptor_for_writing(self.baseFilename, os.O_APPEND)
-        return os.fdopen(held, self.mode, encoding=self.encoding)
+    def _open(self) -> TextIOWrapper:
+        """Open the log for appending; a symbolic link is not followed."""
+        descriptor = descriptor_for_writing(self.baseFilename, os.O_APPEND)
+        return TextIOWrapper(FileIO(descriptor, self.mode), encoding=self.encoding)
 
 
 @contextmanager
