@@ -1,4 +1,4 @@
-"""Passes that give a number for each star: residuals, and outlier probabilities."""
+"""Passes with results per star: residuals and outlier probabilities."""
 
 from __future__ import annotations
 
@@ -28,10 +28,10 @@ def _residuals(first, end, stars, model, blocks, columns, coef, order, out):
 
 
 def residuals(blocks: Int, columns: tuple[Float, ...], coef: Float, order: int) -> Float:
-    """Data minus model (N, 2).
+    """Residuals (N, 2): data minus model.
 
-    `blocks` (n, 3) are `pieces_of` size `BLOCK`; `columns` (N,) are X, Y, u, v and more; `coef` (G,
-    2, K) are effective coefficients of the scaled powers.
+    `blocks` (n, 3) are the pieces of size `BLOCK` from `pieces_of`; `columns` (N,) are X, Y, u, v,
+    var_u, var_v; `coef` (G, 2, K) are the effective coefficients of the scaled powers.
     """
     out = np.empty((len(columns[0]), 2))
     with threads_for(len(out)):
@@ -84,10 +84,10 @@ def memberships(
     constants: Constants,
     each: int,
 ) -> Float:
-    """Outlier probability, log-likelihood and its square (D / each, 3, N) of each star.
+    """Outlier probability, log-likelihood and its square for each star, shape (D / each, 3, N).
 
-    They are averaged over `each` draws at a time.  `coef` (D, G, 2, K) and the constants are those
-    of D draws; other arguments as in `residuals`.
+    They are averaged over `each` consecutive draws.  `coef` (D, G, 2, K) and the constants belong
+    to D draws; see `residuals` for the other arguments.
     """
     out = np.zeros((len(coef) // each, 3, len(columns[0])))
     with threads_for(4 * out.shape[2] * len(coef)):
