@@ -46,18 +46,18 @@ def _weighted_stars(
     S, A, b = np.zeros((2, MOST_STAR)), np.zeros((MOST_STAR, MOST_STAR)), np.zeros(MOST_STAR)
     for s in range(first, end):
         a, e = starts[s], starts[s + 1]
-        rows = own_rows(W, var, a, e)
+        obs = own_rows(W, var, a, e)
         for i in range(a, e):
-            rows[PLACE_U, i - a], rows[PLACE_V, i - a] = z[i, 0], z[i, 1]
+            obs[PLACE_U, i - a], obs[PLACE_V, i - a] = z[i, 0], z[i, 1]
         when = time[a:e] if q >= 4 else time
         parallax = factor[a:e] if q == 5 else factor
         to_mode(
-            rows, e - a, j2, log_core, log_out, when, parallax, centre[s], precision[s], stars[s], S,
+            obs, e - a, j2, log_core, log_out, when, parallax, centre[s], precision[s], stars[s], S,
             A, b, False, least,
         )  # fmt: skip
         for i in range(a, e):
             design(S, q, i - a, when, parallax)
-            _, _, square = residual(i - a, rows, S, stars[s], q)
+            _, _, square = residual(i - a, obs, S, stars[s], q)
             member[i] = membership(odds, square, var[i] + j2)
 
 
