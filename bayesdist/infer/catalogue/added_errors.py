@@ -88,7 +88,7 @@ class GroupedErrors:
 
     @property
     def excess(self) -> Float:
-        """Errors (G, 2) to add to the quoted ones, without the smallest, which the jitter covers."""
+        """Errors (G, 2) to add to the quoted ones; the smallest is left to the jitter."""
         return np.sqrt(self.variance - self.variance.min())
 
     @property

@@ -142,7 +142,7 @@ class StarSums:
         return out
 
     def _products(self, rows: slice, variance: list[Float]) -> Iterator[tuple[int, int, Float]]:
-        """Yield pairs of axes with the sums (n,) over the axes of weight products times variance."""
+        """Yield pairs of axes with the sums (n,) of variance times both weights over the axes."""
         u, v = self.weight[:, rows]
         if self.cross is None:
             yield 0, 0, u**2 * variance[0]

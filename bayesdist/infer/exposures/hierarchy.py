@@ -107,7 +107,7 @@ class HierarchicalFit(Solution):
 
     @property
     def tau(self) -> dict[str, float]:
-        """Posterior median of the scatter tau by kind of deviation, in the unit of the parameter."""
+        """Posterior median of tau by kind of deviation, in the unit of the parameter."""
         median = np.median(self.tau_draws, axis=0)
         return dict(zip(self.scatter.kinds, map(float, median), strict=True))
 
