@@ -21,10 +21,10 @@ of q, E[.] is a mean weighted by e^g.
 **What is not certified.**  The inequality is exact, but chi2 is an estimate.  Its upper limit
 allows for a region that the pilots may have missed.  By the rule of three, a region with more than
 3/n of the probability of q is hit with 95 % confidence; three pilots are therefore added, each with
-twice the largest remainder observed.  Normal theory and the bootstrap would give limits that are too low,
-since the remainders have the tails of a cubic.  All values hold for the region that the pilots
-cover.  The outermost tails of q and everything beyond them, such as a distant second mode, are not
-covered.
+twice the largest remainder observed.  Normal theory and the bootstrap would give limits that are
+too low, since the remainders have the tails of a cubic.  All values hold for the region that the
+pilots cover.  The outermost tails of q and everything beyond them, such as a distant second mode,
+are not covered.
 """
 
 from __future__ import annotations
