@@ -162,7 +162,7 @@ class Scatter:
             columns[np.arange(len(at)), at] = 1.0
             cov = factor.solve(columns)[:, at]
             inverse = np.linalg.inv((cov + cov.T) / 2)
-            # information from the data about this exposure's deviations, without their own prior
+            # information from the data about this exposure's deviations, without their prior
             information = inverse - np.diag(precision[rows])
             pull = inverse @ mean[at]
             mine = np.where(tight[rows], squares[rows], 0.0)

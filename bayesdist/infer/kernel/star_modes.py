@@ -204,7 +204,7 @@ def _sums(own, j2, odds, pu, pv, share):
 def _expanded(own, n, j2, odds, time, factor, centre, precision, p, S, A, b, observed):
     """Write the gradient b and the lower triangle of the curvature A of a star at p.
 
-    Both include the prior, whose log density is returned.  The densities of the detections are
+    Both include the prior; its log density is returned.  The densities of the detections are
     written to the row TERM of `own` (see `_log_density`).
     """
     whole_vectors()

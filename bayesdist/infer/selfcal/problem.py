@@ -45,8 +45,7 @@ class Problem:
     """N detections of S stars, sorted by star, with the model linearised about a solution."""
 
     model: DistortionModel
-    # detections with equal effective coefficients form a group; `index` (N,) is the group of each
-    groups: Groups
+    groups: Groups  # detections of equal effective coefficients; `index` (N,): group of each
     starts: Int  # index (S + 1,) of the first detection of each star, and the number N
     seen: Float  # scaled pixel coordinates (2, N) of the detections
     # scaled pixel coordinates (N,) of the star at the current solution: the model is evaluated there
