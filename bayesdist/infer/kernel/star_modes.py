@@ -289,7 +289,7 @@ def _to_mode_at_rest(own, n, j2, odds, log_core, c0, c1, p00, p10, p11, pu, pv, 
         # a step may be long and gain little; the curvature at its end is different
         moved = own[UU, 0] * du * du + 2.0 * own[UV, 0] * du * dv + own[VV, 0] * dv * dv
         if decrement < CLOSE and moved < STILL * (own[VAR, 0] + j2):
-            if observed == seen:  # the last step changes the curvature by next to nothing
+            if observed == seen:  # the last step hardly changes the curvature
                 value += _log_density(own, n, j2, log_core) + 0.5 * decrement
                 return value, observed, pu, pv, l00, l10, l11
             break
@@ -346,7 +346,7 @@ def to_mode(
         # a step may be long and gain little; the curvature at its end is different
         moved = own[UU, 0] * b[0] ** 2 + 2.0 * own[UV, 0] * b[0] * b[1] + own[VV, 0] * b[1] ** 2
         if decrement < CLOSE and moved < STILL * (own[VAR, 0] + j2):
-            if observed == seen:  # the last step changes the curvature by next to nothing
+            if observed == seen:  # the last step hardly changes the curvature
                 return value + _log_density(own, n, j2, log_core) + 0.5 * decrement, observed
             break
         observed = decrement < NEAR and not failed

@@ -48,7 +48,7 @@ class Problem:
     groups: Groups  # detections of equal effective coefficients; `index` (N,): group of each
     starts: Int  # index (S + 1,) of the first detection of each star, and the number N
     seen: Float  # scaled pixel coordinates (2, N) of the detections
-    # scaled pixel coordinates (N,) of the star at the current solution: the model is evaluated there
+    # scaled pixel coordinates (N,) at the current solution, where the model is evaluated
     X: Float
     Y: Float
     offset: Float  # displacement (N, 2) on the sky from there to the detection
