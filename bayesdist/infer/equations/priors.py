@@ -129,11 +129,20 @@ class Prior:
     """Correlated Gaussian prior on all parameters, expanded about a reference point.
 
     log p = -d^T P d / 2 + r^T d with d = theta - reference.
+
+    Parameters
+    ----------
+    reference : ndarray, shape (D,)
+        Parameters near the solution, to avoid rounding errors.
+    precision : ndarray, shape (D, D)
+        The matrix P.
+    right : ndarray, shape (D,)
+        The vector r, the gradient at `reference`.
     """
 
-    reference: Float  # parameters (D,) near the solution, to avoid rounding errors
-    precision: Float  # P (D, D)
-    right: Float  # r (D,), the gradient at `reference`
+    reference: Float
+    precision: Float
+    right: Float
 
     @classmethod
     def none(cls, reference: Float) -> Prior:

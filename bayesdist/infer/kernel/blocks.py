@@ -42,8 +42,17 @@ PARTS = 4  # tasks per thread, to balance the load
 def pieces_of(starts: Int, size: int) -> Int:
     """Divide the stars into pieces of at most `size` stars, each within one group.
 
-    `starts` (G + 1,) are the indices of the first star of each group, and the total number.
-    Returns rows (group, first star, end), shape (n, 3).
+    Parameters
+    ----------
+    starts : ndarray of int, shape (G + 1,)
+        Index of the first star of each group, and the total number.
+    size : int
+        Maximum number of stars per piece.
+
+    Returns
+    -------
+    ndarray of int, shape (n, 3)
+        Group, first star, and end of each piece.
     """
     first = [np.arange(a, b, size) for a, b in pairwise(starts)]
     group = np.repeat(np.arange(len(first)), [len(f) for f in first])
@@ -153,10 +162,20 @@ def get_threads() -> int:
     """Maximum number of threads of a pass.
 
     The default is that of NUMBA_NUM_THREADS, or the number of processors.
+
+    Returns
+    -------
+    int
     """
     return _threads.get()
 
 
 def set_threads(n: int) -> None:
-    """Set the maximum number of threads for passes started by the calling thread."""
+    """Set the maximum number of threads for passes started by the calling thread.
+
+    Parameters
+    ----------
+    n : int
+        Maximum number of threads, limited to the number of processors and NUMBA_NUM_THREADS.
+    """
     _threads.set(max(1, min(n, nb.config.NUMBA_NUM_THREADS, os.cpu_count() or 1)))

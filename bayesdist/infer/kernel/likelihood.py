@@ -79,11 +79,24 @@ def log_likelihood(
     order: int,
     constants: Constants,
 ) -> Float:
-    """Log-likelihood (D,) of all stars for D parameter vectors.
+    """Log-likelihood of all stars for D parameter vectors.
 
-    `blocks` (n, 3) are the pieces of size `BLOCK` from `pieces_of`; `columns` (N,) are X, Y, u, v,
-    var_u, var_v; `coef` (D, G, 2, K) are the effective coefficients of the powers X^i Y^j of the
-    scaled pixel coordinates for each of G groups; `constants` are those of the mixture.
+    Parameters
+    ----------
+    blocks : ndarray of int, shape (n, 3)
+        Pieces of size `BLOCK` from `pieces_of`.
+    columns : tuple of ndarray, shape (N,)
+        X, Y, u, v, var_u, var_v.
+    coef : ndarray, shape (D, G, 2, K)
+        Effective coefficients of the powers X^i Y^j of the scaled pixel coordinates, for G groups.
+    order : int
+        Polynomial order.
+    constants : Constants
+        Constants of the mixture for the D parameter vectors.
+
+    Returns
+    -------
+    ndarray, shape (D,)
     """
     rows, coef = packed(constants), np.ascontiguousarray(coef)
     out = np.empty(len(coef))

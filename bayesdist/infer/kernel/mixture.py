@@ -26,15 +26,31 @@ LEAST, MOST = 1e-100, 1e100
 
 
 class Constants(NamedTuple):
-    """Constants of the outlier mixture for D parameter vectors, in the unit of u, v."""
+    """Constants of the outlier mixture for D parameter vectors, in the unit of u, v.
 
-    j2: Float  # squared jitter (D,)
-    log_f: Float  # logarithm of the outlier fraction f (D,)
-    log_1_f: Float  # logarithm of 1 - f (D,)
-    out: Float  # variance of Gaussian outliers, or area of the match circle (D,)
-    kind: int  # `NO_OUTLIERS`, `GAUSSIAN` or `UNIFORM`
-    unit2: float  # typical variance, the unit of the densities
-    radius: float = 0.0  # radius of the match circle about nominal positions; 0 for none
+    Parameters
+    ----------
+    j2 : ndarray, shape (D,)
+        Squared jitter.
+    log_f, log_1_f : ndarray, shape (D,)
+        Logarithms of the outlier fraction f and of 1 - f.
+    out : ndarray, shape (D,)
+        Variance of Gaussian outliers, or area of the match circle.
+    kind : int
+        `NO_OUTLIERS`, `GAUSSIAN` or `UNIFORM`.
+    unit2 : float
+        Typical variance, the unit of the densities.
+    radius : float
+        Radius of the match circle about nominal positions; 0 for none.
+    """
+
+    j2: Float
+    log_f: Float
+    log_1_f: Float
+    out: Float
+    kind: int
+    unit2: float
+    radius: float = 0.0
 
     def of(self, rows: slice) -> Constants:
         """Constants of a subset of the parameter vectors."""

@@ -56,13 +56,24 @@ N_HYPER = 3  # hyperparameters: log j, logit f, log s_out
 
 @dataclass(frozen=True, eq=False)
 class Moments:
-    """Sums over the stars of each of G groups, for K polynomial terms."""
+    """Sums over the stars of each of G groups, for K polynomial terms.
 
-    weight: Float  # sum (G, 3, K, K) of w phi phi^T for the axis pairs uu, uv, vv
-    right: Float  # sum (G, 2, K) of phi times d log L / d(model position)
-    # mixed second derivatives (G, 3, 2, K) with log j, logit f, log s_out; zero for least squares
+    Parameters
+    ----------
+    weight : ndarray, shape (G, 3, K, K)
+        Sum of w phi phi^T for the axis pairs uu, uv, vv.
+    right : ndarray, shape (G, 2, K)
+        Sum of phi times d log L / d(model position).
+    cross : ndarray, shape (G, 3, 2, K)
+        Mixed second derivatives with log j, logit f, log s_out; zero for least squares.
+    scalars : ndarray
+        Sums over all groups; see the functions that compute them.
+    """
+
+    weight: Float
+    right: Float
     cross: Float
-    scalars: Float  # sums over all groups; see the functions that compute them
+    scalars: Float
 
 
 def _powers(order: int) -> tuple[Int, Int]:

@@ -73,10 +73,23 @@ def _positions(first, end, group, X, Y, coef, order, out):
 
 
 def positions(group: Int, X: Float, Y: Float, coef: Float, order: int) -> Float:
-    """Sky positions (N, 2) of detections.
+    """Sky positions of detections.
 
-    `group` (N,) are the groups of the detections, X, Y (N,) their scaled pixel coordinates, and
-    `coef` (G, 2, K) the coefficients of the powers of X, Y.
+    Parameters
+    ----------
+    group : ndarray of int, shape (N,)
+        Group of each detection.
+    X, Y : ndarray, shape (N,)
+        Scaled pixel coordinates.
+    coef : ndarray, shape (G, 2, K)
+        Coefficients of the powers of X and Y.
+    order : int
+        Polynomial order.
+
+    Returns
+    -------
+    ndarray, shape (N, 2)
+        Positions u, v.
     """
     out = np.empty((len(X), 2))
     share_out(_positions, len(X), group, X, Y, coef, order, out)
@@ -92,7 +105,18 @@ def _slopes(first, end, group, X, Y, coef, order, out):
 
 
 def slopes(group: Int, X: Float, Y: Float, coef: Float, order: int) -> Float:
-    """Derivatives (N, 2, 2) of sky positions with respect to X and Y; see `positions`."""
+    """Derivatives of sky positions with respect to X and Y.
+
+    Parameters
+    ----------
+    group, X, Y, coef, order
+        See `positions`.
+
+    Returns
+    -------
+    ndarray, shape (N, 2, 2)
+        Rows u, v; columns X, Y.
+    """
     out = np.empty((len(X), 2, 2))
     share_out(_slopes, len(X), group, X, Y, coef, order, out)
     return out

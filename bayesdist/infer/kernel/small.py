@@ -76,7 +76,19 @@ def _precisions(formal, sigma, precision):
 
 
 def precisions(formal: Float, sigma: Float) -> Float:
-    """Inverses (C, k, k, E) of formal (k, k, E) + sigma (C, k, k), both positive definite."""
+    """Inverses of the total covariances of the exposures, formal + sigma.
+
+    Parameters
+    ----------
+    formal : ndarray, shape (k, k, E)
+        Formal covariances.
+    sigma : ndarray, shape (C, k, k)
+        Intrinsic covariances. The sums must be positive definite.
+
+    Returns
+    -------
+    ndarray, shape (C, k, k, E)
+    """
     out = np.empty((*sigma.shape, formal.shape[-1]))
     _precisions(formal, np.ascontiguousarray(sigma), out)
     return out
@@ -121,11 +133,28 @@ def _densities(formal, sigma, residual, fraction, kappa2, density, distance, odd
 def densities(
     formal: Float, sigma: Float, residual: Float, fraction: Float, kappa2: Float
 ) -> tuple[Float, Float, Float]:
-    """Log densities, squared Mahalanobis distances and outlier probabilities (C, E) of exposures.
+    """Log densities and outlier probabilities of the exposures.
 
-    `residual` is (C, k, E).  The covariance of a normal exposure is `formal` (k, k, E) + `sigma`
-    (C, k, k).  A `fraction` (C,) of the exposures are outliers with `kappa2` (C,) times that
-    covariance.
+    Parameters
+    ----------
+    formal : ndarray, shape (k, k, E)
+        Formal covariances.
+    sigma : ndarray, shape (C, k, k)
+        Intrinsic covariances. The covariance of a normal exposure is `formal` + `sigma`.
+    residual : ndarray, shape (C, k, E)
+    fraction : ndarray, shape (C,)
+        Fraction of outlying exposures.
+    kappa2 : ndarray, shape (C,)
+        Factor on the covariance of outlying exposures.
+
+    Returns
+    -------
+    density : ndarray, shape (C, E)
+        Log densities.
+    distance : ndarray, shape (C, E)
+        Squared Mahalanobis distances.
+    probability : ndarray, shape (C, E)
+        Outlier probabilities.
     """
     out = np.empty((3, len(sigma), formal.shape[-1]))
     density, distance, probability = out
@@ -167,11 +196,25 @@ def _deviations(sigma, root, precision, residual, noise, deviation):
 def draw_deviations(
     sigma: Float, root: Float, precision: Float, residual: Float, rng: np.random.Generator
 ) -> Float:
-    """Draws (C, k, E) of the intrinsic part of residuals (C, k, E).
+    """Draw the intrinsic part of residuals.
 
     Uses Matheron's rule: a draw from the prior, corrected with the difference between the residual
-    and a simulated residual.  `root` (k, k, E) is the Cholesky factor of the formal covariance, and
-    `precision` (C, k, k, E) is the result of `precisions`.
+    and a simulated residual.
+
+    Parameters
+    ----------
+    sigma : ndarray, shape (C, k, k)
+        Intrinsic covariances.
+    root : ndarray, shape (k, k, E)
+        Cholesky factors of the formal covariances.
+    precision : ndarray, shape (C, k, k, E)
+        Result of `precisions`.
+    residual : ndarray, shape (C, k, E)
+    rng : numpy.random.Generator
+
+    Returns
+    -------
+    ndarray, shape (C, k, E)
     """
     sigma = np.ascontiguousarray(sigma)
     out = np.linalg.cholesky(sigma) @ rng.standard_normal(residual.shape)
@@ -211,10 +254,20 @@ def _gaussians(matrix, x, noise, value):
 
 
 def gaussians(matrix: Float, right: Float, noise: Float) -> tuple[Float, Float]:
-    """Draws y (C, q) from densities exp(right'y - y' matrix y / 2), and logs of their integrals.
+    """Draws y from densities exp(right'y - y' matrix y / 2), and logs of their integrals.
 
-    `matrix` is (C, q, q), `right` (C, q), and `noise` (C, q) standard normal.  The integrals (C,)
-    are up to a constant, and NaN if a matrix is not positive definite.
+    Parameters
+    ----------
+    matrix : ndarray, shape (C, q, q)
+    right : ndarray, shape (C, q)
+    noise : ndarray, shape (C, q)
+        Standard normal random numbers.
+
+    Returns
+    -------
+    draws : ndarray, shape (C, q)
+    value : ndarray, shape (C,)
+        Log integrals, up to a constant; NaN if a matrix is not positive definite.
     """
     draws, value = right.copy(), np.empty(len(right))
     _gaussians(matrix.copy(), draws, noise, value)

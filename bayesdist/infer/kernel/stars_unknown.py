@@ -65,7 +65,36 @@ def weighted_stars(
     starts: Int, z: Float, W: Float, var: Float, j2: float, log_core: float, log_out: float,
     time: Float, factor: Float, centre: Float, precision: Float, least: float, stars: Float,
 ) -> Float:  # fmt: skip
-    """Move stars (n, q) to their modes for sky positions z (N, 2); return memberships (N,)."""
+    """Move stars to their modes for given sky positions of their N detections.
+
+    Parameters
+    ----------
+    starts : ndarray of int, shape (n + 1,)
+        Index of the first detection of each star, and the number N.
+    z : ndarray, shape (N, 2)
+        Sky positions of the detections.
+    W : ndarray, shape (N, 3)
+        Elements uu, uv, vv of the matrix that converts sky residuals to squared pixels.
+    var : ndarray, shape (N,)
+        Squared quoted errors in square pixels.
+    j2, log_core, log_out : float
+        Squared jitter, log of the core fraction, log density of outliers.
+    time : ndarray, shape (N,)
+        Years since the reference epoch; empty if stars have no proper motion.
+    factor : ndarray, shape (N, 2)
+        Parallax factors; empty without parallax.
+    centre, precision : ndarray, shape (n, q) and (n, q, q)
+        Gaussian priors of the stars.
+    least : float
+        Square root of the smallest curvature allowed for the position of a star.
+    stars : ndarray, shape (n, q)
+        Parameters of the stars, which are changed.
+
+    Returns
+    -------
+    ndarray, shape (N,)
+        Probability that each detection belongs to its star.
+    """
     member = np.zeros(len(z))
     share_out(
         _weighted_stars, len(stars), starts, z, W, var, j2, log_core, log_out, time, factor,
@@ -185,11 +214,20 @@ class EliminationSums(NamedTuple):
 
     The curvature is summed with Legendre functions up to twice the order; `product_table` converts
     these to sums with products of two basis functions.  Padding entries are meaningless.
+
+    Parameters
+    ----------
+    weights : ndarray, shape (G, 3, M or more)
+        Curvature uu, uv, vv in position times Legendre functions.
+    pulls : ndarray, shape (G, 2, K or more)
+        Gradient in position times Legendre functions.
+    scalars : ndarray, shape (3,)
+        Log density, sum of w, sum of w times squared normalised residual.
     """
 
-    weights: Float  # (G, 3, M or more), curvature uu, uv, vv in position times Legendre functions
-    pulls: Float  # (G, 2, K or more), gradient in position times Legendre functions
-    scalars: Float  # (3,): log density, sum of w, sum of w times squared normalised residual
+    weights: Float
+    pulls: Float
+    scalars: Float
 
     @classmethod
     def zero(cls, n_groups: int, order: int) -> EliminationSums:

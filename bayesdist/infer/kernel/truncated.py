@@ -245,10 +245,20 @@ def truncated_log_likelihood(
     order: int,
     constants: Constants,
 ) -> Float:
-    """Log-likelihood (D,) of all stars for D parameter vectors, with match circles.
+    """Log-likelihood of all stars for D parameter vectors, with match circles.
 
-    `offsets` are the nominal positions minus the data, in u and in v (N,).  The radius of the
-    circle is part of the constants.  See `log_likelihood` for the other arguments.
+    Parameters
+    ----------
+    blocks, columns, coef, order
+        See `log_likelihood`.
+    offsets : tuple of ndarray, shape (N,)
+        Nominal positions minus the data, in u and in v.
+    constants : Constants
+        Constants of the mixture, including the radius of the circle.
+
+    Returns
+    -------
+    ndarray, shape (D,)
     """
     rows, coef = packed(constants), np.ascontiguousarray(coef)
     stars, circle, nothing = (*columns, *offsets), _circle(constants), np.empty((0, 3, 0))
@@ -286,10 +296,18 @@ def truncated_memberships(
     constants: Constants,
     each: int,
 ) -> Float:
-    """Outlier probability, log-likelihood and its square for each star, shape (D / each, 3, N).
+    """Outlier probability, log-likelihood and its square for each star, with match circles.
 
-    `offsets` are the nominal positions minus the data, in u and in v (N,).  See `memberships` for
-    the other arguments.
+    Parameters
+    ----------
+    blocks, columns, coef, order, constants, each
+        See `memberships`.
+    offsets : tuple of ndarray, shape (N,)
+        Nominal positions minus the data, in u and in v.
+
+    Returns
+    -------
+    ndarray, shape (D / each, 3, N)
     """
     out = np.empty((len(coef) // each, 3, len(columns[0])))
     with threads_for(INTEGRAL * out.shape[2] * len(coef)):
@@ -322,10 +340,20 @@ def truncated_moments(
 ) -> Moments:
     """Sums for the gradient and Hessian of the mixture log-likelihood, with match circles.
 
-    `offsets` are the nominal positions minus the data, in u and in v (N,).  See `mixture_moments`
-    for the other arguments and the result.  If `em` is True, the curvature is that for fixed
-    memberships instead of the Hessian, and `cross` is zero.  This curvature is the covariance of a
-    truncated Gaussian times two inverse variances, and never negative.
+    Parameters
+    ----------
+    pieces, columns, coef, order, constants
+        See `mixture_moments`.
+    offsets : tuple of ndarray, shape (N,)
+        Nominal positions minus the data, in u and in v.
+    em : bool
+        True for the curvature for fixed memberships instead of the Hessian. It is the covariance of
+        a truncated Gaussian times two inverse variances, and never negative; `cross` is zero.
+
+    Returns
+    -------
+    Moments
+        Its `scalars` are those of `mixture_moments`.
     """
     sums, scalars = empty_sums(len(pieces), order, COLUMNS, N_MIXTURE)
     with threads_for(INTEGRAL * len(columns[0])):
@@ -355,11 +383,23 @@ def truncated_scores(
     order: int,
     constants: Constants,
 ) -> Float:
-    """Derivatives of each star's log-likelihood with respect to the model position, shape (5, N).
+    """Derivatives of each star's log-likelihood with respect to the model position.
 
-    The rows are the first derivatives in u and v, and minus the second derivatives uu, uv, vv.
-    `offsets` are the nominal positions minus the data, in u and in v (N,); `coef` is (G, 2, K), and
-    the constants belong to one parameter vector.  See `residuals` for the other arguments.
+    Parameters
+    ----------
+    blocks, columns, order
+        See `residuals`.
+    offsets : tuple of ndarray, shape (N,)
+        Nominal positions minus the data, in u and in v.
+    coef : ndarray, shape (G, 2, K)
+        Effective coefficients of the scaled powers.
+    constants : Constants
+        Constants of the mixture for one parameter vector.
+
+    Returns
+    -------
+    ndarray, shape (5, N)
+        First derivatives in u and v, and minus the second derivatives uu, uv, vv.
     """
     out = np.empty((5, len(columns[0])))
     with threads_for(INTEGRAL * out.shape[1]):

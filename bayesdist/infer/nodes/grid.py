@@ -25,12 +25,24 @@ STEP = (64.0, 64.0)  # node distance in pixels, as in D2IMFILE and NPOLFILE
 class NodeGrid:
     """Grid of nodes at the centres of equal bins of a chip.
 
-    Raises InputError if there are too few nodes to represent more than the polynomial.
+    Parameters
+    ----------
+    chip : Chip
+    order : int
+        Order of the polynomial that is fitted together with the table.
+    step : tuple of float
+        Size of a bin along x and y in pixels.
+
+    Raises
+    ------
+    InputError
+        If the step is not positive, or if there are too few nodes to represent more than the
+        polynomial.
     """
 
     chip: Chip
-    order: int  # order of the polynomial that is fitted together with the table
-    step: tuple[float, float] = STEP  # size of a bin along x and y, pixels
+    order: int
+    step: tuple[float, float] = STEP
 
     def __post_init__(self) -> None:
         if not min(self.step) > 0:

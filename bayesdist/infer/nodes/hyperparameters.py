@@ -39,11 +39,21 @@ UNFORESEEN = 5.0  # generous upper limit on the ratio of actual to predicted gai
 
 @dataclass(frozen=True)
 class Matern:
-    """Stationary Gaussian random field (Rasmussen and Williams 2006, Equation 4.14)."""
+    """Stationary Gaussian random field (Rasmussen and Williams 2006, Equation 4.14).
 
-    amplitude: float  # standard deviation, pixels
-    length: float  # correlation length, pixels
-    smoothness: float  # 1/2 (not differentiable), 3/2 (once) or 5/2 (twice)
+    Parameters
+    ----------
+    amplitude : float
+        Standard deviation in pixels.
+    length : float
+        Correlation length in pixels.
+    smoothness : float
+        1/2 (not differentiable), 3/2 (once) or 5/2 (twice).
+    """
+
+    amplitude: float
+    length: float
+    smoothness: float
 
     def by_lag(self, distance: Float) -> tuple[Float, Float]:
         """Covariance (n,) at distances (n,) in pixels, and its derivative (n,).

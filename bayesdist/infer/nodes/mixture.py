@@ -23,12 +23,24 @@ CONVERGED = 1e-3  # relative change of the expected number of false matches
 
 @dataclass(frozen=True, eq=False)
 class ResidualMixture:
-    """Outlier mixture of residuals, with the probability that each star is a true match."""
+    """Outlier mixture of residuals, with the probability that each star is a true match.
 
-    probability: Float  # probability (N,) that a star is a true match
-    fraction: float  # fraction of false matches
-    jitter: float  # additional error in excess of the quoted one, in the unit of the residuals
-    outlier_scale: float  # standard deviation of false matches per axis
+    Parameters
+    ----------
+    probability : ndarray, shape (N,)
+        Probability that each star is a true match.
+    fraction : float
+        Fraction of false matches.
+    jitter : float
+        Additional error in excess of the quoted one, in the unit of the residuals.
+    outlier_scale : float
+        Standard deviation of false matches per axis, in the unit of the residuals.
+    """
+
+    probability: Float
+    fraction: float
+    jitter: float
+    outlier_scale: float
 
 
 def fit_mixture(residual: Float, variance: Float) -> ResidualMixture:

@@ -20,11 +20,18 @@ FOLDED = 1e-6  # determinant of the Jacobian over its squared norm, below which 
 
 @dataclass(frozen=True, eq=False)
 class PixelShifts:
-    """Residuals of matched stars in pixels of the detector."""
+    """Residuals of matched stars in pixels of the detector.
 
-    shift: Float  # (N, 2), corrections to be added to x and y, in pixels
-    # (N, 2), variances of the shifts from the quoted errors, in square pixels. The correlation of a
-    # few per cent between x and y that a skewed polynomial causes is neglected
+    Parameters
+    ----------
+    shift : ndarray, shape (N, 2)
+        Corrections to be added to x and y, in pixels.
+    variance : ndarray, shape (N, 2)
+        Variances of the shifts from the quoted errors, in square pixels. The correlation of a few
+        per cent between x and y that a skewed polynomial causes is neglected.
+    """
+
+    shift: Float
     variance: Float
 
 

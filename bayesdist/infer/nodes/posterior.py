@@ -69,12 +69,23 @@ class NodeCovariance:
 
 @dataclass(frozen=True, eq=False)
 class AxisField:
-    """Gaussian posterior of the node values of one axis, with the polynomial integrated out."""
+    """Gaussian posterior of the node values of one axis, with the polynomial integrated out.
+
+    Parameters
+    ----------
+    covariance : NodeCovariance
+    field : FittedField
+        Hyperparameters and their log density.
+    mean : ndarray, shape (n,)
+        Node values in pixels.
+    n_effective : float
+        Effective number of fitted parameters (nodes and polynomial).
+    """
 
     covariance: NodeCovariance
-    field: FittedField  # hyperparameters and their log density
-    mean: Float  # node values (n,) in pixels
-    n_effective: float  # effective number of fitted parameters (nodes and polynomial)
+    field: FittedField
+    mean: Float
+    n_effective: float
 
     @classmethod
     def of(cls, evidence: Evidence, field: FittedField) -> AxisField:

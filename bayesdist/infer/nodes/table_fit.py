@@ -22,14 +22,25 @@ BLOCK = 1024  # positions processed at a time, with dense rows over all nodes
 
 @dataclass(frozen=True)
 class Iteration:
-    """Statistics of one iteration of `fit_with_tables`."""
+    """Statistics of one iteration of `fit_with_tables`.
 
-    number: int  # starting from 1
-    moved: float  # largest change of a node in pixels
-    # rms residual per axis in pixels, before the new tables were made; stars are weighted by their
-    # probability of being true matches
+    Parameters
+    ----------
+    number : int
+        Number of the iteration, starting from 1.
+    moved : float
+        Largest change of a node in pixels.
+    rms : float
+        Rms residual per axis in pixels, before the new tables were made. Stars are weighted by
+        their probability of being true matches.
+    false_fraction : float
+        Fraction of false matches.
+    """
+
+    number: int
+    moved: float
     rms: float
-    false_fraction: float  # fraction of false matches
+    false_fraction: float
 
 
 def shifts_of(table: LookupTable | TablePosterior) -> LookupTable:

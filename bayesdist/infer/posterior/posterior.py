@@ -71,26 +71,53 @@ class Certificate:
 
     They are computed from pilots (exact evaluations of the posterior at draws of the proposal q)
     that were held out when the surrogate was built.  Each pilot takes one pass over the data.
+
+    Parameters
+    ----------
+    n_train, n_held_out : int
+        Number of pilots to which the surrogate was fitted, and number of held-out pilots.
+    n_outside : int
+        Number of pilots where the posterior density is zero.
+    raw_sd : float
+        Standard deviation of log p - log q, that is, without the surrogate.
+    remainder_sd, remainder_max : float
+        Standard deviation and largest absolute value of log p - log s over the held-out pilots,
+        with p and s normalised.
+    raw_efficiency : float
+        Effective fraction of draws of q, weighted by p / q, from all pilots.
+    efficiency : float
+        Effective fraction of draws of s, weighted by p / s, from the held-out pilots: 1 / (1 +
+        chi2).
+    pareto_k : float
+        Pareto shape of p / q; a heavy tail means that q misses a part of p.
+    chi2, chi2_upper : float
+        Estimate of the chi-square divergence chi2(p || s), and its upper limit.
+    mean_shift_bound : float
+        Bound on the error of any posterior mean in posterior standard deviations, from
+        `chi2_upper`.
+    tv_bound : float
+        Bound on the total variation distance, the error of any probability, from `chi2_upper`.
+    unseen : float
+        Upper limit (95 %) on the probability under q of a region that no pilot has hit.
+    reasons : tuple of str
+        Reasons why the certificate is refused; empty if it is granted.
     """
 
     n_train: int
     n_held_out: int
-    n_outside: int  # number of pilots where the posterior density is zero
-    raw_sd: float  # standard deviation of log p - log q, that is, without the surrogate
-    remainder_sd: float  # standard deviation of log p - log s over the held-out pilots
-    remainder_max: float  # largest |log p - log s| of them, with p and s normalised
-    raw_efficiency: float  # effective fraction of draws of q, weighted by p / q; all pilots
-    # effective fraction of draws of s, weighted by p / s; held-out pilots: 1 / (1 + chi2)
+    n_outside: int
+    raw_sd: float
+    remainder_sd: float
+    remainder_max: float
+    raw_efficiency: float
     efficiency: float
-    pareto_k: float  # Pareto shape of p / q; a heavy tail means that q misses a part of p
-    chi2: float  # estimate of the chi-square divergence chi2(p || s)
-    chi2_upper: float  # upper limit of `chi2`
-    # bound on the error of any posterior mean in posterior standard deviations; from `chi2_upper`
+    pareto_k: float
+    chi2: float
+    chi2_upper: float
     mean_shift_bound: float
-    # bound on the total variation distance, the error of any probability; from `chi2_upper`
     tv_bound: float
-    unseen: float  # upper limit (95 %) on the probability under q of a region no pilot has hit
-    reasons: tuple[str, ...]  # why the certificate is refused; empty if it is granted
+    unseen: float
+    reasons: tuple[str, ...]
 
     @property
     def granted(self) -> bool:

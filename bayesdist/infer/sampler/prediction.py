@@ -26,12 +26,24 @@ K_MARGIN = 0.1
 
 @dataclass(frozen=True)
 class Prediction:
-    """Predicted moves and number of passes of a run."""
+    """Predicted moves and number of passes of a run.
+
+    Parameters
+    ----------
+    plan : Plan
+        Moves and walkers of the run.
+    quality : Quality
+        Quality of the proposal.
+    passes : int or None
+        Expected number of passes over the data; None if it cannot be predicted.
+    most_passes : int
+        Number of passes if the run continues to `max_steps`.
+    """
 
     plan: Plan
     quality: Quality
-    passes: int | None  # expected number of passes; None if it cannot be predicted
-    most_passes: int  # number of passes if the run continues to `max_steps`
+    passes: int | None
+    most_passes: int
 
 
 def predict(target: Density, proposal: Proposal, settings: Settings) -> Prediction:

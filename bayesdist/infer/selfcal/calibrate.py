@@ -39,14 +39,27 @@ References = Callable[[Problem, Float], StarPriors]
 
 @dataclass(frozen=True, eq=False)
 class SelfCalibration:
-    """Result of a self-calibration."""
+    """Result of a self-calibration.
 
-    mode: SelfCalibrationMode  # the solution
-    gauge: Gauge  # properties that the detections do not determine, and their constraints
-    friends: Friends  # last grouping; its `star` refers to the input detections
-    # detections with star codes and errors, on a common tangent plane if requested
+    Parameters
+    ----------
+    mode : SelfCalibrationMode
+        The solution.
+    gauge : Gauge
+        Properties that the detections do not determine, and their constraints.
+    friends : Friends
+        Last grouping; its `star` refers to the input detections.
+    detections : Detections
+        Detections with star codes and errors, on a common tangent plane if requested.
+    iterations : int
+        Number of iterations.
+    """
+
+    mode: SelfCalibrationMode
+    gauge: Gauge
+    friends: Friends
     detections: Detections
-    iterations: int  # number of iterations
+    iterations: int
 
 
 @dataclass(frozen=True, eq=False)

@@ -42,16 +42,27 @@ HIDDEN = 1e-5  # fraction of a property along undetermined directions above whic
 
 @dataclass(frozen=True, eq=False)
 class NamedDirection:
-    """A property of the solution, such as its scale or rotation, with its error."""
+    """A property of the solution, such as its scale or rotation, with its error.
 
-    # a key of `GENERATORS` (relative changes); 'zero_point_u', 'zero_point_v'; or a property of
-    # another chip relative to the first one, such as 'WFC1.shift_u' or 'WFC1.rotation'
+    Parameters
+    ----------
+    name : str
+        A key of `GENERATORS` (relative changes); 'zero_point_u', 'zero_point_v'; or a property of
+        another chip relative to the first one, such as 'WFC1.shift_u' or 'WFC1.rotation'.
+    unit : str
+    sigma : float
+        Error from the detections alone; infinite if they do not determine it.
+    sigma_fixed : float
+        Error with information from other sources; infinite if the gauge fixes it by convention.
+    edge_pix : float
+        Displacement in pixels at the detector's edge for one unit of the property.
+    """
+
     name: str
     unit: str
-    sigma: float  # error from the detections alone; infinite if they do not determine it
-    # error with information from other sources; infinite if the gauge fixes it by convention
+    sigma: float
     sigma_fixed: float
-    edge_pix: float  # displacement in pixels at the detector's edge for one unit of the property
+    edge_pix: float
 
     @property
     def free(self) -> bool:
@@ -86,22 +97,39 @@ class Decision:
 
 @dataclass(frozen=True, eq=False)
 class Gauge:
-    """Free directions of a problem, and the constraints that fix them."""
+    """Free directions of a problem, and the constraints that fix them.
 
-    null: Float  # basis (D, d) of the directions that the detections do not determine
-    # basis (D, k) of the directions that are free even with information from other sources
+    Parameters
+    ----------
+    null : ndarray, shape (D, d)
+        Basis of the directions that the detections do not determine.
+    open : ndarray, shape (D, k)
+        Basis of the directions that are free even with information from other sources.
+    held : ndarray of int, shape (k,)
+        Indices of the parameters that are fixed to determine the others.
+    directions : tuple of NamedDirection
+    unnamed : tuple of str
+        Names of the largest parameters in free directions that no `NamedDirection` describes.
+    weakest : ndarray, shape (w, 2)
+        Error in pixels of each nearly free combination of parameters, and the index of its largest
+        parameter.
+    spread : float
+        Largest difference of two roll angles in radians, modulo half a turn.
+    whole : tuple of str
+        Linear maps of the entire sky that are free, from `GENERATORS`.
+    rates : tuple of str
+        Moves of the entire sky with time that are free if stars have proper motions, from `RATES`
+        and `PARALLAX`.
+    """
+
+    null: Float
     open: Float
-    held: Int  # indices (k,) of the parameters that are fixed to determine the others
+    held: Int
     directions: tuple[NamedDirection, ...]
-    # names of the largest parameters in free directions that no `NamedDirection` describes
     unnamed: tuple[str, ...]
-    # (w, 2): error in pixels of each nearly free combination of parameters, and the index of its
-    # largest parameter
     weakest: Float
-    spread: float  # largest difference of two roll angles in radians, modulo half a turn
-    whole: tuple[str, ...] = ()  # linear maps of the entire sky that are free, from `GENERATORS`
-    # moves of the entire sky with time that are free if stars have proper motions, from `RATES` and
-    # `PARALLAX`
+    spread: float
+    whole: tuple[str, ...] = ()
     rates: tuple[str, ...] = ()
 
     @property

@@ -40,19 +40,40 @@ REJECTED = 25.0  # chi-square (sum over both axes) above which a detection count
 
 @dataclass(frozen=True, eq=False)
 class SelfCalibrationMode:
-    """Mode of the posterior of a self-calibration."""
+    """Mode of the posterior of a self-calibration.
 
-    problem: Problem  # detections, linearised at the mode
-    theta: Float  # parameters (D,) of the model
-    stars: Float  # parameters (S, q) of the stars
-    mixture: Mixture  # jitter (by moments) and fraction of false detections
-    free: Int  # indices (F,) of the parameters that were fitted; the gauge fixes the others
-    expansion: Expansion  # expansion of the log density at the mode
-    # curvatures (D, D) with EM weights, which are never indefinite: for the detections alone, and
-    # including the priors of the stars
+    Parameters
+    ----------
+    problem : Problem
+        Detections, linearised at the mode.
+    theta : ndarray, shape (D,)
+        Parameters of the model.
+    stars : ndarray, shape (S, q)
+        Parameters of the stars.
+    mixture : Mixture
+        Jitter (by moments) and fraction of false detections.
+    free : ndarray of int, shape (F,)
+        Indices of the parameters that were fitted; the gauge fixes the others.
+    expansion : Expansion
+        Expansion of the log density at the mode.
+    curvatures : tuple of ndarray, shape (D, D)
+        Curvatures with EM weights, which are never indefinite: for the detections alone, and
+        including the priors of the stars.
+    prior : Prior
+        Information from other sources than the detections.
+    decision : Decision, optional
+        Free directions; None if only `free` was specified.
+    """
+
+    problem: Problem
+    theta: Float
+    stars: Float
+    mixture: Mixture
+    free: Int
+    expansion: Expansion
     curvatures: tuple[Float, Float]
-    prior: Prior  # information from other sources than the detections
-    decision: Decision | None = None  # free directions; None if only `free` was specified
+    prior: Prior
+    decision: Decision | None = None
 
     @property
     def precision(self) -> Float:

@@ -103,7 +103,7 @@ class Problem:
 
     @property
     def least_root(self) -> float:
-        """Square root of a star's smallest curvature, since it is within its match circle."""
+        """Square root of the smallest curvature allowed for a star, set by its match circle."""
         return float(np.sqrt(2.0) / (self.match_radius * self.pixel))
 
     @cached_property
