@@ -14,6 +14,7 @@ from bayesdist.utils.arrays import Float
 
 RELINEARISED = 1e-7  # pixels: the iteration stops when the solution moves less than this
 STALLED = 1e-4  # formal errors: smaller steps that do not shrink are due to rounding
+FLAT = 1e-12  # limit on |determinant| of a linear map, relative to its largest element squared
 TURNS = 50  # maximum number of iterations
 
 
@@ -30,14 +31,29 @@ def starting_point(first: NormalEquations, model: DistortionModel, priors: Gauss
     theta[:n] = np.linalg.lstsq(
         (matrix.border + prior.border)[:n, :n], (right + priors.pull(theta))[:n], rcond=1e-13
     )[0]
+    for chip in model.chips:
+        basis = model.basis(chip.number)
+        rows = basis.monomial_matrix[[basis.terms.index(term) for term in ((1, 0), (0, 1))]]
+        linear = [rows @ theta[model.coefficient_slice(chip.number, axis)] for axis in (0, 1)]
+        _refuse_flat(np.stack(linear), chip.number)
     return theta
+
+
+def _refuse_flat(linear: Float, chip: int) -> None:
+    """Raise DegenerateError if a linear map (2, 2) maps a chip onto a line or a point in u, v."""
+    if abs(np.linalg.det(linear)) <= FLAT * np.abs(linear).max() ** 2:
+        raise DegenerateError(
+            f"the positions u, v of chip {chip} lie on a line or in one point",
+            where="u, v",
+            do="check which columns have the reference positions, and that they are filled in",
+        )
 
 
 def _start_frames(first: NormalEquations, theta: Float, model: DistortionModel) -> None:
     """Set the frames in `theta` from linear fits to each exposure and chip.
 
-    The chips' linear maps come from the first exposure.  The frame of any other exposure is found
-    once one of its chips is known from an exposure that has been processed before.
+    The linear map of each chip comes from the first exposure with a known frame, starting with
+    exposure 0.  The frame of an exposure follows from any chip with a known linear map.
     """
     groups, o = first.groups, np.asarray(model.origin)
     affine = np.array([_affine(w, r) for w, r in zip(first.weight, first.right, strict=True)])
@@ -60,6 +76,7 @@ def _start_frames(first: NormalEquations, theta: Float, model: DistortionModel) 
             for g in np.flatnonzero(groups.exposure == e):
                 w = of_chip.get(int(groups.chip[g]))
                 if w is not None and np.isfinite(affine[g]).all():
+                    _refuse_flat(w[:, 1:], model.chips[groups.chip[g]].number)
                     M = affine[g][:, 1:] @ np.linalg.inv(w[:, 1:])
                     d = affine[g][:, 0] - o - M @ (w[:, 0] - o)
                     frame = nearest_frame(model.frames, M, d)
