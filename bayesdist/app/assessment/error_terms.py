@@ -113,7 +113,7 @@ def errors_of_run(
 def _given_terms(solution: Solution, data: FitData, config: Config) -> list[ErrorTerm]:
     """Terms of the user, and of tables where exposures were fitted jointly."""
     tables = () if data.fitted.scatter is None else _table_terms(solution, data, config)
-    return [*config.linear_terms(solution), *tables, *config.user_terms()]
+    return [*config.linear_terms(solution), *tables, *config.user_terms(solution.model.unit)]
 
 
 def _variation(solution: Solution, scatter: ExposureScatter, matched: Matched) -> ExposureVariation:

@@ -55,7 +55,7 @@ class BudgetBlock(Section):
     sigma_u: Annotated[float, Field(ge=0)] | None = None
     sigma_v: Annotated[float, Field(ge=0)] | None = None
     sigma: Annotated[float, Field(ge=0)] | None = None
-    unit: Unit | None = None  # of sigma_u and sigma_v: pixels by default
+    unit: Unit | None = None  # of sigma_u and sigma_v: pixels, if u and v are
     source: str = GIVEN
     included_in_scatter: bool = False
 
@@ -111,7 +111,7 @@ class RequirementBlock(Section):
     name: str
     statistic: str
     limit: PositiveFloat
-    unit: Unit = "pix"
+    unit: Unit | None = None  # pixels, if u and v are
     probability: Probability = 0.95
     epoch: Epoch | None = None
     chip: int | None = None

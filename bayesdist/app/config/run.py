@@ -37,6 +37,7 @@ from bayesdist.assess import Requirement, UserTerm
 from bayesdist.assess.terms.forms import ErrorTerm
 from bayesdist.assess.terms.given import said_by_user
 from bayesdist.assess.terms.parameters import one_size_term
+from bayesdist.assess.units import stated_unit
 from bayesdist.errors import InputError
 from bayesdist.infer import Compute, OutlierMixture
 from bayesdist.infer.solution.solution import Solution
@@ -151,15 +152,18 @@ class RunConfig(Section):
         """Boolean: a [[budget]] row states the error of proper motions."""
         return any(row.stated and row.of_motions for row in self.budget)
 
-    def user_terms(self) -> tuple[UserTerm, ...]:
-        """The user's terms of the error budget that are the same at every position."""
+    def user_terms(self, unit: str = "pix") -> tuple[UserTerm, ...]:
+        """The user's terms of the error budget that are the same at every position.
+
+        `unit`: of u and v. InputError if it is an angle, and a term has no unit.
+        """
         return tuple(
             UserTerm(
                 b.name,
                 b.kind,
                 b.sigma_u,
                 b.sigma_v,
-                b.unit or "pix",
+                stated_unit(b.unit, unit, f"budget term {b.name!r}"),
                 said_by_user(b.source),
                 included_in_scatter=b.included_in_scatter,
             )
@@ -175,14 +179,14 @@ class RunConfig(Section):
             if b.sigma is not None
         )
 
-    def in_residuals(self) -> tuple[UserTerm, ...]:
-        """User's terms that the scatter of the residuals includes."""
-        return tuple(term for term in self.user_terms() if term.included_in_scatter)
+    def in_residuals(self, unit: str = "pix") -> tuple[UserTerm, ...]:
+        """User's terms that the scatter of the residuals includes; `unit` as of `user_terms`."""
+        return tuple(term for term in self.user_terms(unit) if term.included_in_scatter)
 
     def held_in_residuals(self, unit: str) -> list[tuple[str, float, float]]:
         """Name and standard deviation on each axis of these terms, in the unit of u and v."""
         scale = self.detector.scale_mas
-        return [(t.name, *t.sigma(unit, scale)) for t in self.in_residuals()]
+        return [(t.name, *t.sigma(unit, scale)) for t in self.in_residuals(unit)]
 
     def requirements(self) -> tuple[Requirement, ...]:
         """The requirements."""
