@@ -163,7 +163,7 @@ class RunConfig(Section):
                 b.kind,
                 b.sigma_u,
                 b.sigma_v,
-                stated_unit(b.unit, unit, f"budget term {b.name!r}"),
+                _unit_of(b, unit),
                 said_by_user(b.source),
                 included_in_scatter=b.included_in_scatter,
             )
@@ -191,6 +191,13 @@ class RunConfig(Section):
     def requirements(self) -> tuple[Requirement, ...]:
         """The requirements."""
         return tuple(Requirement(**r.model_dump()) for r in self.requirement)
+
+
+def _unit_of(block: BudgetBlock, unit: str) -> str:
+    """Unit of the sizes of a [[budget]] row; nothing is nothing in any unit."""
+    if not (block.sigma_u or block.sigma_v):
+        return block.unit or "pix"
+    return stated_unit(block.unit, unit, f"budget term {block.name!r}")
 
 
 # -- files of other runs that a configuration goes by ----------------------------------------------
