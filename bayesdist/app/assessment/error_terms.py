@@ -59,6 +59,7 @@ def rehearsal_settings(data: FitData, config: Config) -> EvaluationSettings:
         # errors of centroids that the fit has found hold nothing else
         contained=() if measured else config.held_in_residuals(data.model.unit),
         given=tuple(block.name for block in config.budget if block.stated),
+        field=config.field,
     )
 
 

@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 from pydantic import Field, PositiveFloat, field_validator
 from pydantic_core import PydanticCustomError
 
-from bayesdist.app.config.section import Epoch, Section, Unit
+from bayesdist.app.config.section import Circle, Epoch, Section, Unit
 from bayesdist.assess.terms.correlated import (
     DEVIATIONS,
     FIELDS,
@@ -115,7 +115,7 @@ class RequirementBlock(Section):
     probability: Probability = 0.95
     epoch: Epoch | None = None
     chip: int | None = None
-    region: str | list[tuple[float, float]] = "whole"
+    region: str | Circle | list[tuple[float, float]] = "whole"
     epochs: tuple[Epoch, Epoch] | None = None
     relative: bool = False
     separation: PositiveFloat | None = None

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Self
 
@@ -27,6 +28,7 @@ from bayesdist.app.config.model import CampaignModel, MatchedModel, SelfcalModel
 from bayesdist.app.config.products import Products
 from bayesdist.app.config.section import (
     ChipBlock,
+    Circle,
     Detector,
     Section,
     chips_of,
@@ -34,6 +36,7 @@ from bayesdist.app.config.section import (
     same_names,
 )
 from bayesdist.assess import Requirement, UserTerm
+from bayesdist.assess.domain import WHOLE, Region, check_region
 from bayesdist.assess.terms.forms import ErrorTerm
 from bayesdist.assess.terms.given import said_by_user
 from bayesdist.assess.terms.parameters import one_size_term
@@ -189,8 +192,23 @@ class RunConfig(Section):
         return [(t.name, *t.sigma(unit, scale)) for t in self.in_residuals(unit)]
 
     def requirements(self) -> tuple[Requirement, ...]:
-        """The requirements."""
-        return tuple(Requirement(**r.model_dump()) for r in self.requirement)
+        """The requirements; the field of the detector is the region of those that name none."""
+        return self.within_field(Requirement(**r.model_dump()) for r in self.requirement)
+
+    @property
+    def field(self) -> Region:
+        """The part of the detector that sees the sky."""
+        given = self.detector.field
+        if given is None:
+            return WHOLE
+        circle = given.model_dump() if isinstance(given, Circle) else given
+        return check_region(circle, "detector.field")
+
+    def within_field(self, requirements: Iterable[Requirement]) -> tuple[Requirement, ...]:
+        """Requirements, of which those without a region are on the field of the detector."""
+        return tuple(
+            replace(one, region=self.field) if one.region == WHOLE else one for one in requirements
+        )
 
 
 def _unit_of(block: BudgetBlock, unit: str) -> str:

@@ -36,6 +36,13 @@ Pair = tuple[PositiveFloat, PositiveFloat]
 Block = TypeVar("Block", bound="ChipBlock")
 
 
+class Circle(Section):
+    """A round field on a detector, in pixels."""
+
+    centre: tuple[float, float]
+    radius: PositiveFloat
+
+
 class Detector(Section):
     """A detector of one chip."""
 
@@ -45,6 +52,7 @@ class Detector(Section):
     filter: str = ""
     size: Pair | None = None
     scale_mas: PositiveFloat | None = None
+    field: Circle | list[tuple[float, float]] | None = None
 
 
 class ChipBlock(Section):
@@ -69,6 +77,11 @@ def detector_faults(
         yield (
             "[[chip]] blocks stand in place of detector.size and model.reference_pixel; "
             "give one of the two"
+        )
+    if chips and detector.field is not None:
+        yield (
+            "detector.field is of a detector of one chip, and there are [[chip]] blocks; leave it "
+            "out, and give each requirement the region of its chip"
         )
     if not chips and detector.size is None:
         yield "detector.size is missing; give it, or [[chip]] blocks"

@@ -44,7 +44,7 @@ class Grid:
 
 def contour_levels(values: ArrayLike, n: int = 10) -> Float:
     """Round levels that span some values, at least two; 1, 2, 5, 10 of values far apart."""
-    low, high = float(np.min(values)), float(np.max(values))
+    low, high = float(np.nanmin(values)), float(np.nanmax(values))
     if low > 0 and high > FAR * low:
         decades = 10.0 ** np.arange(np.floor(np.log10(low)), np.ceil(np.log10(high)) + 1)
         steps = np.outer(decades, [1.0, 2.0, 5.0]).ravel()
@@ -62,7 +62,7 @@ def error_levels(values: ArrayLike, least: int = 7) -> Float:
     At least `least` of them lie among the values.  Even levels if values are not positive, or
     differ by less than a factor of 1.5.
     """
-    low, high = float(np.min(values)), float(np.max(values))
+    low, high = float(np.nanmin(values)), float(np.nanmax(values))
     if not (low > 0 and high >= NARROW * low):
         return contour_levels(values)
     decades = 10.0 ** np.arange(np.floor(np.log10(low)), np.ceil(np.log10(high)) + 1)
