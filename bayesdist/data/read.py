@@ -223,8 +223,8 @@ def _with_common_chips(tables: Mapping[Path, Table], options: ReadOptions) -> Re
 
 
 def _read_list(file: Path, name: str | None, options: ReadOptions) -> Matches:
-    names = "columns pixel_origin tangent_point epoch catalogue_epoch not_finite same_position"
-    options.refuse_fixed(str(file), "hst1pass", *names.split(), "plate_scale")
+    names = "columns tangent_point epoch catalogue_epoch not_finite same_position plate_scale"
+    options.refuse_fixed(str(file), "hst1pass", *names.split(), *_other_origin(options))
     if options.unit not in (None, "pix"):
         options.refuse_fixed(str(file), "hst1pass", "unit")
     return read_hst1pass(file).matches(name=name)
@@ -232,9 +232,15 @@ def _read_list(file: Path, name: str | None, options: ReadOptions) -> Matches:
 
 def _read_record(file: Path, options: ReadOptions) -> Matches:
     """Matches of a file that bayesdist wrote, which states all that the options could."""
-    names = "columns unit pixel_origin tangent_point epoch catalogue_epoch chips not_finite"
-    options.refuse_fixed(str(file), "bayesdist", *names.split(), "same_position", "plate_scale")
+    names = "columns unit tangent_point epoch catalogue_epoch chips not_finite same_position"
+    fixed = (*names.split(), "plate_scale", *_other_origin(options))
+    options.refuse_fixed(str(file), "bayesdist", *fixed)
     return read_written_matches(file)
+
+
+def _other_origin(options: ReadOptions) -> tuple[str, ...]:
+    """Name of the option of the origin, if another one than 1 is given, which formats fix."""
+    return () if options.pixel_origin == 1 else ("pixel_origin",)
 
 
 def _read_corr(file: Path, table: Table, name: str | None, options: ReadOptions) -> Matches:
@@ -244,8 +250,7 @@ def _read_corr(file: Path, table: Table, name: str | None, options: ReadOptions)
     Magnitudes are instrumental, -2.5 log10 FLUX, where all fluxes are positive; there are no
     errors.
     """
-    fixed = ["columns"] if options.pixel_origin == 1 else ["columns", "pixel_origin"]
-    options.refuse_fixed(str(file), "astrometry.net", *fixed)
+    options.refuse_fixed(str(file), "astrometry.net", "columns", *_other_origin(options))
     if options.unit not in (None, "arcsec"):
         options.refuse_fixed(str(file), "astrometry.net", "unit")
     options.refuse_fixed(str(file), "astrometry.net", "plate_scale")
