@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from bayesdist.app.config.data import MatchesConfig
-from bayesdist.app.config.section import Detector
+from bayesdist.app.config.section import RunDetector
 from bayesdist.app.pipeline import evaluate
 from bayesdist.app.results import open_results
 from bayesdist.app.store.rundir import RunDirectory
@@ -74,7 +74,7 @@ def test_they_belong_to_one_posterior(results):
 )
 def test_maps_budget_and_requirements_are_of_the_field_of_the_detector(results, field):
     """The same errors as over the whole detector, at the positions that see the sky alone."""
-    detector = Detector(**results.config.detector.model_dump() | {"field": field})
+    detector = RunDetector(**results.config.detector.model_dump() | {"field": field})
     config = results.config.model_copy(update={"detector": detector})
     whole = load_evaluation(results.run, results.fit, results.posterior)
     made = evaluate(

@@ -29,7 +29,7 @@ from bayesdist.app.config.products import Products
 from bayesdist.app.config.section import (
     ChipBlock,
     Circle,
-    Detector,
+    RunDetector,
     Section,
     chips_of,
     detector_faults,
@@ -62,7 +62,7 @@ class RunConfig(Section):
         @property
         def compute(self) -> ComputeBlock: ...
 
-    detector: Detector = Detector()
+    detector: RunDetector = RunDetector()
     chip: list[ChipBlock] = Field(default_factory=list)
     assess: Assess = Assess()
     budget: list[BudgetBlock] = Field(default_factory=list)
@@ -80,6 +80,11 @@ class RunConfig(Section):
                 "give it another"
             )
         yield from detector_faults(self.chip, self.detector, self.model.reference_pixel)
+        if self.chip and self.detector.field is not None:
+            yield (
+                "detector.field is of a detector of one chip, and there are [[chip]] blocks; leave "
+                "it out, and give each requirement the region of its chip"
+            )
         for settings in self.products.asked().values():
             settings.check(self.named_detector, self.detector.size, self.model.reference_pixel)
 

@@ -52,6 +52,11 @@ class Detector(Section):
     filter: str = ""
     size: Pair | None = None
     scale_mas: PositiveFloat | None = None
+
+
+class RunDetector(Detector):
+    """A detector of a run, whose errors are evaluated over the part that sees the sky."""
+
     field: Circle | list[tuple[float, float]] | None = None
 
 
@@ -77,11 +82,6 @@ def detector_faults(
         yield (
             "[[chip]] blocks stand in place of detector.size and model.reference_pixel; "
             "give one of the two"
-        )
-    if chips and detector.field is not None:
-        yield (
-            "detector.field is of a detector of one chip, and there are [[chip]] blocks; leave it "
-            "out, and give each requirement the region of its chip"
         )
     if not chips and detector.size is None:
         yield "detector.size is missing; give it, or [[chip]] blocks"
