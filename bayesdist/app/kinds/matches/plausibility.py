@@ -29,6 +29,7 @@ NORMAL = 1.4826022185056018  # 1 / (median of |z|, z standard normal)
 CLIP = 4.0  # robust standard deviations
 EACH = 4  # stars for each coefficient, at least
 NOISE_FREE = 1e-8  # pixels: scatter that is rounding, and no measurement
+ON_A_LINE = 1e-6  # extent of positions across a line, relative to that along it
 LOW_ORDER = 1.7  # ratio of the scatters about two orders from which the lower one is too low
 BEST_ORDER = 1.2  # ratio of the scatters about two orders that follow the positions equally well
 MOST_STARS = 1500  # by which orders are compared
@@ -139,7 +140,7 @@ def _doubts_on_scatter(stars: Matches, scale: float) -> Iterator[str]:
     if scatter is None:
         return
     in_pixels = scatter / scale
-    if in_pixels < NOISE_FREE:
+    if in_pixels < NOISE_FREE and not _on_a_line(stars):  # which the fit refuses
         raise InputError(
             f"the reference positions follow a polynomial of the pixels to {in_pixels:.1g} px: "
             "they were computed from the pixels by a WCS, or are those of a design, and without "
@@ -158,6 +159,13 @@ def _doubts_on_scatter(stars: Matches, scale: float) -> Iterator[str]:
             "which no detector reaches: they were probably computed from the pixels by a WCS, and "
             "a fit only gives back that WCS; match the detections with a catalogue of their own"
         )
+
+
+def _on_a_line(stars: Matches) -> bool:
+    """Boolean: the reference positions lie on a line, or in one point."""
+    offsets = np.stack([stars.u - stars.u.mean(), stars.v - stars.v.mean()])
+    long, short = np.linalg.svd(offsets, compute_uv=False)
+    return bool(short <= ON_A_LINE * long)
 
 
 def _doubts_on_order(stars: Matches, order: int) -> Iterator[str]:
