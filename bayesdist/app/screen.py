@@ -6,6 +6,7 @@ import logging
 import math
 import os
 import sys
+import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from io import FileIO, TextIOWrapper
@@ -17,6 +18,12 @@ from bayesdist.errors import InputError
 from bayesdist.files.regular import descriptor_for_writing
 
 log = logging.getLogger("bayesdist")
+_UNITS_UNKNOWN_TO_ASTROPY = (
+    r".*did not parse as .*unit",
+    r".*has a unit but is kept as a ",  # Column of a QTable
+    r"The unit '.*' has been deprecated",
+    r".*could not be saved in native FITS format",
+)
 # they write tracebacks of lost connections above the sentence that says so; Dask sets their levels
 DASK_LOGS = ("distributed.client", "distributed.core", "distributed.comm.tcp", "distributed.utils")
 FORMAT = "%(asctime)s %(levelname)-7s %(message)s"
@@ -39,7 +46,13 @@ def open_streams() -> None:
 
 
 def start_logging(*, quiet: bool) -> None:
-    """Send the package's log to stderr, warnings alone where it is quiet."""
+    """Send the package's log to stderr, warnings alone where it is quiet.
+
+    What astropy says of units of columns that nobody uses stays out of the terminal: units that
+    matter are checked column by column.
+    """
+    for message in _UNITS_UNKNOWN_TO_ASTROPY:
+        warnings.filterwarnings("ignore", message=message)
     log.setLevel(logging.INFO)
     log.propagate = False
     for handler in list(log.handlers):

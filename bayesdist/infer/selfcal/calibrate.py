@@ -241,13 +241,15 @@ def self_calibrate(
         raise NotSettledError(
             f"stars and solution still change after {max_iterations} iterations",
             where="self-calibration",
-            do="give a better start, another match radius, or a lower order",
+            do="give a better start (selfcal.initial_distortion), another match radius or a lower "
+            "order",
         )
     raise NotSettledError(
         f"after {max_iterations} iterations the detections still require a linking length of "
         f"{radius:.3g} pix, since they scatter by {scatter:.3g} pix",
         where="self-calibration",
-        do="give a higher order, a better start, or a larger match radius",
+        do="give a higher order, a better start (selfcal.initial_distortion) or a larger match "
+        "radius",
     )
 
 

@@ -295,7 +295,7 @@ def _solved(
     raise NotSettledError(
         f"the solution still moves after {MAX_PASSES} passes",
         where="self-calibration",
-        do="give a better start, or lower the order",
+        do="give a better start (selfcal.initial_distortion), or lower the order",
     )
 
 

@@ -315,7 +315,8 @@ def prepare(
         raise InputError(
             f"no star is detected {max(min_detections, MIN_DETECTIONS)} times",
             where=detections.source,
-            do="give exposures that overlap, a better start, or a larger match radius",
+            do="give exposures that overlap, a better start (selfcal.initial_distortion) or a "
+            "larger match radius",
         )
     if detections.sigma is None:
         raise InputError(
