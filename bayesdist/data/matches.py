@@ -172,6 +172,7 @@ class Matches(MatchColumns):
         chips: Mapping[str, int] | None = None,
         not_finite: str = "refuse",
         same_position: str = "one_star",
+        plate_scale: float | None = None,
     ) -> Matches:
         """Matches from any object with columns.
 
@@ -189,6 +190,8 @@ class Matches(MatchColumns):
         same_position : {'one_star', 'separate_stars'}, optional
             As for `ReadOptions`: rows with the same reference position belong to one star by
             default, if there is no column `star`.
+        plate_scale : float, optional
+            As for `ReadOptions`: arcsec in a millimetre of u and v.
 
         Returns
         -------
@@ -218,8 +221,9 @@ class Matches(MatchColumns):
                 chips,
                 not_finite,
                 same_position,
+                plate_scale,
             )
-            return cls(**match_arguments(table, options)).as_read(sigma)
+            return cls(**match_arguments(table, options)).as_read(options.plane_sigma)
 
     @classmethod
     def from_sky(
@@ -745,6 +749,25 @@ class Matches(MatchColumns):
             return self.with_columns(n_rows=n_rows, rejected=rejected)
         labels = replace(self.labels, n_rows=n_rows, rejected=dict(rejected))
         return Matches.from_readers(self._readers, labels, self._stored)
+
+    def named_below(self, folder: str) -> Matches:
+        """These stars with names of their files that are relative to a folder.
+
+        Parameters
+        ----------
+        folder : str
+            Names that do not begin with it are kept.
+
+        Returns
+        -------
+        Matches
+        """
+        names = tuple(one.removeprefix(f"{folder}/") for one in self.sources)
+        if self._readers is None:
+            return self.with_columns(sources=names)
+        step = partial(Matches.named_below, folder=folder)
+        readers = [_Deferred(one, step, len(one)) for one in self._readers]
+        return Matches.from_readers(readers, replace(self.labels, sources=names), self._stored)
 
     def with_exposure_names(self, names: tuple[str, ...]) -> Matches:
         """These stars with other exposures, which include all of their own.

@@ -21,6 +21,13 @@ _NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eEdD][+-]?\d+)?|nan|inf", re.IGNO
 _DECIMAL_COMMA = re.compile(r"[+-]?\d*,\d+([eEdD][+-]?\d+)?")
 _DECIMAL_POINT = re.compile(r"[+-]?(\d+\.\d*|\.\d+)([eEdD][+-]?\d+)?")
 _MAY_BE_THOUSANDS = re.compile(r"[+-]?[1-9]\d{0,2},\d{3}")
+# in cells that `_FOREIGN` matches, and in few others
+MAYBE_FOREIGN = re.compile(r"\d_\d|0[xX][0-9a-fA-F.]|[^\x00-\x7f]")
+MAYBE_FOREIGN_BYTES = re.compile(rb"\d_\d|[\x80-\xff]|&#")
+_FOREIGN = re.compile(
+    r"[+-]?(0[xX][0-9a-fA-F.]+([pP][+-]?\d+)?"
+    r"|(?=.*(_|[^\x00-\x7f]))[\d_]*\.?[\d_]*\d([eE][+-]?[\d_]+)?\.?)"
+)
 _MARKS = (",", ";", "\t", None)  # None: blanks
 ROWS_ABOVE, FEWEST_ABOVE = 20, 3  # that the last cell is held against
 _DAOPHOT = "DAOPHOT"  # the program's own lists, not the tables of IRAF's version
@@ -185,15 +192,49 @@ def parse_text_table(lines: Sequence[str], budget: Budget) -> Table:
         refuse_cut_end(whole, mark, where=where)
     if kind == "ascii.commented_header":
         heads = [k for k, line in enumerate(lines) if line.strip().startswith("#")]
-        lines = [line for k, line in enumerate(lines) if k not in heads[:-1]]
+        # astropy takes a tab between two names for the mark between all of them
+        lines = [line.replace("\t", " ") for k, line in enumerate(lines) if k not in heads[:-1]]
     elif separated:
+        lines = without_empty_names(lines, mark)
         lines = with_decimal_points(lines, mark, where=where)
         options["comment"] = "#"
+        if mark is not None:
+            refuse_missing_cells(lines, mark, where=where)
         if mark is None:
             lines = [line.replace("\t", " ") for line in lines]
         elif mark == ";":
             options["delimiter"] = mark
-    return Table.read(lines, format=kind, guess=False, **options)
+    table = Table.read(lines, format=kind, guess=False, **options)
+    refuse_foreign_numbers(table, lines, mark, where=where)
+    return table
+
+
+def without_empty_names(lines: list[str], mark: str | None) -> list[str]:
+    """Lines of a table whose names are not followed by marks that the first row does not have."""
+    rows = [k for k, line in enumerate(lines) if line.strip() and not line.lstrip().startswith("#")]
+    if mark is None or len(rows) < 2:
+        return lines
+    names, first = (lines[k].rstrip("\r\n") for k in rows[:2])
+    surplus = names.count(mark) - first.count(mark)
+    if surplus <= 0 or not names.endswith(mark * surplus):
+        return lines
+    end = lines[rows[0]][len(names) :]
+    return [*lines[: rows[0]], names[:-surplus] + end, *lines[rows[0] + 1 :]]
+
+
+def refuse_missing_cells(lines: Sequence[str], mark: str, *, where: str) -> None:
+    """Refuse rows with fewer cells than there are names: astropy fills them up in silence."""
+    width, row = 0, 0
+    for cells in csv.reader((line for line in lines if line[:1] != "#"), delimiter=mark):
+        if not cells or cells == [""]:
+            continue
+        if width and len(cells) < width:
+            raise FormatError(
+                f"has {len(cells)} of {width} cells",
+                where=f"{where}, row {row}",
+                do="the table may be truncated: fetch or write it again",
+            )
+        width, row = width or len(cells), row + 1
 
 
 def refuse_cut_end(lines: Sequence[str], mark: str | None, *, where: str) -> None:
@@ -220,6 +261,31 @@ def refuse_cut_end(lines: Sequence[str], mark: str | None, *, where: str) -> Non
             do="the table may be truncated: fetch or write it again",
         )
     log.warning("%s: its last line has no end, so that the file may be truncated", where)
+
+
+def refuse_foreign_numbers(
+    table: Table, lines: Sequence[str], mark: str | None, *, where: str
+) -> None:
+    """Refuse cells that Python or C takes for numbers, and no format of tables does.
+
+    They are digits with underscores ("1_00"), hexadecimal numbers ("0x64"), and digits of other
+    scripts.  `lines` are those of the table, whose cells are separated by `mark`, or by blanks or
+    the bars of an IPAC table.  In columns of text such cells are names.
+    """
+    kinds = [table[name].dtype.kind for name in table.colnames]
+    for number, line in enumerate(lines, start=1):
+        if not MAYBE_FOREIGN.search(line) or line[:1] in ("#", "\\", "|"):
+            continue
+        cells = [cell.strip() for cell in _cells(line, mark)]
+        known = len(cells) == len(kinds)
+        for k, cell in enumerate(cells):
+            if _FOREIGN.fullmatch(cell) and (not known or kinds[k] in "iuf"):
+                name = f", column {table.colnames[k]!r}" if known else ""
+                raise FormatError(
+                    f"{cell[:40]!r} is no number",
+                    where=f"{where}, line {number}{name}",
+                    do="write it in decimal digits, without marks between them",
+                )
 
 
 def _daophot_list(lines: Sequence[str], where: str) -> Table:

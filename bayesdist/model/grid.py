@@ -61,6 +61,6 @@ def outline_pixels(size: tuple[float, float]) -> tuple[Float, Float]:
 
 
 def position_of_largest(values: Float, x: Float, y: Float) -> tuple[float, float]:
-    """Pixel (x, y) at which a map (ny, nx) is largest."""
-    iy, ix = np.unravel_index(int(np.argmax(values)), values.shape)
+    """Pixel (x, y) at which a map (ny, nx) is largest, NaN apart."""
+    iy, ix = np.unravel_index(int(np.nanargmax(values)), values.shape)
     return float(x[ix]), float(y[iy])

@@ -10,13 +10,14 @@ import numpy as np
 import pytest
 from matplotlib import pyplot
 from matplotlib.collections import LineCollection, QuadMesh
+from matplotlib.figure import Figure
 from matplotlib.quiver import Quiver
 
 from bayesdist.assess import VectorMap
 from bayesdist.errors import InputError
 from bayesdist.report.drawing import save_figures
 from bayesdist.report.figures.arrows import Arrows, cross_map, sparse_step, square_cells
-from bayesdist.report.figures.fields import contour_levels, error_levels
+from bayesdist.report.figures.fields import Grid, contour_levels, draw_grid, error_levels
 from bayesdist.report.figures.mosaic import Mosaic
 from bayesdist.report.figures.panels import ChipPanels
 from bayesdist.report.figures.style import figure_style, nice_below
@@ -451,3 +452,16 @@ def test_at_most_thirteen_crosses_stand_on_an_axis(converged, n):
     shown = x[columns]
     assert len(x[rows]) == len(shown) <= 13
     assert shown[0] == 1.0 and shown[-1] == 1016.0  # corners, where errors are largest
+
+
+def test_contours_end_where_a_field_ends():
+    """A map of a round field: contours within half a step of it, and over nearly all of it."""
+    x = np.linspace(1.0, 1000.0, 33)
+    X, Y = np.meshgrid(x, x)
+    far = np.hypot(X - 500, Y - 500)
+    values = np.where(far <= 400, 1.0 + (far / 400) ** 2, np.nan)
+    ax = Figure().subplots()
+    drawn = draw_grid(ax, Grid(x, x, values), levels=error_levels(values))
+    corners = np.concatenate([path.vertices for path in drawn.get_paths() if len(path.vertices)])
+    reach = np.hypot(*(corners - 500).T)
+    assert 370 < reach.max() < 400 + 999 / 32

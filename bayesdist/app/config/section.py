@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from typing import Annotated, Literal, Self, TypeVar
 
@@ -36,6 +37,13 @@ Pair = tuple[PositiveFloat, PositiveFloat]
 Block = TypeVar("Block", bound="ChipBlock")
 
 
+class Circle(Section):
+    """A round field on a detector, in pixels."""
+
+    centre: tuple[float, float]
+    radius: PositiveFloat
+
+
 class Detector(Section):
     """A detector of one chip."""
 
@@ -45,6 +53,12 @@ class Detector(Section):
     filter: str = ""
     size: Pair | None = None
     scale_mas: PositiveFloat | None = None
+
+
+class RunDetector(Detector):
+    """A detector of a run, whose errors are evaluated over the part that sees the sky."""
+
+    field: Circle | list[tuple[float, float]] | None = None
 
 
 class ChipBlock(Section):
@@ -76,7 +90,7 @@ def detector_faults(
 
 def same_names(block: str, names: Sequence[object], key: str = "name") -> Iterator[str]:
     """Blocks of one name, or of another key that each has to itself."""
-    twice = next((name for name in names if names.count(name) > 1), None)
+    twice = next((name for name, n in Counter(names).items() if n > 1), None)
     if twice is not None:
         yield f"two [[{block}]] blocks have the {key} {twice!r}; give each its own"
 

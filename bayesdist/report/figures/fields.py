@@ -15,6 +15,7 @@ from matplotlib.image import AxesImage
 from matplotlib.ticker import MaxNLocator
 from numpy.typing import ArrayLike
 from scipy.interpolate import RectBivariateSpline
+from scipy.ndimage import distance_transform_edt
 
 from bayesdist.report.figures.panels import Panels
 from bayesdist.report.figures.style import COLORBAR, INK, SEQUENTIAL, figure_style, small_font
@@ -44,7 +45,7 @@ class Grid:
 
 def contour_levels(values: ArrayLike, n: int = 10) -> Float:
     """Round levels that span some values, at least two; 1, 2, 5, 10 of values far apart."""
-    low, high = float(np.min(values)), float(np.max(values))
+    low, high = float(np.nanmin(values)), float(np.nanmax(values))
     if low > 0 and high > FAR * low:
         decades = 10.0 ** np.arange(np.floor(np.log10(low)), np.ceil(np.log10(high)) + 1)
         steps = np.outer(decades, [1.0, 2.0, 5.0]).ravel()
@@ -62,7 +63,7 @@ def error_levels(values: ArrayLike, least: int = 7) -> Float:
     At least `least` of them lie among the values.  Even levels if values are not positive, or
     differ by less than a factor of 1.5.
     """
-    low, high = float(np.min(values)), float(np.max(values))
+    low, high = float(np.nanmin(values)), float(np.nanmax(values))
     if not (low > 0 and high >= NARROW * low):
         return contour_levels(values)
     decades = 10.0 ** np.arange(np.floor(np.log10(low)), np.ceil(np.log10(high)) + 1)
@@ -149,12 +150,24 @@ def draw_grid(
 def _contours(
     ax: Axes, grid: Grid, offset: tuple[float, float], levels: Float, *, labelled: bool
 ) -> QuadContourSet:
-    """Draw filled contours with lines between them, by a spline, as all maps are polynomials."""
+    """Draw filled contours with lines between them, by a spline, as all maps are polynomials.
+
+    Around positions without a value, off the field of a detector, nothing is drawn.
+    """
     x, y, values = grid.x, grid.y, grid.values
+    empty = ~np.isfinite(values)
+    if empty.any():  # a spline needs all values: the nearest ones, which are not drawn
+        nearest = distance_transform_edt(empty, return_distances=False, return_indices=True)
+        values = values[tuple(nearest)]
     spline = RectBivariateSpline(y, x, values, kx=min(3, len(y) - 1), ky=min(3, len(x) - 1))
     fine_x, fine_y = (np.linspace(a[0], a[-1], 4 * len(a)) for a in (x, y))
     # the spline may overshoot a little, and values above the last level would stay white
     fine = np.clip(spline(fine_y, fine_x), values.min(), values.max())
+    if empty.any():
+        rows, columns = (
+            np.abs(fine_a[:, None] - a).argmin(axis=1) for fine_a, a in ((fine_y, y), (fine_x, x))
+        )
+        fine = np.ma.masked_array(fine, empty[np.ix_(rows, columns)])
     at = fine_x + offset[0], fine_y + offset[1]
     even = np.ptp(np.diff(levels)) <= 1e-6 * levels[-1]
     norm = None if even else BoundaryNorm(levels, colormaps[SEQUENTIAL].N)

@@ -98,13 +98,13 @@ def plot_map(
         draw_crosses(ax, m, magnification=M)
         key = _key_length(m.radius_max, m.unit, scale_mas)
         draw_key(ax, key, magnification=M, unit=m.unit, scale_mas=scale_mas)
-        largest = float(m.per_axis.max())
+        largest = float(np.nanmax(m.per_axis))
         scale = scale_of(m.unit, largest, scale_mas)
         default = f"{m.kind}, largest {scale.text(largest)} per axis"
         set_title(ax, title, default, name, pad=KEY_PAD)
         return ax
     chip_axes(ax, size)
-    scale = scale_of(m.unit, float(m.per_axis.max()), scale_mas)
+    scale = scale_of(m.unit, float(np.nanmax(m.per_axis)), scale_mas)
     grid = Grid(m.x, m.y, m.per_axis * scale.factor, m.position_of_max)
     shown = error_levels(grid.values) if levels is None else np.asarray(levels) * scale.factor
     drawn = draw_grid(ax, grid, levels=shown)
@@ -113,7 +113,7 @@ def plot_map(
         add_colorbar(ax, drawn, label)
     elif colorbar is not False:
         ax.figure.colorbar(drawn, ax=list(colorbar), label=label, **COLORBAR)
-    low, high = number(grid.values.min()), number(grid.values.max())
+    low, high = number(np.nanmin(grid.values)), number(np.nanmax(grid.values))
     set_title(ax, title, f"{m.kind}: {low} to {high}", name)
     return ax
 

@@ -83,7 +83,9 @@ def test_stars_that_are_seen_once(truth, tmp_path):
 
 def test_stars_with_too_few_detections(truth, tmp_path):
     table = list_table(truth)
-    _refused_by_the_match(tmp_path, table, "no star is seen 9 times", selfcal={"min_detections": 9})
+    _refused_by_the_match(
+        tmp_path, table, "no star is detected 9 times", selfcal={"min_detections": 9}
+    )
 
 
 def test_an_exposure_turned_by_half_a_turn(tmp_path):
@@ -147,6 +149,8 @@ def test_a_single_exposure(truth, tmp_path):
         ({"data": {"matches": "stars.ecsv"}}, ["[data]", "[selfcal]", "give one"]),
         ({"prior": [{"parameter": "u_9_9", "mean": 0.0, "sigma": 1.0}]}, ["'u_9_9'"]),
         ({"products": {"idctab": SBC}, "detector": {"size": SIZE}}, ["scale"]),
+        ({"products": {"siaf": {}}}, ["products.siaf", "aperture"]),
+        ({"detector": {"size": SIZE, "name": "a\0b"}}, ["detector.name", "U+0000"]),
     ],
 )  # fmt: skip
 def test_a_configuration_that_cannot_be(truth, tmp_path, sections, words):

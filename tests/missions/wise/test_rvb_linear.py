@@ -271,7 +271,7 @@ def test_wrong_input_is_refused(rng):
     matches = pairs(rng, exposure_names=("f1",))
     with pytest.raises(InputError, match="frame 'f1' has no solution with fixed scales"):
         rereference(matches, {"f1": RvbTransform()}, {})
-    with pytest.raises(InputError, match="carry no errors"):
+    with pytest.raises(InputError, match="have no errors"):
         linear_moments(Matches(*[np.arange(3.0)] * 4), CENTRE)
     with pytest.raises(InputError, match=r"scale_u .* is -1"):
         RvbTransform(scale_u=-1.0)

@@ -19,8 +19,8 @@ from bayesdist.app.kinds.matched import Matched, set_aside
 from bayesdist.app.kinds.matches.added_errors import compared_errors, in_circle
 from bayesdist.app.kinds.matches.plausibility import (
     doubts_on_numbers,
-    doubts_on_stars,
     refuse_empty_segments,
+    refuse_stars,
 )
 from bayesdist.app.kinds.matches.sources import check_chips, read_configured
 from bayesdist.app.store.rundir import RunDirectory
@@ -72,9 +72,13 @@ def match_stars(stars: Matches, config: MatchesConfig) -> Matched:
 
 
 def read_stars(config: MatchesConfig, base: Path) -> Matches:
-    """The matched stars that a configuration names."""
-    data = config.data
-    return read_configured(data.paths(base), data, size=config.detector.size, chips=config.chip)
+    """The matched stars that a configuration names, with the names of files as they are there.
+
+    So a run is the same in whatever folder it is made.
+    """
+    data, size = config.data, config.detector.size
+    stars = read_configured(data.paths(base), data, size=size, chips=config.chip)
+    return stars.named_below(str(base))
 
 
 def model_of(stars: Matches, config: Config) -> DistortionModel:
@@ -107,7 +111,7 @@ def fit_stars(
         with closing(StarReader(config.resources())) as reader:
             return fit_stars(matched, config, base, reader=reader)
     model = model_of(matched.stars, config)
-    doubts_on_stars(reader.sample(matched.stars), model, config)  # refuses what cannot be meant
+    refuse_stars(reader.sample(matched.stars), model, config)
     if matched.stars.in_memory and matched.stars.epoch is not None:
         # a sample may have none of a short segment
         refuse_empty_segments(matched.stars.epoch, model.time)

@@ -9,8 +9,7 @@ import numpy as np
 from pydantic import Field
 
 from bayesdist.calibration.calibration import Calibration
-from bayesdist.calibration.inverse import detector_grid
-from bayesdist.calibration.plane import ARCSEC
+from bayesdist.calibration.orientation import MAX_DEPARTURE, departure_from_tangent_plane
 from bayesdist.products.formats.common.cards import header_of
 from bayesdist.products.formats.common.content import Content
 from bayesdist.products.formats.common.document import (
@@ -34,9 +33,6 @@ from bayesdist.products.formats.sip.lint import lint_sip
 from bayesdist.products.formats.sip.positions import sip_read_back
 from bayesdist.products.formats.sip.read import holds_sip, sip_of
 from bayesdist.products.formats.sip.write import sip_text
-
-# Pixels by which other projections may differ from TAN in a header whose u, v are on no sky.
-MAX_DEPARTURE = 0.1
 
 
 class Settings(FormatSettings):
@@ -120,24 +116,14 @@ def _projection_matters(
 ) -> tuple[str, ...]:
     """Warning that angular u, v may be in another projection than TAN; empty if it hardly matters.
 
-    In a small field all projections about one point agree.  A distance r in radians differs
-    between a tangent plane and one that keeps angles (ARC) by r - atan r.
+    See `departure_from_tangent_plane`.
     """
     stated = settings.axes is not None or settings.crval is not None
     if calibration.unit == "pix" or stated or calibration.plane.point is not None:
         return ()
     if calibration.model.time is not None and options.epoch is None:
         return ()  # refused with its reason where the header is made
-    worst = 0.0
-    for one in calibration.at(options.epoch, origin="stated").values():
-        poly = one.monomials()
-        x, y = detector_grid(one.basis.size, 3)
-        offsets = np.stack([x, y]) - np.array(one.basis.reference_pixel)[:, None]
-        arcsec = ARCSEC[calibration.unit] * (poly.linear @ offsets)
-        radians = np.radians(np.hypot(*arcsec) / 3600.0)
-        pixel = np.sqrt(abs(np.linalg.det(poly.linear))) * ARCSEC[calibration.unit]
-        departure = np.degrees(radians - np.arctan(radians)).max() * 3600.0 / pixel
-        worst = max(worst, float(departure))
+    worst = departure_from_tangent_plane(calibration, options.epoch, None)
     if worst <= MAX_DEPARTURE:
         return ()
     return (

@@ -33,16 +33,16 @@ if TYPE_CHECKING:
 def map_table(r: ReportInput) -> TextTable:
     """Table of the extremes of the uncertainty maps."""
     rows = []
-    typical = max(float(m.per_axis.max()) for c in r.chips for m in c.maps)
+    typical = max(float(np.nanmax(m.per_axis)) for c in r.chips for m in c.maps)
     for c in r.chips:
         for m in c.maps:
             sizes = {
                 "Largest σ u": m.sigma_u_max,
                 "Largest σ v": m.sigma_v_max,
-                "Largest per axis": float(m.per_axis.max()),
-                "Median per axis": float(np.median(m.per_axis)),
-                "Largest CE68": float(m.circular_error(0.68).max()),
-                "Largest CE95": float(m.circular_error(0.95).max()),
+                "Largest per axis": float(np.nanmax(m.per_axis)),
+                "Median per axis": float(np.nanmedian(m.per_axis)),
+                "Largest CE68": float(np.nanmax(m.circular_error(0.68))),
+                "Largest CE95": float(np.nanmax(m.circular_error(0.95))),
             }
             row = {k: with_mas(v, m.unit, r.scale_mas, like=typical) for k, v in sizes.items()}
             row["At pixel"] = "({:.0f}, {:.0f})".format(*m.position_of_max)
@@ -65,7 +65,7 @@ def map_table(r: ReportInput) -> TextTable:
 def uncertainty_radius(r: ReportInput) -> Plot:
     """Uncertainty per axis, rms of sigma_u and sigma_v, all maps in one colour scale."""
     maps = [m for c in r.chips for m in c.maps]
-    scale = display_scale(r.unit, max(float(m.per_axis.max()) for m in maps))
+    scale = display_scale(r.unit, max(float(np.nanmax(m.per_axis)) for m in maps))
     grids = [Grid(m.x, m.y, m.per_axis * scale.factor, m.position_of_max) for m in maps]
     panels = ChipPanels(r.mosaic, len(r.chips[0].maps), colorbar=True)
     panels.frame()
@@ -74,8 +74,8 @@ def uncertainty_radius(r: ReportInput) -> Plot:
         panels,
         grids,
         [
-            panels.title(k, f"{kind}: {number(g.values.min())} to {number(g.values.max())}", ", ")
-            for (k, kind), g in zip(kinds, grids, strict=True)
+            panels.title(k, f"{kind}: {low} to {high}", ", ")
+            for (k, kind), (low, high) in zip(kinds, map(_range, grids), strict=True)
         ],
         levels=error_levels(np.concatenate([g.values.ravel() for g in grids])),
         label=f"per axis (1 σ) [{scale.unit}]",
@@ -95,12 +95,17 @@ def uncertainty_radius(r: ReportInput) -> Plot:
     pairs = [(c.formal_map, c.posterior_map) for c in r.chips]
     ratios = [p.radius / f.radius for f, p in pairs if p is not None]
     if ratios:
-        low, high = (number(float(end(ratios))) for end in (np.min, np.max))
+        low, high = (number(float(end(ratios))) for end in (np.nanmin, np.nanmax))
         text += (
             f" The posterior's is {low} to {high} times the formal one;"
             " above 1, the formal errors of least squares with rejection are too small."
         )
     return Plot(figure, "Uncertainty over the detector", text, f"Contour maps. {text}")
+
+
+def _range(grid: Grid) -> tuple[str, str]:
+    """Smallest and largest value as text."""
+    return number(float(np.nanmin(grid.values))), number(float(np.nanmax(grid.values)))
 
 
 @REPORT.figure("maps", printed=True)
@@ -176,7 +181,7 @@ def formal_uncertainty(r: ReportInput) -> Plot:
     panels.frame(M * widest + BORDER * r.mosaic.longest_side)
     titles = [
         panels.title(
-            k, f"{m.kind}, largest {size_of(float(m.per_axis.max()), m.unit)} per axis", ", "
+            k, f"{m.kind}, largest {size_of(float(np.nanmax(m.per_axis)), m.unit)} per axis", ", "
         )
         for k, c in enumerate(r.chips)
         for m in c.maps
@@ -186,7 +191,7 @@ def formal_uncertainty(r: ReportInput) -> Plot:
         max(maps, key=lambda m: m.radius_max)
         for maps in zip(*(c.maps for c in r.chips), strict=True)
     ]
-    found = " and ".join(f"{r.length(float(m.per_axis.max()))} ({m.kind})" for m in by_kind)
+    found = " and ".join(f"{r.length(float(np.nanmax(m.per_axis)))} ({m.kind})" for m in by_kind)
     return Plot(
         panels.figure,
         "Uncertainty diagram",
