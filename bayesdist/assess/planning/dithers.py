@@ -403,9 +403,17 @@ class FurtherDithers:
         """Information (D, D) of the first n exposures by the stars that they have seen."""
         whole, theta, _ = self._field
         model = replace(whole, exposures=whole.exposures[:n])
-        x, y, exposure, chip, star = (column[seen[2] < n] for column in seen)
-        sigma = np.full(len(x), self.mode.error)
-        detections = Detections(x, y, exposure, model.exposures, chip, sigma=sigma, star=star)
+        x, y, exposure, chip, star = seen
+        rows = exposure < n
+        detections = Detections(
+            x[rows],
+            y[rows],
+            exposure[rows],
+            model.exposures,
+            chip[rows],
+            sigma=np.full(np.count_nonzero(rows), self.mode.error),
+            star=star[rows],
+        )
         curvature = expected_curvature(model, theta[: model.n_params], detections)
         # the gauge holds what it holds at present
         D = self.mode.problem.model.n_params

@@ -9,9 +9,10 @@ from dataclasses import dataclass, field
 from bayesdist.utils.arrays import Float
 
 MOST = 4096  # exposures beyond which more are no plan
-# The range of the answer is that of the numbers whose probability differs by no more. Simulated
-# exposures show larger differences, on the side of caution (docs/validation.md).
-PROBABILITY_ERROR = 0.10
+# The range of the answer is that of the numbers whose probability differs by no more. Of exposures
+# that were simulated as asked for fewer met their limits than was stated, by 0.27 +- 0.07
+# (docs/validation.md).
+PROBABILITY_ERROR = 0.25
 SMALL = 0.05  # probability of meeting a limit, below which errors are said to be too large for it
 
 

@@ -201,7 +201,8 @@ def _causes(significant: Mapping[str, Family], outcomes: Sequence[Outcome]) -> d
     singles = ("second order of exposures", "exposures")
     single = [by_name[name] for name in singles if name in significant]
     orders = [by_name[one.name] for one in outcomes if one.family.group == "orders"]
-    rivals = {"pointing": single, "edges": [tuple(np.sum(orders, axis=0))] if orders else []}
+    total = sum(statistic for statistic, _ in orders), sum(dof for _, dof in orders)
+    rivals = {"pointing": single, "edges": [total] if orders else []}
     weaker = {
         name
         for name, others in rivals.items()
