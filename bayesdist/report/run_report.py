@@ -31,10 +31,9 @@ _FOOTER = (
 )
 _BUDGET_WORDS = (
     "The budget of the table at any position, between two positions of one image, and at any epoch"
-    " and magnitude, computed in this page. The bar stacks the variances of the terms; the parts of"
-    " the model are correlated, and the hatched piece is what their correlation adds. Where the"
-    " correlation is negative, the stack is longer than the total, which the dark line marks, and"
-    " the table gives the root of its size with a minus sign."
+    " and magnitude. The bar stacks the variances of the terms; the hatched piece is what the"
+    " correlation of the model's parts adds. Where it is negative, the stack is longer than the"
+    " total (dark line), and the table gives the root of its size with a minus sign."
 )
 _PRINT_WORDS = (
     "All tables and figures, and the budget at any position and epoch, are in report.html."

@@ -117,13 +117,23 @@ def _sizes(row) -> tuple[float, float, float]:
     return row["u"], row["v"], row["radial"] / np.sqrt(2)
 
 
+NUMBER = r"([\d.]+(?:\u202f×\u202f10[⁻⁰¹²³⁴⁵⁶⁷⁸⁹]+)?)"
+PLAIN = str.maketrans("⁻⁰¹²³⁴⁵⁶⁷⁸⁹", "-0123456789")
+
+
+def _worth(number: str) -> float:
+    """Value of a number, with its power of ten where it has one."""
+    mantissa, _, power = number.partition("\u202f×\u202f10")
+    return float(mantissa) * 10.0 ** int(power.translate(PLAIN) or 0)
+
+
 def agree(text: str, value: float) -> bool:
     """Whether a text of three digits in pixels is the value, and its mas are too."""
     if value == 0:
         return text == "0\u202fpix (0\u202fmas)"
-    pix, mas = re.match(r"([\d.]+)\u202fpix \(([\d.]+)\u202f(mas|µas|arcsec)\)", text).group(1, 2)
+    pix, mas = re.match(rf"{NUMBER}\u202fpix \({NUMBER}\u202f(?:mas|µas|arcsec)\)", text).groups()
     unit = {"mas": 1.0, "µas": 1e-3, "arcsec": 1e3}[text.rstrip(")").rsplit("\u202f", 1)[1]]
-    found = (float(pix), float(mas) * unit)
+    found = (_worth(pix), _worth(mas) * unit)
     # half of the third digit, and the rounding of the numbers in the page
     return all(
         abs(f - v) <= 0.5001 * 10 ** (np.floor(np.log10(v)) - 2) + 1e-5 * v
@@ -462,6 +472,6 @@ def test_a_table_is_downloaded_as_it_is_shown(opened):
     assert columns == {len(rows[0]) - 1}
 
 
-def test_downloads_are_offered_below_each_table(opened):
-    buttons = opened.find_elements("xpath", "//section[@id='margins']//p[@class='get']/button")
+def test_downloads_are_offered_in_the_caption_of_each_table(opened):
+    buttons = opened.find_elements("xpath", "//section[@id='margins']//caption/span/button")
     assert {one.text for one in buttons} == {"CSV", "LaTeX"}

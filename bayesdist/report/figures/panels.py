@@ -3,21 +3,25 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.patches import Rectangle
+from matplotlib.patches import Polygon, Rectangle
 
 from bayesdist.report.figures.mosaic import Mosaic
 from bayesdist.report.figures.style import (
     HALF_WIDTH,
+    LARGE_WIDTH,
     OUTLINE,
+    PALE,
     WIDTH,
     Tones,
     figure_style,
     new_figure,
 )
+from bayesdist.utils.arrays import Float
 
 Size = tuple[float, float]
 
@@ -171,6 +175,64 @@ class OneArray(Panels):
                 at_edge = ax.get_yaxis_transform()
                 text = ax.text(1.012, py + ny / 2, f"chip {number}", transform=at_edge)
                 text.set(rotation=270, ha="left", va="center", fontsize=7.5)
+
+
+class FocalPlane(Panels):
+    """One panel for all chips, each where and as it lies in the focal plane.
+
+    `outlines` are the corners (4, 2) of each chip in the axes' pixels, `margin` is the room beyond
+    them in pixels, `colorbar` leaves room for a colour bar.
+    """
+
+    @figure_style()
+    def __init__(
+        self,
+        outlines: Sequence[Float],
+        names: Sequence[str],
+        *,
+        margin: float = 0.0,
+        colorbar: bool = False,
+    ) -> None:
+        corners = np.concatenate(outlines)
+        low, high = corners.min(axis=0) - margin, corners.max(axis=0) + margin
+        room = 0.75 + (0.75 if colorbar else 0.0)
+        aspect = float((high[1] - low[1]) / (high[0] - low[0]))
+        height = (LARGE_WIDTH - room) * min(aspect, 1.6) + 0.9
+        figure = new_figure(LARGE_WIDTH, height, layout="compressed")
+        ax = figure.subplots()
+        ax.set(aspect="equal", xlim=(low[0], high[0]), ylim=(low[1], high[1]))
+        ax.set(xlabel="x [pix]", ylabel="y [pix]")
+        several = len(outlines) > 1
+        for outline, name in zip(outlines, names, strict=True):
+            ax.add_patch(Polygon(outline, fill=False, lw=0.7, ec=OUTLINE, zorder=1))
+            if several:
+                ax.text(*outline.mean(axis=0), name, **_CHIP_NAME)
+        super().__init__(figure, [[ax]] * len(outlines), [""] * len(outlines))
+
+
+_CHIP_NAME: Any = {
+    "ha": "center",
+    "va": "center",
+    "fontsize": 7.5,
+    "color": PALE,
+    "zorder": 2,
+    "clip_on": True,
+}
+
+
+OVERLAP = 0.2  # of the shorter side: sizes that are wrong by less still show where chips lie
+
+
+def overlap(outlines: Sequence[Float]) -> bool:
+    """True if chips lie on each other, by more than `OVERLAP`."""
+    for k, a in enumerate(outlines):
+        for b in outlines[k + 1 :]:
+            shared = np.minimum(a.max(axis=0), b.max(axis=0)) - np.maximum(
+                a.min(axis=0), b.min(axis=0)
+            )
+            if shared.min() > OVERLAP * min(np.ptp(a, axis=0).min(), np.ptp(b, axis=0).min()):
+                return True
+    return False
 
 
 def chip_axes(ax: Axes, size: Size, *, margin: float = 0.0) -> None:
