@@ -127,6 +127,11 @@ class Gauge:
         return tuple(text for text, is_settled in self._remarks if is_settled)
 
     @property
+    def unsettled(self) -> tuple[str, ...]:
+        """Those of `sentences` on what other data or priors would determine."""
+        return tuple(text for text, is_settled in self._remarks if not is_settled)
+
+    @property
     def _remarks(self) -> list[tuple[str, bool]]:
         """Each of `sentences`, and True if it is `settled`."""
         out, free = list[tuple[str, bool]](), set(self.free_names)
