@@ -52,7 +52,7 @@ def records(stars):
 def in_duckdb(stars):
     duckdb = pytest.importorskip("duckdb")
     rows = pyarrow.table({name: pyarrow.array(values) for name, values in stars.items()})
-    return duckdb.connect().from_arrow(rows)
+    return duckdb.from_arrow(rows)  # of the default connection, which stays open
 
 
 OBJECTS = {

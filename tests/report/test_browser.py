@@ -117,23 +117,21 @@ def _sizes(row) -> tuple[float, float, float]:
     return row["u"], row["v"], row["radial"] / np.sqrt(2)
 
 
-NUMBER = r"([\d.]+(?:\u202f×\u202f10[⁻⁰¹²³⁴⁵⁶⁷⁸⁹]+)?)"
-PLAIN = str.maketrans("⁻⁰¹²³⁴⁵⁶⁷⁸⁹", "-0123456789")
-
-
-def _worth(number: str) -> float:
-    """Value of a number, with its power of ten where it has one."""
-    mantissa, _, power = number.partition("\u202f×\u202f10")
-    return float(mantissa) * 10.0 ** int(power.translate(PLAIN) or 0)
+def _number(digits: str, power: str | None) -> float:
+    """Number that is written as digits and a power of ten, if any."""
+    exponents = str.maketrans("⁻⁰¹²³⁴⁵⁶⁷⁸⁹", "-0123456789")
+    return float(f"{digits}e{(power or '0').translate(exponents)}")
 
 
 def agree(text: str, value: float) -> bool:
     """Whether a text of three digits in pixels is the value, and its mas are too."""
     if value == 0:
         return text == "0\u202fpix (0\u202fmas)"
-    pix, mas = re.match(rf"{NUMBER}\u202fpix \({NUMBER}\u202f(?:mas|µas|arcsec)\)", text).groups()
-    unit = {"mas": 1.0, "µas": 1e-3, "arcsec": 1e3}[text.rstrip(")").rsplit("\u202f", 1)[1]]
-    found = (_worth(pix), _worth(mas) * unit)
+    number = r"([\d.]+)(?:×10([⁻⁰-⁹¹²³]+))?"
+    found = re.fullmatch(rf"{number}pix \({number}(mas|µas|arcsec)\)", text.replace("\u202f", ""))
+    assert found, text
+    unit = {"mas": 1.0, "µas": 1e-3, "arcsec": 1e3}[found[5]]
+    found = (_number(*found.group(1, 2)), _number(*found.group(3, 4)) * unit)
     # half of the third digit, and the rounding of the numbers in the page
     return all(
         abs(f - v) <= 0.5001 * 10 ** (np.floor(np.log10(v)) - 2) + 1e-5 * v
@@ -190,7 +188,10 @@ def test_the_rms_and_a_difference_at_any_epoch_are_those_of_the_assessment(asked
     found = shown(opened)
     for row in budget_of(asked.errors, at).rows():
         if row["name"] in found:
-            assert all(map(agree, found[row["name"]], _sizes(row))), (row, found[row["name"]])
+            assert all(map(agree, found[row["name"]], _sizes(row))), (
+                _sizes(row),
+                found[row["name"]],
+            )
     put(opened, mode="two", chip=0, ax=100, ay=200, bx=3000.5, by=1500)
     pixels = [100.0, 3000.5], [200.0, 1500.0]
     truth = place_budget(asked.errors, *pixels, chip=1, epoch=slider(opened), relative=True)

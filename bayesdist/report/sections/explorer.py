@@ -18,10 +18,9 @@ from bayesdist.report.figures.style import CYCLE, SEQUENTIAL
 from bayesdist.utils.arrays import Float
 from bayesdist.utils.numbers import ladder
 
-MOMENT_DIGITS = 7  # quadratic forms of them cancel in part
+MOMENT_DIGITS = 7  # quadratic forms of moments, and differences of displacements, cancel in part
 CURVED_DIGITS = 9  # of moments at more than three epochs, which differ by orders of magnitude
 MAP_DIGITS = 5
-SHIFT_DIGITS = 7  # of displacements: the page takes differences of them
 MOST_POINTS = 65  # of a map on the longer side: a pointer cannot separate more of them
 _COLORS = 12
 
@@ -129,7 +128,7 @@ def _product(term: GridRow) -> dict[str, Any]:
     """Displacements on the grid, by span, chip, node and axis."""
     spans = [
         {
-            str(chip): [[_short(one[:, axis], SHIFT_DIGITS) for axis in (0, 1)] for one in nodes]
+            str(chip): [[_short(one[:, axis], MOMENT_DIGITS) for axis in (0, 1)] for one in nodes]
             for chip, nodes in shifts.items()
         }
         for shifts in term.values
