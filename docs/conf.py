@@ -5,7 +5,11 @@ from __future__ import annotations
 import os
 import sysconfig
 
+from sphinx.ext.autosummary import Autosummary
+
 import bayesdist
+from bayesdist import formats
+from bayesdist.missions import wise
 
 project = "bayesdist"
 author = "The bayesdist developers"
@@ -57,3 +61,23 @@ html_theme_options = {
     "footer_start": ["copyright"],
     "footer_end": [],
 }
+
+
+class TypedNames(Autosummary):
+    """Summary of names as scripts have them, each with a link to its page."""
+
+    def get_items(self, names):
+        """Names as they are shown, signatures, summaries, and names that are linked to."""
+        return [(typed(real), *others, real) for _, *others, real in super().get_items(names)]
+
+
+def typed(full_name):
+    """Name as scripts have it: bd.sample for bayesdist.infer.sample."""
+    name = full_name.rpartition(".")[2]
+    packages = {"bd": bayesdist, "bd.formats": formats, "wise": wise}
+    return next((f"{k}.{name}" for k, v in packages.items() if name in v.__all__), full_name)
+
+
+def setup(app):
+    """Add the directive `typed-names`."""
+    app.add_directive("typed-names", TypedNames)
