@@ -134,10 +134,14 @@ def _difference_from_previous(results: Results) -> tuple[Comparison, ...]:
     )
 
 
+MOST_NAMED = 3  # chips by which a run is called
+
+
 def title_of(config: Config) -> str:
     """Mission, instrument, detector or chips, and filter, as far as they are given."""
-    given = config.detector
-    detector = given.name or " and ".join(chip.name for chip in config.chip)
+    given, names = config.detector, [chip.name for chip in config.chip if chip.name]
+    few = len(names) <= MOST_NAMED
+    detector = given.name or (" and ".join(names) if few else f"{names[0]} to {names[-1]}")
     band = given.filter or (config.campaign and config.campaign.filter)
     named = " ".join(part for part in (given.mission, given.instrument, detector) if part)
     return ", ".join(part for part in (named, band) if part)

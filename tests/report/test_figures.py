@@ -10,15 +10,16 @@ import numpy as np
 import pytest
 from matplotlib import pyplot
 from matplotlib.collections import LineCollection, QuadMesh
+from matplotlib.colors import Normalize
 from matplotlib.quiver import Quiver
 
 from bayesdist.assess import VectorMap
 from bayesdist.errors import InputError
 from bayesdist.report.drawing import save_figures
 from bayesdist.report.figures.arrows import Arrows, cross_map, sparse_step, square_cells
-from bayesdist.report.figures.fields import contour_levels, error_levels
+from bayesdist.report.figures.fields import Grid, contour_levels, error_levels, scalar_map
 from bayesdist.report.figures.mosaic import Mosaic
-from bayesdist.report.figures.panels import ChipPanels, overlap
+from bayesdist.report.figures.panels import ChipPanels, FocalPlane, overlap
 from bayesdist.report.figures.style import figure_style, nice_below
 from bayesdist.report.plots.posterior import (
     correlation_matrix,
@@ -234,6 +235,26 @@ def test_vectors_of_all_chips_are_in_one_focal_plane(wfc):
             np.testing.assert_allclose(quiver.get_array(), np.hypot(quiver.U, quiver.V))
             assert quiver.get_clim() == pytest.approx((0.0, longest), rel=1e-3)
         assert bar.get_ylabel() == "length [pix]"
+
+
+def test_maps_of_many_chips_are_in_one_focal_plane(wfc):
+    """Each cell of a turned chip is where the chip's frame puts its corners."""
+    grid = Grid(np.arange(3.0), np.arange(2.0), np.arange(6.0).reshape(2, 3))
+    outlines = [np.array([[0, 0], [3, 0], [3, 2], [0, 2.0]]) + (10.0 * k, 0) for k in range(5)]
+
+    def turned(x, y):
+        return np.stack([40.0 - np.asarray(y), np.asarray(x)])
+
+    frames = [*[lambda x, y, k=k: np.stack([x + 10 * k, y]) for k in range(4)], turned]
+    panels = FocalPlane(outlines, list("ABCDE"), frames=frames, colorbar=True)
+    scalar_map(panels, [grid] * 5, [""], norm=Normalize(0, 5), label="n")
+    ax, _ = panels.figure.axes
+    meshes = [c for c in ax.collections if isinstance(c, QuadMesh)]
+    corners = [m.get_coordinates() for m in meshes]
+    np.testing.assert_allclose(corners[1][0, 0], (9.5, -0.5))
+    np.testing.assert_allclose(corners[4][0, 0], (40.5, -0.5))
+    np.testing.assert_allclose(corners[4][0, -1], (40.5, 2.5))
+    assert [text.get_text() for text in ax.texts] == list("ABCDE")
 
 
 def test_chips_on_each_other_have_panels_of_their_own():

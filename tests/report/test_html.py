@@ -98,7 +98,7 @@ def test_pictures_are_whole_and_described(page, figures):
     images = lxml_html.fromstring(page).xpath("//figure/div/img")
     every = [one for one in REPORT.entries if one.kind == "figure" and one.each is None]
     # periods, held-out stars and no catalogue were not asked for, and nothing depends on time
-    others = ("periods", "holdout", "selfcal", "campaign")
+    others = ("periods", "holdout", "selfcal", "campaign", "previous")
     named = {one.name for one in every if not one.section.startswith(others)}
     assert set(figures) == named - {"validity_period"}
     assert len(images) == len(figures)

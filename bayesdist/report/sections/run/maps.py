@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -22,7 +22,7 @@ from bayesdist.report.figures.arrows import (
     vector_map,
 )
 from bayesdist.report.figures.fields import Grid, contour_levels, error_levels, scalar_map
-from bayesdist.report.figures.panels import ChipPanels, FocalPlane, overlap
+from bayesdist.report.figures.panels import ChipPanels, FocalPlane, Panels, overlap
 from bayesdist.report.figures.style import nice_below
 from bayesdist.report.plots.maps import BORDER, KEY_PAD
 from bayesdist.report.sections.gauge import gauge_mark, gauge_of_maps
@@ -32,6 +32,7 @@ from bayesdist.utils.numbers import display_scale, number, size_of, with_mas
 if TYPE_CHECKING:
     from bayesdist.assess import VectorMap
 
+MOST_PANELS = 4  # of chips: more are drawn in one focal plane
 MOST_ALONG = 34  # vectors along the longer side of a focal plane: more would hide each other
 
 
@@ -73,16 +74,20 @@ def uncertainty_radius(r: ReportInput) -> Plot:
     maps = [m for c in r.chips for m in c.maps]
     scale = display_scale(r.unit, max(float(m.per_axis.max()) for m in maps))
     grids = [Grid(m.x, m.y, m.per_axis * scale.factor, m.position_of_max) for m in maps]
-    panels = ChipPanels(r.mosaic, len(r.chips[0].maps), colorbar=True)
-    panels.frame()
-    kinds = [(k, m.kind) for k, c in enumerate(r.chips) for m in c.maps]
+    kinds = [m.kind for m in r.chips[0].maps]
+    panels = map_panels(r, len(kinds))
     scalar_map(
         panels,
         grids,
-        [
-            panels.title(k, f"{kind}: {number(g.values.min())} to {number(g.values.max())}", ", ")
-            for (k, kind), g in zip(kinds, grids, strict=True)
-        ],
+        map_titles(
+            panels,
+            grids,
+            [
+                lambda low, high, kind=kind: f"{kind}: {number(low)} to {number(high)}"
+                for kind in kinds
+            ],
+            ", ",
+        ),
         levels=error_levels(np.concatenate([g.values.ravel() for g in grids])),
         label=f"per axis (1 σ) [{scale.unit}]",
     )
@@ -141,15 +146,19 @@ def pixel_area(r: ReportInput) -> Plot:
     """
     areas = [c.area for c in r.chips]
     grids = [Grid(a.x, a.y, 100.0 * (a.area - 1.0)) for a in areas]
-    panels = ChipPanels(r.mosaic, colorbar=True)
-    panels.frame()
+    panels = map_panels(r)
     scalar_map(
         panels,
         grids,
-        [
-            panels.title(k, f"relative area {number(a.area.min(), 6)} to {number(a.area.max(), 6)}")
-            for k, a in enumerate(areas)
-        ],
+        map_titles(
+            panels,
+            grids,
+            [
+                lambda low, high: (
+                    f"relative area {number(1 + low / 100, 6)} to {number(1 + high / 100, 6)}"
+                )
+            ],
+        ),
         levels=contour_levels(np.concatenate([g.values.ravel() for g in grids])),
         label="pixel area − area at reference pixel [%]",
         labelled=True,
@@ -189,15 +198,11 @@ def pixel_scale(r: ReportInput) -> Plot:
     unit = "reference pix" if in_pixels else scale.unit
     by = 1.0 if in_pixels else scale.factor
     grids = [Grid(a.x, a.y, by * v) for a, v in zip(areas, values, strict=True)]
-    panels = ChipPanels(r.mosaic, colorbar=True)
-    panels.frame()
+    panels = map_panels(r)
     scalar_map(
         panels,
         grids,
-        [
-            panels.title(k, f"{g.values.min():.6g} to {g.values.max():.6g}")
-            for k, g in enumerate(grids)
-        ],
+        map_titles(panels, grids, [lambda low, high: f"{low:.6g} to {high:.6g}"]),
         levels=contour_levels(np.concatenate([g.values.ravel() for g in grids])),
         label=f"pixel scale [{unit}/pix]",
         labelled=True,
@@ -225,6 +230,41 @@ def distortion_non_linear(r: ReportInput) -> Plot:
         f" {r.length(v.length_max)} at {where}, ringed.",
         f"Vector diagram of the non-linear part, largest vector {r.length(v.length_max)}.",
     )
+
+
+def map_panels(r: ReportInput, maps: int = 1, *, colorbar: bool = True) -> Panels:
+    """Panels of maps: one for each chip, or one focal plane if there are many."""
+    frames = chip_frames(r.solution, epoch=r.chips[0].best_map.epoch)
+    outlines = [one.outline(c.chip.size) for one, c in zip(frames, r.chips, strict=True)]
+    if len(r.chips) <= MOST_PANELS or overlap(outlines):
+        panels = ChipPanels(r.mosaic, maps, colorbar=colorbar)
+        panels.frame()
+        return panels
+    names = [c.chip.name or f"chip {c.chip.number}" for c in r.chips]
+    border = BORDER * float(np.ptp(np.concatenate(outlines), axis=0).max())
+    look: dict[str, Any] = {"frames": frames, "margin": border, "colorbar": colorbar}
+    return FocalPlane(outlines, names, maps=maps, **look)
+
+
+def map_titles(
+    panels: Panels,
+    grids: Sequence[Grid],
+    texts: Sequence[Callable[[float, float], str]],
+    joined: str = ": ",
+) -> list[str]:
+    """Titles of panels of `map_panels`, which state the extremes of what is in each.
+
+    `grids` are the maps of the first chip, then those of the next; `texts` make words of the lowest
+    and the highest value of each map.
+    """
+    n = len(texts)
+    if isinstance(panels, FocalPlane):
+        values = [np.concatenate([g.values.ravel() for g in grids[k::n]]) for k in range(n)]
+        return [text(float(v.min()), float(v.max())) for text, v in zip(texts, values, strict=True)]
+    return [
+        panels.title(k // n, texts[k % n](float(g.values.min()), float(g.values.max())), joined)
+        for k, g in enumerate(grids)
+    ]
 
 
 def _flow(r: ReportInput, vectors: Sequence[VectorMap]) -> Figure:
@@ -291,7 +331,7 @@ def _longest(r: ReportInput, which: str) -> tuple[VectorMap, str]:
     return vectors, f"pixel {r.position(vectors.position_of_max, worst.chip.number)}"
 
 
-@REPORT.figure("maps")
+@REPORT.figure("maps", when=lambda r: len(r.chips) <= MOST_PANELS)
 def formal_uncertainty(r: ReportInput) -> Plot:
     """Four vectors from each position, to (±sigma_u, ±sigma_v).
 
