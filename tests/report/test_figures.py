@@ -240,7 +240,8 @@ def test_vectors_of_all_chips_are_in_one_focal_plane(wfc):
 def test_maps_of_many_chips_are_in_one_focal_plane(wfc):
     """Each cell of a turned chip is where the chip's frame puts its corners."""
     grid = Grid(np.arange(3.0), np.arange(2.0), np.arange(6.0).reshape(2, 3))
-    outlines = [np.array([[0, 0], [3, 0], [3, 2], [0, 2.0]]) + (10.0 * k, 0) for k in range(5)]
+    square = np.array([[0, 0], [3, 0], [3, 2], [0, 2.0]])
+    outlines = [square + np.array([10.0 * k, 0]) for k in range(5)]
 
     def turned(x, y):
         return np.stack([40.0 - np.asarray(y), np.asarray(x)])
