@@ -93,7 +93,9 @@ def parts_of(registry: Registry, results: Any, drawings: Mapping[str, Drawing]) 
     """
     tables: dict[str, list[TextTable]] = {}
     for item in registry.items(results, "table"):
-        tables.setdefault(item.section, []).extend(_several(item.made(results)))
+        made = _several(item.made(results))
+        folded = (replace(one, folded=one.folded or one.is_long) for one in made)
+        tables.setdefault(item.section, []).extend(folded)
     pictures: dict[str, list[Picture]] = {}
     for item in registry.items(results, "figure"):
         if item.name in drawings:

@@ -74,6 +74,11 @@ class TextTable:
         return sum(Level("note") in row for row in self.rows)
 
     @property
+    def is_long(self) -> bool:
+        """True where a table takes so much of a screen that it is folded."""
+        return len(self.rows) > _FEW_ROWS and not self.of_checks and not self.leading
+
+    @property
     def is_small(self) -> bool:
         """True where another table has room next to it on paper."""
         rows = self.rows[: self.leading or None]
