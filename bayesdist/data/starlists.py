@@ -18,6 +18,7 @@ from bayesdist.data.tables.column import SourceColumn
 from bayesdist.data.tables.names import ALIASES, BASIC, find_columns, origin_of
 from bayesdist.errors import FormatError, InputError
 from bayesdist.files.tables import TABLE_SUFFIXES, read_table
+from bayesdist.files.unpacked import without_codec
 from bayesdist.utils.arrays import Bool, Float
 
 log = logging.getLogger("bayesdist")
@@ -136,7 +137,7 @@ def read_star_lists(
     files = input_files(path)
     out: list[Detections] = []
     for file, name in zip(files, exposure_names(files), strict=True):
-        named = file.name.lower().removesuffix(".gz").endswith(tuple(TABLE_SUFFIXES))
+        named = without_codec(file.name).endswith(tuple(TABLE_SUFFIXES))
         kind = "table" if named else kind_of(file, columns)
         if kind == "hst1pass" and not errors:
             out.append(read_hst1pass(file).detections(name=name))

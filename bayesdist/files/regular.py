@@ -121,22 +121,19 @@ def read_text(path: PathLike, *, most: int | None = None) -> str:
 
     FormatError where it is no such text.
     """
+    return decoded(read_bytes(path, most=most), str(path))
+
+
+def decoded(raw: bytes, where: str) -> str:
+    """Text of bytes in UTF-8; FormatError where they are no such text."""
     try:
-        return read_bytes(path, most=most).decode("utf-8")
+        return raw.decode("utf-8")
     except UnicodeDecodeError as error:
         raise FormatError(
             f"cannot be read (not UTF-8 text at byte {error.start + 1})",
-            where=str(path),
+            where=where,
             do="check the file",
         ) from error
-
-
-def read_lines(path: PathLike) -> list[str]:
-    """Lines of a text file, with their ends and without a byte order mark.
-
-    Errors as of `read_text`.
-    """
-    return io.StringIO(read_text(path).removeprefix("\ufeff"), newline="").readlines()
 
 
 def head_of(path: PathLike, n: int = 4096) -> bytes:

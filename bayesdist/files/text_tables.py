@@ -7,10 +7,13 @@ import io
 import logging
 import re
 from collections.abc import Sequence
+from itertools import takewhile
 
 from astropy.table import Table
 
 from bayesdist.errors import FormatError
+from bayesdist.files.budget import Budget
+from bayesdist.files.documents import refuse_multiplied_yaml
 
 log = logging.getLogger("bayesdist")
 
@@ -141,13 +144,21 @@ def _pointed(line: str, mark: str | None) -> str:
     return out.getvalue()
 
 
-def parse_text_table(lines: Sequence[str], *, where: str) -> Table:
+def refuse_multiplied_header(lines: Sequence[str], budget: Budget) -> None:
+    """Refuse an ECSV file whose header of YAML has too many nodes; see `refuse_multiplied_yaml`."""
+    head = takewhile(lambda line: not line or line[0] == "#", map(str.strip, lines))
+    text = "\n".join(re.sub(r"^# ?", "", line) for line in head)
+    refuse_multiplied_yaml(text, budget)
+
+
+def parse_text_table(lines: Sequence[str], budget: Budget) -> Table:
     """Table of lines of text, with their ends; a row of an IPAC table that is cut short is refused.
 
     Known are an IPAC table, the ASCII_HEAD catalogue of SExtractor, a table of IRAF's daophot, a
     list of DAOPHOT II or ALLSTAR, and columns under a line of names, with "#" before it or not,
     separated by blanks, commas, semicolons or tabs.
     """
+    where = budget.where
     ended = not lines or lines[-1].endswith(("\n", "\r"))
     whole, lines = lines, [line.rstrip("\r\n") for line in lines]
     kind = _kind(lines)
@@ -157,9 +168,15 @@ def parse_text_table(lines: Sequence[str], *, where: str) -> Table:
             where=where,
             do="write one above the numbers",
         )
+    if kind == "ascii.ecsv":
+        refuse_multiplied_header(lines, budget)
+    rows = _rows_of(lines)
+    named = sum(1 for line in lines if line.startswith("#")) if kind == "ascii.sextractor" else 0
+    widths = [len(row.split(mark)) for row in rows[:1] for mark in (None, ",", ";", "|")]
+    budget.refuse_columns(max([named, *widths]))
     options: dict[str, object] = {}
     separated = kind in ("ascii.csv", "ascii.tab", "ascii.basic")
-    mark = mark_of(_rows_of(lines)) if separated else None
+    mark = mark_of(rows) if separated else None
     if kind == _DAOPHOT:
         return _daophot_list(lines, where)
     if kind == "ascii.ipac":

@@ -18,7 +18,7 @@ from bayesdist.data.catalog import ReferenceCatalog
 from bayesdist.data.detections import Detections
 from bayesdist.data.matches import Matches
 from bayesdist.errors import FormatError
-from bayesdist.files.regular import read_lines
+from bayesdist.files.unpacked import read_lines
 from bayesdist.utils.arrays import Float, Int
 
 _COLUMN = re.compile(r"#\s*\((\d+)\)\s+(\S+)\s+--\s")
