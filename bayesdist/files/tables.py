@@ -24,16 +24,19 @@ from bayesdist.files.fits import FITS_START, open_fits, refuse_long_arrays
 from bayesdist.files.parquet import parquet_table
 from bayesdist.files.regular import head_of
 from bayesdist.files.text_tables import (
+    MAYBE_FOREIGN_BYTES,
     is_text_table,
     mark_of,
     parse_text_table,
     refuse_cut_end,
+    refuse_foreign_numbers,
     refuse_multiplied_header,
     refuse_numbers_as_names,
     with_decimal_points,
 )
 from bayesdist.files.unpacked import read_lines, read_unpacked, without_codec
 from bayesdist.files.votable import refuse_unsafe_votable
+from bayesdist.utils.text import number_of
 
 CARD_LENGTH = 80  # characters of a FITS card
 _COMMAS = re.compile(r"# delimiter: ['\"]?,")
@@ -66,12 +69,20 @@ def _whole_lines(lines: list[str], mark: str, path: Path) -> list[str]:
     return bare
 
 
+def _is_comment(line: str) -> bool:
+    return line.startswith("#")
+
+
 def read_ecsv(path: Path, limits: Limits = LIMITS) -> Table:
     """Table of an ECSV file; errors as of `read_table`."""
     with _reading(path):
         lines = read_lines(path, limits)
         refuse_multiplied_header(lines, _budget(path, limits))
-        return Table.read(_whole_lines(lines, " ", path), format="ascii.ecsv")
+        lines = _whole_lines(lines, " ", path)
+        table = Table.read(lines, format="ascii.ecsv")
+        mark = "," if any(map(_COMMAS.match, takewhile(_is_comment, lines))) else " "
+        refuse_foreign_numbers(table, lines, mark, where=str(path))
+        return table
 
 
 def _budget(path: Path, limits: Limits) -> Budget:
@@ -95,7 +106,9 @@ def _read_separated(path: Path, limits: Limits, *, mark: str, format: str) -> Ta
     refuse_numbers_as_names(cells, where=str(path))
     # astropy takes a time for a comment that grows with the square of its length
     lines = with_decimal_points([one for one in lines if one[:1] != "#"], mark, where=str(path))
-    return Table.read(lines, format=format, delimiter=mark, comment="#", guess=False)
+    table = Table.read(lines, format=format, delimiter=mark, comment="#", guess=False)
+    refuse_foreign_numbers(table, lines, mark, where=str(path))
+    return table
 
 
 def _refuse_short_rows(lines: list[str], mark: str, path: Path) -> None:
@@ -117,7 +130,7 @@ def _read_votable(path: Path, limits: Limits) -> Table:
     raw, budget = read_unpacked(path, limits)
     refuse_unsafe_votable(raw, budget)
     table = Table.read(io.BytesIO(raw), format="votable")
-    if any(np.ma.is_masked(table[name]) for name in table.colnames):
+    if MAYBE_FOREIGN_BYTES.search(raw) or any(np.ma.is_masked(table[n]) for n in table.colnames):
         _refuse_unreadable_cells(raw, path)
     return table
 
@@ -152,7 +165,7 @@ def _refuse_unreadable_cells(raw: bytes, path: Path) -> None:
 
 def _says_number(cell: str) -> bool:
     try:
-        float(cell)
+        number_of(cell)
     except ValueError:
         return cell.strip().lower() in _NO_NUMBER
     return True

@@ -21,6 +21,13 @@ _NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eEdD][+-]?\d+)?|nan|inf", re.IGNO
 _DECIMAL_COMMA = re.compile(r"[+-]?\d*,\d+([eEdD][+-]?\d+)?")
 _DECIMAL_POINT = re.compile(r"[+-]?(\d+\.\d*|\.\d+)([eEdD][+-]?\d+)?")
 _MAY_BE_THOUSANDS = re.compile(r"[+-]?[1-9]\d{0,2},\d{3}")
+# in cells that `_FOREIGN` matches, and in few others
+MAYBE_FOREIGN = re.compile(r"\d_\d|0[xX][0-9a-fA-F.]|[^\x00-\x7f]")
+MAYBE_FOREIGN_BYTES = re.compile(rb"\d_\d|[\x80-\xff]|&#")
+_FOREIGN = re.compile(
+    r"[+-]?(0[xX][0-9a-fA-F.]+([pP][+-]?\d+)?"
+    r"|(?=.*(_|[^\x00-\x7f]))[\d_]*\.?[\d_]*\d([eE][+-]?[\d_]+)?\.?)"
+)
 _MARKS = (",", ";", "\t", None)  # None: blanks
 ROWS_ABOVE, FEWEST_ABOVE = 20, 3  # that the last cell is held against
 _DAOPHOT = "DAOPHOT"  # the program's own lists, not the tables of IRAF's version
@@ -193,7 +200,9 @@ def parse_text_table(lines: Sequence[str], budget: Budget) -> Table:
             lines = [line.replace("\t", " ") for line in lines]
         elif mark == ";":
             options["delimiter"] = mark
-    return Table.read(lines, format=kind, guess=False, **options)
+    table = Table.read(lines, format=kind, guess=False, **options)
+    refuse_foreign_numbers(table, lines, mark, where=where)
+    return table
 
 
 def refuse_cut_end(lines: Sequence[str], mark: str | None, *, where: str) -> None:
@@ -220,6 +229,31 @@ def refuse_cut_end(lines: Sequence[str], mark: str | None, *, where: str) -> Non
             do="the table may be truncated: fetch or write it again",
         )
     log.warning("%s: its last line has no end, so that the file may be truncated", where)
+
+
+def refuse_foreign_numbers(
+    table: Table, lines: Sequence[str], mark: str | None, *, where: str
+) -> None:
+    """Refuse cells that Python or C takes for numbers, and no format of tables does.
+
+    They are digits with underscores ("1_00"), hexadecimal numbers ("0x64"), and digits of other
+    scripts.  `lines` are those of the table, whose cells are separated by `mark`, or by blanks or
+    the bars of an IPAC table.  In columns of text such cells are names.
+    """
+    kinds = [table[name].dtype.kind for name in table.colnames]
+    for number, line in enumerate(lines, start=1):
+        if not MAYBE_FOREIGN.search(line) or line[:1] in ("#", "\\", "|"):
+            continue
+        cells = [cell.strip() for cell in _cells(line, mark)]
+        known = len(cells) == len(kinds)
+        for k, cell in enumerate(cells):
+            if _FOREIGN.fullmatch(cell) and (not known or kinds[k] in "iuf"):
+                name = f", column {table.colnames[k]!r}" if known else ""
+                raise FormatError(
+                    f"{cell[:40]!r} is no number",
+                    where=f"{where}, line {number}{name}",
+                    do="write it in decimal digits, without marks between them",
+                )
 
 
 def _daophot_list(lines: Sequence[str], where: str) -> Table:
