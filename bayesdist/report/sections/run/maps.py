@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -76,18 +77,14 @@ def uncertainty_radius(r: ReportInput) -> Plot:
     grids = [Grid(m.x, m.y, m.per_axis * scale.factor, m.position_of_max) for m in maps]
     kinds = [m.kind for m in r.chips[0].maps]
     panels = map_panels(r, len(kinds))
+
+    def title(kind: str, low: float, high: float) -> str:
+        return f"{kind}: {number(low)} to {number(high)}"
+
     scalar_map(
         panels,
         grids,
-        map_titles(
-            panels,
-            grids,
-            [
-                lambda low, high, kind=kind: f"{kind}: {number(low)} to {number(high)}"
-                for kind in kinds
-            ],
-            ", ",
-        ),
+        map_titles(panels, grids, [partial(title, kind) for kind in kinds], ", "),
         levels=error_levels(np.concatenate([g.values.ravel() for g in grids])),
         label=f"per axis (1 σ) [{scale.unit}]",
     )
