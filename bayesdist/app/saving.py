@@ -65,7 +65,10 @@ def save_fit(results: Results) -> None:
         return
     if fitted.solved is not None:
         rehearse_solution(results)
-        warnings = fitted.solved.gauge.sentences
+        gauge = fitted.solved.gauge
+        for text in gauge.settled:
+            log.info("fit: %s", text)
+        warnings = gauge.unsettled
     else:
         warnings = fitted.facts["deviations"]["warnings"]
     for text in warnings:

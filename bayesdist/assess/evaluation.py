@@ -430,6 +430,9 @@ def _within_field(
         return found
     inside = in_region(settings.field, chip.size, *mesh(found.x, found.y))
     inside = inside.reshape(found.sigma_u.shape)
-    names = ("sigma_u", "sigma_v", "correlation")
-    parts = {name: np.where(inside, getattr(found, name), np.nan) for name in names}
-    return replace(found, **parts)
+    return replace(
+        found,
+        sigma_u=np.where(inside, found.sigma_u, np.nan),
+        sigma_v=np.where(inside, found.sigma_v, np.nan),
+        correlation=np.where(inside, found.correlation, np.nan),
+    )

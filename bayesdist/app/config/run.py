@@ -106,9 +106,11 @@ class RunConfig(Section):
         raise NotImplementedError
 
     def files_of_products(self, base: Path) -> list[Path]:
-        """Files that only the products of a run are made from."""
+        """Files that only the products and the report of a run are made from."""
         release, named = self.products.release, self.named_files(base)
         found = [] if release is None else [base / release.reference]
+        if self.products.previous is not None:
+            found.append(previous_file(base / self.products.previous))
         others = named if isinstance(named, list) else [named]
         return [path for path in found if path not in others]
 
@@ -245,6 +247,11 @@ def rates_file(folder: Path) -> Path:
 def calibration_file(path: Path) -> Path:
     """File of an earlier calibration: one of any format as it is named, or a run's posterior."""
     return path if path.is_file() else _file_of_run(path, POSTERIOR, "prior_calibration.source")
+
+
+def previous_file(path: Path) -> Path:
+    """File of the release that is replaced: one of any format, or a run's posterior."""
+    return path if path.is_file() else _file_of_run(path, POSTERIOR, "products.previous")
 
 
 def _file_of_run(folder: Path, name: str, key: str) -> Path:

@@ -112,9 +112,10 @@ class ReadOptions:
         """
         if self.plate_scale is None or isinstance(self.sigma, str):
             return self.sigma
-        if hasattr(self.sigma, "unit"):
-            factor = length_in_mm(self.sigma.unit)
-            return self.sigma if factor is None else self.sigma.value * factor * self.plate_scale
+        quantity: Any = self.sigma
+        if hasattr(quantity, "unit"):
+            factor = length_in_mm(quantity.unit)
+            return quantity if factor is None else quantity.value * factor * self.plate_scale
         factor = length_in_mm(self.unit)
         if factor is None:
             raise InputError(

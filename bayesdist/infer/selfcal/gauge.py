@@ -157,6 +157,11 @@ class Gauge:
         return tuple(text for text, is_settled in self._remarks if is_settled)
 
     @property
+    def unsettled(self) -> tuple[str, ...]:
+        """Those of `sentences` on what other data or priors would determine."""
+        return tuple(text for text, is_settled in self._remarks if not is_settled)
+
+    @property
     def _remarks(self) -> list[tuple[str, bool]]:
         """Each of `sentences`, with True if it belongs to `settled`."""
         out, free = list[tuple[str, bool]](), set(self.free_names)

@@ -70,9 +70,9 @@ def budget_at(
             return "\n".join([_list(rows, errors.unit, mas), origin_line(origin, reason)])
         number_of = chosen_chip(numbers, chip, where=str(run), argument="--chip")
         first = at or (0.0, 0.0)  # one of the two is given
-        x, y = zip(first, *to, strict=True)
+        positions = np.array([first, *to], float)
         budget = place_budget(
-            errors, x, y, chip=number_of, epoch=date, magnitude=magnitude, relative=bool(to)
+            errors, *positions.T, chip=number_of, epoch=date, magnitude=magnitude, relative=bool(to)
         )
         if as_json:
             rows = list(_entries([budget], range(len(budget.x))))

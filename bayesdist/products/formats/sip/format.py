@@ -104,11 +104,25 @@ def _build(
 
 
 def _notes(sip: SipHeader, calibration: Calibration) -> tuple[str, ...]:
-    """Note on CRVAL where the sky position is neither known nor given in the settings."""
-    if not _sky_is_assumed(sip, calibration) or sip.crval != (0.0, 0.0):
-        return ()
-    remedy = f"set products.sip.crval{_or_linear(calibration)}"
-    return (f"CRVAL is a placeholder, and {_axes(sip)}: {remedy}",)
+    """Notes on what the settings of the product cause.
+
+    CRVAL is a placeholder where the sky position is neither known nor given, and terms below order
+    2 are in A and B where they are asked to be.
+    """
+    out = []
+    if _sky_is_assumed(sip, calibration) and sip.crval == (0.0, 0.0):
+        remedy = f"set products.sip.crval{_or_linear(calibration)}"
+        out.append(f"CRVAL is a placeholder, and {_axes(sip)}: {remedy}")
+    low = {k: c for terms in (sip.a, sip.b) for k, c in terms.items() if sum(k) < 2 and c}
+    if low:
+        out.append(
+            "A and B hold constant or linear terms, which astropy applies and stwcs and gwcs drop: "
+            "set products.sip.linear = 'cd' for those"
+            if any(sum(k) == 1 for k in low)
+            else "A_0_0 and B_0_0 hold what CRVAL leaves, which astropy applies and stwcs and gwcs "
+            "drop"
+        )
+    return tuple(out)
 
 
 def _projection_matters(
@@ -134,20 +148,10 @@ def _projection_matters(
 
 
 def _warnings(sip: SipHeader, calibration: Calibration) -> tuple[str, ...]:
-    """Warnings on what programs will make of a header that the solution does not say."""
-    out = []
-    if _sky_is_assumed(sip, calibration) and sip.crval != (0.0, 0.0):
-        out.append(f"{_axes(sip)}: check that they are{_or_linear(calibration)}")
-    low = {k: c for terms in (sip.a, sip.b) for k, c in terms.items() if sum(k) < 2 and c}
-    if low:
-        out.append(
-            "A and B hold constant or linear terms, which astropy applies and stwcs and gwcs drop: "
-            "set products.sip.linear = 'cd' for those"
-            if any(sum(k) == 1 for k in low)
-            else "A_0_0 and B_0_0 hold what CRVAL leaves, which astropy applies and stwcs and gwcs "
-            "drop"
-        )
-    return tuple(out)
+    """Warning on sky axes that the header has and the solution does not state."""
+    if not _sky_is_assumed(sip, calibration) or sip.crval == (0.0, 0.0):
+        return ()
+    return (f"{_axes(sip)}: check that they are{_or_linear(calibration)}",)
 
 
 def _sky_is_assumed(sip: SipHeader, calibration: Calibration) -> bool:
