@@ -10,6 +10,7 @@ from collections.abc import Sequence
 from itertools import takewhile
 
 from astropy.table import Table
+from astropy.table.meta import get_header_from_yaml
 
 from bayesdist.errors import FormatError
 from bayesdist.files.budget import Budget
@@ -153,9 +154,13 @@ def _pointed(line: str, mark: str | None) -> str:
 
 def refuse_multiplied_header(lines: Sequence[str], budget: Budget) -> None:
     """Refuse an ECSV file whose header of YAML has too many nodes; see `refuse_multiplied_yaml`."""
+    refuse_multiplied_yaml("\n".join(_header_lines(lines)), budget)
+
+
+def _header_lines(lines: Sequence[str]) -> list[str]:
+    """Lines of the YAML above an ECSV table."""
     head = takewhile(lambda line: not line or line[0] == "#", map(str.strip, lines))
-    text = "\n".join(re.sub(r"^# ?", "", line) for line in head)
-    refuse_multiplied_yaml(text, budget)
+    return [re.sub(r"^# ?", "", line) for line in head]
 
 
 def parse_text_table(lines: Sequence[str], budget: Budget) -> Table:
@@ -272,20 +277,33 @@ def refuse_foreign_numbers(
     scripts.  `lines` are those of the table, whose cells are separated by `mark`, or by blanks or
     the bars of an IPAC table.  In columns of text such cells are names.
     """
-    kinds = [table[name].dtype.kind for name in table.colnames]
+    numeric: dict[str, bool] | None = None  # by column
     for number, line in enumerate(lines, start=1):
         if not MAYBE_FOREIGN.search(line) or line[:1] in ("#", "\\", "|"):
             continue
+        if numeric is None:
+            numeric = _numeric_columns(table, lines)
         cells = [cell.strip() for cell in _cells(line, mark)]
-        known = len(cells) == len(kinds)
-        for k, cell in enumerate(cells):
-            if _FOREIGN.fullmatch(cell) and (not known or kinds[k] in "iuf"):
-                name = f", column {table.colnames[k]!r}" if known else ""
+        names = list(numeric) if len(cells) == len(numeric) else [""] * len(cells)
+        for name, cell in zip(names, cells, strict=True):
+            if _FOREIGN.fullmatch(cell) and numeric.get(name, True):
+                column = f", column {name!r}" if name else ""
                 raise FormatError(
                     f"{cell[:40]!r} is no number",
-                    where=f"{where}, line {number}{name}",
+                    where=f"{where}, line {number}{column}",
                     do="write it in decimal digits, without marks between them",
                 )
+
+
+def _numeric_columns(table: Table, lines: Sequence[str]) -> dict[str, bool]:
+    """Names of the columns as in the file, with True for those of numbers.
+
+    Of several columns in an ECSV file astropy may make one, such as a SkyCoord or a Time.
+    """
+    if lines[0].startswith("# %ECSV"):
+        datatypes = get_header_from_yaml(_header_lines(lines))["datatype"]
+        return {column["name"]: column["datatype"] != "string" for column in datatypes}
+    return {name: table[name].dtype.kind in "iuf" for name in table.colnames}
 
 
 def _daophot_list(lines: Sequence[str], where: str) -> Table:

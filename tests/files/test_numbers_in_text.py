@@ -3,9 +3,14 @@
 from __future__ import annotations
 
 import pytest
+from astropy import units as u
+from astropy.coordinates import SkyCoord
+from astropy.table import QTable
+from astropy.time import Time
 
 from bayesdist.data import read_matches
 from bayesdist.errors import InputError
+from bayesdist.files.tables import read_table
 from bayesdist.utils.text import number_of
 
 NAMES = ("x", "y", "u", "v", "exposure")
@@ -53,6 +58,23 @@ def test_names_of_exposures_may_look_like_such_numbers(tmp_path, end, name):
     matches = read_matches(written(tmp_path, end, "2.5", name), unit="pix", sigma=0.01)
     assert matches.x.tolist() == [1.5, 2.5, 7.25]
     assert matches.exposure_names == (name,)
+
+
+def test_coordinates_and_times_are_several_columns(tmp_path):
+    """Columns of ECSV that astropy makes one object of."""
+    path = tmp_path / "a.ecsv"
+    QTable(
+        {"exposure": ["1_00", "2_00"], "x": [1.25, 2.5] * u.pix, "y": [3.5, 4.5],
+         "time": Time([58849.25, 58850.5], format="mjd"),
+         "sky": SkyCoord([10.5, 11.5] * u.deg, [1.5, 2.5] * u.deg)}
+    ).write(path)  # fmt: skip
+    assert read_table(path)["sky"].ra.deg.tolist() == [10.5, 11.5]
+    for number, name in (("1.25", "x"), ("11.5", "sky.ra"), ("4.5", "y")):
+        changed = tmp_path / f"{name}.ecsv"
+        text = path.read_text().replace(f" {number}", " 1_0")
+        changed.write_text(text)
+        with pytest.raises(InputError, match=f"column '{name}': '1_0' is no number|cannot be read"):
+            read_table(changed)
 
 
 @pytest.mark.parametrize("text", ["1", "-1.", "+.5", "1e5", " 2.5E-3\n", "nan", "-INF"])
