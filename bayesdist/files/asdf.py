@@ -102,7 +102,8 @@ def _blocks(raw: bytes, at: int, budget: Budget) -> Iterator[tuple[int, bytes]]:
         if begin + used > len(raw):
             raise _damaged("a block ends before its data", budget)
         budget.refuse_content(size)
-        data = _decompressed(raw[begin : begin + used], kind.strip(b"\0").decode("latin-1"), budget)
+        codec = kind.strip(b"\0").decode("latin-1")
+        data = _decompressed(raw[begin : begin + used], codec, size, budget)
         if len(data) != size:
             raise _damaged(f"a block announces {size} bytes and holds others", budget)
         yield flags, data
@@ -110,16 +111,16 @@ def _blocks(raw: bytes, at: int, budget: Budget) -> Iterator[tuple[int, bytes]]:
         at = begin + room
 
 
-def _decompressed(raw: bytes, kind: str, budget: Budget) -> bytes:
-    """Data of a block, at most one byte beyond the budget."""
-    most = budget.content + 1
+def _decompressed(raw: bytes, kind: str, size: int, budget: Budget) -> bytes:
+    """Data of a block; longer than `size` bytes, which it announces, if it holds more."""
+    most = size + 1  # 0 would be no limit
     try:
         if kind == "zlib":
             return zlib.decompressobj().decompress(raw, most)
         if kind == "bzp2":
             return bz2.BZ2Decompressor().decompress(raw, most)
         if kind == "lz4":
-            return b"".join(_lz4_pieces(raw, budget))
+            return b"".join(_lz4_pieces(raw, size, budget))
     except (OSError, ValueError, zlib.error, struct.error, RuntimeError) as error:
         raise _damaged(f"a block cannot be decompressed ({reason_of(error)})", budget) from error
     if kind:
@@ -131,8 +132,11 @@ def _decompressed(raw: bytes, kind: str, budget: Budget) -> bytes:
     return raw
 
 
-def _lz4_pieces(raw: bytes, budget: Budget) -> Iterator[bytes]:
-    """Pieces of a block of lz4, each after its length, and after the size that it has then."""
+def _lz4_pieces(raw: bytes, most: int, budget: Budget) -> Iterator[bytes]:
+    """Pieces of a block of lz4, each after its length, and after the size that it has then.
+
+    The last is the first that leads beyond `most` bytes.
+    """
     try:
         import lz4.block
     except ImportError:
@@ -142,7 +146,7 @@ def _lz4_pieces(raw: bytes, budget: Budget) -> Iterator[bytes]:
             do="install the package lz4, or write the file with zlib or without compression",
         ) from None
     at = total = 0
-    while at < len(raw):
+    while at < len(raw) and total <= most:
         (n,) = struct.unpack_from(">I", raw, at)
         (size,) = struct.unpack_from("<I", raw, at + 4)
         total += size

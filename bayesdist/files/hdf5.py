@@ -104,6 +104,7 @@ class _Announced:
         self._clock = budget.clock()
         self._totals: dict[int, int] = {}  # by the address of a group that has been visited
         self._links = 0
+        self._attributes = 0  # bytes of those of variable length
 
     def bytes_of(self, group: h5py.Group, depth: int = 1) -> int:
         """Bytes in a group and those within it."""
@@ -112,6 +113,7 @@ class _Announced:
         address = h5py.h5o.get_info(group.id).addr
         if address not in self._totals:
             self._budget.refuse_depth(depth, "groups")
+            self._refuse_attributes(group)
             self._totals[address] = 0  # for a group within itself
             self._totals[address] = sum(self._member(group, name, depth) for name in group)
         return self._totals[address]
@@ -128,16 +130,50 @@ class _Announced:
             return self.bytes_of(one, depth + 1)
         if isinstance(one, h5py.Dataset) and not one.external and not one.is_virtual:
             self._refuse_inflated(one)
+            self._refuse_attributes(one)
+            self._refuse_texts(one)
             # a chunk is read whole, also where the array is smaller
             n = max(int(one.size or 0), math.prod(one.chunks or (0,)))
             return n * one.dtype.itemsize
         if not isinstance(one, h5py.Datatype):
+            soft = isinstance(link, h5py.SoftLink)
             raise FormatError(
-                f"{name!r} lies in another file",
+                f"{name!r} {'is a soft link' if soft else 'lies in another file'}",
                 where=self._budget.where,
                 do="restore it, or make it again",
             )
         return 0
+
+    def _refuse_texts(self, array: h5py.Dataset) -> None:
+        """Refuse texts, and other values of variable length, that are together too long.
+
+        Any number of them may lie at one place of the file.  None is longer than the file, so that
+        as many as the budget has room for are read at a time.
+        """
+        if not array.dtype.hasobject or not array.size:
+            return
+        self._budget.refuse_content(8 * array.size)
+        total = 0
+        step = max(1, self._budget.content // max(self._budget.size, 1))
+        for leading in np.ndindex(array.shape[:-1]):
+            for begin in range(0, (array.shape or (1,))[-1], step):
+                self._clock()
+                at = (*leading, slice(begin, begin + step)) if array.shape else ()
+                total += _length(array[at])
+                self._budget.refuse_content(total)
+
+    def _refuse_attributes(self, owner: h5py.Group | h5py.Dataset) -> None:
+        """Refuse attributes as of `_refuse_texts`; each is read whole."""
+        import h5py
+
+        for name in owner.attrs:
+            self._clock()
+            attribute = h5py.h5a.open(owner.id, name.encode())
+            if attribute.dtype.hasobject:
+                n = math.prod(attribute.shape)
+                self._budget.refuse_content(n * self._budget.size)
+                self._attributes += _length(owner.attrs[name])
+                self._budget.refuse_content(self._attributes)
 
     def _refuse_inflated(self, array: h5py.Dataset) -> None:
         """Refuse chunks of gzip that hold more than a chunk: HDF5 reads them to their end."""
@@ -169,6 +205,16 @@ class _Announced:
                     where=self._budget.where,
                     do=DAMAGED,
                 )
+
+
+def _length(value: Any) -> int:
+    """Bytes of texts and arrays, also of those in an array or a record."""
+    if isinstance(value, np.void):
+        return sum(_length(member) for member in value.item())
+    if isinstance(value, np.ndarray):
+        inner = value.ravel() if value.dtype.hasobject else ()
+        return int(value.nbytes) + sum(_length(member) for member in inner)
+    return len(value) if isinstance(value, str | bytes) else 8
 
 
 # -- arrays of our own, each file with the fingerprint of what it belongs to -----------------------

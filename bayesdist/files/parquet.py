@@ -7,7 +7,7 @@ import os
 from collections import Counter
 from collections.abc import Collection, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, BinaryIO
 
 import numpy as np
 from astropy.table import Column, MaskedColumn, Table
@@ -15,7 +15,7 @@ from astropy.table.meta import get_header_from_yaml
 from numpy.typing import NDArray
 
 from bayesdist.errors import FormatError
-from bayesdist.files.budget import LIMITS, Budget, Limits
+from bayesdist.files.budget import DAMAGED, LIMITS, Budget, Limits
 from bayesdist.files.documents import refuse_multiplied_yaml
 from bayesdist.files.regular import opened
 
@@ -53,6 +53,8 @@ def open_parquet(
                     f"has {n} columns named {name!r}", where=str(path), do="rename one of them"
                 )
         _refuse_announced(stored, budget)
+        with opened(path) as stream:
+            _refuse_pages(stream, stored.metadata, budget)
     except FormatError:
         stored.close()
         raise
@@ -76,6 +78,105 @@ def _refuse_announced(stored: pyarrow.parquet.ParquetFile, budget: Budget) -> No
         clock()
     budget.refuse_cells(values)
     budget.refuse_content(max(8.0 * values, stated))
+    leaves = map(metadata.schema.column, range(metadata.num_columns))
+    width = sum(leaf.length for leaf in leaves if leaf.physical_type == "FIXED_LEN_BYTE_ARRAY")
+    budget.refuse_content(float(width) * metadata.num_rows)
+
+
+def _refuse_pages(stream: BinaryIO, metadata: pyarrow.parquet.FileMetaData, budget: Budget) -> None:
+    """Refuse pages that hold more than the budget, whatever is announced for their column.
+
+    Arrow makes room for what the header of each page announces.
+    """
+    clock, total = budget.clock(), 0
+    for group in map(metadata.row_group, range(metadata.num_row_groups)):
+        for column in map(group.column, range(group.num_columns)):
+            starts = [column.data_page_offset, column.dictionary_page_offset or 0]
+            at = min(start for start in starts if start > 0)
+            end = at + column.total_compressed_size
+            while at < end:
+                clock()
+                sizes, begin = _page_header(stream, at, budget)
+                total += sizes[_UNCOMPRESSED]
+                budget.refuse_content(total)
+                at = begin + sizes[_COMPRESSED]
+
+
+_UNCOMPRESSED, _COMPRESSED = 2, 3  # fields of PageHeader in parquet.thrift
+_MOST_HEADER = 2**24  # bytes of a page header that Arrow reads
+
+
+def _page_header(stream: BinaryIO, at: int, budget: Budget) -> tuple[dict[int, int], int]:
+    """Numbers in the header of a page by their fields, and the place of the byte after it."""
+    n = 2**10
+    while n <= _MOST_HEADER:
+        raw = os.pread(stream.fileno(), n, at)
+        try:
+            numbers, length = _thrift_struct(raw)
+            if min(numbers[_UNCOMPRESSED], numbers[_COMPRESSED]) < 0:
+                break
+            return numbers, at + length
+        except IndexError:  # it goes on, for instance with a long text as the maximum
+            if len(raw) < n:
+                break
+            n *= 2**4
+        except (KeyError, ValueError):
+            break
+    raise FormatError("has a page without a header", where=budget.where, do=DAMAGED)
+
+
+def _thrift_struct(raw: bytes, at: int = 0, depth: int = 0) -> tuple[dict[int, int], int]:
+    """Integers of a struct in Thrift's compact protocol by field, and the place of its end.
+
+    IndexError where `raw` ends before the struct, ValueError for what is no such struct.
+    """
+    numbers, field = dict[int, int](), 0
+    while raw[at]:
+        step, kind = divmod(raw[at], 16)
+        at += 1
+        if step:
+            field += step
+        else:
+            field, at = _thrift_integer(raw, at)
+        if kind in (4, 5, 6):  # i16, i32, i64
+            numbers[field], at = _thrift_integer(raw, at)
+        else:
+            at = _after_thrift_value(raw, at, kind, depth)
+    return numbers, at + 1
+
+
+def _thrift_integer(raw: bytes, at: int) -> tuple[int, int]:
+    """Signed integer and the place after it: 7 bits in each byte, and the sign in the lowest."""
+    value, at = _thrift_varint(raw, at)
+    return (value >> 1) ^ -(value & 1), at
+
+
+def _thrift_varint(raw: bytes, at: int) -> tuple[int, int]:
+    value = 0
+    for shift in range(0, 70, 7):
+        value |= (raw[at] & 127) << shift
+        at += 1
+        if raw[at - 1] < 128:
+            return value, at
+    raise ValueError("an integer of more than 64 bits")
+
+
+def _after_thrift_value(raw: bytes, at: int, kind: int, depth: int) -> int:
+    """Place after a value that is no integer: a boolean, byte, double, text or struct."""
+    if kind in (1, 2):  # the kind is the value
+        return at
+    if kind == 8:
+        n, at = _thrift_varint(raw, at)
+        at += n
+    elif kind == 12 and depth < 4:
+        return _thrift_struct(raw, at, depth + 1)[1]
+    elif kind in (3, 7):
+        at += 1 if kind == 3 else 8
+    else:
+        raise ValueError("a list or a map, which headers of pages do not have")
+    if at > len(raw):
+        raise IndexError
+    return at
 
 
 def text_columns(schema: pyarrow.Schema) -> frozenset[str]:
@@ -87,6 +188,15 @@ def text_columns(schema: pyarrow.Schema) -> frozenset[str]:
         *(types.is_binary, types.is_large_binary, types.is_dictionary),
     )
     return frozenset(one.name for one in schema if any(kind(one.type) for kind in kinds))
+
+
+def nested_texts(stored: pyarrow.parquet.ParquetFile) -> frozenset[str]:
+    """Columns of lists or records with text, which Arrow cannot decode as dictionaries."""
+    schema = stored.metadata.schema
+    leaves = map(schema.column, range(len(schema)))
+    paths = [leaf.path for leaf in leaves if leaf.physical_type == "BYTE_ARRAY"]
+    names = stored.schema_arrow.names
+    return frozenset(n for n in names if any(path.startswith(f"{n}.") for path in paths))
 
 
 def refuse_long_text(column: pyarrow.ChunkedArray | pyarrow.Array, budget: Budget) -> None:
@@ -115,10 +225,23 @@ def parquet_table(path: Path, limits: Limits = LIMITS) -> Table:
     with open_parquet(path, texts, limits) as stored:
         units = parquet_units(stored.schema_arrow)
         table = Table(meta=parquet_header(stored.schema_arrow))
-        for name, column in zip(stored.schema_arrow.names, stored.read().columns, strict=True):
+        rows = _counted(stored, budget) if nested_texts(stored) else stored.read()
+        for name, column in zip(stored.schema_arrow.names, rows.columns, strict=True):
             refuse_long_text(column, budget)
             table[name] = parquet_column(column, units.get(name))
     return table
+
+
+def _counted(stored: pyarrow.parquet.ParquetFile, budget: Budget) -> pyarrow.Table:
+    """All rows, read few at a time so that they can be held against the budget."""
+    import pyarrow
+
+    batches, total = list[pyarrow.RecordBatch](), 0
+    for batch in stored.iter_batches(1000):
+        total += batch.nbytes
+        budget.refuse_content(total)
+        batches.append(batch)
+    return pyarrow.Table.from_batches(batches, stored.schema_arrow if not batches else None)
 
 
 def arrow_table(data: Any) -> Table:

@@ -17,7 +17,8 @@ import pytest
 from astropy.io import fits
 from astropy.table import Table
 
-from bayesdist.errors import FormatError
+from bayesdist.data.tables.parquet import describe_part
+from bayesdist.errors import FormatError, InputError
 from bayesdist.files.asdf import asdf_tree
 from bayesdist.files.budget import Budget, Limits
 from bayesdist.files.documents import refuse_multiplied_yaml
@@ -279,6 +280,30 @@ def test_groups_that_are_linked_twice(tmp_path):
                 read(path)
 
 
+@pytest.mark.parametrize("what", ["texts", "arrays", "attribute"])
+def test_values_of_hdf5_that_share_one_place(what, tmp_path):
+    """Each states its length and where it lies: here all lie where the first one does."""
+    path, n, length = tmp_path / "a.h5", 1000, 99_999
+    kind = h5py.vlen_dtype(np.uint8) if what == "arrays" else h5py.string_dtype()
+    with h5py.File(path, "w") as file:
+        if what == "attribute":
+            file.attrs.create("x", [length * "a", *(n - 1) * ["a"]], dtype=kind)
+        else:
+            file.create_dataset("x", (n,), kind)[0] = (
+                length * "a" if what == "texts" else np.ones(length, np.uint8)
+            )
+    raw = path.read_bytes()
+    assert len(raw) < 400_000
+    stated = length.to_bytes(4, "little")  # then 8 bytes for the place of a heap, and 4 in it
+    at = raw.index(stated)
+    while not 0 < int.from_bytes(raw[at + 4 : at + 12], "little") < len(raw):
+        at = raw.index(stated, at + 1)
+    path.write_bytes(raw[:at] + n * raw[at : at + 16] + raw[at + 16 * n :])
+    for read in (hdf5_arrays, netcdf_groups):
+        with pytest.raises(FormatError, match=r"announces .* MB in a file of"):
+            read(path)
+
+
 def test_groups_that_hold_themselves_and_many_links(tmp_path):
     with h5py.File(tmp_path / "a.h5", "w") as file:
         group = file.create_group("a")
@@ -305,6 +330,74 @@ def test_one_long_text_in_all_rows(tmp_path):
     with pytest.raises(FormatError, match="announces 36 MB in a file of"):
         read_table(path)
     assert len(read_table(path, Limits(content=2**27))) == n
+
+
+@pytest.mark.parametrize("kind", ["record", "list", "fixed"])
+def test_long_text_within_cells_and_of_one_width(kind, tmp_path):
+    path, n = tmp_path / "a.parquet", 5000
+    values = {
+        "record": [{"a": 9000 * "x"}] * n,
+        "list": [[9000 * "x"]] * n,
+        "fixed": [bytes(9000)] * n,
+    }
+    types = {
+        "record": pa.struct([("a", pa.string())]),
+        "list": pa.list_(pa.string()),
+        "fixed": pa.binary(9000),
+    }
+    pq.write_table(pa.table({"x": np.arange(n), "name": pa.array(values[kind], types[kind])}), path)
+    assert path.stat().st_size < 300_000
+    with pytest.raises(FormatError, match="announces"):
+        read_table(path)
+    read = pytest.raises(
+        InputError, match="announces" if kind == "fixed" else "several texts stand"
+    )
+    with read:
+        list(describe_part(path).blocks(["x", "name"], size=100))
+    if kind != "fixed":
+        assert sum(map(len, describe_part(path).blocks(["x"], size=100))) == n
+
+
+def test_pages_of_parquet_that_hold_more_than_their_column_announces(tmp_path):
+    """The footer announces 300 numbers in 3 kB, and the one page holds more."""
+    path, n = tmp_path / "a.parquet", 6_000_000
+    pq.write_table(pa.table({"x": np.zeros(n)}), path, compression="zstd", use_dictionary=False,
+                   data_page_size=2**30, max_rows_per_page=n, write_batch_size=n, row_group_size=n,
+                   write_statistics=False, store_schema=False)  # fmt: skip
+    column = pq.read_metadata(path).row_group(0).column(0)
+    raw = path.read_bytes()
+    footer = raw[-8 - int.from_bytes(raw[-8:-4], "little") :]
+    changed = footer
+    for old, new in ((n, 300), (column.total_uncompressed_size, 3000)):
+        assert _varint(2 * old, 4) in changed
+        changed = changed.replace(_varint(2 * old, 4), _varint(2 * new, 4))
+    path.write_bytes(raw[: -len(footer)] + changed)
+    assert pq.read_metadata(path).num_rows == 300
+    with pytest.raises(FormatError, match="announces 48 MB in a file of"):
+        read_table(path)
+
+
+def _varint(value: int, n: int) -> bytes:
+    """Integer of Thrift in n bytes, of which the last may be 0."""
+    return bytes(value >> 7 * k & 127 | 128 * (k < n - 1) for k in range(n))
+
+
+@pytest.mark.parametrize("text", [1, 3000, 50_000])  # bytes of the statistics of each page
+@pytest.mark.parametrize("version", ["1.0", "2.0"])
+def test_headers_of_pages(text, version, tmp_path):
+    """Their pages together hold what the footer, which is right, announces."""
+    path = tmp_path / "a.parquet"
+    names = [f"{k % 7}" + text * "x" for k in range(1000)]
+    pq.write_table(pa.table({"x": np.arange(1000.0), "name": names}), path, data_page_size=2000,
+                   data_page_version=version, use_dictionary=["x"], compression="snappy",
+                   write_page_checksum=True, row_group_size=300)  # fmt: skip
+    metadata = pq.read_metadata(path)
+    groups = map(metadata.row_group, range(metadata.num_row_groups))
+    stated = sum(g.column(k).total_uncompressed_size for g in groups for k in range(2))
+    largest = Limits(content=2**28)
+    assert len(read_table(path, largest)) == 1000
+    with pytest.raises(FormatError, match="announces"):
+        read_table(path, Limits(content=stated - 1, content_per_byte=0))
 
 
 def test_rows_columns_and_lists_of_parquet(tmp_path):

@@ -21,6 +21,7 @@ from bayesdist.errors import InputError
 from bayesdist.files.budget import Budget
 from bayesdist.files.faults import naming_faults
 from bayesdist.files.parquet import (
+    nested_texts,
     numpy_array,
     open_parquet,
     parquet_column,
@@ -151,6 +152,12 @@ class ParquetPart:
             budget = Budget(self.name, self.path.stat().st_size)
             if _group_rows(stored) != self.group_rows or _names(stored) != self.colnames:
                 raise self._changed()
+            for column in sorted(nested_texts(stored).intersection(columns)):
+                raise InputError(
+                    "several texts stand in a cell",
+                    where=f"{self.name}, column {column!r}",
+                    do="give a column with one value in each row",
+                )
             # only next() is guarded: exceptions of the consumer are not the file's fault
             decoded = stored.iter_batches(_BATCH, row_groups=groups, columns=list(columns))
             while True:
