@@ -127,6 +127,21 @@ def test_an_image_that_is_cut_says_so(tmp_path: Path) -> None:
         describe(tmp_path / "plain_cut.fits")
 
 
+def test_a_file_that_is_cut_after_a_header_says_so(tmp_path: Path) -> None:
+    """Headers alone, a whole record of each, are a file that somebody may keep."""
+    header = fits.Header.fromstring((ASTROPY / "irac_sip.hdr").read_bytes())
+    image = fits.ImageHDU(np.zeros((256, 256), "f4"), header, name="SCI")
+    for first in (fits.PrimaryHDU(), fits.PrimaryHDU(np.zeros((9, 9)))):
+        fits.HDUList([first, image]).writeto(tmp_path / "whole.fits", overwrite=True)
+        whole = (tmp_path / "whole.fits").read_bytes()
+        begins = len(whole) - 92 * 2880  # of the data of the image, 262,144 bytes
+        for length in (begins - 10, begins):
+            (tmp_path / "cut.fits").write_bytes(whole[:length])
+            alone = length == begins and first.data is None
+            assert ("it is truncated" in describe(tmp_path / "cut.fits")) != alone
+        assert "truncated" not in describe(tmp_path / "whole.fits")
+
+
 def test_a_compressed_image_has_its_own_size(tmp_path: Path) -> None:
     header = fits.Header.fromstring((ASTROPY / "irac_sip.hdr").read_bytes())
     fits.HDUList([fits.PrimaryHDU(), fits.CompImageHDU(np.ones((256, 256), "i2"), header)]).writeto(

@@ -90,7 +90,11 @@ def _left_over(header: fits.Header) -> Iterator[Finding]:
 def _truncated(file: Content) -> Iterator[Finding]:
     last = file.hdus[-1]
     where = f"HDU {last.number}"
-    if last.state == "cut":
+    # headers alone may be kept in a file, whole records of each, and then none has data
+    headers = last.state == "none" and len(file.hdus) > 1
+    if headers and (len(file.raw) % RECORD or any(hdu.data for hdu in file.hdus)):
+        yield Finding("error", where, "the file ends after this header: it is truncated")
+    elif last.state == "cut":
         yield Finding("error", where, "the file ends before this HDU does: it is truncated")
     elif file.is_fits and last.state == "whole" and len(file.raw) % RECORD:
         yield Finding(
