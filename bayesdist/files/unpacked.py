@@ -8,6 +8,7 @@ import io
 import lzma
 import re
 import zlib
+from codecs import BOM_UTF16_BE, BOM_UTF16_LE
 from collections.abc import Callable
 from typing import Any
 
@@ -95,10 +96,17 @@ def _read(stream: Any, budget: Budget) -> bytes | None:
 def read_lines(path: PathLike, limits: Limits = LIMITS) -> list[str]:
     """Lines of a text file, with their ends and without a byte order mark, decompressed.
 
-    Errors as of `read_bytes` and `unpacked`; FormatError for text that is not in UTF-8, and for
-    lines, cells or a line beyond the budget.
+    Errors as of `read_bytes` and `unpacked`; FormatError for text that is not in UTF-8 or has a
+    NUL, at which readers in C end a cell, and for lines, cells or a line beyond the budget.
     """
     raw, budget = read_unpacked(path, limits)
+    nul = raw.find(b"\0")
+    if nul >= 0 and not raw.startswith((BOM_UTF16_LE, BOM_UTF16_BE)):
+        raise FormatError(
+            "has a NUL character, which no text has",
+            where=f"{path}, line {len((raw[:nul] + b'.').splitlines())}",
+            do="it is damaged: fetch or write it again",
+        )
     ends = raw.count(b"\n") + raw.count(b"\r") - raw.count(b"\r\n")
     budget.refuse_rows(ends, "holds")
     if len(raw) > budget.size:

@@ -60,6 +60,16 @@ def test_names_of_exposures_may_look_like_such_numbers(tmp_path, end, name):
     assert matches.exposure_names == (name,)
 
 
+@pytest.mark.parametrize("end", [".csv", ".tsv", ".ecsv", ".tbl"])
+@pytest.mark.parametrize("cell", ["4\0.5", "\0", "2.5\0"])
+def test_nul_is_refused_with_its_line(tmp_path, end, cell):
+    """Readers in C end the cell there: 4.5 would be 4."""
+    path = written(tmp_path, end, cell)
+    line = 1 + path.read_text().partition("\0")[0].count("\n")
+    with pytest.raises(InputError, match=f"line {line}: has a NUL character"):
+        read_matches(path, unit="pix", sigma=0.01)
+
+
 def test_coordinates_and_times_are_several_columns(tmp_path):
     """Columns of ECSV that astropy makes one object of."""
     path = tmp_path / "a.ecsv"
