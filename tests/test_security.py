@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import json
+import logging
 import sys
 import urllib.request
 from collections.abc import Callable, Iterator
@@ -17,6 +18,7 @@ import pyarrow.parquet as pq
 import pytest
 from astropy.io import fits
 from astropy.table import Table
+from distributed import LocalCluster
 
 import bayesdist
 from bayesdist.app.cli import main
@@ -99,7 +101,8 @@ def _hear(event: str, arguments: tuple[object, ...]) -> None:
     if _heard is not None:
         outside = event == "open" and str(arguments[0]) in ("/etc/passwd", "/dev/zero")
         if outside or event in EVENTS:
-            _heard.append(f"{event} {arguments[:2]}")
+            place = arguments[1] if event == "socket.connect" else arguments[:2]
+            _heard.append(f"{event} {place}")
 
 
 sys.addaudithook(_hear)
@@ -253,3 +256,27 @@ def test_addresses_are_no_paths(address, tmp_path, capsys):
         assert main(["inspect", f"{address}.fits"]) == 1
     assert events == []
     assert "does not exist" in capsys.readouterr().err
+
+
+def test_only_the_scheduler_that_is_named_is_connected_to(tmp_path):
+    """And its workers, which hand over results themselves."""
+    x, y = np.random.default_rng(1).uniform(1, 100, (2, 50))
+    Table({"x": x, "y": y, "u": x, "v": y}).write(tmp_path / "a.csv")
+    with LocalCluster(
+        n_workers=1, threads_per_worker=1, processes=False, protocol="tcp", host="127.0.0.1",
+        dashboard_address=None, silence_logs=logging.CRITICAL,
+    ) as cluster:  # fmt: skip
+        (tmp_path / "config.toml").write_text(
+            '[data]\nmatches = "a.csv"\nunit = "pix"\nsigma = 0.01\n'
+            '[detector]\nname = "A"\nsize = [100, 100]\n[model]\norder = 1\n'
+            f'[compute]\nengine = "dask"\nscheduler = "{cluster.scheduler_address}"\n'
+        )
+        workers = [worker.address for worker in cluster.workers.values()]
+        ports = {
+            int(address.rpartition(":")[2]) for address in [cluster.scheduler_address, *workers]
+        }
+        with heard() as events:
+            assert main(["stage", "fit", str(tmp_path), "-q"]) == 0
+    assert "socket.connect" in {event.split()[0] for event in events}
+    allowed = {f"('127.0.0.1', {port})" for port in ports}
+    assert {event.partition(" ")[2] for event in events} <= allowed
