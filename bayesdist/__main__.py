@@ -2,7 +2,7 @@
 
 import sys
 
-from bayesdist.app.cli import main
+from bayesdist.app.cli import program
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(program())

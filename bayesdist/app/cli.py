@@ -5,6 +5,7 @@ from __future__ import annotations
 import gc
 import os
 import shlex
+import signal
 import sys
 from collections.abc import Callable, Sequence
 
@@ -13,7 +14,7 @@ import click
 from bayesdist.app.commands.options import LazyGroup
 from bayesdist.app.screen import open_streams
 from bayesdist.errors import BayesdistError, RenamedError
-from bayesdist.files.faults import raising_interrupts
+from bayesdist.files.faults import InterruptHandler, raising_interrupts
 from bayesdist.mission import load_mission, mission_names, missions
 from bayesdist.version import __version__
 
@@ -121,6 +122,14 @@ bayesdist = click.version_option(__version__, message="bayesdist %(version)s")(
 )
 
 
+def program() -> int:
+    """Run the command of the process, which ends with it."""
+    signal.signal(signal.SIGINT, InterruptHandler())
+    code = main()
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Python closes what libraries have left open
+    return code
+
+
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run a command."""
     open_streams()
@@ -166,4 +175,4 @@ def _exit_code(call: Callable[[], int | None], command: str) -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(program())

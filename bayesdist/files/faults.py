@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import math
+import signal
 import struct
 import sys
+import time
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -19,13 +22,35 @@ def raising_interrupts() -> Iterator[None]:
     A library that is interrupted in a callback, or as it closes a file, may fail in a way of its
     own: HDF5 does so with a SystemError.  An interrupt that a script was handling before is none.
     """
-    before = sys.exception()
+    before, handler = sys.exception(), signal.getsignal(signal.SIGINT)
+    n_before = handler.n if isinstance(handler, InterruptHandler) else 0
     try:
         yield
     except Exception as error:
-        if _comes_of_interrupt(error, before):
+        noted = isinstance(handler, InterruptHandler) and handler.n > n_before
+        if noted or _comes_of_interrupt(error, before):
             raise KeyboardInterrupt from error
         raise
+
+
+class InterruptHandler:
+    """Handler of SIGINT for a program: a second one soon after the first changes nothing.
+
+    What is open is closed then; an interrupt in the midst of that would leave a traceback.  After
+    `again` seconds the first one may have been lost, and another one counts.
+    """
+
+    def __init__(self, again: float = 2.0) -> None:
+        self.again = again
+        self.n = 0  # interrupts so far
+        self._last = -math.inf
+
+    def __call__(self, number: int, frame: object) -> None:
+        self.n += 1
+        now = time.monotonic()
+        if now - self._last > self.again:
+            self._last = now
+            raise KeyboardInterrupt
 
 
 def _comes_of_interrupt(error: BaseException, before: BaseException | None) -> bool:

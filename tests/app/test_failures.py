@@ -3,13 +3,19 @@
 from __future__ import annotations
 
 import os
+import signal
 import stat
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import click
 import pytest
 
 from bayesdist.app import cli as commands
+from bayesdist.files.faults import InterruptHandler, raising_interrupts
 from tests.app.support import cli
 
 ERRORS = [
@@ -65,6 +71,45 @@ def test_an_error_that_comes_of_an_interrupt_is_one(tmp_path, monkeypatch):
     result = cli("inspect")
     assert (result.code, result.err) == (130, "bayesdist: interrupted; resume with --resume\n")
     assert not list(tmp_path.iterdir())
+
+
+@contextmanager
+def _handled(handler: InterruptHandler) -> Iterator[None]:
+    before = signal.signal(signal.SIGINT, handler)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+def test_a_second_interrupt_leaves_the_first_one_to_its_end():
+    with _handled(InterruptHandler()):
+        with pytest.raises(KeyboardInterrupt):
+            signal.raise_signal(signal.SIGINT)
+        signal.raise_signal(signal.SIGINT)
+        # a library that swallows it, and fails for that
+        with pytest.raises(KeyboardInterrupt), raising_interrupts():
+            signal.raise_signal(signal.SIGINT)
+            raise AttributeError
+        with pytest.raises(AttributeError), raising_interrupts():
+            raise AttributeError
+    with _handled(InterruptHandler(again=0.0)):
+        for _ in range(2):
+            with pytest.raises(KeyboardInterrupt):
+                signal.raise_signal(signal.SIGINT)
+
+
+def test_an_interrupt_while_python_ends_is_silent():
+    """The command has ended, and nothing is left to interrupt."""
+    code = (
+        "import atexit, signal, sys; from bayesdist.app.cli import program\n"
+        "atexit.register(signal.raise_signal, signal.SIGINT); sys.exit(program())"
+    )
+    ended = subprocess.run(
+        [sys.executable, "-c", code, "--version"], capture_output=True, text=True, check=False
+    )
+    assert (ended.returncode, ended.stderr) == (0, "")
+    assert ended.stdout.startswith("bayesdist ")
 
 
 def test_endless_recursion(tmp_path, monkeypatch):
