@@ -45,7 +45,8 @@ class InterruptHandler:
         self.n = 0  # interrupts so far
         self._last = -math.inf
 
-    def __call__(self, number: int, frame: object) -> None:
+    def __call__(self, *_: object) -> None:
+        """Raise the interrupt, unless it follows another one soon."""
         self.n += 1
         now = time.monotonic()
         if now - self._last > self.again:

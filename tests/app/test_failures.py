@@ -7,7 +7,7 @@ import signal
 import stat
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -82,17 +82,22 @@ def _handled(handler: InterruptHandler) -> Iterator[None]:
         signal.signal(signal.SIGINT, before)
 
 
+@raising_interrupts()
+def _fail_after(event: Callable[[], None]) -> None:
+    event()
+    raise AttributeError
+
+
 def test_a_second_interrupt_leaves_the_first_one_to_its_end():
     with _handled(InterruptHandler()):
         with pytest.raises(KeyboardInterrupt):
             signal.raise_signal(signal.SIGINT)
         signal.raise_signal(signal.SIGINT)
         # a library that swallows it, and fails for that
-        with pytest.raises(KeyboardInterrupt), raising_interrupts():
-            signal.raise_signal(signal.SIGINT)
-            raise AttributeError
-        with pytest.raises(AttributeError), raising_interrupts():
-            raise AttributeError
+        with pytest.raises(KeyboardInterrupt):
+            _fail_after(lambda: signal.raise_signal(signal.SIGINT))
+        with pytest.raises(AttributeError):
+            _fail_after(lambda: None)
     with _handled(InterruptHandler(again=0.0)):
         for _ in range(2):
             with pytest.raises(KeyboardInterrupt):
