@@ -59,8 +59,7 @@ def by_calibrations(
         back = calibration.inverses[number].pixels(*about_zero.at(x, y))
         return np.stack([back[0] - x, back[1] - y], axis=-1)
 
-    inverses = all(calibration.inverses for calibration in sets)
-
+    inverses = all(one.inverses for one in sets)
     return ReadBack(file, forward, missed if inverses else None, own_axes=True)
 
 

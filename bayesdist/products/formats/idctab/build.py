@@ -145,10 +145,10 @@ def idctab_from_solution(
     parity = parity_of(instrument, detector)
     _check_positive(vafactor, "vafactor")
     acs_wfc = (instrument, detector) == ("ACS", "WFC")
-    for entry, combinations in entries:
-        check_time(entry.model, acs_wfc=acs_wfc)
-        if entry is not first:
-            _check_alike(entry, first, combinations[0])
+    for calibration, combinations in entries:
+        check_time(calibration.model, acs_wfc=acs_wfc)
+        if calibration is not first:
+            _check_alike(calibration, first, combinations[0])
     numbers = tuple(c.number for c in model.chips) if chips is None else tuple(chips)
     if not numbers:
         raise InputError("no chip is given", where="chips", do="name at least one")
@@ -196,7 +196,7 @@ def _entries(
     filters: Sequence[str] | Sequence[Sequence[str]] | None,
     instrument: str,
 ) -> list[tuple[Calibration, tuple[tuple[str, ...], ...]]]:
-    """Calibrations with the filter combinations of their rows; () for rows valid for all filters."""
+    """Calibrations with the filter combinations of their rows; () for rows of all filters."""
     location = "products.idctab.filters"
     named: list[tuple[tuple[str, ...], Source]]
     if isinstance(solution, Mapping):
