@@ -109,7 +109,8 @@ class SiafTable:
         nominal = self.size
         if nominal is not None and tuple(nominal) != tuple(size):
             raise InputError(
-                f"the image has {nominal[0]:g} x {nominal[1]:g} pixels, and {size[0]:g} x {size[1]:g} "
+                f"the image has {nominal[0]:g} x {nominal[1]:g} pixels, and "
+                f"{size[0]:g} x {size[1]:g} "
                 "are given",
                 where=self.name,
                 do="leave the size out, or give that of the aperture",
