@@ -145,9 +145,8 @@ def grouped(cell: Cell) -> Grouped:
         (np.ones(len(pairs), bool), tuple(pairs.T)), shape=(len(representatives),) * 2
     )
     n, group_of_square = connected_components(links, directed=False)
-    group = group_of_square[of_square].astype(
-        np.int64
-    )  # int64, because codes of groups and exposures are multiplied
+    # int64, because codes of groups and exposures are multiplied
+    group = group_of_square[of_square].astype(np.int64)
     chain = _spans(places, group, n) > MAX_EXTENT * cell.length
     reaches = np.zeros(n, bool)
     reaches[group[cell.inside]] = True  # the first detection of a chain may be outside of the cell

@@ -28,10 +28,8 @@ def hull_of(points: Float) -> tuple[Float, float]:
         )
         area = float(np.prod(high - low))
     else:
-        equations, area = (
-            hull.equations,
-            float(hull.volume),
-        )  # in two dimensions, qhull's volume is the area
+        # in two dimensions, qhull's volume is the area
+        equations, area = (hull.equations, float(hull.volume))
     return equations, max(area, float(np.finfo(float).tiny))
 
 

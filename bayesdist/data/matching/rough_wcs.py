@@ -205,9 +205,8 @@ class _Seen:
     epoch: Float | None  # (N,), decimal years
     exposure: Int  # (N,), codes
     chip: Int
-    names: tuple[
-        tuple[str, ...], tuple[str, ...]
-    ]  # names of exposures and chips; empty without such columns
+    # names of exposures and chips; empty without such columns
+    names: tuple[tuple[str, ...], tuple[str, ...]]
     origin: int
     notes: tuple[str, ...]
 

@@ -27,15 +27,10 @@ _STARS_OF_FIRST_LEVEL = (
     400  # reference stars in the first level; each further level has three times as many
 )
 _LEVEL_FACTOR = 3
-_TOLERANCES = (
-    0.004,
-    0.012,
-)  # tolerances of the logarithms of side ratios, which allow for residual distortion
-_DEPTHS = (
-    1.0,
-    0.5,
-    2.0,
-)  # stars of the list, relative to the number expected from the mean density
+# tolerances of the logarithms of side ratios, which allow for residual distortion
+_TOLERANCES = (0.004, 0.012)
+# stars of the list, relative to the number expected from the mean density
+_DEPTHS = (1.0, 0.5, 2.0)
 _WIDE = 0.3  # mean spacings of reference stars; search radius of the first pairs
 _BRIGHT_STARS = 2000  # stars in the first linear map
 _STARS_CHECKED = 1000  # largest number of stars with which a candidate is checked

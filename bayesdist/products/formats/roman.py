@@ -45,9 +45,8 @@ ELEMENTS = (
     "F062", "F087", "F106", "F129", "F146", "F158", "F184", "F213", "GRISM", "PRISM", "DARK",
 )  # fmt: skip
 DETECTORS = tuple(f"WFI{n:02d}" for n in range(1, 19))
-_WFI = Detector(
-    (4088.0, 4088.0), 0.1075
-)  # mean pixel scale of the FULL apertures, which range from 0.1059 to 0.1093
+# mean pixel scale of the FULL apertures, which range from 0.1059 to 0.1093
+_WFI = Detector((4088.0, 4088.0), 0.1075)
 _REQUIRED = ("reftype", "description", "author", "pedigree", "useafter", "telescope", "origin")
 
 

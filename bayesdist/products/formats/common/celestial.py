@@ -292,9 +292,8 @@ def _from_galactic(lon: float, lat: float) -> tuple[Float, tuple[float, float]]:
     from astropy.coordinates import CartesianRepresentation, Galactic, SkyCoord
 
     axes = SkyCoord(Galactic(CartesianRepresentation(np.eye(3))))
-    matrix = np.asarray(
-        axes.icrs.cartesian.xyz.value, float
-    )  # columns are the ICRS images of the galactic axes
+    # columns are the ICRS images of the galactic axes
+    matrix = np.asarray(axes.icrs.cartesian.xyz.value, float)
     east, north, outwards = plane_axes((lon, lat))
     x, y, z = matrix @ outwards
     ra, dec = np.degrees(np.arctan2(y, x)) % 360.0, np.degrees(np.arctan2(z, np.hypot(x, y)))

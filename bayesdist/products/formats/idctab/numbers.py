@@ -199,9 +199,8 @@ def chip_inverse(calibration: Calibration, chip: int, factor: float) -> ChipInve
     for axis, (prefix, terms) in enumerate((("CX", inverse.x_terms), ("CY", inverse.y_terms))):
         for (i, j), value in terms.items():
             columns.append(idctab_column(prefix, i, j))
-            values.append(
-                value + ((i, j) == (1 - axis, axis))
-            )  # add the position itself, which `inverse` leaves out
+            # add the position itself, which `inverse` leaves out
+            values.append(value + ((i, j) == (1 - axis, axis)))
     closure, _ = inverse.misses(chip_map)
     return ChipInverse(
         dict(zip(columns, values, strict=True)),

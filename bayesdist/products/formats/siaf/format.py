@@ -133,9 +133,8 @@ def _forward(poly: Monomials) -> list[dict[tuple[int, int], float]]:
 
 def _inverse(chip: ChipMap, order: int) -> list[dict[tuple[int, int], float]]:
     """Terms of the inverse, by powers of the Ideal coordinates."""
-    sign = float(
-        np.sign(np.linalg.det(chip.linear))
-    )  # `fit_inverse` needs axes that are not mirrored
+    # `fit_inverse` needs axes that are not mirrored
+    sign = float(np.sign(np.linalg.det(chip.linear)))
 
     def forward(x: Float, y: Float) -> tuple[Float, Float]:
         u, v = chip.at(x, y)

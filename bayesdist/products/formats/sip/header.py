@@ -25,10 +25,8 @@ Terms = Mapping[tuple[int, int], float]
 SIDE_FILE = "BDPARAM"  # keyword with the name of the file that has the covariance
 # Programs ignore lower orders, and a keyword has only one digit for each power.
 SIP_ORDERS = (2, 9)
-LINEAR_AXES = (
-    "U",
-    "V",
-)  # CTYPE of a user-defined plane, which no program interprets as sky coordinates
+# CTYPE of a user-defined plane, which no program interprets as sky coordinates
+LINEAR_AXES = ("U", "V")
 
 
 @dataclass(frozen=True, eq=False)

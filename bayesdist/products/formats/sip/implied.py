@@ -42,9 +42,8 @@ _NODES, _SAMPLED = 129, 2e-4
 @cache
 def _student_nodes(dof: int) -> Float:
     """Equally probable nodes of Student's t distribution with unit scale, centred on zero."""
-    from scipy.special import (
-        stdtrit,
-    )  # imported here because few files need it and it slows down the import
+    # imported here because few files need it and it slows down the import
+    from scipy.special import stdtrit
 
     return np.asarray(stdtrit(dof, _MIDDLES), float)
 
@@ -238,9 +237,8 @@ class _Closure:
         residual = components(changes)
         d = np.where(mask, components(step) - residual, 0.0) / step[:, None]
         norm = (d**2).sum(axis=1)
-        for _ in range(
-            _STEPS
-        ):  # with a constant slope: the closure is nearly linear in the coefficients
+        # with a constant slope: the closure is nearly linear in the coefficients
+        for _ in range(_STEPS):
             changes -= (d * residual).sum(axis=1) / norm
             residual = components(changes)
         n_inside, n_outside = mask.sum(axis=1), (~mask).sum(axis=1)

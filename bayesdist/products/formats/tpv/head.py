@@ -173,9 +173,8 @@ def _headers(content: Content) -> list[fits.Header]:
     out, cards = [], list[str]()
     for line in [*lines, "END"]:
         if line.strip() != "END":
-            cards.append(
-                line.encode("ascii", "replace").decode()
-            )  # replaces Latin-1 characters in comments
+            # replaces Latin-1 characters in comments
+            cards.append(line.encode("ascii", "replace").decode())
         elif any(cards):
             with readable(content.name):
                 out.append(fits.Header.fromstring("\n".join(cards), sep="\n"))

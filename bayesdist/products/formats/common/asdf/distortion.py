@@ -57,11 +57,8 @@ class DistortionFile:
         try:
             columns, rows = self.record["chip"]["size"]
             return float(columns), float(rows)
-        except (
-            KeyError,
-            TypeError,
-            ValueError,
-        ):  # an invalid record is reported when it is read in full
+        # an invalid record is reported when it is read in full
+        except (KeyError, TypeError, ValueError):
             return nominal
 
     @property
