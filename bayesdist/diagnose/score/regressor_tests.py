@@ -182,11 +182,11 @@ def _star_sums(
     if not single:
         size2 = np.add.reduceat(by_star**2, together.starts, axis=1)
     spreads = _spreads(
-        trace, norm, size2, np.array([np.trace(directions) / len(directions) for directions in V])
+        trace, norm, size2, np.array([np.trace(matrix) / len(matrix) for matrix in V])
     )
     leverage /= trace.sum(axis=0)
     return [
-        (directions, a, float(b)) for directions, a, b in zip(V, spreads, leverage, strict=True)
+        (matrix, a, float(b)) for matrix, a, b in zip(V, spreads, leverage, strict=True)
     ]
 
 

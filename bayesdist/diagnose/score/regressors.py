@@ -90,7 +90,10 @@ class Functions:
 
     @cached_property
     def _distinct(self) -> tuple[Int, Int, list[Int]]:
-        """Powers i and j of the distinct terms, those of the model first, and indices per product."""
+        """Powers i and j of the distinct terms, and the indices of these for each product.
+
+        The terms of the model come first.
+        """
         index = {term: k for k, term in enumerate(dict.fromkeys(self.terms))}
         i, j = np.array(list(index), np.int64).T
         return (
