@@ -99,7 +99,7 @@ class SharedErrors:
         return [code[inside], *(self._all[name][inside] for name in names)]
 
     def place_covariance(self, kind: str, n: int) -> tuple[Float, Float]:
-        """Covariances (2 n, 2 n) of position scores in n bins, without and with the errors of cells."""
+        """Covariances (2 n, 2 n) of position scores in n bins, without and with errors of cells."""
         at, star, place = self._inside(kind, "star", "place")
         by_star = products_over(at, star, place, n)
         if self._step is None:

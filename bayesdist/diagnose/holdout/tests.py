@@ -75,7 +75,7 @@ class HeldTest:
 
 @dataclass(frozen=True)
 class AxisCoverage:
-    """Fraction of held-out stars in the central part of their predictive distribution, on one axis."""
+    """Fraction of held-out stars in the central part of their prediction, on one axis."""
 
     axis: str  # 'u' or 'v'
     level: float  # in sigma of a normal distribution

@@ -52,14 +52,9 @@ class HoldoutValidation:
     @property
     def coverage_words(self) -> str:
         """Fractions within one sigma along both axes, as a clause."""
-        one_sigma = [
-            result for result in self.coverage if result.level == 1.0
-        ]
-        return " and ".join(
-            f"{result.value:.3f} along {result.axis}"
-            for result in one_sigma
-        ) + (
-            f" of held-out stars lie within 1 sigma of their prediction, {one_sigma[0].expected:.3f} "
+        inner = [result for result in self.coverage if result.level == 1.0]
+        return " and ".join(f"{result.value:.3f} along {result.axis}" for result in inner) + (
+            f" of held-out stars lie within 1 sigma of their prediction, {inner[0].expected:.3f} "
             "are predicted"
         )
 
