@@ -91,7 +91,7 @@ class Field:
         return SizedField(self, amplitude, variance, np.maximum(values, 0.0), vectors, along)
 
     def draws(self, terms: Float, variance: Float, rng: np.random.Generator) -> Float:
-        """Draw sines (m, n_sines), given terms (m, T) and variances of `SizedField` (m, n_sines)."""
+        """Draw sines (m, n_sines) for given terms (m, T) and variances (m, n_sines)."""
         along = variance * (self.score - terms @ self.tied.T)
         along += np.sqrt(variance) * (rng.standard_normal(variance.shape) @ self.vectors)
         return np.asarray((along @ self.vectors.T) * self.root)
