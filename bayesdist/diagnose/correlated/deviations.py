@@ -307,9 +307,9 @@ def deviation_draws(
     index = np.array([names.index(s) for s in scatter])
     grids = []
     for k, name in enumerate(names):
-        information_ = np.diag(S)[index == k]
-        information_ = information_[information_ > 1e-8 * max(float(information_.max()), 1e-300)]
-        resolved = 1 / np.sqrt(np.median(information_)) if information_.size else medians[name]
+        diagonal = np.diag(S)[index == k]
+        diagonal = diagonal[diagonal > 1e-8 * max(float(diagonal.max()), 1e-300)]
+        resolved = 1 / np.sqrt(np.median(diagonal)) if diagonal.size else medians[name]
         low = LEAST * min(medians[name], resolved)
         high = (MOST_CURVATURE if name == CURVATURE else MOST) * medians[name]
         high = max(high, MOST_RESOLVED * resolved if resolved < 1e-2 else 0.0)

@@ -169,19 +169,26 @@ def neighbour_scores(
     code = np.arange(len(order)) if table.error_codes is None else table.error_codes[order]
     g, h, chip = scores_on_chips(model, stars, likelihood)
     out = {}
-    for c, chip_ in enumerate(model.chips):
+    for c, model_chip in enumerate(model.chips):
         members = np.flatnonzero(chip == c)
-        expected = len(members) ** 2 * np.pi * EDGES[-1] ** 2 / (2 * chip_.size[0] * chip_.size[1])
+        expected = (
+            len(members) ** 2
+            * np.pi
+            * EDGES[-1] ** 2
+            / (2 * model_chip.size[0] * model_chip.size[1])
+        )
         members = members[:: max(1, round(float(np.sqrt(expected / MAX_PAIRS))))]
         at = (
-            np.column_stack([stars.X[members] * chip_.size[0], stars.Y[members] * chip_.size[1]])
+            np.column_stack(
+                [stars.X[members] * model_chip.size[0], stars.Y[members] * model_chip.size[1]]
+            )
             / 2
         )
         pairs = cKDTree(at).query_pairs(EDGES[-1], output_type="ndarray")
         star = np.unique(code[members], return_inverse=True)[1]
         pairs = pairs[star[pairs[:, 0]] != star[pairs[:, 1]]]
         separation = np.linalg.norm(at[pairs[:, 0]] - at[pairs[:, 1]], axis=1)
-        half = max(chip_.size) / 2
+        half = max(model_chip.size) / 2
         X, Y = stars.X[members], stars.Y[members]
         out[c] = NeighbourScores(X, Y, g[members], h[members], star, pairs, separation, half)
     return out

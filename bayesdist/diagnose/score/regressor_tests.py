@@ -185,9 +185,7 @@ def _star_sums(
         trace, norm, size2, np.array([np.trace(matrix) / len(matrix) for matrix in V])
     )
     leverage /= trace.sum(axis=0)
-    return [
-        (matrix, a, float(b)) for matrix, a, b in zip(V, spreads, leverage, strict=True)
-    ]
+    return [(matrix, a, float(b)) for matrix, a, b in zip(V, spreads, leverage, strict=True)]
 
 
 def _spreads(trace: Float, norm: Float, size2: Float, scale: Float) -> Float:

@@ -154,39 +154,39 @@ def corrected(outcomes: Sequence[Outcome]) -> tuple[ScoreTest, ...]:
 
     A finding that another finding may explain mentions it.
     """
-    significant = holm([outcome_.p_value for outcome_ in outcomes]) <= SCORE_TESTS.value
+    significant = holm([result.p_value for result in outcomes]) <= SCORE_TESTS.value
     # the last finding of a group has the remedy for all: a higher order includes the lower ones
     by_name = {
-        name: outcome_.family
-        for outcome_, is_significant in zip(outcomes, significant, strict=True)
+        name: result.family
+        for result, is_significant in zip(outcomes, significant, strict=True)
         if is_significant
-        for name in (outcome_.name, outcome_.family.group)
+        for name in (result.name, result.family.group)
         if name
     }
     causes = _causes(by_name, outcomes)
     out = []
-    for outcome_, is_significant in zip(outcomes, significant, strict=True):
-        family, remedy = outcome_.family, outcome_.family.remedy
+    for result, is_significant in zip(outcomes, significant, strict=True):
+        family, remedy = result.family, result.family.remedy
         # a single effect must pass the first step of Holm's procedure
-        smallest = outcome_.smallest(SCORE_TESTS.value / len(outcomes))
-        finding = f"{family.absent} ({smallest:.2g} {outcome_.unit} rms would have been found)"
+        smallest = result.smallest(SCORE_TESTS.value / len(outcomes))
+        finding = f"{family.absent} ({smallest:.2g} {result.unit} rms would have been found)"
         if is_significant:
             cause = cause_of((family.name, family.group), causes)
-            remedy, explanation = _remedy(family, causes), _explanation(outcome_, outcomes)
+            remedy, explanation = _remedy(family, causes), _explanation(result, outcomes)
             if cause:
                 explanation = f", which may come from {CAUSES[cause].words}"
-            size = f"{outcome_.size:.2g} {outcome_.unit} rms, {p_words(outcome_.p_value)}"
+            size = f"{result.size:.2g} {result.unit} rms, {p_words(result.p_value)}"
             finding = f"{family.present}{explanation} ({size})"
         out.append(
             ScoreTest(
-                outcome_.name,
-                outcome_.statistic,
-                outcome_.dof,
-                outcome_.dof_residual,
-                outcome_.p_value,
-                outcome_.size,
+                result.name,
+                result.statistic,
+                result.dof,
+                result.dof_residual,
+                result.p_value,
+                result.size,
                 smallest,
-                outcome_.unit,
+                result.unit,
                 remedy,
                 finding,
                 bool(is_significant),
@@ -203,17 +203,17 @@ def _causes(significant: Mapping[str, Family], outcomes: Sequence[Outcome]) -> d
 
     `significant` contains all families with significant results.
     """
-    by_name = {outcome_.name: (outcome_.statistic, outcome_.dof) for outcome_ in outcomes}
+    by_name = {result.name: (result.statistic, result.dof) for result in outcomes}
     singles = ("second order of exposures", "exposures")
     single = [by_name[name] for name in singles if name in significant]
-    orders = [by_name[outcome_.name] for outcome_ in outcomes if outcome_.family.group == "orders"]
+    orders = [by_name[result.name] for result in outcomes if result.family.group == "orders"]
     total = sum(statistic for statistic, _ in orders), sum(dof for _, dof in orders)
     rivals = {"pointing": single, "edges": [total] if orders else []}
     weaker = {
         name
         for name, competitors in rivals.items()
         if name in significant
-        and not all(explains_more(by_name[name], outcome_) for outcome_ in competitors)
+        and not all(explains_more(by_name[name], result) for result in competitors)
     }
     return {name: family for name, family in significant.items() if name not in weaker}
 
