@@ -1,11 +1,12 @@
-"""A calibration oriented by another one, with the error of that, or by a position on the sky.
+"""Orientation of a calibration relative to another one or on the sky, with its error.
 
-Shift, turn, scale and parity between two maps are found by least squares over the area of a chip.
-With w = u + i v as Legendre coefficients, mean over the chip,
+Shift, rotation, scale and parity between two maps A and B are determined by least squares over the
+area of a chip.  With the Legendre coefficients of w = u + i v,
 
-    w_A = shift + turn w_B + d        (or the conjugate of w_B, where one of them is mirrored)
+    w_A = shift + turn w_B + d        (or the conjugate of w_B if one of them is mirrored)
 
-Products of two polynomials have their means from the coefficients alone, without any grid.
+Means of products of two polynomials over the chip follow directly from the coefficients, so that no
+grid is needed.
 """
 
 from __future__ import annotations
@@ -35,40 +36,60 @@ def lay_on(
     reference_drift: bool = True,
     scale_arcsec: float | None = None,
 ) -> Orientation:
-    """Similarity from a calibration to an existing one in an aperture [arcsec], with its error.
+    """Similarity from a calibration to a reference in an aperture [arcsec], with its error.
 
-    Shift, rotation and, for u, v in pixels, scale make the mean square distance between the two
-    maps of `chip` at `epoch` smallest over its area; the other chips follow.  A fit over the whole
-    chip is used, not the linear terms at the reference pixel: each pixel then counts alike, and a
-    term that one calibration has and the other has not, or a poorly measured fifth order, cannot
-    tilt the whole.  Where the two maps differ by a similarity only, both ways agree.
+    Shift, rotation and, for u and v in pixels, scale minimise the mean square distance between the
+    two maps of one chip over its area; the same similarity applies to all chips.  The fit uses the
+    whole chip rather than the linear terms at the reference pixel.  All pixels have equal weight,
+    so that a term that only one calibration has, or a poorly measured fifth order, cannot rotate
+    the result.  Both methods agree if the two maps differ only by a similarity.
 
-    `reference_drift` applies the reference's time-dependent terms.  A given `scale_arcsec`
-    (arcseconds in one unit of u, v) is held; without it the scale is fitted for u, v in pixels, and
-    is that of the unit for others.
+    The residuals of the fit have 2 K - 4 free coefficients (K terms per axis).  The four parameters
+    of the similarity are given the mean variance of these coefficients: the reference may be as
+    wrong in roll and scale as it is, on average, in any other term.  If the residuals were treated
+    as white noise on the pixels, the stated errors would be far too small.
 
-    The residuals of the fit are a field of 2 K - 4 free coefficients (K terms of one axis).  The
-    four that it cannot see are given the mean variance of those it can: the reference may be as
-    wrong in its roll and scale as it is, on average, in any other single term.  White noise on
-    these pixels would make them known far too well.
+    Parameters
+    ----------
+    calibration : Calibration
+        Calibration to be oriented.
+    reference : Calibration
+        Existing calibration in the aperture.
+    chip : int
+        Number of the chip over which the maps are compared.
+    epoch : float, optional
+        Decimal years; required if the calibration depends on time.
+    reference_drift : bool
+        True to apply the time-dependent terms of the reference.
+    scale_arcsec : float, optional
+        Fixed scale, in arcsec per unit of u and v.  By default the scale is fitted for u and v in
+        pixels, and is the size of the unit otherwise.
 
-    InputError for a chip that is missing or of another size, a missing epoch, a drift of the
-    reference that cannot be evaluated, a scale that is not positive, or u, v mirrored against x, y;
-    DegenerateError when the calibration maps the chip to one point.
+    Returns
+    -------
+    Orientation
+
+    Raises
+    ------
+    InputError
+        If the chip is missing or differs in size, the epoch is missing, the drift of the reference
+        cannot be evaluated, the scale is not positive, or u and v are mirrored against x and y.
+    DegenerateError
+        If the calibration maps the chip to one point.
     """
     model = calibration.model
     if model.time is not None and epoch is None:
         raise InputError(
-            "the solution depends on time and no epoch is given",
+            "the solution depends on time, but no epoch is given",
             where="epoch",
-            do="give the decimal year at which it is laid on the reference",
+            do="give the decimal year at which it is compared with the reference",
         )
     size = model.chips[model.chip_code(chip)].size
-    other = reference.model.chips[reference.model.chip_code(chip)].size
-    if tuple(size) != tuple(other):
+    reference_size = reference.model.chips[reference.model.chip_code(chip)].size
+    if tuple(size) != tuple(reference_size):
         raise InputError(
-            f"chip {chip} has {other[0]:g} x {other[1]:g} pixels and the solution "
-            f"{size[0]:g} x {size[1]:g}",
+            f"chip {chip} has {reference_size[0]:g} x {reference_size[1]:g} pixels, but in the "
+            f"solution {size[0]:g} x {size[1]:g}",
             where=reference.name,
             do="give a reference of the same detector",
         )
@@ -79,7 +100,7 @@ def lay_on(
     z, slopes = _complex(*calibration.coefficients(chip, epoch), basis.n_terms)
     w, _ = _complex(*reference.coefficients(chip, then), basis.n_terms)
     weight = basis.mean_squares
-    weight[0] = 0.0  # the shift takes the mean
+    weight[0] = 0.0  # the mean is absorbed by the shift
     S, flipped, Q = correlations(w, z, basis)
     if Q == 0 or S == 0:
         raise DegenerateError(
@@ -89,9 +110,9 @@ def lay_on(
         )
     if abs(flipped) > abs(S):
         raise InputError(
-            "u, v are mirrored against the detector's x, y",
+            "u and v are mirrored against the detector's x and y",
             where=reference.name,
-            do="let u run with x and v with y, or change the sign of one of them",
+            do="let u increase with x and v with y, or change the sign of one of them",
         )
     dS = (weight * w) @ slopes.conj()
     held = _held_scale(model.unit, scale_arcsec)
@@ -104,9 +125,9 @@ def lay_on(
     shift = complex(w[0] - b * z[0])
     d_shift = -b * d_log * z[0] - b * slopes[0]
 
-    left = np.asarray(w - b * z, complex)
-    left[0] -= shift
-    agreement = _agreement(left, basis)
+    residual = np.asarray(w - b * z, complex)
+    residual[0] -= shift
+    agreement = _agreement(residual, basis)
     n_free = 2 * basis.n_terms - (4 if held is None else 3)
     variance = (1e-3 * agreement.rms) ** 2 / n_free
     angular = variance / (abs(b) ** 2 * Q)
@@ -126,25 +147,26 @@ def lay_on(
 
 
 def oriented(calibration: Calibration, orientation: Orientation) -> Calibration:
-    """Calibration in the plane of an aperture, in arcseconds, with the error of the orientation.
+    """Apply an orientation: calibration in the plane of an aperture, in arcseconds.
 
-    Every term of both axes is rotated together, those that depend on time as well: where (u, i, j)
-    drifts, (v, i, j) does after the turn, so that the model of the result has both.  The
-    calibration is that of the orientation, or of another filter in the same system, which is taken
-    as independent of it.  InputError for another unit than the orientation's.
+    The errors of the orientation are included.  All terms of both axes are rotated, including those
+    that depend on time: if (u, i, j) drifts, (v, i, j) does after the rotation, so that the model
+    of the result has both.  The calibration is either the one for which the orientation was
+    determined, or that of another filter in the same system, which is assumed to be independent.
+    Raises InputError if its unit differs from that of the orientation.
     """
     solution, base, model = calibration.solution, orientation.base, calibration.model
     if model.unit != base.model.unit:
         raise InputError(
-            f"the solution is in {model.unit} and the orientation is for {base.model.unit}",
+            f"the solution is in {model.unit}, but the orientation is for {base.model.unit}",
             where="model.unit",
-            do="orient solutions of one system only",
+            do="orient only solutions in the same system",
         )
     mean, cov = np.asarray(solution.mean, float), np.asarray(solution.cov, float)
     turn = orientation.scale * np.exp(1j * orientation.angle)
     linear = turned(model, np.eye(model.n_params), turn, 0.0).T
     moved = turned(model, mean, turn, complex(*orientation.shift))
-    # derivatives by shift_x, shift_y, log_scale, angle
+    # derivatives with respect to shift_x, shift_y, log_scale, angle
     by = np.stack(
         [
             turned(model, 0 * mean, turn, 1.0),
@@ -157,14 +179,14 @@ def oriented(calibration: Calibration, orientation: Orientation) -> Calibration:
     if solution is base:
         total = linear + by @ orientation.derivative
         with_plane = total @ cov @ orientation.derivative.T + by @ orientation.reference_cov
-        own = total @ cov @ total.T + by @ orientation.reference_cov @ by.T
+        oriented_cov = total @ cov @ total.T + by @ orientation.reference_cov @ by.T
     else:
         with_plane = by @ orientation.cov
-        own = linear @ cov @ linear.T + with_plane @ by.T
+        oriented_cov = linear @ cov @ linear.T + with_plane @ by.T
     new = replace(turned_model(model), unit="arcsec")
     return replace(
         calibration,
-        solution=_Oriented(new, moved, (own + own.T) / 2, solution, orientation),
+        solution=_Oriented(new, moved, (oriented_cov + oriented_cov.T) / 2, solution, orientation),
         plane=Plane("aperture", v2v3=orientation.v2v3, orientation=orientation),
         with_plane=with_plane,
         scale=None,
@@ -173,7 +195,7 @@ def oriented(calibration: Calibration, orientation: Orientation) -> Calibration:
 
 @dataclass(frozen=True, eq=False)
 class _Oriented(DerivedSolution):
-    """Solution in the plane of an aperture: each draw turned by a draw of the orientation."""
+    """Solution in the plane of an aperture; each draw is rotated by a draw of the orientation."""
 
     model: DistortionModel
     mean: Float
@@ -310,7 +332,7 @@ def correlations(
     `za` and `zb` (K,) are coefficients of u + i v.
     """
     weight = basis.mean_squares
-    weight[0] = 0.0  # the shift takes the mean
+    weight[0] = 0.0  # the mean is absorbed by the shift
     straight = complex(np.sum(weight * za * zb.conj()))
     flipped = complex(np.sum(weight * za * zb))
     return straight, flipped, float(weight @ np.abs(zb) ** 2)
