@@ -139,10 +139,10 @@ def pixel_area_map(chip: ChipMap, scale: float, *, image: Subarray = FULL) -> Pi
         If the scale is not positive, or the size of the subarray is unknown or exceeds the chip.
     """
     number = chip.chip or 1
-    where = f"pixel area map of chip {number}"
+    location = f"pixel area map of chip {number}"
     if not (np.isfinite(scale) and scale > 0):
-        raise InputError(f"the scale is {scale}", where=where, do="give a positive number")
-    x, y = _pixels(chip, image, where)
+        raise InputError(f"the scale is {scale}", where=location, do="give a positive number")
+    x, y = _pixels(chip, image, location)
     area, sigma = pixel_areas(chip, x, y)
     # binning multiplies the areas of image pixels and of corrected pixels by the same factor
     norm = 1.0 / scale**2

@@ -171,14 +171,14 @@ class Calibration:
 
     def __repr__(self) -> str:
         chips = f"chip{'s' if len(self.numbers) > 1 else ''} {', '.join(map(str, self.numbers))}"
-        where = {
+        location = {
             "sky": " on the sky",
             "aperture": " of an aperture",
             "detector": " of the corrected detector",
         }.get(self.plane.kind, "")
         if self.plane.point is not None:
-            where += " at ({:.6g}, {:.6g})".format(*self.plane.point)
-        parts = [chips, f"order {self.model.order}", f"u and v in {self.unit}{where}"]
+            location += " at ({:.6g}, {:.6g})".format(*self.plane.point)
+        parts = [chips, f"order {self.model.order}", f"u and v in {self.unit}{location}"]
         if self.before or self.after:
             parts.append("look-up tables")
         if self.model.time is not None:

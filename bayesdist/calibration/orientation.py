@@ -220,7 +220,7 @@ class _Oriented(DerivedSolution):
 
 
 def _complex(coefficients: Float, jacobian: Float, n_terms: int) -> tuple[Complex, Complex]:
-    """Coefficients (n,) of u + i v and their derivatives (n, D), with zeros for terms not there."""
+    """Coefficients (n,) of u + i v and their derivatives (n, D), zero for missing terms."""
     K = coefficients.shape[1]
     z = np.zeros(n_terms, complex)
     z[:K] = coefficients[0] + 1j * coefficients[1]
@@ -230,7 +230,7 @@ def _complex(coefficients: Float, jacobian: Float, n_terms: int) -> tuple[Comple
 
 
 def _agreement(left: Complex, basis: PolynomialBasis) -> Agreement:
-    """Rms and largest distance over the chip of a difference [arcsec] in Legendre coefficients."""
+    """Rms and largest distance on a chip, from Legendre coefficients of a residual [arcsec]."""
     on_grid = basis.evaluate(*mesh(*grid_pixels(basis.size, DEFAULT_GRID))) @ left
     return Agreement(
         rms=1e3 * float(np.sqrt(basis.mean_squares @ np.abs(left) ** 2)),
@@ -239,7 +239,7 @@ def _agreement(left: Complex, basis: PolynomialBasis) -> Agreement:
 
 
 def _held_scale(unit: str, scale_arcsec: float | None) -> float | None:
-    """Arcseconds in one unit of u, v, or None where it is to be fitted."""
+    """Arcseconds per unit of u and v, or None if the scale is to be fitted."""
     if scale_arcsec is None:
         return None if unit == "pix" else ARCSEC[unit]
     if not (np.isfinite(scale_arcsec) and scale_arcsec > 0):
@@ -250,10 +250,10 @@ def _held_scale(unit: str, scale_arcsec: float | None) -> float | None:
 
 
 def _cov_about(arm: complex, variance: float, log_scale: float, angular: float) -> Float:
-    """Covariance of the four parameters from independent errors at a point.
+    """Covariance (4, 4) of shift_x, shift_y, log_scale and angle.
 
-    The shift holds at (u, v) = (0, 0), which lies at -`arm` from the point where position, scale
-    and angle are independent.
+    The shift refers to (u, v) = (0, 0).  This is offset by -`arm` from the point about which the
+    errors of position, scale and angle are independent.
     """
     to_origin = np.eye(4)
     to_origin[:2, 2] = -arm.real, -arm.imag
@@ -268,30 +268,47 @@ def placed_at(
     *,
     where: str,
 ) -> Calibration:
-    """Calibration with (u, v) = (0, 0) at CRVAL (degrees), u to the east and v to the north.
+    """Place a calibration on the sky, with u increasing to the east and v to the north.
 
-    Pixels become arcseconds by their size.  Without a CRVAL the calibration stays as it is.
-    InputError, that names the configuration `where`, for a plane that lies on the sky already, a
-    CRVAL that is no position, and pixels of unknown size.
+    Parameters
+    ----------
+    calibration : Calibration
+    crval : tuple of float or None
+        Right ascension and declination of (u, v) = (0, 0) in degrees.  If it is None, the
+        calibration is returned unchanged.
+    scale_arcsec : float or None
+        Pixel scale in arcsec per pixel, to convert u and v from pixels.
+    where : str
+        Section of the configuration, for error messages.
+
+    Returns
+    -------
+    Calibration
+
+    Raises
+    ------
+    InputError
+        If the plane has a position on the sky already, CRVAL is invalid, or the pixel scale is
+        unknown.
     """
     if crval is None:
         return calibration
     if calibration.plane.point is not None:
         raise InputError(
-            "a crval is given for a plane that lies on the sky already",
+            "a crval is given for a plane that has a position on the sky already",
             where=f"{where}.crval",
-            do="leave it out",
+            do="omit it",
         )
     if not (np.isfinite(crval).all() and -90 <= crval[1] <= 90):
         raise InputError(
-            f"crval is {crval}, no right ascension and declination in degrees",
+            f"crval is {crval}, which is not a right ascension and declination in degrees",
             where=f"{where}.crval",
-            do="correct it, or leave it out",
+            do="correct it, or omit it",
         )
     if calibration.unit == "pix":
         if scale_arcsec is None:
             raise InputError(
-                "a crval is given, and u and v are in pixels of unknown size",
+                "a crval is given, but u and v are in pixels of unknown size",
                 where="detector.scale_mas",
                 do="give the pixel scale (scale_mas in Python, --scale of convert)",
             )
@@ -301,7 +318,7 @@ def placed_at(
 
 
 def in_arcsec(calibration: Calibration, pixel: float) -> Calibration:
-    """Calibration in arcseconds; `pixel` is the size of one."""
+    """Convert a calibration from pixels to arcseconds; `pixel` is the size of a pixel in arcsec."""
     solution, model = calibration.solution, calibration.model
     return replace(
         calibration,
@@ -327,9 +344,9 @@ def in_arcsec(calibration: Calibration, pixel: float) -> Calibration:
 def correlations(
     za: Complex, zb: Complex, basis: PolynomialBasis
 ) -> tuple[complex, complex, float]:
-    """Mean products, about mean positions, of A with B, of A with B mirrored, and of B with itself.
+    """Covariances over a chip of A with B, of A with the mirror image of B, and of B with itself.
 
-    `za` and `zb` (K,) are coefficients of u + i v.
+    `za` and `zb` (K,) are the Legendre coefficients of u + i v of the maps A and B.
     """
     weight = basis.mean_squares
     weight[0] = 0.0  # the mean is absorbed by the shift
@@ -341,9 +358,9 @@ def correlations(
 def turn_between(
     za: Complex, zb: Complex, basis: PolynomialBasis, name: str
 ) -> tuple[complex, bool]:
-    """Scale and rotation that bring B nearest to A, as one complex number; True if mirrored first.
+    """Scale and rotation from B to A as one complex number, and True if B is mirrored first.
 
-    InputError, with B's `name`, when B maps the chip to one point.
+    Raises InputError, with the `name` of B, if B maps the chip to one point.
     """
     straight, flipped, norm = correlations(za, zb, basis)
     if norm == 0.0:
@@ -353,14 +370,16 @@ def turn_between(
 
 
 def as_real(z: Complex) -> Float:
-    """Coefficients (2 K,), u before v, of u + i v."""
+    """Convert coefficients (K,) of u + i v to real coefficients (2 K,), u before v."""
     return np.concatenate([z.real, z.imag])
 
 
 def similarity_fields(z: Complex) -> Float:
-    """Derivatives (2 K, 4) of positions by shift along u and v, scale and rotation."""
-    one = np.zeros_like(z)
-    one[0] = 1.0
+    """Derivatives (2 K, 4) of coefficients with respect to shift_u, shift_v, scale and rotation."""
+    unit_shift = np.zeros_like(z)
+    unit_shift[0] = 1.0
     offsets = z.copy()
-    offsets[0] = 0.0  # about the mean position, so that a rotation is no shift
-    return np.stack([as_real(f) for f in (one, 1j * one, offsets, 1j * offsets)], axis=1)
+    offsets[0] = 0.0  # about the mean position, so that rotations do not shift
+    return np.stack(
+        [as_real(f) for f in (unit_shift, 1j * unit_shift, offsets, 1j * offsets)], axis=1
+    )

@@ -143,7 +143,7 @@ def test_what_sip_cannot_hold_is_fitted_as_well_as_it_says(wcs):
 
 
 def test_a_plane_without_sky_has_no_sip_header():
-    with pytest.raises(InputError, match="give wcs the point"):
+    with pytest.raises(InputError, match="give the argument point"):
         folded().wcs().to_fits_sip()
 
 
