@@ -171,7 +171,7 @@ def test_a_run_is_shown_with_its_residuals(idctab, tmp_path):
     table = run / "made_idc.fits"
     table.write_bytes(idctab.read_bytes())
     assert (
-        "no residuals, which only runs have"
+        "no residuals, since this is not a run"
         in good("hst", "handbook", table, "-o", tmp_path / "p").out
     )
     table.unlink()
