@@ -229,7 +229,7 @@ def test_solutions_that_say_too_little_or_too_much(tmp_path):
         table.write(tmp_path / "s.ecsv", format="ascii.ecsv", overwrite=True)
         return read_solutions(tmp_path / "s.ecsv", centre=CENTRE)
 
-    with pytest.raises(InputError, match="row 3: frame 'a' stands twice"):
+    with pytest.raises(InputError, match="row 3: frame 'a' occurs twice"):
         read()
     table["frame"] = ["a", "b", "c"]
     assert read()["b"].values.tolist() == [2.0, 0.0, 0.0, 0.0, 0.0, 0.0]
@@ -237,7 +237,7 @@ def test_solutions_that_say_too_little_or_too_much(tmp_path):
     with pytest.raises(InputError, match="no column of parameters"):
         read()
     table["rotation"] = Column([0.0, 0.1, 0.2], unit="m")
-    with pytest.raises(InputError, match="unit m is not one of angles"):
+    with pytest.raises(InputError, match="unit m is not an angle"):
         read()
 
 
@@ -271,7 +271,7 @@ def test_wrong_input_is_refused(rng):
     matches = pairs(rng, exposure_names=("f1",))
     with pytest.raises(InputError, match="frame 'f1' has no solution with fixed scales"):
         rereference(matches, {"f1": RvbTransform()}, {})
-    with pytest.raises(InputError, match="carry no errors"):
+    with pytest.raises(InputError, match="have no errors"):
         linear_moments(Matches(*[np.arange(3.0)] * 4), CENTRE)
     with pytest.raises(InputError, match=r"scale_u .* is -1"):
         RvbTransform(scale_u=-1.0)
