@@ -22,12 +22,13 @@ from bayesdist.app.pipeline import diagnose, sample
 from bayesdist.app.python_terms import in_python_terms
 from bayesdist.app.rehearsal import rehearse
 from bayesdist.app.results import Results
-from bayesdist.app.run import Run, as_requirements
+from bayesdist.app.run import Run
 from bayesdist.app.run_folder import MATCHES_FILE
 from bayesdist.app.screen import progress_bar
 from bayesdist.app.stages import evaluated
 from bayesdist.app.store.rundir import RunDirectory
 from bayesdist.assess import Requirement, UserTerm
+from bayesdist.assess.requirements.requirement import as_requirements
 from bayesdist.assess.terms.given import Catalogue, require_catalogue
 from bayesdist.data import Matches, ReadOptions
 from bayesdist.data.reading.options import check_sigma
@@ -289,6 +290,12 @@ def _stars(matches: Any, sigma: Any, options: Mapping[str, Any]) -> tuple[Matche
         matches = matches.with_star_codes(**options)
     if sigma is None:
         sigma = "by_magnitude" if matches.has_mag and not matches.has_sigma else "columns"
+    elif np.ndim(sigma):
+        raise InputError(
+            f"sigma has {np.size(sigma)} values",
+            where=WHERE,
+            do="give one number, or the errors of each star as columns sigma_u and sigma_v",
+        )
     elif not isinstance(sigma, str):
         sigma = value_in(sigma, matches.unit, "sigma")
     check_sigma(sigma)
@@ -308,6 +315,12 @@ def _in(value: Any, unit: str, what: str) -> float | None:
 
 def _pixels(pair: Any, what: str) -> Any:
     """Pair of numbers without a unit; pixels are the only one."""
+    if pair is not None and (isinstance(pair, str) or np.shape(pair) != (2,)):
+        raise InputError(
+            f"{what} is {pair!r}",
+            where=WHERE,
+            do=f"give two numbers of pixels along x and y, as in {what}=(2048, 1024)",
+        )
     has_unit = hasattr(pair, "unit")
     if isinstance(pair, list | tuple):
         has_unit = any(hasattr(value, "unit") for value in pair)

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self, TypeAlias
 
 import numpy as np
+from astropy.table import Table
 
 from bayesdist.app.products.made_files import with_facts_of_run
 from bayesdist.app.python_terms import in_python_terms, python_terms
@@ -25,10 +26,12 @@ from bayesdist.assess import ErrorBudget, Margin, Requirement, UncertaintyMap
 from bayesdist.assess.budget.budget import budget_of, place_budget
 from bayesdist.assess.drawn import DrawnErrors
 from bayesdist.assess.evaluation import Evaluation, position_map
+from bayesdist.assess.requirements.requirement import as_requirements
 from bayesdist.assess.requirements.verdict import VERDICT_LEVELS
 from bayesdist.calibration.calibration import Calibration, calibration_of_exposure
 from bayesdist.calibration.chip_map import chosen_chip
 from bayesdist.calibration.sky_distribution import sky_distribution
+from bayesdist.calibration.sky_table import pixel_columns, position_column
 from bayesdist.data import Matches
 from bayesdist.diagnose.diagnostics import Diagnostics
 from bayesdist.errors import InputError
@@ -44,7 +47,7 @@ from bayesdist.report.html import (
 )
 from bayesdist.utils.checks import warnings_of
 from bayesdist.utils.numbers import number, with_mas
-from bayesdist.utils.quantities import Random, year_of
+from bayesdist.utils.quantities import Number, Random, value_in, values_in, whole_number, year_of
 
 if TYPE_CHECKING:
     from astropy.coordinates import SkyCoord
@@ -177,7 +180,7 @@ class Run:
         to: Positions | None = None,
         chip: int | None = None,
         epoch: Any = None,
-        magnitude: float | None = None,
+        magnitude: Number | None = None,
     ) -> ErrorBudget:
         """Error budget over the detector, of some positions, or of separations.
 
@@ -192,7 +195,7 @@ class Run:
             Number of the chip, needed with `at` if there are several.
         epoch : float or Time, optional
             Decimal years; that of the evaluation by default.
-        magnitude : float, optional
+        magnitude : float or Quantity, optional
             Magnitude of the star: the error of its centroid is then a term.
 
         Returns
@@ -209,6 +212,8 @@ class Run:
             raise InputError(
                 "a separation is measured from one position", where="budget", do="give at=(x, y)"
             )
+        if magnitude is not None:
+            magnitude = value_in(magnitude, "mag", "magnitude", where="budget")
         date = None if epoch is None else year_of(epoch)
         if at is None:
             if date is None and magnitude is None:
@@ -369,10 +374,11 @@ class Run:
 
     def _date(self, exposure: str | None, epoch: Any) -> float | None:
         """Decimal year of a calibration; None if the model does not depend on time."""
+        date = None if epoch is None else year_of(epoch)
         if self.model.time is None:
             return None
-        if epoch is not None:
-            return year_of(epoch)
+        if date is not None:
+            return date
         stars = self.results.data.sample
         if exposure in stars.exposure_names and stars.epoch is not None:
             rows = stars.exposure == stars.exposure_names.index(exposure)
@@ -434,6 +440,8 @@ class Run:
             ("Converged", state if self.converged else f"NO: {'; '.join(convergence.reasons)}"),
             ("Largest uncertainty per axis", with_mas(largest, fit.unit, scale_mas)),
         ]
+        if self.results.fitted.errors.by_magnitude is not None:
+            facts.insert(1, ("Errors", "estimated from the residuals by magnitude"))
         if self.folder is not None:
             facts.append(("Folder", str(self.folder)))
         not_shown = [
@@ -516,12 +524,17 @@ class Run:
         """
         if self.model.time is not None:
             options = {"epoch": self.results.epoch} | options
+        if draws is not None:
+            draws = whole_number(draws, "draws", least=2, where="to_sky")
         positions = self.calibration.to_sky(table, **options)
         if draws is None:
             return positions
-        names = options.get("columns", ("x", "y"))
-        to_fits = 1.0 - positions.meta["pixel_origin"]
-        x, y = (np.asarray(positions[name], float) + to_fits for name in names)
+        rows = Table(positions)
+        origin = positions.meta["pixel_origin"]
+        x, y, _, _ = pixel_columns(rows, options.get("columns"), origin, "table")
+        centroids = options.get("centroids")
+        if centroids is not None:
+            centroids = tuple(position_column(rows, name, "table") for name in centroids)
         chip = options.get("chip")
         if chip is None and "chip" in positions.colnames:
             chip = np.asarray(positions["chip"])
@@ -534,6 +547,7 @@ class Run:
             chip=chip,
             epoch=options.get("epoch"),
             point=options.get("point"),
+            centroids=centroids,
         )
 
     # -- files ------------------------------------------------------------------------------------
@@ -714,7 +728,20 @@ def run(
 
     Examples
     --------
-    >>> run = bd.run("config.toml", "run")  # doctest: +SKIP
+    >>> from pathlib import Path
+    >>> chip = bd.Chip(1, "camera", (2048, 2048), (1024.5, 1024.5))
+    >>> model = bd.DistortionModel(1, (chip,), "pix")
+    >>> truth, rng = [0, 1000, 0, 0, 0, 1000], np.random.default_rng(1)
+    >>> stars, _ = bd.simulate_matches(model, truth, 500, sigma=0.01, rng=rng)
+    >>> stars.to_table().write("stars.ecsv")
+    >>> config = '''
+    ... data = {matches = "stars.ecsv"}
+    ... detector = {size = [2048, 2048]}
+    ... model = {order = 1}
+    ... '''
+    >>> n = Path("camera.toml").write_text(config)
+    >>> bd.run("camera.toml", "camera-run", report=False).model.order
+    1
     """
     if (Path(folder) / "run.json").exists() and not (resume or overwrite):
         raise InputError(
@@ -729,31 +756,10 @@ def run(
     )
 
 
-def as_requirements(requirements: Requirement | Sequence[Requirement]) -> list[Requirement]:
-    """Requirements as a list; one requirement alone becomes a list of one.
-
-    Raises
-    ------
-    InputError
-        If one of them is something else.
-    """
-    several: list[Any] = [requirements]
-    if isinstance(requirements, list | tuple):
-        several = list(requirements)
-    for requirement in several:
-        if not isinstance(requirement, Requirement):
-            raise InputError(
-                f"{requirement!r} is no requirement",
-                where="requirements",
-                do="give bayesdist.Requirement(name, statistic, limit)",
-            )
-    return several
-
-
 def _pairs(positions: Positions, name: str) -> list[tuple[float, float]]:
     """Positions (x, y) as a list; one position alone becomes a list of one."""
     try:
-        pairs = np.atleast_2d(np.asarray(positions, float))
+        pairs = np.atleast_2d(np.asarray(_without_unit(positions, name), float))
     except (TypeError, ValueError):
         pairs = np.zeros((0, 0))
     if pairs.ndim != 2 or pairs.shape[1] != 2:
@@ -761,3 +767,13 @@ def _pairs(positions: Positions, name: str) -> list[tuple[float, float]]:
             f"{name} is {positions!r}", where="budget", do="give (x, y), or a list of such pairs"
         )
     return [(float(x), float(y)) for x, y in pairs]
+
+
+def _without_unit(positions: Any, name: str) -> Any:
+    """Positions as plain numbers; those with a unit other than the pixel are refused."""
+    several = isinstance(positions, list | tuple)
+    if several and not any(hasattr(value, "to_value") for value in positions):
+        return [_without_unit(value, name) for value in positions]
+    if several or hasattr(positions, "to_value"):
+        return values_in(positions, "pix", name, where="budget")
+    return positions

@@ -22,7 +22,7 @@ from bayesdist.assess.evaluation import (
 )
 from bayesdist.assess.model import ErrorModel, diagnosed_error_model, error_model
 from bayesdist.assess.requirements.margins import Margin, judge
-from bayesdist.assess.requirements.requirement import Requirement
+from bayesdist.assess.requirements.requirement import Requirement, as_requirements
 from bayesdist.assess.solution import place_of
 from bayesdist.assess.terms.forms import ErrorTerm
 from bayesdist.assess.terms.given import (
@@ -40,6 +40,7 @@ from bayesdist.infer import Posterior, Solution
 from bayesdist.infer.equations.scaled import one_thread
 from bayesdist.infer.posterior.checks import convergence_check
 from bayesdist.model.grid import DEFAULT_GRID
+from bayesdist.utils.arguments import takes
 from bayesdist.utils.checks import Check, in_order
 from bayesdist.utils.quantities import Epoch, Number, Random, value_in, year_of
 from bayesdist.utils.streams import assessment_rng
@@ -51,6 +52,7 @@ MISSING_TERMS = (
 )
 
 
+@takes(solution=Solution)
 @one_thread
 def error_budget(
     solution: Solution,
@@ -139,10 +141,11 @@ def error_budget(
     return replace(budget, notes=tuple(notes))
 
 
+@takes(solution=Solution)
 @one_thread
 def check_requirements(
     solution: Solution,
-    requirements: Sequence[Requirement],
+    requirements: Requirement | Sequence[Requirement],
     *,
     diagnostics: Diagnostics | None = None,
     catalogue: Catalogue | None = None,
@@ -182,7 +185,7 @@ def check_requirements(
     ----------
     solution : Posterior or LinearFit
         With `diagnostics` the posterior that they were made of.
-    requirements : sequence of Requirement
+    requirements : Requirement or sequence of Requirement
     diagnostics : Diagnostics, optional
         What the residuals show, as of `diagnose`.
     catalogue : Catalogue, optional
@@ -242,6 +245,7 @@ def check_requirements(
     >>> margin.verdict
     'met'
     """
+    requirements = as_requirements(requirements)
     stated = _stated_terms(catalogue, terms)
     settings = _settings(solution, diagnostics, stated, exposure, grid, epoch, n_draws, pixel_scale)
     scale = pixel_scale_of(solution, chip, settings.scale_mas)

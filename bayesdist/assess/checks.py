@@ -68,9 +68,9 @@ def catalogue_checks(catalogue_stated: bool | None) -> Iterator[Check]:
         yield Check(GROUP, name, "stated", limit, "pass")
         return
     sentence = (
-        "no error of the reference catalogue is stated: give a [[budget]] row that names the "
-        "catalogue ('reference catalogue', 'Gaia DR3'), in Python catalogue=bd.Catalogue(...), of "
-        "size 0 with its source where it has none"
+        "no error of the reference catalogue is stated: give a [[budget]] row that is named after "
+        "the catalogue, such as 'Gaia DR3', or in Python catalogue=bd.Catalogue('Gaia DR3', "
+        "sigma_mas=...); an error of 0 needs a source"
     )
     yield Check(GROUP, name, "not stated", limit, "warn", sentence, LARGER)
 

@@ -166,6 +166,12 @@ class Calibration:
         -------
         Calibration
         """
+        if not isinstance(solution, Solution):
+            raise InputError(
+                f"solution is a {type(solution).__name__}",
+                where="from_solution",
+                do="give a Posterior or LinearFit",
+            )
         plane = None if point is None else Plane("sky", point=direction_in(point, "point"))
         return calibration_of(solution, name, plane=plane, detector=detector, filter=filter)
 
@@ -484,7 +490,7 @@ class Calibration:
         self,
         table: Any,
         *,
-        columns: Sequence[str] = ("x", "y"),
+        columns: Sequence[str] | None = None,
         centroids: Sequence[str] | None = None,
         pixel_origin: float | None = None,
         chip: int | None = None,
@@ -499,8 +505,9 @@ class Calibration:
         table : table
             Pixels of stars, in any type that `Matches.from_table` accepts.  A column chip is needed
             if the detector has several chips.
-        columns : tuple of str
-            Names of the columns with x and y.
+        columns : tuple of str, optional
+            Names of the columns with x and y; by default the names that `Matches.from_table`
+            recognises.
         centroids : tuple of str, optional
             Names of the columns with the standard deviations of x and y, in pixels.
         pixel_origin : float, optional

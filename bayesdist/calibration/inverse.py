@@ -96,9 +96,9 @@ def fitted_inverse(
     basis = chip.basis
     if order is None:
         order = min(basis.order + 1, MAX_ORDER)
-    if not 1 <= order <= MAX_ORDER:
+    if isinstance(order, bool) or order not in range(1, MAX_ORDER + 1):
         raise InputError(
-            f"the order of the inverse is {order}",
+            f"the order of the inverse is {order!r}",
             where="order",
             do=f"choose one from 1 to {MAX_ORDER}",
         )

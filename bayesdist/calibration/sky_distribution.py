@@ -21,7 +21,15 @@ from bayesdist.data.sky.tangent import plane_axes
 from bayesdist.errors import InputError
 from bayesdist.utils.arrays import Float
 from bayesdist.utils.matern import drawn_fields
-from bayesdist.utils.quantities import Direction, Epoch, Random, generator_of, values_in, year_of
+from bayesdist.utils.quantities import (
+    Direction,
+    Epoch,
+    Random,
+    generator_of,
+    values_in,
+    whole_number,
+    year_of,
+)
 
 if TYPE_CHECKING:
     from astropy.coordinates import SkyCoord
@@ -87,8 +95,7 @@ def sky_distribution(
     from astropy.coordinates import SkyCoord
     from astropy.uncertainty import Distribution
 
-    if n_draws < 2:
-        raise InputError(f"n_draws is {n_draws}", do="give at least 2")
+    n_draws = whole_number(n_draws, "n_draws", least=2)
     if calibration.errors == "none" and not calibration.further and centroids is None:
         raise InputError(
             "has no errors that could be drawn",

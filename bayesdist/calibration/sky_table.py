@@ -14,7 +14,8 @@ from bayesdist.calibration.apply import on_chip
 from bayesdist.calibration.calibration import Calibration
 from bayesdist.calibration.sky_positions import sky_positions
 from bayesdist.data.reading.table import as_table
-from bayesdist.data.tables.names import origin_of
+from bayesdist.data.tables.names import ALIASES, find_columns, origin_of
+from bayesdist.data.tables.units import unit_of
 from bayesdist.errors import InputError
 from bayesdist.utils.arrays import Float, Int
 from bayesdist.utils.quantities import Direction, Epoch, direction_in, year_of
@@ -29,7 +30,7 @@ def table_on_sky(
     calibration: Calibration,
     table: Any,
     *,
-    columns: Sequence[str] = ("x", "y"),
+    columns: Sequence[str] | None = None,
     centroids: Sequence[str] | None = None,
     pixel_origin: float | None = None,
     chip: int | None = None,
@@ -128,19 +129,42 @@ def position_column(table: Table, name: str, where: str) -> Float:
 
 
 def pixel_columns(
-    table: Table, names: Sequence[str], pixel_origin: float | None, where: str
+    table: Table, names: Sequence[str] | None, pixel_origin: float | None, where: str
 ) -> tuple[Float, Float, float, str]:
     """FITS 1-based pixels x and y (N,), the pixel origin of the columns, and its reason.
 
-    The origin is `pixel_origin` if it is given.  Otherwise it is that of the program that writes
-    such columns, as for tables of matches, or 1 if the program is unknown.
+    If `names` is None, the columns are found by their usual names, as in tables of matches.  The
+    origin is `pixel_origin` if it is given.  Otherwise it is that of the program that writes such
+    columns, or 1 if the program is unknown.  Raises InputError if a column has a unit other than
+    the pixel.
     """
+    if names is None:
+        names = usual_pixel_names(table.colnames, where)
+    for name in names:
+        unit = (
+            unit_of(table[name], where=f"{where}, column {name!r}")
+            if name in table.colnames
+            else None
+        )
+        if unit is not None and unit != units.pix:
+            raise InputError(
+                f"unit is {unit}, and detector positions are in pix",
+                where=f"{where}, column {name!r}",
+                do="name the columns of raw pixels",
+            )
     x, y = (position_column(table, name, where) for name in names)
     if pixel_origin is not None:
         origin, reason = float(pixel_origin), "as given"
     else:
         origin, reason = origin_of(names[0], table.colnames, table.meta)
     return x + (1.0 - origin), y + (1.0 - origin), origin, reason or "as in FITS"
+
+
+def usual_pixel_names(names: Sequence[str], where: str) -> tuple[str, str]:
+    """Names of the pixel columns among the usual ones; ("x", "y") if there are none."""
+    usual = {key: ALIASES[key] for key in ("x", "y")}
+    column_of = find_columns(names, None, usual, source=where, pairs=(("x", "y"),))
+    return (column_of["x"], column_of["y"]) if len(column_of) == 2 else ("x", "y")
 
 
 def chip_numbers(

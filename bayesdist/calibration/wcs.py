@@ -33,6 +33,7 @@ from bayesdist.utils.quantities import (
     direction_in,
     generator_of,
     value_in,
+    whole_number,
     year_of,
 )
 
@@ -303,8 +304,7 @@ class CalibrationWCS(BaseLowLevelWCS, HighLevelWCSMixin):
         InputError
             If the calibration has no errors of the coefficients, or `n` is negative.
         """
-        if n < 0:
-            raise InputError(f"the number of draws is {n}", where="draw", do="give 0 or more")
+        n = whole_number(n, "the number of draws", least=0, where="draw")
         if self.calibration.errors == "none":
             raise InputError(
                 "has no errors of the coefficients that could be drawn",
@@ -426,12 +426,19 @@ class CalibrationWCS(BaseLowLevelWCS, HighLevelWCSMixin):
                 where=self.calibration.name,
                 do="give the argument point of wcs, the sky position of u, v = 0",
             )
+        allowed = value_in(max_residual, "pix", "max_residual", where="to_fits_sip")
+        if not allowed >= 0:
+            raise InputError(
+                f"max_residual is {max_residual}",
+                where="to_fits_sip",
+                do="give a distance in pixels, 0 or more",
+            )
         chip_map, worst, rms = self.chip_map.polynomial(
             min(self.chip_map.basis.order, SIP_ORDER)
             if not (self.chip_map.before or self.chip_map.after)
             else SIP_ORDER
         )
-        if worst > max_residual:
+        if worst > allowed:
             raise InputError(
                 f"look-up tables or terms above order {SIP_ORDER} cannot be written in SIP: a "
                 f"polynomial of order {chip_map.basis.order} differs by up to {worst:.2g} pixels "
@@ -529,6 +536,12 @@ def wcs_of_chip(
             angle = value_in(position_angle, "deg", "position_angle", where="wcs")
         if pixel_scale is not None:
             scale = value_in(pixel_scale, "arcsec", "pixel_scale", where="wcs")
+            if not (np.isfinite(scale) and scale > 0):
+                raise InputError(
+                    f"pixel_scale is {scale:g}",
+                    where="wcs",
+                    do="give the size of a pixel in arcsec, a positive number",
+                )
         elif calibration.pixel_mas is not None:
             scale = calibration.pixel_mas / 1000
         _check_placement(calibration, angle, scale)

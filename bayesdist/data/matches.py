@@ -18,7 +18,7 @@ from bayesdist.data.columns.joining import joined_arguments, joined_columns
 from bayesdist.data.columns.labels import Labels, merged_counts
 from bayesdist.data.columns.output import arrow_stream, html_of, table_of
 from bayesdist.data.magnitude_errors import AddedErrors, MagnitudeErrors, no_magnitudes
-from bayesdist.data.reading.options import ReadOptions, refuse_missing_errors
+from bayesdist.data.reading.options import ReadOptions, option_names, refuse_missing_errors
 from bayesdist.data.reading.sky_table import sky_table
 from bayesdist.data.reading.table import match_arguments
 from bayesdist.data.repeated_stars import check_same_position, error_codes, star_codes
@@ -206,19 +206,20 @@ class Matches(MatchColumns):
         >>> bd.Matches.from_table(stars, unit="arcsec", sigma=0.01)
         <2 matches in memory: 1 exposure, 1 chip, u and v in arcsec, median error 0.01 arcsec>
         """
-        options = ReadOptions(
-            columns,
-            unit,
-            sigma,
-            pixel_origin,
-            tangent_point,
-            epoch,
-            catalogue_epoch,
-            chips,
-            not_finite,
-            same_position,
-        )
-        return cls(**match_arguments(table, options)).as_read(sigma)
+        with option_names():
+            options = ReadOptions(
+                columns,
+                unit,
+                sigma,
+                pixel_origin,
+                tangent_point,
+                epoch,
+                catalogue_epoch,
+                chips,
+                not_finite,
+                same_position,
+            )
+            return cls(**match_arguments(table, options)).as_read(sigma)
 
     @classmethod
     def from_sky(

@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from math import comb
+from numbers import Integral
 from typing import Any, overload
 
 import numpy as np
@@ -150,9 +151,9 @@ class PolynomialBasis:
     reference_pixel: tuple[float, float]
 
     def __post_init__(self) -> None:
-        if not 1 <= self.order <= MAX_ORDER:
+        if not isinstance(self.order, Integral) or not 1 <= self.order <= MAX_ORDER:
             raise InputError(
-                f"polynomial order is {self.order}",
+                f"polynomial order is {self.order!r}",
                 where="model.order",
                 do=f"choose an order from 1 to {MAX_ORDER}",
             )

@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from itertools import product
+from numbers import Integral
+from typing import Any
 
 import numpy as np
 from numpy.polynomial.legendre import leggauss
@@ -15,7 +18,7 @@ from bayesdist.model.basis import PolynomialBasis
 from bayesdist.model.frames import CHIP_DEVIATIONS, FRAME_KINDS, RIGID, frame_names
 from bayesdist.model.timedep import AXES, TimeDependence
 from bayesdist.utils.arrays import Float, Int
-from bayesdist.utils.quantities import values_in
+from bayesdist.utils.quantities import UNITS, values_in
 
 GAUGES = ("first", "held")
 
@@ -47,11 +50,18 @@ class Chip:
     reference_pixel: tuple[float, float]
 
     def __post_init__(self) -> None:
+        if not isinstance(self.number, Integral):
+            raise InputError(
+                f"number is {self.number!r}", where=f"chip {self.name!r}", do="give a whole number"
+            )
         for name in ("size", "reference_pixel"):
             pair = getattr(self, name)
-            if hasattr(pair, "unit") or any(hasattr(side, "unit") for side in pair):
+            is_pair = isinstance(pair, Sequence) and not isinstance(pair, str)
+            if hasattr(pair, "unit") or (is_pair and any(hasattr(side, "unit") for side in pair)):
                 pixels = values_in(pair, "pix", name, where=f"chip {self.number}")
                 object.__setattr__(self, name, tuple(pixels.tolist()))
+        check_pixels(self.size, "size", self.number, positive=True)
+        check_pixels(self.reference_pixel, "reference_pixel", self.number)
 
     def quadrature(self, nodes: int) -> tuple[Float, Float, Float]:
         """Nodes and weights for Gauss-Legendre quadrature over the area of the chip.
@@ -73,6 +83,20 @@ class Chip:
         nx, ny = self.size
         x, y = np.meshgrid((nx + 1 + nx * node) / 2, (ny + 1 + ny * node) / 2)
         return x.ravel(), y.ravel(), nx * ny / 4 * np.outer(weight, weight).ravel()
+
+
+def check_pixels(pair: Any, name: str, chip: Any, *, positive: bool = False) -> None:
+    """Raise InputError unless `pair` has two finite numbers, and positive ones if required."""
+    try:
+        pixels = np.asarray(pair, float)
+    except (TypeError, ValueError):
+        pixels = np.zeros(0)
+    if pixels.shape != (2,) or not np.isfinite(pixels).all() or (positive and pixels.min() <= 0):
+        raise InputError(
+            f"{name} is {pair!r}",
+            where=f"chip {chip}",
+            do=f"give two {'positive ' if positive else ''}numbers of pixels, along x and y",
+        )
 
 
 @dataclass(frozen=True)
@@ -106,6 +130,12 @@ class ParameterLayout:
     _bases: tuple[PolynomialBasis, ...] = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
+        if self.unit not in UNITS:
+            raise InputError(
+                f"unknown unit {self.unit!r}",
+                where="model",
+                do=f"choose one of {', '.join(UNITS)}",
+            )
         if self.frames not in FRAME_KINDS:
             raise InputError(
                 f"unknown kind of frame {self.frames!r}",
@@ -113,6 +143,12 @@ class ParameterLayout:
                 do=f"choose one of {', '.join(FRAME_KINDS)}",
             )
         self._check_gauge()
+        if not isinstance(self.chips, Sequence) or not all(
+            isinstance(chip, Chip) for chip in self.chips
+        ):
+            raise InputError(
+                f"chips is {self.chips!r}", where="model", do="give a tuple of bayesdist.Chip"
+            )
         if not self.chips:
             raise InputError("no chip is given", where="chip", do="describe at least one chip")
         for label, labels in (

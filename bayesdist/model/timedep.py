@@ -9,6 +9,8 @@ have different reference dates.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from numbers import Integral, Real
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -51,10 +53,10 @@ class TimeDependence:
 
     def __post_init__(self) -> None:
         location = "model.tdd"
-        for axis, i, j in self.terms:
-            if axis not in AXES or i < 0 or j < 0:
+        for term in self.terms:
+            if not _is_term(term):
                 raise InputError(
-                    f"term {(axis, i, j)} is not (axis, power of x, power of y)",
+                    f"term {term!r} is not (axis, power of x, power of y)",
                     where=f"{location}.terms",
                     do="write, for example, ['u', 1, 0]",
                 )
@@ -76,6 +78,14 @@ class TimeDependence:
                 where=f"{location}.epoch0",
                 do="give one date, or one per segment",
             )
+
+        for name in ("epoch0", "breaks"):
+            if not all(isinstance(date, Real) for date in getattr(self, name)):
+                raise InputError(
+                    f"{name} is {getattr(self, name)!r}",
+                    where=location,
+                    do="give dates in decimal years",
+                )
 
     @property
     def n_segments(self) -> int:
@@ -116,3 +126,10 @@ class TimeDependence:
         later = segment > 0
         out[rows[later], 2 * segment[later] - 1] = 1.0
         return out
+
+
+def _is_term(term: Any) -> bool:
+    """True for an axis and two powers."""
+    if not (isinstance(term, tuple | list) and len(term) == 3 and term[0] in AXES):
+        return False
+    return all(isinstance(power, Integral) and int(power) >= 0 for power in term[1:])

@@ -15,7 +15,7 @@ from bayesdist.data.storage.write import write_partitioned
 from bayesdist.errors import InputError
 from bayesdist.model import DistortionModel
 from bayesdist.utils.arrays import Bool, Float, Int
-from bayesdist.utils.quantities import Number, Random, generator_of, value_in
+from bayesdist.utils.quantities import Number, Random, generator_of, value_in, whole_number
 
 _AT_ONCE, _STEP = 65_536, 8192
 CHUNK = 1_000_000  # maximum number of matches in memory
@@ -95,7 +95,8 @@ def simulate_matches(
     Raises
     ------
     InputError
-        If the kind of outliers is unknown, or `sigma` is a function and `mag` is missing.
+        If the kind of outliers is unknown, there are no matches, a fraction is not from 0 to 1, or
+        `sigma` is a function and `mag` is missing.
 
     Examples
     --------
@@ -107,6 +108,9 @@ def simulate_matches(
     """
     if outliers not in ("gaussian", "uniform"):
         raise InputError(f"unknown kind of outliers {outliers!r}", do="choose gaussian or uniform")
+    n = whole_number(n, "the number of matches", least=1)
+    if not 0 <= fraction <= 1:
+        raise InputError(f"the fraction of false matches is {fraction}", do="give 0 to 1")
     rng = generator_of(rng)
     theta = np.asarray(theta, float)
     chip = rng.integers(len(model.chips), size=n)

@@ -9,6 +9,9 @@ from typing import ParamSpec, TypeVar
 
 from bayesdist.errors import InputError
 
+_OF_A_SOLUTION = "Posterior or LinearFit"  # what users have of the abstract class
+_OF_A_TABLE = "; bayesdist.Matches.from_table makes it of a table"
+
 P = ParamSpec("P")
 R = TypeVar("R")
 
@@ -41,10 +44,16 @@ def takes(**kinds: type | tuple[type, ...]) -> Callable[[Callable[P, R]], Callab
                 raise InputError(
                     f"{name} is a {type(value).__name__}",
                     where=function.__name__,
-                    do=f"give a {' or '.join(allowed_type.__name__ for allowed_type in allowed)}",
+                    do=f"give a {' or '.join(map(_name_of, allowed))}"
+                    + (_OF_A_TABLE if allowed[0].__name__ == "Matches" else ""),
                 )
             return function(*args, **kwargs)
 
         return checked
 
     return decorated
+
+
+def _name_of(kind: type) -> str:
+    """Name of a type in messages."""
+    return _OF_A_SOLUTION if kind.__name__ == "Solution" else kind.__name__

@@ -25,6 +25,7 @@ __all__ = [
     "unit_name",
     "value_in",
     "values_in",
+    "whole_number",
     "year_of",
 ]
 
@@ -86,7 +87,7 @@ def values_in(values: Any, unit: str, what: str, *, where: str = "") -> Float:
             raise InputError(
                 f"{what} is given in {given_unit}, which cannot be converted to {unit}",
                 where=where,
-                do=f"give {what} in {unit}",
+                do=scale_advice(given_unit, unit, what) or f"give {what} in {unit}",
             ) from None
     if isinstance(values, tuple | list) and any(hasattr(item, "to_value") for item in values):
         return np.array([value_in(item, unit, what, where=where) for item in values])
@@ -98,6 +99,25 @@ def values_in(values: Any, unit: str, what: str, *, where: str = "") -> Float:
             where=where,
             do=f"give a number in {unit}, or a Quantity",
         ) from None
+
+
+def scale_advice(given: str, unit: str, what: str) -> str:
+    """Advice for a value in pixels if an angle is required, or the reverse; otherwise empty."""
+    angles = ("arcsec", "mas", "deg")
+    if given == "pix" and unit in angles:
+        return f"multiply {what} by the size of a pixel in {unit}"
+    if given in angles and unit == "pix":
+        return f"divide {what} by the size of a pixel"
+    return ""
+
+
+def whole_number(value: Any, what: str, *, least: int, where: str = "") -> int:
+    """Convert to an integer of at least `least`; raises InputError for any other value."""
+    if isinstance(value, int | np.integer) and not isinstance(value, bool) and value >= least:
+        return int(value)
+    raise InputError(
+        f"{what} is {value!r}", where=where, do=f"give a whole number of {least} or more"
+    )
 
 
 def unit_name(value: Any, what: str, *, where: str = "") -> str | None:

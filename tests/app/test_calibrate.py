@@ -11,6 +11,7 @@ from astropy.table import QTable
 from astropy.time import Time
 
 import bayesdist as bd
+from tests.calibration.cameras import PIXEL, camera
 from tests.reduced import only_in_full
 
 from .conftest import BUDGET, REQUIREMENTS
@@ -229,6 +230,30 @@ def test_wrong_settings_are_named(name):
     assert caught.value.do and "\n" not in str(caught.value)
 
 
+def test_pixels_of_a_budget_may_have_their_unit(run):
+    plain = run.budget(at=[(10, 20), (30, 40)], to=None).rows()
+    assert run.budget(at=[(10 * u.pix, 20 * u.pix), (30, 40)]).rows() == plain
+    assert run.budget(at=[(10, 20), (30, 40)] * u.pix).rows() == plain
+    one = run.budget(at=(10, 20)).rows()
+    assert run.budget(at=(10 * u.pix, 20 * u.pix)).rows() == one
+
+
+def test_draws_of_positions_have_the_errors_of_the_centroids(run):
+    """Errors of 20 pixels, far above those of the calibration; the columns are photutils's."""
+    on_sky = bd.Run(run.results)
+    vars(on_sky)["calibration"] = camera()  # a cached property; that of `run` is in pixels
+    stars = {"xcentroid": [100.0, 700.0], "ycentroid": [100.0, 500.0], "sx": [20.0, 20.0]}
+    drawn = on_sky.to_sky(stars, centroids=("sx", "sx"), draws=2000)
+    table = on_sky.to_sky(stars, centroids=("sx", "sx"))
+    expected = np.full(2, 20 * PIXEL * 1000)
+    np.testing.assert_allclose(table["sigma_dec"].to_value("mas"), expected, rtol=0.05)
+    np.testing.assert_allclose(
+        drawn.dec.pdf_std().to_value("mas"), table["sigma_dec"].value, rtol=0.08
+    )
+    wcs = camera().wcs().pixel_to_world(stars["xcentroid"], stars["ycentroid"])
+    np.testing.assert_allclose(table["dec"].value, wcs.dec.deg, rtol=1e-13)
+
+
 def test_wrong_questions_are_named(run):
     with pytest.raises(bd.InputError, match="chip"):
         run.map(chip=7)
@@ -236,8 +261,14 @@ def test_wrong_questions_are_named(run):
         run.budget(to=(1, 2))
     with pytest.raises(bd.InputError, match="give \\(x, y\\)"):
         run.budget(at="corner")
+    with pytest.raises(bd.InputError, match="at is given in deg"):
+        run.budget(at=(1 * u.deg, 2 * u.deg))
     with pytest.raises(bd.InputError, match="not on chip"):
         run.budget(at=(2000, 1))
+    with pytest.raises(bd.InputError, match="draws is 'many'"):
+        run.to_sky({"x": [1.0], "y": [1.0]}, draws="many")
+    with pytest.raises(bd.InputError, match="epoch is 'never'"):  # the model depends on no date
+        run.wcs(point=(1.0, 2.0), pixel_scale=0.05, epoch="never")
     with pytest.raises(bd.InputError, match="epoch"):
         run.map(epoch=16.5)
     with pytest.raises(bd.InputError, match="is no run"):

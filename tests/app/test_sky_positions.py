@@ -197,6 +197,9 @@ def test_tables_of_photutils_count_from_zero_in_every_command(calibration, stars
     sky = calibration.to_sky(from_zero, columns=names)
     assert sky.meta["pixel_origin"] == 0 and expected.meta["pixel_origin"] == 1
     np.testing.assert_allclose(sky["ra"].value, expected["ra"].value, rtol=1e-13)
+    if names[0] in ("xcentroid", "x"):  # names that tables of matches are known by
+        usual = calibration.to_sky(from_zero)
+        np.testing.assert_array_equal(usual["ra"].value, sky["ra"].value)
     given = calibration.to_sky(from_zero, columns=names, pixel_origin=1)
     assert np.abs(given["dec"] - expected["dec"]).max() > 0.1 * units.arcsec
     head = str(tmp_path / "tpv.head")
@@ -282,3 +285,12 @@ def test_a_crval_that_cannot_be_is_refused(calibration, to, plane, unit, crval, 
             replace(calibration, solution=solution, plane=plane),
             product_settings()[to](crval=crval),
         )
+
+
+@pytest.mark.parametrize("unit", [units.arcsec, units.mm, units.deg])
+def test_positions_that_are_no_pixels_are_refused(calibration, unit):
+    rows = QTable({"x": [1.0] * units.pix, "y": [2.0] * unit, "chip": [1]})
+    with pytest.raises(InputError, match=f"column 'y': unit is {unit}, and .* are in pix; name"):
+        calibration.to_sky(rows)
+    rows["y"] = [2.0] * units.pix
+    assert np.isfinite(calibration.to_sky(rows)["ra"][0])

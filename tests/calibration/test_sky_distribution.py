@@ -108,7 +108,7 @@ def test_seeds_and_units(pixels):
 @pytest.mark.parametrize(
     ("change", "says"),
     [
-        ({"n_draws": 1}, "n_draws is 1; give at least 2"),
+        ({"n_draws": 1}, "n_draws is 1; give a whole number of 2 or more"),
         ({"rng": 1.5}, "rng is 1.5, which is neither a seed nor a generator"),
         ({"chip": None}, "camera: has 2 chips, but none is given; give chip, one of 1, 2"),
         ({"x": np.ones(N) * u.deg}, "x is given in deg, which cannot be converted to pix"),

@@ -343,5 +343,17 @@ def test_what_makes_no_sense_is_refused():
             asked()
     with pytest.raises(InputError, match="neither a seed nor a generator"):
         camera().wcs().draw(3, "seed")
+    for scale in (-0.2, 0.0, np.nan):
+        with pytest.raises(InputError, match="pixel_scale is"):
+            camera().wcs(pixel_scale=scale)
+    for distance in (-1, np.nan):
+        with pytest.raises(InputError, match=r"max_residual is .*in pixels, 0 or more"):
+            camera().wcs().to_fits_sip(max_residual=distance)
+    for order in (0, "4", 2.5, True):
+        with pytest.raises(InputError, match="order of the inverse is"):
+            camera().wcs().to_gwcs(inverse_order=order)
+    for n in ("a", 2.5, None):
+        with pytest.raises(InputError, match="number of draws"):
+            camera().wcs().draw(n)
     with pytest.raises(InputError, match="number of draws"):
         camera().wcs().draw(-1, 3)

@@ -13,6 +13,8 @@ from astropy.time import Time
 
 from bayesdist.data import Matches, read_matches
 from bayesdist.data.columns.checked import COLUMNS
+from bayesdist.data.reading.options import ReadOptions
+from bayesdist.data.reading.table import match_arguments
 from bayesdist.errors import InputError
 
 pandas = pytest.importorskip("pandas")
@@ -168,6 +170,27 @@ def test_errors_have_units():
         matches.with_errors(1 * u.pix)
     with pytest.raises(InputError, match="holds no errors of the positions"):
         Matches.from_table(stars, **UNIT)
+
+
+def test_errors_of_centroids_are_named():
+    """They are no errors of matches, and are not passed over in silence."""
+    table = {"x": [1.0, 2.0], "y": [1.0, 2.0], "u": [1.0, 2.0], "v": [1.0, 2.0], "mag": [9.0, 9.0]}
+    errors = {"x_err": [0.1, 0.1], "y_err": [0.1, 0.1]}
+    given = match_arguments(table | errors, ReadOptions(**UNIT))
+    assert [note for note in given["notes"] if note.startswith("x_err and y_err are errors of")]
+    known = {"sigma_u": [0.1, 0.1], "sigma_v": [0.1, 0.1]}
+    for other in (table, table | errors | known):
+        notes = match_arguments(other, ReadOptions(**UNIT)).get("notes", ())
+        assert not [note for note in notes if "centroids" in note]
+
+
+def test_options_are_named_as_arguments():
+    stars = {"x": [1.0, 2.0], "y": [1.0, np.nan], "u": [1.0, 2.0], "v": [1.0, 2.0]}
+    with pytest.raises(InputError, match=r"leave out 1 of 2 with not_finite = \"reject\""):
+        Matches.from_table(stars, **UNIT, sigma=0.1)
+    assert len(Matches.from_table(stars, **UNIT, sigma=0.1, not_finite="reject")) == 1
+    with pytest.raises(InputError, match=r"^epoch: epoch is 'yesterday'"):
+        Matches.from_table(stars, **UNIT, sigma=0.1, epoch="yesterday")
 
 
 # -- sky coordinates ------------------------------------------------------------------------------

@@ -143,7 +143,7 @@ class ErrorBudget:
     def _cells(self) -> list[tuple[str, ...]]:
         """Texts of a table: its head, and one row for each term."""
         units = [f"{name} [{self.unit}]" for name in ("u", "v", "radial")]
-        out = [("term", *units, "relative error", "kind", "source")]
+        out = [("term", *units, "relative uncertainty", "kind", "source")]
         for row in self.rows():
             sizes = [f"{row[name]:.3g}" for name in ("u", "v", "radial")]
             relative = _relative_error(row)

@@ -14,6 +14,7 @@ from bayesdist.assess.solution import place_of
 from bayesdist.calibration.chip_map import position_moments
 from bayesdist.infer.solution.solution import Solution
 from bayesdist.model.grid import DEFAULT_GRID, grid_pixels, mesh, position_of_largest
+from bayesdist.utils.arguments import takes
 from bayesdist.utils.arrays import Float
 from bayesdist.utils.quantities import Epoch, year_of
 
@@ -139,6 +140,7 @@ def with_local(found: UncertaintyMap, sigma: Float | None) -> UncertaintyMap:
     )
 
 
+@takes(solution=Solution)
 def uncertainty_map(
     solution: Solution,
     *,

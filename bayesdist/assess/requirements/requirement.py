@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
+from numbers import Real
+from typing import Any
 
 from bayesdist.assess.domain import (
     WHOLE,
@@ -49,7 +52,7 @@ class Requirement:
         positions, in place of that of one position.
     separation : float or Quantity, optional
         Pairs on one chip that are not farther apart than so many pixels; for relative errors.
-    magnitude : float, optional
+    magnitude : float or Quantity, optional
         Of the star whose error is meant: its centroid's error counts in.
 
     Raises
@@ -87,6 +90,9 @@ class Requirement:
         if self.separation is not None:
             apart = value_in(self.separation, "pix", "separation", where=self.where)
             object.__setattr__(self, "separation", apart)
+        if self.magnitude is not None:
+            magnitude = value_in(self.magnitude, "mag", "magnitude", where=self.where)
+            object.__setattr__(self, "magnitude", magnitude)
         if self.epoch is not None:
             object.__setattr__(self, "epoch", year_of(self.epoch, where=self.where))
         if self.epochs is not None:
@@ -99,8 +105,8 @@ class Requirement:
                 "give a positive number",
             ),
             (
-                not 0 < self.probability < 1,
-                f"the probability is {self.probability}",
+                not (isinstance(self.probability, Real) and 0 < self.probability < 1),
+                f"the probability is {self.probability!r}",
                 "give a number between 0 and 1, without the ends",
             ),
             (
@@ -166,3 +172,24 @@ class Requirement:
         judged = in_region(self.region, chip.size, x, y)
         far = covered.beyond(x, y) > BEYOND_STARS.value * max(chip.size)
         return bool((judged & far).any())
+
+
+def as_requirements(requirements: Requirement | Sequence[Requirement]) -> list[Requirement]:
+    """Requirements as a list; one requirement alone becomes a list of one.
+
+    Raises
+    ------
+    InputError
+        If one of them is something else.
+    """
+    several: list[Any] = [requirements]
+    if isinstance(requirements, list | tuple):
+        several = list(requirements)
+    for requirement in several:
+        if not isinstance(requirement, Requirement):
+            raise InputError(
+                f"{requirement!r} is no requirement",
+                where="requirements",
+                do="give bayesdist.Requirement(name, statistic, limit)",
+            )
+    return several

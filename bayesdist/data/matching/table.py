@@ -25,6 +25,7 @@ from bayesdist.data.matching.similarity import (
     pattern_index,
 )
 from bayesdist.errors import InputError
+from bayesdist.utils.arguments import takes
 from bayesdist.utils.arrays import Int
 from bayesdist.utils.quantities import Number, value_in
 
@@ -160,6 +161,7 @@ def match_to_catalog(
     )
 
 
+@takes(table=Matches, catalog=ReferenceCatalog)
 def match_table(
     table: Matches,
     catalog: ReferenceCatalog,

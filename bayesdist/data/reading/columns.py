@@ -19,6 +19,12 @@ from bayesdist.data.tables.units import check_unit
 from bayesdist.errors import InputError
 from bayesdist.utils.arrays import Float, Int
 
+# errors of x and y in pixels, as photutils and others call them
+CENTROID_ERRORS = (
+    *(("x_err", "y_err"), ("xerr", "yerr"), ("x_error", "y_error"), ("sigma_x", "sigma_y")),
+    *(("e_x", "e_y"), ("xcentroid_err", "ycentroid_err"), ("x_fit_err", "y_fit_err")),
+)
+
 
 def position_unit(pair: tuple[SourceColumn, SourceColumn], unit: str | None) -> str:
     """Unit ('pix', 'arcsec', 'mas', 'deg') of a pair of columns, from the file or else the option.
@@ -121,6 +127,8 @@ def needed_columns(
             f"name {'it' if len(lacking) == 1 else 'them'} in the option 'columns' "
             f"(bayesdist init --columns {','.join(f'{key}=NAME' for key in lacking)})"
         )
+        if {"u", "v"} <= set(lacking):
+            do += ", or positions on the sky as ra and dec"
         if "x" in found and "y" in found:
             do += ", or make the file one of the lists of a [campaign] or [selfcal]"
         raise InputError(
@@ -137,11 +145,26 @@ def columns_read(
     """Column of each quantity, the options with the origin of the pixels, and notes about it."""
     found = needed_columns(names, options.columns, source=source, read_sigma=options.read_sigma)
     _refuse_unused(options, found, source)
+    notes = _unused_centroid_errors(names, found) if options.read_sigma else ()
     if options.pixel_origin is not None:
-        return found, options, ()
+        return found, options, notes
     origin, why = origin_of(found["x"], names, header)
-    notes = (f"the first pixel is taken as {origin}: {why}",) if why else ()
+    if why:
+        notes = (f"the first pixel is taken as {origin}: {why}", *notes)
     return found, replace(options, pixel_origin=origin), notes
+
+
+def _unused_centroid_errors(names: Sequence[str], found: Mapping[str, str]) -> tuple[str, ...]:
+    """Note on columns with errors of x and y, if the table has no errors of the matches."""
+    lower = {name.lower(): name for name in names}
+    pair = next((pair for pair in CENTROID_ERRORS if lower.keys() >= set(pair)), None)
+    if pair is None or "sigma_u" in found:
+        return ()
+    x, y = (lower[name] for name in pair)
+    return (
+        f"{x} and {y} are errors of the centroids in pixels and are not used: write the errors of "
+        "the matches, in the unit of u and v, to columns sigma_u and sigma_v",
+    )
 
 
 def _refuse_unused(options: ReadOptions, found: Mapping[str, str], source: str) -> None:

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+import re
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, fields
 from typing import Any
 
 import numpy as np
@@ -11,7 +13,7 @@ import numpy as np
 from bayesdist.data.magnitude_errors import no_magnitudes
 from bayesdist.data.repeated_stars import check_same_position
 from bayesdist.data.tables.checks import check_not_finite
-from bayesdist.errors import InputError
+from bayesdist.errors import BayesdistError, InputError
 from bayesdist.utils.quantities import Number, direction_in, year_of
 
 
@@ -117,6 +119,20 @@ class ReadOptions:
         """Refuse options that the format `kind` leaves no room for."""
         why = f"the format {kind} fixes it"
         self.refuse(source, why, *names, do="leave {} out or set the format to 'table'")
+
+
+@contextmanager
+def option_names() -> Iterator[None]:
+    """Context in which errors name options without the section [data] of a configuration."""
+    key = re.compile(rf"\bdata\.({'|'.join(field.name for field in fields(ReadOptions))})\b")
+    try:
+        yield
+    except BayesdistError as error:
+        error.where, error.cause, error.do = (
+            key.sub(r"\1", text) for text in (error.where, error.cause, error.do)
+        )
+        error.args = (error.sentence,)
+        raise
 
 
 def check_sigma(sigma: str | Number) -> None:

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from bayesdist.errors import InputError
+from bayesdist.utils.quantities import scale_advice
 
 if TYPE_CHECKING:
     import astropy.units as apu
@@ -76,7 +77,9 @@ def conversion(unit: apu.UnitBase | str, to: str, *, where: str) -> float:
         raise InputError(
             f"unit {unit} cannot be brought to {to}",
             where=where,
-            do=length_advice(str(unit)) or "correct the unit in the file or in the configuration",
+            do=scale_advice(str(unit), to, "the values")
+            or length_advice(str(unit))
+            or "correct the unit",
         ) from None
 
 

@@ -146,7 +146,8 @@ def check_coverage(
     n = survey.n
     if 2 * n + n_priors < model.n_params:
         raise DegenerateError(
-            f"{n} stars give {2 * n} numbers, fewer than the {model.n_params} parameters",
+            f"{n} {'star gives' if n == 1 else 'stars give'} {2 * n} numbers, fewer than the "
+            f"{model.n_params} parameters",
             where=survey.where,
             do="lower model.order or give more stars",
         )

@@ -32,6 +32,7 @@ from bayesdist.infer.stars.shards import Compute, Shards
 from bayesdist.infer.stars.stars import Stars
 from bayesdist.utils.arguments import takes
 from bayesdist.utils.memory import require_memory
+from bayesdist.utils.quantities import whole_number
 
 STEPS_KEPT = 100  # at least, of each walker
 METHODS = ("exact", "certified")
@@ -119,6 +120,10 @@ def sample(
     >>> posterior.convergence.converged
     True
     """
+    seed = whole_number(seed, "seed", least=0, where="sample")
+    steps = {"max_steps": max_steps, "checkpoint_every": checkpoint_every}
+    for name, number in steps.items():
+        whole_number(number, name, least=1, where="sample")
     require_memory(
         8.0 * ensembles * (walkers or 1) * len(fit.model.names) * STEPS_KEPT,
         f"the draws of {ensembles} ensembles",
@@ -132,8 +137,6 @@ def sample(
             where="sampler.method",
             do=f"choose {' or '.join(METHODS)}",
         )
-    if max_steps < 1 or checkpoint_every < 1:
-        raise InputError("steps must be positive", where="sampler")
     started = time.monotonic()
     with opened(fit.model, matches, compute) as shards:
         mixture = outliers or OutlierMixture()

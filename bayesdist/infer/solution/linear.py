@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from numbers import Real
 
 import numpy as np
 
@@ -67,6 +68,12 @@ class Rejection:
         if self.clip_abs is not None:
             limit = value_in(self.clip_abs, "pix", "clip_abs", where="fit.clip_abs")
             object.__setattr__(self, "clip_abs", limit)
+        for name in ("clip_chi2", "clip_abs", "radial_weight"):
+            limit = getattr(self, name)
+            if limit is not None and not (isinstance(limit, Real) and float(limit) > 0):
+                raise InputError(
+                    f"{name} is {limit!r}", where="Rejection", do="give a positive number"
+                )
 
 
 DEFAULT_REJECTION = Rejection()
@@ -393,6 +400,7 @@ def _some_chi2(stars: Stars, theta: Float, every: int) -> tuple[Float, ...]:
     return ((residual**2 / var).sum(axis=1),)
 
 
+@takes(solution=Solution, matches=Matches)
 def residuals(solution: Solution, matches: Matches) -> Float:
     """Data minus the model at a solution's mean.
 

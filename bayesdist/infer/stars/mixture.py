@@ -25,6 +25,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from numbers import Real
 from typing import Any
 
 import numpy as np
@@ -179,7 +180,12 @@ class OutlierMixture:
 
 def _number(length: Any) -> Any:
     """Number of a Quantity, whose unit is compared with that of u and v later."""
-    return getattr(length, "value", length)
+    number = getattr(length, "value", length)
+    if number is not None and not isinstance(number, Real):
+        raise InputError(
+            f"{length!r} is no length", where="outliers", do="give a number or a Quantity"
+        )
+    return number
 
 
 @dataclass(frozen=True)

@@ -30,7 +30,7 @@ def axes_of(ax: Axes | None, *, height: float = 0.0) -> Axes:
         raise InputError(
             f"ax is a {type(ax).__name__}{shape}",
             where="plot",
-            do="give one matplotlib Axes, such as an element of that array",
+            do="give one matplotlib Axes" + (", such as an element of that array" if shape else ""),
         )
     return ax
 

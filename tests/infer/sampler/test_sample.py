@@ -202,8 +202,8 @@ def test_counts_of_passes(campaign, monkeypatch, walkers):
     ("options", "says"),
     [
         ({"ensembles": 1}, "cannot show convergence"),
-        ({"max_steps": 0}, "steps must be positive"),
-        ({"checkpoint_every": 0}, "steps must be positive"),
+        ({"max_steps": 0}, "max_steps is 0; give a whole number of 1 or more"),
+        ({"checkpoint_every": 0}, "checkpoint_every is 0; give a whole number"),
     ],
     ids=str,
 )

@@ -59,9 +59,10 @@ def apply_to_table(
 ) -> str:
     """Take the positions of a table to the output frame, or `inverse` back to pixels, into a file.
 
-    Positions are in `columns`, by default x, y (back: x_out, y_out), and the chip's number in a
-    column chip unless `chip` gives it.  Pixels that are read count from `pixel_origin`, by default
-    from that of the program whose columns they are; those that are written count from 1.
+    Positions are in `columns`, by default those with the usual names of pixels (back: x_out,
+    y_out), and the chip's number in a column chip unless `chip` gives it.  Pixels that
+    are read count from `pixel_origin`, by default from that of the program whose columns they are;
+    those that are written count from 1.
 
     `method` is one of METHODS: Newton's method on the forward
     polynomials, a polynomial fitted here, of an `order`, or the INVERSE rows of an IDCTAB; `epoch`
@@ -78,12 +79,11 @@ def apply_to_table(
     frame = OutputFrame(pixel, (ox, oy), vafactor)
     images = images_of(found, image=image, ltv=ltv, corner=corner)
     a = Application(chips_of, frame, images)
-    names = tuple(columns or (OUT if inverse else ("x", "y")))
     rows = read_positions(Path(table))
     if inverse:
-        x, y = (position_column(rows, name, str(table)) for name in names)
+        x, y = (position_column(rows, name, str(table)) for name in columns or OUT)
     else:
-        x, y, first, reason = pixel_columns(rows, names, pixel_origin, str(table))
+        x, y, first, reason = pixel_columns(rows, columns, pixel_origin, str(table))
     what = found.name, str(table)
     if inverse:
         given = chip is not None or len(chips_of) == 1 or "chip" in rows.colnames

@@ -56,13 +56,12 @@ def sky_to_table(
     found = on_the_sky(Path(path), calibration_at(path, filter=filter, size=size))
     refuse_unused_date(epoch, found)
     positions = read_positions(Path(table))
-    names = columns or ("x", "y")
-    origin, reason = pixel_columns(positions, names, pixel_origin, str(table))[2:]
+    origin, reason = pixel_columns(positions, columns, pixel_origin, str(table))[2:]
     rows = table_on_sky(
         found,
         QTable(positions),
         name=str(table),
-        columns=names,
+        columns=columns,
         centroids=centroids,
         pixel_origin=origin,
         chip=chip,
