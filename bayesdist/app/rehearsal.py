@@ -8,7 +8,7 @@ from bayesdist.app.assessment.error_terms import assessment_rng, errors_of_fit, 
 from bayesdist.app.assessment.periods import check_pairs
 from bayesdist.app.config import Config
 from bayesdist.app.kinds.fit_data import FitData
-from bayesdist.app.products.made_files import made_files, product_input
+from bayesdist.app.products.made_files import product_input, rehearse_files, rehearse_outline
 from bayesdist.app.results import Results
 from bayesdist.assess import Requirement
 from bayesdist.assess.budget.budget import budget_of
@@ -27,7 +27,9 @@ def rehearse(results: Results) -> Results:
     """
     kind, config, base = results.kind, results.config, results.base
     kind.refuse(results.inputs)
-    if kind.begins_with == "match":  # which takes long
+    if kind.outline is not None:  # to match stars takes long
+        outline = kind.outline(results.inputs)
+        rehearse_outline(outline, config, base, str(results.run.path))
         return results
     matched = results.matched
     check_pairs(matched.stars, config)
@@ -42,7 +44,7 @@ def rehearse_solution(results: Results) -> None:
     """Refuse terms, requirements and files that could not be made of a fit; nothing is written."""
     data, config = results.data, results.config
     _rehearse_evaluation(data, config, REHEARSAL_DRAWS)
-    made_files(product_input(data.fit, data, config, str(results.run.path)), config)
+    rehearse_files(product_input(data.fit, data, config, str(results.run.path)), config)
 
 
 def _check_residuals(data: FitData, config: Config) -> None:
@@ -64,7 +66,12 @@ def _rehearse_evaluation(data: FitData, config: Config, n_draws: int) -> None:
     budget_of(drawn, settings.domain(errors))
     # without a posterior centroids have no errors yet
     has_mag = data.placed.has_mag
-    requirements = [_of_any_star(r, has_mag=has_mag) for r in config.requirements()]
+    # one of each form: others differ in what nothing is refused for
+    forms = {
+        replace(r, name="any", limit=1.0, probability=0.5): _of_any_star(r, has_mag=has_mag)
+        for r in reversed(config.requirements())
+    }
+    requirements = list(reversed(forms.values()))
     judge(
         drawn,
         requirements,

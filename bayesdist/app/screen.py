@@ -10,11 +10,14 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from numbers import Integral, Real
 from pathlib import Path
-from typing import Any
+from typing import Any, TextIO
 
 from bayesdist.errors import InputError
+from bayesdist.files.regular import descriptor_for_writing
 
 log = logging.getLogger("bayesdist")
+# they write tracebacks of lost connections above the sentence that says so; Dask sets their levels
+DASK_LOGS = ("distributed.client", "distributed.core", "distributed.comm.tcp", "distributed.utils")
 FORMAT = "%(asctime)s %(levelname)-7s %(message)s"
 
 
@@ -44,6 +47,13 @@ def start_logging(*, quiet: bool) -> None:
     handler.setFormatter(logging.Formatter("%(message)s"))
     handler.setLevel(logging.WARNING if quiet else logging.INFO)
     log.addHandler(handler)
+    for name in DASK_LOGS:
+        logging.getLogger(name).addFilter(_nothing)
+
+
+def _nothing(_: logging.LogRecord) -> bool:
+    """Pass no record; a function of its own, so that it is added to a logger only once."""
+    return False
 
 
 class _QuietHandler(logging.FileHandler):
@@ -51,6 +61,11 @@ class _QuietHandler(logging.FileHandler):
 
     def handleError(self, record: logging.LogRecord) -> None:  # noqa: N802  logging's own name
         """Pass over it."""
+
+    def _open(self) -> TextIO:
+        """File to be appended to; a link that others may have laid there is not followed."""
+        held = descriptor_for_writing(self.baseFilename, os.O_APPEND)
+        return os.fdopen(held, self.mode, encoding=self.encoding)
 
 
 @contextmanager
@@ -60,7 +75,9 @@ def log_file(path: Path) -> Iterator[None]:
         handler = _QuietHandler(path, encoding="utf-8")
     except OSError as error:
         raise InputError(
-            f"cannot be written ({error.strerror})", where=str(path), do="check its permissions"
+            f"cannot be written ({error.strerror})",
+            where=str(path),
+            do="check its permissions",
         ) from error
     handler.setFormatter(logging.Formatter(FORMAT))
     log.addHandler(handler)

@@ -195,8 +195,12 @@ class DrawnErrors:
                 )
             return out
 
-        with ThreadPoolExecutor(os.cpu_count()) as pool:
-            blocks = list(pool.map(found, range(0, n, step)))
+        starts = range(0, n, step)
+        if len(starts) == 1:  # sooner than a thread starts
+            blocks = [found(0)]
+        else:
+            with ThreadPoolExecutor(os.cpu_count()) as pool:
+                blocks = list(pool.map(found, starts))
         return tuple(
             {name: np.concatenate([b[e][k] for b in blocks]) for k, name in enumerate(names)}
             for e in range(len(errors))

@@ -19,10 +19,18 @@ from bayesdist.errors import InputError
 from bayesdist.files.atomic import atomic_path
 from bayesdist.files.tables import read_table
 from bayesdist.utils.arrays import Float
+from bayesdist.utils.text import ascii_of, refuse_control_characters
 
 _NUMBERS = ("exptime", "vafactor", "pa_v3", "ra", "dec")
 _SLOWEST = 2e-4  # |VAFACTOR - 1| of anything in orbit about the Earth stays below 1.4e-4
 _UNITS = {"epoch": "yr", "exptime": "s", "pa_v3": "deg", "ra": "deg", "dec": "deg"}
+# plausible values: angles in other units and numbers of another meaning are beyond
+_RANGES = {
+    "exptime": (0.0, 1e7),
+    "pa_v3": (-360.0, 720.0),
+    "ra": (-180.0, 360.0),
+    "dec": (-90.0, 90.0),
+}
 _FORMATS = {".ecsv": "ascii.ecsv", ".csv": "ascii.csv", ".fits": "fits"}
 _ALIASES: dict[str, tuple[str, ...]] = {
     "exposure": ("exposure", "name", "rootname"),
@@ -59,7 +67,8 @@ class Exposure:
     Raises
     ------
     InputError
-        For an empty name, numbers that are not finite, or a factor that no orbit brings about.
+        For an empty name, numbers that are not finite or beyond all that exposures have, or a
+        factor that no orbit brings about.
     """
 
     name: str
@@ -74,6 +83,7 @@ class Exposure:
     def __post_init__(self) -> None:
         if not self.name:
             raise InputError("an exposure has no name", do="name it")
+        refuse_control_characters((self.name, self.filter), f"exposure {self.name!r:.60}")
         for key in ("epoch", *_NUMBERS):
             value = getattr(self, key)
             if value is not None and not np.isfinite(value):
@@ -81,6 +91,17 @@ class Exposure:
                     f"{key} is {value}, and must be finite",
                     where=f"exposure {self.name}",
                     do="correct it or leave it out",
+                )
+            if (
+                value is not None
+                and key in _RANGES
+                and not _RANGES[key][0] <= value <= _RANGES[key][1]
+            ):
+                low, high = _RANGES[key]
+                raise InputError(
+                    f"{key} is {value:g}, and must be between {low:g} and {high:g}",
+                    where=f"exposure {self.name}",
+                    do=f"give it in {_UNITS[key]}, or leave it out",
                 )
         if self.vafactor is not None and abs(self.vafactor - 1.0) > _SLOWEST:
             raise InputError(
@@ -336,7 +357,8 @@ def write_exposures(log: ExposureLog, path: str | os.PathLike[str]) -> None:
     Raises
     ------
     InputError
-        For another extension, or when the file cannot be written.
+        For another extension, names that are not ASCII in a FITS table, or when the file cannot be
+        written.
     """
     path = Path(path)
     if path.suffix.lower() not in _FORMATS:
@@ -344,6 +366,14 @@ def write_exposures(log: ExposureLog, path: str | os.PathLike[str]) -> None:
             f"extension {path.suffix!r} is not one of a log",
             where=str(path),
             do=f"choose one of {', '.join(_FORMATS)}",
+        )
+    texts = (text for one in log for text in (one.name, one.filter))
+    other = next((text for text in texts if ascii_of(text) != text), None)
+    if path.suffix.lower() == ".fits" and other is not None:  # lists are found by these names
+        raise InputError(
+            f"the name {other!r} is not ASCII, which FITS tables hold alone",
+            where=str(path),
+            do="write .ecsv or .csv",
         )
     table = Table()
     for one in fields(Exposure):

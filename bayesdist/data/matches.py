@@ -746,6 +746,25 @@ class Matches(MatchColumns):
         labels = replace(self.labels, n_rows=n_rows, rejected=dict(rejected))
         return Matches.from_readers(self._readers, labels, self._stored)
 
+    def named_below(self, folder: str) -> Matches:
+        """These stars with names of their files that are relative to a folder.
+
+        Parameters
+        ----------
+        folder : str
+            Names that do not begin with it are kept.
+
+        Returns
+        -------
+        Matches
+        """
+        names = tuple(one.removeprefix(f"{folder}/") for one in self.sources)
+        if self._readers is None:
+            return self.with_columns(sources=names)
+        step = partial(Matches.named_below, folder=folder)
+        readers = [_Deferred(one, step, len(one)) for one in self._readers]
+        return Matches.from_readers(readers, replace(self.labels, sources=names), self._stored)
+
     def with_exposure_names(self, names: tuple[str, ...]) -> Matches:
         """These stars with other exposures, which include all of their own.
 

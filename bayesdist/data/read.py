@@ -37,8 +37,8 @@ from bayesdist.data.tables.checks import absent
 from bayesdist.data.tables.column import SourceColumn
 from bayesdist.data.tables.names import ALIASES, find_columns
 from bayesdist.errors import InputError
-from bayesdist.files.regular import read_lines
 from bayesdist.files.tables import read_table
+from bayesdist.files.unpacked import read_lines
 from bayesdist.utils.quantities import Direction, Epoch, Number
 
 PathLike = str | os.PathLike[str]

@@ -13,11 +13,13 @@ from astropy.table import Table
 from bayesdist.data.detections import Detections
 from bayesdist.data.formats.files import exposure_names, input_files, kind_of
 from bayesdist.data.formats.hst1pass import read_hst1pass
-from bayesdist.data.tables.checks import COMPLETED, counted
+from bayesdist.data.tables.checks import COMPLETED, counted, row_number
 from bayesdist.data.tables.column import SourceColumn
 from bayesdist.data.tables.names import ALIASES, BASIC, find_columns, origin_of
+from bayesdist.data.tables.repeated import first_duplicate
 from bayesdist.errors import FormatError, InputError
 from bayesdist.files.tables import TABLE_SUFFIXES, read_table
+from bayesdist.files.unpacked import without_codec
 from bayesdist.utils.arrays import Bool, Float
 
 log = logging.getLogger("bayesdist")
@@ -130,13 +132,13 @@ def read_star_lists(
     Raises
     ------
     InputError
-        For files that cannot be read, missing columns, wrong values, or an exposure that stands in
-        two files.
+        For files that cannot be read, missing columns, wrong values, a detection that stands twice,
+        or an exposure that stands in two files.
     """
     files = input_files(path)
     out: list[Detections] = []
     for file, name in zip(files, exposure_names(files), strict=True):
-        named = file.name.lower().removesuffix(".gz").endswith(tuple(TABLE_SUFFIXES))
+        named = without_codec(file.name).endswith(tuple(TABLE_SUFFIXES))
         kind = "table" if named else kind_of(file, columns)
         if kind == "hst1pass" and not errors:
             out.append(read_hst1pass(file).detections(name=name))
@@ -156,6 +158,7 @@ def read_star_lists(
             )
     names = [one.name for one in out]
     for k, one in enumerate(out):
+        _refuse_repeated(one)
         if one.name in names[:k]:
             raise InputError(
                 f"exposure {one.name} stands in {out[names.index(one.name)].source}, too",
@@ -163,6 +166,19 @@ def read_star_lists(
                 do="give each exposure in one file",
             )
     return tuple(out)
+
+
+def _refuse_repeated(one: Detections) -> None:
+    """Refuse a list that has a detection twice, as where a table was appended to itself."""
+    keys = [one.x, one.y, one.chip] + ([] if one.mag is None else [one.mag])
+    pair = first_duplicate(keys)
+    if pair is not None:
+        first, second = (row_number(k) for k in pair)
+        raise InputError(
+            f"{second} of exposure {one.name} repeats {first}: the same x, y and magnitude",
+            where=one.source,
+            do="keep each detection once",
+        )
 
 
 def _of_table(

@@ -2,32 +2,50 @@
 
 from __future__ import annotations
 
+import bz2
 import io
+import math
+import re
+import struct
 import warnings
-from collections.abc import Mapping
+import zlib
+from collections.abc import Iterator, Mapping
 from types import ModuleType
 from typing import Any
 
 from bayesdist.errors import FormatError, InputError
+from bayesdist.files.budget import DAMAGED, Budget
+from bayesdist.files.documents import refuse_multiplied_yaml
 from bayesdist.files.faults import reason_of
 
+_TREE_END = re.compile(rb"\r?\n\.\.\.(\r?\n|$)")  # as asdf finds it
+_MAGIC = b"\xd3BLK"
+_HEADER = struct.Struct(">I4sQQQ16s")  # flags, compression, bytes: allocated, used, of data; MD5
+_STREAMED = 1
 
-def asdf_tree(raw: bytes, where: str) -> Mapping[str, Any]:
-    """Tree of an ASDF file, its arrays in memory.
 
-    FormatError for a file that is truncated or damaged, InputError where asdf is not installed.
+def asdf_tree(raw: bytes, budget: Budget, *, max_order: int) -> Mapping[str, Any]:
+    """Tree of an ASDF file, its arrays in memory, and its polynomials of at most this order.
+
+    FormatError for a file that is truncated or damaged, that refers to other files, or that holds
+    more than its budget; InputError where asdf is not installed.
     """
-    asdf = asdf_with_transforms(where)
+    asdf = asdf_with_transforms(budget.where)
+    plain = _uncompressed(raw, budget)
     with warnings.catch_warnings():
         # tags of Roman's data models, where these are not installed
         warnings.simplefilter("ignore")
         try:
-            with asdf.open(io.BytesIO(raw), lazy_load=False, memmap=False) as file:
+            tagged = asdf.util.load_yaml(io.BytesIO(plain), tagged=True)
+            _refuse_larger(tagged, budget, max_order)
+            with asdf.open(io.BytesIO(plain), lazy_load=False, memmap=False) as file:
                 return dict(file.tree)
+        except FormatError:
+            raise
         except Exception as error:  # asdf, yaml and converters raise errors of all kinds
             raise FormatError(
                 f"is an ASDF file that cannot be read: {reason_of(error)}",
-                where=where,
+                where=budget.where,
                 do="fetch the file again",
             ) from error
 
@@ -44,3 +62,154 @@ def asdf_with_transforms(where: str) -> ModuleType:
             do="pip install 'bayesdist[asdf]'",
         ) from error
     return asdf
+
+
+# -- what asdf is given to read --------------------------------------------------------------------
+
+
+def _uncompressed(raw: bytes, budget: Budget) -> bytes:
+    """The same file with blocks that are not compressed, and without an index of blocks.
+
+    asdf decompresses whatever a block holds, whatever its header announces.
+    """
+    found = _TREE_END.search(raw)
+    if found is None:
+        raise _damaged("its tree has no end", budget)
+    refuse_multiplied_yaml(raw[: found.end()].decode("utf-8", "replace"), budget)
+    parts, total = [raw[: found.end()]], 0
+    for flags, data in _blocks(raw, raw.find(_MAGIC, found.end()), budget):
+        total += len(data)
+        budget.refuse_content(total)
+        sizes = (0,) * 3 if flags & _STREAMED else (len(data),) * 3
+        header = _HEADER.pack(flags, bytes(4), *sizes, bytes(16))
+        parts += [_MAGIC, struct.pack(">H", len(header)), header, data]
+    return b"".join(parts)
+
+
+def _blocks(raw: bytes, at: int, budget: Budget) -> Iterator[tuple[int, bytes]]:
+    """Flags and data of the blocks from the byte `at` on, none where it is negative."""
+    number, clock = 0, budget.clock()
+    while at >= 0 and raw[at : at + 4] == _MAGIC:
+        number += 1
+        budget.refuse_parts(number, "blocks")
+        begin = at + 6 + int.from_bytes(raw[at + 4 : at + 6])
+        if begin - at - 6 < _HEADER.size or begin > len(raw):
+            raise _damaged("the header of a block is not whole", budget)
+        flags, kind, room, used, size, _ = _HEADER.unpack_from(raw, at + 6)
+        if flags & _STREAMED:
+            yield flags, raw[begin:]
+            return
+        if begin + used > len(raw):
+            raise _damaged("a block ends before its data", budget)
+        budget.refuse_content(size)
+        data = _decompressed(raw[begin : begin + used], kind.strip(b"\0").decode("latin-1"), budget)
+        if len(data) != size:
+            raise _damaged(f"a block announces {size} bytes and holds others", budget)
+        yield flags, data
+        clock()
+        at = begin + room
+
+
+def _decompressed(raw: bytes, kind: str, budget: Budget) -> bytes:
+    """Data of a block, at most one byte beyond the budget."""
+    most = budget.content + 1
+    try:
+        if kind == "zlib":
+            return zlib.decompressobj().decompress(raw, most)
+        if kind == "bzp2":
+            return bz2.BZ2Decompressor().decompress(raw, most)
+        if kind == "lz4":
+            return b"".join(_lz4_pieces(raw, budget))
+    except (OSError, ValueError, zlib.error, struct.error, RuntimeError) as error:
+        raise _damaged(f"a block cannot be decompressed ({reason_of(error)})", budget) from error
+    if kind:
+        raise FormatError(
+            f"has blocks that are compressed by {kind[:8]!r}",
+            where=budget.where,
+            do="write it with zlib, bzp2, lz4 or none",
+        )
+    return raw
+
+
+def _lz4_pieces(raw: bytes, budget: Budget) -> Iterator[bytes]:
+    """Pieces of a block of lz4, each after its length, and after the size that it has then."""
+    try:
+        import lz4.block
+    except ImportError:
+        raise FormatError(
+            "has blocks that are compressed by lz4, which is not installed",
+            where=budget.where,
+            do="install the package lz4, or write the file with zlib or without compression",
+        ) from None
+    at = total = 0
+    while at < len(raw):
+        (n,) = struct.unpack_from(">I", raw, at)
+        (size,) = struct.unpack_from("<I", raw, at + 4)
+        total += size
+        budget.refuse_content(total)
+        yield lz4.block.decompress(raw[at + 4 : at + 4 + n])
+        at += 4 + n
+
+
+def _refuse_larger(tree: Any, budget: Budget, max_order: int) -> None:
+    """Refuse arrays that are larger than their blocks, or elsewhere, and polynomials of high order.
+
+    The steps of an array may be 0, so that its shape is no measure of its block.
+    """
+    nodes, clock, cells = [tree], budget.clock(), 0.0
+    while nodes:
+        node = nodes.pop()
+        clock()
+        if isinstance(node, Mapping):
+            tag = str(getattr(node, "_tag", ""))
+            if "/core/ndarray" in tag or {"source", "shape", "datatype"} <= set(node):
+                cells += _cells(node, budget)
+            if isinstance(node.get("$ref"), str) and not node["$ref"].startswith("#"):
+                raise FormatError(
+                    "refers to another file", where=budget.where, do="write it with its arrays"
+                )
+            if "polynomial" in tag:
+                _refuse_order(node.get("coefficients"), budget, max_order)
+            nodes += node.values()
+        elif isinstance(node, list | tuple):
+            nodes += node
+    budget.refuse_cells(cells)
+
+
+def _cells(node: Mapping[str, Any], budget: Budget) -> float:
+    """Numbers of an array, as its shape states them."""
+    if isinstance(node.get("source"), str):
+        raise FormatError(
+            "an array lies in another file", where=budget.where, do="write it with its arrays"
+        )
+    return math.prod(float(n) for n in _shape(node))
+
+
+def _shape(node: Any) -> list[float]:
+    """Shape of an array in a block, or of one that stands in the tree; empty where it has none."""
+    if isinstance(node, Mapping):
+        shape = node.get("shape")
+        if shape is None:
+            return _shape(node.get("data"))
+        return [n for n in shape if isinstance(n, int)]
+    shape = []
+    while isinstance(node, list | tuple):
+        shape.append(len(node))
+        node = node[0] if node else None
+    return shape
+
+
+def _refuse_order(coefficients: Any, budget: Budget, max_order: int) -> None:
+    order = max(_shape(coefficients), default=1) - 1
+    if order > max_order:
+        raise FormatError(
+            f"has a polynomial of order {order}",
+            where=budget.where,
+            do=f"give one of order {max_order} at most",
+        )
+
+
+def _damaged(cause: str, budget: Budget) -> FormatError:
+    return FormatError(
+        f"is an ASDF file that cannot be read: {cause}", where=budget.where, do=DAMAGED
+    )

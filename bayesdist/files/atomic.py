@@ -13,6 +13,7 @@ from bayesdist.errors import InputError
 from bayesdist.files.regular import opened
 
 _MARK = ".bayesdist-"
+LONGEST_NAME = 200  # bytes, of 255 that file systems have room for, beside the mark
 _watchers: list[Callable[[Sequence[Path]], None]] = []
 
 
@@ -119,6 +120,20 @@ def path_within(
             do="restore it, or choose another folder",
         )
     return path
+
+
+def refuse_unsafe_name(name: str, *, where: str) -> None:
+    """Refuse (InputError) a file name that leads into another folder or that no system takes.
+
+    `where`: the setting that the name is made from.
+    """
+    if not name.isprintable() or {*name} & {*"/\\"} or not 0 < len(name.encode()) <= LONGEST_NAME:
+        start = name if len(name) <= 60 else f"{name[:60]}..."
+        raise InputError(
+            f"{start!r} cannot be the name of a file",
+            where=where,
+            do=f"choose shorter names without slashes, of {LONGEST_NAME} bytes at most",
+        )
 
 
 def is_leftover(name: str) -> bool:

@@ -3,32 +3,39 @@
 from __future__ import annotations
 
 import io
+import re
 import warnings
 
+import numpy as np
 from astropy.io import fits
 
 from bayesdist.errors import FormatError
+from bayesdist.files.budget import Budget
 
 FITS_START = b"SIMPLE  ="
 HDU_STARTS = (FITS_START, b"XTENSION=")
 RECORD = 2880  # bytes
 
 
-def open_fits(raw: bytes, where: str) -> fits.HDUList:
+def open_fits(raw: bytes, budget: Budget) -> fits.HDUList:
     """HDUs by astropy, with their data in memory.
 
-    FormatError for a file that is truncated, or whose headers cannot be followed.
+    FormatError for a file that is truncated, whose headers cannot be followed, or that announces
+    more than its budget.
     """
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of other programs' cards
-        _refuse_unfounded(raw, where)
-    # from memory: after a failure astropy leaves a file of its own open
-    return fits.open(io.BytesIO(raw), memmap=False, lazy_load_hdus=False)
+        _refuse_unfounded(raw, budget)
+    # from memory: after a failure astropy leaves a file of its own open; compressed images stay
+    # the tables that they are, whose tiles are not decompressed
+    return fits.open(
+        io.BytesIO(raw), memmap=False, lazy_load_hdus=False, disable_image_compression=True
+    )
 
 
-def _refuse_unfounded(raw: bytes, where: str) -> None:
+def _refuse_unfounded(raw: bytes, budget: Budget) -> None:
     """Refuse a file that ends before the data that its headers announce."""
-    at, number = 0, 0
+    at, number, where, clock = 0, 0, budget.where, budget.clock()
     while raw[at : at + 9] in HDU_STARTS:
         end = raw.find(b"END" + 77 * b" ", at)
         while end >= 0 and (end - at) % 80:
@@ -40,7 +47,9 @@ def _refuse_unfounded(raw: bytes, where: str) -> None:
                 do="it is truncated: fetch or write it again",
             )
         begin = at + padded(end + 80 - at)
-        size = data_size(fits.Header.fromstring(raw[at:end].decode("latin-1")))
+        budget.refuse_nodes((end - at) // 80, "header cards")
+        header = fits.Header.fromstring(raw[at:end].decode("latin-1"))
+        size = data_size(header)
         if size is None or begin + size > len(raw):
             announced = "a size that is none" if size is None else f"{size} bytes"
             raise FormatError(
@@ -49,7 +58,34 @@ def _refuse_unfounded(raw: bytes, where: str) -> None:
                 where=where,
                 do="it is truncated or damaged: fetch or write it again",
             )
+        refuse_many_rows(header, budget)
         at, number = begin + padded(size), number + 1
+        budget.refuse_parts(number, "HDUs")
+        clock()
+
+
+def refuse_many_rows(header: fits.Header, budget: Budget) -> None:
+    """Refuse a table of too many rows, which may have no bytes."""
+    rows = header.get("NAXIS2", 0)
+    if header.get("XTENSION", "") in ("TABLE", "BINTABLE") and isinstance(rows, int):
+        budget.refuse_rows(rows)
+
+
+def refuse_long_arrays(hdu: fits.BinTableHDU, budget: Budget) -> None:
+    """Refuse columns of arrays of any length which together exceed the budget.
+
+    Each row states where in the heap its array lies, and all may state the same place.
+    """
+    total = 0.0
+    for name, form in zip(hdu.columns.names, hdu.columns.formats, strict=True):
+        kind = re.match(r"\d*[PQ]([A-Z])", str(form))
+        if kind is not None and hdu.data is not None:
+            lengths = np.asarray(hdu.data.view(np.ndarray)[name]).reshape(-1, 2)[:, 0]
+            total += float(lengths.astype(float).sum()) * _ARRAY_BYTES.get(kind[1], 8)
+    budget.refuse_content(total)
+
+
+_ARRAY_BYTES = {"L": 1, "X": 1, "B": 1, "A": 1, "I": 2, "J": 4, "E": 4, "M": 16}
 
 
 MOST = 999  # axes, and columns of a table (FITS 4.0, sections 4.4.1 and 7.3.1)

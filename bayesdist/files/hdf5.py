@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import io
+import math
 import os
+import zlib
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -15,16 +17,17 @@ from numpy.typing import NDArray
 
 from bayesdist.errors import FormatError, InputError
 from bayesdist.files.atomic import atomic_path
+from bayesdist.files.budget import DAMAGED, LIMITS, Budget, Limits
 from bayesdist.files.faults import restoring
 from bayesdist.files.regular import opened
-from bayesdist.files.unpacked import refuse_inflated
+from bayesdist.utils.memory import size_text
 
 if TYPE_CHECKING:
     import h5py
 
 
 def hdf5_arrays(
-    path: Path, names: Sequence[str] | None = None
+    path: Path, names: Sequence[str] | None = None, limits: Limits = LIMITS
 ) -> tuple[dict[str, NDArray[Any]], dict[str, Any]]:
     """Arrays by name, and attributes, of an HDF5 file.
 
@@ -32,7 +35,7 @@ def hdf5_arrays(
     that is no regular file. FormatError for arrays that the file cannot hold. OSError, KeyError as
     h5py raises them for a damaged file.
     """
-    with _checked(path) as file:
+    with _checked(path, limits) as file:
         arrays = {name: file[name][...] for name in names or file}
         return arrays, dict(file.attrs)
 
@@ -45,14 +48,14 @@ class NetcdfGroup:
     attrs: dict[str, Any]
 
 
-def netcdf_groups(path: Path) -> dict[str, NetcdfGroup]:
+def netcdf_groups(path: Path, limits: Limits = LIMITS) -> dict[str, NetcdfGroup]:
     """Groups of a netCDF file by their names, '' at its top; errors as of `hdf5_arrays`.
 
     A tree of xarray takes five times as long, and half a second to import.
     """
     import h5py
 
-    with _checked(path) as file:
+    with _checked(path, limits) as file:
         groups = {name: one for name, one in file.items() if isinstance(one, h5py.Group)}
         return {name: _group(group) for name, group in {"": file, **groups}.items()}
 
@@ -74,34 +77,98 @@ def _group(group: h5py.Group) -> NetcdfGroup:
 
 
 @contextmanager
-def _checked(path: Path) -> Iterator[h5py.File]:
+def _checked(path: Path, limits: Limits = LIMITS) -> Iterator[h5py.File]:
     """Context with an open file whose arrays can be read."""
     import h5py
 
     with opened(path) as stream:
-        size = os.fstat(stream.fileno()).st_size
+        budget = Budget(str(path), os.fstat(stream.fileno()).st_size, limits)
     with h5py.File(path, "r") as file:
-        refuse_inflated(_bytes_of(file, str(path)), size, str(path))
+        budget.refuse_content(_Announced(budget).bytes_of(file))
         yield file
 
 
-def _bytes_of(group: h5py.Group, where: str) -> int:
-    """Bytes of the arrays in a group and those within it, as they are announced."""
-    import h5py
+_DEFLATE, _DEFLATE_RATIO = 1, 1032  # code of gzip in HDF5, and what zlib reaches at most
+_COMPRESSORS = {_DEFLATE, 4, 32000}  # szip and lzf, which hold no more than a hundred times as much
+_FILTERS = {2, 3, 5, 6}  # shuffle, fletcher32, nbit and scale-offset, of which sizes follow
 
-    total = 0
-    for name in group:
+
+class _Announced:
+    """Bytes of arrays as a file announces them, each as often as a path leads to it.
+
+    Links may lead to one group by more paths than can be followed: each group is visited once.
+    """
+
+    def __init__(self, budget: Budget) -> None:
+        self._budget = budget
+        self._clock = budget.clock()
+        self._totals: dict[int, int] = {}  # by the address of a group that has been visited
+        self._links = 0
+
+    def bytes_of(self, group: h5py.Group, depth: int = 1) -> int:
+        """Bytes in a group and those within it."""
+        import h5py
+
+        address = h5py.h5o.get_info(group.id).addr
+        if address not in self._totals:
+            self._budget.refuse_depth(depth, "groups")
+            self._totals[address] = 0  # for a group within itself
+            self._totals[address] = sum(self._member(group, name, depth) for name in group)
+        return self._totals[address]
+
+    def _member(self, group: h5py.Group, name: str, depth: int) -> int:
+        import h5py
+
+        self._links += 1
+        self._budget.refuse_nodes(self._links, "groups and arrays")
+        self._clock()
         link = group.get(name, getlink=True)
         one = group.get(name) if isinstance(link, h5py.HardLink) else None
         if isinstance(one, h5py.Group):
-            total += _bytes_of(one, where)
-        elif isinstance(one, h5py.Dataset) and not one.external and not one.is_virtual:
-            total += int(one.size or 0) * one.dtype.itemsize
-        elif not isinstance(one, h5py.Datatype):
+            return self.bytes_of(one, depth + 1)
+        if isinstance(one, h5py.Dataset) and not one.external and not one.is_virtual:
+            self._refuse_inflated(one)
+            # a chunk is read whole, also where the array is smaller
+            n = max(int(one.size or 0), math.prod(one.chunks or (0,)))
+            return n * one.dtype.itemsize
+        if not isinstance(one, h5py.Datatype):
             raise FormatError(
-                f"{name!r} lies in another file", where=where, do="restore it, or make it again"
+                f"{name!r} lies in another file",
+                where=self._budget.where,
+                do="restore it, or make it again",
             )
-    return total
+        return 0
+
+    def _refuse_inflated(self, array: h5py.Dataset) -> None:
+        """Refuse chunks of gzip that hold more than a chunk: HDF5 reads them to their end."""
+        pipeline = array.id.get_create_plist()
+        filters = [pipeline.get_filter(k)[0] for k in range(pipeline.get_nfilters())]
+        compressors = [code for code in filters if code not in _FILTERS]
+        if len(compressors) > 1 or not set(compressors) <= _COMPRESSORS:
+            raise FormatError(
+                "has an array whose compression is not read",
+                where=self._budget.where,
+                do="write it with gzip, lzf, szip or none",
+            )
+        if _DEFLATE not in compressors:
+            return
+        large = list[tuple[int, ...]]()
+
+        def note(chunk: Any) -> None:
+            if _DEFLATE_RATIO * chunk.size > self._budget.content:
+                large.append(chunk.chunk_offset)
+
+        array.id.chunk_iter(note)
+        room = math.prod(array.chunks) * array.dtype.itemsize
+        for offset in large:
+            self._clock()
+            _, raw = array.id.read_direct_chunk(offset)
+            if len(zlib.decompressobj().decompress(raw, room + 1)) > room:
+                raise FormatError(
+                    f"has a chunk of {size_text(room)} that holds more",
+                    where=self._budget.where,
+                    do=DAMAGED,
+                )
 
 
 # -- arrays of our own, each file with the fingerprint of what it belongs to -----------------------

@@ -15,8 +15,9 @@ from astropy.table.meta import get_header_from_yaml
 from numpy.typing import NDArray
 
 from bayesdist.errors import FormatError
+from bayesdist.files.budget import LIMITS, Budget, Limits
+from bayesdist.files.documents import refuse_multiplied_yaml
 from bayesdist.files.regular import opened
-from bayesdist.files.unpacked import refuse_inflated
 
 if TYPE_CHECKING:
     import pyarrow
@@ -26,15 +27,18 @@ HEADER = "bayesdist"  # key of the metadata in which matches state what no colum
 _BUFFER = 2**18  # bytes: without a buffer, Arrow loads the columns of a whole row group
 
 
-def open_parquet(path: Path, as_codes: Collection[str] = ()) -> pyarrow.parquet.ParquetFile:
+def open_parquet(
+    path: Path, as_codes: Collection[str] = (), limits: Limits = LIMITS
+) -> pyarrow.parquet.ParquetFile:
     """Open file of which only the part being decoded is held in memory.
 
-    Columns `as_codes` are decoded as dictionaries.
+    Columns `as_codes` are decoded as dictionaries.  FormatError for columns of one name, and for a
+    file that announces more than its budget.
     """
     import pyarrow.parquet  # 0.1 s that other formats need not wait for
 
-    with opened(path):
-        pass
+    with opened(path) as stream:
+        budget = Budget(str(path), os.fstat(stream.fileno()).st_size, limits)
     stored = pyarrow.parquet.ParquetFile(
         path,
         read_dictionary=sorted(as_codes) or None,
@@ -42,24 +46,77 @@ def open_parquet(path: Path, as_codes: Collection[str] = ()) -> pyarrow.parquet.
         buffer_size=_BUFFER,
         page_checksum_verification=True,
     )
-    for name, n in Counter(stored.schema_arrow.names).items():
-        if n > 1:
-            stored.close()
-            raise FormatError(
-                f"has {n} columns named {name!r}", where=str(path), do="rename one of them"
-            )
+    try:
+        for name, n in Counter(stored.schema_arrow.names).items():
+            if n > 1:
+                raise FormatError(
+                    f"has {n} columns named {name!r}", where=str(path), do="rename one of them"
+                )
+        _refuse_announced(stored, budget)
+    except FormatError:
+        stored.close()
+        raise
     return stored
 
 
-def parquet_table(path: Path) -> Table:
-    """All rows of a Parquet file as an astropy Table."""
-    with open_parquet(path) as stored, opened(path) as stream:
-        metadata = stored.metadata
-        announced = 8.0 * metadata.num_rows * max(1, metadata.num_columns)
-        refuse_inflated(announced, os.fstat(stream.fileno()).st_size, str(path))
+def _refuse_announced(stored: pyarrow.parquet.ParquetFile, budget: Budget) -> None:
+    """Refuse rows, values and bytes that a file announces beyond its budget."""
+    metadata, clock = stored.metadata, budget.clock()
+    budget.refuse_rows(metadata.num_rows)
+    budget.refuse_columns(metadata.num_columns)
+    budget.refuse_nodes(metadata.num_row_groups, "row groups")
+    header = (metadata.metadata or {}).get(b"table_meta_yaml")
+    if header is not None:
+        refuse_multiplied_yaml(header.decode(), budget)
+    values = stated = 0
+    for group in map(metadata.row_group, range(metadata.num_row_groups)):
+        columns = [group.column(k) for k in range(group.num_columns)]
+        values += sum(column.num_values for column in columns)
+        stated += sum(column.total_uncompressed_size for column in columns)
+        clock()
+    budget.refuse_cells(values)
+    budget.refuse_content(max(8.0 * values, stated))
+
+
+def text_columns(schema: pyarrow.Schema) -> frozenset[str]:
+    """Columns of text: strings, bytes or dictionaries."""
+    from pyarrow import types
+
+    kinds = (
+        *(types.is_string, types.is_large_string),
+        *(types.is_binary, types.is_large_binary, types.is_dictionary),
+    )
+    return frozenset(one.name for one in schema if any(kind(one.type) for kind in kinds))
+
+
+def refuse_long_text(column: pyarrow.ChunkedArray | pyarrow.Array, budget: Budget) -> None:
+    """Refuse a column of dictionaries whose text would exceed the budget as an array of numpy.
+
+    One text of a dictionary may stand in every row, at no cost to the file.
+    """
+    import pyarrow.compute
+    from pyarrow import types
+
+    if not types.is_dictionary(column.type):
+        return
+    kind = column.type.value_type
+    if types.is_string(kind) or types.is_large_string(kind) or types.is_binary(kind):
+        for chunk in getattr(column, "chunks", [column]):
+            lengths = pyarrow.compute.binary_length(chunk.dictionary)
+            longest = pyarrow.compute.min_max(lengths)["max"].as_py() or 0
+            budget.refuse_content(4.0 * longest * len(column))
+
+
+def parquet_table(path: Path, limits: Limits = LIMITS) -> Table:
+    """All rows of a Parquet file as an astropy Table; FormatError where they exceed its budget."""
+    budget = Budget(str(path), path.stat().st_size, limits)
+    with open_parquet(path, limits=limits) as plain:
+        texts = text_columns(plain.schema_arrow)
+    with open_parquet(path, texts, limits) as stored:
         units = parquet_units(stored.schema_arrow)
         table = Table(meta=parquet_header(stored.schema_arrow))
         for name, column in zip(stored.schema_arrow.names, stored.read().columns, strict=True):
+            refuse_long_text(column, budget)
             table[name] = parquet_column(column, units.get(name))
     return table
 

@@ -1,7 +1,11 @@
-"""Bytes and text of regular files: no pipe, device or folder, and no more than fits in memory."""
+"""Bytes and text of regular files: no pipe, device or folder, and no more than fits in memory.
+
+Files that are written in place, a log and a lock, are regular ones, too.
+"""
 
 from __future__ import annotations
 
+import errno
 import io
 import os
 import stat
@@ -24,7 +28,9 @@ _KINDS = {
     stat.S_IFCHR: "a device",
     stat.S_IFBLK: "a device",
     stat.S_IFSOCK: "a socket",
+    stat.S_IFLNK: "a symbolic link",
 }
+_REMOVE = "remove it, or choose another folder"
 
 
 @contextmanager
@@ -61,6 +67,29 @@ def _without_waiting(path: str, flags: int) -> int:
     return os.open(path, flags | getattr(os, "O_NONBLOCK", 0))
 
 
+def descriptor_for_writing(path: PathLike, flags: int = 0) -> int:
+    """Descriptor of a regular file that is written in place, and made where there is none.
+
+    `flags`: of `os.open`, in addition.  A folder may come from others: a symbolic link is not
+    followed, since what it leads to would be overwritten.  InputError for a link, a pipe, a device
+    or a folder.  OSError, as the system raises it, for a file that cannot be opened.
+    """
+    flags |= os.O_RDWR | os.O_CREAT | getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0)
+    try:
+        held = os.open(path, flags, 0o666)
+    except IsADirectoryError as error:
+        raise _irregular(path, stat.S_IFDIR, _REMOVE) from error
+    except OSError as error:
+        if error.errno != errno.ELOOP:
+            raise
+        raise _irregular(path, stat.S_IFLNK, _REMOVE) from error
+    kind = stat.S_IFMT(os.fstat(held).st_mode)
+    if kind != stat.S_IFREG:
+        os.close(held)
+        raise _irregular(path, kind, _REMOVE)
+    return held
+
+
 def _refuse_hollow(path: PathLike, found: os.stat_result) -> None:
     """Refuse a large file of which hardly anything was written: to read its holes takes hours."""
     written = 512 * getattr(found, "st_blocks", found.st_size)
@@ -72,10 +101,8 @@ def _refuse_hollow(path: PathLike, found: os.stat_result) -> None:
         )
 
 
-def _irregular(path: PathLike, kind: int) -> InputError:
-    return InputError(
-        f"is {_KINDS.get(kind, 'no file')}, not a file", where=str(path), do="give a regular file"
-    )
+def _irregular(path: PathLike, kind: int, do: str = "give a regular file") -> InputError:
+    return InputError(f"is {_KINDS.get(kind, 'no file')}, not a file", where=str(path), do=do)
 
 
 def read_bytes(path: PathLike, *, most: int | None = None) -> bytes:
@@ -121,22 +148,19 @@ def read_text(path: PathLike, *, most: int | None = None) -> str:
 
     FormatError where it is no such text.
     """
+    return decoded(read_bytes(path, most=most), str(path))
+
+
+def decoded(raw: bytes, where: str) -> str:
+    """Text of bytes in UTF-8; FormatError where they are no such text."""
     try:
-        return read_bytes(path, most=most).decode("utf-8")
+        return raw.decode("utf-8")
     except UnicodeDecodeError as error:
         raise FormatError(
             f"cannot be read (not UTF-8 text at byte {error.start + 1})",
-            where=str(path),
+            where=where,
             do="check the file",
         ) from error
-
-
-def read_lines(path: PathLike) -> list[str]:
-    """Lines of a text file, with their ends and without a byte order mark.
-
-    Errors as of `read_text`.
-    """
-    return io.StringIO(read_text(path).removeprefix("\ufeff"), newline="").readlines()
 
 
 def head_of(path: PathLike, n: int = 4096) -> bytes:

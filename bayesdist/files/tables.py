@@ -18,19 +18,25 @@ from astropy.table import Table, vstack
 from astropy.utils.xml.iterparser import get_xml_iterator
 
 from bayesdist.errors import FormatError, InputError
+from bayesdist.files.budget import LIMITS, Budget, Limits
 from bayesdist.files.faults import naming_faults
-from bayesdist.files.fits import FITS_START, open_fits
+from bayesdist.files.fits import FITS_START, open_fits, refuse_long_arrays
 from bayesdist.files.parquet import parquet_table
-from bayesdist.files.regular import head_of, read_bytes, read_lines
+from bayesdist.files.regular import head_of
 from bayesdist.files.text_tables import (
+    MAYBE_FOREIGN_BYTES,
     is_text_table,
     mark_of,
     parse_text_table,
     refuse_cut_end,
+    refuse_foreign_numbers,
+    refuse_multiplied_header,
     refuse_numbers_as_names,
     with_decimal_points,
 )
-from bayesdist.files.unpacked import unpacked
+from bayesdist.files.unpacked import read_lines, read_unpacked, without_codec
+from bayesdist.files.votable import refuse_unsafe_votable
+from bayesdist.utils.text import number_of
 
 CARD_LENGTH = 80  # characters of a FITS card
 _COMMAS = re.compile(r"# delimiter: ['\"]?,")
@@ -63,27 +69,46 @@ def _whole_lines(lines: list[str], mark: str, path: Path) -> list[str]:
     return bare
 
 
-def read_ecsv(path: Path) -> Table:
+def _is_comment(line: str) -> bool:
+    return line.startswith("#")
+
+
+def read_ecsv(path: Path, limits: Limits = LIMITS) -> Table:
     """Table of an ECSV file; errors as of `read_table`."""
     with _reading(path):
-        return Table.read(_whole_lines(read_lines(path), " ", path), format="ascii.ecsv")
+        lines = read_lines(path, limits)
+        refuse_multiplied_header(lines, _budget(path, limits))
+        lines = _whole_lines(lines, " ", path)
+        table = Table.read(lines, format="ascii.ecsv")
+        mark = "," if any(map(_COMMAS.match, takewhile(_is_comment, lines))) else " "
+        refuse_foreign_numbers(table, lines, mark, where=str(path))
+        return table
 
 
-def _read_text(path: Path) -> Table:
-    return parse_text_table(read_lines(path), where=str(path))
+def _budget(path: Path, limits: Limits) -> Budget:
+    return Budget(str(path), path.stat().st_size, limits)
 
 
-def _read_separated(path: Path, *, mark: str, format: str) -> Table:
+def _read_text(path: Path, limits: Limits) -> Table:
+    return parse_text_table(read_lines(path, limits), _budget(path, limits))
+
+
+def _read_separated(path: Path, limits: Limits, *, mark: str, format: str) -> Table:
     """Table of a file that ends in .csv, whose cells may be separated by semicolons, or in .tsv."""
-    lines = read_lines(path)
+    lines = read_lines(path, limits)
     rows = (line for line in lines if line.strip() and not line.startswith("#"))
     names = next(rows, "")
     if mark == "," and mark_of([names, next(rows, names)]) == ";":
         mark = ";"
     lines = _whole_lines(lines, mark, path)
-    refuse_numbers_as_names(next(csv.reader([names], delimiter=mark), []), where=str(path))
-    lines = with_decimal_points(lines, mark, where=str(path))
-    return Table.read(lines, format=format, delimiter=mark, comment="#", guess=False)
+    cells = next(csv.reader([names], delimiter=mark), [])
+    _budget(path, limits).refuse_columns(len(cells))
+    refuse_numbers_as_names(cells, where=str(path))
+    # astropy takes a time for a comment that grows with the square of its length
+    lines = with_decimal_points([one for one in lines if one[:1] != "#"], mark, where=str(path))
+    table = Table.read(lines, format=format, delimiter=mark, comment="#", guess=False)
+    refuse_foreign_numbers(table, lines, mark, where=str(path))
+    return table
 
 
 def _refuse_short_rows(lines: list[str], mark: str, path: Path) -> None:
@@ -101,18 +126,11 @@ def _refuse_short_rows(lines: list[str], mark: str, path: Path) -> None:
         width, row = width or len(cells), row + 1
 
 
-def _read_votable(path: Path) -> Table:
-    raw = unpacked(read_bytes(path), str(path))
-    for announced in re.findall(rb"nrows\s*=\s*[\"'](\d+)", raw):
-        # room is made for so many rows before any is read; a row has a tag or a byte at least
-        if len(announced) > 12 or int(announced) > len(raw):
-            raise FormatError(
-                f"announces {announced[:20].decode()} rows in {len(raw)} bytes",
-                where=str(path),
-                do="fetch or write it again",
-            )
+def _read_votable(path: Path, limits: Limits) -> Table:
+    raw, budget = read_unpacked(path, limits)
+    refuse_unsafe_votable(raw, budget)
     table = Table.read(io.BytesIO(raw), format="votable")
-    if any(np.ma.is_masked(table[name]) for name in table.colnames):
+    if MAYBE_FOREIGN_BYTES.search(raw) or any(np.ma.is_masked(table[n]) for n in table.colnames):
         _refuse_unreadable_cells(raw, path)
     return table
 
@@ -147,16 +165,24 @@ def _refuse_unreadable_cells(raw: bytes, path: Path) -> None:
 
 def _says_number(cell: str) -> bool:
     try:
-        float(cell)
+        number_of(cell)
     except ValueError:
         return cell.strip().lower() in _NO_NUMBER
     return True
 
 
-def _read_fits(path: Path) -> Table:
-    with open_fits(unpacked(read_bytes(path), str(path)), str(path)) as hdus:
-        tables = [hdu for hdu in hdus if isinstance(hdu, fits.BinTableHDU | fits.TableHDU)]
+def _read_fits(path: Path, limits: Limits) -> Table:
+    raw, budget = read_unpacked(path, limits)
+    with open_fits(raw, budget) as hdus:
+        tables = [
+            hdu
+            for hdu in hdus
+            if isinstance(hdu, fits.BinTableHDU | fits.TableHDU) and "ZIMAGE" not in hdu.header
+        ]
         objects = [hdu for hdu in tables if hdu.name == "LDAC_OBJECTS"]
+        for hdu in objects or tables[:1]:
+            if isinstance(hdu, fits.BinTableHDU):
+                refuse_long_arrays(hdu, budget)
         if objects:
             return _ldac(hdus, objects)
         if tables:
@@ -204,7 +230,7 @@ def _image_header(hdu: fits.BinTableHDU) -> fits.Header:
     return fits.Header.fromstring("".join(filled))
 
 
-TABLE_SUFFIXES: dict[str, Callable[[Path], Table]] = {
+TABLE_SUFFIXES: dict[str, Callable[[Path, Limits], Table]] = {
     ".ecsv": read_ecsv,
     ".csv": partial(_read_separated, mark=",", format="ascii.csv"),
     ".tsv": partial(_read_separated, mark="\t", format="ascii.tab"),
@@ -230,18 +256,19 @@ def is_fits(path: Path) -> bool:
     return head_of(path).startswith(FITS_START)
 
 
-def read_table(path: Path) -> Table:
+def read_table(path: Path, limits: Limits = LIMITS) -> Table:
     """Table of a file, by its extension; one that is missing, damaged or unknown is refused.
 
     Known are .ecsv, .csv, .tsv, .fits (first table extension, of FITS_LDAC the objects; also
     .fits.gz), .parquet, .vot or .xml (VOTable), .tbl and .ipac; other names by content: FITS, and
-    text as `parse_text_table` knows it.
+    text as `parse_text_table` knows it.  Each but .parquet may be compressed by gzip, bzip2 or xz,
+    with .gz, .bz2 or .xz at the end of its name or without.
     """
-    name = path.name.lower().removesuffix(".gz")
+    name = without_codec(path.name)
     reader = next((r for end, r in TABLE_SUFFIXES.items() if name.endswith(end)), None)
     if reader is None and is_fits(path):
         reader = _read_fits
-    if reader is None and not is_binary(path) and is_text_table(read_lines(path)):
+    if reader is None and not is_binary(path) and is_text_table(read_lines(path, limits)):
         reader = _read_text
     if reader is None:
         raise InputError(
@@ -252,4 +279,4 @@ def read_table(path: Path) -> Table:
     if path.is_file() and not path.stat().st_size:
         raise FormatError("is empty", where=str(path), do="fetch or write it again")
     with _reading(path):
-        return reader(path)
+        return reader(path, limits)

@@ -7,10 +7,13 @@ import io
 import logging
 import re
 from collections.abc import Sequence
+from itertools import takewhile
 
 from astropy.table import Table
 
 from bayesdist.errors import FormatError
+from bayesdist.files.budget import Budget
+from bayesdist.files.documents import refuse_multiplied_yaml
 
 log = logging.getLogger("bayesdist")
 
@@ -18,6 +21,13 @@ _NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eEdD][+-]?\d+)?|nan|inf", re.IGNO
 _DECIMAL_COMMA = re.compile(r"[+-]?\d*,\d+([eEdD][+-]?\d+)?")
 _DECIMAL_POINT = re.compile(r"[+-]?(\d+\.\d*|\.\d+)([eEdD][+-]?\d+)?")
 _MAY_BE_THOUSANDS = re.compile(r"[+-]?[1-9]\d{0,2},\d{3}")
+# in cells that `_FOREIGN` matches, and in few others
+MAYBE_FOREIGN = re.compile(r"\d_\d|0[xX][0-9a-fA-F.]|[^\x00-\x7f]")
+MAYBE_FOREIGN_BYTES = re.compile(rb"\d_\d|[\x80-\xff]|&#")
+_FOREIGN = re.compile(
+    r"[+-]?(0[xX][0-9a-fA-F.]+([pP][+-]?\d+)?"
+    r"|(?=.*(_|[^\x00-\x7f]))[\d_]*\.?[\d_]*\d([eE][+-]?[\d_]+)?\.?)"
+)
 _MARKS = (",", ";", "\t", None)  # None: blanks
 ROWS_ABOVE, FEWEST_ABOVE = 20, 3  # that the last cell is held against
 _DAOPHOT = "DAOPHOT"  # the program's own lists, not the tables of IRAF's version
@@ -141,13 +151,21 @@ def _pointed(line: str, mark: str | None) -> str:
     return out.getvalue()
 
 
-def parse_text_table(lines: Sequence[str], *, where: str) -> Table:
+def refuse_multiplied_header(lines: Sequence[str], budget: Budget) -> None:
+    """Refuse an ECSV file whose header of YAML has too many nodes; see `refuse_multiplied_yaml`."""
+    head = takewhile(lambda line: not line or line[0] == "#", map(str.strip, lines))
+    text = "\n".join(re.sub(r"^# ?", "", line) for line in head)
+    refuse_multiplied_yaml(text, budget)
+
+
+def parse_text_table(lines: Sequence[str], budget: Budget) -> Table:
     """Table of lines of text, with their ends; a row of an IPAC table that is cut short is refused.
 
     Known are an IPAC table, the ASCII_HEAD catalogue of SExtractor, a table of IRAF's daophot, a
     list of DAOPHOT II or ALLSTAR, and columns under a line of names, with "#" before it or not,
     separated by blanks, commas, semicolons or tabs.
     """
+    where = budget.where
     ended = not lines or lines[-1].endswith(("\n", "\r"))
     whole, lines = lines, [line.rstrip("\r\n") for line in lines]
     kind = _kind(lines)
@@ -157,9 +175,15 @@ def parse_text_table(lines: Sequence[str], *, where: str) -> Table:
             where=where,
             do="write one above the numbers",
         )
+    if kind == "ascii.ecsv":
+        refuse_multiplied_header(lines, budget)
+    rows = _rows_of(lines)
+    named = sum(1 for line in lines if line.startswith("#")) if kind == "ascii.sextractor" else 0
+    widths = [len(row.split(mark)) for row in rows[:1] for mark in (None, ",", ";", "|")]
+    budget.refuse_columns(max([named, *widths]))
     options: dict[str, object] = {}
     separated = kind in ("ascii.csv", "ascii.tab", "ascii.basic")
-    mark = mark_of(_rows_of(lines)) if separated else None
+    mark = mark_of(rows) if separated else None
     if kind == _DAOPHOT:
         return _daophot_list(lines, where)
     if kind == "ascii.ipac":
@@ -176,7 +200,9 @@ def parse_text_table(lines: Sequence[str], *, where: str) -> Table:
             lines = [line.replace("\t", " ") for line in lines]
         elif mark == ";":
             options["delimiter"] = mark
-    return Table.read(lines, format=kind, guess=False, **options)
+    table = Table.read(lines, format=kind, guess=False, **options)
+    refuse_foreign_numbers(table, lines, mark, where=where)
+    return table
 
 
 def refuse_cut_end(lines: Sequence[str], mark: str | None, *, where: str) -> None:
@@ -203,6 +229,31 @@ def refuse_cut_end(lines: Sequence[str], mark: str | None, *, where: str) -> Non
             do="the table may be truncated: fetch or write it again",
         )
     log.warning("%s: its last line has no end, so that the file may be truncated", where)
+
+
+def refuse_foreign_numbers(
+    table: Table, lines: Sequence[str], mark: str | None, *, where: str
+) -> None:
+    """Refuse cells that Python or C takes for numbers, and no format of tables does.
+
+    They are digits with underscores ("1_00"), hexadecimal numbers ("0x64"), and digits of other
+    scripts.  `lines` are those of the table, whose cells are separated by `mark`, or by blanks or
+    the bars of an IPAC table.  In columns of text such cells are names.
+    """
+    kinds = [table[name].dtype.kind for name in table.colnames]
+    for number, line in enumerate(lines, start=1):
+        if not MAYBE_FOREIGN.search(line) or line[:1] in ("#", "\\", "|"):
+            continue
+        cells = [cell.strip() for cell in _cells(line, mark)]
+        known = len(cells) == len(kinds)
+        for k, cell in enumerate(cells):
+            if _FOREIGN.fullmatch(cell) and (not known or kinds[k] in "iuf"):
+                name = f", column {table.colnames[k]!r}" if known else ""
+                raise FormatError(
+                    f"{cell[:40]!r} is no number",
+                    where=f"{where}, line {number}{name}",
+                    do="write it in decimal digits, without marks between them",
+                )
 
 
 def _daophot_list(lines: Sequence[str], where: str) -> Table:

@@ -1,57 +1,119 @@
-"""Sizes that the content of a file announces, held against the file's own, and gzip."""
+"""Content of files that gzip, bzip2 or xz have compressed, within the budget of the file."""
 
 from __future__ import annotations
 
+import bz2
 import gzip
 import io
+import lzma
+import re
 import zlib
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
 
 from bayesdist.errors import FormatError
-from bayesdist.files.regular import read_up_to
-from bayesdist.utils.memory import memory_limit, size_text
+from bayesdist.files.budget import LIMITS, Budget, Limits
+from bayesdist.files.regular import PIECE, PathLike, decoded, read_bytes
+from bayesdist.utils.memory import size_text
 
-GZIP = b"\x1f\x8b"
-PLAUSIBLE = 2**28  # bytes that any file may hold, however well they are compressed
-RATIO = 100  # of larger content to the file: tables of stars are compressed by less than ten
+# how content begins by which a codec is known, its name, and its reader of a stream
+CODECS: tuple[tuple[re.Pattern[bytes], str, Callable[[io.BytesIO], Any]], ...] = (
+    (re.compile(rb"\x1f\x8b"), "gzip", lambda stream: gzip.GzipFile(fileobj=stream)),
+    (re.compile(rb"BZh[1-9](1AY&SY|\x17rE8P\x90)"), "bzip2", bz2.BZ2File),
+    (re.compile(rb"\xfd7zXZ\0"), "xz", lzma.LZMAFile),
+)
+CODEC_SUFFIXES = (".gz", ".bz2", ".xz")
+_UNKNOWN = ((b"PK\3\4", "zip"), (b"\x1f\x9d", "compress"), (b"(\xb5/\xfd", "zstd"))
 
 
-def most_unpacked(size: int) -> int:
-    """Bytes that a file of a size may hold."""
-    return min(memory_limit(), max(PLAUSIBLE, RATIO * size))
+def without_codec(name: str) -> str:
+    """Name of a file in lower case, without the end that says by what it is compressed."""
+    name = name.lower()
+    for suffix in CODEC_SUFFIXES:
+        name = name.removesuffix(suffix)
+    return name
 
 
-def refuse_inflated(announced: float, size: int, where: str) -> None:
-    """Refuse a file that announces more content than its size allows.
+def _codec(raw: bytes) -> tuple[str, Callable[[io.BytesIO], Any]] | None:
+    return next(((name, reader) for start, name, reader in CODECS if start.match(raw)), None)
 
-    `announced`: bytes. `size`: of the file.
+
+def read_unpacked(path: PathLike, limits: Limits = LIMITS) -> tuple[bytes, Budget]:
+    """Content of a file, decompressed, with what it may hold; errors as of `unpacked`."""
+    raw = read_bytes(path)
+    budget = Budget(str(path), len(raw), limits)
+    return unpacked(raw, budget), budget
+
+
+def unpacked(raw: bytes, budget: Budget) -> bytes:
+    """Content of a file, decompressed where gzip, bzip2 or xz have compressed it.
+
+    FormatError for a broken file, for one that holds more than its budget, and for one that is
+    compressed twice or in another way.
     """
-    if not announced <= most_unpacked(size):
-        raise FormatError(
-            f"announces {size_text(announced)} in a file of {size_text(size)}",
-            where=where,
-            do="it is damaged, or made to exhaust the memory: fetch or write it again",
-        )
-
-
-def unpacked(raw: bytes, where: str) -> bytes:
-    """Content of a file, decompressed where gzip has compressed it.
-
-    FormatError for a broken gzip file, or one that holds more than is plausible.
-    """
-    if raw[:2] != GZIP:
+    known = _codec(raw)
+    if known is None:
+        for start, other in _UNKNOWN:
+            if raw.startswith(start):
+                raise FormatError(
+                    f"is compressed by {other}", where=budget.where, do="decompress it first"
+                )
         return raw
-    most = most_unpacked(len(raw))
+    codec, reader = known
     try:
-        with gzip.GzipFile(fileobj=io.BytesIO(raw)) as stream:
-            content = read_up_to(stream, most)
-    except (EOFError, OSError, zlib.error) as error:
+        with reader(io.BytesIO(raw)) as stream:
+            content = _read(stream, budget)
+    except (EOFError, OSError, zlib.error, lzma.LZMAError, MemoryError) as error:
         raise FormatError(
-            f"is a broken gzip file ({error})", where=where, do="fetch the file again"
+            f"is a broken {codec} file ({error})", where=budget.where, do="fetch the file again"
         ) from error
-    if len(content) > most:
+    if content is None:
         raise FormatError(
-            f"is a gzip file of {size_text(len(raw))} that holds more than {size_text(most)}",
-            where=where,
+            f"is compressed by {codec} to {size_text(len(raw))}, and that holds more than "
+            f"{size_text(budget.content)}",
+            where=budget.where,
             do="check where it comes from, or decompress it first",
         )
+    if _codec(content) is not None:
+        raise FormatError("is compressed twice", where=budget.where, do="decompress it first")
     return content
+
+
+def _read(stream: Any, budget: Budget) -> bytes | None:
+    """Bytes of a stream; None where there are more than its budget."""
+    clock = budget.clock()
+    parts, left = list[bytes](), budget.content + 1
+    while left and (part := stream.read(min(left, PIECE))):
+        parts.append(part)
+        left -= len(part)
+        clock()
+    return b"".join(parts) if left else None
+
+
+def read_lines(path: PathLike, limits: Limits = LIMITS) -> list[str]:
+    """Lines of a text file, with their ends and without a byte order mark, decompressed.
+
+    Errors as of `read_bytes` and `unpacked`; FormatError for text that is not in UTF-8, and for
+    lines, cells or a line beyond the budget.
+    """
+    raw, budget = read_unpacked(path, limits)
+    ends = raw.count(b"\n") + raw.count(b"\r") - raw.count(b"\r\n")
+    budget.refuse_rows(ends, "holds")
+    if len(raw) > budget.size:
+        budget.refuse_cells(_cells(raw))
+    text = decoded(raw, str(path)).removeprefix("\ufeff")
+    del raw
+    lines = io.StringIO(text, newline="").readlines()
+    for number, line in enumerate(lines, start=1):
+        if len(line) > budget.limits.line:
+            budget.refuse_line(len(line), number)
+    return lines
+
+
+def _cells(raw: bytes) -> int:
+    """Cells of a text table, whatever separates them."""
+    marks = np.isin(np.frombuffer(raw, np.uint8), np.frombuffer(b" ,;\t\r\n", np.uint8))
+    between_blanks = int(np.count_nonzero(marks[1:] > marks[:-1]))
+    return max(between_blanks, *(raw.count(mark) for mark in (b",", b";", b"\t")))

@@ -19,6 +19,7 @@ from bayesdist.model.frames import CHIP_DEVIATIONS, FRAME_KINDS, RIGID, frame_na
 from bayesdist.model.timedep import AXES, TimeDependence
 from bayesdist.utils.arrays import Float, Int
 from bayesdist.utils.quantities import UNITS, values_in
+from bayesdist.utils.text import refuse_control_characters
 
 GAUGES = ("first", "held")
 
@@ -54,6 +55,7 @@ class Chip:
             raise InputError(
                 f"number is {self.number!r}", where=f"chip {self.name!r}", do="give a whole number"
             )
+        refuse_control_characters([str(self.name)], f"chip {self.number}")
         for name in ("size", "reference_pixel"):
             pair = getattr(self, name)
             is_pair = isinstance(pair, Sequence) and not isinstance(pair, str)

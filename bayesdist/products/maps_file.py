@@ -19,6 +19,7 @@ from bayesdist.assess.maps.uncertainty import RELATIVE
 from bayesdist.calibration.area import PixelAreaMap
 from bayesdist.errors import InputError
 from bayesdist.files.atomic import atomic_path
+from bayesdist.products.formats.common.cards import append_cards, set_text, wrapped_cards
 from bayesdist.utils.arrays import Float
 
 PREFIX = {"least squares": "LSQ", "posterior": "MIX", RELATIVE: "REL"}
@@ -46,7 +47,7 @@ def write_maps(
     hdus[0].header["BDCONV"] = (converged, "has the sampler converged?")
     for note in notes:
         if note:
-            hdus[0].header["COMMENT"] = note
+            append_cards(hdus[0], wrapped_cards("COMMENT", [note]))
     chips = list(dict.fromkeys(m.chip for m in maps))
     ends = {chip: f"_{chip}" if len(chips) > 1 else "" for chip in chips}
     for m in sorted(maps, key=lambda m: chips.index(m.chip)):  # stable within a chip
@@ -80,7 +81,7 @@ def _image(
 ) -> fits.ImageHDU:
     hdu = fits.ImageHDU(np.ascontiguousarray(values), name=name)
     if unit:
-        hdu.header["BUNIT"] = {"pix": "pixel"}.get(unit, unit)
+        set_text(hdu.header, "BUNIT", {"pix": "pixel"}.get(unit, unit))
     for k, (axis, grid) in enumerate((("X", x), ("Y", y)), start=1):
         hdu.header[f"CTYPE{k}"] = (axis, "detector pixel, FITS 1-based")
         hdu.header[f"CUNIT{k}"] = "pixel"
@@ -124,11 +125,11 @@ def write_pam(
             hdus.append(hdu)
     for keyword, text in (("INSTRUME", instrument), ("DETECTOR", detector)):
         if text:
-            primary.header[keyword] = text
+            set_text(primary.header, keyword, text)
     primary.header["FILETYPE"] = "PIXEL AREA MAP"
     primary.header["CREATOR"] = "bayesdist"
     if source:
-        primary.header["BDSOURCE"] = (Path(source).name[:60], "the calibration")
+        set_text(primary.header, "BDSOURCE", Path(source).name[:60], "the calibration")
     with atomic_path(path) as temporary:
         fits.HDUList(hdus).writeto(temporary, checksum=True)
 

@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING
 
 from bayesdist.calibration.calibration import Calibration
 from bayesdist.errors import InputError, required
+from bayesdist.files.atomic import refuse_unsafe_name
 from bayesdist.products import formats
 from bayesdist.products.formats.common.content import Content, read_content, readable
 from bayesdist.products.formats.common.document import (
@@ -223,9 +224,12 @@ def build(
         )
     if one.holds_tables and not calibration.before:
         calibration = replace(calibration, before=options.tables)
-    return required(one.build, f"files of {one.title} cannot be built")(
+    files = required(one.build, f"files of {one.title} cannot be built")(
         calibration, settings, options
     )
+    for file in files:
+        refuse_unsafe_name(file.file_name, where=f"products.{key}")
+    return files
 
 
 def read_back(

@@ -16,7 +16,7 @@ from bayesdist.calibration.calibration import Calibration
 from bayesdist.calibration.orientation import oriented
 from bayesdist.calibration.plane import Orientation
 from bayesdist.errors import InputError
-from bayesdist.files.atomic import made_folder, path_within
+from bayesdist.files.atomic import made_folder, refuse_unsafe_name
 from bayesdist.model.lookup import LookupTable
 from bayesdist.products.formats.idctab.build import idctab_from_solution
 from bayesdist.products.formats.idctab.drift import Loss, storable
@@ -171,9 +171,7 @@ def write_release(
         )
 
     folder = made_folder(folder)
-    idctabs = {
-        period: path_within(folder, f"{name}_{period}_idc.fits", where="name") for period in made
-    }
+    idctabs = {period: _path(folder, f"{name}_{period}_idc.fits", "the name") for period in made}
     for period_name, path in idctabs.items():
         write_idctab(made[period_name], path)
     first = periods[0]
@@ -186,7 +184,7 @@ def write_release(
     detector_tables = [t for t in tables if not t.filter]
     d2im = None
     if detector_tables:
-        d2im = path_within(folder, f"{name}_d2i.fits", where="name")
+        d2im = _path(folder, f"{name}_d2i.fits", "the name")
         columns, lines = next(iter(calibrations.values())).model.chips[0].size
         size = (int(columns), int(lines))
         write_d2im(
@@ -194,7 +192,7 @@ def write_release(
         )
     npol = {}
     for filter in dict.fromkeys(t.filter for t in tables if t.filter):
-        npol[filter] = path_within(folder, f"{name}_{filter.lower()}_npl.fits", where="filter")
+        npol[filter] = _path(folder, f"{name}_{filter.lower()}_npl.fits", "the filter")
         write_npol(
             [t for t in tables if t.filter == filter],
             npol[filter],
@@ -203,6 +201,12 @@ def write_release(
             **common,
         )
     return Release(idctabs, d2im, npol, lost)
+
+
+def _path(folder: Path, name: str, source: str) -> Path:
+    """Path of a file of the set; `source` of its name is for the error."""
+    refuse_unsafe_name(name, where=f"{source} of the release")
+    return folder / name
 
 
 def _stored(

@@ -394,6 +394,24 @@ def test_a_list_with_nan(campaign, column):
     campaign.refused(f"{ONE}.parquet", "row 5", f"'{column}'")
 
 
+def test_a_list_that_was_appended_to_itself(campaign):
+    campaign.lists(lambda t: vstack([t, t]), "f606w-003").refused("f606w-003", "repeats row 1")
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [("exptime", 1e300), ("exptime", -1.0), ("pa_v3", 1e30), ("ra", 1e300), ("dec", 91.0)],
+)
+def test_numbers_of_a_log_that_no_exposure_has(campaign, name, value):
+    campaign.log(setting(name, 2, value)).refused("exposures.ecsv, row 2", name)
+
+
+@pytest.mark.parametrize("name", ["exptime", "ra", "dec", "pa_v3"])
+def test_numbers_that_a_log_lacks_in_some_rows_are_said(campaign, name):
+    text = campaign.log(setting(name, 2, np.nan)).check()
+    assert f"{name} is missing of 1 of 8 exposures" in text.lower()
+
+
 def test_one_exposure_in_two_lists(campaign):
     (campaign.path / "more").mkdir()
     shutil.copy(campaign.path / "lists" / f"{ONE}.parquet", campaign.path / "more")
@@ -610,3 +628,25 @@ def test_a_damaged_campaign_is_calibrated_and_says_so(campaign, monkeypatch):
     assert "No detection on chip 2" in warnings and "f606w-006" in warnings
     assert summary_of(run)["data"]["n_exposures"] == 7
     assert len(summary_of(run)["products"]) >= 2
+
+
+# -- files that could not be written ---------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "words"),
+    [
+        ('name = "acs_wfc"', f'name = "{"a" * 240}"', ["cannot be the name of a file", "release"]),
+        ('name = "acs_wfc"', 'name = "acs"\ninstrument = "WFC3"', ["WFC3/WFC", "ACS/WFC"]),
+        ("[products.release]", "[products.stdgdc]\n[products.release]", ["STDGDC", "chips 2, 1"]),
+        ('name = "WFC2"', 'name = "W\\u0000"', ["chip[1].name", "U+0000"]),
+    ],
+)
+def test_files_are_made_on_trial_before_stars_are_matched(campaign, old, new, words):
+    campaign.replaced(old, new).refused(*words)
+
+
+def test_names_in_other_scripts_are_no_fault(campaign):
+    campaign.replaced('name = "WFC2"', 'name = "Détecteur 检测器"')
+    campaign.replaced("[products.release]", "[products.tpv]\n[products.cpdis]\n[products.release]")
+    good("check", campaign.path / CONFIG)

@@ -4,16 +4,21 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import shutil
 from pathlib import Path
 
+import numpy as np
 import pytest
+from astropy.io.fits import FITSDiff
 
 from bayesdist.app.store.record import FileMark, Record
 from bayesdist.app.store.rundir import RunDirectory
 from bayesdist.errors import InputError
 from bayesdist.files.atomic import path_within
-from tests.app.support import cli, good, refused, write_config
+from bayesdist.files.hdf5 import netcdf_groups
+from bayesdist.infer import load_fit
+from tests.app.support import EXACT, cli, good, refused, snapshot, write_config, write_job
 from tests.reduced import case_in_full
 
 pytestmark = pytest.mark.usefixtures("no_report")
@@ -164,6 +169,35 @@ def test_a_link_does_not_lead_to_files_of_others(project, tmp_path):
     assert (other / "x.txt").exists()
 
 
+@pytest.mark.parametrize("name", ["bayesdist.log", ".bayesdist.lock", "figures"])
+def test_nothing_is_written_through_a_link(project, tmp_path, name):
+    """A run that others made may hold links in place of what is written in place."""
+    run, other = project / "run", tmp_path / "precious"
+    if name == "figures":
+        shutil.rmtree(run / name)
+        other.mkdir()
+        (other / "corner.svg").write_text("precious", encoding="utf-8")
+    else:
+        (run / name).unlink(missing_ok=True)
+        other.write_text("precious", encoding="utf-8")
+    (run / name).symlink_to(other)
+    before = snapshot(other) if other.is_dir() else other.read_text(encoding="utf-8")
+    (run / "report.html").unlink()
+    result = cli("stage", "report", run)
+    assert result.code == 1, result.err
+    assert "symbolic link" in result.err or "outside of its folder" in result.err
+    assert "Traceback" not in result.err
+    assert before == (snapshot(other) if other.is_dir() else other.read_text(encoding="utf-8"))
+
+
+@pytest.mark.parametrize("name", ["bayesdist.log", ".bayesdist.lock"])
+def test_a_pipe_in_place_of_a_file_is_not_waited_for(project, name):
+    (project / "run" / name).unlink(missing_ok=True)
+    os.mkfifo(project / "run" / name)
+    result = cli("stage", "report", project / "run")
+    assert result.code == 1 and "a pipe" in result.err
+
+
 def test_matches_of_a_folder_above_are_as_the_user_wants_them(finished, tmp_path):
     """A configuration is its user's own: '../stars.ecsv' is read, and keeps its name."""
     shutil.copy(finished.config.with_name("stars.ecsv"), tmp_path / "stars.ecsv")
@@ -187,3 +221,44 @@ def test_products_have_names_and_no_folders(tmp_path, finished):
         with pytest.raises(ValueError, match="name"):
             ReleaseBlock(reference="r", name="x", period=[period | given])
     assert ReleaseBlock(reference="r", name="v1.0-b", period=[period]).name == "v1.0-b"
+
+
+TIMED = {"bayesdist.log", "run.json", "summary.json"}  # with dates and durations
+# these, hashes of files that have them, and where the input was
+TIMES = re.compile(
+    r'\d{4}-\d\d-\d\d[T ]\d\d:\d\d:\d\d[^ "]*|"(wall_s|size|mtime_ns?|base)": [^,}\n]+'
+    r"|\d+(\.\d+)? s\b|[0-9a-f]{64}"
+)
+
+
+def test_runs_in_two_folders_are_the_same_but_for_dates_and_durations(tmp_path, monkeypatch):
+    runs = []
+    for name in ("one", "two/deeper"):
+        folder = write_job(tmp_path / name, budget=[EXACT], products={"sip": {}, "parameters": {}})
+        monkeypatch.chdir(folder.parent)
+        good("run", "config.toml", "-o", "run", "-q")
+        runs.append(folder.parent / "run")
+    first, second = (snapshot(run) for run in runs)
+    assert first.keys() == second.keys()
+    other = {name for name in first if first[name] != second[name]}
+    assert other <= TIMED | {"posterior.nc", "maps.fits"}
+    for name in TIMED:
+        texts = [TIMES.sub("", (run / name).read_text(encoding="utf-8")) for run in runs]
+        assert str(tmp_path) not in texts[0] and texts[0] == texts[1], name
+    groups = [netcdf_groups(run / "posterior.nc") for run in runs]
+    for name, group in groups[0].items():
+        same = groups[1][name]
+        assert all(np.array_equal(group.arrays[k], same.arrays[k]) for k in group.arrays)
+        texts = [{k: TIMES.sub("", str(v)) for k, v in g.attrs.items()} for g in (group, same)]
+        differ = {k for k in texts[0] if texts[0][k] != texts[1][k]}
+        assert differ <= {"wall_s"}, name
+    maps = [str(run / "maps.fits") for run in runs]
+    diff = FITSDiff(*maps, ignore_keywords=["CHECKSUM"], ignore_comments=["DATASUM"])
+    assert diff.identical, diff.report()
+
+
+def test_inspect_describes_the_fit_of_a_run(finished):
+    text = good("inspect", finished.path / "fit.nc").out
+    fit = load_fit(finished.path / "fit.nc")
+    assert "linear fit" in text and f"{fit.n_used} stars" in text
+    assert all(name in text for name in fit.model.names)

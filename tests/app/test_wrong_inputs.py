@@ -29,6 +29,23 @@ def sound() -> Table:
     return Table({"x": np.clip(x + dx, 0.5, 1000.5), "y": y + dy, "ra": ra, "dec": dec})
 
 
+@pytest.mark.parametrize("frames", ["none", "shift", "affine"])
+@pytest.mark.parametrize(
+    "plane",
+    [lambda u: (0 * u, 0 * u), lambda u: (u, u), lambda u: (u, -2 * u), lambda u: (0 * u, u)],
+)
+def test_positions_in_one_point_or_on_a_line(tmp_path, frames, plane):
+    rng = np.random.default_rng(2)
+    x, y = rng.uniform(1, 1000, 200), rng.uniform(1, 800, 200)
+    u, v = plane(x + 0.3 * y)
+    exposure = np.array(["a", "b"])[np.arange(200) % 2]
+    table = Table({"x": x, "y": y, "u": u, "v": v, "exposure": exposure})
+    data = {"matches": "stars.ecsv", "unit": "pix", "sigma": 0.05}
+    model = {"order": 2, "reference_pixel": (500.5, 400.5), "frames": frames}
+    result = cli("check", write_job(tmp_path, table, data=data, model=model))
+    assert result.code == 1 and "of chip 1 lie on a line or in one point" in result.err, result.err
+
+
 def change(**columns):
     """Function that replaces columns of a table by functions of the table."""
 

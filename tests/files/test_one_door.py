@@ -37,7 +37,6 @@ OPENERS = {
 ALLOWED = {
     ("app/run.py", "webbrowser.open"): "a report of our own, in a browser",
     ("app/screen.py", "os.open"): "nothing, in place of a stream that is closed",
-    ("app/store/lock.py", "os.open"): "a file to be locked",
     ("report/drawing.py", "Image.open"): "a picture in memory, of our own",
 }
 NAMES = set[str]().union(*OPENERS.values())

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import bz2
 import gzip
+import lzma
 import os
+import re
 import shutil
 from pathlib import Path
 
@@ -103,10 +106,30 @@ def utf16(content):
     return content.decode("utf-8", "replace").encode("utf-16")
 
 
-@changes("bomb", KNOWABLE)
-def compressed(content):
-    """gzip under a name that does not say so."""
-    return gzip.compress(content)
+CODECS = {"gzip": gzip.compress, "bzip2": bz2.compress, "xz": lzma.compress}
+
+
+@changes(
+    "bomb", KNOWABLE,
+    arguments=lambda c: st.fixed_dictionaries({"codec": st.sampled_from(sorted(CODECS))}),
+)  # fmt: skip
+def compressed(content, codec="gzip"):
+    """Another codec under a name that does not say so."""
+    return CODECS[codec](content)
+
+
+@changes(
+    "bomb", KNOWABLE, "text",
+    arguments=lambda c: st.just(
+        {"address": "file:///dev/zero"} if b"<VOTABLE" in c else {"address": ""}
+    ),
+)  # fmt: skip
+def elsewhere(content, address):
+    """Data of a VOTable at an address, which would be read for ever."""
+    if not address:
+        return content
+    stream = f'<DATA><BINARY><STREAM href="{address}"/></BINARY></DATA>'.encode()
+    return re.sub(rb"<DATA>.*</DATA>", stream, content, flags=re.DOTALL)
 
 
 _bombs: dict[int, bytes] = {}

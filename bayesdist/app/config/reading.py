@@ -22,6 +22,7 @@ from bayesdist.assess import Requirement
 from bayesdist.errors import ConfigError, InputError
 from bayesdist.files.documents import toml_of
 from bayesdist.files.regular import MOST_TEXT, read_text
+from bayesdist.utils.text import refuse_control_characters
 
 # by the section that says of which kind a configuration is
 KINDS: dict[str, type[RunConfig]] = {
@@ -134,7 +135,11 @@ def _settings(text: str, where: str, *, begin: str) -> dict[str, Any]:
         raw = toml_of(text.removeprefix("\ufeff"), where)
     if not raw:
         raise ConfigError("holds no settings", where=where, do=begin)
-    for key, value in _numbers(raw, ""):
+    for key, value in _leaves(raw, ""):
+        if isinstance(value, str):
+            with _as_config_errors():
+                refuse_control_characters([value], f"{where}: {key}")
+            continue
         large = MOST_WHOLE if isinstance(value, int) else MOST
         if abs(value) > large or 0 < abs(value) < LEAST:
             said = str(value) if len(str(value)) < 30 else f"{str(value)[:20]}..."
@@ -146,15 +151,15 @@ def _settings(text: str, where: str, *, begin: str) -> dict[str, Any]:
     return raw
 
 
-def _numbers(tree: Any, key: str) -> Iterator[tuple[str, int | float]]:
-    """Numbers of a tree that are finite, with their keys."""
+def _leaves(tree: Any, key: str) -> Iterator[tuple[str, int | float | str]]:
+    """Texts of a tree and numbers that are finite, with their keys."""
     if isinstance(tree, dict):
         for name, inner in tree.items():
-            yield from _numbers(inner, f"{key}.{name}" if key else name)
+            yield from _leaves(inner, f"{key}.{name}" if key else name)
     elif isinstance(tree, list):
         for k, inner in enumerate(tree, 1):
-            yield from _numbers(inner, f"{key}[{k}]")
-    elif isinstance(tree, int) or (isinstance(tree, float) and math.isfinite(tree)):
+            yield from _leaves(inner, f"{key}[{k}]")
+    elif isinstance(tree, int | str) or (isinstance(tree, float) and math.isfinite(tree)):
         yield key, tree
 
 

@@ -111,6 +111,12 @@ class RunConfig(Section):
         """This configuration with polynomials of another order."""
         return self.model_copy(update={"model": self.model.model_copy(update={"order": order})})
 
+    def holding_at_most(self, memory_mb: float) -> Self:
+        """The same configuration with at most so many megabytes of stars in memory."""
+        most = min(memory_mb, self.compute.memory_mb)
+        compute = self.compute.model_copy(update={"memory_mb": most})
+        return self.model_copy(update={"compute": compute})
+
     def chips(self) -> tuple[Chip, ...]:
         """Chips of the model; empty for a detector of one chip."""
         return chips_of(self.chip)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from typing import Annotated, Literal, Self, TypeVar
 
@@ -76,7 +77,7 @@ def detector_faults(
 
 def same_names(block: str, names: Sequence[object], key: str = "name") -> Iterator[str]:
     """Blocks of one name, or of another key that each has to itself."""
-    twice = next((name for name in names if names.count(name) > 1), None)
+    twice = next((name for name, n in Counter(names).items() if n > 1), None)
     if twice is not None:
         yield f"two [[{block}]] blocks have the {key} {twice!r}; give each its own"
 

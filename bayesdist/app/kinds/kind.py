@@ -11,7 +11,7 @@ from typing import Any
 from bayesdist.app.config import Config
 from bayesdist.app.kinds.fit_data import StarReader
 from bayesdist.app.kinds.fitted import Fitted, load_fitted
-from bayesdist.app.kinds.matched import Matched
+from bayesdist.app.kinds.matched import Matched, Outline
 from bayesdist.app.kinds.matches.stars import (
     fit_stars,
     match_stars,
@@ -47,6 +47,9 @@ class Kind:
     refuse: Callable[[Any], None] = lambda inputs: None
     # of inputs: what `check` says of them; None where the fit says more
     lines: Callable[[Any], Iterator[str] | None] = lambda inputs: None
+    # of inputs: shape of the solution, from which files are made on trial before stars are matched;
+    # None where the fit serves for that
+    outline: Callable[[Any], Outline] | None = None
     begins_with: str = "match"  # its first stage: 'match', or 'fit' where stars are matched already
     rows: str = "stars"  # what a row of the data is, in words
     chooser: str = "least-squares fit"  # what leaves out rows that are far off, in words
@@ -60,7 +63,7 @@ def _campaign() -> Kind:
     """A campaign; like self-calibrations it is imported where there is one."""
     from bayesdist.app.kinds.campaign.fit import fit_campaign
     from bayesdist.app.kinds.campaign.input_validation import refuse_campaign
-    from bayesdist.app.kinds.campaign.inputs import read_campaign
+    from bayesdist.app.kinds.campaign.inputs import outline_of_campaign, read_campaign
     from bayesdist.app.kinds.campaign.matched import load_matched_campaign
     from bayesdist.app.kinds.campaign.matching import campaign_lines, match_lists
 
@@ -71,13 +74,14 @@ def _campaign() -> Kind:
         load_matched=load_matched_campaign,
         refuse=refuse_campaign,
         lines=campaign_lines,
+        outline=outline_of_campaign,
     )
 
 
 @cache
 def _selfcal() -> Kind:
     from bayesdist.app.kinds.selfcal.fit import fit_selfcal, load_selfcal, sample_detections
-    from bayesdist.app.kinds.selfcal.inputs import read_selfcal, refuse_selfcal
+    from bayesdist.app.kinds.selfcal.inputs import outline_of_selfcal, read_selfcal, refuse_selfcal
     from bayesdist.app.kinds.selfcal.matched import load_matched_selfcal
     from bayesdist.app.kinds.selfcal.matching import match_dithers, selfcal_lines
 
@@ -90,6 +94,7 @@ def _selfcal() -> Kind:
         load_fitted=load_selfcal,
         refuse=refuse_selfcal,
         lines=selfcal_lines,
+        outline=outline_of_selfcal,
         rows="detections",
         chooser="limits of residuals",
     )

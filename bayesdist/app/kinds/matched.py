@@ -23,11 +23,21 @@ from bayesdist.errors import InputError
 from bayesdist.infer import Posterior
 from bayesdist.infer.catalogue.star_errors import StarErrors
 from bayesdist.infer.solution.solution import Solution
-from bayesdist.model import LookupTable
+from bayesdist.model import DistortionModel, LookupTable
 from bayesdist.utils.arrays import Float
 from bayesdist.utils.limits import HELD_OUT
 
 MATCHING = "matching.ecsv"
+
+
+@dataclass(frozen=True)
+class Outline:
+    """What is known of a solution before stars are matched."""
+
+    model: DistortionModel  # without frames of exposures
+    pixel: float  # size of a pixel in the unit of u and v
+    filter: str = ""
+    tables: tuple[LookupTable, ...] = ()  # at the nodes that the run's own will have
 
 
 @dataclass(frozen=True, eq=False)

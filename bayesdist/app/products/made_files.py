@@ -5,25 +5,30 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
+
+import numpy as np
 
 from bayesdist.app.assessment.error_terms import assessment_epoch
 from bayesdist.app.config import Config
 from bayesdist.app.config.products import ReleaseBlock
 from bayesdist.app.kinds.fit_data import FitData
 from bayesdist.app.kinds.fitted import Fitted
+from bayesdist.app.kinds.matched import Outline
 from bayesdist.assess.budget.budget import TOTAL
 from bayesdist.assess.model import with_diagnosed_errors
 from bayesdist.assess.terms.correlated import DEVIATIONS, STRUCTURE, STRUCTURE_IN_FIT
 from bayesdist.assess.terms.forms import PRODUCT
 from bayesdist.assess.terms.parameters import ABERRATION, CATALOGUE, MOTIONS
 from bayesdist.assess.terms.solution import COEFFICIENTS, EXPOSURE_FRAME, TIME_DEPENDENCE
-from bayesdist.calibration.calibration import Calibration, calibration_of
+from bayesdist.calibration.calibration import Calibration, GaussianSolution, calibration_of
 from bayesdist.calibration.further import FurtherError
 from bayesdist.calibration.orientation import lay_on
 from bayesdist.calibration.plane import ARCSEC, Plane
 from bayesdist.diagnose.diagnostics import Diagnostics
 from bayesdist.infer import Posterior
+from bayesdist.infer.selfcal.start import fitted_polynomials, undistorted
 from bayesdist.infer.solution.solution import Solution
 from bayesdist.infer.solution.transforms import reference_gauge, without_frames
 from bayesdist.model import LookupTable
@@ -36,6 +41,9 @@ IN_COVARIANCE = (
     *(COEFFICIENTS, TIME_DEPENDENCE, EXPOSURE_FRAME, STRUCTURE_IN_FIT, DEVIATIONS),
     *(CATALOGUE, MOTIONS, ABERRATION),
 )
+
+
+REHEARSED_SIGMA = 1e-3  # pixels, of each coefficient: files state their errors
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,7 +103,7 @@ def with_facts_of_run(
 
 def product_input(solution: Solution, data: FitData, config: Config, source: str) -> ProductInput:
     """Ingredients of the files of a solution; they say that it is from `source`, or a detector."""
-    fitted, model, detector = data.fitted, data.model, config.detector
+    fitted, model = data.fitted, data.model
     plane, point = Plane(), data.matched.tangent_point
     if point is not None:
         note = ""
@@ -104,18 +112,60 @@ def product_input(solution: Solution, data: FitData, config: Config, source: str
             first = model.exposures[0]
             note = f"On the sky it is exposure {first}: others have frames of their own."
         plane = Plane("sky", point=point, note=note)
-    found = calibration_of(
-        solution,
-        source or detector.name or "solution",
-        plane=plane,
-        detector=detector.name,
-        filter=data.matched.filter,
-    )
+    epoch, tables = assessment_epoch(data, config), fitted.tables.tables
+    found = _input_of(solution, config, source, plane, data.matched.filter, epoch, tables)
     notes = (fitted.gauge_words,) if fitted.gauge_words else ()
+    calibration = replace(found.calibration, notes=notes)
+    return replace(found, calibration=calibration, aligned=fitted.scatter is not None)
+
+
+def _input_of(
+    solution: Solution,
+    config: Config,
+    source: str,
+    plane: Plane,
+    filter: str,
+    epoch: float | None,
+    tables: tuple[LookupTable, ...],
+) -> ProductInput:
+    detector = config.detector
+    name = source or detector.name or "solution"
+    found = calibration_of(solution, name, plane=plane, detector=detector.name, filter=filter)
     scale = None if detector.scale_mas is None else detector.scale_mas / 1000
-    options = BuildOptions(assessment_epoch(data, config), scale, fitted.tables.tables)
-    joint = fitted.scatter is not None
-    return ProductInput(solution, replace(found, notes=notes), options, joint)
+    return ProductInput(solution, found, BuildOptions(epoch, scale, tables))
+
+
+def rehearse_files(product: ProductInput, config: Config) -> None:
+    """Make the files that the configuration asks for, with the names of its error terms.
+
+    Nothing is written; whatever a format cannot hold is refused.
+    """
+    rows = tuple(
+        FurtherError(block.name, block.kind, 0.0, 0.0, block.source) for block in config.budget
+    )
+    made_files(replace(product, calibration=replace(product.calibration, further=rows)), config)
+
+
+def rehearse_outline(outline: Outline, config: Config, base: Path, source: str) -> None:
+    """Make all files of a run from a solution of undistorted chips, before stars are matched."""
+    model, time = outline.model, outline.model.time
+    chips = fitted_polynomials(undistorted(model.chips, outline.pixel), model.chips, model.order)
+    mean = np.zeros(model.n_params)
+    for chip, coefficients in zip(model.chips, chips, strict=True):
+        for axis in (0, 1):
+            mean[model.coefficient_slice(chip.number, axis)] = coefficients[axis]
+    small = (REHEARSED_SIGMA * outline.pixel) ** 2
+    solution = GaussianSolution(model, mean, small * np.eye(model.n_params))
+    epoch = config.assess.epoch
+    if epoch is None and time is not None:
+        epoch = max((*time.epoch0, *config.products.useafter_years()))
+    filter, tables = outline.filter, outline.tables
+    rehearse_files(_input_of(solution, config, source, Plane(), filter, epoch, tables), config)
+    release = config.products.release
+    if release is not None:
+        number = config.chips()[0].number
+        with TemporaryDirectory() as nowhere:
+            write_files(release, number, base, Path(nowhere), {filter: solution}, tables)
 
 
 def solution_of(posterior: Posterior, found: Diagnostics | None, fitted: Fitted) -> Posterior:

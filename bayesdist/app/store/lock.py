@@ -15,6 +15,7 @@ from typing import Any
 
 from bayesdist.errors import InputError
 from bayesdist.files.atomic import made_folder
+from bayesdist.files.regular import descriptor_for_writing
 
 # some systems know no such locks
 fcntl: Any = import_module("fcntl") if find_spec("fcntl") else None
@@ -55,7 +56,7 @@ def _acquired(path: Path) -> int:
     """Descriptor of the locked file."""
     while True:
         try:
-            held = os.open(path, os.O_RDWR | os.O_CREAT, 0o666)
+            held = descriptor_for_writing(path)
         except OSError as error:
             raise InputError(
                 f"the folder cannot be written into ({error.strerror})",
@@ -83,7 +84,7 @@ def _acquired(path: Path) -> int:
 def _is_at(held: int, path: Path) -> bool:
     """Boolean: an open file still has its name."""
     with suppress(FileNotFoundError):
-        return os.path.samestat(os.fstat(held), path.stat())
+        return os.path.samestat(os.fstat(held), path.lstat())
     return False
 
 

@@ -272,6 +272,8 @@ class ArtefactStore:
             names = self._own(paths) - self._written
             if not names:  # as of run.json itself, which need not be read again then
                 return
+            for name in names:  # a folder of the run may be a link to one of other files
+                path_within(self.path, name, where=str(self.path), links=True)
             record = self.record
             if record.begins_files(names):
                 record.write(self.path / RECORD)

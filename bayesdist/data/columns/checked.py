@@ -23,6 +23,7 @@ from bayesdist.data.tables.repeated import first_duplicate
 from bayesdist.data.tables.units import check_unit, conversion, unit_of, without_unit
 from bayesdist.errors import InputError
 from bayesdist.utils.arrays import Float, Int
+from bayesdist.utils.text import refuse_control_characters
 
 POSITIONS = ("x", "y", "u", "v")
 SIGMAS = ("sigma_u", "sigma_v")
@@ -221,6 +222,8 @@ def _check(
     refuse_half(SIGMAS, columns, where=where, what="errors")
     refuse_half(_NOMINAL, columns, where=where, what="nominal positions")
     for name, names in labels.items():
+        if name != "source":  # names of files may be any
+            refuse_control_characters((n for n in names if isinstance(n, str)), where)
         if columns[name].min() < 0 or columns[name].max() >= len(names):
             label = {**LABELS_OF_CODES, "source": "sources"}[name]
             raise InputError(

@@ -13,9 +13,9 @@ from astropy.table import Table
 from bayesdist.data.formats.hst1pass import is_hst1pass, is_matchup
 from bayesdist.data.formats.record import SUFFIX
 from bayesdist.errors import FormatError, InputError
-from bayesdist.files.regular import read_lines
 from bayesdist.files.tables import TABLE_SUFFIXES, is_binary, is_fits, read_table
 from bayesdist.files.text_tables import is_text_table
+from bayesdist.files.unpacked import read_lines, without_codec
 from bayesdist.mission import load_object, missions
 
 PathLike = str | os.PathLike[str]
@@ -103,7 +103,7 @@ def kind_of(file: Path, columns: Mapping[str, str] | None) -> str:
         for own, one in mission_formats().items():
             if one.recognizes(file):
                 return own
-    name = file.name.lower().removesuffix(".gz")
+    name = without_codec(file.name)
     if name.endswith(tuple(TABLE_SUFFIXES)):
         if columns is None and name.endswith((".fits", ".fit")):
             corr = set(CORR_COLUMNS.values()) <= set(read_table(file).colnames)

@@ -18,8 +18,9 @@ from bayesdist.data.catalog import ReferenceCatalog
 from bayesdist.data.detections import Detections
 from bayesdist.data.matches import Matches
 from bayesdist.errors import FormatError
-from bayesdist.files.regular import read_lines
+from bayesdist.files.unpacked import read_lines
 from bayesdist.utils.arrays import Float, Int
+from bayesdist.utils.text import number_of
 
 _COLUMN = re.compile(r"#\s*\((\d+)\)\s+(\S+)\s+--\s")
 _KEYWORD = re.compile(r"#\s*(\w+)\s*:\s*(.*?)\s*$")
@@ -247,7 +248,7 @@ def read_hst1pass(path: str | Path) -> Hst1passList:
 
 def _float(text: str | None) -> float | None:
     try:
-        value = float(text or "")
+        value = number_of(text or "")
     except ValueError:
         return None
     return value if np.isfinite(value) else None
@@ -266,6 +267,8 @@ def _numbers(path: Path, lines: list[str], n_columns: int, kept: Sequence[int]) 
         try:
             if len(fields) < n_columns:
                 raise ValueError(f"has {len(fields)} of {n_columns} columns")
+            if "_" in line or not line.isascii():  # which Python takes for parts of numbers
+                raise ValueError(f"{line.strip()[:40]!r} holds other characters than numbers do")
             out[k] = [fields[m].removeprefix("K") for m in kept]
         except ValueError as error:
             raise FormatError(str(error), where=f"{path}, row {k + 1}", do=_DAMAGED) from None

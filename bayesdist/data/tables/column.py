@@ -19,6 +19,7 @@ from bayesdist.data.tables.units import conversion, unit_of
 from bayesdist.errors import InputError
 from bayesdist.utils.arrays import Float, Int
 from bayesdist.utils.quantities import YEARS
+from bayesdist.utils.text import number_of, refuse_control_characters
 
 log = logging.getLogger("bayesdist")
 
@@ -116,7 +117,7 @@ class SourceColumn:
         if values.dtype.kind in "iuf":
             out = values.astype(np.float64)
         elif values.dtype.kind in "SUO":
-            out = self._parsed(values, float, "a number").astype(np.float64)
+            out = self._parsed(values, number_of, "a number").astype(np.float64)
         else:
             raise InputError(
                 f"holds values of type {values.dtype}, not numbers",
@@ -221,6 +222,7 @@ class SourceColumn:
         else:
             codes, found = encoded(values)
         names = [_text(v) for v in found]
+        refuse_control_characters(names, self.where)
         again, unique = encoded(np.array(names))  # 'a' and 'a ' are one name
         return again[codes], unique
 
@@ -292,7 +294,7 @@ class SourceColumn:
     def _year(self, text: str) -> float:
         """Decimal year of a date, or of a number that stands among dates."""
         if _all_numbers([text]):
-            number = Column([float(text)], unit=getattr(self.values, "unit", None))
+            number = Column([number_of(text)], unit=getattr(self.values, "unit", None))
             return float(replace(self, values=number)._numeric_years()[0])
         return float(Time(text, scale="tt").decimalyear)
 
@@ -309,7 +311,7 @@ def _text(value: Any) -> str:
 def _all_numbers(texts: Iterable[Any]) -> bool:
     try:
         for text in texts:
-            float(text)
+            number_of(text)
     except (ValueError, TypeError):
         return False
     return True

@@ -18,6 +18,7 @@ import numpy as np
 from bayesdist.data.tables.checks import Place
 from bayesdist.data.tables.column import EncodedColumn
 from bayesdist.errors import InputError
+from bayesdist.files.budget import Budget
 from bayesdist.files.faults import naming_faults
 from bayesdist.files.parquet import (
     numpy_array,
@@ -25,6 +26,8 @@ from bayesdist.files.parquet import (
     parquet_column,
     parquet_header,
     parquet_units,
+    refuse_long_text,
+    text_columns,
 )
 from bayesdist.utils.arrays import Int
 
@@ -117,7 +120,7 @@ class ParquetPart:
         stop = self.n_rows if stop is None else stop
         batches: list[pyarrow.RecordBatch] = []
         held = 0
-        for batch in self._batches(columns, encoded, start, stop):
+        for batch in self._batches(columns, start, stop):
             while len(batch):
                 head = batch.slice(0, size - held)
                 batch = batch.slice(len(head))
@@ -134,7 +137,7 @@ class ParquetPart:
             raise self._changed()
 
     def _batches(
-        self, columns: Sequence[str], encoded: Collection[str], start: int, stop: int
+        self, columns: Sequence[str], start: int, stop: int
     ) -> Iterator[pyarrow.RecordBatch]:
         """Rows as they are decoded."""
         import pyarrow
@@ -143,7 +146,9 @@ class ParquetPart:
             return
         groups = list(range(self._group_of(start), self._group_of(stop - 1) + 1))
         at = int(self._edges[groups[0]])
-        with _opened(self.path, self.name, self.texts & set(encoded)) as stored:
+        # a text that is stored once may stand in all rows: it is decoded once, too
+        with _opened(self.path, self.name, self.texts) as stored:
+            budget = Budget(self.name, self.path.stat().st_size)
             if _group_rows(stored) != self.group_rows or _names(stored) != self.colnames:
                 raise self._changed()
             # only next() is guarded: exceptions of the consumer are not the file's fault
@@ -156,6 +161,8 @@ class ParquetPart:
                 if batch is None:
                     break
                 end = at + len(batch)
+                for column in batch.columns:
+                    refuse_long_text(column, budget)
                 if end > start:
                     yield batch.slice(max(0, start - at), min(end, stop) - max(start, at))
                 at = end
@@ -193,24 +200,15 @@ class ParquetPart:
 
 def describe_part(path: Path) -> ParquetPart:
     """Description of a Parquet file from its footer; one that is missing or damaged is refused."""
-    import pyarrow
-
     with _opened(path, str(path)) as stored, naming_faults(path):
         schema = stored.schema_arrow
-        is_text = (
-            pyarrow.types.is_string,
-            pyarrow.types.is_large_string,
-            pyarrow.types.is_binary,
-            pyarrow.types.is_large_binary,
-            pyarrow.types.is_dictionary,
-        )
         return ParquetPart(
             path.absolute(),
             str(path),
             _group_rows(stored),
             _names(stored),
             parquet_units(schema),
-            frozenset(one.name for one in schema if any(kind(one.type) for kind in is_text)),
+            text_columns(schema),
             parquet_header(schema),
         )
 

@@ -11,6 +11,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.fft import fft2
 
 from bayesdist.diagnose.score.pattern import log_tail_of_walk
@@ -139,14 +140,15 @@ def _frequencies(curvature: float, extent: Float) -> Bool:
 def _candidates(chip: _Chip, curvature: float, allowed: Bool) -> Iterator[_Rings]:
     """Rings with the largest sums of one curvature."""
     phase = np.exp(-1j * curvature * (chip.x**2).sum(axis=0))
-    power = np.zeros(allowed.shape)
+    power = np.zeros(allowed.shape, np.float32)
     for score in chip.score:
         transformed = fft2(_binned(chip.cell, score * phase), allowed.shape)
         power += (transformed.real**2 + transformed.imag**2) / (score**2).sum()
     power[~allowed] = 0.0
     n = CANDIDATES if int(chip.star.max()) + 1 < len(chip.star) else 1
     y, x = _centres(curvature, chip.extent)
-    for k in np.argpartition(power.ravel(), -n)[-n:]:
+    largest = [power.argmax()] if n == 1 else np.argpartition(power.ravel(), -n)[-n:]
+    for k in largest:
         j, i = np.unravel_index(k, power.shape)
         centre = np.array([x[0, i], y[j, 0]])
         wave = phase * np.exp(2j * curvature * (centre @ chip.x))
@@ -173,10 +175,11 @@ def _even_length(steps: Complex) -> float:
     return float(np.sqrt(square))
 
 
-def _binned(cell: Int, values: Complex) -> Complex:
+def _binned(cell: Int, values: Complex) -> NDArray[np.complex64]:
     """Sums (BINS, BINS) of values (N,) in cells."""
-    real, imaginary = (np.bincount(cell, part, BINS**2) for part in (values.real, values.imag))
-    return np.asarray((real + 1j * imaginary).reshape(BINS, BINS))
+    sums = np.empty(BINS**2, np.complex64)  # candidates alone: their sums are computed again
+    sums.real, sums.imag = (np.bincount(cell, part, BINS**2) for part in (values.real, values.imag))
+    return sums.reshape(BINS, BINS)
 
 
 def _by_star(star: Int, values: Complex) -> Complex:

@@ -14,6 +14,7 @@ from bayesdist.utils.arrays import Float
 
 RELINEARISED = 1e-7  # pixels: where the Gauss-Newton iteration over the frames stops
 STALLED = 1e-4  # formal errors: steps below this that do not shrink are rounding
+FLAT = 1e-12  # determinant of a linear map over its largest element squared
 TURNS = 50  # most iterations
 
 
@@ -30,7 +31,22 @@ def starting_point(first: NormalEquations, model: DistortionModel, priors: Gauss
     theta[:n] = np.linalg.lstsq(
         (matrix.border + prior.border)[:n, :n], (right + priors.pull(theta))[:n], rcond=1e-13
     )[0]
+    for chip in model.chips:
+        basis = model.basis(chip.number)
+        rows = basis.monomial_matrix[[basis.terms.index(term) for term in ((1, 0), (0, 1))]]
+        linear = [rows @ theta[model.coefficient_slice(chip.number, axis)] for axis in (0, 1)]
+        _refuse_flat(np.stack(linear), chip.number)
     return theta
+
+
+def _refuse_flat(linear: Float, chip: int) -> None:
+    """Refuse (DegenerateError) a linear map (2, 2) of a chip onto a line or a point of u, v."""
+    if abs(np.linalg.det(linear)) <= FLAT * np.abs(linear).max() ** 2:
+        raise DegenerateError(
+            f"the positions u, v of chip {chip} lie on a line or in one point",
+            where="u, v",
+            do="check which columns have the reference positions, and that they are filled in",
+        )
 
 
 def _start_frames(first: NormalEquations, theta: Float, model: DistortionModel) -> None:
@@ -56,6 +72,7 @@ def _start_frames(first: NormalEquations, theta: Float, model: DistortionModel) 
             for g in np.flatnonzero(groups.exposure == e):
                 w = of_chip.get(int(groups.chip[g]))
                 if w is not None and np.isfinite(affine[g]).all():
+                    _refuse_flat(w[:, 1:], model.chips[groups.chip[g]].number)
                     M = affine[g][:, 1:] @ np.linalg.inv(w[:, 1:])
                     d = affine[g][:, 0] - o - M @ (w[:, 0] - o)
                     frame = nearest_frame(model.frames, M, d)

@@ -59,6 +59,8 @@ except ModuleNotFoundError as error:
         do="pip install 'bayesdist[dask]'",
     ) from error
 
+log = logging.getLogger("bayesdist")
+
 CONNECT = 10.0  # seconds to find the scheduler
 PATIENCE = 60.0  # seconds without any worker after which none is expected any more
 POLL = 1.0  # seconds between two checks for workers
@@ -410,6 +412,12 @@ def _connected(compute: Compute) -> tuple[Any, LocalCluster | None]:
 
 def _places(client: Any) -> list[str]:
     """Addresses of the workers, each as often as it has threads, in turn."""
+    if not client.nthreads():
+        log.warning(
+            "cluster %s has no workers yet: waiting for %g seconds",
+            client.scheduler.address,
+            PATIENCE,
+        )
     try:
         client.wait_for_workers(1, timeout=PATIENCE)
     except TimeoutError as error:
@@ -417,6 +425,12 @@ def _places(client: Any) -> list[str]:
             f"has no workers after {PATIENCE:g} seconds",
             where=f"cluster {client.scheduler.address}",
             do="start workers",
+        ) from error
+    except OSError as error:
+        raise InputError(
+            "the connection to the scheduler is lost",
+            where=f"cluster {client.scheduler.address}",
+            do="start it and the run again",
         ) from error
     threads = sorted(client.nthreads().items())
     most = max(n for _, n in threads)

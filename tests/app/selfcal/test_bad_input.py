@@ -147,6 +147,8 @@ def test_a_single_exposure(truth, tmp_path):
         ({"data": {"matches": "stars.ecsv"}}, ["[data]", "[selfcal]", "give one"]),
         ({"prior": [{"parameter": "u_9_9", "mean": 0.0, "sigma": 1.0}]}, ["'u_9_9'"]),
         ({"products": {"idctab": SBC}, "detector": {"size": SIZE}}, ["scale"]),
+        ({"products": {"siaf": {}}}, ["products.siaf", "aperture"]),
+        ({"detector": {"size": SIZE, "name": "a\0b"}}, ["detector.name", "U+0000"]),
     ],
 )  # fmt: skip
 def test_a_configuration_that_cannot_be(truth, tmp_path, sections, words):

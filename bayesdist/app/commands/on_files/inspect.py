@@ -6,21 +6,48 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from bayesdist.app.screen import number, table_text
+from bayesdist.errors import FormatError
 
 if TYPE_CHECKING:
+    from bayesdist.infer import LinearFit
     from bayesdist.infer.posterior import Posterior
 
 
 def inspect(path: str | Path) -> str:
-    """Text on an IDCTAB, a D2IMFILE or NPOLFILE, a WCS in FITS, a posterior, or that of a run."""
+    """Text on a calibration file, a WCS in FITS, a fit, a posterior, or the posterior of a run."""
     path = Path(path)
     if path.is_dir() or path.suffix == ".nc":
-        from bayesdist.infer.posterior.files import load_posterior
+        from bayesdist.infer.posterior.files import load_fit, load_posterior
 
-        return _posterior_text(load_posterior(path))
+        try:
+            return _posterior_text(load_posterior(path))
+        except FormatError:
+            try:
+                return _fit_text(load_fit(path))
+            except FormatError:
+                pass
+            raise
     from bayesdist.products.registry import describe  # each reading loads what it needs alone
 
     return describe(path)
+
+
+def _fit_text(fit: LinearFit) -> str:
+    m = fit.model
+    rows = [
+        {"parameter": name, "mean": number(mean, 8), "formal sigma": number(sigma, 3), "unit": unit}
+        for name, mean, sigma, unit in zip(m.names, fit.mean, fit.sigma, m.units, strict=False)
+    ]
+    lines = [
+        "linear fit of a distortion, by which sampling starts",
+        f"model      order {m.order}, {len(m.chips)} chip(s), frames '{m.frames}', "
+        f"{len(m.exposures)} exposure(s), {m.n_params} parameters, u and v in {m.unit}",
+        f"fit        {fit.n_used} stars, {fit.n_rejected} rejected, rms {number(fit.rms_u)} and "
+        f"{number(fit.rms_v)} {fit.unit}, chi2/dof {number(fit.chi2 / max(fit.dof, 1))}",
+        "",
+        table_text(rows),
+    ]
+    return "\n".join(lines)
 
 
 def _posterior_text(p: Posterior) -> str:

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-from astropy.table import Table
+from astropy.table import MaskedColumn, Table
 from numpy.typing import NDArray
 
 from bayesdist.app.commands.on_files.calibrations import notes_of
@@ -19,6 +19,7 @@ from bayesdist.errors import InputError
 from bayesdist.files.atomic import atomic_path
 from bayesdist.files.tables import read_table
 from bayesdist.utils.arrays import Float
+from bayesdist.utils.text import ascii_of
 
 OUT = ("x_out", "y_out")
 _FORMATS = {".ecsv": "ascii.ecsv", ".csv": "ascii.csv", ".fits": "fits"}
@@ -64,11 +65,28 @@ def add_positions(table: Table, at: Positions, names: tuple[str, str], where: st
             table[name].unit = "pix"
 
 
+def fits_table(table: Table) -> Table:
+    """Table as FITS holds it: text in ASCII, and a header of short names without lists."""
+    out = table.copy(copy_data=False)
+    for name in table.colnames:
+        if out[name].dtype.kind == "U":
+            texts, codes = np.unique(np.ma.filled(out[name], ""), return_inverse=True)
+            mask, plain = getattr(out[name], "mask", None), np.array(list(map(ascii_of, texts)))
+            out[name] = plain[codes] if mask is None else MaskedColumn(plain[codes], mask=mask)
+    out.rename_columns(table.colnames, list(map(ascii_of, table.colnames)))
+    out.meta = {
+        ascii_of(key).upper()[:8]: ascii_of(value) if isinstance(value, str) else value
+        for key, value in table.meta.items()
+        if not isinstance(value, list)
+    }
+    return out
+
+
 def write_positions(table: Table, output: Path) -> None:
     """Write a table in the format of its extension, whole or not at all."""
     kind = _FORMATS[output.suffix.lower()]
-    if kind == "fits":  # whose header has short names and takes no lists
-        table.meta = {k.upper()[:8]: v for k, v in table.meta.items() if not isinstance(v, list)}
+    if kind == "fits":
+        table = fits_table(table)
     with atomic_path(output) as temporary:
         try:
             table.write(temporary, format=kind)

@@ -13,6 +13,7 @@ from bayesdist.app.calibrations import calibration_at, on_the_sky, refuse_unused
 from bayesdist.app.commands.on_files.position_table import (
     check_output,
     closing_lines,
+    fits_table,
     head_line,
     origin_line,
     read_positions,
@@ -99,10 +100,9 @@ def _lines(
 
 def _write_joint(table: Table, matrix: Float, output: Path) -> None:
     """Write a table, and the covariance of all its rows as an image."""
-    table.meta = {k.upper()[:8]: v for k, v in table.meta.items() if not isinstance(v, list)}
     image = fits.ImageHDU(matrix, name="COVARIANCE")
     image.header["BUNIT"] = "mas2"
     image.header.add_comment("rows: east and north of each star in turn, as in the table")
-    made = fits.HDUList([fits.PrimaryHDU(), fits.table_to_hdu(table), image])
+    made = fits.HDUList([fits.PrimaryHDU(), fits.table_to_hdu(fits_table(table)), image])
     with atomic_path(output) as temporary:
         made.writeto(temporary)

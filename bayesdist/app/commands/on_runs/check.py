@@ -29,6 +29,7 @@ IN_CIRCLE = 80.0  # times as much for a star that was matched in a circle about 
 EXPANSIONS = 40  # in the search for the proposal
 OVERHEAD_S = 6e-5  # of emcee and the proposal, for each walker and step
 FIXED_S = 1.0  # diagnostics and files
+MEMORY_MB = 256.0  # of stars: it passes over them a few times, and no more need stay in memory
 # stars and parameters up to which the run's own pilot is tried, in some ten seconds
 MOST_STARS, MOST_PARAMS = 200_000, 200
 
@@ -39,6 +40,7 @@ def check(path: str | Path) -> str:
     Whatever would stop the run is refused: bad input, or parameters that the data do not determine.
     """
     config, text = load_config(path)
+    config = config.holding_at_most(MEMORY_MB)
     with TemporaryDirectory() as nowhere:
         run = RunDirectory.plan(nowhere, config, text, Path(path).resolve().parent)
     with open_results(run) as results:

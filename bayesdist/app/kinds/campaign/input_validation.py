@@ -68,6 +68,10 @@ def input_warnings(inputs: Inputs) -> list[str]:
     out = []
     if inputs.unlogged:
         out.append(_unlogged(inputs.unlogged, log.source))
+    for key in ("exptime", "ra", "dec"):  # PA_V3 is examined with the matches
+        unknown = int(np.isnan(log.values(key)).sum())
+        if 0 < unknown < len(log):
+            out.append(f"{key} is missing of {unknown} of {len(log)} exposures in {log.source}")
     epochs = log.values("epoch")
     span = float(np.ptp(epochs))
     if catalog.pm_u is None and span > YEARS_AT_REST:

@@ -9,7 +9,8 @@ import numpy as np
 
 from bayesdist.app.config import CampaignConfig
 from bayesdist.app.config.campaign import CampaignBlock
-from bayesdist.app.kinds.matched import columns_by_code
+from bayesdist.app.kinds.campaign.reference import held_tables
+from bayesdist.app.kinds.matched import Outline, columns_by_code
 from bayesdist.app.kinds.star_lists import StarLists, lists_of
 from bayesdist.calibration.plane import ARCSEC
 from bayesdist.data import (
@@ -23,6 +24,7 @@ from bayesdist.data.sky.tangent import mean_direction, tangent_plane
 from bayesdist.errors import InputError
 from bayesdist.files.tables import read_table
 from bayesdist.infer.catalogue.star_errors import StarErrors
+from bayesdist.model import DistortionModel, LookupTable
 from bayesdist.products import IdcTab
 from bayesdist.products.formats.idctab.hst import parity_of
 
@@ -61,6 +63,22 @@ class Inputs:
     def filter(self) -> str:
         """The one filter of the exposures."""
         return self.log.filters[0]
+
+
+def outline_of_campaign(inputs: Inputs) -> Outline:
+    """Shape of the solution, with the look-up tables that are fitted and those that are held."""
+    config = inputs.config
+    chips, block = config.chips(), config.tables
+    tables = held_tables(block, chips, inputs.base)
+    if block.method != "none":
+        name = inputs.filter if tables else ""
+        for chip in chips:
+            nx, ny = np.maximum(np.floor_divide(chip.size, block.step), 2).astype(int)
+            values = np.zeros((2, ny, nx))
+            first = tuple((step + 1) / 2 for step in block.step)
+            tables += (LookupTable(chip.number, values, name, first, block.step, values),)
+    model = DistortionModel(config.model.order, chips, inputs.catalog.unit, config.time())
+    return Outline(model, inputs.pixel_arcsec / inputs.unit_arcsec, inputs.filter, tables)
 
 
 def read_campaign(config: CampaignConfig, base: Path) -> Inputs:

@@ -86,6 +86,7 @@ class CampaignMatched(Matched):
 
 def matched_campaign(pairs: Matches, inputs: Inputs, **more: Any) -> CampaignMatched:
     """Matches of a campaign, with what the configuration holds out set aside."""
+    pairs = pairs.named_below(str(inputs.base))
     parts = set_aside(inputs.config, pairs, GAUGE_EXPOSURES)
     return CampaignMatched(*parts, catalogue=inputs.catalog, inputs=inputs, pairs=pairs, **more)
 

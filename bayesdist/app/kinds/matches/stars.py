@@ -72,9 +72,13 @@ def match_stars(stars: Matches, config: MatchesConfig) -> Matched:
 
 
 def read_stars(config: MatchesConfig, base: Path) -> Matches:
-    """The matched stars that a configuration names."""
-    data = config.data
-    return read_configured(data.paths(base), data, size=config.detector.size, chips=config.chip)
+    """The matched stars that a configuration names, with the names of files as they are there.
+
+    So a run is the same in whatever folder it is made.
+    """
+    data, size = config.data, config.detector.size
+    stars = read_configured(data.paths(base), data, size=size, chips=config.chip)
+    return stars.named_below(str(base))
 
 
 def model_of(stars: Matches, config: Config) -> DistortionModel:

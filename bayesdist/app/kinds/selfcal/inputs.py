@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from bayesdist.app.config import SelfcalConfig
+from bayesdist.app.kinds.matched import Outline
 from bayesdist.app.kinds.selfcal.known import Commanded, GaugeConstraints, read_commanded
 from bayesdist.app.kinds.selfcal.start import started
 from bayesdist.app.kinds.star_lists import lists_of, refuse_other_chips
@@ -178,6 +179,13 @@ def refuse_selfcal(inputs: Inputs) -> None:
     """Refuse exposures that cannot be laid onto each other, and a start that cannot be read."""
     model, _ = inputs.start
     inputs.known_for(model)
+
+
+def outline_of_selfcal(inputs: Inputs) -> Outline:
+    """Shape of the solution, as its start has it."""
+    model, theta = inputs.start
+    plain = DistortionModel(model.order, model.chips, model.unit, model.time)
+    return Outline(plain, model.pixel_size(theta))
 
 
 def _unit_arcsec(config: SelfcalConfig) -> float | None:

@@ -21,6 +21,7 @@ from bayesdist.products.formats.common.content import Content
 from bayesdist.products.formats.common.document import Choice, required_size
 from bayesdist.products.formats.common.parameters import with_parameters
 from bayesdist.utils.arrays import Float
+from bayesdist.utils.text import number_of
 
 _REMARK = re.compile(r"#\s*bayesdist\s+(\w+)\s+(.*?)\s*$", re.MULTILINE)
 _BEGIN = re.compile(r"(#.*\n|\s*\n)*\s*Begin\s+\w+")
@@ -53,7 +54,7 @@ class AstFile:
         if key not in self.remarks:
             return None
         try:
-            a, b = (float(v) for v in self.remarks[key].split())
+            a, b = (number_of(v) for v in self.remarks[key].split())
         except ValueError:
             raise FormatError(
                 f"the remark {key} is {self.remarks[key]!r}", where=self.content.name,

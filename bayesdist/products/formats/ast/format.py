@@ -26,6 +26,7 @@ from bayesdist.products.formats.common.document import (
 )
 from bayesdist.products.formats.common.parameters import parameters_content
 from bayesdist.utils.arrays import Float
+from bayesdist.utils.text import ascii_of
 
 
 class Settings(FormatSettings):
@@ -52,7 +53,7 @@ def build(calibration: Calibration, settings: Settings, options: BuildOptions) -
         text = _text(one, settings, options.scale_arcsec, side)
         out += [
             Built(side, PARAMETERS, parameters_content(one), one, number),
-            Built(name, "AST", text.encode("ascii", "replace"), one, number),
+            Built(name, "AST", text.encode("ascii"), one, number),
         ]
     return tuple(out)
 
@@ -87,7 +88,7 @@ def _text(
         remarks["point"] = " ".join(repr(float(v)) for v in calibration.plane.point)
     lines = [
         "# Pixels, counted from 0, to degrees on the tangent plane, by bayesdist",
-        *(f"# {note}" for note in calibration.remarks),
+        *(f"# {ascii_of(note)}" for note in calibration.remarks),
         *(f"# bayesdist {key} {value}" for key, value in remarks.items()),
         " Begin CmpMap",
         "    Nin = 2",

@@ -16,6 +16,7 @@ import numpy as np
 from bayesdist.errors import FormatError, InputError
 from bayesdist.model.basis import MAX_ORDER
 from bayesdist.utils.arrays import Float
+from bayesdist.utils.text import number_of
 
 _BEGIN = re.compile(r"\s*Begin\s+(\w+)\s*(#.*)?$")
 _END = re.compile(r"\s*End\s+(\w+)\s*(#.*)?$")
@@ -36,7 +37,7 @@ class AstObject:
         if text is None and default is not None:
             return default
         try:
-            return float(str(text).strip('"'))
+            return number_of(str(text).strip('"'))
         except ValueError:
             what = "is missing" if text is None else f"is {text}, no number"
             raise FormatError(f"{name} of the {self.kind} {what}", do="write it again") from None

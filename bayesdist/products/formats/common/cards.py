@@ -13,8 +13,10 @@ from bayesdist.errors import FormatError
 from bayesdist.infer.solution.solution import Solution
 from bayesdist.model import LookupTable
 from bayesdist.utils.arrays import Float
+from bayesdist.utils.text import ascii_of
 
-_UNPRINTABLE = re.compile(r"[^ -~]")  # a header has printable ASCII alone
+LONGEST_KEYWORD = 8  # characters; longer ones are of ESO's convention HIERARCH
+_UNPRINTABLE = re.compile(r"[^ -~]")
 # Without one of these nothing ties pixels to a world.
 _NEEDED = re.compile(r"(CTYPE|CRVAL)\d+[A-Z]?$|A_ORDER$|(T?CTYP|TCTY|TCRVL|TCRV)\d+[A-Z]?$")
 
@@ -29,14 +31,14 @@ def number_card(keyword: str, value: float | int, comment: str = "") -> str:
     return f"{keyword:<8}= {number:>20}{' / ' + comment if comment else ''}"[:80].ljust(80)
 
 
-def printable(text: str) -> str:
-    """Text with ? for characters that no header has."""
-    return _UNPRINTABLE.sub("?", text)
+def ascii_card(card: str) -> str:
+    """Card that was read, as long as it was, with ? for characters that no header has."""
+    return _UNPRINTABLE.sub("?", card)
 
 
 def text_card(keyword: str, value: str, comment: str = "") -> str:
-    """Card of a string, or of a COMMENT or HISTORY, with ? for characters that no header has."""
-    value = printable(value)
+    """Card of a string, or of a COMMENT or HISTORY, in ASCII as `ascii_of` has it."""
+    value = ascii_of(value)
     if keyword in ("COMMENT", "HISTORY"):
         return f"{keyword:<8}{value}"[:80].ljust(80)
     return fits.Card(keyword, value, comment).image
@@ -121,6 +123,28 @@ def node_cards(table: LookupTable) -> list[str]:
             ("CDELT", table.step[axis], "[pixel] between nodes"),
         )
     ]
+
+
+def set_text(header: fits.Header, keyword: str, value: str, comment: str = "") -> None:
+    """Set a keyword to a string, in ASCII as `ascii_of` has it.
+
+    All text goes into headers by this function or `text_card`: astropy refuses other characters.
+    """
+    set_value(header, keyword, ascii_of(value), comment)
+
+
+def set_value(
+    header: fits.Header, keyword: str, value: str | float | bool, comment: str = ""
+) -> None:
+    """Set a keyword; a new one goes to the end of the header.
+
+    astropy itself puts it before the comments, in a time that grows with the number of cards.
+    """
+    if keyword in header:
+        header[keyword] = value, comment
+        return
+    name = keyword if len(keyword) <= LONGEST_KEYWORD else f"HIERARCH {keyword}"
+    header.append(fits.Card(name, value, comment), end=True)
 
 
 def append_cards(hdu: fits.hdu.base._BaseHDU, cards: Iterable[str]) -> None:

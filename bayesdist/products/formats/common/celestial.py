@@ -21,6 +21,7 @@ from bayesdist.calibration.inverse import detector_grid
 from bayesdist.data.sky.tangent import plane_axes, separation, sky_of_plane
 from bayesdist.errors import FormatError, InputError
 from bayesdist.files.faults import reason_of
+from bayesdist.model.basis import MAX_ORDER
 from bayesdist.products.formats.common.cards import card_images, header_of, keyword_of
 from bayesdist.utils.arrays import Float
 
@@ -31,6 +32,11 @@ TOLERANCE_MAS = 0.01  # largest distance between positions read here and those b
 _GRID = 17  # points of each axis at which these are compared
 # Look-up tables are passed on only where they are read; inverses do not change positions.
 _TABLES = re.compile(r"(D2IM\w*|CPDIS\d|CPERR\d|CQDIS\d|CQERR\d|DP\d|DQ\d)$")
+# Keywords with the square of which memory grows
+_LARGEST = {
+    **dict.fromkeys(("A_ORDER", "B_ORDER", "AP_ORDER", "BP_ORDER"), MAX_ORDER),
+    "WCSAXES": 99,  # as many as keywords such as CTYPEn can number with CDi_j (FITS 4.0, 8.2)
+}
 _INVERSE = re.compile(r"(AP|BP)_")
 _SAMPLE = (
     "sample it through astropy.wcs and fit a polynomial: `bayesdist convert FILE --sample --to sip`"
@@ -206,11 +212,30 @@ def _without(header: fits.Header, *patterns: re.Pattern[str]) -> fits.Header:
     )
 
 
+def refuse_oversized(header: fits.Header, where: str) -> None:
+    """Refuse orders and axes for which astropy.wcs makes room that no header needs.
+
+    It takes as much memory as the square of the number, and reads it from texts as well.
+    """
+    for keyword, most in _LARGEST.items():
+        try:
+            stated = float(str(header.get(keyword, 0)))
+        except (ValueError, fits.VerifyError):
+            continue  # which astropy.wcs refuses
+        if stated > most:
+            raise FormatError(
+                f"is {stated:g}, and at most {most} is read",
+                where=f"{where}, keyword {keyword}",
+                do="correct the keyword",
+            )
+
+
 def wcs_of(header: fits.Header, where: str, opened: fits.HDUList | None = None) -> WCS:
-    """World coordinates by astropy.wcs; InputError if it refuses the header."""
+    """World coordinates by astropy.wcs; InputError if the header is refused."""
     from astropy import log
     from astropy.wcs import WCS, SingularMatrixError  # slow to import
 
+    refuse_oversized(header, where)
     before = log.level
     log.setLevel("ERROR")  # astropy remarks on CTYPE without -SIP there
     try:

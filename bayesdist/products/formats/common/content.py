@@ -26,10 +26,18 @@ from numpy.typing import NDArray
 
 from bayesdist.errors import BayesdistError, FormatError
 from bayesdist.files.atomic import atomic_path
+from bayesdist.files.budget import Budget
 from bayesdist.files.faults import reason_of
-from bayesdist.files.fits import HDU_STARTS, RECORD, data_size, open_fits, padded
-from bayesdist.files.regular import read_bytes
-from bayesdist.files.unpacked import unpacked
+from bayesdist.files.fits import (
+    HDU_STARTS,
+    RECORD,
+    data_size,
+    open_fits,
+    padded,
+    refuse_long_arrays,
+    refuse_many_rows,
+)
+from bayesdist.files.unpacked import read_unpacked
 from bayesdist.products.formats.common.cards import card_images, header_of
 from bayesdist.utils.arrays import Float
 
@@ -76,7 +84,11 @@ class Hdu:
         if self.header.get("XTENSION", "").strip() != "BINTABLE":
             raise FormatError(f"HDU {self.name!r} is no binary table")
         try:
-            table = fits.BinTableHDU.fromstring(self.to_bytes()).data
+            hdu = fits.BinTableHDU.fromstring(self.to_bytes())
+            refuse_long_arrays(hdu, Budget(f"HDU {self.name!r}", len(self.data)))
+            table = hdu.data
+        except FormatError:
+            raise
         except Exception as error:  # astropy raises all kinds on cards that no file should have
             raise FormatError(
                 f"HDU {self.name!r} cannot be read ({reason_of(error)})",
@@ -106,6 +118,12 @@ class Content:
     name: str
     raw: bytes
     path: Path | None = None  # of a file; None in memory
+    size: int | None = None  # bytes of the file before decompression; None in memory
+
+    @property
+    def budget(self) -> Budget:
+        """What the file may hold."""
+        return Budget(self.name, len(self.raw) if self.size is None else self.size)
 
     def beside(self, name: str) -> Content | None:
         """Content of a file in the same folder; None in memory, or where there is none."""
@@ -130,9 +148,11 @@ class Content:
     def hdus(self) -> tuple[Hdu, ...]:
         """HDUs as far as they can be found, or one HDU of the cards of a text file."""
         if self.is_fits:
-            return tuple(_walked(self.raw))
+            return tuple(_walked(self.raw, self.budget))
         if not _CARD.match(self.text):
             return ()
+        budget = self.budget
+        budget.refuse_nodes(max(len(self.text) // 80, self.text.count("\n")), "header cards")
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # of other programs' cards
             sep = "\n" if "\n" in self.text.strip() else ""
@@ -178,7 +198,7 @@ class Content:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             try:
-                return open_fits(self.raw, self.name)
+                return open_fits(self.raw, self.budget)
             except (FormatError, OSError, ValueError, fits.VerifyError):
                 return None
 
@@ -201,12 +221,9 @@ def readable(where: str) -> Iterator[None]:
 
 
 def read_content(path: str | os.PathLike[str]) -> Content:
-    """Content of a file, decompressed where gzip has compressed it.
-
-    InputError when the file cannot be read, FormatError when it is a broken gzip file, or one that
-    grows beyond what is plausible.
-    """
-    return Content(str(path), unpacked(read_bytes(path), str(path)), Path(path))
+    """Content of a file, decompressed; errors as of `read_unpacked`."""
+    raw, budget = read_unpacked(path)
+    return Content(str(path), raw, Path(path), budget.size)
 
 
 def read_hdus(path: str | os.PathLike[str]) -> tuple[Hdu, ...]:
@@ -235,10 +252,12 @@ def write_hdus(hdus: Iterable[Hdu], path: str | os.PathLike[str]) -> None:
         temporary.write_bytes(raw)
 
 
-def _walked(raw: bytes) -> Iterable[Hdu]:
+def _walked(raw: bytes, budget: Budget) -> Iterable[Hdu]:
     """HDUs one after the other, with their data between them or not."""
-    number, at = 0, 0
+    number, at, clock = 0, 0, budget.clock()
     while raw[at : at + 9] in HDU_STARTS:
+        clock()
+        budget.refuse_parts(number + 1, "HDUs")
         cards, after, ended = list[str](), at, False
         while after < len(raw) and not ended:
             card = raw[after : after + 80].decode("latin-1")
@@ -246,8 +265,11 @@ def _walked(raw: bytes) -> Iterable[Hdu]:
             ended = card[:8].rstrip() == "END"
             if not ended:
                 cards.append(card.ljust(80))
+                budget.refuse_nodes(len(cards), "header cards")
         begin = at + padded(after - at)
-        size = data_size(header_of(cards))
+        header = header_of(cards)
+        size = data_size(header)
+        refuse_many_rows(header, budget)
         state, at = "whole", begin + padded(size or 0)
         if size is None or begin + size > len(raw):
             follows = raw[begin : begin + 9] == HDU_STARTS[1]

@@ -27,7 +27,7 @@ from bayesdist.calibration.inverse import detector_grid
 from bayesdist.calibration.plane import Plane
 from bayesdist.errors import FormatError
 from bayesdist.model import Chip, DistortionModel
-from bayesdist.products.formats.common.cards import named_in, printable
+from bayesdist.products.formats.common.cards import named_in, set_text, set_value
 from bayesdist.products.formats.common.content import Content, Hdu, fits_bytes
 
 EXTENSION = "BDPARAM"
@@ -63,11 +63,11 @@ def parameters_hdu(calibration: Calibration, epoch: float | None = None) -> fits
     ]
     hdu = fits.BinTableHDU.from_columns(columns, name=EXTENSION)
     header = hdu.header
-    header["BDUNIT"] = model.unit, "unit of u and v"
+    set_text(header, "BDUNIT", model.unit, "unit of u and v")
     header["BDORDER"] = model.order, "order of the polynomials"
-    header["BDERROR"] = calibration.errors, "covariance, sigma (no correlations) or none"
+    set_text(header, "BDERROR", calibration.errors, "covariance, sigma (no correlations) or none")
     header["BDNUMB"] = calibration.numbered, "are the chips numbered?"
-    header["BDPLANE"] = calibration.plane.kind, "plane of u and v"
+    set_text(header, "BDPLANE", calibration.plane.kind, "plane of u and v")
     if calibration.plane.point is not None:
         for k, value in enumerate(calibration.plane.point, start=1):
             header[f"BDTAN{k}"] = float(value), "[deg] sky position of u, v = 0"
@@ -77,17 +77,17 @@ def parameters_hdu(calibration: Calibration, epoch: float | None = None) -> fits
         header["BDSCALE"] = float(calibration.scale), "size of a corrected pixel"
     for keyword, text in (("DETECTOR", calibration.detector), ("FILTER", calibration.filter)):
         if text:
-            header[keyword] = printable(text)
+            set_text(header, keyword, text)
     for k, row in enumerate(calibration.further, start=1):
-        header[f"BDNAME{k}"] = printable(row.name)
-        header[f"BDKIND{k}"] = row.kind
-        header[f"BDSIGU{k}"] = row.u, "standard deviation of u"
-        header[f"BDSIGV{k}"] = row.v, "standard deviation of v"
-        header[f"BDFROM{k}"] = printable(row.source)
+        set_text(header, f"BDNAME{k}", row.name)
+        set_text(header, f"BDKIND{k}", row.kind)
+        set_value(header, f"BDSIGU{k}", row.u, "standard deviation of u")
+        set_value(header, f"BDSIGV{k}", row.v, "standard deviation of v")
+        set_text(header, f"BDFROM{k}", row.source)
         if row.correlation:
             # fractions of the variance, each with its length in pixels
             words = " ".join(f"{part:g}@{length:g}" for part, length in row.correlation)
-            header[f"BDCORR{k}"] = words
+            set_text(header, f"BDCORR{k}", words)
     header.add_comment("u = sum VALUE P_I(X) P_J(Y), P Legendre, X = (2 x - (NX + 1)) / NX")
     return hdu
 

@@ -48,6 +48,7 @@ from bayesdist.products.formats.siaf.table import (
     table_of,
 )
 from bayesdist.utils.arrays import Float
+from bayesdist.utils.text import ascii_of
 
 WHERE = "products.siaf"
 
@@ -155,8 +156,8 @@ def _lines(aperture: str, order: int, columns: Sequence[dict[tuple[int, int], fl
 
 
 def _joined(head: Sequence[str], lines: Sequence[str]) -> bytes:
-    plain = (f"# {line}" for text in head for line in text.splitlines())
-    return ("\n".join([*plain, "#", *lines]) + "\n").encode("ascii", "replace")
+    plain = (f"# {ascii_of(line)}" for text in head for line in text.splitlines())
+    return ("\n".join([*plain, "#", *lines]) + "\n").encode("ascii")
 
 
 def _covariance(poly: Monomials) -> dict[str, Any]:

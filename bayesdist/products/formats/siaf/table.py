@@ -31,6 +31,7 @@ from bayesdist.products.formats.common.document import Choice, MissingSizeError
 from bayesdist.products.formats.common.read_back import ReadBack
 from bayesdist.products.formats.common.record import calibration_from
 from bayesdist.utils.arrays import Float
+from bayesdist.utils.text import number_of
 
 NAMES = ("Sci2IdlX", "Sci2IdlY", "Idl2SciX", "Idl2SciY")
 COLUMNS = ("AperName", "siaf_index", "exponent_x", "exponent_y", *NAMES)
@@ -250,7 +251,7 @@ def _row(cells: Mapping[str, str], number: int, where: str) -> Row:
 
 def _number(text: str, where: str) -> float:
     try:
-        value = float(text)
+        value = number_of(text)
     except ValueError:
         value = np.nan
     if not np.isfinite(value):

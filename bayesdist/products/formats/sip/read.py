@@ -9,6 +9,7 @@ from astropy.io import fits
 
 from bayesdist.errors import FormatError, InputError
 from bayesdist.products.formats.common.cards import card_images
+from bayesdist.products.formats.common.celestial import refuse_oversized
 from bayesdist.products.formats.common.coefficients import sip_powers
 from bayesdist.products.formats.common.content import Content, read_content, readable
 from bayesdist.products.formats.sip.header import SipHeader
@@ -105,6 +106,7 @@ def parsed(header: fits.Header, where: str) -> SipHeader:
 
 
 def _parsed(header: fits.Header, where: str) -> SipHeader:
+    refuse_oversized(header, where)
     if "A_ORDER" not in header:
         raise FormatError(
             "there is no A_ORDER", where=where, do="give a header with SIP keywords, or its HDU"

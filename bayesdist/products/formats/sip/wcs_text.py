@@ -14,6 +14,7 @@ from astropy.wcs import WCS, FITSFixedWarning
 
 from bayesdist.files.fits import RECORD
 from bayesdist.products.formats.common.cards import holds_wcs
+from bayesdist.products.formats.common.celestial import refuse_oversized
 from bayesdist.products.formats.common.content import Content, Hdu
 from bayesdist.products.formats.common.document import Finding, finding_lines
 from bayesdist.products.formats.sip.lint import lint_sip
@@ -167,6 +168,7 @@ def _systems(file: Content, hdu: Hdu, text: HeaderText) -> list[WCS]:
 
 def _system(file: Content, header: fits.Header, key: str, text: HeaderText) -> WCS | None:
     where = f"WCS {key}".strip()
+    refuse_oversized(header, file.name)
     stated = [k for k in _TABLES if k in header]
     fobj = file.opened
     with warnings.catch_warnings(record=True) as caught:

@@ -9,10 +9,10 @@ from astropy.io import fits
 
 from bayesdist.files.atomic import atomic_path
 from bayesdist.products.formats.common.cards import (
+    ascii_card,
     header_of,
     keyword_of,
     number_card,
-    printable,
     text_card,
 )
 from bayesdist.products.formats.common.coefficients import sip_keyword, sip_powers
@@ -75,7 +75,7 @@ def write_sip(sip: SipHeader, path: str | os.PathLike[str]) -> None:
 
 def sip_text(sip: SipHeader) -> str:
     """Header as text, one card a line."""
-    return "\n".join(map(printable, _cards(sip))) + "\n"
+    return "\n".join(map(ascii_card, _cards(sip))) + "\n"
 
 
 def sip_header(sip: SipHeader) -> fits.Header:
@@ -83,7 +83,7 @@ def sip_header(sip: SipHeader) -> fits.Header:
 
     Returns the cards that were read, except where fields differ.
     """
-    return header_of(list(map(printable, _cards(sip))))
+    return header_of(list(map(ascii_card, _cards(sip))))
 
 
 def _cards(sip: SipHeader) -> list[str]:

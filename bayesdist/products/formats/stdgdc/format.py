@@ -18,6 +18,7 @@ from bayesdist.products.formats.common.cards import (
     append_cards,
     convergence_cards,
     number_card,
+    set_text,
     wrapped_cards,
 )
 from bayesdist.products.formats.common.content import fits_bytes
@@ -81,10 +82,9 @@ def build(calibration: Calibration, settings: Settings, options: BuildOptions) -
     header["BDCHIP"] = number, "chip number"
     if one.before or one.after:
         header["BDTABLES"] = True, "XGC and YGC hold look-up tables, too"
-    if calibration.detector:
-        header["DETECTOR"] = calibration.detector
-    if calibration.filter:
-        header["FILTER"] = calibration.filter
+    for keyword, text in (("DETECTOR", calibration.detector), ("FILTER", calibration.filter)):
+        if text:
+            set_text(header, keyword, text)
     stated = frame.keywords() | {"BDWORST": (worst, "[pix] of rounding and between nodes")}
     append_cards(primary, (number_card(keyword, *value) for keyword, value in stated.items()))
     append_cards(primary, wrapped_cards("COMMENT", calibration.remarks))

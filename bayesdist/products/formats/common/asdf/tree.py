@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from bayesdist.files.asdf import asdf_tree, asdf_with_transforms
+from bayesdist.model.basis import MAX_ORDER
 from bayesdist.products.formats.common.content import Content
 from bayesdist.products.formats.common.document import FormatSettings
 
@@ -61,7 +62,7 @@ def is_asdf(content: Content) -> bool:
 
 def tree_of(content: Content) -> Mapping[str, Any]:
     """Tree of an ASDF file, its arrays in memory; errors as of `asdf_tree`."""
-    return asdf_tree(content.raw, content.name)
+    return asdf_tree(content.raw, content.budget, max_order=MAX_ORDER)
 
 
 def packed(

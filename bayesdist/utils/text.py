@@ -1,0 +1,85 @@
+"""Names and other short texts: what they may hold, and how ASCII has them."""
+
+from __future__ import annotations
+
+import re
+import unicodedata
+from collections.abc import Iterable
+
+from bayesdist.errors import InputError
+
+_LETTER = re.compile(r"(LATIN|GREEK) (SMALL|CAPITAL) LETTER (\w+)( WITH .*)?")
+_NUMBER = re.compile(
+    r"[+-]?(([0-9]+\.?[0-9]*|\.[0-9]+)(e[+-]?[0-9]+)?|nan|inf|infinity)", re.IGNORECASE | re.ASCII
+)
+_PRINTABLE = re.compile(r"[ -~]*")
+# control characters and the separators of lines and paragraphs
+_CONTROLS = re.compile(r"[\x00-\x1f\x7f-\x9f\u2028\u2029\ud800-\udfff]")
+
+
+def ascii_of(text: str) -> str:
+    """Text in printable ASCII, as FITS headers have it.
+
+    Accents are dropped, Greek letters are spelled out, dashes become "-"; any other character,
+    control characters among them, becomes "?".
+
+    Parameters
+    ----------
+    text : str
+
+    Returns
+    -------
+    str
+
+    Examples
+    --------
+    >>> ascii_of("Détecteur, σ of Gaia")
+    'Detecteur, sigma of Gaia'
+    """
+    if _PRINTABLE.fullmatch(text):
+        return text
+    whole = unicodedata.normalize("NFKC", text)
+    return "".join(c if _PRINTABLE.fullmatch(c) else _substitute(c) for c in whole)
+
+
+def _substitute(character: str) -> str:
+    """Printable ASCII for one character."""
+    if unicodedata.category(character) == "Pd":
+        return "-"
+    if unicodedata.combining(character):
+        return ""
+    letter = _LETTER.fullmatch(unicodedata.name(character, ""))
+    if letter is None:
+        return "?"
+    script, case, name, _ = letter.groups()
+    if script == "LATIN":
+        name = name if len(name) <= 2 else "?"  # as AE; others have names, as ETH
+    return name.lower() if case == "SMALL" else name if script == "LATIN" else name.capitalize()
+
+
+def number_of(text: str) -> float:
+    """Number of a text in ASCII decimals, "nan", "inf" or "infinity"; blanks around it may be.
+
+    ValueError for any other text.  Python's `float` takes "1_00" and digits of other scripts for
+    100, and C takes "0x64" for it: no format of tables does.
+    """
+    plain = text.strip(" \t\r\n")
+    if _NUMBER.fullmatch(plain) is None:
+        raise ValueError(f"{text[:40]!r} is no number")
+    return float(plain)
+
+
+def refuse_control_characters(texts: Iterable[str], where: str) -> None:
+    """Refuse (InputError) a name with a control character, such as a line end, a tab or NUL.
+
+    Tables, headers and reports put a name on one line, and netCDF files end it at NUL.
+    """
+    for text in texts:
+        found = _CONTROLS.search(text)
+        if found is not None:
+            start = text if len(text) <= 40 else f"{text[:40]}..."
+            raise InputError(
+                f"{start!r} holds the control character U+{ord(found[0]):04X}",
+                where=where,
+                do="write it in letters, digits and blanks on one line",
+            )

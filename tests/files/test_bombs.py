@@ -1,0 +1,446 @@
+"""Small files that hold, or announce, more than any file may: of each container and codec."""
+
+from __future__ import annotations
+
+import bz2
+import gzip
+import io
+import lzma
+import zlib
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+from astropy.io import fits
+from astropy.table import Table
+
+from bayesdist.errors import FormatError
+from bayesdist.files.asdf import asdf_tree
+from bayesdist.files.budget import Budget, Limits
+from bayesdist.files.documents import refuse_multiplied_yaml
+from bayesdist.files.fits import open_fits
+from bayesdist.files.hdf5 import hdf5_arrays, netcdf_groups
+from bayesdist.files.tables import TABLE_SUFFIXES, read_table
+from bayesdist.files.unpacked import CODECS, read_unpacked, unpacked
+from bayesdist.products.formats.common.content import Content
+
+N = 2000
+SMALL = Limits(content=10_000, content_per_byte=2)
+COMPRESS = {"gzip": gzip.compress, "bzip2": bz2.compress, "xz": lzma.compress}
+WRITTEN_AS = {
+    ".ecsv": "ascii.ecsv", ".csv": "ascii.csv", ".tsv": "ascii.tab", ".fits": "fits",
+    ".fit": "fits", ".ldac": "fits", ".vot": "votable", ".xml": "votable", ".tbl": "ascii.ipac",
+    ".ipac": "ascii.ipac",
+}  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def written(tmp_path_factory) -> dict[str, bytes]:
+    """A table of equal rows, in each container."""
+    folder = tmp_path_factory.mktemp("bombs")
+    table = Table({name: np.full(N, 1.5) for name in ("x", "y", "u", "v")})
+    out = {}
+    for suffix, form in WRITTEN_AS.items():
+        path = folder / f"a{suffix}"
+        table.write(path, format=form)
+        out[suffix] = path.read_bytes()
+    return out
+
+
+def test_every_container_and_codec_has_a_bomb():
+    assert set(WRITTEN_AS) | {".parquet"} == set(TABLE_SUFFIXES)
+    assert set(COMPRESS) == {name for _, name, _ in CODECS}
+
+
+@pytest.mark.parametrize("codec", COMPRESS)
+@pytest.mark.parametrize("suffix", WRITTEN_AS)
+def test_tables_that_are_compressed(written, suffix, codec, tmp_path):
+    for name in (f"a{suffix}", f"b{suffix}.gz"):
+        path = tmp_path / name
+        path.write_bytes(COMPRESS[codec](written[suffix]))
+        assert np.array_equal(read_table(path)["x"], np.full(N, 1.5))
+        with pytest.raises(FormatError, match=f"compressed by {codec} .* holds more than 10 kB"):
+            read_table(path, SMALL)
+
+
+@pytest.mark.parametrize("codec", COMPRESS)
+def test_content_of_any_kind(codec, tmp_path):
+    path = tmp_path / "a"
+    path.write_bytes(COMPRESS[codec](bytes(100_000)))
+    assert read_unpacked(path)[0] == bytes(100_000)
+    with pytest.raises(FormatError, match="holds more than 10 kB"):
+        read_unpacked(path, SMALL)
+
+
+@pytest.mark.parametrize("codec", COMPRESS)
+def test_compressed_twice_in_other_ways_or_in_part(codec):
+    one = COMPRESS[codec](b"x,y\n1,2\n")
+    for outer in COMPRESS.values():
+        with pytest.raises(FormatError, match="is compressed twice"):
+            unpacked(outer(one), Budget("a", 100))
+    with pytest.raises(FormatError, match=f"is a broken {codec} file"):
+        unpacked(one[:-3], Budget("a", 100))
+    for start, name in ((b"PK\3\4", "zip"), (b"\x1f\x9d", "compress"), (b"(\xb5/\xfd", "zstd")):
+        with pytest.raises(FormatError, match=f"is compressed by {name}; decompress it first"):
+            unpacked(start + bytes(10), Budget("a", 100))
+
+
+@pytest.mark.parametrize("codec", ["none", "snappy", "gzip", "zstd", "brotli", "lz4"])
+def test_parquet_of_equal_numbers(codec, tmp_path):
+    path = tmp_path / "a.parquet"
+    pq.write_table(pa.table({"x": np.full(N, 1.5)}), path, compression=codec)
+    assert np.array_equal(read_table(path)["x"], np.full(N, 1.5))
+    with pytest.raises(FormatError, match="announces 16 kB in a file of"):
+        read_table(path, SMALL)
+
+
+@pytest.mark.parametrize("codec", [None, "gzip", "lzf"])
+def test_hdf5_of_equal_numbers(codec, tmp_path):
+    path = tmp_path / "a.h5"
+    with h5py.File(path, "w") as file:
+        file.create_dataset("x", data=np.full(N, 1.5), compression=codec, chunks=(100,))
+    assert np.array_equal(hdf5_arrays(path)[0]["x"], np.full(N, 1.5))
+    if codec is not None:
+        for read in (hdf5_arrays, netcdf_groups):
+            with pytest.raises(FormatError, match="announces 16 kB in a file of"):
+                read(path, limits=Limits(content=10_000, content_per_byte=0))
+
+
+@pytest.mark.parametrize("codec", ["zlib", "bzp2", "lz4"])
+def test_blocks_of_asdf(codec):
+    asdf = pytest.importorskip("asdf")
+    stream, values = io.BytesIO(), np.full(N, 1.5)
+    asdf.AsdfFile({"a": values, "b": values + 1}).write_to(stream, all_array_compression=codec)
+    raw = stream.getvalue()
+    tree = asdf_tree(raw, Budget("a.asdf", len(raw)), max_order=12)
+    assert np.array_equal(tree["a"], values)
+    assert np.array_equal(tree["b"], values + 1)
+    with pytest.raises(FormatError, match="announces 16 kB in a file of"):
+        asdf_tree(raw, Budget("a.asdf", len(raw), SMALL), max_order=12)
+    # a block that holds more than it announces
+    announced = (8 * N).to_bytes(8)
+    assert raw.count(announced) == 2
+    less = raw.replace(announced, (80).to_bytes(8))
+    for limits in (Limits(), SMALL):
+        with pytest.raises(FormatError, match=r"and holds others|announces \d"):
+            asdf_tree(less, Budget("a.asdf", len(raw), limits), max_order=12)
+
+
+def test_chunks_of_hdf5_that_hold_more_than_a_chunk(tmp_path):
+    """HDF5 decompresses a chunk to its end, whatever the size of its array."""
+    path = tmp_path / "a.h5"
+    for content, words in ((bytes(80), None), (bytes(10**8), "has a chunk of 80 bytes that holds")):
+        with h5py.File(path, "w") as file:
+            array = file.create_dataset("x", (10,), float, chunks=(10,), compression="gzip")
+            array.id.write_direct_chunk((0,), zlib.compress(content, 1))
+        if words is None:
+            assert not hdf5_arrays(path)[0]["x"].any()
+            continue
+        for read in (hdf5_arrays, netcdf_groups):
+            with pytest.raises(FormatError, match=words):
+                read(path)
+
+
+def test_arrays_of_hdf5_that_are_compressed_twice(tmp_path):
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        layout = h5py.h5p.create(h5py.h5p.DATASET_CREATE)
+        layout.set_chunk((10,))
+        layout.set_deflate(1)
+        layout.set_deflate(1)
+        space = h5py.h5s.create_simple((10,))
+        h5py.h5d.create(file.id, b"x", h5py.h5t.NATIVE_DOUBLE, space, layout)
+    with pytest.raises(FormatError, match="has an array whose compression is not read"):
+        hdf5_arrays(tmp_path / "a.h5")
+
+
+# -- text -----------------------------------------------------------------------------------------
+
+
+def test_long_lines_many_lines_many_cells_and_many_columns(tmp_path):
+    path, zipped = tmp_path / "a.csv", tmp_path / "b.csv.gz"
+    path.write_text("# " + 100 * "a" + "\nx,y\n" + 200 * "1,2\n")
+    assert len(read_table(path)) == 200
+    for limits, words in [
+        (Limits(line=50), "line 1: has 103 characters, and at most 50 are read"),
+        (Limits(rows=100, rows_per_byte=0), "holds 202 rows in a file of"),
+        (Limits(columns=1), "has more than 1 columns"),
+    ]:
+        with pytest.raises(FormatError, match=words):
+            read_table(path, limits)
+    zipped.write_bytes(gzip.compress(path.read_bytes()))
+    with pytest.raises(FormatError, match="holds 404 cells"):
+        read_table(zipped, Limits(cells=100, cells_per_byte=0))
+    with pytest.raises(FormatError, match="takes more than"):
+        read_table(zipped, Limits(seconds=0, seconds_per_byte=0))
+
+
+def test_long_comments_take_no_time(tmp_path):
+    """astropy's reader takes the square of their length."""
+    path = tmp_path / "a.csv"
+    path.write_text(20 * ("# " + 60_000 * "a" + "\n") + "x,y\n1,2\n")
+    assert len(read_table(path, Limits(seconds=1))) == 1
+
+
+# -- trees ----------------------------------------------------------------------------------------
+
+LAUGHS = "\n".join(
+    ["a0: &a0 [x, x, x, x, x]", *(f"a{k}: &a{k} [{','.join(5 * [f'*a{k - 1}'])}]" for k in (1, 2))]
+)
+
+
+@pytest.mark.parametrize(
+    ("text", "limits", "words"),
+    [
+        (LAUGHS, Limits(nodes=100), "has more than 100 nodes in its YAML, with aliases"),
+        ("a: &a [1, *a]", Limits(), "YAML that refers to itself"),
+        ("[" * 20 + "]" * 20, Limits(depth=10), "more than 10 brackets within each other"),
+        ("a: " + 200 * "x", Limits(header=100), "more than 100 characters in its header"),
+        ("a: [1", Limits(), "is not YAML that can be read"),
+        (LAUGHS, Limits(seconds=0, seconds_per_byte=0), "takes more than"),
+    ],
+)
+def test_trees_of_yaml(text, limits, words):
+    with pytest.raises(FormatError, match=words):
+        refuse_multiplied_yaml(text, Budget("a", len(text), limits))
+
+
+def test_aliases_of_a_plausible_size_pass():
+    refuse_multiplied_yaml("%ECSV 1.0\n---\n" + LAUGHS, Budget("a", 100))
+
+
+def test_aliases_in_every_header(tmp_path):
+    table, limits = Table({"x": [1.0, 2.0], "y": [3.0, 4.0]}), Limits(nodes=100)
+    ecsv, other, parquet = (tmp_path / n for n in ("a.ecsv", "b.tbl", "a.parquet"))
+    table.write(ecsv)
+    lines = ecsv.read_text().splitlines()
+    meta = ["# meta:", *(f"#   {line}" for line in LAUGHS.splitlines())]
+    at = next(k for k, line in enumerate(lines) if line.startswith("# schema"))
+    for path in (ecsv, other):
+        path.write_text("\n".join([*lines[:at], *meta, *lines[at:]]) + "\n")
+    text = "\n".join(line[2:] for line in [*lines[2:at], *meta])
+    rows = pa.table({name: np.asarray(table[name]) for name in table.colnames})
+    pq.write_table(rows.replace_schema_metadata({"table_meta_yaml": text}), parquet)
+    for path in (ecsv, other, parquet):
+        assert len(read_table(path)) == 2
+        with pytest.raises(FormatError, match="with aliases"):
+            read_table(path, limits)
+
+
+def test_aliases_in_asdf():
+    pytest.importorskip("asdf")
+    raw = b"#ASDF 1.0.0\n%YAML 1.1\n--- !<tag:stsci.edu:asdf/core/asdf-1.1.0>\n"
+    raw += LAUGHS.encode() + b"\n...\n"
+    assert set(asdf_tree(raw, Budget("a", len(raw)), max_order=12)) >= {"a0", "a1", "a2"}
+    with pytest.raises(FormatError, match="with aliases"):
+        asdf_tree(raw, Budget("a", len(raw), Limits(nodes=100)), max_order=12)
+
+
+ARRAY = "!<tag:stsci.edu:asdf/core/ndarray-1.1.0> {{source: {}, shape: {}, datatype: float64{}}}"
+
+
+@pytest.mark.parametrize(
+    ("node", "words"),
+    [
+        (ARRAY.format(0, "[100000, 100000]", ", strides: [0, 0]"), r"holds 1e\+10 cells"),
+        (ARRAY.format("file:///etc/passwd", "[10]", ""), "an array lies in another file"),
+        ("{$ref: 'http://127.0.0.1:9/a.asdf#/b'}", "refers to another file"),
+        (
+            "!<tag:stsci.edu:asdf/transform/polynomial-1.2.0> {coefficients: "
+            + ARRAY.format(0, "[14, 14]", "")
+            + "}",
+            "has a polynomial of order 13",
+        ),
+    ],
+)
+def test_what_asdf_would_fetch_or_make(node, words):
+    pytest.importorskip("asdf")
+    raw = b"#ASDF 1.0.0\n%YAML 1.1\n--- !<tag:stsci.edu:asdf/core/asdf-1.1.0>\na: "
+    raw += node.encode() + b"\n...\n"
+    with pytest.raises(FormatError, match=words):
+        asdf_tree(raw, Budget("a", len(raw)), max_order=12)
+
+
+def test_groups_that_are_linked_twice(tmp_path):
+    """There are 2^30 paths to one array."""
+    for depth, words in ((30, "announces"), (70, "has more than 64 groups within each other")):
+        path = tmp_path / f"{depth}.h5"
+        with h5py.File(path, "w") as file:
+            group = file.create_group("a")
+            for _ in range(depth):
+                inner = group.create_group("a")
+                group["b"] = inner
+                group = inner
+            group["x"] = np.zeros(10)
+        for read in (hdf5_arrays, netcdf_groups):
+            with pytest.raises(FormatError, match=words):
+                read(path)
+
+
+def test_groups_that_hold_themselves_and_many_links(tmp_path):
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        group = file.create_group("a")
+        group["b"] = group
+        group["x"] = np.arange(3)
+    assert list(netcdf_groups(tmp_path / "a.h5")["a"].arrays["x"]) == [0, 1, 2]
+    with pytest.raises(FormatError, match="has more than 2 groups and arrays"):
+        netcdf_groups(tmp_path / "a.h5", Limits(nodes=2))
+    with pytest.raises(FormatError, match="takes more than"):
+        netcdf_groups(tmp_path / "a.h5", Limits(seconds=0, seconds_per_byte=0))
+    with h5py.File(tmp_path / "b.h5", "w") as file:  # one chunk, which is read whole
+        file.create_dataset("x", (1,), "f4", chunks=(2**26,), maxshape=(None,))
+    with pytest.raises(FormatError, match="announces 268 MB"):
+        hdf5_arrays(tmp_path / "b.h5")
+
+
+# -- tables ---------------------------------------------------------------------------------------
+
+
+def test_one_long_text_in_all_rows(tmp_path):
+    path, n = tmp_path / "a.parquet", 1000
+    texts = pa.DictionaryArray.from_arrays(pa.array(np.zeros(n, np.int32)), pa.array([9000 * "x"]))
+    pq.write_table(pa.table({"x": np.arange(n), "name": texts}), path)
+    with pytest.raises(FormatError, match="announces 36 MB in a file of"):
+        read_table(path)
+    assert len(read_table(path, Limits(content=2**27))) == n
+
+
+def test_rows_columns_and_lists_of_parquet(tmp_path):
+    path = tmp_path / "a.parquet"
+    lists = pa.array([[0] * 1000] * 10)
+    pq.write_table(pa.table({"x": np.zeros(10), "y": lists}), path)
+    for limits, words in [
+        (Limits(rows=5, rows_per_byte=0), "announces 10 rows"),
+        (Limits(columns=1), "has more than 1 columns"),
+        (Limits(cells=5000, cells_per_byte=0), r"holds 1e\+04 cells"),
+        (Limits(seconds=0, seconds_per_byte=0), "takes more than"),
+    ]:
+        with pytest.raises(FormatError, match=words):
+            read_table(path, limits)
+
+
+def _fits(*hdus) -> bytes:
+    stream = io.BytesIO()
+    fits.HDUList([fits.PrimaryHDU(), *hdus]).writeto(stream)
+    return stream.getvalue()
+
+
+def test_parts_and_cards_of_fits():
+    many = _fits(*(fits.ImageHDU() for _ in range(5)))
+    cards = fits.ImageHDU(header=fits.Header([(f"A{k}", k) for k in range(50)]))
+    for raw, limits, words in [
+        (many, Limits(parts=3), "has more than 3 HDUs"),
+        (_fits(cards), Limits(nodes=40), "has more than 40 header cards"),
+        (many, Limits(seconds=0, seconds_per_byte=0), "takes more than"),
+    ]:
+        budget = Budget("a.fits", len(raw))
+        assert len(open_fits(raw, budget)) > 1
+        with pytest.raises(FormatError, match=words):
+            open_fits(raw, Budget("a.fits", len(raw), limits))
+
+
+def test_compressed_images_are_not_decompressed(tmp_path):
+    raw = _fits(
+        fits.CompImageHDU(np.zeros((100, 100))),
+        fits.BinTableHDU.from_columns([fits.Column("x", "D", array=[1.0])]),
+    )
+    assert type(open_fits(raw, Budget("a.fits", len(raw)))[1]) is fits.BinTableHDU
+    (tmp_path / "a.fits").write_bytes(raw)
+    assert read_table(tmp_path / "a.fits").colnames == ["x"]
+
+
+def test_rows_of_fits_without_bytes(tmp_path):
+    raw = _fits(fits.BinTableHDU.from_columns([fits.Column("x", "D", array=[1.0, 2.0])]))
+    for keyword, old, new in [
+        ("NAXIS1  ", "8", "0"), ("NAXIS2  ", "2", "9000000000"), ("TFORM1  ", "'D ", "'0D")
+    ]:  # fmt: skip
+        before, after = (f"{keyword}= {text:>{20 if old.isdigit() else 0}}" for text in (old, new))
+        assert before.encode() in raw
+        raw = raw.replace(before.encode(), after.encode())
+    (tmp_path / "a.fits").write_bytes(raw)
+    with pytest.raises(FormatError, match="announces 9000000000 rows"):
+        read_table(tmp_path / "a.fits")
+
+
+def test_arrays_of_fits_that_share_one_place(tmp_path):
+    """Each of 1000 rows states the same array of 1000 numbers."""
+    arrays = np.empty(1000, object)
+    arrays[:] = [np.arange(1000.0) if k == 0 else np.zeros(0) for k in range(1000)]
+    hdu = fits.BinTableHDU.from_columns([fits.Column("x", "PD()", array=arrays)])
+    raw = bytearray(_fits(hdu))
+    first = raw.index((1000).to_bytes(4) + bytes(4), 5760)
+    for k in range(1000):
+        raw[first + 8 * k : first + 8 * k + 8] = raw[first : first + 8]
+    (tmp_path / "a.fits").write_bytes(raw)
+    with pytest.raises(FormatError, match="announces 8 MB"):
+        read_table(tmp_path / "a.fits", Limits(content=10**6))
+    # read as a product, whose budget is not given
+    assert len(Content("a.fits", bytes(raw)).hdus[1].rows) == 1000
+    for k in range(1000):
+        raw[first + 8 * k : first + 8 * k + 4] = (25_000).to_bytes(4)
+    with pytest.raises(FormatError, match="announces 200 MB"):
+        Content("a.fits", bytes(raw)).hdus[1].rows  # noqa: B018
+
+
+# -- VOTables -------------------------------------------------------------------------------------
+
+
+def _votable(path: Path, *, binary: bool = False) -> str:
+    table = Table({"x": np.arange(50.0), "y": np.arange(50.0)})
+    table.write(path, format="votable", overwrite=True,
+                tabledata_format="binary" if binary else "tabledata")  # fmt: skip
+    return path.read_text()
+
+
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-16", "iso-8859-1"])
+@pytest.mark.parametrize("codec", [None, *COMPRESS])
+def test_a_votable_in_any_encoding_and_codec(encoding, codec, tmp_path):
+    path = tmp_path / "a.vot"
+    text = _votable(path).replace("utf-8", encoding, 1)
+    begins = text.index("<DATA>")
+    away = '<DATA><BINARY><STREAM href="{}"/></BINARY></DATA></TABLE></RESOURCE></VOTABLE>'
+    for changed, words in [
+        (text, None),
+        (text[:begins] + away.format("file:///etc/passwd"), "its data lie elsewhere"),
+        (text[:begins] + away.format("http&#58;//127.0.0.1:9/a"), "its data lie elsewhere"),
+        (text.replace("?>", '?><!DOCTYPE a [<!ENTITY b "c">]>', 1), "has a document type"),
+        (text.replace("?>", '?><!DOCTYPE a SYSTEM "file:///dev/zero">', 1), "has a document type"),
+        (text.replace("<TABLE", '<TABLE nrows="&#57;000000000"', 1), "announces 9000000000 rows"),
+        (text.replace("<TABLE", '<TABLE nrows="9e9"', 1), "announces 9e9 rows"),
+        (text.replace('datatype="double"', 'datatype="double" arraysize="99999"', 1), "announces"),
+    ]:
+        raw = changed.encode(encoding)
+        path.write_bytes(raw if codec is None else COMPRESS[codec](raw))
+        if words is None:
+            assert list(read_table(path)["x"]) == list(range(50))
+            continue
+        with pytest.raises(FormatError, match=words):
+            read_table(path)
+
+
+def test_sizes_of_a_votable(tmp_path):
+    path, none = tmp_path / "a.vot", {"rows_per_byte": 0, "cells_per_byte": 0}
+    for binary in (False, True):
+        _votable(path, binary=binary)
+        assert len(read_table(path)) == 50
+        for limits, words in [
+            (Limits(rows=40, **none), r"holds \d+ rows"),
+            (Limits(cells=80, **none), "cells in a file of"),
+            (Limits(columns=1), "has more than 1 columns"),
+            (Limits(depth=2), "has more than 2 elements within each other"),
+            (Limits(nodes=3), "has more than 3 elements"),
+            (Limits(seconds=0, seconds_per_byte=0), "takes more than"),
+        ]:
+            with pytest.raises(FormatError, match=words):
+                read_table(path, limits)
+
+
+def test_binary_rows_of_no_bytes(tmp_path):
+    """Reading them would never end."""
+    path = tmp_path / "a.vot"
+    text = _votable(path, binary=True)
+    path.write_text(text.replace('datatype="double"', 'datatype="double" arraysize="0"'))
+    with pytest.raises(FormatError, match="has rows of no bytes"):
+        read_table(path)
