@@ -6,6 +6,9 @@ import os
 import sysconfig
 
 import bayesdist
+from bayesdist import formats
+from bayesdist.missions import wise
+from sphinx.ext.autosummary import Autosummary
 
 project = "bayesdist"
 author = "The bayesdist developers"
@@ -36,7 +39,9 @@ nb_execution_in_temp = True
 nb_execution_raise_on_error = True
 nb_execution_timeout = 600  # seconds for one cell, on a machine with much else to do
 nb_merge_streams = True
-os.environ["PATH"] = os.pathsep.join([sysconfig.get_path("scripts"), os.environ.get("PATH", "")])
+os.environ["PATH"] = os.pathsep.join(
+    [sysconfig.get_path("scripts"), os.environ.get("PATH", "")]
+)
 
 myst_enable_extensions = ["dollarmath", "amsmath"]
 myst_heading_anchors = 3
@@ -57,3 +62,28 @@ html_theme_options = {
     "footer_start": ["copyright"],
     "footer_end": [],
 }
+
+
+class TypedNames(Autosummary):
+    """Summary of names as scripts have them, each with a link to its page."""
+
+    def get_items(self, names):
+        """Names as they are shown, signatures, summaries, and names that are linked to."""
+        return [
+            (typed(real), *others, real)
+            for _, *others, real in super().get_items(names)
+        ]
+
+
+def typed(full_name):
+    """Name as scripts have it: bd.sample for bayesdist.infer.sample."""
+    name = full_name.rpartition(".")[2]
+    packages = {"bd": bayesdist, "bd.formats": formats, "wise": wise}
+    return next(
+        (f"{k}.{name}" for k, v in packages.items() if name in v.__all__), full_name
+    )
+
+
+def setup(app):
+    """Add the directive `typed-names`."""
+    app.add_directive("typed-names", TypedNames)

@@ -144,7 +144,7 @@ def test_solutions_of_other_types(stars, kind):
         (lambda: bd.DistortionModel(2, (CHIP,), "m"), "unknown unit 'm'"),
         (lambda: bd.TimeDependence("ab", (2000.0,)), "term 'a'"),
         (lambda: bd.TimeDependence((("u", 1, 0),), ("x",)), "epoch0 is ('x',)"),
-        (lambda: bd.OutlierMixture("uniform", "2"), "'2' is no length"),
+        (lambda: bd.OutlierMixture("uniform", "2"), "'2' is not a length"),
         (lambda: bd.Rejection(-1), "clip_chi2 is -1"),
         (lambda: bd.Rejection("x"), "clip_chi2 is 'x'"),
         (lambda: bd.Requirement("a", "p95", 1, probability="high"), "probability is 'high'"),

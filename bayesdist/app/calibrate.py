@@ -391,7 +391,8 @@ def _budget(
 
 
 def _requirement_block(requirement: Requirement) -> Settings:
-    return {key: getattr(requirement, key) for key in RequirementBlock.model_fields}
+    block = {key: getattr(requirement, key) for key in RequirementBlock.model_fields}
+    return block | {"unit": requirement.unit or None}
 
 
 def _merged(configured: Settings, settings: Mapping[str, Any]) -> Settings:

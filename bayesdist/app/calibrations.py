@@ -6,6 +6,7 @@ import os
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 from pydantic import TypeAdapter
 
 from bayesdist.app.kinds.fitted import FIT_AGAIN, TABLES, read_tables
@@ -13,6 +14,7 @@ from bayesdist.app.products.made_files import with_facts_of_run
 from bayesdist.app.results import open_results
 from bayesdist.app.store.rundir import RunDirectory
 from bayesdist.app.store.summary import Summary
+from bayesdist.assess.comparison.compare import NOISE_SEED, Comparison, compare
 from bayesdist.calibration.calibration import Calibration, calibration_of
 from bayesdist.calibration.plane import ARCSEC, Plane
 from bayesdist.data.sky.tangent import sky_of_plane
@@ -21,7 +23,7 @@ from bayesdist.files.documents import read_json_as
 from bayesdist.infer import LinearFit, load_fit, load_posterior
 from bayesdist.infer.solution.solution import Solution
 from bayesdist.products import registry
-from bayesdist.products.formats.common.document import Choice
+from bayesdist.products.formats.common.document import Choice, MissingSizeError
 from bayesdist.utils.arrays import Float
 
 __all__ = ["read_calibration"]
@@ -104,6 +106,48 @@ def calibration_at(
             do="leave the size (--size on the command line) out",
         )
     return found
+
+
+def common_chips(a: Calibration, b: Calibration) -> list[tuple[int, int]]:
+    """Pairs of chips of two calibrations: by their numbers, or the single ones of both."""
+    if a.numbered == b.numbered:
+        common = sorted(set(a.numbers) & set(b.numbers))
+        if common:
+            return [(number, number) for number in common]
+    if len(a.numbers) == len(b.numbers) == 1:
+        return [(a.numbers[0], b.numbers[0])]
+    listed = " and ".join(
+        ", ".join(map(str, one.numbers)) if one.numbered else "none" for one in (a, b)
+    )
+    raise InputError(
+        f"their chips are {listed}",
+        where=f"{a.name}, {b.name}",
+        do="choose the chip by --chip, which a file without chip numbers takes for its own",
+    )
+
+
+def difference_from_previous(
+    calibration: Calibration, previous: Path, epoch: float | None
+) -> tuple[Comparison, ...]:
+    """Each chip of a calibration minus that of the release at `previous`.
+
+    Shift, rotation and scale are taken out. `epoch`: decimal years, of what depends on time. The
+    filter and the size that a file asks for are those of the calibration.
+    """
+    filter = calibration.filter or None if "filter" in asks_of(previous) else None
+    try:
+        released = calibration_at(previous, filter=filter)
+    except MissingSizeError:
+        size = calibration.model.chips[0].size
+        released = calibration_at(previous, filter=filter, size=size)
+    maps = [
+        one.by_chip(epoch if one.model.time is not None else None)
+        for one in (calibration, replace(released, name=str(previous)))
+    ]
+    rng = np.random.default_rng(NOISE_SEED)
+    return tuple(
+        compare(maps[0][n], maps[1][m], rng=rng) for n, m in common_chips(calibration, released)
+    )
 
 
 def asks_of(path: Path) -> tuple[str, ...]:

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 from bayesdist.app.assessment.error_terms import assessment_rng, errors_of_fit, rehearsal_settings
 from bayesdist.app.assessment.periods import check_pairs
+from bayesdist.app.calibrations import difference_from_previous
 from bayesdist.app.config import Config
 from bayesdist.app.kinds.fit_data import FitData
 from bayesdist.app.products.made_files import product_input, rehearse_files, rehearse_outline
@@ -44,7 +45,11 @@ def rehearse_solution(results: Results) -> None:
     """Refuse terms, requirements and files that could not be made of a fit; nothing is written."""
     data, config = results.data, results.config
     _rehearse_evaluation(data, config, REHEARSAL_DRAWS)
-    rehearse_files(product_input(data.fit, data, config, str(results.run.path)), config)
+    product = product_input(data.fit, data, config, str(results.run.path))
+    rehearse_files(product, config)
+    if config.products.previous is not None:
+        path = results.base / config.products.previous
+        difference_from_previous(product.calibration, path, product.options.epoch)
 
 
 def _check_residuals(data: FitData, config: Config) -> None:

@@ -10,12 +10,14 @@ from typing import Any
 
 import numpy as np
 
+from bayesdist.app.calibrations import difference_from_previous
 from bayesdist.app.config import Config
 from bayesdist.app.kinds.fitted import Fitted, required
 from bayesdist.app.results import Results
 from bayesdist.app.store import as_json
 from bayesdist.app.store.rundir import RunDirectory
 from bayesdist.assess.coefficients import coefficient_table
+from bayesdist.assess.comparison.compare import Comparison
 from bayesdist.assess.evaluation import Evaluation
 from bayesdist.assess.solution import chip_places
 from bayesdist.assess.vectors import diagram_vectors
@@ -100,6 +102,7 @@ def report_input(results: Results) -> ReportInput:
         posterior=posterior,
         chips=_chip_results(solution, found, evaluation, epoch),
         coefficients=coefficient_table(fit, solution),
+        previous=_difference_from_previous(results),
         budget=evaluation.budget,
         surface=evaluation.surface,
         margins=evaluation.margins,
@@ -120,10 +123,25 @@ def report_input(results: Results) -> ReportInput:
     )
 
 
+def _difference_from_previous(results: Results) -> tuple[Comparison, ...]:
+    """The run minus the release that it replaces, chip by chip; empty if none is named."""
+    previous = results.config.products.previous
+    if previous is None:
+        return ()
+    product = results.product
+    return difference_from_previous(
+        product.calibration, results.base / previous, product.options.epoch
+    )
+
+
+MOST_NAMED = 3  # chips by which a run is called
+
+
 def title_of(config: Config) -> str:
     """Mission, instrument, detector or chips, and filter, as far as they are given."""
-    given = config.detector
-    detector = given.name or " and ".join(chip.name for chip in config.chip)
+    given, names = config.detector, [chip.name for chip in config.chip if chip.name]
+    few = len(names) <= MOST_NAMED
+    detector = given.name or (" and ".join(names) if few else f"{names[0]} to {names[-1]}")
     band = given.filter or (config.campaign and config.campaign.filter)
     named = " ".join(part for part in (given.mission, given.instrument, detector) if part)
     return ", ".join(part for part in (named, band) if part)

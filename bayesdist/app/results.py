@@ -253,6 +253,7 @@ def errors_of(results: Results) -> DrawnErrors:
 
 def margins_of(results: Results, requirements: Sequence[Requirement]) -> tuple[Margin, ...]:
     """Margins of a run against requirements."""
+    requirements = results.config.within_field(requirements)
     given = results.errors, results.diagnostics, requirements, results.settings
     return judged(*given, assessment_rng(results.config), checks=results.checks)
 

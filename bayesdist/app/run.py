@@ -430,7 +430,7 @@ class Run:
         evaluation, fit, config = self.evaluation, self.fit, self.results.config
         convergence = self.posterior.convergence
         scale_mas = config.detector.scale_mas
-        largest = max(float(one.per_axis.max()) for one in evaluation.maps)
+        largest = max(float(np.nanmax(one.per_axis)) for one in evaluation.maps)
         exposures = len(self.results.data.placed.exposures)
         state = f"yes, R-hat {convergence.rhat_max:.3f}, ESS {convergence.ess_bulk_min:.0f}"
         facts = [

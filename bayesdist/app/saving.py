@@ -8,6 +8,8 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from bayesdist.app.assessment.diagnosing import holdout_summary, holdout_table
 from bayesdist.app.assessment.error_terms import idle_dates
 from bayesdist.app.assessment.periods import periods_summary, periods_table
@@ -63,7 +65,10 @@ def save_fit(results: Results) -> None:
         return
     if fitted.solved is not None:
         rehearse_solution(results)
-        warnings = fitted.solved.gauge.sentences
+        gauge = fitted.solved.gauge
+        for text in gauge.settled:
+            log.info("fit: %s", text)
+        warnings = gauge.unsettled
     else:
         warnings = fitted.facts["deviations"]["warnings"]
     for text in warnings:
@@ -169,7 +174,7 @@ def save_evaluation(results: Results) -> None:
         run.summarise(**line_sections(solution, config.chips()[0].number))
     for one in found.validity:
         log.info("evaluate: %s", one.sentence)
-    largest = max(float(one.per_axis.max()) for one in found.maps)
+    largest = max(float(np.nanmax(one.per_axis)) for one in found.maps)
     log.info(
         "evaluate: largest uncertainty per axis %.4g %s (1 sigma)", largest, results.fit.model.unit
     )

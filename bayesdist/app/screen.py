@@ -6,16 +6,24 @@ import logging
 import math
 import os
 import sys
+import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
+from io import FileIO, TextIOWrapper
 from numbers import Integral, Real
 from pathlib import Path
-from typing import Any, TextIO
+from typing import Any
 
 from bayesdist.errors import InputError
 from bayesdist.files.regular import descriptor_for_writing
 
 log = logging.getLogger("bayesdist")
+_UNITS_UNKNOWN_TO_ASTROPY = (
+    r".*did not parse as .*unit",
+    r".*has a unit but is kept as a ",  # Column of a QTable
+    r"The unit '.*' has been deprecated",
+    r".*could not be saved in native FITS format",
+)
 # they write tracebacks of lost connections above the sentence that says so; Dask sets their levels
 DASK_LOGS = ("distributed.client", "distributed.core", "distributed.comm.tcp", "distributed.utils")
 FORMAT = "%(asctime)s %(levelname)-7s %(message)s"
@@ -38,7 +46,13 @@ def open_streams() -> None:
 
 
 def start_logging(*, quiet: bool) -> None:
-    """Send the package's log to stderr, warnings alone where it is quiet."""
+    """Send the package's log to stderr, warnings alone where it is quiet.
+
+    What astropy says of units of columns that nobody uses stays out of the terminal: units that
+    matter are checked column by column.
+    """
+    for message in _UNITS_UNKNOWN_TO_ASTROPY:
+        warnings.filterwarnings("ignore", message=message)
     log.setLevel(logging.INFO)
     log.propagate = False
     for handler in list(log.handlers):
@@ -62,10 +76,10 @@ class _QuietHandler(logging.FileHandler):
     def handleError(self, record: logging.LogRecord) -> None:  # noqa: N802  logging's own name
         """Pass over it."""
 
-    def _open(self) -> TextIO:
-        """File to be appended to; a link that others may have laid there is not followed."""
-        held = descriptor_for_writing(self.baseFilename, os.O_APPEND)
-        return os.fdopen(held, self.mode, encoding=self.encoding)
+    def _open(self) -> TextIOWrapper:
+        """Open the log for appending; a symbolic link is not followed."""
+        descriptor = descriptor_for_writing(self.baseFilename, os.O_APPEND)
+        return TextIOWrapper(FileIO(descriptor, self.mode), encoding=self.encoding)
 
 
 @contextmanager

@@ -249,6 +249,7 @@ def check_requirements(
     stated = _stated_terms(catalogue, terms)
     settings = _settings(solution, diagnostics, stated, exposure, grid, epoch, n_draws, pixel_scale)
     scale = pixel_scale_of(solution, chip, settings.scale_mas)
+    requirements = [r.in_unit_of(solution.model.unit) for r in requirements]
     for r in requirements:
         convert(r.limit, r.unit, solution.model.unit, scale, where=r.where)
     errors = _error_model(solution, diagnostics, stated, settings, aligned=aligned, chip=chip)

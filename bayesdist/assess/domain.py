@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, TypeAlias
@@ -22,6 +22,8 @@ Region: TypeAlias = "str | tuple[tuple[float, float], ...]"
 WHOLE = "whole"
 QUADRANTS = ("lower left", "lower right", "upper left", "upper right")
 _INNER = re.compile(r"inner\s+(\d+(?:\.\d*)?)\s*%")
+_NUMBER = r"(-?\d+(?:\.\d*)?(?:e[+-]?\d+)?)"
+_CIRCLE = re.compile(rf"circle of radius {_NUMBER} about \({_NUMBER}, {_NUMBER}\)")
 
 
 @dataclass(frozen=True)
@@ -268,15 +270,23 @@ class EvaluationDomain:
         return hash(self._key)
 
 
-def check_region(region: Region | Sequence[Sequence[float]], where: str) -> Region:
+def check_region(
+    region: Region | Sequence[Sequence[float]] | Mapping[str, Any], where: str
+) -> Region:
     """A region as it is kept: in a form that can be compared.
 
     `region`: 'whole'; 'inner 80 %', the rectangle of so much of both sides around the middle of the
     chip; a quadrant: 'lower left', 'lower right', 'upper left', 'upper right'; or the corners of a
-    polygon in FITS 1-based pixels. `where`: for the message. InputError for anything else.
+    polygon in FITS 1-based pixels; or a mapping with centre [x, y] and radius of a circle, which
+    is kept as 'circle of radius 900 about (1024.5, 1024.5)'. `where`: for the message. InputError
+    for anything else.
     """
+    if isinstance(region, Mapping):
+        return _circle(region, where)
     if isinstance(region, str):
         text = " ".join(region.lower().split())
+        if _CIRCLE.fullmatch(text):
+            return text
         inner = _INNER.fullmatch(text)
         if text in (WHOLE, *QUADRANTS) or (inner and 0 < float(inner[1]) <= 100):
             return text
@@ -284,7 +294,7 @@ def check_region(region: Region | Sequence[Sequence[float]], where: str) -> Regi
             f"there is no region {region!r}",
             where=where,
             do=f"name 'whole', 'inner 80 %', {', '.join(map(repr, QUADRANTS))}, or give the "
-            "corners of a polygon, [[x, y], ...]",
+            "corners of a polygon, [[x, y], ...], or {centre = [x, y], radius = r}",
         )
     corners = tuple(tuple(float(value) for value in corner) for corner in region)
     if len(corners) < 3 or any(len(c) != 2 or not np.isfinite(c).all() for c in corners):
@@ -298,6 +308,21 @@ def check_region(region: Region | Sequence[Sequence[float]], where: str) -> Regi
     return tuple((x, y) for x, y in corners)
 
 
+def _circle(given: Mapping[str, Any], where: str) -> str:
+    """Words for a circle, from which `in_region` reads it."""
+    try:
+        (x, y), radius = (float(v) for v in given["centre"]), float(given["radius"])
+    except (KeyError, TypeError, ValueError):
+        x = y = radius = np.nan
+    if given.keys() != {"centre", "radius"} or not np.isfinite([x, y]).all() or not radius > 0:
+        raise InputError(
+            f"{dict(given)} is no circle",
+            where=where,
+            do="give {centre = [x, y], radius = r} in pixels",
+        )
+    return f"circle of radius {radius!r} about ({x!r}, {y!r})"
+
+
 def in_region(region: Region, size: tuple[float, float], x: Float, y: Float) -> Bool:
     """Boolean mask of the pixels in a region; its edge belongs to rectangles.
 
@@ -306,6 +331,10 @@ def in_region(region: Region, size: tuple[float, float], x: Float, y: Float) -> 
     """
     if not isinstance(region, str):
         return _in_polygon(np.array(region), x, y)
+    circle = _CIRCLE.fullmatch(region)
+    if circle:
+        radius, x0, y0 = map(float, circle.groups())
+        return np.asarray(np.hypot(x - x0, y - y0) <= radius)
     # from -1 to 1 between the centres of the outermost pixels
     X, Y = (2.0 * (a - 1.0) / (n - 1.0) - 1.0 for a, n in zip((x, y), size, strict=True))
     if region in QUADRANTS:
@@ -332,5 +361,9 @@ def region_words(region: Region) -> str:
     if region == WHOLE:
         return ""
     if isinstance(region, str):
+        circle = _CIRCLE.fullmatch(region)
+        if circle:
+            radius, x, y = map(float, circle.groups())
+            return f" over the circle of radius {radius:g} about ({x:g}, {y:g})"
         return f" over the {region}" + (" quadrant" if region in QUADRANTS else "")
     return f" over a polygon of {len(region)} corners"

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from bayesdist.assess.budget.budget import ErrorBudget, budget_of
 from bayesdist.assess.budget.surface import BudgetSurface, budget_surface
-from bayesdist.assess.domain import EvaluationDomain
+from bayesdist.assess.domain import WHOLE, EvaluationDomain, Region, in_region
 from bayesdist.assess.drawn import DrawnErrors
 from bayesdist.assess.maps.area import AreaMap, area_map
 from bayesdist.assess.maps.uncertainty import RELATIVE, UncertaintyMap, uncertainty_map, with_local
@@ -27,7 +28,7 @@ from bayesdist.errors import InputError, required
 from bayesdist.infer import LinearFit, Posterior, Solution
 from bayesdist.infer.equations.scaled import one_thread
 from bayesdist.model import Chip
-from bayesdist.model.grid import DEFAULT_GRID
+from bayesdist.model.grid import DEFAULT_GRID, mesh
 from bayesdist.utils.arrays import Float
 from bayesdist.utils.checks import Check, in_order, worst
 from bayesdist.utils.streams import restarted
@@ -62,6 +63,9 @@ class EvaluationSettings:
         Names of the errors that the user gives.
     dates : ndarray
         Of the matches, decimal years.
+    field : Region
+        Part of the detector that sees the sky, as `check_region` gives it, over which errors are
+        evaluated.
     """
 
     grid: tuple[int, int] = DEFAULT_GRID
@@ -72,12 +76,13 @@ class EvaluationSettings:
     single: bool = False
     contained: Sequence[tuple[str, float, float]] = ()
     given: tuple[str, ...] = ()
-    dates: Float = field(default_factory=lambda: np.zeros(0))
+    dates: Float = dataclasses.field(default_factory=lambda: np.zeros(0))
+    field: Region = WHOLE
 
     def domain(self, errors: ErrorModel) -> EvaluationDomain:
-        """The grid of all chips."""
+        """The grid of all chips, within the field."""
         model = errors.solution.solution.model
-        return EvaluationDomain.of_chips(model, self.grid, epoch=self.epoch)
+        return EvaluationDomain.of_chips(model, self.grid, epoch=self.epoch, region=self.field)
 
     def pixel_scale(self, errors: ErrorModel) -> float | None:
         """Size of a pixel in mas, as given or of the solution."""
@@ -178,13 +183,15 @@ def evaluate(
     chips, grid, epoch = solution.model.chips, settings.grid, settings.epoch
 
     def uncertainty(of: Solution, chip: Chip) -> UncertaintyMap:
-        return uncertainty_map(of, grid=grid, epoch=epoch, chip=chip.number)
+        found = uncertainty_map(of, grid=grid, epoch=epoch, chip=chip.number)
+        return _within_field(found, chip, settings)
 
     own = request_checks(errors, diagnostics, settings)
     every = in_order((*checks, *diagnostics.checks, *own))
     whole = drawn_errors(errors, diagnostics, settings, rng, files=files)
     surface = None
-    if _contradiction(diagnostics, settings) is None:
+    # a page knows averages over whole chips alone
+    if _contradiction(diagnostics, settings) is None and settings.field == WHOLE:
         years = _years(solution, diagnostics, epoch)
         surface = budget_surface(whole, grid, epoch=epoch, years=years)
     maps = [position_map(errors, solution, settings, chip) for chip in chips]
@@ -226,7 +233,8 @@ def position_map(
     UncertaintyMap
     """
     shared = uncertainty_map(solution, grid=settings.grid, epoch=settings.epoch, chip=chip.number)
-    return with_local(shared, errors.structure_sigma(_domain(solution, chip, settings)))
+    found = with_local(shared, errors.structure_sigma(_domain(solution, chip, settings)))
+    return _within_field(found, chip, settings)
 
 
 @one_thread
@@ -411,4 +419,20 @@ def _relative(
     found = uncertainty_map(
         gauge_free(solution, null), grid=settings.grid, epoch=settings.epoch, chip=chip.number
     )
-    return replace(with_local(found, local), kind=RELATIVE)
+    return _within_field(replace(with_local(found, local), kind=RELATIVE), chip, settings)
+
+
+def _within_field(
+    found: UncertaintyMap, chip: Chip, settings: EvaluationSettings
+) -> UncertaintyMap:
+    """Map with NaN at the positions of a chip that see no sky."""
+    if settings.field == WHOLE:
+        return found
+    inside = in_region(settings.field, chip.size, *mesh(found.x, found.y))
+    inside = inside.reshape(found.sigma_u.shape)
+    return replace(
+        found,
+        sigma_u=np.where(inside, found.sigma_u, np.nan),
+        sigma_v=np.where(inside, found.sigma_v, np.nan),
+        correlation=np.where(inside, found.correlation, np.nan),
+    )

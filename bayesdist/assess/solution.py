@@ -70,6 +70,45 @@ def place_of(
     return Place(model, group, None if epoch is None else float(epoch))
 
 
+@dataclass(frozen=True, eq=False)
+class ChipFrame:
+    """Position of a chip in the focal plane, along the pixel axes of the first chip."""
+
+    centre: Float  # (2,), of the chip, in pixels of the first chip
+    middle: Float  # (2,), the same point in the chip's own pixels
+    turn: Float  # (2, 2), takes offsets in the chip's own pixels to those of the first chip
+
+    def __call__(self, x: Float, y: Float) -> Float:
+        """Positions (2, N) in the focal plane of pixels of the chip."""
+        return self.centre[:, None] + self.turn @ (np.stack([x, y]) - self.middle[:, None])
+
+    def outline(self, size: tuple[float, float]) -> Float:
+        """Corners (4, 2) of a chip of that size."""
+        right, top = size[0] + 0.5, size[1] + 0.5
+        return self(np.array([0.5, right, right, 0.5]), np.array([0.5, 0.5, top, top])).T
+
+
+def chip_frames(solution: Solution, *, epoch: float | None = None) -> tuple[ChipFrame, ...]:
+    """Positions of all chips in the focal plane, in the order of the model's chips.
+
+    `epoch`: decimal years; needed by a model with time dependence. The solution is linear about the
+    centre of each chip, so that outlines show gaps and rotations but no distortion.
+    """
+    centres, gradients, middles = [], [], []
+    for chip in solution.model.chips:
+        place = place_of(solution.model, epoch=epoch, chip=chip.number)
+        polynomial = place.polynomial(solution.mean)
+        middle = (np.array(chip.size) + 1) / 2
+        centres.append(polynomial @ place.basis.evaluate(*middle[:, None])[0])
+        px, py = place.basis.gradient(*middle[:, None])
+        gradients.append(np.column_stack([polynomial @ px[0], polynomial @ py[0]]))
+        middles.append(middle)
+    turns = [np.linalg.lstsq(gradients[0], one, rcond=None)[0] for one in gradients]
+    offsets = np.transpose([one - centres[0] for one in centres])
+    at = middles[0] + np.linalg.lstsq(gradients[0], offsets, rcond=None)[0].T
+    return tuple(map(ChipFrame, at, middles, turns))
+
+
 def chip_places(solution: Solution, *, epoch: float | None = None) -> tuple[tuple[int, int], ...]:
     """Row and column of each chip in a drawing of the detector, along the axes of the first chip.
 
@@ -78,15 +117,7 @@ def chip_places(solution: Solution, *, epoch: float | None = None) -> tuple[tupl
     chips have the same place: where they overlap, all stand in one column.
     """
     chips = solution.model.chips
-    centres, gradients = [], []
-    for chip in chips:
-        place = place_of(solution.model, epoch=epoch, chip=chip.number)
-        polynomial = place.polynomial(solution.mean)
-        middle = (np.array(chip.size) + 1) / 2
-        centres.append(polynomial @ place.basis.evaluate(*middle[:, None])[0])
-        px, py = place.basis.gradient(*middle[:, None])
-        gradients.append(np.column_stack([polynomial @ px[0], polynomial @ py[0]]))
-    x, y = np.linalg.lstsq(gradients[0], np.transpose(centres), rcond=None)[0]
+    x, y = np.transpose([one.centre for one in chip_frames(solution, epoch=epoch)])
     half = np.array([c.size for c in chips]).min(axis=0) / 2
     places = tuple(zip(_ranks(-y, half[1]), _ranks(x, half[0]), strict=True))
     if len(set(places)) < len(places):

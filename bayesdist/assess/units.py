@@ -53,6 +53,21 @@ def convert(
     return value * (mas[from_unit] / mas[to_unit])
 
 
+def stated_unit(stated: str | None, unit: str, where: str) -> str:
+    """Unit of a number of the user: the stated one, or pixels if u and v are in pixels.
+
+    `unit`: of u and v; `where`: what the number is, for the message. InputError where none is
+    stated and u and v are angles: the number may be in either.
+    """
+    if not stated and unit != "pix":
+        raise InputError(
+            f"no unit is given, and u and v are in {unit}",
+            where=where,
+            do=f'state it, as unit = "{unit}" or unit = "pix"',
+        )
+    return stated or "pix"
+
+
 def require_scale(scale_mas: float) -> None:
     """Pass a pixel scale that is positive and finite."""
     if not (math.isfinite(scale_mas) and scale_mas > 0):

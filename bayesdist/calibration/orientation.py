@@ -17,7 +17,8 @@ import numpy as np
 
 from bayesdist.calibration.calibration import Calibration
 from bayesdist.calibration.further import scaled
-from bayesdist.calibration.plane import ARCSEC, Agreement, Orientation, Plane
+from bayesdist.calibration.inverse import detector_grid
+from bayesdist.calibration.plane import ARCSEC, Agreement, Orientation, Plane, arcsec_per
 from bayesdist.errors import DegenerateError, InputError
 from bayesdist.infer.solution.solution import DerivedSolution, Solution
 from bayesdist.model import DistortionModel, PolynomialBasis
@@ -25,6 +26,9 @@ from bayesdist.model.grid import DEFAULT_GRID, grid_pixels, mesh
 from bayesdist.model.similarity import turned, turned_model
 from bayesdist.utils.arrays import Complex, Float
 from bayesdist.utils.quantities import Random, generator_of
+
+# Pixels by which other projections may differ from TAN in a header whose u, v are on no sky.
+MAX_DEPARTURE = 0.1
 
 
 def lay_on(
@@ -315,6 +319,49 @@ def placed_at(
         calibration = in_arcsec(calibration, scale_arcsec)
     plane = Plane("sky", point=(float(crval[0]), float(crval[1])), note=calibration.plane.note)
     return replace(calibration, plane=plane, with_plane=None)
+
+
+def departure_from_tangent_plane(
+    calibration: Calibration, epoch: float | None, scale_arcsec: float | None
+) -> float:
+    """Pixels by which another projection of the sky may differ from TAN over the detector.
+
+    In a small field all projections about one point agree.  A distance r in radians differs between
+    a tangent plane and one that keeps angles (ARC) by r - atan r.  `scale_arcsec` is the size of a
+    pixel, for u and v in pixels.
+    """
+    unit, worst = arcsec_per(calibration.unit, scale_arcsec), 0.0
+    for one in calibration.at(epoch, origin="stated").values():
+        poly = one.monomials()
+        x, y = detector_grid(one.basis.size, 3)
+        offsets = np.stack([x, y]) - np.array(one.basis.reference_pixel)[:, None]
+        radians = np.radians(unit * np.hypot(*(poly.linear @ offsets)) / 3600.0)
+        pixel = np.sqrt(abs(np.linalg.det(poly.linear))) * unit
+        departure = np.degrees(radians - np.arctan(radians)).max() * 3600.0 / pixel
+        worst = max(worst, float(departure))
+    return worst
+
+
+def refuse_wide_planes(
+    calibration: Calibration, epoch: float | None, scale_arcsec: float | None, *, where: str
+) -> None:
+    """Raise InputError if TAN is one choice of several for u, v that lie on no sky.
+
+    `epoch`, `scale_arcsec`: as of `departure_from_tangent_plane`. `where`: the configuration.
+    """
+    if calibration.plane.point is not None or calibration.plane.kind == "aperture":
+        return
+    if calibration.unit == "pix" and scale_arcsec is None:
+        return  # of no size
+    worst = departure_from_tangent_plane(calibration, epoch, scale_arcsec)
+    if worst > MAX_DEPARTURE:
+        raise InputError(
+            "the header is that of a tangent plane, and where u, v lie on the sky is not stated: "
+            f"whether they are a tangent plane is worth {worst:.2g} px in so wide a field",
+            where=where,
+            do=f"if they are one, set {where}.crval (--option 'crval=[RA, Dec]' of convert); if "
+            "not, write a SIP header with linear axes, or the parameters",
+        )
 
 
 def in_arcsec(calibration: Calibration, pixel: float) -> Calibration:

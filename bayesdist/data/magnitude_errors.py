@@ -129,7 +129,7 @@ def estimate(
         raise InputError(
             f"residuals near magnitude {np.median(mag[bins[bad]]):.2f} have no scatter",
             where=where,
-            do="give errors",
+            do="give errors; positions that were computed have none",
         )
     scatter = _with_lost_freedom(scatter, n, n_params)
     smooth = [np.exp(_smoothed(np.log(s), n)) for s in scatter]

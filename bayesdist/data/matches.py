@@ -172,6 +172,7 @@ class Matches(MatchColumns):
         chips: Mapping[str, int] | None = None,
         not_finite: str = "refuse",
         same_position: str = "one_star",
+        plate_scale: float | None = None,
     ) -> Matches:
         """Matches from any object with columns.
 
@@ -189,6 +190,8 @@ class Matches(MatchColumns):
         same_position : {'one_star', 'separate_stars'}, optional
             As for `ReadOptions`: rows with the same reference position belong to one star by
             default, if there is no column `star`.
+        plate_scale : float, optional
+            As for `ReadOptions`: arcsec in a millimetre of u and v.
 
         Returns
         -------
@@ -218,8 +221,9 @@ class Matches(MatchColumns):
                 chips,
                 not_finite,
                 same_position,
+                plate_scale,
             )
-            return cls(**match_arguments(table, options)).as_read(sigma)
+            return cls(**match_arguments(table, options)).as_read(options.plane_sigma)
 
     @classmethod
     def from_sky(

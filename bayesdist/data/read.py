@@ -60,6 +60,7 @@ def read_matches(
     chips: Mapping[str, int] | None = None,
     not_finite: str = "refuse",
     same_position: str = "one_star",
+    plate_scale: float | None = None,
 ) -> Matches:
     r"""Read matched star positions.
 
@@ -77,6 +78,8 @@ def read_matches(
         adds, or 'auto': by name and content.
     columns, unit, sigma, pixel_origin, tangent_point, epoch, catalogue_epoch, chips, not_finite
         As `ReadOptions`.
+    plate_scale : float, optional
+        As `ReadOptions`: arcsec in a millimetre of u and v.
     same_position : {'one_star', 'separate_stars'}, optional
         As `ReadOptions`: rows with the same reference position, in one file or in several, belong
         to one star by default, if there is no column `star`.
@@ -114,6 +117,7 @@ def read_matches(
         chips,
         not_finite,
         same_position,
+        plate_scale,
     )
     if is_table(path):
         if format not in ("auto", "table"):
@@ -122,7 +126,7 @@ def read_matches(
                 where="format",
                 do="leave it out",
             )
-        return Matches(**match_arguments(path, options)).as_read(sigma)
+        return Matches(**match_arguments(path, options)).as_read(options.plane_sigma)
     files = input_files(path)
     kinds = [kind_of(file, columns) if format == "auto" else format for file in files]
     masters = [file for file, kind in zip(files, kinds, strict=True) if kind == "matchup"]
@@ -131,7 +135,7 @@ def read_matches(
     else:
         in_parts = isinstance(path, str | os.PathLike) and Path(path).is_dir()
         table = _read_plain(files, kinds, options, in_parts=in_parts)
-    return table.as_read(sigma)
+    return table.as_read(options.plane_sigma)
 
 
 def _read_plain(
@@ -219,8 +223,8 @@ def _with_common_chips(tables: Mapping[Path, Table], options: ReadOptions) -> Re
 
 
 def _read_list(file: Path, name: str | None, options: ReadOptions) -> Matches:
-    names = "columns pixel_origin tangent_point epoch catalogue_epoch not_finite same_position"
-    options.refuse_fixed(str(file), "hst1pass", *names.split())
+    names = "columns tangent_point epoch catalogue_epoch not_finite same_position plate_scale"
+    options.refuse_fixed(str(file), "hst1pass", *names.split(), *_other_origin(options))
     if options.unit not in (None, "pix"):
         options.refuse_fixed(str(file), "hst1pass", "unit")
     return read_hst1pass(file).matches(name=name)
@@ -228,9 +232,15 @@ def _read_list(file: Path, name: str | None, options: ReadOptions) -> Matches:
 
 def _read_record(file: Path, options: ReadOptions) -> Matches:
     """Matches of a file that bayesdist wrote, which states all that the options could."""
-    names = "columns unit pixel_origin tangent_point epoch catalogue_epoch chips not_finite"
-    options.refuse_fixed(str(file), "bayesdist", *names.split(), "same_position")
+    names = "columns unit tangent_point epoch catalogue_epoch chips not_finite same_position"
+    fixed = (*names.split(), "plate_scale", *_other_origin(options))
+    options.refuse_fixed(str(file), "bayesdist", *fixed)
     return read_written_matches(file)
+
+
+def _other_origin(options: ReadOptions) -> tuple[str, ...]:
+    """Name of the option of the origin, if another one than 1 is given, which formats fix."""
+    return () if options.pixel_origin == 1 else ("pixel_origin",)
 
 
 def _read_corr(file: Path, table: Table, name: str | None, options: ReadOptions) -> Matches:
@@ -240,10 +250,10 @@ def _read_corr(file: Path, table: Table, name: str | None, options: ReadOptions)
     Magnitudes are instrumental, -2.5 log10 FLUX, where all fluxes are positive; there are no
     errors.
     """
-    fixed = ["columns"] if options.pixel_origin == 1 else ["columns", "pixel_origin"]
-    options.refuse_fixed(str(file), "astrometry.net", *fixed)
+    options.refuse_fixed(str(file), "astrometry.net", "columns", *_other_origin(options))
     if options.unit not in (None, "arcsec"):
         options.refuse_fixed(str(file), "astrometry.net", "unit")
+    options.refuse_fixed(str(file), "astrometry.net", "plate_scale")
     options.refuse(
         str(file),
         "the format astrometry.net has no proper motions and would not use it",

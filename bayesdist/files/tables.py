@@ -30,9 +30,11 @@ from bayesdist.files.text_tables import (
     parse_text_table,
     refuse_cut_end,
     refuse_foreign_numbers,
+    refuse_missing_cells,
     refuse_multiplied_header,
     refuse_numbers_as_names,
     with_decimal_points,
+    without_empty_names,
 )
 from bayesdist.files.unpacked import read_lines, read_unpacked, without_codec
 from bayesdist.files.votable import refuse_unsafe_votable
@@ -64,7 +66,7 @@ def _whole_lines(lines: list[str], mark: str, path: Path) -> list[str]:
         head = takewhile(lambda line: line.startswith("#"), lines)
         mark = "," if any(_COMMAS.match(line) for line in head) else " "
     bare = [line.rstrip("\r\n") for line in lines]
-    _refuse_short_rows(bare, mark, path)
+    refuse_missing_cells(bare, mark, where=str(path))
     refuse_cut_end(lines, mark, where=str(path))
     return bare
 
@@ -93,37 +95,24 @@ def _read_text(path: Path, limits: Limits) -> Table:
     return parse_text_table(read_lines(path, limits), _budget(path, limits))
 
 
-def _read_separated(path: Path, limits: Limits, *, mark: str, format: str) -> Table:
-    """Table of a file that ends in .csv, whose cells may be separated by semicolons, or in .tsv."""
+def _read_separated(path: Path, limits: Limits, *, mark: str) -> Table:
+    """Table of a file that ends in .csv or .tsv, whose cells may be separated by another mark."""
     lines = read_lines(path, limits)
-    rows = (line for line in lines if line.strip() and not line.startswith("#"))
+    rows = (line.rstrip("\r\n") for line in lines if line.strip() and not line.startswith("#"))
     names = next(rows, "")
-    if mark == "," and mark_of([names, next(rows, names)]) == ";":
-        mark = ";"
-    lines = _whole_lines(lines, mark, path)
+    found = mark_of([names, next(rows, names)])
+    if found is None and is_text_table(lines):
+        return _read_text(path, limits)
+    mark = found or mark
+    lines = _whole_lines(without_empty_names(lines, mark), mark, path)
     cells = next(csv.reader([names], delimiter=mark), [])
     _budget(path, limits).refuse_columns(len(cells))
     refuse_numbers_as_names(cells, where=str(path))
     # astropy takes a time for a comment that grows with the square of its length
     lines = with_decimal_points([one for one in lines if one[:1] != "#"], mark, where=str(path))
-    table = Table.read(lines, format=format, delimiter=mark, comment="#", guess=False)
+    table = Table.read(lines, format="ascii.csv", delimiter=mark, comment="#", guess=False)
     refuse_foreign_numbers(table, lines, mark, where=str(path))
     return table
-
-
-def _refuse_short_rows(lines: list[str], mark: str, path: Path) -> None:
-    """Refuse rows with fewer cells than there are names: astropy fills them up in silence."""
-    width, row = 0, 0
-    for cells in csv.reader((line for line in lines if line[:1] != "#"), delimiter=mark):
-        if not cells or cells == [""]:
-            continue
-        if width and len(cells) < width:
-            raise FormatError(
-                f"has {len(cells)} of {width} cells",
-                where=f"{path}, row {row}",
-                do="the table may be truncated: fetch or write it again",
-            )
-        width, row = width or len(cells), row + 1
 
 
 def _read_votable(path: Path, limits: Limits) -> Table:
@@ -232,8 +221,8 @@ def _image_header(hdu: fits.BinTableHDU) -> fits.Header:
 
 TABLE_SUFFIXES: dict[str, Callable[[Path, Limits], Table]] = {
     ".ecsv": read_ecsv,
-    ".csv": partial(_read_separated, mark=",", format="ascii.csv"),
-    ".tsv": partial(_read_separated, mark="\t", format="ascii.tab"),
+    ".csv": partial(_read_separated, mark=","),
+    ".tsv": partial(_read_separated, mark="\t"),
     ".fits": _read_fits,
     ".fit": _read_fits,
     ".ldac": _read_fits,

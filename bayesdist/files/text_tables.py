@@ -192,10 +192,14 @@ def parse_text_table(lines: Sequence[str], budget: Budget) -> Table:
         refuse_cut_end(whole, mark, where=where)
     if kind == "ascii.commented_header":
         heads = [k for k, line in enumerate(lines) if line.strip().startswith("#")]
-        lines = [line for k, line in enumerate(lines) if k not in heads[:-1]]
+        # astropy takes a tab between two names for the mark between all of them
+        lines = [line.replace("\t", " ") for k, line in enumerate(lines) if k not in heads[:-1]]
     elif separated:
+        lines = without_empty_names(lines, mark)
         lines = with_decimal_points(lines, mark, where=where)
         options["comment"] = "#"
+        if mark is not None:
+            refuse_missing_cells(lines, mark, where=where)
         if mark is None:
             lines = [line.replace("\t", " ") for line in lines]
         elif mark == ";":
@@ -203,6 +207,34 @@ def parse_text_table(lines: Sequence[str], budget: Budget) -> Table:
     table = Table.read(lines, format=kind, guess=False, **options)
     refuse_foreign_numbers(table, lines, mark, where=where)
     return table
+
+
+def without_empty_names(lines: list[str], mark: str | None) -> list[str]:
+    """Lines of a table whose names are not followed by marks that the first row does not have."""
+    rows = [k for k, line in enumerate(lines) if line.strip() and not line.lstrip().startswith("#")]
+    if mark is None or len(rows) < 2:
+        return lines
+    names, first = (lines[k].rstrip("\r\n") for k in rows[:2])
+    surplus = names.count(mark) - first.count(mark)
+    if surplus <= 0 or not names.endswith(mark * surplus):
+        return lines
+    end = lines[rows[0]][len(names) :]
+    return [*lines[: rows[0]], names[:-surplus] + end, *lines[rows[0] + 1 :]]
+
+
+def refuse_missing_cells(lines: Sequence[str], mark: str, *, where: str) -> None:
+    """Refuse rows with fewer cells than there are names: astropy fills them up in silence."""
+    width, row = 0, 0
+    for cells in csv.reader((line for line in lines if line[:1] != "#"), delimiter=mark):
+        if not cells or cells == [""]:
+            continue
+        if width and len(cells) < width:
+            raise FormatError(
+                f"has {len(cells)} of {width} cells",
+                where=f"{where}, row {row}",
+                do="the table may be truncated: fetch or write it again",
+            )
+        width, row = width or len(cells), row + 1
 
 
 def refuse_cut_end(lines: Sequence[str], mark: str | None, *, where: str) -> None:

@@ -1,8 +1,8 @@
-"""Convergence of the sampler, judged over independent ensembles, never over coupled walkers.
+"""Convergence diagnostics, computed over independent ensembles rather than over coupled walkers.
 
-Differential evolution couples the walkers of an ensemble.  Then two estimates of the effective
-sample size are made and the smaller counts: that of the walkers laid end to end, and that of the
-ensemble averages, which shows a drift that all walkers share (Goodman and Weare 2010, section 5).
+Differential evolution couples the walkers of an ensemble.  In that case the effective sample size
+is the smaller of two estimates: that of the concatenated walkers, and that of the ensemble
+averages, which reveals a drift common to all walkers (Goodman and Weare 2010, section 5).
 """
 
 from __future__ import annotations
@@ -18,22 +18,22 @@ from bayesdist.utils.arrays import Float
 from bayesdist.utils.limits import DRAWS_PER_WALKER
 from bayesdist.utils.numbers import count
 
-TAIL = (0.05, 0.95)  # quantiles whose effective sample sizes are those of the tails
-MIN_WEIGHTS = 25  # to a fifth of which a tail is fitted
+TAIL = (0.05, 0.95)  # the tail ESS is the effective sample size of these quantiles
+MIN_WEIGHTS = 25  # fewest importance weights; the Pareto tail is fitted to a fifth of them
 
 DIAGNOSTICS = ("rhat", "ess_bulk", "ess_tail", "mcse_mean", "mcse_sd")
 
 
 @dataclass(frozen=True)
 class Limits:
-    """Targets of a converged run.
+    """Convergence criteria.
 
     Parameters
     ----------
     ess : float
-        Bulk and tail effective sample size of every parameter.
+        Smallest bulk and tail effective sample size allowed for any parameter.
     rhat : float
-        Rank-normalised split R-hat of every parameter.
+        Largest rank-normalised split R-hat allowed for any parameter.
     """
 
     ess: float = 400.0
@@ -42,22 +42,25 @@ class Limits:
 
 @dataclass(frozen=True, eq=False)
 class Convergence:
-    """Diagnostics of every sampled parameter, and the verdict.
+    """Convergence diagnostics of all sampled parameters, and whether the criteria are met.
 
     Parameters
     ----------
     names : tuple of str
-        theta, then the hyperparameters as sampled.
+        Names of the D parameters: theta, then the hyperparameters in sampled coordinates.
     rhat, ess_bulk, ess_tail, mcse_mean, mcse_sd : ndarray, shape (D,)
-        NaN for fixed parameters, which are not judged.
+        R-hat, bulk and tail effective sample sizes, and Monte-Carlo standard errors of the mean
+        and of the standard deviation. NaN for fixed parameters, which the criteria ignore.
     pareto_k : float
-        Of the importance weights of the independence proposal (Vehtari et al. 2024).
+        Pareto shape of the importance weights of the independence proposal (Vehtari et al. 2024).
     importance_efficiency : float
-        Effective fraction of the proposal's draws.
+        Effective sample size of the proposal's draws as a fraction of their number.
     converged : bool
+        True if all criteria are met.
     reasons : tuple of str
-        Failed criteria, with the worst parameter; empty when converged.
+        One sentence per failed criterion, naming the worst parameter; empty if converged.
     limits : Limits
+        The criteria that were applied.
     """
 
     names: tuple[str, ...]
@@ -88,7 +91,7 @@ class Convergence:
         return float(np.nanmin(self.ess_tail))
 
     def worst(self, n: int) -> tuple[str, ...]:
-        """Names of the `n` parameters that are farthest from the limits."""
+        """Names of the `n` parameters that are farthest from meeting the criteria."""
         ess = np.minimum(self.ess_bulk, self.ess_tail)
         lacking = np.maximum(
             (self.rhat - 1) / max(self.limits.rhat - 1, 1e-6),
@@ -97,7 +100,7 @@ class Convergence:
         return tuple(self.names[k] for k in np.argsort(-lacking)[:n])
 
     def among(self, names: tuple[str, ...]) -> Convergence:
-        """Convergence with further names, of parameters that are fixed and not judged."""
+        """Diagnostics extended to `names`; the parameters that are added are fixed (NaN)."""
         at = [names.index(name) for name in self.names]
 
         def spread(values: Float) -> Float:
@@ -118,10 +121,11 @@ def diagnose(
     coupled: bool,
     n_outside: int = 0,
 ) -> Convergence:
-    """Diagnostics from the draws after warm-up: chains (ensembles, steps, walkers, D).
+    """Compute the convergence diagnostics of the draws after warm-up.
 
-    `log_weights` (n,) are log importance weights of independent proposals; `n_outside` further ones
-    fell outside the support and have weight zero.  `coupled` if the walkers of an ensemble
+    `chains` has the shape (ensembles, steps, walkers, D).  `log_weights` (n,) are the log
+    importance weights of independent proposals; `n_outside` is the number of further proposals
+    outside the support, which have weight zero.  `coupled` is True if the walkers of an ensemble
     influence each other.
     """
     E, T, W, D = chains.shape
@@ -143,7 +147,7 @@ def diagnose(
     spread = in_time.reshape(-1, D).std(axis=0)
     squares = (by_walker - by_walker.reshape(-1, D).mean(axis=0)) ** 2
     ess_squares = np.maximum(mean_draws(squares), 1.0)
-    with np.errstate(invalid="ignore", divide="ignore"):  # by the delta method
+    with np.errstate(invalid="ignore", divide="ignore"):  # delta method
         mcse_sd = squares.reshape(-1, D).std(axis=0) / np.sqrt(ess_squares) / (2 * spread)
     reasons = []
     for label, values, bad, limit in (
@@ -154,16 +158,16 @@ def diagnose(
         if bad.any():
             if label == "R-hat":
                 k, side = int(np.argmax(values)), "at most"
-                found, asked = f"{values[k]:.4f}", f"{limit:g}"
+                value, asked = f"{values[k]:.4f}", f"{limit:g}"
             else:
                 k, side = int(np.argmin(values)), "at least"
-                found, asked = count(np.floor(values[k])), count(limit)
+                value, asked = count(np.floor(values[k])), count(limit)
             reasons.append(
-                f"{label} of {names[k]} is {found} and must be {side} {asked}"
+                f"{label} of {names[k]} is {value} and must be {side} {asked}"
                 f" ({int(bad.sum())} of {D} parameters)"
             )
-    # every walker counts at least as one draw, even if it never moved: many walkers must not
-    # compensate for walkers that do not mix
+    # the draws of a walker always count as at least one effective draw, even if it never moved:
+    # a large number of walkers must not hide that the walkers do not mix
     each_walker = float(np.minimum(bulk, tail).min()) / (E * W)
     if not DRAWS_PER_WALKER.met_by(each_walker):
         k = int(np.argmin(np.minimum(bulk, tail)))
@@ -187,7 +191,7 @@ def diagnose(
 
 
 def _coupled_ess(chains: Float) -> Float:
-    """Effective sample size of the mean over ensembles that may move as one."""
+    """Effective sample size (D,) of the mean if the walkers of an ensemble may move together."""
     D = chains.shape[-1]
     averages = chains.mean(axis=2)
     share = averages.reshape(-1, D).var(axis=0)
@@ -198,7 +202,10 @@ def _coupled_ess(chains: Float) -> Float:
 
 
 def importance_efficiency(log_weights: Float, n_outside: int = 0) -> float:
-    """Effective fraction of draws with these log weights, and of others with weight zero."""
+    """Effective sample size of weighted draws, as a fraction of their number.
+
+    `n_outside` is the number of further draws with weight zero.
+    """
     if not len(log_weights):
         return 0.0
     weights = np.exp(log_weights - log_weights.max())
@@ -206,10 +213,10 @@ def importance_efficiency(log_weights: Float, n_outside: int = 0) -> float:
 
 
 def pareto_k(log_weights: Float) -> float:
-    """Shape of the Pareto tail of importance weights; above 0.7 they cannot be trusted.
+    """Shape k of the Pareto tail of importance weights; above 0.7 they cannot be trusted.
 
-    0 where no weight is more than twice the mean: there is no tail then, and the shape of nearly
-    equal weights means nothing.
+    Returns 0 if no weight exceeds twice the mean: such weights have no tail, and a shape fitted to
+    nearly equal weights would be meaningless.
     """
     finite = log_weights[np.isfinite(log_weights)]
     if len(finite) < MIN_WEIGHTS or np.ptp(finite) < 1e-9:
@@ -221,9 +228,9 @@ def pareto_k(log_weights: Float) -> float:
 
 
 def smoothed_weights(log_weights: Float, independent: float) -> tuple[Float, float]:
-    """Importance weights (n,) of sum 1 with a Pareto tail, and the shape k of that tail.
+    """Pareto-smoothed importance weights (n,), normalised to a sum of 1, and their tail shape k.
 
-    `independent` is the effective fraction of the draws.  With k above 0.7 the weights cannot be
+    `independent` is the effective fraction of the draws.  Weights with k above 0.7 cannot be
     trusted.
     """
     smoothed, k = _pareto_smoothed(log_weights, independent)
@@ -231,15 +238,15 @@ def smoothed_weights(log_weights: Float, independent: float) -> tuple[Float, flo
 
 
 def _pareto_smoothed(log_weights: Float, independent: float) -> tuple[Float, float]:
-    """Log weights (n,) of sum 1 whose largest follow a Pareto distribution, and its shape k.
+    """Pareto-smoothed, normalised log weights (n,), and the shape k of their tail.
 
-    k is infinite, and the weights are as they were, where there is no tail to be fitted.
+    If no tail can be fitted, k is infinite and the weights are only normalised.
     """
     from arviz_stats.base import array_stats  # half a second
 
     try:
         with np.errstate(all="ignore"):  # draws of negligible weight
-            # ArviZ takes log likelihoods, of which importance weights are the inverse
+            # ArviZ takes log likelihoods; importance weights are their inverse
             smoothed, k = array_stats.psislw(-log_weights, r_eff=independent)
     except ValueError:  # equal weights in the tail, or too few
         return log_weights - logsumexp(log_weights), float("inf")

@@ -1,8 +1,8 @@
 """R-hat and effective sample sizes of many parameters at once (Vehtari et al. 2021).
 
-The numbers are those of ArviZ, which goes through parameter after parameter.  Chains are
-(C, N, D): as many chains, draws and parameters.  Each is split into halves, which are compared as
-if they were further chains.  NaN where a draw is.
+The results equal those of ArviZ, which computes them one parameter at a time.  Chains have the
+shape (chains, draws, parameters) = (C, N, D).  Each chain is split into halves, which are compared
+like separate chains.  A parameter with a NaN among its draws gets NaN.
 """
 
 from __future__ import annotations
@@ -15,26 +15,26 @@ from scipy.special import ndtri
 
 from bayesdist.utils.arrays import Float
 
-FEWEST = 4  # draws in a chain whose halves can be compared
-AT_ONCE = 2**18  # draws of as many parameters as are transformed together fit into the cache
+FEWEST = 4  # draws per chain needed to compare its halves
+AT_ONCE = 2**18  # draws (of several parameters) that are transformed together, to fit the cache
 
 
 def rhat_and_bulk_draws(chains: Float, walkers: int = 1) -> Float:
-    """Rank-normalised split R-hat and effective sample size of the bulk (2, D).
+    """Rank-normalised split R-hat and bulk effective sample size, stacked to shape (2, D).
 
-    A chain has the draws of all its walkers at one step after the other.  So R-hat goes through
-    them: it is the larger one of bulk and tails.  The sample size, that of the normal scores' mean,
-    goes through one walker after the other.
+    The N draws of a chain are ordered by step and, within a step, by walker.  R-hat uses this
+    order; it is the larger of the values for bulk and tails.  The effective sample size is that of
+    the mean of the normal scores, with the draws reordered walker by walker.
     """
 
     def both(some: Float) -> Float:
         halves = _halves(some)
-        if some.shape[2] % 2:  # the middle draw is another one
+        if some.shape[2] % 2:  # the two orders drop different middle draws
             scores = _normal_scores(halves)
             by_walker = _normal_scores(_halves(_by_walker(some, walkers)))
         else:
-            every = _normal_scores(some)
-            scores, by_walker = _halves(every), _halves(_by_walker(every, walkers))
+            all_scores = _normal_scores(some)
+            scores, by_walker = _halves(all_scores), _halves(_by_walker(all_scores, walkers))
         folded = np.abs(halves - np.median(halves, axis=(1, 2), keepdims=True))
         rhat = np.maximum(_rhat(scores), _rhat(_normal_scores(folded)))
         return np.stack([rhat, _effective(by_walker)])
@@ -43,12 +43,12 @@ def rhat_and_bulk_draws(chains: Float, walkers: int = 1) -> Float:
 
 
 def tail_draws(chains: Float, tails: tuple[float, float]) -> Float:
-    """Effective sample size (D,) of the tails: the smaller one of two quantiles."""
+    """Effective sample size (D,) of the tails: the smaller value of the two `tails` quantiles."""
 
     def smaller(some: Float) -> Float:
         limits = np.quantile(some, tails, axis=(1, 2))
         sides = [_effective(_halves((some <= q[:, None, None]).astype(float))) for q in limits]
-        # no draw lies beyond a limit that is not a number, as if none had ever moved
+        # comparisons with a NaN limit are False, as if the parameter had never moved
         return np.where(np.isnan(limits).any(axis=0), np.nan, np.min(sides, axis=0))
 
     return _by_parameters(smaller, chains)
@@ -60,9 +60,10 @@ def mean_draws(chains: Float) -> Float:
 
 
 def _by_parameters(function: Callable[[Float], Float], chains: Float, *numbers: int) -> Float:
-    """A function of (d, C, N) for all parameters, of which some are treated at once.
+    """Apply a function of draws (d, C, N) to all parameters, d of them at a time.
 
-    NaN for fewer than `FEWEST` draws in a chain.  It returns as many `numbers` (n, d), or one (d,).
+    The function returns an array (*numbers, d), and the results are joined to (*numbers, D).
+    They are NaN if a chain has fewer than `FEWEST` draws.
     """
     C, N, D = chains.shape
     if N < FEWEST:
@@ -77,27 +78,27 @@ def _by_parameters(function: Callable[[Float], Float], chains: Float, *numbers: 
 
 
 def _halves(chains: Float) -> Float:
-    """First and last half of each chain, (d, 2 C, N / 2), without a middle draw."""
+    """First and last half of each chain, shape (d, 2 C, N // 2); a middle draw is dropped."""
     half = chains.shape[2] // 2
     return np.concatenate([chains[..., :half], chains[..., -half:]], axis=1)
 
 
 def _by_walker(chains: Float, walkers: int) -> Float:
-    """Draws of one walker after the other, (d, C, N), of those at one step after the other."""
+    """Draws (d, C, N) reordered from step by step to walker by walker."""
     d, C, N = chains.shape
     return np.swapaxes(chains.reshape(d, C, N // walkers, walkers), 2, 3).reshape(d, C, N)
 
 
 def _normal_scores(chains: Float) -> Float:
     """Normal quantiles of the ranks among all draws of a parameter (Blom 1958)."""
-    from scipy.stats import rankdata  # takes half a second to import: not where nothing is sampled
+    from scipy.stats import rankdata  # its import takes half a second, so only when needed
 
     ranks = rankdata(chains.reshape(len(chains), -1), axis=1)
     return ndtri((ranks - 3 / 8) / (ranks.shape[1] + 1 / 4)).reshape(chains.shape)
 
 
 def _rhat(chains: Float) -> Float:
-    """R-hat (d,) of chains that are compared as they are."""
+    """R-hat (d,) of chains, without splitting them or ranking their draws."""
     N = chains.shape[2]
     between = chains.mean(axis=2).var(axis=1, ddof=1)
     within = chains.var(axis=2, ddof=1).mean(axis=1)
@@ -105,7 +106,7 @@ def _rhat(chains: Float) -> Float:
 
 
 def _effective(chains: Float) -> Float:
-    """Effective sample size (d,) of the mean, from autocorrelations that Geyer's rules limit."""
+    """Effective sample size (d,) of the mean; autocorrelations are truncated by Geyer's rules."""
     _, C, N = chains.shape
     means = chains.mean(axis=2, keepdims=True)
     size = next_fast_len(2 * N, real=True)
@@ -118,14 +119,14 @@ def _effective(chains: Float) -> Float:
     unexplained = covariance[:, :1] * N / (N - 1) - covariance
     correlation = 1 - unexplained / variance[:, None]
     correlation[:, 0] = 1.0
-    # pairs of lags have positive sums up to the first one that has not
+    # initial positive sequence: sums over pairs of lags, up to the first that is not positive
     n_pairs = max((N - 1) // 2, 1)
     even, odd = correlation[:, 0 : 2 * n_pairs : 2], correlation[:, 1 : 2 * n_pairs : 2]
     sums = even + odd
     ends = ~(sums > 0)
     ends[:, -1] = True
     end = ends.argmax(axis=1)[:, None]
-    # and do not rise
+    # initial monotone sequence
     falling = np.minimum.accumulate(sums, axis=1)
     total = np.where(np.arange(n_pairs) < end, falling, 0.0).sum(axis=1)
     last = np.take_along_axis(even, end, axis=1)[:, 0]

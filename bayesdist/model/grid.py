@@ -62,6 +62,6 @@ def outline_pixels(size: tuple[float, float]) -> tuple[Float, Float]:
 
 
 def position_of_largest(values: Float, x: Float, y: Float) -> tuple[float, float]:
-    """Pixel (x, y) of the maximum of a map (ny, nx)."""
-    iy, ix = np.unravel_index(int(np.argmax(values)), values.shape)
+    """Pixel (x, y) of the maximum of a map (ny, nx), ignoring NaN."""
+    iy, ix = np.unravel_index(int(np.nanargmax(values)), values.shape)
     return float(x[ix]), float(y[iy])

@@ -57,6 +57,7 @@ class Entry:
     when: When | None = None  # condition that no attribute states
     each: Callable[[Any], Mapping[str, Any]] | None = None
     printed: bool | When = False  # on paper
+    folded: bool = False  # shown on the screen when a reader asks for it
 
     def applies(self, results: Any) -> bool:
         """True where it can be made of these results."""
@@ -74,6 +75,7 @@ class Item:
     make: Callable[..., Any]
     arguments: tuple[Any, ...] = ()
     printed: bool = False
+    folded: bool = False
 
     def made(self, results: Any) -> Any:
         """Figure, table or data made of the results."""
@@ -95,9 +97,11 @@ class Registry:
         when: When | None = None,
         each: Callable[[Any], Mapping[str, Any]] | None = None,
         printed: bool | When = False,
+        folded: bool = False,
     ) -> Callable[[Make], Make]:
         """Decorator of a function that makes a `Plot`, in our style; parameters as of `Entry`."""
         options = {"needs": needs, "when": when, "each": each, "printed": printed}
+        options["folded"] = folded
         return self._decorator(section, "figure", options)
 
     def table(
@@ -137,10 +141,13 @@ class Registry:
                 continue
             printed = entry.printed(results) if callable(entry.printed) else entry.printed
             if entry.each is None:
-                out.append(Item(entry.name, entry.section, entry.make, printed=printed))
-                continue
-            for name, argument in entry.each(results).items():
-                out.append(Item(name, entry.section, entry.make, (argument,), printed))
+                items: Mapping[str, tuple[Any, ...]] = {entry.name: ()}
+            else:
+                items = {name: (argument,) for name, argument in entry.each(results).items()}
+            out += [
+                Item(name, entry.section, entry.make, arguments, printed, entry.folded)
+                for name, arguments in items.items()
+            ]
         return tuple(out)
 
 
@@ -184,6 +191,7 @@ REPORT = Registry(
         ),
         Section("coefficients", "Coefficients"),
         Section("maps", "Distortion and its uncertainty over the detector"),
+        Section("previous", "Difference from the previous release"),
         Section("periods", "Time variation"),
         Section("budget", "Error budget", empty="No error budget was made."),
         Section("margins", "Margins", empty="No requirement was stated."),
@@ -208,6 +216,7 @@ EXPLAINED = {
     "outliers": ("concepts", "Jitter and membership"),
     "coefficients": ("method", "Model"),
     "maps": ("concepts", "What 68 % means"),
+    "previous": ("report", "Difference from the previous release"),
     "periods": ("wise", ""),
     "budget": ("method", "Error budget and margins"),
     "margins": ("method", "What a verdict rests on"),

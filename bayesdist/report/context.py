@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from bayesdist.assess import AreaMap, Margin, UncertaintyMap, VectorMap
     from bayesdist.assess.budget.budget import ErrorBudget
     from bayesdist.assess.budget.surface import BudgetSurface
+    from bayesdist.assess.comparison.compare import Comparison
     from bayesdist.assess.requirements.validity import ValidityPeriod
     from bayesdist.data import MagnitudeErrors
     from bayesdist.diagnose import ScoreTest
@@ -145,6 +146,7 @@ class ReportInput:
     flagged: Int | None = None  # (E,), stars more likely false than not
     provenance: Mapping[str, Any] = field(default_factory=dict)  # nested
     campaign: CampaignResults | None = None  # of a run on star lists
+    previous: tuple[Comparison, ...] = ()  # minus the release that is replaced, of each chip
     periods: TimeVariation | None = None  # models of several periods compared
     held_out: HoldoutValidation | None = None  # stars set aside before the fit
     selfcal: SelfcalResults | None = None  # of a run without a catalogue

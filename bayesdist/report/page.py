@@ -35,6 +35,7 @@ class Picture:
     width: float  # inches, at which its letters have the size they were set in
     words: Drawing  # title, text and text alternative
     printed: bool = True  # True where it is on paper
+    folded: bool = False  # True where it is shown when a reader asks for it
     number: int = 0  # by which the page calls it; 0 where figures are not numbered
 
     @property
@@ -92,11 +93,15 @@ def parts_of(registry: Registry, results: Any, drawings: Mapping[str, Drawing]) 
     """
     tables: dict[str, list[TextTable]] = {}
     for item in registry.items(results, "table"):
-        tables.setdefault(item.section, []).extend(_several(item.made(results)))
+        made = _several(item.made(results))
+        folded = (replace(one, folded=one.folded or one.is_long) for one in made)
+        tables.setdefault(item.section, []).extend(folded)
     pictures: dict[str, list[Picture]] = {}
     for item in registry.items(results, "figure"):
         if item.name in drawings:
-            picture = picture_of(item.name, drawings[item.name], printed=item.printed)
+            picture = picture_of(
+                item.name, drawings[item.name], printed=item.printed, folded=item.folded
+            )
             pictures.setdefault(item.section, []).append(picture)
 
     def within(parent: str) -> Sequence[Part]:
@@ -104,12 +109,12 @@ def parts_of(registry: Registry, results: Any, drawings: Mapping[str, Drawing]) 
         for section in registry.sections:
             if section.parent != parent:
                 continue
-            shown = tuple(tables.get(section.name, ()))
+            shown = tuple(sorted(tables.get(section.name, ()), key=lambda one: one.folded))
             part = Part(
                 section.name,
                 section.title_of(results),
                 shown,
-                tuple(pictures.get(section.name, ())),
+                tuple(sorted(pictures.get(section.name, ()), key=lambda one: one.folded)),
                 tuple(within(section.name)),
                 "" if shown else section.empty,
                 section.is_printed(results),
@@ -127,10 +132,14 @@ def _several(made: TextTable | Iterable[TextTable] | None) -> Iterable[TextTable
     return (made,) if isinstance(made, TextTable) else made
 
 
-def picture_of(name: str, drawing: Drawing, *, printed: bool = True) -> Picture:
+def picture_of(
+    name: str, drawing: Drawing, *, printed: bool = True, folded: bool = False
+) -> Picture:
     """Figure as a page holds it."""
     data = base64.b64encode(drawing.file).decode("ascii")
-    return Picture(name, data, _AS_BROWSERS_SAY[drawing.kind], drawing.width, drawing, printed)
+    return Picture(
+        name, data, _AS_BROWSERS_SAY[drawing.kind], drawing.width, drawing, printed, folded
+    )
 
 
 @functools.cache
@@ -212,7 +221,8 @@ def _widths(parts: Iterable[Part]) -> list[int]:
     """Widths of all pictures of some sections, each once."""
     found: set[int] = set()
     for part in parts:
-        found.update((picture.hundredths for picture in part.pictures), _widths(part.parts))
+        pictures = (*part.pictures, *part.on_top)
+        found.update((picture.hundredths for picture in pictures), _widths(part.parts))
     return sorted(found)
 
 

@@ -24,6 +24,7 @@ _PROVISIONAL = (
     " on its draws and may be wrong by more than their stated errors. Sample longer, or look at the"
     " reasons, before anything is used."
 )
+MOST_NAMED = 4  # chips that are listed by name
 STRIP = ("margins", "uncertainty_radius", "distortion")  # figures on top of the page
 _FOOTER = (
     "u and v are the reference axes; x runs to the right and y up, in FITS"
@@ -31,10 +32,9 @@ _FOOTER = (
 )
 _BUDGET_WORDS = (
     "The budget of the table at any position, between two positions of one image, and at any epoch"
-    " and magnitude, computed in this page. The bar stacks the variances of the terms; the parts of"
-    " the model are correlated, and the hatched piece is what their correlation adds. Where the"
-    " correlation is negative, the stack is longer than the total, which the dark line marks, and"
-    " the table gives the root of its size with a minus sign."
+    " and magnitude. The bar stacks the variances of the terms; the hatched piece is what the"
+    " correlation of the model's parts adds. Where it is negative, the stack is longer than the"
+    " total (dark line), and the table gives the root of its size with a minus sign."
 )
 _PRINT_WORDS = (
     "All tables and figures, and the budget at any position and epoch, are in report.html."
@@ -141,7 +141,10 @@ def _chips(r: ReportInput) -> str:
     for c in r.chips:
         size = "{:g} × {:g}".format(*c.chip.size)
         names.setdefault(size, []).append(c.chip.name or f"chip {c.chip.number}")
-    return "; ".join(
-        f"{', '.join(several[:-1])}{' and ' if len(several) > 1 else ''}{several[-1]}, {size}"
-        for size, several in names.items()
-    )
+
+    def listed(several: list[str]) -> str:
+        if len(several) > MOST_NAMED:
+            return f"{len(several)} chips ({several[0]} to {several[-1]})"
+        return f"{', '.join(several[:-1])}{' and ' if len(several) > 1 else ''}{several[-1]}"
+
+    return "; ".join(f"{listed(several)}, {size}" for size, several in names.items())

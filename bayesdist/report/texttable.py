@@ -53,14 +53,30 @@ class TextTable:
 
     @property
     def open(self) -> TextTable:
-        """Rows of checks that are not passed."""
-        return replace(self, rows=tuple(row for row in self.rows if Level("pass") not in row))
+        """Rows of checks that fail or warn."""
+        return replace(self, rows=tuple(row for row in self.rows if _is_open(row)))
 
     @property
     def passed(self) -> TextTable:
-        """Rows of checks that are passed."""
-        rows = tuple(row for row in self.rows if Level("pass") in row)
-        return replace(self, caption="Criteria that pass", rows=rows)
+        """Rows of checks that are passed, and notes."""
+        rows = tuple(row for row in self.rows if not _is_open(row))
+        named = "Criteria that pass, and notes" if self.n_notes else "Criteria that pass"
+        return replace(self, caption=named, rows=rows)
+
+    @property
+    def n_passed(self) -> int:
+        """Number of checks that are passed."""
+        return sum(Level("pass") in row for row in self.rows)
+
+    @property
+    def n_notes(self) -> int:
+        """Number of notes, of which nothing is asked."""
+        return sum(Level("note") in row for row in self.rows)
+
+    @property
+    def is_long(self) -> bool:
+        """True where a table takes so much of a screen that it is folded."""
+        return len(self.rows) > _FEW_ROWS and not self.of_checks and not self.leading
 
     @property
     def is_small(self) -> bool:
@@ -68,6 +84,11 @@ class TextTable:
         rows = self.rows[: self.leading or None]
         widths = (max(map(len, column)) for column in zip(self.columns, *rows, strict=True))
         return len(rows) <= _FEW_ROWS and sum(widths) <= _FEW_LETTERS
+
+
+def _is_open(row: Sequence[str]) -> bool:
+    """True for a check that fails or warns."""
+    return Level("warn") in row or Level("fail") in row
 
 
 def tabulated(caption: str, rows: Sequence[Mapping[str, str]], **look: Any) -> TextTable:

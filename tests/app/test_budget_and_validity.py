@@ -93,6 +93,32 @@ def test_the_budget_of_a_position_names_every_term_and_its_source(run):
     assert fit["budget"][-1]["name"] == "total"
 
 
+def test_a_table_of_positions_has_the_budget_of_each(run):
+    """Aberration grows with the distance from the reference pixel, (256, 128)."""
+    path = run.parent / "places.csv"
+    path.write_text("name,xcentroid,ycentroid\na,511,127\nb,255,127\nc,127,127\n")  # from 0
+    options = ("--at-table", path, "--columns", "xcentroid", "ycentroid", "--magnitude", 16)
+    said = json.loads(good("budget", run, *options, "--json").out)
+    assert [(row["x"], row["y"]) for row in said["positions"]] == [
+        (512, 128),
+        (256, 128),
+        (128, 128),
+    ]
+    assert (said["unit"], said["pixel_origin_of_table"], said["magnitude"]) == ("pix", 0, 16)
+    sizes = [{t["name"]: t["u"] for t in row["terms"]} for row in said["positions"]]
+    for row, x in zip(sizes, (512, 256, 128), strict=True):
+        expected = 4e-6 * abs(x - 256)
+        assert row["aberration"] == pytest.approx(expected, rel=5 / np.sqrt(2 * 2000), abs=1e-12)
+        assert row["catalogue"] == pytest.approx(0.004)
+    text = good("budget", run, *options).out
+    first = text.splitlines()[2].split()
+    assert first[:3] == ["512", "128", "1"] and "the first pixel is 0" in text
+    assert float(first[3]) == pytest.approx(sizes[0]["total"], rel=1e-3)
+    for arguments, words in (((), "no position is given"), (("--at", 1, 1, *options), "twice")):
+        result = cli("budget", run, *arguments)
+        assert result.code == 1 and words in result.err
+
+
 def test_the_budget_of_a_difference_leaves_out_what_both_share(run):
     near = rows_of(good("budget", run, "--at", 300, 128, "--to", 310, 128).out)
     far = rows_of(good("budget", run, "--at", 1, 128, "--to", 512, 128).out)

@@ -186,7 +186,7 @@ def test_a_key_like_no_other_lists_the_known_ones():
         (
             "data",
             {"matches": "a", "unit": "mm"},
-            ["'mm'", "divide u, v", "size of a pixel", "'pix'"],
+            ["'mm'", "data.plate_scale", "divide u, v", "'pix'"],
         ),
         ("data", {"matches": "a", "format": "xls"}, ["data.format", "'hst1pass'"]),
         ("data", {"matches": "a", "pixel_origin": 2}, ["data.pixel_origin", "0 or 1"]),

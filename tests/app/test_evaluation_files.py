@@ -7,6 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from bayesdist.app.config.data import MatchesConfig
+from bayesdist.app.config.section import RunDetector
 from bayesdist.app.pipeline import evaluate
 from bayesdist.app.results import open_results
 from bayesdist.app.store.rundir import RunDirectory
@@ -61,3 +63,48 @@ def test_they_belong_to_one_posterior(results):
     assert load_diagnostics(results.run, results.fit, other) is None
     with pytest.raises(InputError, match="other data or settings"):
         load_evaluation(results.run, results.fit, other)
+
+
+@pytest.mark.parametrize(
+    "field",
+    [
+        {"centre": (480.0, 410.0), "radius": 310.0},
+        [(200.0, 100.0), (800.0, 100.0), (800.0, 700.0), (200.0, 700.0)],
+    ],
+)
+def test_maps_budget_and_requirements_are_of_the_field_of_the_detector(results, field):
+    """The same errors as over the whole detector, at the positions that see the sky alone."""
+    detector = RunDetector(**results.config.detector.model_dump() | {"field": field})
+    config = results.config.model_copy(update={"detector": detector})
+    whole = load_evaluation(results.run, results.fit, results.posterior)
+    made = evaluate(
+        results.errors, results.posterior, results.diagnostics, results.data, config, results.base
+    )
+    found, every = made.maps[0], whole.maps[0]
+    X, Y = np.meshgrid(every.x, every.y)
+    inside = (X > 200) & (X < 800) & (Y > 100) & (Y < 700)
+    if isinstance(field, dict):
+        inside = np.hypot(X - 480, Y - 410) <= 310
+    assert 0 < inside.sum() < inside.size
+    np.testing.assert_array_equal(found.radius, np.where(inside, every.radius, np.nan))
+    assert found.radius_max == every.radius[inside].max() < every.radius_max
+    x, y = found.position_of_max
+    assert inside[every.y.tolist().index(y), every.x.tolist().index(x)]
+    [row] = [r for r in made.budget.rows() if r["name"] == "coefficients"]
+    [term] = [t for t in whole.budget.terms if t.name == "coefficients"]
+    on_grid = whole.budget.on_grid(term.u)
+    assert row["u"] == pytest.approx(np.sqrt(np.mean(on_grid[inside] ** 2)), rel=1e-12)
+    again = made.budget.on_grid(made.budget.terms[0].u)
+    np.testing.assert_allclose(again, np.where(inside, on_grid, np.nan), rtol=1e-12)
+    for margin, before in zip(made.margins, whole.margins, strict=True):
+        assert margin.requirement.region == config.field
+        assert margin.value <= before.value
+
+
+def test_a_field_is_of_a_detector_of_one_chip():
+    chips = [
+        {"number": n, "name": f"C{n}", "size": (9, 9), "reference_pixel": (5, 5)} for n in (1, 2)
+    ]
+    settings = {"data": {"matches": "a.csv"}, "model": {"order": 1}, "chip": chips}
+    with pytest.raises(ValueError, match=r"detector\.field is of a detector of one chip"):
+        MatchesConfig(**settings, detector={"field": {"centre": (5, 5), "radius": 3}})

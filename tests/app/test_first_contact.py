@@ -7,7 +7,7 @@ import shlex
 import click
 import pytest
 
-from bayesdist.app.cli import CORE, EPILOG, EXAMPLES, bayesdist, main
+from bayesdist.app.cli import CORE, EPILOG, bayesdist, main
 from bayesdist.app.config import load_requirements
 from bayesdist.errors import BayesdistError
 
@@ -19,14 +19,36 @@ unit = "pix"
 """
 
 
-@pytest.mark.parametrize("name", CORE)
-def test_every_help_has_an_example_that_the_command_understands(name, capsys):
-    assert main([name, "--help"]) == 0
+def every_command(group: click.Group, path: tuple[str, ...] = ()) -> list[tuple[str, ...]]:
+    """Names that lead to each command and each group of commands, those of missions too."""
+    found = []
+    context = click.Context(group)
+    for name in group.list_commands(context):
+        command = group.get_command(context, name)
+        found.append((*path, name))
+        if isinstance(command, click.Group):
+            found += every_command(command, (*path, name))
+    return found
+
+
+def test_every_core_command_is_looked_at():
+    names = every_command(bayesdist)
+    assert {(name,) for name in CORE} <= set(names)
+    assert {("hst", "pam"), ("wise", "rvb", "transform"), ("simulate", "camera")} <= set(names)
+
+
+@pytest.mark.parametrize("path", every_command(bayesdist), ids=" ".join)
+def test_every_help_has_an_example_that_the_command_understands(path, capsys):
+    assert main([*path, "--help"]) == 0
     shown = " ".join(capsys.readouterr().out.split())
-    assert f"Example: bayesdist {EXAMPLES[name]}" in shown
-    _, *arguments = shlex.split(EXAMPLES[name])
-    found = bayesdist.get_command(click.Context(bayesdist), name)
-    context = found.make_context(name, arguments)  # UsageError if it is not understood
+    _, example = shown.split("Example: bayesdist ")
+    arguments = shlex.split(example)
+    assert tuple(arguments[: len(path)]) == path
+    group, name = bayesdist, ""
+    while isinstance(group, click.Group):
+        name, arguments = arguments[0], arguments[1:]
+        group = group.get_command(click.Context(group), name)
+    context = group.make_context(name, arguments)  # UsageError if it is not understood
     assert context.params
 
 

@@ -111,13 +111,23 @@ def test_the_matches_of_the_release_cannot_test_it(finished, tmp_path) -> None:
     refused(tmp_path, "monitor", finished.path, old, words=["stars.ecsv", *words])
     shutil.copy(old, tmp_path / "copy.ecsv")
     refused(tmp_path, "monitor", finished.path, tmp_path / "copy.ecsv", words=["copy.ecsv", *words])
-    as_table(new_matches()).write(tmp_path / "new.ecsv")
-    config = write_config(tmp_path / "new.toml", data={"matches": ["new.ecsv", "copy.ecsv"]})
-    refused(tmp_path, "monitor", finished.path, config, words=["copy.ecsv", *words])
-
-
-def test_a_run_is_no_table_of_matches(finished, tmp_path) -> None:
     run, other = finished.path, tmp_path / "other"
     shutil.copytree(run, other)
     refused(tmp_path, "monitor", run, run, words=["is the released run itself", "new matches"])
-    refused(tmp_path, "monitor", run, other, words=["is a run, and not matches", "other"])
+    refused(tmp_path, "monitor", run, other, words=words)
+
+
+@pytest.mark.parametrize("is_folder", [True, False])
+def test_matches_of_the_release_are_left_out_where_there_are_others(finished, tmp_path, is_folder):
+    new = as_table(new_matches())
+    new.remove_column("epoch")  # as the release's own
+    new.write(tmp_path / "new.ecsv")
+    alone = good("monitor", finished.path, tmp_path / "new.ecsv").out
+    shutil.copy(finished.config.parent / "stars.ecsv", tmp_path / "copy.ecsv")
+    names = ["new.ecsv", "copy.ecsv"]
+    config = write_config(tmp_path / "config.toml", data={"matches": names})
+    said = good("monitor", finished.path, tmp_path if is_folder else config).out
+    assert "left out: 1 exposure(s) or file(s) that the release was made from (" in said
+    assert "copy.ecsv)" in said
+    assert said.splitlines()[0] == alone.splitlines()[0]
+    assert "new matches: 1200, of which" in said

@@ -331,10 +331,10 @@ def test_what_cannot_be_compared_is_refused_before_anything_is_sampled(quiet, tm
     for k, (sections, words) in enumerate((
         ({"data": {"matches": "stars.ecsv", "columns": {"epoch": ""}}},
          ("needs an epoch for every pair", "data.columns")),
-        ({"periods": {"centres": [55212.5], "days": 5.0}}, ("1 periods are given",)),
+        ({"periods": {"centres": [55212.5], "days": 5.0}}, ("the number of periods is 1",)),
         ({"periods": {"centres": [55212.5, 55214.0], "days": 5.0}}, ("overlap",)),
         ({"periods": {"centres": [55212.5, 55212.5], "days": 5.0}}, ("given twice",)),
-        ({"periods": {"centres": [1e9, 55212.5], "days": 5.0}}, ("no Modified Julian Date",)),
+        ({"periods": {"centres": [1e9, 55212.5], "days": 5.0}}, ("not a Modified Julian Date",)),
         ({"periods": {"centres": [212.5, 262.5], "days": 5.0}},
          ("MJD 212.5 has no pairs", "from MJD 552", "210.000 to 215.000")),
         ({"periods": {"centres": CENTRES, "days": 0.0}}, ("periods.days",)),

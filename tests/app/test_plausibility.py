@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from astropy.table import Table
 from astropy.wcs import WCS
+from numpy.polynomial import legendre
 
 from bayesdist.app.config import parse_config
 from bayesdist.app.kinds.matches.plausibility import doubts_on_stars, refuse_empty_segments
@@ -50,6 +51,52 @@ def model(unit="pix"):
 
 def doubts(found, **settings):
     return doubts_on_stars(found, model(found.unit), config(**settings))
+
+
+def dots(rng, order, noise=0.02, false=0.0, n=1200):
+    """Positions that follow Legendre terms of one order, 3 px large, and false matches."""
+    x, y = rng.uniform(1, 1000, n), rng.uniform(1, 800, n)
+    X, Y = (x - 500.5) / 500, (y - 400.5) / 400
+    top = legendre.Legendre.basis(order)
+    u, v = (z + 3 * top(Z) + rng.normal(0, noise, n) for z, Z in ((x, X), (y, Y)))
+    wrong = rng.random(n) < false
+    u[wrong] += rng.uniform(-20, 20, wrong.sum())
+    sigma = np.full(n, 0.02)
+    return Matches(x=x, y=y, u=u, v=v, sigma_u=sigma, sigma_v=sigma, unit="pix")
+
+
+@pytest.mark.parametrize("false", [0.0, 0.3])
+@pytest.mark.parametrize("order", [2, 5, 9])
+def test_an_order_that_is_too_low_is_named_before_sampling(rng, order, false):
+    """Not that of the true order, with the same false matches."""
+    found = dots(rng, order, false=false)
+    asked = (1, order - 1, order)
+    chip = model().chips[0]
+    texts = [
+        " ".join(doubts_on_stars(found, DistortionModel(n, (chip,), unit="pix"), config()))
+        for n in asked
+    ]
+    for text in texts[:2]:
+        assert f"px about one of order {order}: the order is too low" in text
+        assert "raise model.order" in text
+    assert "too low" not in texts[2]
+
+
+@pytest.mark.parametrize("false", [0.1, 0.6])
+def test_false_matches_alone_are_no_order_that_is_too_low(rng, false):
+    assert "too low" not in " ".join(doubts(dots(rng, 1, false=false)))
+
+
+@pytest.mark.parametrize("noise", [0.0, 1e-10])
+def test_positions_that_were_computed_are_refused_with_a_way_out(rng, noise):
+    """Those of a design on a grid, and those with as few digits as a table has, which are not."""
+    found = dots(rng, 3, noise=noise)
+    words = "or are those of a design, and without the noise of measured positions"
+    with pytest.raises(InputError, match=words) as caught:
+        doubts(found)
+    assert "bayesdist.fit_linear" in str(caught.value)
+    written = replace(found, u=found.u.round(6), v=found.v.round(6))
+    assert any("computed from the pixels by a WCS" in text for text in doubts(written))
 
 
 # -- too few stars ---------------------------------------------------------------------------------
@@ -113,7 +160,8 @@ def job(folder, rng, hours=False, scale_mas=None, stretch=1.0):
     c, s = 0.15 / 3600 * np.cos(np.radians(30)), 0.15 / 3600 * np.sin(np.radians(30))
     plane.wcs.crpix, plane.wcs.cd = [500.5, 400.5], [[-c * stretch, s], [s * stretch, c]]
     ra, dec = plane.all_pix2world(x, y, 1)
-    table = Table({"x": x, "y": y, "ra": ra / 15 if hours else ra, "dec": dec})
+    dx, dy = rng.normal(0, 1e-4, (2, 200))  # pixels: measured, if by a very good camera
+    table = Table({"x": x + dx, "y": y + dy, "ra": ra / 15 if hours else ra, "dec": dec})
     detector = {"name": "A", "size": (1000, 800)}
     detector |= {} if scale_mas is None else {"scale_mas": scale_mas}
     data = {"matches": "stars.ecsv", "sigma": 0.01}

@@ -851,6 +851,10 @@ def test_demo(tmp_path, full, monkeypatch):
     np.testing.assert_allclose(header.all_pix2world(pixels, 1), there, atol=1e-6)
     assert np.abs(there[0]).max() < 1
     summary = summary_of(run)
+    # a default run of good data is green
+    assert "WARNING" not in out + err + (run / "bayesdist.log").read_text()
+    assert [one["verdict"] for one in summary["margins"]] == ["met", "met"]
+    assert not summary["warnings"]
     assert summary["sampler"]["converged"] is True
     assert min(summary["sampler"]["ess_bulk_min"], summary["sampler"]["ess_tail_min"]) >= 400
     assert summary["sampler"]["rhat_max"] < 1.01

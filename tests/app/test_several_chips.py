@@ -419,3 +419,16 @@ def test_blocks_must_differ(tmp_path, change, word):
     path = tmp_path / "c.toml"
     path.write_text(config_text(**(SETTINGS | {"chip": blocks})), encoding="utf-8")
     refused(tmp_path, "check", path, words=["[[chip]] blocks", word])
+
+
+def test_a_table_of_positions_on_several_chips_keeps_its_order(run, tmp_path):
+    places = [(2, 10.0, 20.0), (1, 4000.0, 2000.0), (2, 3000.0, 5.0), (1, 1.0, 1.0)]
+    table = tmp_path / "places.csv"
+    table.write_text("chip,x,y\n" + "".join(f"{c},{x},{y}\n" for c, x, y in places))
+    said = json.loads(good("budget", run, "--at-table", table, "--json").out)["positions"]
+    assert [(row["chip"], row["x"], row["y"]) for row in said] == places
+    for row, (chip, x, y) in zip(said, places, strict=True):
+        [alone] = json.loads(good("budget", run, "--at", x, y, "--chip", chip, "--json").out)[
+            "positions"
+        ]
+        assert [t["u"] for t in row["terms"]] == pytest.approx([t["u"] for t in alone["terms"]])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import replace
 
 import numpy as np
@@ -179,6 +180,25 @@ def test_the_command_writes_what_python_gives(calibration, stars, tmp_path):
     assert done.code == 1 and "name a .fits file" in done.err
     done = cli("apply", head, table, "-o", str(tmp_path / "a.ecsv"), "--joint")
     assert done.code == 2 and "--sky" in done.err
+
+
+@pytest.mark.parametrize("options", [(), ("--sky",), ("--sky", "--joint")])
+def test_units_unknown_to_astropy_stay_out_of_the_terminal(calibration, stars, tmp_path, options):
+    for one in build("tpv", calibration, product_settings()["tpv"]()):
+        (tmp_path / one.file_name).write_bytes(one.content)
+    table = Table(stars, copy=True)
+    table["counts"], table["brightness"] = 1.0, 12.0
+    hdu = fits.BinTableHDU(table.as_array())
+    for name, unit in (("counts", "ELECTRONS/foo"), ("brightness", "Mag")):
+        hdu.header[f"TUNIT{table.colnames.index(name) + 1}"] = unit
+    hdu.writeto(tmp_path / "stars.fits")
+    head, path, out = (str(tmp_path / n) for n in ("tpv.head", "stars.fits", "out.fits"))
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        done = cli("apply", head, path, "-o", out, *options)
+    assert done.code == 0, done.err
+    assert [str(one.message) for one in caught] == [] and "Warning" not in done.err
+    assert fits.getheader(out, 1)["TUNIT6"] == "ELECTRONS/foo"
 
 
 @pytest.mark.parametrize("names", [("xcentroid", "ycentroid"), ("x_init", "y_init"), ("x", "y")])

@@ -22,6 +22,8 @@ TRANSFORM = "wise rvb transform f -o d --fit"
 
 # command in its mode, option that this mode does not use
 UNUSED = [
+    ("budget r --at-table t.csv", "--to 1 1"),
+    ("budget r --at 1 1", "--columns a b"),
     (SKY, "--inverse"),
     (SKY, "--method newton"),
     (SKY, "--order 3"),

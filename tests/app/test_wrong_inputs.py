@@ -118,7 +118,12 @@ CASES = [
     ("no column", lambda t: t.remove_column("x"), {}, "no column for 'x'"),
     ("few stars", lambda t: t.remove_rows(slice(5, None)), {}, "fewer than the 12 parameters"),
     ("no stars", lambda t: t.remove_rows(slice(0, None)), {}, "holds no rows"),
-    ("errors of zero", change(sigma_u=lambda _: 0.0, sigma_v=lambda _: 0.0), {}, "sigma is 0"),
+    (
+        "errors of zero",
+        change(sigma_u=lambda _: 0.0, sigma_v=lambda _: 0.0),
+        {},
+        "sigma is 0 in all rows",
+    ),
     ("negative errors", change(sigma_u=lambda _: -1.0, sigma_v=lambda _: 1.0), {}, "sigma is -1"),
     (
         "errors in mas",

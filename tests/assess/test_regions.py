@@ -58,3 +58,20 @@ def test_words_of_regions():
     assert region_words("inner 80 %") == " over the inner 80 %"
     assert region_words("upper left") == " over the upper left quadrant"
     assert region_words(((1, 1), (5, 1), (1, 5))) == " over a polygon of 3 corners"
+
+
+def test_a_circle_is_the_pixels_within_its_radius():
+    circle = check_region({"centre": [51, 26.0], "radius": 20}, "")
+    assert (in_region(circle, SIZE, X, Y) == (np.hypot(X - 51, Y - 26) <= 20)).all()
+    assert check_region(circle, "") == circle  # as files keep it
+    assert region_words(circle) == " over the circle of radius 20 about (51, 26)"
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [{"centre": [1, 2]}, {"centre": [1, 2], "radius": 0}, {"centre": [1], "radius": 1},
+     {"centre": [1, 2], "radius": "wide"}, {"centre": [1, 2], "radius": 3, "unit": "mm"}],
+)  # fmt: skip
+def test_what_is_no_circle_is_refused(wrong):
+    with pytest.raises(InputError, match=r"is no circle; give \{centre = \[x, y\], radius = r\}"):
+        check_region(wrong, "detector.field")

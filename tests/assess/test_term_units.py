@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from astropy import units as u
 
 import bayesdist as bd
 from bayesdist.app.calibrate import _budget
+from bayesdist.app.config.data import MatchesConfig
 from bayesdist.errors import InputError
 from bayesdist.infer.stars.stars import errors_of
 
@@ -26,6 +28,38 @@ def test_a_configuration_states_the_unit_of_a_term():
     assert _budget(None, [term], "arcsec")[0]["unit"] == "arcsec"
     with pytest.raises(InputError, match='unit="arcsec"'):
         _budget(None, [term], None)
+
+
+@pytest.mark.parametrize("unit", ["arcsec", "mas", "deg"])
+def test_a_limit_without_unit_is_refused_where_u_v_are_angles(unit):
+    """It was in pixels: 0.02 pixels are not 0.02 arcsec."""
+    need = bd.Requirement("field", "p95", 0.02)
+    assert need.in_unit_of("pix").unit == "pix"
+    with pytest.raises(InputError, match=f"'field': no unit is given, and u and v are in {unit}"):
+        need.in_unit_of(unit)
+    assert bd.Requirement("field", "p95", 0.02 * u.arcsec).in_unit_of(unit).unit == "arcsec"
+    assert bd.Requirement("field", "p95", 0.02, "pix").in_unit_of(unit).unit == "pix"
+
+
+def test_blocks_of_a_configuration_without_unit_are_refused_where_u_v_are_angles():
+    row = {"name": "thermal", "kind": "random", "sigma_u": 0.004, "sigma_v": 0.003}
+    settings = {"data": {"matches": "a.csv"}, "detector": {"size": [9.0, 9.0]}}
+    settings |= {"model": {"order": 1}, "budget": [row], "requirement": [
+        {"name": "field", "statistic": "max", "limit": 0.1}]}  # fmt: skip
+    config = MatchesConfig(**settings)
+    assert [term.unit for term in config.user_terms("pix")] == ["pix"]
+    with pytest.raises(InputError, match="'thermal': no unit is given, and u and v are in mas"):
+        config.user_terms("mas")
+    assert [need.unit for need in config.requirements()] == [""]
+    stated = MatchesConfig(**settings | {"budget": [row | {"unit": "mas"}]})
+    assert [term.unit for term in stated.user_terms("arcsec")] == ["mas"]
+
+
+def test_margins_without_unit_are_refused_before_they_are_judged(from_monomials):
+    plane = {"order": 1, "size": (9.0, 9.0), "reference_pixel": (5.0, 5.0), "unit": "arcsec"}
+    solution = from_monomials({(1, 0): 0.1}, {(0, 1): 0.1}, **plane)
+    with pytest.raises(InputError, match='state it, as unit = "arcsec"'):
+        bd.check_requirements(solution, [bd.Requirement("field", "p95", 0.02)])
 
 
 def test_advice_of_matches_without_errors_does_not_repeat_what_was_done():

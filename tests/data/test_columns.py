@@ -6,7 +6,7 @@ import pytest
 from astropy.table import MaskedColumn, QTable, Table
 from astropy.time import Time
 
-from bayesdist.data import ReadOptions, tangent_plane
+from bayesdist.data import Matches, ReadOptions, tangent_plane
 from bayesdist.errors import InputError
 from tests.data.tables import matches_from_table
 
@@ -241,3 +241,44 @@ def test_lengths_are_refused_with_what_to_do(unit):
         InputError, match="divide u, v and their errors by the size of a pixel in mm"
     ):
         read(t, unit=unit)
+
+
+@pytest.mark.parametrize(("unit", "size"), [("mm", 1.0), ("um", 1e-3), ("cm", 10.0)])
+@pytest.mark.parametrize("stated", [True, False])
+def test_lengths_become_arcsec_by_the_plate_scale(unit, size, stated):
+    """12.5 arcsec per mm; errors in the same unit, in another length, and in an angle."""
+    t = stars()
+    sky = read(t, unit="arcsec")
+    for name in ("u", "v"):
+        t[name].unit = unit if stated else None
+    t["su"], t["sv"] = 0.002 / size, 0.05
+    t["sv"].unit = "arcsec"
+    t["su"].unit = unit if stated else None
+    columns = {"sigma_u": "su", "sigma_v": "sv"}
+    given = None if stated else unit
+    m = read(t, unit=given, plate_scale=12.5, columns=columns)
+    assert m.unit == "arcsec" and "12.5 arcsec per mm" in " ".join(m.notes)
+    np.testing.assert_allclose(m.u, 12.5 * size * sky.u, rtol=1e-14)
+    np.testing.assert_allclose(m.sigma_u, 0.025, rtol=1e-14)
+    np.testing.assert_allclose(m.sigma_v, 0.05)
+
+
+def test_a_number_for_sigma_is_in_the_length_that_is_stated():
+    t = stars()
+    t = t["x", "y", "u", "v"]
+    m = Matches.from_table(t, unit="um", sigma=2.0, plate_scale=12.5)
+    np.testing.assert_allclose(m.sigma_u, 0.025, rtol=1e-14)
+    m = Matches.from_table(t, unit="mm", sigma=2.0 * apu.um, plate_scale=12.5)
+    np.testing.assert_allclose(m.sigma_v, 0.025, rtol=1e-14)
+    for name in ("u", "v"):
+        t[name].unit = "mm"
+    with pytest.raises(InputError, match="u and v are in a length that only the file states"):
+        Matches.from_table(t, sigma=2.0, plate_scale=12.5)
+
+
+@pytest.mark.parametrize("unit", ["pix", "arcsec", None])
+def test_a_plate_scale_beside_what_is_no_length_is_refused(unit):
+    with pytest.raises(InputError, match="a plate scale is given, and the unit is"):
+        read(stars(), unit=unit, plate_scale=12.5)
+    with pytest.raises(InputError, match="give a positive number of arcsec per mm"):
+        ReadOptions(plate_scale=0.0)

@@ -72,6 +72,13 @@ def written(path, head, rows, mark, comma=False, end="\n"):
         ("a.txt", "x y\tu v", " ", False),  # one tab among blanks
         ("a.txt", "x\ty\tu\tv", "   ", False),
         ("a.txt", "x y u v", "\t", False),
+        ("a.txt", "# x y\tu v", " ", False),
+        ("a.txt", "x\ty\tu\tv\t", "\t", False),  # a tab at the end
+        ("a.csv", "x,y,u,v,", ",", False),
+        ("a.csv", "x y u v", " ", False),  # other marks than the extension says
+        ("a.csv", "x\ty\tu\tv", "\t", False),
+        ("a.tsv", "x,y,u,v", ",", False),
+        ("a.tsv", "x y\tu v", "  ", False),
     ],
 )
 def test_marks_of_text_tables(tmp_path, name, head, mark, comma, end):
@@ -111,6 +118,15 @@ def test_a_truncated_ipac_table_is_refused(tmp_path):
     assert len(read_matches(path, sigma=1.0, unit="pix")) == 6
     path.write_text(path.read_text()[:-9])
     with pytest.raises(InputError, match=r"stars\.txt, row 6: ends after"):
+        read_matches(path, sigma=1.0, unit="pix")
+
+
+@pytest.mark.parametrize("mark", [",", ";", "\t"])
+@pytest.mark.parametrize("name", ["a.txt", "a.csv", "a.tsv"])
+def test_a_row_without_all_cells_is_refused_whatever_the_mark(tmp_path, name, mark):
+    path = tmp_path / name
+    path.write_text("x,y,u,v\n1,2,3,4\n5,6,7\n8,9,1,2\n".replace(",", mark))
+    with pytest.raises(InputError, match=r"row 2: has 3 of 4 cells"):
         read_matches(path, sigma=1.0, unit="pix")
 
 

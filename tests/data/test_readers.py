@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+from functools import partial
+
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
@@ -9,7 +11,7 @@ from astropy.io import fits
 from astropy.table import Table
 from astropy.wcs.utils import fit_wcs_from_points
 
-from bayesdist.data import input_files, open_matches, read_matches
+from bayesdist.data import Matches, input_files, open_matches, read_matches
 from bayesdist.data.formats.record import write_matches
 from bayesdist.errors import FormatError, InputError
 
@@ -314,3 +316,14 @@ def test_lists_and_saved_matches_refuse_options_that_they_fix(option, tmp_path, 
     for path, format in zip(files, ("bayesdist", "hst1pass"), strict=True):
         with pytest.raises(InputError, match=f"option '{option}' is given, but the format"):
             read_matches(path, format=format, **{option: OPTIONS[option]})
+
+
+def test_the_origin_that_a_format_has_may_be_stated(rng, tmp_path):
+    x, y = rng.uniform(1, 100, (2, 9))
+    write_matches(
+        tmp_path / "matches.h5", Matches(x=x, y=y, u=x, v=y, unit="pix", mag=np.arange(9.0))
+    )
+    read = partial(read_matches, tmp_path / "matches.h5", sigma="by_magnitude")
+    assert (read(pixel_origin=1).x == x).all()
+    with pytest.raises(InputError, match="option 'pixel_origin' is given"):
+        read(pixel_origin=0)

@@ -214,9 +214,9 @@ def test_large_tables_are_sampled_and_say_what_the_sample_sees(monkeypatch):
     assert min(one.p_value for one in part.values()) > 1e-3
 
 
-def test_a_view_does_not_say_how_it_was_fitted():
+def test_a_transformed_solution_has_no_likelihood():
     table, fit = Scene(200, 1, "shift", 2).fitted(1)
-    with pytest.raises(InputError, match="how it was fitted"):
+    with pytest.raises(InputError, match="has no likelihood"):
         score_tests(table, without_frames(fit))
 
 

@@ -14,6 +14,7 @@ from bayesdist.calibration.calibration import Calibration, GaussianSolution, cal
 from bayesdist.calibration.further import FurtherError
 from bayesdist.calibration.plane import Plane
 from bayesdist.errors import InputError
+from bayesdist.formats import sip_from_solution
 from bayesdist.missions.wise import simulate_wise
 from bayesdist.products.formats.common.document import BuildOptions, Choice
 from bayesdist.products.registry import (
@@ -83,14 +84,15 @@ def test_what_programs_would_make_of_a_header_is_warned_of(fit, tmp_path):
     assert "crval" not in one.warnings[0].lower()
 
 
-def test_constant_and_linear_terms_are_warned_of(tmp_path):
+def test_constant_and_linear_terms_that_are_asked_for_are_noted(tmp_path):
     rng = np.random.default_rng(3)
     matches, _ = simulate_wise(400, rng=rng)
     fit = bd.fit_linear(matches, bd.build_model(matches, order=3, size=(1016, 1016)))
     [_, one], _ = made(fit, tmp_path, linear="sip")
-    assert any("stwcs and gwcs drop" in w for w in one.warnings)
+    assert any("stwcs and gwcs drop" in note for note in one.notes)
+    assert not one.warnings  # the setting causes it
     [_, one], _ = made(fit, tmp_path, linear="cd")
-    assert not any("stwcs" in w for w in one.warnings)
+    assert not any("stwcs" in text for text in (*one.notes, *one.warnings))
 
 
 def test_axes_of_the_sky_are_not_linear(fit, tmp_path):
@@ -151,6 +153,8 @@ def test_a_wide_plane_on_no_sky_is_not_written_as_tan(fit, tmp_path, scale, line
         wcs = WCS(fits.Header.fromtextfile(path))
     assert wcs.has_celestial is not linear
     assert any("tangent plane is worth" in text for text in files[-1].warnings) is linear
+    plain = sip_from_solution(calibration)  # as Python calls it
+    assert plain.ctype[0].startswith("RA---TAN") is not linear
     if not linear:
         return
     x, y = np.random.default_rng(2).uniform(1, 700, (2, 50))
@@ -164,3 +168,52 @@ def test_a_wide_plane_on_no_sky_is_not_written_as_tan(fit, tmp_path, scale, line
     product = product_settings()["sip"](axes="linear", crval=(1.0, 2.0))
     with pytest.raises(InputError, match="have one"):
         build("sip", calibration, product, BuildOptions())
+
+
+WIDE = [(key, size) for key in ("tpv", "cpdis") for size in (120.0, 1.0)]
+
+
+@pytest.mark.parametrize(("key", "scale"), WIDE)
+@pytest.mark.parametrize("unit", ["arcsec", "pix"])
+def test_formats_of_a_tangent_plane_refuse_wide_planes_on_no_sky(key, scale, unit, tmp_path):
+    """ARC and TAN differ by r - atan r, r the distance from the point of contact."""
+    chip = bd.Chip(1, "camera", (900.0, 700.0), (450.5, 350.5))
+    model = bd.DistortionModel(2, (chip,), unit)
+    factor = scale if unit == "arcsec" else 1.0
+    theta = np.zeros(model.n_params)
+    basis = model.basis()
+    for axis, power in enumerate(((1, 0), (0, 1))):
+        values = np.array([factor * (term == power) for term in basis.terms])
+        theta[model.coefficient_slice(None, axis)] = basis.from_monomials(values)
+    cov = 1e-8 * np.eye(model.n_params)
+    calibration = Calibration("run", GaussianSolution(model, theta, cov), Plane())
+    options = BuildOptions(scale_arcsec=scale)
+    corner = np.radians(scale * np.hypot(449.5, 349.5) / 3600)
+    worst = np.degrees(corner - np.arctan(corner)) * 3600 / scale
+    plain, placed = product_settings()[key](), product_settings()[key](crval=(10.0, 20.0))
+    if worst > 0.1:
+        with pytest.raises(InputError, match=rf"is worth {worst:.2g} px") as caught:
+            build(key, calibration, plain, options)
+        assert f"products.{key}.crval" in str(caught.value)
+    else:
+        assert build(key, calibration, plain, options)
+    for one in build(key, calibration, placed, options):
+        (tmp_path / one.file_name).write_bytes(one.content)
+    x, y = np.array([1.0, 900.0]), np.array([1.0, 350.5])
+    u, v = (np.radians(scale * (a - c) / 3600) for a, c in ((x, 450.5), (y, 350.5)))
+    header = tmp_path / ("tpv.head" if key == "tpv" else "cpdis.fits")
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        if key == "tpv":
+            wcs = WCS(fits.Header.fromtextfile(header))
+            ra, dec = wcs.all_pix2world(x, y, 1)
+        else:
+            with fits.open(header) as hdus:
+                ra, dec = WCS(hdus[1].header, hdus).all_pix2world(x, y, 1)
+    # positions of a tangent plane, in closed form
+    dec0 = np.radians(20.0)
+    expected_ra = 10.0 + np.degrees(np.arctan2(u, np.cos(dec0) - v * np.sin(dec0)))
+    norm = np.sqrt(1 + u**2 + v**2)
+    expected_dec = np.degrees(np.arcsin((np.sin(dec0) + v * np.cos(dec0)) / norm))
+    np.testing.assert_allclose(ra, expected_ra % 360, atol=1e-7)
+    np.testing.assert_allclose(dec, expected_dec, atol=1e-7)

@@ -473,6 +473,6 @@ def test_a_table_is_downloaded_as_it_is_shown(opened):
     assert columns == {len(rows[0]) - 1}
 
 
-def test_downloads_are_offered_below_each_table(opened):
-    buttons = opened.find_elements("xpath", "//section[@id='margins']//p[@class='get']/button")
+def test_downloads_are_offered_in_the_caption_of_each_table(opened):
+    buttons = opened.find_elements("xpath", "//section[@id='margins']//caption/span/button")
     assert {one.text for one in buttons} == {"CSV", "LaTeX"}

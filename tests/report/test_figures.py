@@ -10,15 +10,23 @@ import numpy as np
 import pytest
 from matplotlib import pyplot
 from matplotlib.collections import LineCollection, QuadMesh
+from matplotlib.colors import Normalize
+from matplotlib.figure import Figure
 from matplotlib.quiver import Quiver
 
 from bayesdist.assess import VectorMap
 from bayesdist.errors import InputError
 from bayesdist.report.drawing import save_figures
 from bayesdist.report.figures.arrows import Arrows, cross_map, sparse_step, square_cells
-from bayesdist.report.figures.fields import contour_levels, error_levels
+from bayesdist.report.figures.fields import (
+    Grid,
+    contour_levels,
+    draw_grid,
+    error_levels,
+    scalar_map,
+)
 from bayesdist.report.figures.mosaic import Mosaic
-from bayesdist.report.figures.panels import ChipPanels
+from bayesdist.report.figures.panels import ChipPanels, FocalPlane, overlap
 from bayesdist.report.figures.style import figure_style, nice_below
 from bayesdist.report.plots.posterior import (
     correlation_matrix,
@@ -176,7 +184,7 @@ def test_key_of_the_crosses_is_to_their_scale(converged):
         assert drawn == pytest.approx(paper * m.radius_max / stated, rel=1e-9)
 
 
-MAPS = ("distortion", "distortion_non_linear", "formal_uncertainty", "uncertainty_radius",
+MAPS = ("formal_uncertainty", "uncertainty_radius",
         "pixel_area", "residual_vectors", "budget_dominating")  # fmt: skip
 
 
@@ -199,8 +207,6 @@ def test_each_chip_has_a_panel_where_it_lies(wfc):
         np.testing.assert_allclose(scales, scales[0][0], rtol=1e-6)
         keys = [_key(ax) for ax in panels if any("drawn" in t.get_text() for t in ax.texts)]
         if name in (
-            "distortion",
-            "distortion_non_linear",
             "residual_vectors",
             "formal_uncertainty",
         ):
@@ -214,6 +220,58 @@ def test_each_chip_has_a_panel_where_it_lies(wfc):
             if c.get_cmap().name == "cividis" and c.get_array() is not None
         }
         assert len(fills) == (name in ("uncertainty_radius", "pixel_area"))
+
+
+def test_vectors_of_all_chips_are_in_one_focal_plane(wfc):
+    """WFC1 is 30 pixels above WFC2, and the longest arrow is as long as a cell of the grid."""
+    for name, fig in figures_of(wfc, "distortion", "distortion_non_linear").items():
+        which = {"distortion": "displacement", "distortion_non_linear": "non_linear"}[name]
+        vectors = [getattr(c, which) for c in wfc.chips]
+        ax, bar = fig.axes
+        low, high = (patch.get_xy()[:4] for patch in ax.patches[:2])
+        assert np.ptp(low, axis=0) == pytest.approx((4096, 2048), rel=1e-6)
+        assert np.ptp(high, axis=0) == pytest.approx((4096, 2048), rel=1e-3)
+        assert high[:, 1].min() - low[:, 1].max() == pytest.approx(30, abs=3)
+        quivers = [c for c in ax.collections if isinstance(c, Quiver)]
+        assert len(quivers) == 2
+        M = 1.0 / quivers[0].scale
+        longest = max(float(np.hypot(*v.on_detector).max()) for v in vectors)
+        step = min(np.diff(np.unique(q.X)).max() for q in quivers[:1])
+        assert 0.9 * step < M * longest <= step * (1 + 1e-9)
+        for quiver in quivers:
+            np.testing.assert_allclose(quiver.get_array(), np.hypot(quiver.U, quiver.V))
+            assert quiver.get_clim() == pytest.approx((0.0, longest), rel=1e-3)
+        assert bar.get_ylabel() == "length [pix]"
+
+
+def test_maps_of_many_chips_are_in_one_focal_plane(wfc):
+    """Each cell of a turned chip is where the chip's frame puts its corners."""
+    grid = Grid(np.arange(3.0), np.arange(2.0), np.arange(6.0).reshape(2, 3))
+    square = np.array([[0, 0], [3, 0], [3, 2], [0, 2.0]])
+    outlines = [square + np.array([10.0 * k, 0]) for k in range(5)]
+
+    def turned(x, y):
+        return np.stack([40.0 - np.asarray(y), np.asarray(x)])
+
+    frames = [*[lambda x, y, k=k: np.stack([x + 10 * k, y]) for k in range(4)], turned]
+    panels = FocalPlane(outlines, list("ABCDE"), frames=frames, colorbar=True)
+    scalar_map(panels, [grid] * 5, [""], norm=Normalize(0, 5), label="n")
+    ax, _ = panels.figure.axes
+    meshes = [c for c in ax.collections if isinstance(c, QuadMesh)]
+    corners = [m.get_coordinates() for m in meshes]
+    np.testing.assert_allclose(corners[1][0, 0], (9.5, -0.5))
+    np.testing.assert_allclose(corners[4][0, 0], (40.5, -0.5))
+    np.testing.assert_allclose(corners[4][0, -1], (40.5, 2.5))
+    assert [text.get_text() for text in ax.texts] == list("ABCDE")
+
+
+def test_chips_on_each_other_have_panels_of_their_own():
+    def square(x: float, y: float):
+        return np.array([[x, y], [x + 100, y], [x + 100, y + 100], [x, y + 100]])
+
+    assert overlap([square(0, 0), square(50, 10)])
+    assert not overlap([square(0, 0), square(95, 0)])
+    assert not overlap([square(0, 0), square(0, 130), square(130, 0)])
 
 
 def test_chips_of_several_sizes_share_one_scale():
@@ -451,3 +509,16 @@ def test_at_most_thirteen_crosses_stand_on_an_axis(converged, n):
     shown = x[columns]
     assert len(x[rows]) == len(shown) <= 13
     assert shown[0] == 1.0 and shown[-1] == 1016.0  # corners, where errors are largest
+
+
+def test_contours_end_where_a_field_ends():
+    """A map of a round field: contours within half a step of it, and over nearly all of it."""
+    x = np.linspace(1.0, 1000.0, 33)
+    X, Y = np.meshgrid(x, x)
+    far = np.hypot(X - 500, Y - 500)
+    values = np.where(far <= 400, 1.0 + (far / 400) ** 2, np.nan)
+    ax = Figure().subplots()
+    drawn = draw_grid(ax, Grid(x, x, values), levels=error_levels(values))
+    corners = np.concatenate([path.vertices for path in drawn.get_paths() if len(path.vertices)])
+    reach = np.hypot(*(corners - 500).T)
+    assert 370 < reach.max() < 400 + 999 / 32

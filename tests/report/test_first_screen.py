@@ -8,6 +8,7 @@ from dataclasses import replace
 import pytest
 from lxml import html as lxml_html
 
+from bayesdist.report.drawing import Drawing
 from bayesdist.report.run_report import render_report
 from bayesdist.report.sections.run.status import facts_line, requirement_lines, status_table
 from bayesdist.utils.checks import Check
@@ -76,3 +77,25 @@ def test_rows_that_fail_or_warn_are_open_and_those_that_pass_are_folded(converge
     assert "level warn" in shown and "level pass" not in shown
     groups = list(dict.fromkeys(row[0] for row in status_table(run).rows))
     assert groups == ["Requirements", "Fit", "Sampling", "Products"]
+
+
+def test_a_small_run_has_ten_screens(converged, plots, browser, tmp_path):
+    """At 1440 x 900 pixels, with pictures as large as the figures are; nothing is wider."""
+    drawn = {}
+    for name, plot in plots.items():
+        width, height = plot.figure.get_size_inches()
+        blank = f'<svg xmlns="http://www.w3.org/2000/svg" width="{width}in" height="{height}in"/>'
+        words = {"title": plot.title, "text": plot.text, "alt": plot.alt}
+        drawn[name] = Drawing(blank.encode(), "svg", width, **words)
+    path = tmp_path / "report.html"
+    path.write_text(render_report(converged, drawn), encoding="utf-8")
+    size = {"width": 1440, "height": 900, "deviceScaleFactor": 1, "mobile": False}
+    browser.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", size)
+    try:
+        browser.get(path.as_uri())
+        root = "document.documentElement"
+        found = browser.execute_script(f"return [{root}.scrollHeight, {root}.scrollWidth]")
+    finally:
+        browser.execute_cdp_cmd("Emulation.clearDeviceMetricsOverride", {})
+    assert found[0] <= 10 * 900
+    assert found[1] <= 1440

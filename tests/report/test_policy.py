@@ -180,7 +180,8 @@ def test_nothing_runs_while_the_budget_is_asked(opened):
 def test_pictures_have_the_width_that_they_were_drawn_for(opened):
     [(width, expected)] = opened.execute_script(
         "return [...document.querySelectorAll('figure img')].map(e => [e.style.cssText ||"
-        " getComputedStyle(e).width, Number(e.className.split('-')[1]) * 0.96])"
+        " getComputedStyle(e).width,"
+        " Number(e.closest('figure').className.match(/width-(\\d+)/)[1]) * 0.96])"
     )
     assert float(width.removesuffix("px")) == pytest.approx(expected, abs=0.1)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +17,7 @@ from bayesdist.app.kinds.fit_data import FitData
 from bayesdist.app.kinds.kind import kind_of
 from bayesdist.app.kinds.matches.added_errors import in_circle
 from bayesdist.app.store.summary import CoverageRow, Holdout, HoldoutTest
+from bayesdist.assess.domain import WHOLE, in_region
 from bayesdist.assess.evaluation import EvaluationSettings
 from bayesdist.assess.model import ErrorModel, with_diagnosed_errors
 from bayesdist.diagnose.diagnostics import Diagnostics, diagnose_fit, diagnose_posterior
@@ -64,7 +66,7 @@ def diagnose_residuals(posterior: Posterior | None, data: FitData, config: Confi
     fitted, kind = data.fitted, kind_of(config)
     # errors of centroids that the fit has found
     measured = fitted.scatter is not None or fitted.solved is not None
-    return diagnose_fit(
+    found = diagnose_fit(
         data.fit,
         posterior,
         data.stars,
@@ -80,6 +82,10 @@ def diagnose_residuals(posterior: Posterior | None, data: FitData, config: Confi
         rows=kind.rows,
         chooser=kind.chooser,
     )
+    if config.field == WHOLE:
+        return found
+    inside = partial(in_region, config.field, data.model.chips[0].size)
+    return replace(found, coverage=tuple(one.within(inside) for one in found.coverage))
 
 
 TOGETHER = 1.5  # steps between nodes over which tables err as one: what their covariance comes to

@@ -59,6 +59,7 @@ def rehearsal_settings(data: FitData, config: Config) -> EvaluationSettings:
         # errors of centroids that the fit has found hold nothing else
         contained=() if measured else config.held_in_residuals(data.model.unit),
         given=tuple(block.name for block in config.budget if block.stated),
+        field=config.field,
     )
 
 
@@ -113,7 +114,7 @@ def errors_of_run(
 def _given_terms(solution: Solution, data: FitData, config: Config) -> list[ErrorTerm]:
     """Terms of the user, and of tables where exposures were fitted jointly."""
     tables = () if data.fitted.scatter is None else _table_terms(solution, data, config)
-    return [*config.linear_terms(solution), *tables, *config.user_terms()]
+    return [*config.linear_terms(solution), *tables, *config.user_terms(solution.model.unit)]
 
 
 def _variation(solution: Solution, scatter: ExposureScatter, matched: Matched) -> ExposureVariation:

@@ -63,7 +63,7 @@ def period_settings(data: FitData, config: Config) -> PeriodSettings | None:
     angle = fit.unit != "pix" or scale is not None
     limits = [
         convert(r.limit, r.unit, fit.unit, scale, where=f"requirement {r.name!r}")
-        for r in config.requirements()
+        for r in (one.in_unit_of(fit.unit) for one in config.requirements())
     ]
     return PeriodSettings(
         config.spans(),

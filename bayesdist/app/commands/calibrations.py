@@ -203,7 +203,8 @@ def compare() -> None:
 def monitor() -> None:
     """Test whether a released calibration still describes new matches.
 
-    NEW is a table of matches, or a CONFIG.toml that names them.
+    NEW is a table of matches, or a CONFIG.toml, a run or a folder with a config.toml
+    that names them.
     """
 
 

@@ -30,6 +30,13 @@ class LazyGroup(click.Group):
         """Command of a name, loaded; None for an unknown one."""
         return self.load(self._lazy[cmd_name]) if cmd_name in self._lazy else None
 
+    def format_epilog(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        """Write the epilog: without one of its own, the example of the first command."""
+        if not self.epilog:
+            first = self.get_command(ctx, self.list_commands(ctx)[0])
+            self.epilog = None if first is None else first.epilog
+        super().format_epilog(ctx, formatter)
+
     def resolve_command(
         self, ctx: click.Context, args: list[str]
     ) -> tuple[str | None, click.Command | None, list[str]]:
@@ -130,6 +137,7 @@ class _Command(click.Command):
     """A command that refuses options which it does not use in the mode that is asked for."""
 
     unused: tuple[Unused, ...] = ()
+    example: str = ""  # as of `command`
     calls: str = ""  # as of `command`
 
     def invoke(self, ctx: click.Context) -> Any:
@@ -140,14 +148,19 @@ class _Command(click.Command):
 
 
 def command(
-    calls: str = "", *, recorded: bool = False, unused: Sequence[Unused] = (), **settings: Any
+    calls: str = "",
+    *,
+    example: str = "",
+    recorded: bool = False,
+    unused: Sequence[Unused] = (),
+    **settings: Any,
 ) -> Callable[[Callable[..., int | None]], click.Command]:
     """Decorator of a command, which takes --quiet.
 
     `calls`: as "module:function", what the command does: it is loaded when that runs, takes the
     options (and the command line, to be `recorded`), and returns what is printed.  Without it the
     decorated function does all by itself, and returns the exit code.  `unused`: options that are
-    refused in some modes.
+    refused in some modes.  `example`: a command line without 'bayesdist', which the help ends with.
     """
     quiet = click.option(
         "-q",
@@ -165,8 +178,11 @@ def command(
                 options["command"] = click.get_current_context().obj
             click.echo(load_object(calls)(**options))
 
-        made = click.command(cls=_Command, **settings)(quiet(calling if calls else function))
-        made.unused, made.calls = tuple(unused), calls
+        epilog = f"Example: bayesdist {example}" if example else None
+        made = click.command(cls=_Command, epilog=epilog, **settings)(
+            quiet(calling if calls else function)
+        )
+        made.unused, made.calls, made.example = tuple(unused), calls, example
         return made
 
     return decorated

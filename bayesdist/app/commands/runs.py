@@ -131,9 +131,28 @@ def requirements(run: str, requirements: str) -> int:
     return code
 
 
-@command(calls=f"{ON_RUNS}.budget:budget_at")
+@command(
+    calls=f"{ON_RUNS}.budget:budget_at",
+    unused=[
+        Unused("to", "with --at-table", lambda o: o["at_table"] is not None, "give --at"),
+        Unused("columns", "without --at-table", lambda o: o["at_table"] is None),
+    ],
+)
 @click.argument("run", metavar="RUN", type=click.Path())
-@click.option("--at", required=True, nargs=2, type=float, metavar="X Y", help="FITS 1-based pixel.")
+@click.option("--at", nargs=2, type=float, metavar="X Y", help="FITS 1-based pixel.")
+@click.option(
+    "--at-table",
+    type=click.Path(),
+    metavar="FILE",
+    help="Table of positions in place of --at; it may have a column chip.",
+)
+@click.option(
+    "--columns",
+    nargs=2,
+    metavar="X Y",
+    show_default="x y",
+    help="Columns of the pixels in that table.",
+)
 @click.option(
     "--to",
     multiple=True,
@@ -149,8 +168,9 @@ def requirements(run: str, requirements: str) -> int:
 @click.option(
     "--magnitude", type=float, metavar="M", help="Add the centroid error at this magnitude."
 )
+@click.option("--json", "as_json", is_flag=True, help="Print every term of all positions as JSON.")
 def budget() -> None:
-    """Print the error budget of a position, or of a separation."""
+    """Print the error budget of a position, of a table of them, or of a separation."""
 
 
 @command()

@@ -12,7 +12,7 @@ from bayesdist.errors import InputError
 from bayesdist.files.atomic import atomic_path
 
 
-@command()
+@command(example="simulate camera -o camera_gaia.csv")
 @click.option(
     "-o",
     "--output",

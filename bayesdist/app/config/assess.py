@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 from pydantic import Field, PositiveFloat, field_validator
 from pydantic_core import PydanticCustomError
 
-from bayesdist.app.config.section import Epoch, Section, Unit
+from bayesdist.app.config.section import Circle, Epoch, Section, Unit
 from bayesdist.assess.terms.correlated import (
     DEVIATIONS,
     FIELDS,
@@ -55,7 +55,7 @@ class BudgetBlock(Section):
     sigma_u: Annotated[float, Field(ge=0)] | None = None
     sigma_v: Annotated[float, Field(ge=0)] | None = None
     sigma: Annotated[float, Field(ge=0)] | None = None
-    unit: Unit | None = None  # of sigma_u and sigma_v: pixels by default
+    unit: Unit | None = None  # of sigma_u and sigma_v: pixels, if u and v are
     source: str = GIVEN
     included_in_scatter: bool = False
 
@@ -111,11 +111,11 @@ class RequirementBlock(Section):
     name: str
     statistic: str
     limit: PositiveFloat
-    unit: Unit = "pix"
+    unit: Unit | None = None  # pixels, if u and v are
     probability: Probability = 0.95
     epoch: Epoch | None = None
     chip: int | None = None
-    region: str | list[tuple[float, float]] = "whole"
+    region: str | Circle | list[tuple[float, float]] = "whole"
     epochs: tuple[Epoch, Epoch] | None = None
     relative: bool = False
     separation: PositiveFloat | None = None

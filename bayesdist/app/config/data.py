@@ -36,6 +36,8 @@ from bayesdist.errors import InputError
 from bayesdist.infer.compare.period_dates import check_periods, mjd_periods
 from bayesdist.mission import load_object, missions
 
+LENGTHS = ("mm", "um")  # units that a plate scale brings to arcsec
+
 
 class Data(Section):
     """Matched stars, and how their files are read."""
@@ -43,7 +45,8 @@ class Data(Section):
     matches: str | list[str]
     format: str = "auto"
     columns: dict[str, str] | None = None
-    unit: Unit | None = None
+    unit: Unit | Literal["mm", "um"] | None = None
+    plate_scale: PositiveFloat | None = None  # arcsec per mm
     sigma: Literal["columns", "by_magnitude"] | PositiveFloat = "columns"
     pixel_origin: Literal[0, 1] | None = None
     tangent_point: RightAscensionDeclination | None = None
@@ -70,14 +73,19 @@ class Data(Section):
     @classmethod
     def _no_length(cls, unit: Any) -> Any:
         advice = length_advice(unit) if isinstance(unit, str) else ""
-        if advice:
+        if advice and unit not in LENGTHS:
             raise ValueError(
                 f"data.unit is {unit!r}, and positions are in pixels or angles; {advice}"
             )
         return unit
 
     def faults(self) -> Iterator[str]:
-        """Nominal positions of what is no table."""
+        """Nominal positions of what is no table, and lengths without a plate scale."""
+        if self.unit in LENGTHS and self.plate_scale is None:
+            yield (
+                f"data.unit is {self.unit!r}, and positions are in pixels or angles; "
+                f"{length_advice(str(self.unit))}"
+            )
         if self.has_nominal and self.format not in ("auto", "table"):
             yield (
                 f"nominal positions are columns of tables, and data.format is {self.format!r}; "

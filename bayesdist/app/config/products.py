@@ -52,7 +52,9 @@ class ReleaseBlock(Section):
 
 
 class Products(Section):
-    """Files for pipelines."""
+    """Files for pipelines, and the release that they replace."""
+
+    previous: str | None = None  # a calibration of any format, or a run
 
     if TYPE_CHECKING:
 

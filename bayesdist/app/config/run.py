@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Self
 
@@ -27,16 +28,19 @@ from bayesdist.app.config.model import CampaignModel, MatchedModel, SelfcalModel
 from bayesdist.app.config.products import Products
 from bayesdist.app.config.section import (
     ChipBlock,
-    Detector,
+    Circle,
+    RunDetector,
     Section,
     chips_of,
     detector_faults,
     same_names,
 )
 from bayesdist.assess import Requirement, UserTerm
+from bayesdist.assess.domain import WHOLE, Region, check_region
 from bayesdist.assess.terms.forms import ErrorTerm
 from bayesdist.assess.terms.given import said_by_user
 from bayesdist.assess.terms.parameters import one_size_term
+from bayesdist.assess.units import stated_unit
 from bayesdist.errors import InputError
 from bayesdist.infer import Compute, OutlierMixture
 from bayesdist.infer.solution.solution import Solution
@@ -58,7 +62,7 @@ class RunConfig(Section):
         @property
         def compute(self) -> ComputeBlock: ...
 
-    detector: Detector = Detector()
+    detector: RunDetector = RunDetector()
     chip: list[ChipBlock] = Field(default_factory=list)
     assess: Assess = Assess()
     budget: list[BudgetBlock] = Field(default_factory=list)
@@ -76,6 +80,11 @@ class RunConfig(Section):
                 "give it another"
             )
         yield from detector_faults(self.chip, self.detector, self.model.reference_pixel)
+        if self.chip and self.detector.field is not None:
+            yield (
+                "detector.field is of a detector of one chip, and there are [[chip]] blocks; leave "
+                "it out, and give each requirement the region of its chip"
+            )
         for settings in self.products.asked().values():
             settings.check(self.named_detector, self.detector.size, self.model.reference_pixel)
 
@@ -97,9 +106,11 @@ class RunConfig(Section):
         raise NotImplementedError
 
     def files_of_products(self, base: Path) -> list[Path]:
-        """Files that only the products of a run are made from."""
+        """Files that only the products and the report of a run are made from."""
         release, named = self.products.release, self.named_files(base)
         found = [] if release is None else [base / release.reference]
+        if self.products.previous is not None:
+            found.append(previous_file(base / self.products.previous))
         others = named if isinstance(named, list) else [named]
         return [path for path in found if path not in others]
 
@@ -157,15 +168,18 @@ class RunConfig(Section):
         """Boolean: a [[budget]] row states the error of proper motions."""
         return any(row.stated and row.of_motions for row in self.budget)
 
-    def user_terms(self) -> tuple[UserTerm, ...]:
-        """The user's terms of the error budget that are the same at every position."""
+    def user_terms(self, unit: str = "pix") -> tuple[UserTerm, ...]:
+        """The user's terms of the error budget that are the same at every position.
+
+        `unit`: of u and v. InputError if it is an angle, and a term has no unit.
+        """
         return tuple(
             UserTerm(
                 b.name,
                 b.kind,
                 b.sigma_u,
                 b.sigma_v,
-                b.unit or "pix",
+                _unit_of(b, unit),
                 said_by_user(b.source),
                 included_in_scatter=b.included_in_scatter,
             )
@@ -181,18 +195,40 @@ class RunConfig(Section):
             if b.sigma is not None
         )
 
-    def in_residuals(self) -> tuple[UserTerm, ...]:
-        """User's terms that the scatter of the residuals includes."""
-        return tuple(term for term in self.user_terms() if term.included_in_scatter)
+    def in_residuals(self, unit: str = "pix") -> tuple[UserTerm, ...]:
+        """User's terms that the scatter of the residuals includes; `unit` as of `user_terms`."""
+        return tuple(term for term in self.user_terms(unit) if term.included_in_scatter)
 
     def held_in_residuals(self, unit: str) -> list[tuple[str, float, float]]:
         """Name and standard deviation on each axis of these terms, in the unit of u and v."""
         scale = self.detector.scale_mas
-        return [(t.name, *t.sigma(unit, scale)) for t in self.in_residuals()]
+        return [(t.name, *t.sigma(unit, scale)) for t in self.in_residuals(unit)]
 
     def requirements(self) -> tuple[Requirement, ...]:
-        """The requirements."""
-        return tuple(Requirement(**r.model_dump()) for r in self.requirement)
+        """The requirements; the field of the detector is the region of those that name none."""
+        return self.within_field(Requirement(**r.model_dump()) for r in self.requirement)
+
+    @property
+    def field(self) -> Region:
+        """The part of the detector that sees the sky."""
+        given = self.detector.field
+        if given is None:
+            return WHOLE
+        circle = given.model_dump() if isinstance(given, Circle) else given
+        return check_region(circle, "detector.field")
+
+    def within_field(self, requirements: Iterable[Requirement]) -> tuple[Requirement, ...]:
+        """Requirements, of which those without a region are on the field of the detector."""
+        return tuple(
+            replace(one, region=self.field) if one.region == WHOLE else one for one in requirements
+        )
+
+
+def _unit_of(block: BudgetBlock, unit: str) -> str:
+    """Unit of the sizes of a [[budget]] row; nothing is nothing in any unit."""
+    if not (block.sigma_u or block.sigma_v):
+        return block.unit or "pix"
+    return stated_unit(block.unit, unit, f"budget term {block.name!r}")
 
 
 # -- files of other runs that a configuration goes by ----------------------------------------------
@@ -211,6 +247,11 @@ def rates_file(folder: Path) -> Path:
 def calibration_file(path: Path) -> Path:
     """File of an earlier calibration: one of any format as it is named, or a run's posterior."""
     return path if path.is_file() else _file_of_run(path, POSTERIOR, "prior_calibration.source")
+
+
+def previous_file(path: Path) -> Path:
+    """File of the release that is replaced: one of any format, or a run's posterior."""
+    return path if path.is_file() else _file_of_run(path, POSTERIOR, "products.previous")
 
 
 def _file_of_run(folder: Path, name: str, key: str) -> Path:

@@ -37,6 +37,13 @@ Pair = tuple[PositiveFloat, PositiveFloat]
 Block = TypeVar("Block", bound="ChipBlock")
 
 
+class Circle(Section):
+    """A round field on a detector, in pixels."""
+
+    centre: tuple[float, float]
+    radius: PositiveFloat
+
+
 class Detector(Section):
     """A detector of one chip."""
 
@@ -46,6 +53,12 @@ class Detector(Section):
     filter: str = ""
     size: Pair | None = None
     scale_mas: PositiveFloat | None = None
+
+
+class RunDetector(Detector):
+    """A detector of a run, whose errors are evaluated over the part that sees the sky."""
+
+    field: Circle | list[tuple[float, float]] | None = None
 
 
 class ChipBlock(Section):

@@ -225,9 +225,9 @@ def _map_summary(found: Evaluation) -> dict[str, Any]:
     chips: list[dict[str, Any]] = [
         {
             **attributes(m, "chip sigma_u_max sigma_v_max radius_max position_of_max"),
-            "sigma_max": float(m.per_axis.max()),
-            "ce68_max": float(m.circular_error(0.68).max()),
-            "ce95_max": float(m.circular_error(0.95).max()),
+            "sigma_max": float(np.nanmax(m.per_axis)),
+            "ce68_max": float(np.nanmax(m.circular_error(0.68))),
+            "ce95_max": float(np.nanmax(m.circular_error(0.95))),
             "radius_max_least_squares": least_squares.radius_max,
         }
         for m, least_squares in zip(found.maps, found.formal, strict=True)

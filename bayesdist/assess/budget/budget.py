@@ -12,7 +12,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from bayesdist.assess.domain import EvaluationDomain
 from bayesdist.assess.drawn import DrawnErrors
+from bayesdist.assess.solution import place_of
 from bayesdist.assess.terms.forms import PRODUCT
+from bayesdist.model.grid import grid_pixels
 from bayesdist.utils.arrays import Float, Int
 
 if TYPE_CHECKING:
@@ -269,13 +271,18 @@ class ErrorBudget:
     @property
     def axes(self) -> tuple[Float, Float]:
         """Columns (nx,) and rows (ny,) of the grid, of a budget over the grid of one chip."""
-        nx, ny = self.domain.grid or (self.domain.size, 1)
-        return self.x[:nx], self.y.reshape(ny, nx)[:, 0]
+        if self.domain.grid is None:
+            return self.x, self.y[:1]
+        [number] = self.domain.chips
+        place = place_of(self.domain.model, epoch=self.epoch, chip=number)
+        return grid_pixels(place.chip.size, self.domain.grid)
 
     def on_grid(self, values: NDArray[Any]) -> NDArray[Any]:
-        """Values (N,) of a budget over the grid of one chip as a map (ny, nx)."""
-        nx, ny = self.domain.grid or (self.domain.size, 1)
-        return values.reshape(ny, nx)
+        """Values (N,) of a budget over the grid of one chip as a map (ny, nx), NaN off it."""
+        x, y = self.axes
+        found = np.full((y.size, x.size), np.nan)
+        found[np.searchsorted(y, self.y), np.searchsorted(x, self.x)] = values
+        return found
 
     def rows(self) -> list[dict[str, Any]]:
         """The budget as a table: one row for each term and each product, the total last.

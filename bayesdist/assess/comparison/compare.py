@@ -41,6 +41,9 @@ __all__ = [
 ]
 
 
+NOISE_SEED = 20150206  # of the noise fields: the same comparison gives the same numbers
+
+
 @dataclass(frozen=True, eq=False)
 class Comparison:
     """Difference that remains between two calibrations, in pixels of A without distortion.

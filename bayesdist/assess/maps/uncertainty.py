@@ -33,7 +33,7 @@ class UncertaintyMap:
     y : ndarray, shape (ny,)
         FITS 1-based pixels.
     sigma_u, sigma_v : ndarray, shape (ny, nx)
-        In `unit`.
+        In `unit`; NaN at positions that see no sky, where a field of the detector is given.
     correlation : ndarray, shape (ny, nx)
         Between u and v; 0 where one of them is known exactly.
     unit : str
@@ -68,9 +68,10 @@ class UncertaintyMap:
     def __repr__(self) -> str:
         x, y = position_of_largest(self.per_axis, self.x, self.y)
         when = "" if self.epoch is None else f" in {self.epoch:.2f}"
+        largest = float(np.nanmax(self.per_axis))
         return (
             f"UncertaintyMap({self.kind}, chip {self.chip}{when}, {self.x.size} x {self.y.size} "
-            f"positions: at most {float(self.per_axis.max()):.3g} {self.unit} per axis, at pixel "
+            f"positions: at most {largest:.3g} {self.unit} per axis, at pixel "
             f"({x:g}, {y:g}))"
         )
 
@@ -97,7 +98,7 @@ class UncertaintyMap:
     @property
     def radius_max(self) -> float:
         """Largest radius: the "max radius" of WSDC D-T033, section 6."""
-        return float(self.radius.max())
+        return float(np.nanmax(self.radius))
 
     @property
     def position_of_max(self) -> tuple[float, float]:
@@ -107,12 +108,12 @@ class UncertaintyMap:
     @property
     def sigma_u_max(self) -> float:
         """Largest sigma_u."""
-        return float(self.sigma_u.max())
+        return float(np.nanmax(self.sigma_u))
 
     @property
     def sigma_v_max(self) -> float:
         """Largest sigma_v."""
-        return float(self.sigma_v.max())
+        return float(np.nanmax(self.sigma_v))
 
 
 def sigmas_of(uu: Float, vv: Float, uv: Float) -> tuple[Float, Float, Float]:

@@ -233,7 +233,8 @@ class Futures:
 
     @cached_property
     def _places(self) -> list[_Place]:
-        r, drawn = self.requirement, self._drawn
+        drawn = self._drawn
+        r = self.requirement.in_unit_of(drawn.unit)
         limit = convert(r.limit, r.unit, drawn.unit, self.pixel_scale)
         ways = [_without(way) for way in (drawn, *drawn.treatments(self.grid))]
         out = []

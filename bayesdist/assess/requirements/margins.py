@@ -181,6 +181,7 @@ def judge(
     if not requirements:
         return ()
     model, unit = errors.solution.model, errors.unit
+    requirements = [r.in_unit_of(unit) for r in requirements]
     for r in requirements:
         convert(r.limit, r.unit, unit, pixel_scale, where=r.where)
     factors = [convert(1.0, unit, r.unit, pixel_scale) for r in requirements]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from numbers import Real
 from typing import Any
 
@@ -16,7 +16,7 @@ from bayesdist.assess.domain import (
     region_words,
 )
 from bayesdist.assess.statistics import STATISTICS
-from bayesdist.assess.units import UNITS
+from bayesdist.assess.units import UNITS, stated_unit
 from bayesdist.diagnose.residuals.coverage import Coverage
 from bayesdist.errors import InputError, require_known
 from bayesdist.model.grid import grid_pixels, mesh
@@ -35,8 +35,9 @@ class Requirement:
         One of `STATISTICS`.
     limit : float or Quantity
         Positive; stored as a number in `unit`.
-    unit : str
-        'pix', 'arcsec', 'mas' or 'deg'; of a Quantity it is its own.
+    unit : str, optional
+        'pix', 'arcsec', 'mas' or 'deg'; of a Quantity it is its own.  It may be left out (empty)
+        for models whose u and v are in pixels: see `in_unit_of`.
     probability : float
         With which the statistic must be at or under the limit, between 0 and 1.
     epoch : float, str, Time, date or Quantity, optional
@@ -62,7 +63,7 @@ class Requirement:
 
     Examples
     --------
-    >>> need = bd.Requirement("field-wide", "p95", 0.03, probability=0.95)
+    >>> need = bd.Requirement("field-wide", "p95", 0.03, "pix", probability=0.95)
     >>> need.unit
     'pix'
     """
@@ -70,7 +71,7 @@ class Requirement:
     name: str
     statistic: str
     limit: float
-    unit: str = "pix"
+    unit: str = ""
     probability: float = 0.95
     epoch: float | None = None
     chip: int | None = None
@@ -82,9 +83,12 @@ class Requirement:
 
     def __post_init__(self) -> None:
         require_known(self.statistic, STATISTICS, "statistic", where=self.where)
-        require_known(self.unit, UNITS, "unit", where=self.where)
-        unit = unit_name(self.limit, "limit", where=self.where) or self.unit
-        object.__setattr__(self, "limit", value_in(self.limit, unit, "limit", where=self.where))
+        if self.unit:
+            require_known(self.unit, UNITS, "unit", where=self.where)
+        unit = unit_name(self.limit, "limit", where=self.where) or self.unit or ""
+        # a plain number is the same in any unit
+        limit = value_in(self.limit, unit or "pix", "limit", where=self.where)
+        object.__setattr__(self, "limit", limit)
         object.__setattr__(self, "unit", unit)
         object.__setattr__(self, "region", check_region(self.region, self.where))
         if self.separation is not None:
@@ -133,6 +137,25 @@ class Requirement:
         ):
             if wrong:
                 raise InputError(cause, where=self.where, do=do)
+
+    def in_unit_of(self, unit: str) -> Requirement:
+        """Requirement with a unit: its own, or pixels if those are the unit of u and v.
+
+        Parameters
+        ----------
+        unit : str
+            Of u and v.
+
+        Returns
+        -------
+        Requirement
+
+        Raises
+        ------
+        InputError
+            If it has no unit, and u and v are in angles.
+        """
+        return self if self.unit else replace(self, unit=stated_unit(self.unit, unit, self.where))
 
     @property
     def where(self) -> str:

@@ -93,6 +93,7 @@ def validity_period(
     `check_requirements`.
     """
     at = np.asarray(epochs, float)
+    requirement = requirement.in_unit_of(errors.unit)
     factor = convert(1.0, errors.unit, requirement.unit, pixel_scale, where=requirement.where)
     n = errors.n_effective
     here = replace(requirement, epoch=float(at[0]), epochs=None)

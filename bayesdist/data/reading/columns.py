@@ -319,6 +319,14 @@ def _sigma(column: SourceColumn, unit: str) -> Float:
     good = sigma > 0
     if not good.all():
         bad = int(np.argmin(good))
+        if not sigma.any():
+            raise InputError(
+                "sigma is 0 in all rows, and must be positive",
+                where=column.where,
+                do="leave the column out and set data.sigma to a number, or to 'by_magnitude'; "
+                "positions that were computed, as those of a design, have no errors to calibrate: "
+                "fit them by bayesdist.fit_linear with sigma = 1",
+            )
         raise column.fail(bad, f"sigma is {sigma[bad]:g}, and must be positive")
     return sigma
 

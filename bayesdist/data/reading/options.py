@@ -13,6 +13,7 @@ import numpy as np
 from bayesdist.data.magnitude_errors import no_magnitudes
 from bayesdist.data.repeated_stars import check_same_position
 from bayesdist.data.tables.checks import check_not_finite
+from bayesdist.data.tables.units import length_in_mm
 from bayesdist.errors import BayesdistError, InputError
 from bayesdist.utils.quantities import Number, direction_in, year_of
 
@@ -55,6 +56,9 @@ class ReadOptions:
         Meaning of rows with the same reference position, where the table has no column `star`: they
         are measurements of one star, which share the error of its position, or of separate stars
         with independent errors.  Catalogue positions are compared before proper motions.
+    plate_scale : float, optional
+        Arcsec in a millimetre, for u and v in a length (of a focal plane, a mask or a metrology),
+        which is their unit in the file or `unit`.  They become arcsec, and so do their errors.
 
     Raises
     ------
@@ -72,11 +76,18 @@ class ReadOptions:
     chips: Mapping[str, int] | None = None
     not_finite: str = "refuse"
     same_position: str = "one_star"
+    plate_scale: float | None = None
 
     def __post_init__(self) -> None:
         check_sigma(self.sigma)
         check_not_finite(self.not_finite)
         check_same_position(self.same_position)
+        if self.plate_scale is not None and not 0 < self.plate_scale < np.inf:
+            raise InputError(
+                f"plate_scale is {self.plate_scale}",
+                where="data.plate_scale",
+                do="give a positive number of arcsec per mm",
+            )
         if self.tangent_point is not None:
             point = direction_in(self.tangent_point, "tangent_point", where="data.tangent_point")
             object.__setattr__(self, "tangent_point", point)
@@ -89,6 +100,30 @@ class ReadOptions:
     def read_sigma(self) -> bool:
         """True where errors come from columns."""
         return self.sigma == "columns"
+
+    @property
+    def plane_sigma(self) -> str | Number:
+        """Option `sigma` in the unit to which u and v come: lengths become arcsec.
+
+        Raises
+        ------
+        InputError
+            For a number without unit beside u and v whose unit the file states.
+        """
+        if self.plate_scale is None or isinstance(self.sigma, str):
+            return self.sigma
+        quantity: Any = self.sigma
+        if hasattr(quantity, "unit"):
+            factor = length_in_mm(quantity.unit)
+            return quantity if factor is None else quantity.value * factor * self.plate_scale
+        factor = length_in_mm(self.unit)
+        if factor is None:
+            raise InputError(
+                f"sigma is {self.sigma}, and u and v are in a length that only the file states",
+                where="data.sigma",
+                do="set the unit, as in unit = 'mm', in which sigma then is",
+            )
+        return self.sigma * factor * self.plate_scale
 
     def refuse(self, source: str, why: str, *names: str, do: str = "leave {} out") -> None:
         """Refuse options that are set and would not be used.

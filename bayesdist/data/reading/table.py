@@ -19,6 +19,7 @@ from bayesdist.data.sky.positions import MOTIONS, SPARED, sky_columns
 from bayesdist.data.tables.checks import absent, row_number, without_missing
 from bayesdist.data.tables.column import Quantities
 from bayesdist.data.tables.names import ALIASES, PAIRS, find_columns
+from bayesdist.data.tables.units import length_in_mm, unit_of, without_unit
 from bayesdist.errors import InputError
 from bayesdist.files.parquet import arrow_table
 from bayesdist.utils.arrays import Float
@@ -100,6 +101,43 @@ def _without_none(column: Any) -> Any:
     filling = next((value for value in column if value is not None), 0)
     return MaskedColumn([filling if gone else v for v, gone in zip(column, mask, strict=True)],
                         mask=mask)  # fmt: skip
+
+
+def _through_plate_scale(
+    table: Table, found: Mapping[str, str], options: ReadOptions, source: str
+) -> tuple[Table, str]:
+    """Table whose positions and errors in a length are in arcsec, and a note on that."""
+    if "u" not in found:
+        raise InputError(
+            "a plate scale is given, and the reference positions are on the sky",
+            where=source,
+            do="leave plate_scale out, or name the columns u and v",
+        )
+    table = table.copy(copy_data=False)
+    stated = length_in_mm(options.unit)
+    words = str(options.unit)
+    for key in ("u", "v", "sigma_u", "sigma_v", "u_nominal", "v_nominal"):
+        if key not in found:
+            continue
+        column = table[found[key]]
+        unit = unit_of(column, where=f"{source}, column {found[key]!r}")
+        factor = stated if unit is None else length_in_mm(unit)
+        if factor is None and key not in ("u", "v") and unit is not None:
+            continue  # an angle, as it is
+        if factor is None or (stated is not None and factor != stated):
+            raise InputError(
+                f"a plate scale is given, and the unit is {unit or options.unit or 'not stated'}",
+                where=f"{source}, column {found[key]!r}",
+                do="state a length for u and v, as unit = 'mm', or leave plate_scale out",
+            )
+        if key == "u":
+            stated, words = factor, str(unit or options.unit)
+        values = factor * float(options.plate_scale or 0.0) * without_unit(column)
+        table[found[key]] = MaskedColumn(values, unit="arcsec")
+    return table, (
+        f"u and v in {words} are taken to arcsec by the plate scale, {options.plate_scale:g} "
+        "arcsec per mm"
+    )
 
 
 def sky_positions(
@@ -203,6 +241,9 @@ def match_arguments(
     found, options, notes = columns_read(table.colnames, table.meta, options, source=source)
     if len(table) == 0:
         raise InputError("holds no rows", where=source, do="give a table with matched stars")
+    if options.plate_scale is not None:
+        table, scaled = _through_plate_scale(table, found, options, source)
+        options, notes = replace(options, unit="arcsec", plate_scale=None), (*notes, scaled)
     if options.epoch is None and "pm_ra" in found and "epoch" not in found:
         options = replace(options, epoch=own_epoch(table.meta))
     dated = "catalogue_epoch" in found or options.catalogue_epoch is not None

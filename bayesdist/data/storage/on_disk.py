@@ -110,6 +110,12 @@ def open_matches(path: PathLike | Sequence[PathLike], **options: Any) -> Matches
             where="data.not_finite",
             do="write the table without them",
         )
+    if given.plate_scale is not None:
+        raise InputError(
+            "tables on disk are not brought to another unit",
+            where="data.plate_scale",
+            do="write u, v and their errors in arcsec",
+        )
     files = input_files(path)
     for file in files:
         if file.suffix.lower() != ".parquet":

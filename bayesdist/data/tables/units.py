@@ -44,9 +44,19 @@ def length_advice(unit: str) -> str:
     if parsed.physical_type != "length":
         return ""
     return (
-        f"divide u, v and their errors by the size of a pixel in {unit} and call them 'pix', or "
-        "multiply them by the plate scale and call them 'arcsec'"
+        "give plate_scale, the arcsec in a millimetre of u and v (data.plate_scale); or "
+        f"divide u, v and their errors by the size of a pixel in {unit} and call them 'pix'"
     )
+
+
+def length_in_mm(unit: apu.UnitBase | str | None) -> float | None:
+    """Millimetres in a unit of length; None for other units, and for none."""
+    import astropy.units as apu
+
+    if unit is None:
+        return None
+    parsed = apu.Unit(unit, parse_strict="silent")
+    return float(parsed.to(apu.mm)) if parsed.physical_type == "length" else None
 
 
 def unit_of(column: Any, *, where: str) -> apu.UnitBase | None:

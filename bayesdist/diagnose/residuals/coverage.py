@@ -5,7 +5,8 @@ The formal and the posterior errors hold beyond it only if the model does, and n
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.optimize import linprog
@@ -14,7 +15,7 @@ from scipy.spatial import ConvexHull, QhullError
 from bayesdist.diagnose.residuals.binned import BinnedSums
 from bayesdist.model import Chip
 from bayesdist.model.grid import mesh
-from bayesdist.utils.arrays import Float
+from bayesdist.utils.arrays import Bool, Float
 from bayesdist.utils.limits import UNCOVERED, UNCOVERED_BY_CHANCE
 
 SPARSE = 0.02  # of the density where stars usually are: strays, not coverage
@@ -64,6 +65,14 @@ class Coverage:
         ]
         return np.einsum("aca->ac", np.array(found))
 
+    def within(self, field: Callable[[Float, Float], Bool]) -> Coverage:
+        """Coverage of the part of the chip that sees the sky; `field` is True for its pixels."""
+        x, y = _fine_pixels(self.chip)
+        inside = field(x, y)
+        if not inside.any():
+            return self
+        return replace(self, gap=float((self.beyond(x, y)[inside] > 0).mean()))
+
     def beyond(self, x: Float, y: Float) -> Float:
         """Distance (N,) of pixels beyond the area; negative inside."""
         return np.asarray((self.sides @ np.stack([x, y, np.ones_like(x)])).max(axis=0))
@@ -97,11 +106,16 @@ def coverage_of(
         + 0.5
     )
     sides = np.concatenate([_sides(cells), _sides(corners)])
-    step = [(np.arange(k) + 0.5) / k for k in _FINE]
-    x, y = mesh(*(s * length + 0.5 for s, length in zip(step, size, strict=True)))
+    x, y = _fine_pixels(chip)
     beyond = (sides @ np.stack([x, y, np.ones_like(x)])).max(axis=0) > 0
     chance = 8 / 3 * np.log(max(n, 2)) / max(n, 2)
     return Coverage(chip, several, sides, float(beyond.mean()), known, float(chance))
+
+
+def _fine_pixels(chip: Chip) -> tuple[Float, Float]:
+    """Pixels (N,) of equal cells, by which areas are counted."""
+    step = [(np.arange(k) + 0.5) / k for k in _FINE]
+    return mesh(*(s * length + 0.5 for s, length in zip(step, chip.size, strict=True)))
 
 
 def _sides(points: Float) -> Float:

@@ -134,6 +134,7 @@ def _test(cells: BinnedResiduals, absorbed: float) -> tuple[float, float]:
     shrink = np.sqrt((n - 3) / (n - 1))
     mean = np.stack([cells.mean_u[good], cells.mean_v[good]])
     sem = np.stack([cells.sem_u[good], cells.sem_v[good]]) / shrink
+    sem = np.maximum(sem, np.finfo(float).tiny ** 0.25)  # residuals may be equal to the last bit
     total = float(((mean / sem) ** 2).sum())
     dof = max(mean.size - absorbed * n.size / cells.count.size, 1.0)
     p = float(chi2_sf(total, dof))

@@ -102,7 +102,7 @@ def majority_sentence(
     if not FALSE_MAJORITY.met_by(share):
         return (
             f"the fit left out {100 * share:.0f} % of the {things}: most of them are "
-            "false, or the quoted errors are far too small, and the solution may rest on "
-            "chance alignments"
+            "false, the quoted errors are far too small or the order of the model is too low, and "
+            "the solution may rest on chance alignments"
         )
     return ""

@@ -1,1 +1,1 @@
-"""Errors of the reference catalogue and of the detections: by star, by magnitude, by group."""
+"""Errors of the reference catalogue (per star) and of the detections (by magnitude or group)."""

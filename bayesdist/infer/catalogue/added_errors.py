@@ -1,26 +1,26 @@
-"""Errors to be added to the quoted ones: one for both axes, or one for each group of stars.
+"""Errors to be added to the quoted errors: one for both axes, or one per group of stars.
 
-A star of group g has, along an axis, the variance s^2 + a_g.  The a_g are those of the restricted
-likelihood (REML: Patterson and Thompson 1971), in which the part of the residuals that the fit
-absorbs is added again star by star,
+A star of group g has, along an axis, the variance s^2 + a_g.  The a_g maximise the restricted
+likelihood (REML; Patterson and Thompson 1971), in which the part of the residuals that the fit
+absorbs is added star by star,
 
     E[e_i^2] = r_i^2 + x_i^T C x_i
 
-with the covariance C of the fit and the derivatives x_i of the star's position; without it errors
-would be too small by the parameters per star.  Good stars and false matches are separated by the
-mixture of `by_magnitude`, so that a few false ones do not count, and parameters, memberships and
-errors climb one bound in turn.
+with the covariance C of the fit and the derivatives x_i of the star's position.  Without this term
+the errors would be too small, depending on the number of parameters per star.  Good stars and false
+matches are separated by the mixture of `by_magnitude`, so that false matches have little influence.
+Parameters, memberships and errors are updated in turn, each step increasing the same bound.
 
-Groupings are compared by their evidence after Laplace with unit-information priors,
+Groupings are compared by their evidence (Laplace approximation, unit-information priors),
 
     ln E = ln L_R / c - sum_g ln(n_g) / 2
 
-where n_g are the good stars of a group and c, one for normal errors, is the factor by which the
-sums of squares scatter more than those of independent normal errors (from the squares themselves,
-all detections of a star together): long tails and stars that are matched often make no groups.
-With few stars in a group the penalty keeps it from being split off; where there are many groups,
-their errors are shrunk to the common one as far as chance makes them differ (empirical Bayes), as
-the errors that come out are used as if they were known.
+where n_g is the number of good stars in a group.  The dispersion c is the variance of the sums of
+squares relative to that of independent normal errors.  It is estimated from the squares, with all
+detections of a star taken together, so that neither long tails nor stars with many matches suggest
+groups that do not exist.  The second term prevents small groups from being split off.  If there are
+many groups, their errors are shrunk towards the common error, as far as their differences may be
+noise (empirical Bayes), since the results are used as if they were exact.
 """
 
 from __future__ import annotations
@@ -46,34 +46,34 @@ from bayesdist.model import DistortionModel
 from bayesdist.utils.arrays import Bool, Float, Int
 
 ONE, AXIS = "one", "axis"
-STARS = 50_000  # from which the errors are estimated: they are then known to half a percent
-PER_EXPOSURE = 100  # mean number of stars of each exposure among these, at least
-DECISIVE = 3.0  # ln evidence, odds of 20 to 1, needed for errors that differ between stars
-MATERIAL = 0.01  # of the errors of typical stars: groups that differ by less are not separated
-SETTLED, TURNS = 1e-3, 50  # change of ln variance at which the maximisation ends; most iterations
-HALVINGS = 45  # of the range in which an added variance lies
-WIDER = 5.0  # false matches scatter at least this many times as wide as typical good ones
-SHRUNK = 3  # fewest labels whose scatter can be estimated
+STARS = 50_000  # sample size; it determines the errors to half a percent
+PER_EXPOSURE = 100  # the sample has on average at least this many stars per exposure and chip
+DECISIVE = 3.0  # ln evidence (odds of 20 to 1) required for a grouping
+MATERIAL = 0.01  # relative difference in the errors of typical stars required for a grouping
+SETTLED, TURNS = 1e-3, 50  # tolerance in ln variance, and maximum number of iterations
+HALVINGS = 45  # number of bisections in the search for an added variance
+WIDER = 5.0  # smallest ratio of the scatter of false matches to that of typical good ones
+SHRUNK = 3  # smallest number of groups whose scatter can be estimated
 
 
 @dataclass(frozen=True, eq=False)
 class GroupedErrors:
-    """Added errors by group, for the grouping of largest evidence."""
+    """Added errors by group, for the grouping with the largest evidence."""
 
-    # 'one' (both axes alike), 'axis', 'chip', 'exposure', 'filter' (both axes alike), or these 'and
-    # axis'
+    # 'one' (a single error for both axes), 'axis', 'chip', 'exposure', 'filter' (each with the same
+    # error for both axes), or 'chip and axis' and so on
     grouping: str
     by: str  # 'chip', 'exposure', 'filter' or empty
-    labels: tuple[str, ...]  # of the G groups, as in `AddedErrors`
-    n: Float  # good stars (G, 2) on which each error rests
+    labels: tuple[str, ...]  # labels of the G groups, as in `AddedErrors`
+    n: Float  # number of good stars (G, 2) from which each error is estimated
     variance: Float  # added variances (G, 2) along u and v
     error: Float  # standard errors (G, 2) of the variances
-    evidence: dict[str, float]  # gain of ln evidence over 'one', by grouping compared
-    dispersion: float  # the factor c
+    evidence: dict[str, float]  # ln evidence relative to 'one', by grouping
+    dispersion: float  # the dispersion c
 
     @property
     def by_axis(self) -> bool:
-        """True if each axis has errors of its own."""
+        """True if the axes have different errors."""
         return self.grouping.endswith(AXIS)
 
     @property
@@ -83,23 +83,23 @@ class GroupedErrors:
 
     @property
     def sigma_error(self) -> Float:
-        """Standard errors (G, 2) of `sigma`; near zero they follow from that of the variance."""
+        """Standard errors (G, 2) of `sigma`, limited near zero by those of the variance."""
         return self.error / (2.0 * np.sqrt(np.maximum(self.variance, self.error)))
 
     @property
     def excess(self) -> Float:
-        """Errors (G, 2) to add to the quoted ones; the smallest of them is left to the jitter."""
+        """Errors (G, 2) to add to the quoted ones; the smallest is left to the jitter."""
         return np.sqrt(self.variance - self.variance.min())
 
     @property
     def added(self) -> AddedErrors | None:
-        """The excess as errors to be added; None where one jitter is enough."""
+        """`excess` as `AddedErrors`; None if a single jitter is enough."""
         if self.grouping == ONE:
             return None
         excess = self.excess
         weight = np.maximum(self.n, 1e-300)
-        other = np.sqrt(np.average(excess**2, axis=0, weights=weight))
-        return AddedErrors(self.by, self.labels, excess, other)
+        average = np.sqrt(np.average(excess**2, axis=0, weights=weight))
+        return AddedErrors(self.by, self.labels, excess, average)
 
 
 @dataclass(eq=False)
@@ -107,12 +107,12 @@ class _State:
     """State of the maximisation: fit, mixture and added variances of one grouping."""
 
     fit: LinearFit
-    square: Float
-    f: float
-    wide: float
-    variance: Float
-    good: Float
-    log_likelihood: float = -np.inf
+    square: Float  # expected squared errors (2, N)
+    f: float  # fraction of false matches
+    wide: float  # variance of false matches
+    variance: Float  # added variances, one per group
+    good: Float  # probability (N,) of being a true match
+    log_likelihood: float = -np.inf  # restricted log-likelihood
 
 
 def grouped_errors(
@@ -123,15 +123,32 @@ def grouped_errors(
     outliers: bool = True,
     priors: GaussianPriors | None = None,
 ) -> GroupedErrors:
-    """Added errors of the best grouping: one error for both axes compared with one for each group.
+    """Estimate added errors for several groupings of the stars and select the best grouping.
 
-    Of very many matches a sample is used.  The maximisation starts from `fit`, made of these
-    matches or of those that they are a sample of, with `priors`.  `by` ('chip', 'exposure',
-    'filter') names groups that are compared in addition to the axes; with `outliers` some matches
-    may be false.
+    Parameters
+    ----------
+    matches : Matches
+        Stars with quoted errors. A sample is used if there are very many.
+    fit : LinearFit
+        Fit to these matches, or to the matches from which they were sampled; starting point.
+    by : str
+        'chip', 'exposure' or 'filter' to compare groups by these in addition to a single error and
+        an error per axis.
+    outliers : bool
+        True if some matches may be false.
+    priors : GaussianPriors, optional
+        Priors of the fit.
 
-    Raises InputError where all matches are of one chip, exposure or filter by which they are to be
-    grouped, and DegenerateError where the sample does not determine the model.
+    Returns
+    -------
+    GroupedErrors
+
+    Raises
+    ------
+    InputError
+        If all matches have the same chip, exposure or filter `by` which they are to be grouped.
+    DegenerateError
+        If the sample does not determine the model.
     """
     model = fit.model
     count = max(STARS, PER_EXPOSURE * len(model.exposures) * len(model.chips))
@@ -158,8 +175,9 @@ def grouped_errors(
     dispersion = _dispersion(table, states[last], quoted, codes[last])
     counts = {name: _counts(states[name].good, code) for name, code in codes.items()}
     value = {
-        name: one.log_likelihood / dispersion - 0.5 * np.log(np.maximum(counts[name], 1.0)).sum()
-        for name, one in states.items()
+        name: state_of_grouping.log_likelihood / dispersion
+        - 0.5 * np.log(np.maximum(counts[name], 1.0)).sum()
+        for name, state_of_grouping in states.items()
     }
     evidence = {name: float(value[name] - value[ONE]) for name in codes if name != ONE}
     best = max(evidence, key=lambda name: evidence[name])
@@ -176,9 +194,9 @@ def _quoted(table: Matches) -> Float:
 
 
 def _starting_state(table: Matches, fit: LinearFit, quoted: Float, outliers: bool) -> _State:
-    """Starting state with one added variance for all, from the median residual."""
+    """Starting state with a common added variance, from the median residual."""
     square = residuals_of(fit, table) ** 2
-    core = float(np.median(square)) / 0.4549  # of a squared normal variable
+    core = float(np.median(square)) / 0.4549  # median of a squared standard normal variable
     variance = max(0.0, core - float(np.median(quoted)))
     wide = max(WIDER**2 * max(core, float(np.median(quoted))), float(square.sum(axis=0).max()) / 8)
     f = FALSE[0] if outliers else 0.0
@@ -194,7 +212,7 @@ def _maximised(
     outliers: bool,
     priors: GaussianPriors | None,
 ) -> _State:
-    """State at the maximum of the restricted likelihood, for groups with codes (2, N)."""
+    """State at the maximum of the restricted likelihood; `code` (2, N) is the group per axis."""
     n_groups = int(code.max()) + 1
     variance = np.full(n_groups, float(np.average(start.variance)))
     f, wide, square, typical = start.f, start.wide, start.square, float(np.median(quoted))
@@ -214,15 +232,15 @@ def _maximised(
         each = np.logaddexp(*log_densities(residual**2, var, f, wide))
     else:
         each = -0.5 * (residual**2 / var + np.log(var)).sum(axis=0)
-    # the determinant of the fit's normal matrix makes the likelihood the restricted one
+    # with the determinant of the normal matrix this is the restricted likelihood
     value = float(each.sum() + 0.5 * np.linalg.slogdet(fit.cov)[1])
     return _State(fit, square, f, wide, variance, good, value)
 
 
 def _maxima(quoted: Float, square: Float, good: Float, code: Int, n_groups: int) -> Float:
-    """Variance (G,), 0 or more, of each group at which its likelihood is largest.
+    """Added variance a >= 0 (G,) of each group that maximises its likelihood.
 
-    The derivative, sum w (e^2 - s^2 - a) / (s^2 + a)^2, changes its sign there: found by halving.
+    It is the zero of the derivative, sum w (e^2 - s^2 - a) / (s^2 + a)^2, found by bisection.
     """
     flat, weight = code.ravel(), np.concatenate([good, good])
     s2, e2 = quoted.ravel(), square.ravel()
@@ -235,7 +253,9 @@ def _maxima(quoted: Float, square: Float, good: Float, code: Int, n_groups: int)
     high = np.bincount(flat, weight * e2, n_groups) / np.maximum(
         np.bincount(flat, weight, n_groups), 1e-300
     )
-    for _ in range(HALVINGS):  # where small quoted errors come with large residuals
+    for _ in range(
+        HALVINGS
+    ):  # raise the upper limit if stars with small errors have large residuals
         if not (up := rising(high)).any():
             break
         high = np.where(up, 2.0 * high, high)
@@ -248,12 +268,12 @@ def _maxima(quoted: Float, square: Float, good: Float, code: Int, n_groups: int)
 
 
 def _counts(good: Float, code: Int) -> Float:
-    """Number (G,) of good stars in each group; each axis of a star counts."""
+    """Expected number (G,) of good measurements in each group, counting both axes of a star."""
     return np.asarray(np.bincount(code.ravel(), np.concatenate([good, good])), float)
 
 
 def _dispersion(table: Matches, state: _State, quoted: Float, code: Int) -> float:
-    """Factor by which sums of squares scatter more than those of independent normal errors."""
+    """Dispersion c: variance of sums of squares relative to independent normal errors."""
     var = quoted + state.variance[code]
     score = state.good * (state.square / var - 1.0)
     star = np.arange(len(table)) if table.star is None else table.star
@@ -273,7 +293,7 @@ def _result(
     evidence: dict[str, float],
     dispersion: float,
 ) -> GroupedErrors:
-    """Table of labels and axes for the chosen groups."""
+    """Arrange the results of the selected grouping by label and axis, shrunk if necessary."""
     columns = 2 if grouping.endswith(AXIS) else 1
     flat, weight = code.ravel(), np.concatenate([state.good, state.good])
     weight = weight / (quoted + state.variance[code]).ravel() ** 2
@@ -282,13 +302,13 @@ def _result(
     n = _counts(state.good, code) / (3 - columns)  # stars, not axes of stars
     variance = state.variance
     if len(variance) >= SHRUNK * columns:
-        whole = np.bincount(flat, weight * state.square.ravel()) / total
-        own = np.bincount(flat, weight * quoted.ravel()) / total
+        total_variance = np.bincount(flat, weight * state.square.ravel()) / total
+        quoted_variance = np.bincount(flat, weight * quoted.ravel()) / total
         variance = variance.copy()
         for k in range(columns):
             rows = slice(k, None, columns)
-            drawn = _shrunk(whole[rows], (error[rows] / whole[rows]) ** 2)
-            variance[rows] = np.maximum(drawn - own[rows], 0.0)
+            drawn = _shrunk(total_variance[rows], (error[rows] / total_variance[rows]) ** 2)
+            variance[rows] = np.maximum(drawn - quoted_variance[rows], 0.0)
     several = grouping.startswith(by) if by else False
     n, variance, error = (
         np.broadcast_to(values.reshape(-1, columns), (len(values) // columns, 2))
@@ -307,10 +327,10 @@ def _result(
 
 
 def _shrunk(variance: Float, noise: Float) -> Float:
-    """Variances (G,) whose logarithms are shrunk to their mean by how much chance explains.
+    """Shrink the logarithms of variances (G,) towards their mean (DerSimonian and Laird 1986).
 
-    After DerSimonian and Laird 1986; `noise` (G,) is the variance of each logarithm by chance, half
-    of which a logarithm's mean lies below that of the variance.
+    `noise` (G,) is the sampling variance of each logarithm.  Half of it is added to the logarithm,
+    to correct the bias of the logarithm of an estimate.
     """
     log = np.log(variance) + 0.5 * noise
     weight = 1.0 / noise

@@ -1,11 +1,11 @@
-"""Fit and errors by magnitude together, by climbing one function, so that no step goes back.
+"""Joint estimate of the distortion and of the errors as a function of magnitude.
 
-Stars are good with probability 1 - f and have the errors of a smooth law of magnitude
-(`magnitude_law`), or are false matches of a wide normal distribution.  Parameters of the
-distortion, memberships and law climb the same bound on the restricted likelihood in turn
-(variational EM: the law is that of the errors after the part that the fit absorbs is added again,
-star by star).  There is no rejection by a limit: stars that go in and out of a fit made errors
-swing.
+Stars are true matches with probability 1 - f, with errors that are a smooth function of magnitude
+(`magnitude_law`); otherwise they are false matches from a wide normal distribution.  Distortion,
+memberships and error law are updated in turn, each step increasing the same bound on the restricted
+likelihood (variational EM).  The error law describes the residuals plus the part that the fit
+absorbs, star by star.  Stars are not rejected by a limit, because stars that alternate between
+rejected and accepted would make the errors oscillate.
 """
 
 from __future__ import annotations
@@ -31,13 +31,13 @@ from bayesdist.model import DistortionModel
 from bayesdist.utils.arguments import takes
 from bayesdist.utils.arrays import Float
 
-STARS = 200_000  # from which the law is estimated: it is then known to a part in a thousand
-PER_EXPOSURE = 100  # mean number of stars of each exposure among these, at least
-SETTLED = 1e-3  # change of ln sigma at which the maximisation ends
-TURNS = 200  # far more than it takes; after these the last iteration is the best there is
-FALSE = 0.02, 50.0  # prior mean of the fraction of false matches, worth so many stars
-WIDER = 10.0  # false matches scatter at least this many times as wide as the worst good ones
-LEAST_WEIGHT = 1e-9  # of a star: a fit needs finite errors
+STARS = 200_000  # sample size; it determines the error law to a part in a thousand
+PER_EXPOSURE = 100  # the sample has on average at least this many stars per exposure and chip
+SETTLED = 1e-3  # change of ln sigma below which the iteration has converged
+TURNS = 200  # maximum number of iterations; far fewer are needed
+FALSE = 0.02, 50.0  # prior of the fraction of false matches: mean, and weight in stars
+WIDER = 10.0  # smallest ratio of the scatter of false matches to the largest error of true ones
+LEAST_WEIGHT = 1e-9  # smallest weight of a star, to keep its error finite
 
 
 @takes(matches=Matches, model=DistortionModel, rejection=Rejection, compute=Compute)
@@ -49,32 +49,35 @@ def fit_by_magnitude(
     priors: GaussianPriors | None = None,
     compute: Compute | None = None,
 ) -> tuple[LinearFit, Matches, MagnitudeErrors]:
-    """Fit, and errors by magnitude from its residuals, estimated together.
+    """Fit a distortion model and the errors as a function of magnitude simultaneously.
 
     Parameters
     ----------
     matches : Matches
-        With magnitudes; errors already in the table are replaced.
+        Stars with magnitudes; any errors in the table are replaced.
     model : DistortionModel
     rejection : Rejection
+        See `fit_linear`.
     priors : GaussianPriors, optional
+        See `fit_linear`.
     compute : Compute, optional
-        As of `fit_linear`.
+        See `fit_linear`.
 
     Returns
     -------
     fit : LinearFit
-        Of all matches with these errors.
+        Fit to all matches with the new errors.
     matches : Matches
-        With these errors, and without nominal positions: residuals that the match circle has cut
-        give errors that describe the selected stars, which must not be corrected a second time.
+        The matches with the new errors and without nominal positions. If a match circle truncates
+        the residuals, the errors describe the truncated distribution, so that a correction for the
+        circle must not be applied in addition.
     errors : MagnitudeErrors
-        The law at its nodes, and the scatter about each.
+        Error as a function of magnitude at its nodes, and the scatter near each node.
 
     Raises
     ------
     InputError
-        When the table has no magnitudes, too few stars, or stars without scatter.
+        If the table has no magnitudes, too few stars, or no scatter.
 
     Examples
     --------
@@ -105,7 +108,7 @@ def _law(
     rejection: Rejection,
     priors: GaussianPriors | None,
 ) -> MagnitudeErrors:
-    """Law of the errors with magnitude of some stars."""
+    """Estimate the errors as a function of magnitude from a sample of stars."""
     mag = stars.column("mag")
     fit = fit_linear(stars.with_errors(1.0), model, rejection=rejection, priors=priors)
     residual = residuals_of(fit, stars)
@@ -129,7 +132,7 @@ def _law(
 
 
 def _scatter(bins: MagnitudeErrors, mag: Float, good: Float, square: Float) -> Float:
-    """Scatter (2, B) on each axis of the good stars that are nearest to each node."""
+    """Rms error (2, B) per axis of the true matches nearest in magnitude to each of B nodes."""
     nearest = np.searchsorted((bins.mag[1:] + bins.mag[:-1]) / 2.0, mag)
     count = len(bins.mag)
     n = np.bincount(nearest, weights=good, minlength=count)
@@ -144,7 +147,10 @@ def refitted(
     good: Float,
     priors: GaussianPriors | None,
 ) -> tuple[LinearFit, Float]:
-    """Fit of stars with variances (2, N), each as far as it is good (N,); and residuals (2, N)."""
+    """Fit stars with variances (2, N), weighted by the probabilities `good` (N,).
+
+    Returns the fit and its residuals (2, N).
+    """
     sigma_u, sigma_v = np.sqrt(variance) / np.sqrt(np.maximum(good, LEAST_WEIGHT))
     weighted = stars.with_errors((sigma_u, sigma_v))
     fit = fit_linear(weighted, model, rejection=NO_REJECTION, priors=priors)
@@ -152,9 +158,9 @@ def refitted(
 
 
 def false_matches(good: Float, square: Float, least: float) -> tuple[float, float]:
-    """Most probable fraction of false matches, and their variance along an axis, `least` or more.
+    """Most probable fraction of false matches, and their variance per axis (at least `least`).
 
-    `good` (N,) are the probabilities of true ones, `square` (2, N) the squares of the residuals.
+    `good` (N,) are the probabilities of true matches, `square` (2, N) the squared residuals.
     """
     bad = 1.0 - good
     fraction = float((bad.sum() + FALSE[0] * FALSE[1]) / (len(bad) + FALSE[1]))
@@ -162,13 +168,13 @@ def false_matches(good: Float, square: Float, least: float) -> tuple[float, floa
 
 
 def residuals_of(fit: LinearFit, stars: Matches) -> Float:
-    """Data minus model (2, N)."""
-    some, order = prepare(fit.model, stars.with_errors(1.0))
-    return in_table_order(some.residuals(fit.mean), order).T
+    """Residuals (2, N): data minus model."""
+    prepared, order = prepare(fit.model, stars.with_errors(1.0))
+    return in_table_order(prepared.residuals(fit.mean), order).T
 
 
 def variances_of(fit: LinearFit, stars: Matches) -> Float:
-    """Variances (2, N) of the fitted positions of stars."""
+    """Variances (2, N) of the fitted positions of the stars, from the covariance of the fit."""
     model = fit.model
     groups = groups_of(model, stars)
     out = np.empty((2, len(stars)))

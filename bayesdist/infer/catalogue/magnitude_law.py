@@ -1,8 +1,8 @@
-"""Smooth law of the errors with magnitude, by penalised likelihood.
+"""Errors as a smooth function of magnitude, by penalised likelihood.
 
-ln sigma is linear between nodes in magnitude.  Its changes of slope have a normal prior (an
-integrated Wiener process), whose size is estimated from the scatter in the bins by restricted
-likelihood and then fixed, so that all later steps climb one function.
+ln sigma is linear between nodes in magnitude.  Its changes of slope have a normal prior (integrated
+Wiener process).  The scale of the prior is estimated from the scatter in bins by restricted
+likelihood and then fixed, so that all later steps maximise the same function.
 """
 
 from __future__ import annotations
@@ -15,26 +15,26 @@ from scipy.optimize import minimize_scalar
 from bayesdist.data.magnitude_errors import MagnitudeErrors
 from bayesdist.utils.arrays import Float, Int
 
-CELLS = 1000  # cells of magnitude, within which the law hardly changes
+CELLS = 1000  # number of magnitude cells, small enough that the error is constant in each
 LOG_VARIANCE = 1.36  # variance of ln(scatter) times n, for the median absolute deviation
-BENDS = (1e-3, 1e2)  # limits of the prior size: changes of slope over the range of magnitudes
-ROOM = 2.0  # prior sigma of ln sigma about the scatter of the bins: a factor of 7, and never zero
+BENDS = (1e-3, 1e2)  # limits of the prior scale of changes of slope over the range of magnitudes
+ROOM = 2.0  # prior sigma of ln sigma about the scatter of the bins (a factor of 7)
 
 
 @dataclass(frozen=True, eq=False)
 class MagnitudeLaw:
-    """Design and prior of ln sigma at B nodes, for cells of stars of about equal magnitude."""
+    """Interpolation and prior of ln sigma at B nodes, for C cells of stars of similar magnitude."""
 
     cell: Int  # cell (N,) of each star
     design: Float  # linear interpolation (C, B) from the nodes to the cells
-    # ln sigma (2, B) of u and v at the nodes, from the scatter in bins; centre of a weak prior that
-    # keeps it from zero
+    # ln sigma (2, B) of u and v at the nodes from the scatter in bins; centre of a weak prior that
+    # keeps sigma away from zero
     start: Float
-    penalty: Float  # inverse covariance (B, B) of the prior of the shape
+    penalty: Float  # inverse covariance (B, B) of the smoothness prior
 
     @classmethod
     def of(cls, mag: Float, bins: MagnitudeErrors) -> MagnitudeLaw:
-        """Law for stars with magnitudes (N,), with nodes and start from bins."""
+        """Law for stars with magnitudes (N,); the bins provide nodes and starting values."""
         count = min(len(mag), CELLS)
         rank = np.argsort(np.argsort(mag, kind="stable"), kind="stable")
         cell = rank * count // len(mag)
@@ -55,32 +55,32 @@ class MagnitudeLaw:
         return np.asarray(np.exp(2.0 * nodes @ self.design.T)[:, self.cell])
 
     def climbed(self, nodes: Float, weight: Float, square: Float) -> Float:
-        """ln sigma (2, B) at the maximum of the penalised likelihood, starting from `nodes` (2, B).
+        """Maximise the penalised likelihood; return ln sigma (2, B) at the nodes.
 
-        `weight` (N,) is the probability that a star is a good match, `square` (2, N) its expected
-        squared error.  The likelihood is concave: Newton's steps, halved where they do not climb,
-        find its only maximum.
+        `nodes` (2, B) is the starting point, `weight` (N,) the probability that a star is a true
+        match, and `square` (2, N) its expected squared error.  The likelihood is concave, so that
+        Newton's method with step halving finds its only maximum.
         """
         n = self._of_cells(weight)
         prior = self.penalty + np.eye(len(self.penalty)) / ROOM**2
         out = nodes.copy()
         for axis in (0, 1):
             s = self._of_cells(weight * square[axis])
-            eta, here = out[axis], self._value(out[axis], axis, n, s)
+            eta, value = out[axis], self._value(out[axis], axis, n, s)
             for _ in range(100):
                 of_cells = s * np.exp(-2.0 * self.design @ eta)
                 pull = self.penalty @ eta + (eta - self.start[axis]) / ROOM**2
                 gradient = self.design.T @ (of_cells - n) - pull
                 hessian = 2.0 * (self.design.T * of_cells) @ self.design + prior
-                # far below the maximum the curvature is that of an exponential: limit the steps
+                # limit the steps: far below the maximum the curvature grows exponentially
                 step = np.linalg.solve(hessian, gradient)
                 step *= min(1.0, 1.0 / max(np.abs(step).max(), 1e-300))
-                there = self._value(eta + step, axis, n, s)
-                while there < here and np.abs(step).max() > 1e-8:
+                new_value = self._value(eta + step, axis, n, s)
+                while new_value < value and np.abs(step).max() > 1e-8:
                     step /= 2.0
-                    there = self._value(eta + step, axis, n, s)
-                if there >= here:
-                    eta, here = eta + step, there
+                    new_value = self._value(eta + step, axis, n, s)
+                if new_value >= value:
+                    eta, value = eta + step, new_value
                 if np.abs(step).max() < 1e-6:
                     break
             out[axis] = eta
@@ -97,7 +97,7 @@ class MagnitudeLaw:
 
 
 def _bends(mag: Float) -> Float:
-    """Matrix (B - 2, B) of changes of slope at the inner nodes, of unit variance for unit size."""
+    """Matrix (B - 2, B) of changes of slope at the inner nodes, with unit prior variance."""
     at = (mag - mag[0]) / (mag[-1] - mag[0])
     gap = np.diff(at)
     slopes = np.diff(np.eye(len(mag)), axis=0) / gap[:, None]
@@ -105,7 +105,7 @@ def _bends(mag: Float) -> Float:
 
 
 def _size_of_bends(found: Float, bends: Float, n: Int) -> float:
-    """Prior size of the changes of slope, by their likelihood given the noise of the bins."""
+    """Most likely prior scale of the changes of slope `found`, given the noise of the bins."""
     noise = (bends * (LOG_VARIANCE / n)) @ bends.T
 
     def misfit(log_tau: float) -> float:

@@ -1,17 +1,17 @@
-"""Effect of reference-catalogue errors, which a star has in common in all of its exposures.
+"""Effect of errors of the reference catalogue, which are the same in all exposures of a star.
 
-A fit counts every match as an independent measurement, with the catalogue's error in its sigma.
-But a star that is matched in many exposures is wrong in all of them by the same amount (and by a
-proper motion that is wrong by the same amount), so this part of the error does not average out.
-With normal matrix H and the sums G_s over all matches of star s (`star_sums`),
+A fit treats every match as an independent measurement, with the catalogue's error included in its
+sigma.  The position of a star in the catalogue, however, has the same error in all exposures, and
+so has its proper motion.  This part of the error does not average out.  With the normal matrix H
+and the sums G_s over all matches of star s (`star_sums`),
 
     cov = H^-1 [sum_s G_s Sigma_s G_s^T] H^-1
 
-is the covariance of the parameters by the errors Sigma_s of the catalogue.  The fit has already
-counted the diagonal part, sum_i instead of (sum_i)^2.
+is the covariance of the parameters caused by the catalogue errors Sigma_s.  The covariance of the
+fit already includes the diagonal part, sum_i instead of (sum_i)^2.
 
-An error c_s of star s moves the parameters by H^-1 G_s c_s.  So a star that is seen again, in an
-exposure that was no part of the fit, has an error with which the solution's own is correlated:
+An error c_s of star s changes the parameters by H^-1 G_s c_s.  If the star is observed in another
+exposure that was not part of the fit, its error is therefore correlated with that of the solution:
 cov(c_s, theta) = Sigma_s (H^-1 G_s)^T.
 """
 
@@ -33,16 +33,17 @@ from bayesdist.utils.arrays import Float, Int
 
 @dataclass(frozen=True, eq=False)
 class StarErrors:
-    """Errors of a catalogue by code of the star.
+    """Errors of a reference catalogue by star code.
 
     Parameters
     ----------
     position : ndarray, shape (S, 2)
         Standard errors of the positions along u and v, in the unit of u, v.
     motion : ndarray, shape (S, 2), optional
-        Standard errors of the proper motions, in that unit per year.
+        Standard errors of the proper motions along u and v, in the unit of u, v per year.
     epoch : ndarray, shape (S,), optional
-        Dates at which errors of positions and motions are uncorrelated; needed with motions.
+        Dates (decimal years) at which the errors of position and proper motion are uncorrelated;
+        required with `motion`.
     """
 
     position: Float
@@ -50,26 +51,55 @@ class StarErrors:
     epoch: Float | None = None
 
     def levers(self, star: Int, epoch: Float | None) -> Float:
-        """Derivatives (levers, n) of matched positions by the errors of position and motion."""
-        one = np.ones(len(star))
+        """Derivatives of matched positions with respect to catalogue position and proper motion.
+
+        Parameters
+        ----------
+        star : ndarray of int, shape (n,)
+            Star codes of the matches.
+        epoch : ndarray, shape (n,), or None
+            Dates of the matches in decimal years.
+
+        Returns
+        -------
+        ndarray, shape (1, n) or (2, n)
+            1 for the position and, if proper motions have errors, years since the catalogue epoch.
+        """
+        ones = np.ones(len(star))
         if self.motion is None or self.epoch is None or epoch is None:
-            return one[None]
-        return np.stack([one, epoch - self.epoch[star]])
+            return ones[None]
+        return np.stack([ones, epoch - self.epoch[star]])
 
     @property
     def variances(self) -> Float:
-        """Variances (levers, S, 2) of positions, and then of motions where there are any."""
+        """Variances (1 or 2, S, 2) of the positions and, if given, of the proper motions."""
         parts = [self.position] if self.motion is None else [self.position, self.motion]
         return np.asarray(np.stack(parts) ** 2)
 
     def at(self, star: Int, epoch: Float | None) -> Float:
-        """Variances (n, 2) of the catalogue's positions for some matches."""
+        """Variances of the catalogue positions at the dates of the matches.
+
+        Parameters
+        ----------
+        star : ndarray of int, shape (n,)
+            Star codes of the matches.
+        epoch : ndarray, shape (n,), or None
+            Dates of the matches in decimal years.
+
+        Returns
+        -------
+        ndarray, shape (n, 2)
+        """
         levers = self.levers(star, epoch)
         variances = self.variances[: len(levers), star]
         return np.asarray(np.einsum("ln,lna->na", levers**2, variances))
 
     def checked(self, n_stars: int) -> StarErrors:
-        """These errors of the first stars; InputError for fewer, and for numbers that are none."""
+        """Errors of the first `n_stars` stars, validated.
+
+        Raises InputError if there are fewer stars, values are not finite or negative, or the epoch
+        is missing.
+        """
         position = _checked(self.position, n_stars, "position")
         if self.motion is None or not self.motion.any():
             return StarErrors(position)
@@ -81,17 +111,17 @@ class StarErrors:
 
 @dataclass(frozen=True, eq=False)
 class StarCovariance:
-    """Covariance of a solution's parameters by the errors of the catalogue.
+    """Covariance of a solution's parameters caused by the errors of the catalogue.
 
     Parameters
     ----------
     total : ndarray, shape (D, D)
-        Covariance of the parameters' error that the catalogue causes.
+        Covariance of the parameters caused by the catalogue errors.
     counted : ndarray, shape (D, D)
-        The part of it that is in the solution's covariance, by errors taken as independent from
-        match to match.
+        Part that the covariance of the solution already includes, because it treats the errors of
+        all matches as independent.
     motions : ndarray, shape (D, D), optional
-        The part of `total` that the errors of the proper motions cause; None where there are none.
+        Part of `total` caused by the errors of the proper motions; None if they have no errors.
     """
 
     total: Float
@@ -100,7 +130,7 @@ class StarCovariance:
 
     @property
     def extra(self) -> Float:
-        """Covariance (D, D) to add to the solution's own."""
+        """Covariance (D, D) to add to that of the solution."""
         return self.total - self.counted
 
 
@@ -112,22 +142,22 @@ def star_covariance(
     *,
     frames: bool = True,
 ) -> StarCovariance:
-    """Covariance of a solution's parameters by the errors of the catalogue.
+    """Compute the covariance of a solution's parameters caused by the errors of the catalogue.
 
     Parameters
     ----------
     solution : Solution
-        A fit or a posterior of these matches: its covariance stands for the inverse of the normal
-        matrix, so that it must not come from a fit with extra weight in the corners.
+        Fit or posterior of these matches. Its covariance is used as the inverse of the normal
+        matrix; the fit must therefore not have additional weight in the corners.
     matches : Matches
-        All stars at once, with their codes.  Their quoted errors contain the catalogue's; those
-        that a fit left out do not count.
+        All stars with their star codes. Their quoted errors must include the catalogue errors.
+        Stars that the fit rejects are ignored.
     errors : StarErrors
-        Of the catalogue, by star code; where there are errors of proper motions, with dates.
+        Errors of the catalogue by star code.
     frames : bool
-        True to propagate to the frames of the exposures exactly.  If False, only polynomials and
-        drift are exact, in a fraction of the time (a seventh with 110 exposures), and the errors of
-        the frames change only as far as they are correlated with those.
+        True to compute the covariance of the exposure frames exactly. If False, only polynomials
+        and drift are exact, and the frames change according to their correlation with those; this
+        is much faster (by a factor of seven for 110 exposures).
 
     Returns
     -------
@@ -136,12 +166,12 @@ def star_covariance(
     Raises
     ------
     InputError
-        When the stars have no codes, for errors that are negative or not finite, or of too few
-        stars, and errors of the catalogue that quoted errors do not contain.
+        If the matches have no star codes, catalogue errors are missing, negative or not finite, or
+        the quoted errors are smaller than the catalogue errors.
     """
     if matches.star is None:
         raise InputError(
-            "the matches do not say which star is which",
+            "the matches have no star codes",
             where=", ".join(matches.sources),
             do="give a table with a column 'star'",
         )
@@ -168,7 +198,7 @@ def star_covariance(
 
 
 def _require_contained(matches: Matches, code: Int, variances: Float, levers: Float) -> None:
-    """Raise InputError for quoted errors that are smaller than the catalogue's part of them."""
+    """Raise InputError if quoted errors are smaller than the catalogue errors."""
     for axis, quoted in enumerate((matches.sigma_u, matches.sigma_v)):
         if quoted is None:
             continue  # `prepare` refuses these
@@ -184,12 +214,12 @@ def _require_contained(matches: Matches, code: Int, variances: Float, levers: Fl
 
 
 def _checked(values: Float, n_stars: int, name: str, *, signed: bool = False) -> Float:
-    """Values of the first stars, which must be finite and, but for signed ones, not negative."""
+    """Values of the first stars; they must be finite and, unless `signed`, not negative."""
     if len(values) < n_stars:
         raise InputError(
-            f"{name} is given for {len(values)} stars, and codes go up to {n_stars - 1}",
+            f"{name} is given for {len(values)} stars, but star codes go up to {n_stars - 1}",
             where=name,
-            do="give that of all stars",
+            do="give it for all stars",
         )
     values = values[:n_stars]
     good = np.isfinite(values) & (signed | (values >= 0))
@@ -204,26 +234,29 @@ def _checked(values: Float, n_stars: int, name: str, *, signed: bool = False) ->
 
 @dataclass(frozen=True, eq=False)
 class StarInfluence:
-    """Errors of a catalogue, and their effect on polynomials and drift of a solution."""
+    """Catalogue errors and their effect on the polynomials and the drift of a solution."""
 
     errors: StarErrors
-    codes: Int  # stars (k,) in the solution, ascending; all others have no effect on it
-    # derivatives (levers, 2, k, n_distortion) of the parameters by these stars' errors on either
-    # axis
+    codes: Int  # codes (k,) of the stars that affect the solution, ascending
+    # derivatives (levers, 2, k, n_distortion) of the parameters with respect to the errors of these
+    # stars in u and v
     by: Float
 
     def with_solution(self, star: Int, epoch: Float | None) -> Float:
-        """Covariance (n, 2, n_distortion) of the stars' errors with those of the parameters."""
+        """Covariance (n, 2, n_distortion) of catalogue errors with the errors of the parameters.
+
+        `star` (n,) are star codes and `epoch` (n,) the dates in decimal years, or None.
+        """
         out = np.zeros((len(star), 2, self.by.shape[-1]))
         if not len(self.codes):
             return out
         at = np.minimum(np.searchsorted(self.codes, star), len(self.codes) - 1)
-        known = np.flatnonzero(self.codes[at] == star)
-        star, at = star[known], at[known]
-        levers = self.errors.levers(star, None if epoch is None else epoch[known])
+        common = np.flatnonzero(self.codes[at] == star)
+        star, at = star[common], at[common]
+        levers = self.errors.levers(star, None if epoch is None else epoch[common])
         variances = self.errors.variances[: len(levers), star]
         weight = levers[..., None] * variances  # (levers, n, 2)
-        out[known] = np.einsum("lna,land->nad", weight, self.by[: len(levers)][:, :, at])
+        out[common] = np.einsum("lna,land->nad", weight, self.by[: len(levers)][:, :, at])
         return out
 
 
@@ -231,9 +264,10 @@ class StarInfluence:
 def star_influence(
     fit: LinearFit, matches: Matches, errors: StarErrors, codes: Int
 ) -> StarInfluence:
-    """Effect on a fit of the catalogue errors of the stars `codes` (k,), ascending.
+    """Compute the effect of the catalogue errors of the stars `codes` (k,), ascending, on a fit.
 
-    The fit has no extra weight in the corners; `matches` are its own, with errors and star codes.
+    The fit must not have additional weight in the corners.  `matches` are the matches of the fit,
+    with errors and star codes.
     """
     code = matches.column("star")
     model, D = fit.model, fit.model.n_distortion

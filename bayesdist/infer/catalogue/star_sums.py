@@ -1,11 +1,12 @@
-"""Sums over the matches of each star: the derivatives of the parameters by an error common to them.
+"""Sums over the matches of each star, for the effect of errors common to all of them.
 
-With residual weights W and the derivatives J of all matches i of star s,
+For star s with matches i, the sums are
 
     G_s = sum_i a_i J_i^T W_i
 
-where a_i is the derivative of the match's position by the error: 1 for a position, t - t0 for a
-proper motion.
+with weights W and derivatives J of the positions with respect to the parameters.  a_i is the
+derivative of the match's position with respect to the error: 1 for a position, t - t0 for a proper
+motion.
 """
 
 from __future__ import annotations
@@ -19,25 +20,25 @@ from bayesdist.infer.stars.stars import Stars
 from bayesdist.model import DistortionModel, Groups
 from bayesdist.utils.arrays import Float, Int
 
-SCRATCH = 64_000_000  # bytes of the stars' sums in memory at a time
+SCRATCH = 64_000_000  # bytes of sums that are computed at a time
 
 
 def influence_by_group(
     model: DistortionModel, theta: Float, groups: Groups, cov: Float | None, D: int
 ) -> list[Float]:
-    """Matrices (2, K, D) for each group, from weighted basis functions to D parameters.
+    """Matrices (2, K, D) of each group that map weighted basis functions to D parameters.
 
-    With a covariance these are changes of the first D parameters; without, gradients with respect
-    to them.
+    If `cov` is given, the results are changes of the first D parameters; otherwise gradients with
+    respect to them.
     """
     out = []
     for columns, d in model.effective_jacobian(theta, groups):
         if cov is not None:
             out.append(d @ cov[columns, :D])
             continue
-        own = columns < D
+        included = columns < D
         gradient = np.zeros((*d.shape[:2], D))
-        gradient[:, :, columns[own]] = d[:, :, own]
+        gradient[:, :, columns[included]] = d[:, :, included]
         out.append(gradient)
     return out
 
@@ -50,10 +51,10 @@ class StarSums:
     code: Int  # star (N,) of each match
     phi: list[Float]  # basis functions (n_g, K) of each group
     weight: Float  # weights (2, N) of both axes
-    # derivatives (N,) of the match's position by an error of the star: first 1, then years where
-    # stars move
+    # derivatives (N,) of the match's position with respect to an error of the star: 1 for its
+    # position and, if proper motions have errors, years
     levers: list[Float]
-    cross: Float | None = None  # weight (N,) of either axis in the score of the other
+    cross: Float | None = None  # off-diagonal weight (N,) between u and v
 
     @classmethod
     def of(
@@ -64,7 +65,7 @@ class StarSums:
         levers: list[Float],
         cross: Float | None = None,
     ) -> StarSums:
-        """Sums for matches in the order of `stars`, with the codes of their stars (N,)."""
+        """Sort matches, given in the order of `stars`, with their star codes (N,)."""
         bounds = [slice(a, b) for a, b in zip(stars.starts[:-1], stars.starts[1:], strict=True)]
         order = np.concatenate(
             [rows.start + np.argsort(code[rows], kind="stable") for rows in bounds]
@@ -86,7 +87,7 @@ class StarSums:
         )
 
     def each(self, influence: list[Float], first: int, end: int) -> Float:
-        """Sums (levers, 2, stars, D) of the stars first to end, for each lever and axis."""
+        """Sums (levers, 2, end - first, D) of the stars first..end, for each lever and axis."""
         out = np.zeros((len(self.levers), 2, end - first, influence[0].shape[2]))
         for g, phi in enumerate(self.phi):
             a = int(self.starts[g])
@@ -96,20 +97,20 @@ class StarSums:
                 continue
             rows, at = slice(a + lo, a + hi), code[lo:hi] - first
             new = np.flatnonzero(np.diff(at, prepend=-1))  # a star may occur twice in a group
-            twice = len(new) < len(at)
+            repeated = len(new) < len(at)
             for axis in (0, 1):
                 pull = (phi[lo:hi] * self.weight[axis, rows, None]) @ influence[g][axis]
                 if self.cross is not None:
                     pull += (phi[lo:hi] * self.cross[rows, None]) @ influence[g][1 - axis]
                 for c, lever in enumerate(self.levers):
                     moved = pull if c == 0 else pull * lever[rows, None]  # the first lever is 1
-                    if twice:
+                    if repeated:
                         moved = np.add.reduceat(moved, new, axis=0)
                     out[c, axis, at[new]] += moved
         return out
 
     def shared(self, influence: list[Float], variances: list[Float]) -> Float:
-        """Covariances (levers, D, D) by errors, of variances (n_stars, 2), common to a star."""
+        """Covariances (levers, D, D) from errors with variances (n_stars, 2) common to a star."""
         D, n_stars = influence[0].shape[2], len(variances[0])
         out = np.zeros((len(variances), D, D))
         step = max(1, SCRATCH // (16 * D * len(variances)))
@@ -123,7 +124,7 @@ class StarSums:
         return out
 
     def independent(self, influence: list[Float], variances: list[Float]) -> Float:
-        """Covariance (D, D) by the same errors if they were independent from match to match."""
+        """Covariance (D, D) from the same errors if they were independent between matches."""
         D = influence[0].shape[2]
         out = np.zeros((D, D))
         for g, phi in enumerate(self.phi):
@@ -135,13 +136,13 @@ class StarSums:
                 )
                 for axis in (0, 1)
             ]
-            for one, other, weight in self._products(rows, variance):
+            for axis_a, axis_b, weight in self._products(rows, variance):
                 moment = (phi * weight[:, None]).T @ phi
-                out += influence[g][one].T @ moment @ influence[g][other]
+                out += influence[g][axis_a].T @ moment @ influence[g][axis_b]
         return out
 
     def _products(self, rows: slice, variance: list[Float]) -> Iterator[tuple[int, int, Float]]:
-        """Pairs of axes, and the sums (n,) over the axes of products of their weights."""
+        """Yield pairs of axes with the sums (n,) of variance times both weights over the axes."""
         u, v = self.weight[:, rows]
         if self.cross is None:
             yield 0, 0, u**2 * variance[0]
@@ -150,6 +151,6 @@ class StarSums:
         cross = self.cross[rows]
         yield 0, 0, u**2 * variance[0] + cross**2 * variance[1]
         yield 1, 1, cross**2 * variance[0] + v**2 * variance[1]
-        both = cross * (u * variance[0] + v * variance[1])
-        yield 0, 1, both
-        yield 1, 0, both
+        mixed = cross * (u * variance[0] + v * variance[1])
+        yield 0, 1, mixed
+        yield 1, 0, mixed

@@ -1,1 +1,1 @@
-"""Solutions compared: polynomial orders, periods, dates of change, and exposures to come."""
+"""Comparison of solutions: polynomial orders, periods, dates of change, planned exposures."""

@@ -1,12 +1,12 @@
-"""Date since when a solution no longer describes the data: a scan over the dates of new matches.
+"""Date after which a solution no longer describes the data, from a scan over the new matches.
 
-Each period of the new matches, once its frames are eliminated, gives a normal matrix N_b and a
-score r_b of the polynomials about the released ones.  With the release's own error e, of covariance
-C and common to all periods, and a change d from the date t on,
+Each period b of the new matches gives a normal matrix N_b and a score r_b of the polynomials about
+the released ones, with the frames eliminated.  Let e be the error of the release, with covariance C
+and common to all periods, and let d be a change that starts at the date t.  Then
 
-    r_b = N_b (e + d [b from t on]) + noise of covariance N_b
+    r_b = N_b (e + d [b after t]) + noise of covariance N_b
 
-so that the gain in log-likelihood of each date follows from these sums.
+and the gain in log-likelihood for each date t follows from sums over the periods.
 """
 
 from __future__ import annotations
@@ -28,49 +28,50 @@ from bayesdist.model.frames import nearest_frame
 from bayesdist.utils.arrays import Float, Int
 from bayesdist.utils.distributions import chi2_sf
 
-MOST_PERIODS = 24
-CREDIBLE = 0.95
+MOST_PERIODS = 24  # maximum number of periods
+CREDIBLE = 0.95  # probability of the interval of the date
 
 
 @dataclass(frozen=True, eq=False)
 class PeriodScore:
-    """Normal matrix and score of the polynomials by the matches of one period, without frames."""
+    """Normal matrix and score of the polynomials for one period, with the frames eliminated."""
 
     first: float  # date of the first match, decimal years
-    last: float  # date of the last match
+    last: float  # date of the last match, decimal years
     n: int  # number of matches
-    normal: Float  # normal matrix (n, n)
-    score: Float  # score (n,) about the released polynomials
+    normal: Float  # normal matrix (n_polynomial, n_polynomial)
+    score: Float  # score (n_polynomial,) about the released polynomials
 
 
 @dataclass(frozen=True, eq=False)
 class ChangeDate:
-    """Date from which on a change describes the data best.
+    """Most likely date of a change, with its significance.
 
-    The change lies between `after` and `before`.  `after` and the start of `interval` are minus
-    infinity where it may be there from the first new match on.
+    The change happened between the dates `after` and `before` (decimal years).  `after` and the
+    start of `interval` are minus infinity if the change may precede the first new match.
     """
 
     after: float
     before: float
-    # dates that hold 95 % of the likelihood, for a prior that is equal for all gaps between periods
+    # interval of dates with 95 % probability, with equal prior probability for all gaps between
+    # periods
     interval: tuple[float, float]
-    gain: Float  # decrease (P,) of chi-square by a change from period k on
-    dof: int  # of the best change
-    p_value: float  # probability of the largest gain by chance, times the number of gains
-    change: Change  # from the best date on, in place of the change of all matches
-    # chi-square per degree of freedom of the periods about the best change; 1 where errors are
-    # right and independent, or slightly less, since the date was chosen
+    gain: Float  # decrease (P,) of chi-square for a change that starts with period k
+    dof: int  # degrees of freedom of the best change
+    p_value: float  # chance probability of the largest gain, times the number of dates tried
+    change: Change  # change after the best date, instead of that of all matches
+    # chi-square per degree of freedom of the periods about the best change; about 1 if errors are
+    # correct and independent (slightly less, since the date was optimised)
     scatter: float
-    scatter_dof: int
+    scatter_dof: int  # degrees of freedom of `scatter`
     p_scatter: float  # probability of a larger scatter
 
 
 def period_scores(new: NewFit, change: Change, matches: Matches) -> tuple[PeriodScore, ...]:
-    """Scores of each period in the order of time, from one pass over the data in chunks.
+    """Scores of the periods in chronological order, from one pass over the data in chunks.
 
-    `matches` are those of `new`, with epochs; where they have no more than `MOST_PERIODS` dates,
-    each date is a period.
+    `matches` are those of `new`, with epochs.  With at most `MOST_PERIODS` dates, each date is a
+    period.
     """
     edges = _edges(matches)
     held: dict[int, tuple[NormalEquations, float, float, int]] = {}
@@ -79,8 +80,8 @@ def period_scores(new: NewFit, change: Change, matches: Matches) -> tuple[Period
         of_period = np.searchsorted(edges, table.column("epoch"), side="right")
         for b in np.unique(of_period):
             part = table.select(of_period == b)
-            found = _sums(new, part, constants)
-            held[int(b)] = _joined(held[int(b)], found) if int(b) in held else found
+            chunk = _sums(new, part, constants)
+            held[int(b)] = _joined(held[int(b)], chunk) if int(b) in held else chunk
     return tuple(
         PeriodScore(first, last, n, *_score(new, change, equations))
         for equations, first, last, n in (held[b] for b in sorted(held))
@@ -88,7 +89,7 @@ def period_scores(new: NewFit, change: Change, matches: Matches) -> tuple[Period
 
 
 def _edges(matches: Matches) -> Float:
-    """Dates at which a new period begins."""
+    """Dates (decimal years) at which the second and later periods begin."""
     epoch = matches.sample(1_000_000).column("epoch")
     dates, counts = np.unique(epoch, return_counts=True)
     if len(dates) <= MOST_PERIODS:
@@ -113,7 +114,7 @@ def _joined(
 
 
 def _score(new: NewFit, change: Change, equations: NormalEquations) -> tuple[Float, Float]:
-    """Normal matrix and score of the polynomials about the release, frames eliminated."""
+    """Normal matrix and score of the polynomials about the release, with frames eliminated."""
     codes = np.unique(equations.groups.exposure)
     model = _of_exposures(new.model, codes)
     groups = replace(
@@ -124,8 +125,8 @@ def _score(new: NewFit, change: Change, equations: NormalEquations) -> tuple[Flo
     M, d = change.frame
     if model.n_frame:
         for k, code in enumerate(codes):
-            own, shift = new.model.frame(new.theta, int(code))
-            frame = nearest_frame(model.frames, own @ M, own @ d + shift)
+            linear, shift = new.model.frame(new.theta, int(code))
+            frame = nearest_frame(model.frames, linear @ M, linear @ d + shift)
             single = new.theta[new.model.frame_slice(int(code))][len(frame) - model.n_frame :]
             theta[model.frame_slice(k + 1)] = [*frame, *(single if model.chip_deviations else ())]
     n = model.n_polynomial
@@ -133,8 +134,8 @@ def _score(new: NewFit, change: Change, equations: NormalEquations) -> tuple[Flo
     scatter = new.scatter if len(new.scatter) else np.zeros(model.n_frame)
     equations = replace(equations, groups=groups, cross=equations.cross[:, :0])
     for last in (False, False, True):
-        here = equations.moved(model.effective(theta, groups))
-        matrix, right = here.assemble(model, theta)
+        expanded = equations.moved(model.effective(theta, groups))
+        matrix, right = expanded.assemble(model, theta)
         if not model.n_frame:
             return matrix.border[:n, :n], right[:n]
         blocks = matrix.blocks + np.diag(scatter)
@@ -142,7 +143,7 @@ def _score(new: NewFit, change: Change, equations: NormalEquations) -> tuple[Flo
         local = matrix.split(right)[1] - scatter * values
         if last:
             break
-        # frames are at their mode for polynomials fixed at the release
+        # Newton step of the frames, with the polynomials fixed at the release
         step = np.linalg.solve(blocks, local[..., None])[..., 0]
         theta[model.n_global :] += step.ravel()
     gain = np.linalg.solve(blocks, np.swapaxes(matrix.edge[:, :n], 1, 2))
@@ -152,17 +153,18 @@ def _score(new: NewFit, change: Change, equations: NormalEquations) -> tuple[Flo
 
 
 def _of_exposures(model: DistortionModel, codes: Int) -> DistortionModel:
-    """Model of some exposures, after one without matches in the frame of the release."""
+    """Model of selected exposures, preceded by one without matches in the frame of the release."""
     names = tuple(model.exposures[int(code)] for code in codes)
     return replace(model, exposures=("(release)", *names))
 
 
 def scan_dates(scores: tuple[PeriodScore, ...], change: Change) -> ChangeDate:
-    """Most likely date of a change, its interval, and the scatter of the periods.
+    """Find the most likely date of a change, its interval, and the scatter of the periods.
 
-    `change` gives the covariance of the release and the fields that frames absorb.
+    `change` provides the covariance of the release and the fields that frames absorb.
     """
-    # what frames absorb is no change; a drift between the periods leaves a trace of it in N_b
+    # Exclude the fields that frames absorb: they are not changes. Because of the drift between the
+    # periods, N_b retains a small part of them.
     free = null_space((change.absorbed / np.linalg.norm(change.absorbed, axis=0)).T)
     cov, normals = change.released_cov, np.array([s.normal for s in scores])
     rights = np.array([s.score for s in scores])
@@ -175,7 +177,7 @@ def scan_dates(scores: tuple[PeriodScore, ...], change: Change) -> ChangeDate:
         (normal - normal @ inner @ normal, right - normal @ inner @ all_r)
         for normal, right in zip(after_n, after_r, strict=True)
     ]
-    gain, dofs = np.array([_gain(*one, free) for one in ahead]).T
+    gain, dofs = np.array([_gain(*item, free) for item in ahead]).T
     best = int(gain.argmax())
     starts = np.array([-np.inf, *(s.last for s in scores[:-1])])
     ends = np.array([s.first for s in scores])
@@ -185,7 +187,7 @@ def scan_dates(scores: tuple[PeriodScore, ...], change: Change) -> ChangeDate:
     inside = order[: int(np.searchsorted(reached, CREDIBLE)) + 1]
     parts = [(normals[:best].sum(axis=0), rights[:best].sum(axis=0))] if best else []
     parts.append((after_n[best], after_r[best]))
-    singly = [_gain(one.normal, one.score, free) for one in scores]
+    singly = [_gain(item.normal, item.score, free) for item in scores]
     jointly = [_gain(normal, right, free) for normal, right in parts]
     dof = sum(d for _, d in singly) - sum(d for _, d in jointly)
     chi2 = max(sum(v for v, _ in singly) - sum(v for v, _ in jointly), 0.0)
@@ -204,19 +206,19 @@ def scan_dates(scores: tuple[PeriodScore, ...], change: Change) -> ChangeDate:
 
 
 def _gain(normal: Float, right: Float, free: Float) -> tuple[float, int]:
-    """Twice the gain in log-likelihood of the best polynomials, and the number determined."""
+    """Decrease of chi-square for the best-fitting change, and its degrees of freedom."""
     white = right @ _root(normal, free)
     return float(white @ white), len(white)
 
 
 def _root(normal: Float, free: Float) -> Float:
-    """Root (n, rank) of the covariance of the free directions."""
+    """Matrix R (n, rank) such that R R^T is the covariance of a change in the free directions."""
     inside = free.T @ normal @ free
     return np.asarray(free @ determined((inside + inside.T) / 2))
 
 
 def _from_then_on(change: Change, normal: Float, right: Float, free: Float) -> Change:
-    """Change for a normal matrix and its score, without what frames absorb."""
+    """Best-fitting change for a normal matrix and score, without the fields that frames absorb."""
     root = without(change.absorbed, mean_squares(change.model)) @ _root(normal, free)
     white = right @ _root(normal, free)
     return replace(

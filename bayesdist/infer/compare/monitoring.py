@@ -1,11 +1,12 @@
 """Test of a released solution against new matches.
 
-The new matches are fitted independently, with the polynomial order of the release, own frames for
-every exposure, the drift fixed at its released rates, and the outlier mixture with its jitter anew.
-Their polynomials at their mean date, mapped to the released ones by the frame that no data can
-determine, differ by a change whose covariance is that of the fit plus that of the release at this
-date, extrapolated rates included.  Exposures of a campaign deviate from their polynomials with the
-scatter of the release; no data can then determine their shifts and rotations alone.
+The new matches are fitted independently of the release, with its polynomial order, frames for each
+exposure, a drift fixed to the released rates, and a new outlier mixture with jitter.  The new
+polynomials at the mean date are mapped to the released ones by the frame that the data cannot
+determine.  The remaining difference is the change.  Its covariance is the sum of those of the new
+fit and of the release at this date, including the extrapolated rates.  For a campaign, exposures
+deviate from the polynomials with the scatter of the release, and only shifts and rotations cannot
+be determined.
 """
 
 from __future__ import annotations
@@ -36,37 +37,38 @@ from bayesdist.utils.arrays import Float
 
 __all__ = ["Change", "NewFit", "change_of", "fit_new", "new_model", "with_star_errors_of"]
 
-SAMPLE = 1_000_000  # matches from which the mean date is computed
-HELD = 1e-4  # sigma of a fixed rate, in units of its released sigma
+SAMPLE = 1_000_000  # number of matches used to compute the mean date
+HELD = 1e-4  # prior sigma of a fixed rate, in units of its released sigma
 
 
 @dataclass(frozen=True, eq=False)
 class NewFit:
-    """Independent fit of the new matches.
+    """Fit of the new matches, independent of the release.
 
     Parameters
     ----------
     released : TransformedSolution
         The released polynomials and their drift, without frames.
     fit : LinearFit
-        Least squares of the new matches, which starts the mixture.
+        Least-squares fit of the new matches, from which the mixture fit starts.
     theta : ndarray, shape (D,)
-        Mode of the mixture, in the model of `fit`.
+        Mode of the mixture posterior, for the model of `fit`.
     cov : ndarray, shape (D, D)
+        Covariance of theta.
     hyper : dict of str to float
-        'j', 'f', 's_out' at the mode, as far as the mixture has them.
+        Hyperparameters 'j', 'f', 's_out' of the mixture at the mode, if they are fitted.
     target : Target
-        Density of the new matches.
+        Posterior density of the new matches.
     psi : ndarray
         The mode in sampled coordinates.
     epoch : float or None
-        Mean date of the matches, where the model depends on time.
+        Mean date of the matches in decimal years; None if the model does not depend on time.
     scatter : ndarray, shape (q,)
-        Inverse variances of the parameters of an exposure; zero for those that are free.
+        Prior inverse variances of the parameters of an exposure; zero for free parameters.
     extra : ndarray, shape (n, n) or None
-        Added to the covariance of the polynomials for errors that all matches of a star share.
+        Additional covariance of the polynomials from errors common to all matches of a star.
     common : ndarray, shape (n_distortion, n) or None
-        Covariance of the release with these polynomials, by stars in both.
+        Covariance between the release and these polynomials, caused by common stars.
     """
 
     released: TransformedSolution
@@ -83,18 +85,18 @@ class NewFit:
 
     @property
     def model(self) -> DistortionModel:
-        """Model of the new matches: the released structure with their exposures."""
+        """Model of the new matches: that of the release, with the new exposures."""
         return self.fit.model
 
     @property
     def likelihood(self) -> MixtureAt:
-        """Mixture at its mode."""
+        """Likelihood of the mixture at its mode."""
         h = self.psi[None, self.target.n_theta :]
         return MixtureAt(self.theta, self.target.hyper.constants(h))
 
     @property
     def open(self) -> DistortionModel:
-        """Model with only those frame parameters that no data can determine."""
+        """Model in which the frames have only the parameters that the data cannot determine."""
         if self.model.gauge == "first":
             return self.model
         return replace(
@@ -108,26 +110,28 @@ class NewFit:
 
 @dataclass(frozen=True, eq=False)
 class Change:
-    """Difference of the new matches' polynomials from the released ones.
+    """Difference between the polynomials of the new matches and the released ones.
 
     Parameters
     ----------
     model : DistortionModel
-        Released structure without frames.
+        Model of the release, without frames.
     epoch : float or None
-        Date at which the solutions are compared.
+        Date at which the solutions are compared, in decimal years.
     released : ndarray, shape (chips, 2, K)
         Released polynomials at that date.
     difference : ndarray, shape (chips, 2, K)
-        New minus released, in the frame of the release, without what frames could absorb.
+        New minus released polynomials, in the frame of the release, without the part that frames
+        can absorb.
     cov : ndarray, shape (n, n)
-        Of the difference, n = 2 K chips.
+        Covariance of the difference, with n = 2 K chips.
     released_cov : ndarray, shape (n, n)
-        Of the released polynomials at that date, and of all other errors common to the new matches.
+        Covariance of the released polynomials at that date, including all other errors that are
+        common to the new matches.
     absorbed : ndarray, shape (n, q)
-        Fields that frames absorb.
+        Coefficients of the fields that frames can absorb.
     test : FieldTest
-        Of the whole difference.
+        Chi-square test of the difference.
     frame : tuple of ndarray
         Matrix (2, 2) and shift (2,) from the release to the first new exposure.
     """
@@ -158,17 +162,18 @@ def fit_new(
     Parameters
     ----------
     released : Solution
-        A fit or a posterior; only the kind of its frames matters, not the frames of its exposures.
+        A fit or a posterior. The kind of its frames is used, but not the frames themselves.
     matches : Matches
-        With errors.
+        New stars, with errors.
     mixture : OutlierMixture, optional
-        That of a released posterior by default, else Gaussian outliers.
+        Outlier model; by default that of a released posterior, or Gaussian outliers.
     rejection : Rejection
-        As of `fit_linear`.
+        See `fit_linear`.
     compute : Compute, optional
+        See `fit_linear`.
     scatter : mapping of str to float, optional
-        Standard deviations of a campaign's exposures, by the name of the parameter: 'scale', ...
-        Required for such a release.
+        Standard deviations of the exposures of a campaign by name of the frame parameter, such as
+        'scale'. Required if the release is that of a campaign.
     frames : str, optional
         Kind of the frames of the new exposures; by default that of the release.
 
@@ -179,9 +184,9 @@ def fit_new(
     Raises
     ------
     InputError
-        For matches in another unit, or without the epochs that the release needs.
+        If the matches have another unit than the release, or lack the epochs that it needs.
     DegenerateError
-        When the matches do not determine polynomials of the released order.
+        If the matches do not determine polynomials of the released order.
     """
     bare = without_frames(released)
     model = new_model(released.model, matches)
@@ -216,46 +221,56 @@ def fit_new(
 
 
 def new_model(released: DistortionModel, matches: Matches) -> DistortionModel:
-    """Released structure with the exposures of new matches.
+    """Model of the release with the exposures of the new matches.
+
+    Parameters
+    ----------
+    released : DistortionModel
+    matches : Matches
+
+    Returns
+    -------
+    DistortionModel
 
     Raises
     ------
     InputError
-        For matches in another unit, of an unknown chip, or without epochs that are needed.
+        If the matches have another unit, or lack the epochs that the release needs.
     """
-    where = ", ".join(matches.sources)
+    location = ", ".join(matches.sources)
     if matches.unit != released.unit:
         raise InputError(
             f"the new matches are in {matches.unit} and the release is in {released.unit}",
-            where=where,
-            do="bring them to one unit",
+            where=location,
+            do="convert them to one unit",
         )
     if released.time is not None and not matches.has_epoch:
         raise InputError(
             "the release depends on time and the new matches have no epochs",
-            where=where,
+            where=location,
             do="map column 'epoch'",
         )
-    some = matches.sample(SAMPLE)
+    sample = matches.sample(SAMPLE)
     return replace(
         released,
         exposures=matches.exposure_names,
         gauge="first",
         held=(0.0, 0.0, 0.0),
         chip_deviations=False,
-        origin=(float(np.median(some.u)), float(np.median(some.v))),
+        origin=(float(np.median(sample.u)), float(np.median(sample.v))),
     )
 
 
 def change_of(new: NewFit, *, draws: float = np.inf) -> Change:
-    """Difference of the new matches' polynomials from the release.
+    """Difference between the polynomials of the new matches and the release, with its test.
 
     Parameters
     ----------
     new : NewFit
     draws : float
-        Effective draws from which the released covariance was estimated; they are worth the more,
-        the smaller its fraction of the whole is (Welch and Satterthwaite).
+        Effective number of draws from which the released covariance was estimated. Their finite
+        number matters less if the release contributes a small fraction of the covariance
+        (Welch and Satterthwaite).
 
     Returns
     -------
@@ -266,8 +281,8 @@ def change_of(new: NewFit, *, draws: float = np.inf) -> Change:
     at = _at_epoch(model, new.epoch)  # (n, n_distortion)
     old = (at @ released.mean).reshape(C, 2, K)
     now = (at @ new.theta[: model.n_distortion]).reshape(C, 2, K)
-    # the rates are the same on both sides, and their error counts once: with the release
-    own = new.cov[:n, :n]
+    # both solutions have the same rates; their error is counted once, with the release
+    new_cov = new.cov[:n, :n]
     origin = np.asarray(new.model.origin)
     M, d = frame_between(old, now, new.open)
     back = np.linalg.inv(M)
@@ -283,25 +298,25 @@ def change_of(new: NewFit, *, draws: float = np.inf) -> Change:
     if new.common is not None:
         common = at @ new.common @ turn.T
         released_cov = released_cov - common - common.T
-    cov = turn @ own @ turn.T + released_cov
+    cov = turn @ new_cov @ turn.T + released_cov
     absorbed = frame_fields(model, new.open.frames, old, origin)
     norm = mean_squares(model)
     difference = (moved - old).ravel()
     projector = without(absorbed, norm)
-    rest = projector @ difference
+    remainder = projector @ difference
     variance = np.einsum("ij,jk,ik->i", projector, cov, projector)
     of_release = np.einsum("ij,jk,ik->i", projector, released_cov, projector)
-    known = variance > 1e-16 * np.diag(cov)
-    fraction = max(float(np.mean(of_release[known] / variance[known])), 1e-3)
+    varying = variance > 1e-16 * np.diag(cov)
+    fraction = max(float(np.mean(of_release[varying] / variance[varying])), 1e-3)
     return Change(
         model=model,
         epoch=new.epoch,
         released=old,
-        difference=rest.reshape(C, 2, K),
+        difference=remainder.reshape(C, 2, K),
         cov=projector @ cov @ projector.T,
         released_cov=released_cov,
         absorbed=absorbed,
-        test=chi_square(rest, cov, without=absorbed, norm=norm, draws=draws / fraction**2),
+        test=chi_square(remainder, cov, without=absorbed, norm=norm, draws=draws / fraction**2),
         frame=(M, d),
     )
 
@@ -309,14 +324,14 @@ def change_of(new: NewFit, *, draws: float = np.inf) -> Change:
 def _priors(
     released: TransformedSolution, model: DistortionModel, scatter: Mapping[str, float]
 ) -> GaussianPriors:
-    """Priors that fix the drift at its released values, and those of exposures' deviations."""
+    """Priors that fix the drift to its released values and constrain the exposures' deviations."""
     priors = GaussianPriors.none(model)
     rows = slice(released.model.n_polynomial, released.model.n_distortion)
     centre, precision = priors.centre.copy(), priors.precision.copy()
     centre[rows] = released.mean[rows]
     sigma = np.sqrt(np.maximum(np.diag(released.cov)[rows], 0.0))
-    least = 1e-12 * np.abs(released.mean).max(initial=1.0)
-    precision[rows] = np.maximum(HELD * sigma, least) ** -2.0
+    floor = 1e-12 * np.abs(released.mean).max(initial=1.0)
+    precision[rows] = np.maximum(HELD * sigma, floor) ** -2.0
     for code in range(len(model.exposures)):
         first = model.frame_slice(code).start
         for k, name in enumerate(model.free_frame_names(code)):
@@ -326,7 +341,7 @@ def _priors(
 
 
 def _at_epoch(model: DistortionModel, epoch: float | None) -> Float:
-    """Matrix from polynomials and drift to the polynomials (n, n_distortion) at a date."""
+    """Matrix (n, n_distortion) from polynomials and drift to the polynomials at a date."""
     out = np.eye(model.n_polynomial, model.n_distortion)
     if model.time is None:
         return out
@@ -347,24 +362,25 @@ def with_star_errors_of(
     matches: Matches,
     released: tuple[LinearFit, Matches] | None = None,
 ) -> NewFit:
-    """New fit whose covariance includes the catalogue errors that all matches of a star have.
+    """Include the catalogue errors, which are common to all matches of a star, in the covariance.
 
-    A star has one error in all of its new exposures.  Where the release was made with the same
-    catalogue, that error has moved both sides, and what it moved alike is no change.
+    If the release was made with the same catalogue, these errors affect both solutions, and their
+    covariance is taken into account.
 
     Parameters
     ----------
     errors : StarErrors
-        Of the catalogue, by code of the star; the quoted errors contain them.
+        Errors of the catalogue by star code. The quoted errors of the matches include them.
     new : NewFit
     matches : Matches
-        Those of `new`, with codes of the stars.
+        The matches of `new`, with star codes.
     released : tuple of LinearFit and Matches, optional
-        The release and its matches, where they have the same catalogue and codes.
+        The release and its matches, if they have the same catalogue and star codes.
 
     Returns
     -------
     NewFit
+        Copy of `new` with `extra` and `common` set.
     """
     n = new.model.n_polynomial
     shared = star_covariance(new.fit, matches, errors, frames=False)

@@ -1,9 +1,9 @@
-"""Selection of the polynomial order, by binned surfaces and by stars held out.
+"""Selection of the polynomial order by fits to binned residuals and by held-out stars.
 
-WSDC D-T033, section 3, fits surfaces of order 3 to 9 to mean offsets in bins, and finds order 3
-just short and order 4 as good as those above.  In addition each order predicts stars that it was
-not fitted to.  All of it comes from two passes over the data, beyond those of one fit of the
-highest order.
+WSDC D-T033, section 3, fits surfaces of order 3 to 9 to mean offsets in bins.  It finds that order
+3 is just inadequate and that order 4 is as good as higher orders.  Here, in addition, each order
+predicts stars that were not used to fit it.  This takes two passes over the data in addition to a
+fit of the highest order.
 """
 
 from __future__ import annotations
@@ -46,17 +46,40 @@ def select_order(
     folds: int = 100,
     rejection: Rejection = DEFAULT_REJECTION,
 ) -> OrderSelection:
-    """Comparison of two or more polynomial orders, for one chip without frames and time dependence.
+    """Compare polynomial orders on one chip, without frames and time dependence.
 
-    Stars are clipped once, by the two-pass fit of the highest order, and alike for all orders; the
-    model's own order does not matter.  `bins` (surfaces) and `regions` (held out, each made of
-    whole bins) are numbers along each axis; `folds` is the number of random subsets of the stars
-    that are held out, one at a time.
+    Stars are clipped once, by the two-pass fit of the highest order, for all orders.
 
-    Raises InputError for fewer than two orders, unusable ones, a model of several chips, or numbers
-    of bins, regions and subsets that do not fit together; DegenerateError as `fit_linear`, for the
-    highest order, and when too few bins have stars, or a group holds all that determines a
-    coefficient.
+    Parameters
+    ----------
+    matches : Matches or Shards
+        Stars with errors.
+    model : DistortionModel
+        Model of one chip; its order is ignored.
+    orders : sequence of int
+        At least two polynomial orders.
+    bins : int
+        Number of bins along each axis in which residuals are averaged.
+    regions : int
+        Number of regions along each axis that are held out one at a time. Regions consist of whole
+        bins.
+    folds : int
+        Number of random subsets of the stars that are held out one at a time.
+    rejection : Rejection
+        See `fit_linear`.
+
+    Returns
+    -------
+    OrderSelection
+
+    Raises
+    ------
+    InputError
+        If there are fewer than two orders or an order is out of range, the model has several chips,
+        frames or time dependence, or the numbers of bins, regions and folds are inconsistent.
+    DegenerateError
+        If the data do not determine the highest order (see `fit_linear`), also without one of the
+        held-out groups, or if too few bins have stars.
     """
     chosen = _checked(orders, model, bins, regions, folds)
     top = replace(model, order=chosen[-1])
@@ -71,7 +94,7 @@ def select_order(
     region = binned.joined(iy * regions // bins * regions + ix * regions // bins, regions**2)
     try:
         by_stars, by_regions = (
-            held_out_gain(one.filled(), about, n_terms) / scale2 for one in (by_fold, region)
+            held_out_gain(sums.filled(), about, n_terms) / scale2 for sums in (by_fold, region)
         )
     except np.linalg.LinAlgError:
         raise DegenerateError(
@@ -95,7 +118,7 @@ def select_order(
 def _checked(
     orders: Sequence[int], model: DistortionModel, bins: int, regions: int, folds: int
 ) -> tuple[int, ...]:
-    """Orders in ascending sequence; InputError if a setting cannot be used."""
+    """Orders, ascending and distinct; raises InputError if a setting is invalid."""
     chosen = tuple(sorted({int(n) for n in orders}))
     if len(chosen) < 2 or chosen[0] < 1 or chosen[-1] > MAX_ORDER:
         raise InputError(
@@ -107,11 +130,11 @@ def _checked(
         raise InputError(
             "orders are compared on one chip, without frames and time dependence",
             where="model",
-            do="select one chip, and bring the exposures to one frame before",
+            do="select one chip, and transform the exposures to one frame first",
         )
     if not 2 <= regions <= bins or folds < 2:
         raise InputError(
-            f"{bins} bins, {regions} regions and {folds} folds do not go together",
+            f"{bins} bins, {regions} regions and {folds} folds are inconsistent",
             where="orders",
             do="give at least 2 regions and folds, and no more regions than bins",
         )
@@ -137,16 +160,16 @@ def _surfaces(
         weight, right = (basis * w[:, None]).T @ basis, (basis * w[:, None]).T @ mean
         noise[axis] = np.sqrt(scale2 * n / w.sum())
         for m, k in enumerate(n_terms):
-            left = mean - basis @ truncated(weight, right, about[axis], k)
-            chi2[m, axis] = w @ left**2 / scale2
-            rms[m, axis] = np.sqrt(w @ left**2 / w.sum())
+            residual = mean - basis @ truncated(weight, right, about[axis], k)
+            chi2[m, axis] = w @ residual**2 / scale2
+            rms[m, axis] = np.sqrt(w @ residual**2 / w.sum())
     return OrderSurfaces(orders, n, chi2, n - np.array(n_terms), rms, noise)
 
 
 def _lost(
     sums: FoldStatistics, about: Float, n_terms: list[int], scale2: float, fit: LinearFit
 ) -> Float:
-    """Rms over the detector of the difference of each order's fit from the highest."""
+    """Rms difference (orders,) over the detector between each order and the highest, denoised."""
     area = fit.model.basis().mean_squares
     square = (departures(sums, about, n_terms) ** 2 @ area).sum(axis=1)
     weight = sums.weight.sum(axis=0)
@@ -154,18 +177,33 @@ def _lost(
     for m, k in enumerate(n_terms):
         low = np.linalg.inv(weight[:, :k, :k])
         variance[m] = np.einsum("akk,k->", low, area[:k])
-    # errors of nested fits: that of the difference is the difference of theirs
+    # nested fits: the variance of the difference is the difference of the variances
     noise = scale2 * (variance[-1] - variance)
     return np.sqrt(np.maximum(square - noise, 0.0))
 
 
 def in_one_frame(solution: Solution, matches: Matches, chip: int) -> Matches:
-    """Matches of one chip with the frames and the drift of a solution taken out.
+    """Remove the frames and the drift of a solution from the matches of one chip.
 
-    `matches`: with errors, of the exposures of the solution's model. `chip`: number of the chip.
-    Result: in memory, of one exposure and without dates. They lie as far from the polynomials
-    alone, at their first reference date, as they lay from the solution; residuals and errors are
-    along the axes of these polynomials. InputError for matches without errors.
+    Parameters
+    ----------
+    solution : Solution
+    matches : Matches
+        Stars with errors, of exposures of the solution's model.
+    chip : int
+        Number of the chip.
+
+    Returns
+    -------
+    Matches
+        Stars in memory, as a single exposure without dates. Their residuals from the polynomials at
+        the first reference date are those from the solution. Residuals and errors are rotated to
+        the axes of the polynomials.
+
+    Raises
+    ------
+    InputError
+        If the matches have no errors.
     """
     matches = matches.load()
     if len(solution.model.chips) > 1:
@@ -173,12 +211,14 @@ def in_one_frame(solution: Solution, matches: Matches, chip: int) -> Matches:
     errors = np.stack([matches.column("sigma_u"), matches.column("sigma_v")], axis=1)
     model, bare = solution.model, without_frames(solution)
     x, y, epoch = matches.x, matches.y, matches.epoch
-    seen = model.predict(solution.mean, x, y, exposure=matches.exposure, chip=chip, epoch=epoch)
+    predicted = model.predict(
+        solution.mean, x, y, exposure=matches.exposure, chip=chip, epoch=epoch
+    )
     date = None if bare.model.time is None else bare.model.time.epoch0[0]
     alone = bare.model.predict(bare.mean, x, y, chip=chip, epoch=date)
     frames = np.array([model.frame(solution.mean, e)[0] for e in range(len(model.exposures))])
     back = np.linalg.inv(frames)[matches.exposure if len(frames) > 1 else 0]
-    residual = np.stack([matches.u, matches.v], axis=1) - seen
+    residual = np.stack([matches.u, matches.v], axis=1) - predicted
     u, v = (alone + np.einsum("...ab,...b->...a", back, residual)).T
     sigma_u, sigma_v = np.sqrt(np.einsum("...ab,...b->...a", back**2, errors**2)).T
     return Matches.of_distinct_rows(

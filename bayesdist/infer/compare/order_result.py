@@ -1,4 +1,4 @@
-"""Result of a comparison of polynomial orders: statistics for each order, and the verdict."""
+"""Result of a comparison of polynomial orders: statistics per order, and the selected order."""
 
 from __future__ import annotations
 
@@ -12,59 +12,59 @@ from bayesdist.utils.arrays import Float, Int
 from bayesdist.utils.distributions import chi2_sf, f_sf, norm_sf
 from bayesdist.utils.numbers import p_words
 
-CLEAR = 3.0  # standard errors from which on a higher order counts as better
+CLEAR = 3.0  # standard errors above which a higher order counts as better
 CLEAR_P = float(norm_sf(CLEAR))
 
 
 @dataclass(frozen=True, eq=False)
 class OrderSurfaces:
-    """Fits of each order to the means of the residuals in bins.
+    """Fits of each order to the mean residuals in bins.
 
-    A bin's mean is compared with the mean of the model over the same stars, not with its value at
-    the bin's centre: neither curvature inside a bin nor its uneven filling matters.
+    The mean of a bin is compared with the mean of the model over the same stars, not with the model
+    at the centre of the bin.  Curvature within a bin and uneven coverage therefore have no effect.
     """
 
     orders: tuple[int, ...]
-    n_bins: int  # bins that have stars
-    chi2: Float  # remaining in u and v (orders, 2), relative to the noise of the bins' means
-    dof: Int  # of one axis (orders,)
-    # remaining in the bins of u and v (orders, 2), in the unit of u, v; bins weigh as their stars
-    # do
+    n_bins: int  # number of bins with stars
+    chi2: Float  # chi-square (orders, 2) in u and v, relative to the noise of the bin means
+    dof: Int  # degrees of freedom (orders,) per axis
+    # rms residual (orders, 2) of the bins in u and v, in their unit, weighted like the stars
     rms: Float
-    noise: Float  # part (2,) of the rms that is noise of the bins' means
+    noise: Float  # rms noise (2,) of the bin means
 
     def p_noise(self) -> Float:
-        """Probability (orders, 2) of a larger chi-square if only noise is left."""
+        """Probability (orders, 2) of a larger chi-square if the residuals are only noise."""
         return np.asarray(chi2_sf(self.chi2, self.dof[:, None]))
 
     def f_test(self, low: int, high: int) -> tuple[float, float]:
-        """F of both axes together, and the probability of a larger F if the lower order is right.
+        """F statistic of both axes, and probability of a larger F if the lower order is adequate.
 
-        The noise is estimated from the surface itself, as the residuals of the higher order.
+        The noise is estimated from the residuals of the higher order.
         """
         a, b = self.orders.index(low), self.orders.index(high)
-        left = self.chi2.sum(axis=1)
-        more, free = 2 * (self.dof[a] - self.dof[b]), 2 * self.dof[b]
-        F = float((left[a] - left[b]) / more / (left[b] / free))
-        return F, float(f_sf(F, more, free))
+        chi2 = self.chi2.sum(axis=1)
+        n_added, free = 2 * (self.dof[a] - self.dof[b]), 2 * self.dof[b]
+        F = float((chi2[a] - chi2[b]) / n_added / (chi2[b] / free))
+        return F, float(f_sf(F, n_added, free))
 
 
 @dataclass(frozen=True, eq=False)
 class HeldOutOrders:
-    """Predictive density of groups of stars by each order, fitted to all other groups."""
+    """Predictive density of held-out groups of stars for each order, fitted to the other groups."""
 
     orders: tuple[int, ...]
     kind: str  # 'stars' or 'regions'
-    # of L groups (L, orders, 2), of u and v, up to a constant that the orders share
+    # log density (L, orders, 2) of L groups in u and v, up to a constant common to all orders
     log_density: Float
 
     def difference(self, low: int, high: int) -> tuple[float, float]:
         """Log predictive density of a higher order minus that of a lower one, with its error.
 
-        Both axes together; the standard error is from the scatter between the groups.  Where the
-        p further coefficients of both axes stand out by d of their errors, that scatter sums to a
-        variance of d^2 + p, since each group is held against an estimate that the groups share;
-        the sum itself, half a non-central chi-square, has d^2 + p/2.
+        Both axes are summed.  The standard error is derived from the scatter between the groups.
+        If the p additional coefficients of both axes deviate from zero by d standard errors in
+        total, the scatter implies a variance of d^2 + p, because the groups are compared with
+        estimates that have most data in common.  The actual variance of the sum, half a non-central
+        chi-square, is d^2 + p/2; this is corrected.
         """
         a, b = self.orders.index(low), self.orders.index(high)
         each = (self.log_density[:, b] - self.log_density[:, a]).sum(axis=-1)
@@ -79,31 +79,31 @@ class OrderSelection:
 
     orders: tuple[int, ...]  # ascending
     surfaces: OrderSurfaces
-    stars: HeldOutOrders  # for random subsets of the stars
-    regions: HeldOutOrders  # for whole regions of the detector
-    # rms (orders,) over the detector, both axes in quadrature, of the difference of each order's
-    # fit from the highest, noise subtracted
+    stars: HeldOutOrders  # random subsets of the stars held out
+    regions: HeldOutOrders  # regions of the detector held out
+    # rms difference (orders,) over the detector between the fit of each order and that of the
+    # highest, both axes in quadrature, noise subtracted
     lost: Float
     pair_rms: float  # rms residual of a single match, both axes in quadrature
-    # factor on all quoted errors by which the highest order has a chi-square of 1 per degree of
+    # factor on the quoted errors that gives the highest order a chi-square of 1 per degree of
     # freedom
     error_scale: float
-    n_used: int  # matches that were not clipped
-    unit: str  # of `lost`, `pair_rms` and the surfaces
+    n_used: int  # number of matches that were not clipped
+    unit: str  # unit of `lost`, `pair_rms` and the surfaces
 
     def rows(self) -> list[dict[str, Any]]:
-        """Row of surfaces and held-out stars for each order.
+        """Statistics of each order as a list of dictionaries.
 
-        Keys: order; terms (of one axis); rms_u, rms_v of the bins; chi2_u, chi2_v for each degree
-        of freedom, and p_noise, the smaller of their two probabilities; F and p_surface of the
-        F-test between this order and the chosen one; stars and stars_error, regions and
-        regions_error: log density of the held-out stars, minus that of the chosen order; lost.
-        None where the chosen order would be compared with itself.
+        The keys are: order; terms (per axis); rms_u, rms_v of the bins; chi2_u, chi2_v per degree
+        of freedom; p_noise, the smaller of their two probabilities; F and p_surface of the F-test
+        between this order and the selected one; stars, stars_error, regions, regions_error: log
+        density of the held-out stars minus that of the selected order, with errors; lost.  Values
+        that compare with the selected order are None for that order itself.
         """
         noise, s = self.surfaces.p_noise(), self.surfaces
         out = []
         for k, order in enumerate(self.orders):
-            one = {
+            statistics = {
                 "order": order,
                 "terms": (order + 1) * (order + 2) // 2,
                 "rms_u": float(s.rms[k, 0]),
@@ -113,7 +113,7 @@ class OrderSelection:
                 "p_noise": float(noise[k].min()),
             }
             lost = 0.0 if order == self.orders[-1] else float(self.lost[k])  # no rounding error
-            out.append(one | self._against_chosen(order) | {"lost": lost})
+            out.append(statistics | self._against_chosen(order) | {"lost": lost})
         return out
 
     def _against_chosen(self, order: int) -> dict[str, float | None]:
@@ -130,24 +130,24 @@ class OrderSelection:
 
     @property
     def by_surfaces(self) -> int:
-        """Lowest order on which no higher one improves by the F-test, at 3 sigma."""
+        """Lowest order that no higher order improves significantly by the F-test (3 sigma)."""
         return self._lowest(lambda low, high: self.surfaces.f_test(low, high)[1] < CLEAR_P)
 
     @property
     def by_stars(self) -> int:
-        """Lowest order on which no higher one improves by 3 standard errors for held-out stars."""
+        """Lowest order that no higher order improves by 3 standard errors for held-out stars."""
         return self._lowest(lambda low, high: _clear(self.stars, low, high))
 
     @property
     def by_regions(self) -> int:
-        """As `by_stars`, for held-out regions."""
+        """Lowest order that no higher order improves by 3 standard errors for held-out regions."""
         return self._lowest(lambda low, high: _clear(self.regions, low, high))
 
     @property
     def order(self) -> int:
-        """Lowest order that neither surfaces nor held-out stars reject.
+        """Selected order: the lowest one that neither surfaces nor held-out stars reject.
 
-        Held-out regions are left out of this: where they disagree, `sentence` says so.
+        Held-out regions are not considered; `sentence` mentions any disagreement.
         """
         return max(self.by_surfaces, self.by_stars)
 
@@ -159,7 +159,7 @@ class OrderSelection:
 
     @property
     def sentence(self) -> str:
-        """Verdict on the order with its reason."""
+        """The selected order and the reasons for it, as text."""
         parts = [self._of_the_chosen()]
         k = self.orders.index(self.order)
         if k > 0:
@@ -188,11 +188,11 @@ class OrderSelection:
         return " ".join(parts)
 
     def _of_the_one_below(self, low: int) -> str:
-        here, there = (self.lost[self.orders.index(n)] for n in (low, self.order))
-        lost = float(np.sqrt(max(here**2 - there**2, 0.0)))
+        lost_low, lost_selected = (self.lost[self.orders.index(n)] for n in (low, self.order))
+        lost = float(np.sqrt(max(lost_low**2 - lost_selected**2, 0.0)))
         F, p = self.surfaces.f_test(low, self.order)
         gain, error = self.stars.difference(low, self.order)
-        # an effect below the error of one match shows only in the mean of many
+        # an effect below the error of a single match is visible only in averages
         word = "just inadequate" if lost < self.pair_rms else "inadequate"
         return (
             f"Order {low} is {word}: order {self.order} differs from it by {lost:.2g} {self.unit} "
@@ -208,9 +208,9 @@ class OrderSelection:
                 f"Order {top} is the highest that was tried, and the next lower one does not "
                 "suffice: try higher orders, or look-up tables."
             )
-        rest = self.orders[self.orders.index(self.order) + 1 :]
-        gain, error, best = max((*self.stars.difference(self.order, m), m) for m in rest)
-        p = min(self.surfaces.f_test(self.order, m)[1] for m in rest)
+        higher = self.orders[self.orders.index(self.order) + 1 :]
+        gain, error, best = max((*self.stars.difference(self.order, m), m) for m in higher)
+        p = min(self.surfaces.f_test(self.order, m)[1] for m in higher)
         return (
             f"Order {self.order} is as good as any up to {top}: of the higher ones order {best} "
             f"does best for held-out stars, with {gain:+.2g} +- {error:.2g} in log density, and "

@@ -1,9 +1,9 @@
-"""Normal equations of the highest order by group of stars, which contain those of all lower orders.
+"""Normal equations of the highest order for groups of stars; they include all lower orders.
 
 The terms of a polynomial are sorted by total order, so that the normal matrix of a lower order is
-the first part of that of a higher one.  A fold is a bin of the detector, or a random subset of the
-stars.  With the sums of each fold, every order is fitted to all folds, to all but one, or to the
-means of the folds, without the data.
+the leading block of that of a higher order.  A fold is a bin of the detector or a random subset of
+the stars.  From the sums of each fold, every order can be fitted to all folds, to all but one, or
+to the means of the folds, without another pass over the data.
 """
 
 from __future__ import annotations
@@ -25,14 +25,14 @@ from bayesdist.utils.streams import mixed
 
 @dataclass(frozen=True, eq=False)
 class FoldStatistics(Sums):
-    """Sums over the stars of each fold, about one polynomial."""
+    """Sums over the stars of each of F folds, for residuals from a given polynomial."""
 
-    count: Int  # number (F,) of stars, including clipped ones
-    weight: Float  # sum (F, 2, K, K) of w phi phi^T of u and of v
-    right: Float  # sum (F, 2, K) of w r phi, r the residual
+    count: Int  # number (F,) of stars, including clipped stars
+    weight: Float  # sum (F, 2, K, K) of w phi phi^T for u and v
+    right: Float  # sum (F, 2, K) of w r phi, with r the residual
 
     def joined(self, code: Int, n: int) -> FoldStatistics:
-        """Sums of `n` larger folds; `code` (F,) is the larger fold of each."""
+        """Merge the folds to `n` larger folds; `code` (F,) is the new fold of each."""
 
         def joined(column: NDArray[Any]) -> NDArray[Any]:
             out = np.zeros((n, *column.shape[1:]), column.dtype)
@@ -42,26 +42,26 @@ class FoldStatistics(Sums):
         return FoldStatistics(joined(self.count), joined(self.weight), joined(self.right))
 
     def filled(self) -> FoldStatistics:
-        """Sums of the folds that have weight."""
+        """Drop the folds without weight."""
         has = self.weight[:, 0, 0, 0] > 0
         return FoldStatistics(self.count[has], self.weight[has], self.right[has])
 
 
 def bin_sums(stars: Stars, theta: Float, clip: Clip, bins: int) -> FoldStatistics:
-    """Sums of equal bins that cover the detector, `bins` on each axis: fold `iy * bins + ix`.
+    """Sums for `bins` x `bins` equal bins that cover the detector; fold number iy * bins + ix.
 
-    The stars are of one chip, without frames; residuals are taken about `theta`, and `clip` leaves
-    stars out.
+    The model must have one chip and no frames.  Residuals are computed at `theta`, and `clip` has
+    the rejection limits.
     """
     code = cell_index(stars.X, stars.Y, (bins, bins))
     return _sums(stars, code, bins * bins, theta, clip)
 
 
 def fold_sums(stars: Stars, theta: Float, clip: Clip, folds: int) -> FoldStatistics:
-    """Sums of `folds` random subsets of the stars; other arguments as of `bin_sums`.
+    """Sums for `folds` random subsets of the stars; see `bin_sums` for the other arguments.
 
-    The subset of a star follows from the digits of its own numbers, so that it depends neither on
-    the order of the rows nor on the chunks into which the data are cut.
+    The subset of a star is a hash of its coordinates, so that it depends neither on the order of
+    the rows nor on the division of the data into chunks.
     """
     bits = np.zeros(len(stars), np.uint64)
     for column in (stars.X, stars.Y, stars.u, stars.v):
@@ -95,14 +95,14 @@ def _sums(stars: Stars, code: Int, n: int, theta: Float, clip: Clip) -> FoldStat
 
 
 def truncated(weight: Float, right: Float, about: Float, n_terms: int) -> Float:
-    """Coefficients (..., K), minus `about`, of a fit with only the first `n_terms` terms.
+    """Fit only the first `n_terms` terms; return the coefficients (..., K) minus `about`.
 
-    `weight` (..., K, K) and `right` (..., K) are the normal equations of the residuals about the
+    `weight` (..., K, K) and `right` (..., K) are the normal equations for residuals from the
     polynomial `about` (..., K).
     """
     low, high = slice(None, n_terms), slice(n_terms, None)
     out = -np.broadcast_to(about, right.shape)
-    # the fit lacks the high terms of `about`: their part returns to the residuals
+    # the fit lacks the high-order terms of `about`, so add their contribution to the residuals
     owed = np.einsum("...kl,...l->...k", weight[..., low, high], out[..., high])
     out[..., low] = np.linalg.solve(weight[..., low, low], (right[..., low] - owed)[..., None])[
         ..., 0
@@ -117,12 +117,12 @@ def departures(sums: FoldStatistics, about: Float, n_terms: list[int]) -> Float:
 
 
 def held_out_gain(sums: FoldStatistics, about: Float, n_terms: list[int]) -> Float:
-    """Log predictive density (F, orders, 2) of every fold by each order's fit to all others.
+    """Log predictive density (F, orders, 2) of each fold for each order, fitted to all other folds.
 
-    It is minus half the difference of the fold's chi-square, of u and of v, from that about the
-    coefficients `about` (2, K), and so up to a constant that all orders share.  The coefficients'
-    own uncertainty is not added to the errors: where a star's leverage h is small, that would
-    change the expectation by terms of the second order in h only.
+    It is minus half the chi-square of the fold in u and v, relative to that of the coefficients
+    `about` (2, K), and thus up to a constant common to all orders.  The uncertainty of the
+    coefficients is not added to the errors.  For a small leverage h of the stars, this would change
+    the expectation only to second order in h.
     """
     weight = sums.weight.sum(axis=0) - sums.weight
     right = sums.right.sum(axis=0) - sums.right

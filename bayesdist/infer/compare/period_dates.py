@@ -1,4 +1,4 @@
-"""Periods: their begin and end, and sums over the matches of each."""
+"""Periods (start and end dates), and sums over the matches of each period."""
 
 from __future__ import annotations
 
@@ -14,28 +14,30 @@ from bayesdist.errors import InputError
 
 __all__ = ["Periods", "check_periods", "mjd_periods", "sum_by_period"]
 
-Periods = Mapping[str, tuple[float, float]]  # begin and end by name, decimal years
+Periods = Mapping[str, tuple[float, float]]  # start and end in decimal years, by name
 
-MOST_MJD = 2e6  # some five thousand years: calendars end not far beyond
+MOST_MJD = 2e6  # about five thousand years, close to the range of date libraries
 
 
 def mjd_periods(centres: Sequence[float], days: float) -> dict[str, tuple[float, float]]:
-    """Periods of `days` about Modified Julian Dates, in decimal years, by name of the central date.
+    """Periods of `days` days centred on Modified Julian Dates, named after the central date.
 
-    InputError for a length that is not positive, and a centre that is no date.
+    Raises InputError if the length is not positive or a centre is not a valid date.
     """
     if not days > 0:
         raise InputError(
-            f"periods of {days:g} days are asked for", where="periods", do="give a positive length"
+            f"the length of the periods is {days:g} days",
+            where="periods",
+            do="give a positive length",
         )
     beyond = [c for c in centres if not abs(c) < MOST_MJD]
     if beyond:
         raise InputError(
-            f"a period is centred on {beyond[0]:g}, which is no Modified Julian Date",
+            f"a period is centred on {beyond[0]:g}, which is not a Modified Julian Date",
             where="periods",
             do="give days such as 55212.5",
         )
-    # time scale of the epochs that a file gives as Modified Julian Dates
+    # same time scale as for epochs that a file gives as Modified Julian Dates
     edges = np.asarray(centres, float)[:, None] + np.array([-days / 2, days / 2])
     years = np.asarray(Time(edges, format="mjd", scale="tt").decimalyear, float)
     return {
@@ -45,41 +47,41 @@ def mjd_periods(centres: Sequence[float], days: float) -> dict[str, tuple[float,
 
 
 def check_periods(periods: Periods) -> None:
-    """Raise InputError for fewer than two periods, one that ends before it begins, or overlap."""
+    """Raise InputError if there are fewer than two periods, or if they are reversed or overlap."""
     if len(periods) < 2:
         raise InputError(
-            f"{len(periods)} periods are given",
+            f"the number of periods is {len(periods)}",
             where="periods",
-            do="give two or more: a change needs a before",
+            do="give at least two periods to compare",
         )
     ordered = sorted(periods.items(), key=lambda one: one[1])
     for name, (start, stop) in ordered:
         if not start < stop:
             raise InputError(
-                f"period {name} goes from {start:.8g} to {stop:.8g}",
+                f"period {name} starts at {start:.8g} and ends at {stop:.8g}",
                 where="periods",
-                do="turn it round",
+                do="give the earlier date first",
             )
     for (first, before), (second, after) in pairwise(ordered):
         if after[0] < before[1]:
             raise InputError(
                 f"periods {first} and {second} overlap",
                 where="periods",
-                do="let each begin where the one before it is over, or later",
+                do="start each period at or after the end of the previous one",
             )
 
 
 def sum_by_period(matches: Matches, periods: Periods, task: Callable[[Matches], Any]) -> Any:
-    """Sum of a task over the matches of each period, from one pass over the data in chunks.
+    """Sum the results of `task` over the matches of each period, in one pass over the data.
 
-    The matches need epochs; those outside all periods [first, end) are not used.  `task` gets the
-    matches of a period in one chunk, and its results are added.  InputError without epochs, for
-    periods that overlap, and for a period without matches.
+    `task` is called with the matches of a period in each chunk, and its results are added.  Matches
+    outside all periods [start, end) are ignored.  Returns the sums by name of the period.  Raises
+    InputError if there are no epochs, periods overlap, or a period has no matches.
     """
-    where = ", ".join(matches.sources)
+    location = ", ".join(matches.sources)
     if not matches.has_epoch:
         raise InputError(
-            "periods need an epoch for every pair", where=where, do="map column 'epoch'"
+            "periods need an epoch for every pair", where=location, do="map column 'epoch'"
         )
     check_periods(periods)
     sums: dict[str, Any] = {}
@@ -94,7 +96,7 @@ def sum_by_period(matches: Matches, periods: Periods, task: Callable[[Matches], 
         if name not in sums:
             raise InputError(
                 f"period {name} ({start:.8g} to {stop:.8g}) has no pairs",
-                where=where,
+                where=location,
                 do="correct the period or leave it out",
             )
     return {name: sums[name] for name in periods}

@@ -1,13 +1,13 @@
-"""Models of several periods, their differences, and the significance of these.
+"""Models of several periods, their differences, and the significance of the differences.
 
-WSDC D-T033, Appendix C.  The normal equations of the periods add up to those of all data, so that
-the model of each period, the combined one and all statistics of their differences come from these
-sums.  The combined model shares its data with each period: with A_p = N^-1 N_p, the fraction of
-period p in the normal equations, it is sum_q A_q theta_q, hence
+See WSDC D-T033, Appendix C.  The normal equations of the periods add up to those of all data, so
+that the models of the periods, the combined model, and the statistics of their differences follow
+from these sums.  The combined model includes the data of each period.  With A_p = N^-1 N_p, the
+fraction of period p in the normal equations, it is sum_q A_q theta_q, hence
 
-    theta_p - theta = (1 - A_p) theta_p - sum_{q != p} A_q theta_q,
+    theta_p - theta = (1 - A_p) theta_p - sum_{q != p} A_q theta_q.
 
-whose covariance for weights that are the inverse variances is C_p - C, not C_p + C.
+If the weights are the inverse variances, the covariance of this difference is C_p - C, not C_p + C.
 """
 
 from __future__ import annotations
@@ -52,9 +52,10 @@ class PeriodSums(Sums):
     Parameters
     ----------
     equations : NormalEquations
-        About the mean of the fit of all data, with the matches that it uses.
+        Normal equations about the mean of the fit to all data, with its rejection limits.
     squares : NormalEquations or None
-        With squared weights, where extra weights make the sandwich necessary.
+        The same sums with squared weights, which the sandwich covariance needs; None without
+        additional weights.
     n : int
         Number of matches used.
     """
@@ -65,15 +66,16 @@ class PeriodSums(Sums):
 
 
 def sums_of_stars(stars: Stars, fit: LinearFit, radial_weight: float = 1.0) -> PeriodSums:
-    """Sums over some matches of one period.
+    """Accumulate the sums over matches of one period.
 
     Parameters
     ----------
     stars : Stars
+        Matches of the period.
     fit : LinearFit
-        Of all data: its model, and its rule for leaving matches out, which is then one for all.
+        Fit to all data; its model and rejection limits are applied to every period.
     radial_weight : float
-        As the fit's.
+        Weight in the corners, as in the fit; see `Rejection`.
 
     Returns
     -------
@@ -89,35 +91,35 @@ def sums_of_stars(stars: Stars, fit: LinearFit, radial_weight: float = 1.0) -> P
 def compare_periods(
     fit: LinearFit, sums: Mapping[str, PeriodSums], *, rescale: bool = True
 ) -> PeriodComparison:
-    """Model of each period, and the differences from the combined one.
+    """Fit the model to each period and to all of them.
 
     Parameters
     ----------
     fit : LinearFit
-        Of all data, as given to `sums_of_stars`.
+        Fit to all data, as given to `sums_of_stars`.
     sums : mapping of str to PeriodSums
-        Two or more periods.  Together they are the combined data set, of which `fit` need not be
-        the fit: where matches lie outside all periods it is not.
+        Sums of at least two periods by name. The combined model is fitted to these periods; it
+        differs from `fit` if there are matches outside all periods.
     rescale : bool
-        True to multiply all errors by one factor, the root of chi-square per degree of freedom
-        about the models of the periods.  Otherwise quoted errors that are too small make a change
-        of noise.
+        True to multiply all errors by the square root of chi-square per degree of freedom about
+        the models of the periods. Otherwise, quoted errors that are too small make noise look
+        significant.
 
     Returns
     -------
     PeriodComparison
-        Residual structure that is the same in all periods cancels in the differences as far as
-        the periods cover the array alike.
+        Residual structure that is constant in time cancels in the differences if all periods
+        cover the array in the same way.
 
     Raises
     ------
     InputError
-        For fewer than two periods, and for a model with frames or time dependence.
+        If there are fewer than two periods, or the model has frames or time dependence.
     DegenerateError
-        When a period does not determine the model, naming the parameters.
+        If a period does not determine the model; the message names the parameters.
     """
     if len(sums) < 2:
-        raise InputError(f"{len(sums)} periods are given", do="give two or more")
+        raise InputError(f"the number of periods is {len(sums)}", do="give at least two")
     model = fit.model
     if model.n_frame or model.time is not None:
         raise InputError(
@@ -128,27 +130,28 @@ def compare_periods(
             "time-dependent terms",
         )
     steps, covs, normals, chi2, dof = [], [], [], 0.0, 0
-    for name, one in sums.items():
-        arrow, right = one.equations.assemble(model, fit.mean)
+    for name, period_sums in sums.items():
+        arrow, right = period_sums.equations.assemble(model, fit.mean)
         try:
-            require_full_rank(arrow, model, one.equations.groups)
+            require_full_rank(arrow, model, period_sums.equations.groups)
         except DegenerateError as error:
             raise DegenerateError(
-                f"the {one.n} pairs of period {name} do not determine the model: {error.cause}",
+                f"the {period_sums.n} pairs of period {name} do not determine the model: "
+                f"{error.cause}",
                 where="periods",
                 do="give longer periods or lower model.order",
             ) from error
         normal = arrow.dense()
         inverse = scaled_inverse(normal)
         step, cov = inverse @ right, inverse
-        chi2 += float(one.equations.scalars[2])
-        dof += 2 * one.n
-        if one.squares is None:
-            # with extra weights chi-square stays that about the fit of all data
+        chi2 += float(period_sums.equations.scalars[2])
+        dof += 2 * period_sums.n
+        if period_sums.squares is None:
+            # with additional weights, chi-square remains that about the fit to all data
             chi2 -= float(right @ step)
             dof -= len(step)
         else:
-            meat, _ = one.squares.assemble(model, fit.mean)
+            meat, _ = period_sums.squares.assemble(model, fit.mean)
             cov = inverse @ meat.dense() @ inverse
         steps.append(step)
         covs.append(cov)
@@ -162,20 +165,21 @@ def compare_periods(
         means=fit.mean + np.array(steps),
         covs=np.array(covs) * scale**2,
         fractions=fractions,
-        counts=tuple(one.n for one in sums.values()),
+        counts=tuple(period_sums.n for period_sums in sums.values()),
         error_scale=scale,
     )
 
 
 @dataclass(frozen=True, eq=False)
 class CoefficientChange:
-    """Differences of all coefficients between two models.
+    """Differences between the coefficients of two models.
 
     Parameters
     ----------
     names : tuple of str, length D
+        Names of the coefficients.
     difference, sigma : ndarray, shape (D,)
-        Difference and its standard error.
+        Differences and their standard errors.
     """
 
     names: tuple[str, ...]
@@ -189,28 +193,29 @@ class CoefficientChange:
 
     @property
     def p_value(self) -> Float:
-        """Two-sided probability (D,) of each difference, regardless of the others."""
+        """Two-sided p-value (D,) of each difference by itself."""
         return np.asarray(2 * norm_sf(np.abs(self.z)))
 
 
 @dataclass(frozen=True, eq=False)
 class PeriodComparison:
-    """Models of several periods and the combined one.
+    """Models of several periods and the combined model.
 
     Parameters
     ----------
     model : DistortionModel
     names : tuple of str, length P
-        Periods.
+        Names of the periods.
     means : ndarray, shape (P, D)
+        Parameters of each period.
     covs : ndarray, shape (P, D, D)
-        Covariance of each, independent of the others.
+        Covariance of the parameters of each period; periods are independent.
     fractions : ndarray, shape (P, D, D)
         A_p = N^-1 N_p; their sum is the identity.
     counts : tuple of int
-        Number of matches in each.
+        Number of matches in each period.
     error_scale : float
-        Factor on the quoted errors.
+        Factor that was applied to the quoted errors.
     """
 
     model: DistortionModel
@@ -223,7 +228,7 @@ class PeriodComparison:
 
     @cached_property
     def combined(self) -> Float:
-        """Parameters (D,) of the model of all periods."""
+        """Parameters (D,) of the combined model."""
         return np.einsum("pij,pj->i", self.fractions, self.means)
 
     def _code(self, period: str) -> int:
@@ -234,7 +239,7 @@ class PeriodComparison:
         return self.names.index(period)
 
     def _contrast(self, period: str, against: str | None) -> Float:
-        """Factors (P, D, D) on the means that give a difference."""
+        """Matrices (P, D, D) that give a difference as a linear combination of the means."""
         D = self.means.shape[1]
         out = np.zeros_like(self.covs)
         p = self._code(period)
@@ -255,6 +260,7 @@ class PeriodComparison:
         Parameters
         ----------
         period : str
+            Name of the period.
         against : str, optional
             Another period; the combined model by default.
 
@@ -262,14 +268,15 @@ class PeriodComparison:
         -------
         difference : ndarray, shape (D,)
         cov : ndarray, shape (D, D)
+            Covariance of the difference.
 
         Raises
         ------
         InputError
-            For an unknown period, or one against itself.
+            If a period is unknown, or is compared with itself.
         """
         contrast = self._contrast(period, against)
-        # differences of the means: large constants cancel before they meet rounding errors
+        # subtract a common mean first, to avoid rounding errors from large constants
         difference = np.einsum("pij,pj->i", contrast, self.means - self.means[0])
         return difference, _covariance(contrast, self.covs, contrast)
 
@@ -281,9 +288,10 @@ class PeriodComparison:
         Parameters
         ----------
         period, against
-            As `difference`.
+            See `difference`.
         monomial : bool
-            True for coefficients of pixel offsets, as in SIP, in place of Legendre ones.
+            True for coefficients of powers of the pixel offsets, as in SIP, instead of Legendre
+            coefficients.
 
         Returns
         -------
@@ -291,9 +299,9 @@ class PeriodComparison:
         """
         difference, cov = self.difference(period, against)
         if monomial:
-            both = (self.model.basis(chip.number).monomial_matrix for chip in self.model.chips)
+            matrices = (self.model.basis(chip.number).monomial_matrix for chip in self.model.chips)
             # without time and frames the parameters are u and v of each chip in turn
-            to_monomials = block_diag(*(m for m in both for _ in (0, 1)))
+            to_monomials = block_diag(*(m for m in matrices for _ in (0, 1)))
             difference, cov = to_monomials @ difference, to_monomials @ cov @ to_monomials.T
         return CoefficientChange(self.model.names, difference, np.sqrt(np.diag(cov)))
 
@@ -306,18 +314,18 @@ class PeriodComparison:
         grid: int = 33,
         n_draws: int = 2000,
     ) -> PositionChange:
-        """Largest difference over the array with its significance.
+        """Largest difference in position over the array, with its significance.
 
         Parameters
         ----------
         period, against
-            As `difference`.
+            See `difference`.
         rng : numpy.random.Generator
         grid : int
-            Points along each axis, from edge to edge of the detector.
+            Number of points along each axis, from edge to edge of the detector.
         n_draws : int
-            Fields of noise that the largest difference is compared with; its probability is at
-            least 1 / (n_draws + 1).
+            Number of simulated noise fields with which the largest difference is compared. The
+            smallest possible p-value is 1 / (n_draws + 1).
 
         Returns
         -------
@@ -334,16 +342,16 @@ class PeriodComparison:
         chip: Chip | None = None,
         grid: tuple[int, int] = (17, 17),
     ) -> DifferenceField:
-        """Difference of the positions over a chip.
+        """Difference in position over a chip.
 
         Parameters
         ----------
         period, against
-            As `difference`.
+            See `difference`.
         chip : Chip, optional
             The first chip by default.
         grid : tuple of int
-            Points on x and on y.
+            Number of points along x and y.
 
         Returns
         -------
@@ -354,19 +362,25 @@ class PeriodComparison:
 
     @cached_property
     def homogeneity(self) -> FieldTest:
-        """Chi-square of the periods about one model for all.
+        """Chi-square test of the hypothesis that all periods have the same model.
 
-        Computed from the differences of all periods but one from the combined model, with their
-        joint covariance: the last one follows from them.
+        It uses the differences of all periods but the last from the combined model, with their
+        joint covariance; that of the last period follows from these.
         """
         contrasts = [self._contrast(name, None) for name in self.names[:-1]]
         cov = np.block(
-            [[_covariance(one, self.covs, other) for other in contrasts] for one in contrasts]
+            [
+                [
+                    _covariance(row_contrast, self.covs, column_contrast)
+                    for column_contrast in contrasts
+                ]
+                for row_contrast in contrasts
+            ]
         )
         differences = np.concatenate([self.difference(name)[0] for name in self.names[:-1]])
         return chi_square(differences, cov)
 
 
 def _covariance(one: Float, covs: Float, other: Float) -> Float:
-    """Covariance (D, D) of two combinations (P, D, D) of independent vectors."""
+    """Covariance (D, D) of two linear combinations (P, D, D) of P independent vectors."""
     return np.asarray((one @ covs @ other.swapaxes(1, 2)).sum(axis=0))

@@ -1,4 +1,4 @@
-"""Gain of a solution by more data: Fisher information of exposures not yet taken."""
+"""Improvement of a solution by future exposures, from their Fisher information."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False)
 class ExposureContent:
-    """Information of an average exposure's stars about the polynomials of each chip."""
+    """Information of the stars of an average exposure about the polynomials of each chip."""
 
-    # by chip number, sums (2, K, K) over the stars of weight times products of basis functions, for
-    # each axis
+    # sums (2, K, K) over the stars of weight times products of basis functions, for each axis; by
+    # chip number
     moments: dict[int, Float]
-    n_stars: float
+    n_stars: float  # number of stars in the exposure
 
 
 def exposure_content(
@@ -37,10 +37,10 @@ def exposure_content(
     n_total: int | None = None,
     n_exposures: int = 1,
 ) -> ExposureContent:
-    """Content of the average of `n_exposures` exposures.
+    """Compute the average content of `n_exposures` exposures.
 
-    `matches` are all stars, or a sample of `n_total`; `weight` (N, 2) is the inverse variance of
-    both axes times the probability that the match is true.
+    `matches` are all their stars, or a sample from `n_total` stars; `weight` (N, 2) is the inverse
+    variance in u and v times the probability that the match is true.
     """
     weight = np.asarray(weight, float)
     K = model.n_terms
@@ -61,11 +61,11 @@ def exposure_information(
     content: ExposureContent,
     epoch: float | None,
 ) -> Float:
-    """Fisher information (d, d) of one more exposure about polynomials and drift.
+    """Fisher information (d, d) of one additional exposure about polynomials and drift.
 
-    The model is linearised at the solution; d is its `n_distortion`, and `epoch` (decimal years) is
-    needed with time dependence.  The exposure's own frame is fitted as that of the others, and its
-    parameters are eliminated.
+    The model is linearised at the solution, and d is its `n_distortion`.  `epoch` (decimal years)
+    is required if the model depends on time.  The frame of the exposure is assumed to be fitted;
+    its parameters are eliminated.
     """
     model = solution.model
     D, last = model.n_params, len(model.exposures) - 1
@@ -93,15 +93,15 @@ def with_information(solution: Posterior, information: Float) -> Posterior: ...
 @overload
 def with_information(solution: Solution, information: Float) -> Solution: ...
 def with_information(solution: Solution, information: Float) -> Solution:
-    """Solution with the additional information (d, d) about polynomials and drift.
+    """Add information (d, d) about polynomials and drift to a solution.
 
-    Frames of the existing exposures change as far as they are correlated with these.  InputError
-    for information of another number of parameters.
+    The covariance of the existing exposures' frames changes according to its correlation with
+    these.  Raises InputError if the shape of the information does not match the model.
     """
     n = solution.model.n_distortion
     if information.shape != (n, n):
         raise InputError(
-            f"the information is of shape {information.shape} for {n} parameters",
+            f"the information has shape {information.shape} for {n} parameters",
             do="give that of the polynomials and their drift",
         )
     cov = np.asarray(solution.cov, float)
@@ -109,7 +109,7 @@ def with_information(solution: Solution, information: Float) -> Solution:
     root = scaled_cholesky(cov[:n, :n])
     inner = np.eye(n) + root.T @ information @ root
     after = root @ np.linalg.solve(inner, root.T)
-    free = np.flatnonzero(np.diag(cov[:n, :n]) > 0)  # without those that a gauge fixes
+    free = np.flatnonzero(np.diag(cov[:n, :n]) > 0)  # parameters not fixed by a gauge
     follow = np.zeros((len(cov), n))
     follow[:, free] = cov[:, free] @ scaled_inverse(cov[np.ix_(free, free)])
     changed = cov + follow @ (after - cov[:n, :n]) @ follow.T

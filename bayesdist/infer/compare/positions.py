@@ -1,4 +1,4 @@
-"""Difference of two models in positions over the array, compared with that of noise."""
+"""Difference in position between two models over the array, compared with noise."""
 
 from __future__ import annotations
 
@@ -15,34 +15,32 @@ from bayesdist.utils.distributions import chi2_sf
 
 @dataclass(frozen=True, eq=False)
 class PositionChange:
-    """Largest difference of two models over the array, and the probability that noise makes it."""
+    """Largest difference in position between two models over the array, with its significance."""
 
-    largest: float  # length of the vector, in the unit of u, v
-    at: tuple[float, float]  # position of the largest, FITS 1-based pixels
+    largest: float  # length of the largest difference vector, in the unit of u, v
+    at: tuple[float, float]  # its position, FITS 1-based pixels
     chip: int  # number of its chip
     sigma: float  # standard error of the difference there, along its direction
-    noise_median: float  # of the largest difference over the array by noise alone
-    noise_95: float  # its 95th percentile
-    # fraction of noise fields with a largest difference of this size, which accounts for the search
-    # over the array
+    noise_median: float  # median of the largest difference over the array from noise alone
+    noise_95: float  # 95th percentile of the same
+    # fraction of noise fields with a largest difference of at least this size, which accounts for
+    # the search over the array
     p_value: float
-    # of the whole field with its joint covariance; the field has the information of its
-    # coefficients, so this is also the chi-square of these
-    chi2: float
-    dof: int
+    chi2: float  # chi-square of the entire field, which equals that of its coefficients
+    dof: int  # degrees of freedom of `chi2`
     p_field: float  # probability of a larger chi-square
 
 
 @dataclass(frozen=True, eq=False)
 class DifferenceField:
-    """Difference of the positions of two models over one chip."""
+    """Difference in position between two models on a grid over one chip."""
 
     chip: Chip
     x: Float  # (nx,) FITS 1-based pixels, from edge to edge
-    y: Float  # (ny,)
-    du: Float  # (ny, nx) in the unit of u, v
-    dv: Float
-    p_value: Float  # (ny, nx) probability of a vector as long by noise, at each position alone
+    y: Float  # (ny,) FITS 1-based pixels, from edge to edge
+    du: Float  # (ny, nx) difference in u, in the unit of u, v
+    dv: Float  # (ny, nx) difference in v
+    p_value: Float  # (ny, nx) chance probability of the difference at each position by itself
 
 
 def largest_difference(
@@ -54,10 +52,10 @@ def largest_difference(
     grid: int,
     n_draws: int,
 ) -> PositionChange:
-    """Largest difference over the array, compared with `n_draws` fields of noise.
+    """Find the largest difference over the array and compare it with `n_draws` noise fields.
 
-    The model is without frames and time dependence; `difference` (D,) and `cov` (D, D) are of its
-    parameters; `grid` is the number of points along each axis.
+    The model must have neither frames nor time dependence.  `difference` (D,) and `cov` (D, D) are
+    the difference of its parameters and the covariance; `grid` is the number of points per axis.
     """
     noise = rng.standard_normal((n_draws, len(cov))) @ scaled_cholesky(cov).T
     largest, worst = np.zeros(n_draws), (-1.0, 0, (0.0, 0.0), 0.0)
@@ -94,15 +92,17 @@ def largest_difference(
 def difference_field(
     model: DistortionModel, difference: Float, cov: Float, chip: Chip, grid: tuple[int, int]
 ) -> DifferenceField:
-    """Difference on a grid (nx, ny) of one chip; other arguments as of `largest_difference`."""
+    """Difference on a grid (nx, ny) of one chip; see `largest_difference` for the arguments."""
     x, y = grid_pixels(chip.size, grid)
     phi = model.basis(chip.number).evaluate(*mesh(x, y))
     parts = [model.coefficient_slice(chip.number, axis) for axis in (0, 1)]
     field = np.stack([phi @ difference[part] for part in parts], axis=-1)
     joint = np.empty((len(phi), 2, 2))
-    for a, one in enumerate(parts):
-        for b, other in enumerate(parts):
-            joint[:, a, b] = np.einsum("nk,kl,nl->n", phi, cov[one, other], phi, optimize=True)
+    for a, row_slice in enumerate(parts):
+        for b, column_slice in enumerate(parts):
+            joint[:, a, b] = np.einsum(
+                "nk,kl,nl->n", phi, cov[row_slice, column_slice], phi, optimize=True
+            )
     z2 = np.einsum("na,na->n", field, np.linalg.solve(joint, field[..., None])[..., 0])
     du, dv, p_value = (a.reshape(len(y), len(x)) for a in (*field.T, chi2_sf(z2, 2)))
     return DifferenceField(chip, x, y, du, dv, p_value)

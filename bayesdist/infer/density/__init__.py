@@ -1,1 +1,1 @@
-"""The posterior density and its approximations."""
+"""The posterior density, and its Laplace approximation on a grid of hyperparameters."""

@@ -1,8 +1,8 @@
 """Coordinates in which the conditional posterior of f and s_out is nearly Gaussian.
 
-Few outliers make logit f and log s_out skewed, with exponential tails that no Gaussian proposal
-covers. A gamma variable is nearly Gaussian in its cube root (Wilson and Hilferty 1931), so
-proposals live in
+With few outliers logit f and log s_out are skewed, with exponential tails that a Gaussian proposal
+does not cover. The cube root of a gamma variable is nearly Gaussian (Wilson and Hilferty 1931), so
+proposals are made in
 
     f^(1/3)     and     s_out^(-2/3)  (the cube root of the outliers' precision)
 """
@@ -17,7 +17,10 @@ from bayesdist.utils.arrays import Bool, Float
 
 
 def to_cube_root(names: tuple[str, ...], h: Float) -> Float:
-    """Proposal coordinates (..., k) of sampled ones; `names` are those of h: 'f', 's_out'."""
+    """Convert sampled coordinates h (..., k) to cube-root coordinates (..., k).
+
+    `names` are the hyperparameters along the last axis of h: 'f' (logit f), 's_out' (log s_out).
+    """
     out = np.empty_like(h)
     for k, name in enumerate(names):
         t = h[..., k]
@@ -26,7 +29,7 @@ def to_cube_root(names: tuple[str, ...], h: Float) -> Float:
 
 
 def inside(names: tuple[str, ...], z: Float) -> Bool:
-    """Boolean mask (...) of points (..., k) in the support."""
+    """Boolean mask (...) that is True for cube-root coordinates z (..., k) in the support."""
     ok = np.all(z > 0, axis=-1)
     if "f" in names:
         ok &= z[..., names.index("f")] < 1
@@ -34,11 +37,11 @@ def inside(names: tuple[str, ...], z: Float) -> Bool:
 
 
 def from_cube_root(names: tuple[str, ...], z: Float) -> tuple[Float, Float, Float, Float, Float]:
-    """Sampled coordinates h and the derivatives needed for a change of variables.
+    """Convert cube-root coordinates to sampled coordinates, with derivatives.
 
-    Of points z (..., k) inside the support, with a name 'f' or 's_out' for each coordinate: h
-    (logit f or log s_out), its first and second derivative by z, h1 and h2, and the first and
-    second derivative of log |h1|, all (..., k).
+    `z` (..., k) are points in the support, `names` the hyperparameter ('f' or 's_out') of each
+    coordinate.  Returns h (logit f or log s_out), its first and second derivatives h1 and h2 with
+    respect to z, and the first and second derivatives of log |h1|, each of shape (..., k).
     """
     h, h1, h2 = np.empty_like(z), np.empty_like(z), np.empty_like(z)
     g1, g2 = np.empty_like(z), np.empty_like(z)
@@ -58,15 +61,15 @@ def from_cube_root(names: tuple[str, ...], z: Float) -> tuple[Float, Float, Floa
 
 @dataclass(frozen=True)
 class Split:
-    """Division of the hyperparameters into those on a grid and those that move with the distortion.
+    """Division of the sampled coordinates into those on a grid and those that are Gaussian.
 
-    Sampled coordinates psi (..., D) are divided into y = (theta, cube-root hyperparameters), (...,
-    D'), and the grid's coordinates `at` (..., g): log j, log s_out.
+    Points psi (..., D) are split into the coordinates `at` (..., g) on the grid, such as log j and
+    log s_out, and y (..., D'): theta and the other hyperparameters in cube-root coordinates.
     """
 
     n_theta: int
-    hyper: tuple[str, ...]  # sampled ones of 'j', 'f', 's_out', in this order
-    held: tuple[str, ...]  # those on the grid: 'j' at least, where it is sampled
+    hyper: tuple[str, ...]  # hyperparameters that are sampled, in the order 'j', 'f', 's_out'
+    held: tuple[str, ...]  # hyperparameters on the grid; includes 'j' if it is sampled
 
     @property
     def rest(self) -> tuple[str, ...]:
@@ -75,27 +78,27 @@ class Split:
 
     @property
     def columns(self) -> tuple[list[int], list[int]]:
-        """Indices among the hyperparameters of those on the grid, and of the rest."""
+        """Indices in `hyper` of the hyperparameters on the grid, and of the remaining ones."""
         held = [self.hyper.index(name) for name in self.held]
         return held, [self.hyper.index(name) for name in self.rest]
 
     def contains(self, y: Float) -> Bool:
-        """Boolean mask (...) of points (..., D') in the support."""
+        """Boolean mask (...) that is True for points y (..., D') in the support."""
         return np.isfinite(y).all(axis=-1) & inside(self.rest, y[..., self.n_theta :])
 
     def to_psi(self, y: Float, at: Float) -> Float:
-        """Sampled coordinates (..., D)."""
-        n, (held, rest) = self.n_theta, self.columns
+        """Sampled coordinates psi (..., D) from y (..., D') and grid coordinates (..., g)."""
+        n, (held, off_grid) = self.n_theta, self.columns
         out = np.empty((*y.shape[:-1], n + len(self.hyper)))
         out[..., :n] = y[..., :n]
         out[..., [n + k for k in held]] = at
-        out[..., [n + k for k in rest]] = from_cube_root(self.rest, y[..., n:])[0]
+        out[..., [n + k for k in off_grid]] = from_cube_root(self.rest, y[..., n:])[0]
         return out
 
     def from_psi(self, psi: Float) -> tuple[Float, Float]:
-        """y (..., D') and the grid's coordinates (..., g)."""
-        n, (held, rest) = self.n_theta, self.columns
-        z = to_cube_root(self.rest, psi[..., [n + k for k in rest]])
+        """Split psi (..., D) into y (..., D') and the grid coordinates (..., g)."""
+        n, (held, off_grid) = self.n_theta, self.columns
+        z = to_cube_root(self.rest, psi[..., [n + k for k in off_grid]])
         return np.concatenate([psi[..., :n], z], axis=-1), psi[..., [n + k for k in held]]
 
     def log_jacobian(self, y: Float) -> Float:

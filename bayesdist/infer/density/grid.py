@@ -1,4 +1,8 @@
-"""Nodes of the proposal's grid, along the modes as far as the posterior extends."""
+"""Placement of the nodes of the proposal's grid.
+
+The grid covers one or two hyperparameters (log j, log s_out) over the range where the posterior is
+not negligible.  At each node all other parameters are at their conditional mode.
+"""
 
 from __future__ import annotations
 
@@ -20,28 +24,30 @@ from bayesdist.infer.solution.linear import LinearFit
 from bayesdist.infer.stars.mixture import TAILS
 from bayesdist.utils.arrays import Float
 
-Line = dict[float, Conditional]  # nodes by their value on one axis
+Line = dict[float, Conditional]  # nodes along an axis of the grid, by their coordinate
 
-N_NODES = 25
-N_SCALES, STRIDE = 17, 2  # nodes of log s_out; then every other one of log j is enough
-DROP = 18.0  # distance (in log density) below the top to which the grid extends: 1e-8 lies beyond
-NOTHING = 40.0  # distance below the top that is assigned to nodes that were not searched for
-NEAR = 1e-4  # Newton decrement at which a node's search stops
-# number of outliers, and their scale over the core's, below which the scale may be open
+N_NODES = 25  # nodes of a one-dimensional grid
+N_SCALES, STRIDE = 17, 2  # 2-D grid: nodes of log s_out, and every STRIDE-th node of log j
+DROP = 18.0  # the grid ends this far (log density) below the maximum; 1e-8 of the mass is outside
+NOTHING = 40.0  # log density below the maximum assigned to nodes that are not searched
+NEAR = 1e-4  # Newton decrement at which the search for a node's mode stops
+# with fewer outliers, or a smaller ratio of their scale to the core's, the data may not determine
+# the outlier scale
 FEW, CLOSE = 30.0, 2.0
-TRIAL = 128  # proposals that compare both grids
-# efficiency that needs no second axis; fraction of it that may be lost by one
+TRIAL = 128  # draws used to compare the one- and two-dimensional grids
+# efficiency of a 1-D grid above which no second axis is tried; smallest acceptable ratio of the
+# 2-D grid's efficiency to that of the 1-D grid
 GOOD, WORSE = 0.98, 0.8
-VAGUE = 0.2  # standard deviation of log s_out beyond which one Gaussian is not enough
-# distance from the median quoted error at which the end of an axis may begin to be its prior's tail
+VAGUE = 0.2  # standard deviation of log s_out above which a single Gaussian is not enough
+# multiple of the median quoted error beyond which the marginal may be the tail of the prior
 FAR = {"j": 0.3, "s_out": 30.0}
 
 
 def build_proposal(target: Target, fit: LinearFit) -> GridProposal:
-    """Proposal from conditional modes over a grid that carries all but 1e-8 of the posterior.
+    """Build the grid proposal; the grid covers all but 1e-8 of the posterior.
 
-    The search starts from `fit`.  DegenerateError when no mode is found, or the posterior of the
-    grid's coordinates has no end.
+    The search for the mode starts from `fit`.  Raises DegenerateError if no mode is found, or if
+    the marginal posterior of a grid coordinate does not fall off.
     """
     hyper = target.mixture.hyper
     split = Split(target.n_theta, hyper, tuple(name for name in hyper if name == "j"))
@@ -60,15 +66,15 @@ def build_proposal(target: Target, fit: LinearFit) -> GridProposal:
         wide = _with_scales(target, narrow, line, best)
     except DegenerateError:
         return narrow
-    # a few draws do not show the tails, for which the second axis is needed
+    # the second axis is preferred unless clearly worse: it covers tails that few draws do not show
     return wide if _trial(target, wide) > WORSE * worth else narrow
 
 
 def _is_vague(target: Target, split: Split, node: Node) -> bool:
     """True if the data may not determine the scale of the outliers.
 
-    That is so where the curvature shows it, where the outliers are few, and where they are hardly
-    wider than the core: the mode that was found may then be one of several.
+    This is assumed if the curvature implies a large uncertainty, if there are few outliers, or if
+    they are hardly wider than the core (the posterior may then have several modes).
     """
     if "s_out" not in split.rest:
         return False
@@ -83,7 +89,7 @@ def _is_vague(target: Target, split: Split, node: Node) -> bool:
 
 
 def _trial(target: Target, proposal: GridProposal) -> float:
-    """Importance efficiency of the proposal from a few draws."""
+    """Importance efficiency of the proposal, estimated from `TRIAL` draws."""
     psi = proposal.draw(TRIAL, np.random.default_rng(0))
     out = np.full(TRIAL, np.nan)
     inside = np.isfinite(psi).all(axis=1)
@@ -95,7 +101,7 @@ def _trial(target: Target, proposal: GridProposal) -> float:
 def _with_scales(
     target: Target, narrow: GridProposal, line: Line, best: Conditional
 ) -> GridProposal:
-    """Proposal with log s_out as a further axis of the grid."""
+    """Proposal with log s_out as an additional axis of the grid."""
     split = narrow.split
     wide = Split(split.n_theta, split.hyper, (*split.held, "s_out"))
     y, at = wide.from_psi(split.to_psi(best.mode, best.at))
@@ -111,7 +117,7 @@ def _with_scales(
 
 
 def _thinned(line: Line, best: Conditional) -> list[float]:
-    """About half the nodes of a line, the best one and the ends among them."""
+    """Coordinates of about half the nodes of a line, including the best node and both ends."""
     grid = sorted(line)
     k = grid.index(float(best.at[0]))
     return sorted({grid[0], *grid[k % STRIDE :: STRIDE], grid[-1]})
@@ -120,31 +126,31 @@ def _thinned(line: Line, best: Conditional) -> list[float]:
 def _column(
     target: Target, split: Split, middle: Conditional, log_j: list[float], top: float
 ) -> list[Node]:
-    """Nodes at some jitters and the s_out of one node, searched from there outwards.
+    """Nodes at the values `log_j`, all with the s_out of the node `middle`.
 
-    Beyond the end of the posterior there is no search: the last node is repeated with a negligible
-    marginal density.
+    The search proceeds from `middle` in both directions.  Where the marginal density has become
+    negligible, the last node is repeated with a negligible density instead of searching on.
     """
     start = float(middle.at[0])
-    found: dict[float, Node] = {start: middle}
+    nodes: dict[float, Node] = {start: middle}
     above, below = [x for x in log_j if x > start], [x for x in log_j if x < start]
     for side in (above, below[::-1]):
-        here: Conditional | None = middle
+        neighbour: Conditional | None = middle
         last: Node = middle
         for x in side:
             at = np.array([x, middle.at[1]])
-            if here is not None:
-                here = _reached(target, split, here, at)
-            if here is None or here.log_marginal < top - DROP:
-                here = None
-                found[x] = Node(at, last.mode, last.factor, top - NOTHING)
+            if neighbour is not None:
+                neighbour = _reached(target, split, neighbour, at)
+            if neighbour is None or neighbour.log_marginal < top - DROP:
+                neighbour = None
+                nodes[x] = Node(at, last.mode, last.factor, top - NOTHING)
             else:
-                found[x] = last = here
-    return [found[x] for x in log_j]
+                nodes[x] = last = neighbour
+    return [nodes[x] for x in log_j]
 
 
 def _reached(target: Target, split: Split, here: Conditional, at: Float) -> Conditional | None:
-    """Node at a point next to another node, or None where no mode is found."""
+    """Node at grid coordinates `at`, searched from the adjacent node `here`; None if it fails."""
     y = expected_mode(split, here, at - here.at)
     try:
         return conditional_mode(target, split, y, at, tolerance=NEAR)
@@ -156,7 +162,10 @@ def _reached(target: Target, split: Split, here: Conditional, at: Float) -> Cond
 
 
 def _line(target: Target, split: Split, node: Conditional, axis: int, n: int) -> Line:
-    """Nodes along an axis, from a first one near the top: `n` of them, where the density is."""
+    """At least `n` nodes along an axis, placed where the marginal density is not negligible.
+
+    `node` is the first node, near the maximum.
+    """
     nodes = {float(node.at[axis]): node}
     for direction in (1, -1):
         _walk(target, split, nodes, axis, direction)
@@ -179,9 +188,9 @@ def _ahead(split: Split, node: Conditional, axis: int, step: float) -> Float:
 
 
 def _climb(target: Target, split: Split, node: Conditional) -> Conditional:
-    """Node along the modes where log j is about most probable."""
+    """Node near the maximum of the marginal density of log j."""
     for _ in range(30):
-        # where the curvature is not that of a peak, steps of a size that leaves the plateau
+        # without the curvature of a maximum, take a step that is large enough to leave a plateau
         slope = float(node.slope[0])
         curvature = max(float(node.curvature[0, 0]), abs(slope), 1e-3)
         step = float(np.clip(slope / curvature, -1.0, 1.0))
@@ -193,24 +202,24 @@ def _climb(target: Target, split: Split, node: Conditional) -> Conditional:
 
 
 def _walk(target: Target, split: Split, nodes: Line, axis: int, direction: int) -> None:
-    """Step along an axis until the marginal has dropped, or is the pure tail of the prior."""
+    """Add nodes along an axis until the marginal is negligible or follows the tail of the prior."""
     outermost = max if direction > 0 else min
     curvature = float(nodes[outermost(nodes)].curvature[axis, axis])
     step = 1.0 / np.sqrt(np.clip(curvature, 1.0, 1e12))
     for _ in range(200):
         edge = outermost(nodes)
-        here = nodes[edge]
+        edge_node = nodes[edge]
         stride = direction * step
-        y = _ahead(split, here, axis, stride)
-        there = _neighbour(target, split, here, axis, edge + stride, y)
-        nodes[edge + stride] = there
+        y = _ahead(split, edge_node, axis, stride)
+        new_node = _neighbour(target, split, edge_node, axis, edge + stride, y)
+        nodes[edge + stride] = new_node
         top = max(node.log_marginal for node in nodes.values())
-        change = there.log_marginal - here.log_marginal
-        if there.log_marginal < top - DROP:
+        change = new_node.log_marginal - edge_node.log_marginal
+        if new_node.log_marginal < top - DROP:
             return
         if _is_tail(target, split.held[axis], edge, direction, change / stride):
             return
-        # steps that change the density by about 2: neither creeping nor leaping
+        # aim at steps that change the log density by about 2
         step = float(
             np.clip(step * np.clip((2.0 / max(abs(change), 0.25)) ** 0.7, 0.2, 4.0), 1e-7, 1.0)
         )
@@ -222,15 +231,15 @@ def _walk(target: Target, split: Split, nodes: Line, axis: int, direction: int) 
 
 
 def _is_tail(target: Target, name: str, x: float, direction: int, slope: float) -> bool:
-    """True if the likelihood no longer depends on the hyperparameter."""
-    end, known = TAILS[name]
+    """True if the marginal follows the prior: the likelihood is independent of the parameter."""
+    end, prior_slope = TAILS[name]
     outward = -1 if end == "left" else 1
     distance = outward * (x - np.log(FAR[name] * target.hyper.scale))
-    return direction == outward and distance > 0 and bool(abs(slope / known - 1.0) < 2e-3)
+    return direction == outward and distance > 0 and bool(abs(slope / prior_slope - 1.0) < 2e-3)
 
 
 def _worth_keeping(nodes: Line) -> Line:
-    """Nodes without those far below the top, except one on either side."""
+    """Drop the nodes far below the maximum, except one on either side."""
     top = max(node.log_marginal for node in nodes.values())
     grid = sorted(nodes)
     good = [k for k, x in enumerate(grid) if nodes[x].log_marginal > top - DROP]
@@ -239,7 +248,11 @@ def _worth_keeping(nodes: Line) -> Line:
 
 
 def _refine(target: Target, split: Split, nodes: Line, axis: int) -> None:
-    """Halve the interval that carries most of the posterior, its tails given weight."""
+    """Add a node halfway in the interval that matters most for the interpolation.
+
+    Intervals are ranked by squared width times the square root of the density, which gives weight
+    to the tails.
+    """
     grid = np.array(sorted(nodes))
     values = np.array([nodes[x].log_marginal for x in grid])
     density = np.exp((values - values.max()) / 2)

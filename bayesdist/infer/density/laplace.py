@@ -1,7 +1,8 @@
-"""Mode and curvature of the posterior at a given jitter, or jitter and scale of the outliers.
+"""Conditional mode and curvature of the posterior at a point of the proposal's grid.
 
-Newton's method on the mixture, with the EM weights wherever the full Hessian is not positive: far
-from the mode steps are EM steps, near it convergence is quadratic.
+The grid fixes the jitter, or the jitter and the outlier scale.  The mode is found by Newton's
+method on the mixture.  Where the full Hessian is not positive definite, it is replaced by the one
+with EM weights.  Steps far from the mode are thus EM steps; near it, convergence is quadratic.
 """
 
 from __future__ import annotations
@@ -18,37 +19,39 @@ from bayesdist.infer.solution.linear import LinearFit
 from bayesdist.utils.arrays import Float
 
 MAX_STEPS = 60
-UNSEEN = 1e-8  # decrement that rounding of the log density may hide: the step is taken unseen
-ON_A_RIDGE = 1e-2  # decrement at which a search stops where the curvature had to be made positive
+UNSEEN = 1e-8  # below this decrement rounding may hide the gain: the step is taken unchecked
+ON_A_RIDGE = 1e-2  # decrement at which a search stops if the curvature had to be made positive
 
 
 @dataclass(frozen=True, eq=False)
 class Node:
-    """Laplace approximation of everything else at one point of the grid.
+    """Laplace approximation of the parameters y, conditional on a point of the grid.
 
-    Coordinates are y = (theta, cube-root hyperparameters) and those of the grid: see `Split`.
+    y = (theta, cube-root hyperparameters); see `Split`.
     """
 
-    at: Float  # the grid's coordinates (g,)
-    mode: Float  # y (D',) at the mode
-    # of minus the Hessian in the last step of the search, made positive where it is not
+    at: Float  # coordinates of the grid point (g,)
+    mode: Float  # y (D',) at the conditional mode
+    # factor of minus the Hessian at the last step of the search, made positive if necessary
     factor: ArrowFactor
-    # Laplace estimate of the log posterior density of the grid's coordinates, up to a constant
+    # Laplace estimate of the log marginal posterior density at the grid point, up to a constant
     log_marginal: float
 
 
 @dataclass(frozen=True, eq=False)
 class Conditional(Node):
-    """A `Node` with the derivatives that the search for its neighbours needs."""
+    """A `Node` with the derivatives needed to search for adjacent nodes.
 
-    # derivative (g, D') of the mode by the grid's coordinates, for the start at a neighbour
-    tangent: Float
-    slope: Float  # gradient (g,), by the grid's coordinates, of the log posterior along the modes
-    curvature: Float  # minus its Hessian (g, g)
+    All derivatives are with respect to the grid coordinates.
+    """
+
+    tangent: Float  # derivative (g, D') of the mode; predicts the mode of an adjacent node
+    slope: Float  # gradient (g,) of the log posterior along the conditional modes
+    curvature: Float  # minus the Hessian (g, g) of the log posterior along the conditional modes
 
 
 def starting_point(target: Target, fit: LinearFit) -> Float:
-    """Starting point (D,): the linear fit, and hyperparameters from its rejected stars."""
+    """Starting point psi (D,): theta of the linear fit; hyperparameters from its rejected stars."""
     scale = target.hyper.scale
     excess = max(fit.chi2 / max(fit.dof, 1) - 1.0, 0.0)
     f = np.clip(fit.n_rejected / fit.n_rows, 0.5 / fit.n_rows, 0.9)
@@ -63,17 +66,18 @@ def starting_point(target: Target, fit: LinearFit) -> Float:
 def conditional_mode(
     target: Target, split: Split, y: Float, at: Float, *, tolerance: float = 1e-9
 ) -> Conditional:
-    """Mode of the posterior at the grid's coordinates `at` (g,), starting from y (D',).
+    """Find the conditional mode at the grid coordinates `at` (g,), starting from y (D',).
 
-    The search ends at a Newton decrement (expected gain in log density) of `tolerance`.  Where the
-    curvature is not positive, along a ridge, `ON_A_RIDGE` is enough: steps would be many and gain
-    little.  DegenerateError when no maximum is found, or the curvature there is not positive.
+    The search ends when the Newton decrement (expected gain in log density) is below `tolerance`.
+    Along a ridge, where the curvature is not positive, it ends at `ON_A_RIDGE`, since many more
+    steps would gain little.  Raises DegenerateError if no maximum is found, or if its curvature is
+    not positive.
     """
-    here = _expand(target, split, y, at)
+    current = _expand(target, split, y, at)
     for _ in range(MAX_STEPS):
-        factor, mended = _positive(target, split, here, at)
-        step = factor.solve(here.gradient)
-        decrement = 0.5 * float(here.gradient @ step)
+        factor, mended = _positive(target, split, current, at)
+        step = factor.solve(current.gradient)
+        decrement = 0.5 * float(current.gradient @ step)
         if decrement < (max(tolerance, ON_A_RIDGE) if mended else tolerance):
             y = y + step if split.contains(y + step) else y
             break
@@ -81,9 +85,9 @@ def conditional_mode(
         for _ in range(40):
             trial = y + length * step
             if split.contains(trial):
-                there = _expand(target, split, trial, at)
-                if there.value - here.value > 1e-4 * length * decrement:
-                    y, here, moved = trial, there, True
+                candidate = _expand(target, split, trial, at)
+                if candidate.value - current.value > 1e-4 * length * decrement:
+                    y, current, moved = trial, candidate, True
                     break
             length /= 2
         if not moved:
@@ -103,25 +107,25 @@ def conditional_mode(
             where="posterior",
             do="check the match, the errors and the outlier model",
         )
-    # the last step needs no pass of its own: to second order its gain is its decrement
-    gain = float(here.gradient @ (y - here.y)) / 2
-    tangent = -factor.solve(here.coupling) if len(at) else here.coupling
+    # no further pass over the data: to second order the gain of the last step is its decrement
+    gain = float(current.gradient @ (y - current.y)) / 2
+    tangent = -factor.solve(current.coupling) if len(at) else current.coupling
     return Conditional(
         at=at,
         mode=y,
         factor=factor,
-        log_marginal=here.value + gain - 0.5 * factor.logdet,
+        log_marginal=current.value + gain - 0.5 * factor.logdet,
         tangent=tangent,
-        slope=here.slope - here.coupling @ (y - here.y),
-        curvature=here.curvature + here.coupling @ tangent.T,
+        slope=current.slope - current.coupling @ (y - current.y),
+        curvature=current.curvature + current.coupling @ tangent.T,
     )
 
 
 def expected_mode(split: Split, node: Conditional, step: Float) -> Float:
-    """Starting point for the search at a point of the grid that is a step (g,) away from a node.
+    """Predicted mode (D',) at a grid point displaced by `step` (g,) from a node.
 
-    The tangent may lead out of the support, to a fraction above one or below zero: then it is the
-    node's own mode.
+    It is extrapolated along the tangent.  If this leaves the support (an outlier fraction below
+    zero or above one), the mode of the node is returned.
     """
     y = node.mode + step @ node.tangent
     return y if split.contains(y) else node.mode
@@ -129,10 +133,11 @@ def expected_mode(split: Split, node: Conditional, step: Float) -> Float:
 
 @dataclass(frozen=True, eq=False)
 class _Expansion:
-    """Second-order expansion in the coordinates y at a point of the grid, and mixed derivatives.
+    """Second-order expansion of the log posterior about y (D',) at a point of the grid.
 
-    `slope` (g,) and `curvature` (g, g) are the gradient by the grid's coordinates and minus the
-    Hessian; `coupling` (g, D') is minus the mixed derivatives.
+    `value`, `gradient` and `matrix` (minus the Hessian) belong to y.  `slope` (g,) and `curvature`
+    (g, g) are the gradient and minus the Hessian with respect to the grid coordinates; `coupling`
+    (g, D') is minus the mixed second derivatives.
     """
 
     y: Float
@@ -147,11 +152,11 @@ class _Expansion:
 def _positive(
     target: Target, split: Split, here: _Expansion, at: Float
 ) -> tuple[ArrowFactor, bool]:
-    """Factor of the Hessian, made positive where it is not, and True if that was needed.
+    """Factor of minus the Hessian, made positive definite, and True if it had to be modified.
 
-    The distortion part falls back to the EM weights.  The hyperparameters' Schur complement gets
-    eigenvalues of at least one, in units of half their own value: where outliers cannot be
-    separated from the core, the posterior is flat in f and s_out, or even curved upwards.
+    The distortion part falls back to the EM weights.  The eigenvalues of the hyperparameters' Schur
+    complement are raised to at least one, in units of half the hyperparameters' values: where
+    outliers cannot be separated from the core, the posterior is flat or even convex in f and s_out.
     """
     for em in (False, True):
         matrix = _expand(target, split, here.y, at, em=True).matrix if em else here.matrix
@@ -183,21 +188,23 @@ def _positive(
 
 
 def _expand(target: Target, split: Split, y: Float, at: Float, *, em: bool = False) -> _Expansion:
-    """`Target.expand` in the coordinates y, at a point of the grid."""
-    n, (held, rest) = target.n_theta, split.columns
+    """Expansion of the log posterior in the coordinates y: `Target.expand`, transformed."""
+    n, (held, off_grid) = target.n_theta, split.columns
     value, gradient, matrix = target.expand(split.to_psi(y, at), em=em)
     _, h1, h2, g1, g2 = from_cube_root(split.rest, y[n:])
-    by_h = gradient[n:][rest]
+    by_h = gradient[n:][off_grid]
     bend = -by_h * h2 - g2
 
     g = matrix.n_global
     fixed = [g + k for k in held]
-    free = [*range(g), *(g + k for k in rest)]
+    free = [*range(g), *(g + k for k in off_grid)]
     scale = np.concatenate([np.ones(g), h1])
     border = matrix.border[np.ix_(free, free)] * np.outer(scale, scale)
     tail = np.arange(g, len(free))
     border[tail, tail] += np.maximum(bend, 0.0) if em else bend
-    inner = Arrow(border, matrix.edge[:, free] * scale[:, None], matrix.blocks, n_tail=len(rest))
+    inner = Arrow(
+        border, matrix.edge[:, free] * scale[:, None], matrix.blocks, n_tail=len(off_grid)
+    )
     return _Expansion(
         y=y,
         value=value + float(split.log_jacobian(y)),

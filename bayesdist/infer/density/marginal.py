@@ -1,4 +1,4 @@
-"""Density of the grid's coordinates, interpolated between the nodes."""
+"""Marginal density of the grid coordinates, interpolated between the nodes."""
 
 from __future__ import annotations
 
@@ -12,14 +12,15 @@ from bayesdist.infer.density.piecewise import PiecewiseExponential
 from bayesdist.infer.stars.mixture import TAILS
 from bayesdist.utils.arrays import Bool, Float
 
-MESH = {1: 4001, 2: 401}  # points of each axis, by the number of axes
+MESH = {1: 4001, 2: 401}  # interpolation points per axis, by the number of axes
 
 
 def cardinal(axis: Float, *, local: bool) -> CubicSpline | CubicHermiteSpline:
-    """Splines (len(axis),) that are one at their own node and zero at the others.
+    """Cardinal splines (len(axis),): spline k is one at node k and zero at the other nodes.
 
-    If `local`, slopes are those of the parabolas through three nodes each, so that a node has no
-    effect beyond its neighbours' neighbours; else natural splines, which are smoother.
+    If `local` is True, slopes are those of parabolas through three adjacent nodes, so that a node
+    has no effect beyond the second node to either side.  Otherwise cubic splines, which are
+    smoother.
     """
     unit = np.eye(len(axis))
     if not local:
@@ -29,19 +30,20 @@ def cardinal(axis: Float, *, local: bool) -> CubicSpline | CubicHermiteSpline:
 
 @dataclass(frozen=True, eq=False)
 class Marginal:
-    """A normalised density in zero, one or two dimensions, to be drawn from and evaluated."""
+    """Normalised density in zero, one or two dimensions that can be sampled and evaluated."""
 
-    first: PiecewiseExponential | None
-    # of the second coordinate, around each mesh point of the first
+    first: PiecewiseExponential | None  # marginal density of the first coordinate
+    # density of the second coordinate, conditional on each mesh point of the first
     second: tuple[PiecewiseExponential, ...] = ()
 
     @classmethod
     def of(cls, names: Sequence[str], axes: Sequence[Float], values: Float) -> Marginal:
-        """Density interpolated from log densities at the nodes of a product grid.
+        """Interpolate log densities `values` at the nodes of a product grid with these `axes`.
 
-        `names` are the hyperparameters of the axes, which give the slopes of their tails.
+        `names` are the hyperparameters of the axes; their priors determine the slopes of the tails.
         """
-        # along one axis the nodes are where the density is; a product has some far below the top
+        # nodes of a single axis follow the density; a product grid has nodes of negligible density,
+        # where a cubic spline would overshoot
         kind = CubicSpline if len(axes) == 1 else PchipInterpolator
         meshes = [np.linspace(axis[0], axis[-1], MESH[len(axes)]) for axis in axes]
         for k, (axis, mesh) in enumerate(zip(axes, meshes, strict=True)):
@@ -55,7 +57,7 @@ class Marginal:
         return cls(_with_tails(names[0], meshes[0], masses), second)
 
     def draw(self, p: Float) -> Float:
-        """Points (n, g) from uniform random numbers (n, g)."""
+        """Convert uniform random numbers (n, g) to draws (n, g) of the density."""
         out = np.empty_like(p)
         if self.first is not None:
             out[:, 0] = self.first.quantile(p[:, 0])
@@ -73,7 +75,7 @@ class Marginal:
         return out
 
     def _conditionals(self, at: Float) -> Iterator[tuple[Bool, PiecewiseExponential]]:
-        """Masks (n,) of points, with the density of their second coordinate."""
+        """Yield Boolean masks (n,) of points and the density of their second coordinate."""
         if self.first is None or not self.second:
             return
         mesh = self.first.mesh
@@ -84,12 +86,12 @@ class Marginal:
 
 def _with_tails(name: str, mesh: Float, values: Float) -> PiecewiseExponential:
     step = mesh[1] - mesh[0]
-    left = max(values[1] - values[0], 1e-3) / step
+    left_slope = max(values[1] - values[0], 1e-3) / step
     right = min(values[-1] - values[-2], -1e-3) / step
     end, slope = TAILS[name]
     return PiecewiseExponential(
         mesh,
         values,
-        left_slope=slope if end == "left" else left,
+        left_slope=slope if end == "left" else left_slope,
         right_slope=slope if end == "right" else right,
     )

@@ -1,4 +1,4 @@
-"""Densities in one dimension that are drawn from and evaluated exactly."""
+"""Piecewise exponential densities in one dimension, sampled and evaluated exactly."""
 
 from __future__ import annotations
 
@@ -8,10 +8,11 @@ from bayesdist.utils.arrays import Float
 
 
 class PiecewiseExponential:
-    """Density whose logarithm is linear between ascending mesh points (m,) and beyond them.
+    """Density with a piecewise linear logarithm.
 
-    `values` (m,) are log densities up to a constant; beyond the mesh `left_slope` is positive and
-    `right_slope` negative.
+    `mesh` (m,) are ascending points and `values` (m,) the log densities there, up to a constant.
+    The logarithm is linear between them and, with `left_slope` > 0 and `right_slope` < 0, beyond
+    the first and last point.
     """
 
     def __init__(self, mesh: Float, values: Float, left_slope: float, right_slope: float) -> None:
@@ -19,7 +20,7 @@ class PiecewiseExponential:
         self.slopes = np.concatenate([[left_slope], np.diff(values) / np.diff(mesh), [right_slope]])
         self.top = values.max()
         heights = np.exp(values - self.top)
-        # of each cell from its higher end, so that nothing overflows
+        # mass of each cell relative to its higher end, so that nothing overflows
         fall = np.abs(np.diff(values))
         inner = np.maximum(heights[1:], heights[:-1]) * np.diff(mesh) * _mean_of_fall(fall)
         mass = np.concatenate([[heights[0] / left_slope], inner, [-heights[-1] / right_slope]])
@@ -33,27 +34,29 @@ class PiecewiseExponential:
         return float(self.top + np.log(self.total))
 
     def log_density(self, x: Float) -> Float:
-        """Normalised log density of points."""
+        """Normalised log density (n,) at points (n,)."""
         k = np.searchsorted(self.mesh, x)  # 0: left of the mesh
         anchor = np.maximum(k - 1, 0)
         return self.values[anchor] + self.slopes[k] * (x - self.mesh[anchor])
 
     def quantile(self, p: Float) -> Float:
-        """Points at which the distribution function equals probabilities."""
+        """Quantiles (n,) of probabilities (n,)."""
         m = np.clip(p, 1e-300, 1 - 1e-16) * self.total
         k = np.clip(np.searchsorted(self.cumulative, m, side="right") - 1, 0, len(self.slopes) - 1)
         share = (m - self.cumulative[k]) / (self.cumulative[k + 1] - self.cumulative[k])
         share = np.clip(share, 1e-300, 1.0)
         last = len(self.slopes) - 1
-        left, right = self.mesh[np.maximum(k - 1, 0)], self.mesh[np.minimum(k, last - 1)]
-        rise = self.slopes[k] * (right - left)  # of the cell; 0 for the tails
-        # from the higher end: fraction of the mass beyond x, and depth in the cell at which that is
+        left_end, right = self.mesh[np.maximum(k - 1, 0)], self.mesh[np.minimum(k, last - 1)]
+        rise = self.slopes[k] * (right - left_end)  # of the cell; 0 for the tails
+        # measured from the higher end of the cell: fraction of its mass, and of its width, up to x
         beyond = np.where(rise > 0, 1 - share, share)
         fall = np.abs(rise)
         flat = fall < 1e-9
         safe = np.where(flat, 1.0, fall)
         down = np.where(flat, beyond, -np.log1p(beyond * np.expm1(-safe)) / safe)
-        inside = np.where(rise > 0, right - down * (right - left), left + down * (right - left))
+        inside = np.where(
+            rise > 0, right - down * (right - left_end), left_end + down * (right - left_end)
+        )
         with np.errstate(divide="ignore"):
             below = self.mesh[0] + np.log(share) / self.slopes[0]
             above = self.mesh[-1] + np.log1p(-np.minimum(share, 1 - 1e-16)) / self.slopes[-1]

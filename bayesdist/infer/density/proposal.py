@@ -1,13 +1,15 @@
 """Independence proposal: a Laplace approximation at each node of a grid.
 
-When the quoted errors are right, the jitter piles up at its bound and a single Gaussian misses the
-tail of log j while its acceptance still looks fine.  Here log j is drawn from its marginal,
-interpolated over about 25 values, with the exact exponential tail that prior and Jacobian give at
-small j; everything else is drawn from the conditional Gaussian.
+If the quoted errors are right, the posterior of the jitter is concentrated at its lower bound, and
+a single Gaussian misses the tail of log j although its acceptance still looks good.  Therefore
+log j is drawn from its marginal density, interpolated over about 25 values, with the exact
+exponential tail of prior and Jacobian at small j.  All other parameters are drawn from the
+conditional Gaussian.
 
-A table with next to no false matches hardly determines their scale, and the fraction that it allows
-depends on that scale by orders of magnitude.  Then the grid has log s_out as its second axis, and
-the conditional of f has heavier tails than a Gaussian: one doubtful star skews it.
+A table with hardly any false matches does not determine their scale, and the outlier fraction that
+is compatible with the data depends on that scale by orders of magnitude.  In this case log s_out is
+the second axis of the grid, and the conditional density of f has heavier tails than a Gaussian,
+since a single doubtful star skews it.
 """
 
 from __future__ import annotations
@@ -27,15 +29,15 @@ from bayesdist.utils.arrays import Float, Int
 
 Random = np.random.Generator | np.random.RandomState
 
-WIDE, SHARE = 2.0, 0.1  # draws of an uncertain f are so much wider, so often
+WIDE, SHARE = 2.0, 0.1  # heavier tails of f: a fraction SHARE of the draws is WIDE times wider
 
 
 class Proposal(Protocol):
-    """A density near the posterior, to be drawn from and evaluated."""
+    """Approximation of the posterior density that can be sampled and evaluated."""
 
     @property
     def best(self) -> Node:
-        """Laplace approximation where the grid's coordinates are most probable."""
+        """Laplace approximation at the most probable grid point."""
 
     def draw(self, n: int, rng: Random) -> Float:
         """Points (n, D) in sampled coordinates; NaN where a draw falls outside the support."""
@@ -46,10 +48,10 @@ class Proposal(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class GridProposal:
-    """Proposal density q(psi), to be drawn from and evaluated.
+    """Proposal density q(psi) from Laplace approximations at the nodes of a grid.
 
-    The nodes are on the product of the axes of `split`, the last of them running fastest; a single
-    one where no hyperparameter is on the grid.
+    The nodes form a product grid over the hyperparameters `split.held`, the last axis varying
+    fastest; there is a single node if no hyperparameter is on the grid.
     """
 
     split: Split
@@ -66,7 +68,7 @@ class GridProposal:
 
     @cached_property
     def _axes(self) -> tuple[Float, ...]:
-        """Values of the nodes along each axis."""
+        """Coordinates of the nodes along each axis."""
         return tuple(np.unique(column) for column in self._at.T)
 
     @cached_property
@@ -84,9 +86,9 @@ class GridProposal:
 
     @cached_property
     def _between(self) -> Float:
-        """Interpolated quantities (nodes, 2 D'): means, and logarithms of the standard deviations.
+        """Quantities (nodes, 2 D') to interpolate: conditional means and log standard deviations.
 
-        The means of the hyperparameters, which change by orders of magnitude, are logarithms too.
+        For hyperparameters, which change by orders of magnitude, it is the logarithm of the mean.
         """
         means, n = self._modes.copy(), self.split.n_theta
         means[:, n:] = np.log(means[:, n:])
@@ -95,13 +97,15 @@ class GridProposal:
 
     @property
     def _n_wide(self) -> int:
-        """Number of the last coordinates that have heavier tails."""
+        """Number of coordinates, at the end of y, that have heavier tails than a Gaussian."""
         return len(self.split.rest) if "s_out" in self.split.held else 0
 
     def _conditional(self, at: Float) -> tuple[Float, Float, Int]:
-        """Conditional mean (n, D'), and nearest node (n,) with factors (n, D') on its sigma.
+        """Conditional Gaussians at grid coordinates (n, g), interpolated between the nodes.
 
-        Correlations hardly change from node to node, so only standard deviations are scaled.
+        Returns the means (n, D'), the log ratios (n, D') of the standard deviations to those of the
+        nearest node, and the indices (n,) of the nearest nodes.  The correlations of the nearest
+        node are used, since they hardly change from node to node.
         """
         weights, nearest = np.ones((len(at), 1)), np.zeros(len(at), np.int64)
         local = len(self._axes) > 1
@@ -131,7 +135,7 @@ class GridProposal:
         return out
 
     def log_density(self, psi: Float) -> Float:
-        """Log q (n,) of points (n, D), normalised up to the mass outside the support."""
+        """Log q (n,) of points (n, D); the mass outside the support is not renormalised."""
         y, at = self.split.from_psi(psi)
         centre, log_scale, nearest = self._conditional(at)
         shift = (y - centre) * np.exp(-log_scale)
@@ -149,7 +153,7 @@ class GridProposal:
     # -- as arrays, for checkpoints ---------------------------------------------------------------
 
     def to_arrays(self) -> dict[str, Float]:
-        """Arrays by name from which `from_arrays` builds it again, bit for bit."""
+        """Arrays by name; `from_arrays` restores the proposal from them, bit for bit."""
         return {
             "at": self._at,
             "held": np.array(self.split.columns[0], float),
@@ -164,7 +168,7 @@ class GridProposal:
     def from_arrays(
         cls, n_theta: int, hyper: tuple[str, ...], arrays: Mapping[str, Float]
     ) -> GridProposal:
-        """Proposal from the arrays of `to_arrays`; other arguments as in `Split`."""
+        """Restore a proposal from the arrays of `to_arrays`; see `Split` for `n_theta`, `hyper`."""
         split = Split(n_theta, hyper, tuple(hyper[int(k)] for k in arrays["held"]))
         n_tail = len(split.rest)
         matrices = zip(arrays["border"], arrays["edge"], arrays["blocks"], strict=True)

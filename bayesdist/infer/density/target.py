@@ -1,4 +1,4 @@
-"""The posterior density as a function of parameters, for many points at once."""
+"""The posterior density as a function of the parameters, evaluated for many points at once."""
 
 from __future__ import annotations
 
@@ -23,11 +23,11 @@ SCRATCH = 32_000_000  # bytes of effective coefficients in memory at a time
 
 
 class Density(Protocol):
-    """A density that is sampled, of psi = (theta, hyperparameters)."""
+    """Density of psi = (theta, hyperparameters) that can be sampled."""
 
     @property
     def n_theta(self) -> int:
-        """Number of parameters that are no hyperparameters."""
+        """Number of parameters in theta, that is, without the hyperparameters."""
         ...
 
     @property
@@ -36,7 +36,7 @@ class Density(Protocol):
         ...
 
     def log_density(self, psi: Float) -> Float:
-        """Log density of points (n, D); minus infinity outside the support."""
+        """Log density (n,) of points psi (n, D); minus infinity outside the support."""
         ...
 
 
@@ -44,7 +44,7 @@ class Density(Protocol):
 class Target:
     """Posterior density of psi = (theta, hyperparameters).
 
-    InputError for a star outside the circle in which it was matched.
+    Raises InputError if a star is outside its match circle.
     """
 
     shards: Shards
@@ -75,9 +75,9 @@ class Target:
         return self.model.names + self.hyper.names
 
     def log_density(self, psi: Float) -> Float:
-        """Log posterior of points (n, D), up to a constant, from one pass over the data for all.
+        """Log posterior (n,) of points (n, D), up to a constant, in one pass over the data.
 
-        Points outside the support, or not finite, give minus infinity.
+        Minus infinity for points that are not finite or outside the support.
         """
         ok = np.isfinite(psi).all(axis=1)
         out = np.full(len(psi), -np.inf)
@@ -90,10 +90,11 @@ class Target:
         return out
 
     def expand(self, psi: Float, *, em: bool = False) -> tuple[float, Float, Arrow]:
-        """Value, gradient (D,) and minus the Hessian of the log posterior at one point: one pass.
+        """Value, gradient (D,) and minus the Hessian of the log posterior at a point (D,).
 
-        With `em` the curvature has the EM weights, whose distortion part is never indefinite;
-        otherwise it may be indefinite away from the mode.
+        The Hessian may be indefinite away from the mode.  If `em` is True, it is computed with EM
+        weights, which make the distortion part positive semidefinite.  Takes one pass over the
+        data.
         """
         model = self.model
         theta, h = psi[: self.n_theta], psi[self.n_theta :]
@@ -101,39 +102,39 @@ class Target:
         sums = self.shards.sum(mixture, theta, constants, em)
         loglik, by_j, n_outliers, by_s, jj, jf, js, ff, fs, ss = sums.scalars
         by_f = n_outliers - len(self.shards) * float(np.exp(constants.log_f[0]))
-        which = [tuple(HYPER_NAMES).index(name) for name in self.mixture.hyper]
-        by_hyper = np.array([by_j, by_f, by_s])[which]
-        curvature = np.array([[jj, jf, js], [jf, ff, fs], [js, fs, ss]])[np.ix_(which, which)]
+        sampled = [tuple(HYPER_NAMES).index(name) for name in self.mixture.hyper]
+        by_hyper = np.array([by_j, by_f, by_s])[sampled]
+        curvature = np.array([[jj, jf, js], [jf, ff, fs], [js, fs, ss]])[np.ix_(sampled, sampled)]
 
         by_hyper, curvature, chain = self.hyper.chained(h, by_hyper, curvature)
         prior_gradient, prior_curvature = self.hyper.prior_terms(h)
         curvature = curvature + prior_curvature
-        sums = replace(sums, cross=np.einsum("ghak,hi->giak", sums.cross[:, which], chain))
+        sums = replace(sums, cross=np.einsum("ghak,hi->giak", sums.cross[:, sampled], chain))
         matrix, right = sums.assemble(model, theta)
         gradient = np.concatenate([right + self.priors.pull(theta), by_hyper + prior_gradient])
         matrix = matrix + self.priors.matrix(model, len(h))
         g = model.n_global
-        # without coupling the tail has to be positive by itself
+        # the EM matrix needs a positive definite hyperparameter block by itself
         matrix.border[g:, g:] += _positive(curvature) if em else curvature
         value = loglik + float(self.priors.log_density(theta)) + float(self.hyper.log_prior(h))
         return value, gradient, matrix
 
 
 def log_likelihood(stars: Stars, theta: Float, constants: Constants) -> Float:
-    """Log-likelihood (n,) of some stars at parameter vectors (n, n_params)."""
+    """Log-likelihood (n,) of the stars at parameter vectors theta (n, n_params)."""
     model = stars.model
     out = np.empty(len(theta))
     step = max(1, SCRATCH // (16 * model.n_terms * len(stars.groups)))
     for a in range(0, len(theta), step):
         rows = slice(a, a + step)
-        powers, some = stars.powers(theta[rows]), constants.of(rows)
+        powers, mixture_constants = stars.powers(theta[rows]), constants.of(rows)
         if circle := stars.circle(constants):
             out[rows] = kernel.truncated_log_likelihood(
-                stars.blocks, stars.columns, circle, powers, model.order, some
+                stars.blocks, stars.columns, circle, powers, model.order, mixture_constants
             )
         else:
             out[rows] = kernel.log_likelihood(
-                stars.blocks, stars.columns, powers, model.order, some
+                stars.blocks, stars.columns, powers, model.order, mixture_constants
             )
     return out
 

@@ -1,1 +1,1 @@
-"""Normal equations: sums over the stars, their null space, priors, and how they are solved."""
+"""Normal equations: accumulation over the stars, rank, priors, and solution."""

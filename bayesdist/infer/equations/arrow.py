@@ -1,8 +1,8 @@
-"""Symmetric matrices of arrow shape: a dense border and many small blocks on the diagonal.
+"""Symmetric arrow matrices: a dense border and many small blocks on the diagonal.
 
-The normal matrix of exposures with their own frames has this shape: parameters of different
-exposures are coupled only through the global ones.  Local blocks are eliminated by Schur
-complement, so that cost grows linearly with the number of exposures.
+The normal matrix of a model with a frame per exposure has this form, since parameters of different
+exposures are coupled only through the global parameters.  The local blocks are eliminated by the
+Schur complement, so that the cost grows linearly with the number of exposures.
 """
 
 from __future__ import annotations
@@ -20,11 +20,11 @@ Float = NDArray[Any]  # numpy's stubs lose float64 in its linear algebra
 
 @dataclass(frozen=True, eq=False)
 class Arrow:
-    """A symmetric matrix [[border, edge], [edge^T, diag(blocks)]].
+    """Symmetric matrix [[border, edge], [edge^T, diag(blocks)]].
 
-    Its vectors are laid out as (global, local blocks, tail): the border (b, b), b = n_global +
-    n_tail, belongs to the first `n_global` and the last `n_tail` entries, the blocks (n_blocks, q,
-    q) to those between; the edge is (n_blocks, b, q).
+    Vectors are ordered as (global, local blocks, tail).  The border (b, b), with b = n_global +
+    n_tail, belongs to the first `n_global` and the last `n_tail` entries, and the blocks
+    (n_blocks, q, q) to the entries in between.  The edge (n_blocks, b, q) couples the two.
     """
 
     border: Float
@@ -34,7 +34,7 @@ class Arrow:
 
     @property
     def n_global(self) -> int:
-        """Number of entries before the blocks."""
+        """Number of entries that precede the blocks."""
         return len(self.border) - self.n_tail
 
     @property
@@ -98,13 +98,13 @@ class Arrow:
         return out
 
     def factor(self) -> ArrowFactor:
-        """Cholesky factors with the local blocks eliminated first.
+        """Cholesky factorisation, with the local blocks eliminated first.
 
-        Raises numpy.linalg.LinAlgError when the matrix is not positive definite.
+        Raises numpy.linalg.LinAlgError if the matrix is not positive definite.
         """
         chol_blocks = np.linalg.cholesky(self.blocks)
         inverse_blocks = np.linalg.inv(chol_blocks)
-        # L_e^-1 B_e^T of all blocks, one below the other
+        # L_e^-1 B_e^T of all blocks, stacked
         half = inverse_blocks @ self.edge.mT
         rows = half.reshape(-1, len(self.border))
         chol_border = np.linalg.cholesky(self.border - rows.T @ rows)
@@ -113,16 +113,16 @@ class Arrow:
 
 @dataclass(frozen=True, eq=False)
 class ArrowFactor:
-    """A factored positive definite `Arrow` H: solves, determinants and Gaussian draws."""
+    """Cholesky factors of a positive definite `Arrow` H, for solutions, log det and draws."""
 
     matrix: Arrow
     chol_border: Float  # lower Cholesky factor (b, b) of the Schur complement
-    chol_blocks: Float  # of each block (n_blocks, q, q)
-    inverse_blocks: Float  # inverses of these
-    gain: Float  # C^-1 B^T (n_blocks, q, b) of each block
+    chol_blocks: Float  # lower Cholesky factors (n_blocks, q, q) of the blocks
+    inverse_blocks: Float  # inverses (n_blocks, q, q) of `chol_blocks`
+    gain: Float  # C^-1 B^T (n_blocks, q, b), with C a block and B its edge (b, q)
 
     def solve(self, right: Float) -> Float:
-        """H^-1 times vectors (..., size)."""
+        """Solve H x = right for vectors (..., size)."""
         b, l = self.matrix.split(right)
         b = b - np.einsum("nqb,...nq->...b", self.gain, l)
         top = cho_solve((self.chol_border, True), b.reshape(-1, b.shape[-1]).T).T.reshape(b.shape)
@@ -137,7 +137,7 @@ class ArrowFactor:
         return float(out + 2 * np.log(np.einsum("nqq->nq", self.chol_blocks)).sum())
 
     def colour(self, z: Float) -> Float:
-        """Vectors x (..., size) with covariance H^-1 from white ones z.
+        """Transform standard normal vectors z (..., size) to vectors x with covariance H^-1.
 
         x_b = L_S^-T z_b and x_e = L_e^-T z_e - C_e^-1 B_e^T x_b, so that |z|^2 = x^T H x.
         """
@@ -146,22 +146,22 @@ class ArrowFactor:
         low = np.einsum("nrq,...nr->...nq", self.inverse_blocks, l)
         return self.matrix.join(top, low - np.einsum("nqb,...b->...nq", self.gain, top))
 
-    # Explicit inverses, of the blocks too: `colour` is called for every proposal, with few vectors
-    # at a time, where a triangular solve costs a hundred times its arithmetic.
+    # Border and blocks are inverted explicitly: `colour` is called for every proposal with only a
+    # few vectors, for which the overhead of a triangular solve is a hundred times its arithmetic.
 
     @cached_property
     def _inverse_border(self) -> Float:
         return solve_triangular(self.chol_border, np.eye(len(self.chol_border)), lower=True)
 
     def whiten(self, x: Float) -> Float:
-        """White vectors z from x (..., size): the inverse of `colour`."""
+        """Transform vectors x (..., size) to z with |z|^2 = x^T H x: the inverse of `colour`."""
         b, l = self.matrix.split(x)
         low = l + np.einsum("nqb,...b->...nq", self.gain, b)
         low = np.einsum("nrq,...nr->...nq", self.chol_blocks, low)
         return self.matrix.join(b @ self.chol_border, low)
 
     def variances(self) -> Float:
-        """Diagonal (size,) of H^-1, computed without the rest of it."""
+        """Diagonal (size,) of H^-1, computed without the off-diagonal elements."""
         root = self._inverse_border
         top = (root**2).sum(axis=0)
         spread = self.gain @ root.T

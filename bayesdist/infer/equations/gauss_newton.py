@@ -1,4 +1,4 @@
-"""Gauss-Newton over the frames of exposures, by moving normal equations instead of the data."""
+"""Gauss-Newton iteration over the exposure frames, by re-expanding the normal equations."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from bayesdist.model import DistortionModel
 from bayesdist.model.frames import nearest_frame
 from bayesdist.utils.arrays import Float
 
-RELINEARISED = 1e-7  # pixels: where the Gauss-Newton iteration over the frames stops
-STALLED = 1e-4  # formal errors: steps below this that do not shrink are rounding
-FLAT = 1e-12  # determinant of a linear map over its largest element squared
-TURNS = 50  # most iterations
+RELINEARISED = 1e-7  # pixels: the iteration stops when the solution moves less than this
+STALLED = 1e-4  # formal errors: smaller steps that do not shrink are due to rounding
+FLAT = 1e-12  # limit on |determinant| of a linear map, relative to its largest element squared
+TURNS = 50  # maximum number of iterations
 
 
 def starting_point(first: NormalEquations, model: DistortionModel, priors: GaussianPriors) -> Float:
-    """Starting parameters: frames from linear maps, then polynomials for these frames."""
+    """Starting parameters: frames from linear fits, then polynomials with these frames fixed."""
     groups = first.groups
     theta = np.zeros(model.n_params)
     if model.n_frame:
@@ -40,7 +40,7 @@ def starting_point(first: NormalEquations, model: DistortionModel, priors: Gauss
 
 
 def _refuse_flat(linear: Float, chip: int) -> None:
-    """Refuse (DegenerateError) a linear map (2, 2) of a chip onto a line or a point of u, v."""
+    """Raise DegenerateError if a linear map (2, 2) maps a chip onto a line or a point in u, v."""
     if abs(np.linalg.det(linear)) <= FLAT * np.abs(linear).max() ** 2:
         raise DegenerateError(
             f"the positions u, v of chip {chip} lie on a line or in one point",
@@ -50,13 +50,17 @@ def _refuse_flat(linear: Float, chip: int) -> None:
 
 
 def _start_frames(first: NormalEquations, theta: Float, model: DistortionModel) -> None:
-    """Set the frames of `theta` from linear maps, each exposure after one with a common chip."""
+    """Set the frames in `theta` from linear fits to each exposure and chip.
+
+    The linear map of each chip comes from the first exposure with a known frame, starting with
+    exposure 0.  The frame of an exposure follows from any chip with a known linear map.
+    """
     groups, o = first.groups, np.asarray(model.origin)
     affine = np.array([_affine(w, r) for w, r in zip(first.weight, first.right, strict=True)])
-    of_chip: dict[int, Float] = {}  # constant and linear coefficients of w, before the frame
+    of_chip: dict[int, Float] = {}  # constant and linear coefficients (2, 3) without the frame
 
     def enter(e: int) -> None:
-        """Take the chips' linear maps from an exposure whose frame is known."""
+        """Store the linear maps of the chips of an exposure, using its frame in `theta`."""
         M, d = model.frame(theta, e)
         for g in np.flatnonzero(groups.exposure == e):
             if int(groups.chip[g]) not in of_chip and np.isfinite(affine[g]).all():
@@ -67,7 +71,7 @@ def _start_frames(first: NormalEquations, theta: Float, model: DistortionModel) 
     enter(0)
     waiting = list(range(1, len(model.exposures)))
     while waiting:
-        still = []
+        unplaced = []
         for e in waiting:
             for g in np.flatnonzero(groups.exposure == e):
                 w = of_chip.get(int(groups.chip[g]))
@@ -80,10 +84,10 @@ def _start_frames(first: NormalEquations, theta: Float, model: DistortionModel) 
                     enter(e)
                     break
             else:
-                still.append(e)
-        if len(still) == len(waiting):
+                unplaced.append(e)
+        if len(unplaced) == len(waiting):
             return
-        waiting = still
+        waiting = unplaced
 
 
 def refuse_absorbed_drift(
@@ -92,10 +96,10 @@ def refuse_absorbed_drift(
     model: DistortionModel,
     priors: GaussianPriors,
 ) -> None:
-    """Raise an error for frames that absorb the drift of the linear terms.
+    """Raise DegenerateError if the exposure frames absorb the drift of the linear terms.
 
-    With a curved polynomial such a degeneracy is not exact, and the fit would follow its valley to
-    numbers that mean nothing.  On the linear part of the model it is exact, and shows.
+    The test uses the linear part of the model only, for which such a degeneracy is exact.  With
+    higher orders it is not exact, and the fit would converge to meaningless values.
     """
     if model.time is None or not model.n_frame:
         return
@@ -109,7 +113,7 @@ def refuse_absorbed_drift(
 
 
 def _affine(weight: Float, right: Float) -> Float:
-    """Constant and linear coefficients (2, 3) of one group alone; NaN where undetermined."""
+    """Constant and linear coefficients (2, 3) of a group by itself; NaN if undetermined."""
     out = np.full((2, 3), np.nan)
     for axis, pair in ((0, 0), (1, 2)):
         W = weight[pair][:3, :3]
@@ -124,7 +128,11 @@ def gauss_newton(
     model: DistortionModel,
     priors: GaussianPriors,
 ) -> Float:
-    """Solution of the equations, which are moved instead of passing over the data again."""
+    """Solve the normal equations by Gauss-Newton, starting from `theta` (n_params,).
+
+    The equations are re-expanded about each iterate without another pass over the data.  Raises
+    DegenerateError if the parameters are degenerate or the iteration does not converge.
+    """
     groups = equations.groups
     prior = priors.matrix(model)
     about = model.effective(theta, groups)
@@ -142,8 +150,9 @@ def gauss_newton(
         moved = np.abs(about - before).sum(axis=2).max()
         if moved < RELINEARISED * model.pixel_size(theta):
             return theta
-        # outside the area of the stars rounding always moves high orders by more than that: the
-        # criterion is the step in formal errors, and without frames there is nothing but rounding
+        # Where there are no stars, rounding alone moves high orders by more than that. Then the
+        # step in formal errors decides. Without frames the problem is linear, so that steps after
+        # the first are rounding.
         last, decrement = decrement, float(pull @ step)
         if decrement >= last / 4 and (not model.n_frame or decrement < STALLED**2):
             return theta

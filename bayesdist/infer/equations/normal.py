@@ -1,9 +1,9 @@
-"""Normal equations as sums over groups of stars: streaming, mergeable, movable without the data.
+"""Normal equations as sums over groups of stars, accumulated in chunks.
 
-Within a group the model is one polynomial, so the data enter only through the moments of the basis
-functions.  Partial sums over any chunks of the data add.  Because positions are linear in the
-effective coefficients, the equations can be moved to other coefficients exactly, which is how
-Gauss-Newton over the exposure frames runs without another pass.
+Within a group the model is a single polynomial, so the data enter only through the moments of the
+basis functions.  Partial sums over chunks of the data can be added.  Since positions are linear in
+the effective coefficients, the equations can be re-expanded about other coefficients exactly and
+without the data.  Gauss-Newton over the exposure frames therefore needs no further pass.
 """
 
 from __future__ import annotations
@@ -24,24 +24,24 @@ from bayesdist.utils.arrays import Float
 
 @dataclass(frozen=True, eq=False)
 class NormalEquations(Sums):
-    """Moments of weighted residuals about given effective coefficients.
+    """Sums over G groups of stars that form the normal equations for K polynomial terms.
 
-    Two of them add where residuals of a group were taken at the same coefficients.
+    Sums over different stars of a group can be added if they have the same `about`.
     """
 
     weight: Float  # sum (G, 3, K, K) of w phi phi^T for the axis pairs uu, uv, vv
-    right: Float  # sum (G, 2, K) of phi (W r), r the residual at `about`
-    about: Float  # effective coefficients (G, 2, K) at which r is taken
+    right: Float  # sum (G, 2, K) of phi (W r), with r the residual at `about`
+    about: Float  # effective coefficients (G, 2, K) at which r is computed
     chi2: float  # sum of r^T W r
-    cross: Float  # mixed second derivatives (G, h, 2, K) with h further parameters
-    scalars: Float  # further sums over the stars, named by the pass that made the equations
+    cross: Float  # mixed second derivatives (G, h, 2, K) with h additional parameters
+    scalars: Float  # additional sums over the stars, documented by the kernel that computes them
     groups: Groups
 
     BY_GROUP = ("weight", "right", "cross")
     OF_GROUP = ("about",)
 
     def moved(self, about: Float) -> NormalEquations:
-        """Equations about other effective coefficients: exact, without the data."""
+        """Re-expand about other effective coefficients (G, 2, K); exact, and without the data."""
         step = about - self.about
         pull = self._apply(step)
         chi2 = self.chi2 - 2 * float((self.right * step).sum()) + float((pull * step).sum())
@@ -54,10 +54,11 @@ class NormalEquations(Sums):
         return np.stack([u, v], axis=1)
 
     def assemble(self, model: DistortionModel, theta: Float) -> tuple[Arrow, Float]:
-        """Normal matrix and right-hand side (n_params,) in the model's parameters.
+        """Normal matrix and right-hand side (n_params,) for the model's parameters.
 
-        Frames are linearised at `theta`, whose effective coefficients are `about`.  The matrix has
-        the h further parameters as zero rows of its tail, except for `cross`.
+        The model is linearised at `theta` (n_params,); its effective coefficients must be `about`.
+        The h additional parameters form the tail of the matrix, with the mixed derivatives `cross`
+        and zeros elsewhere.
         """
         G, q, h = model.n_global, model.n_frame, self.cross.shape[1]
         n_blocks = len(model.local_blocks)
@@ -79,7 +80,7 @@ class NormalEquations(Sums):
             border[tail, glob] += across
             border[glob, tail] += across.T
             if n < m:
-                # groups stand in the order of their exposures, of which some have several dates
+                # groups are sorted by exposure; an exposure may have several of them (chips, dates)
                 e, first = divmod(columns[:, n] - G, q)
                 local = columns[0, n:] - columns[0, n] + first[0]
                 at, starts = np.unique(e, return_index=True)
@@ -98,10 +99,11 @@ def least_squares(
     corner: float = 1.0,
     power: int = 1,
 ) -> NormalEquations:
-    """Normal equations of weighted least squares with rejection: one pass over the stars.
+    """Accumulate the normal equations of weighted least squares in one pass over the stars.
 
-    Residuals are taken at `about` (n_params,), or None for the data themselves; `clip` decides on
-    rejection.  `corner`, `power` and the `scalars` are those of `kernel.least_squares_moments`.
+    Residuals are computed at the parameters `about` (n_params,); None means zero, so that they are
+    the data.  `clip` has the rejection limits; None keeps all stars.  See
+    `kernel.least_squares_moments` for `corner`, `power` and the `scalars` of the result.
     """
     moments = kernel.least_squares_moments(
         stars.pieces,
@@ -125,10 +127,10 @@ def least_squares(
 
 
 def mixture(stars: Stars, theta: Float, constants: Constants, em: bool = False) -> NormalEquations:
-    """Gradient and Hessian of the mixture's log-likelihood: one pass over the stars.
+    """Gradient and Hessian of the mixture log-likelihood at `theta`, in one pass over the stars.
 
-    `right` is the gradient by the effective coefficients; `em` and the `scalars` are those of
-    `kernel.mixture_moments`.
+    `right` of the result is the gradient with respect to the effective coefficients, and `weight`
+    minus the Hessian.  See `kernel.mixture_moments` for `em` and `scalars`.
     """
     powers, order = stars.powers(theta), stars.model.order
     if circle := stars.circle(constants):

@@ -1,4 +1,4 @@
-"""Gaussian priors of the parameters: independent ones by name, and correlated ones."""
+"""Gaussian priors on the parameters, independent or correlated."""
 
 from __future__ import annotations
 
@@ -16,24 +16,25 @@ from bayesdist.utils.arrays import Float
 
 @dataclass(frozen=True, eq=False)
 class JointPrior:
-    """Gaussian prior of the first entries of theta with their correlations."""
+    """Correlated Gaussian prior on the first G entries of theta."""
 
-    centre: Float  # (G,)
-    precision: Float  # (G, G), inverse covariance; it may leave directions flat
-    rank: int  # number of directions that are not flat
+    centre: Float  # mean (G,)
+    precision: Float  # inverse covariance (G, G); may be singular (flat in some directions)
+    rank: int  # rank of `precision`
 
 
 @dataclass(frozen=True, eq=False)
 class GaussianPriors:
-    """Gaussian priors on entries of theta: independent ones, and a joint one of the first entries.
+    """Independent Gaussian priors on the parameters, and optionally a correlated prior.
 
     Parameters
     ----------
     centre : ndarray, shape (D,)
+        Prior means, in the order of `model.names`.
     precision : ndarray, shape (D,)
-        Inverse variances; 0 is a flat prior.
+        Inverse prior variances; 0 means a flat prior.
     joint : JointPrior, optional
-        Of the polynomials and their drift.
+        Correlated prior on the polynomials and their drift, in addition to the independent ones.
     """
 
     centre: Float
@@ -42,17 +43,27 @@ class GaussianPriors:
 
     @classmethod
     def none(cls, model: DistortionModel) -> GaussianPriors:
-        """Flat priors on everything."""
+        """Flat priors on all parameters of a model."""
         return cls(np.zeros(model.n_params), np.zeros(model.n_params))
 
     @classmethod
     def of(cls, model: DistortionModel, named: Mapping[str, tuple[float, float]]) -> GaussianPriors:
-        """Priors from a mapping of parameter names to (mean, sigma).
+        """Independent priors on named parameters; flat on all others.
+
+        Parameters
+        ----------
+        model : DistortionModel
+        named : mapping of str to (float, float)
+            Prior mean and standard deviation, in the parameter's unit, by parameter name.
+
+        Returns
+        -------
+        GaussianPriors
 
         Raises
         ------
         InputError
-            For an unknown name or a sigma that is not positive.
+            If a name is unknown, a mean is not finite, or a standard deviation is not positive.
         """
         centre, precision = np.zeros(model.n_params), np.zeros(model.n_params)
         for name, (mean, sigma) in named.items():
@@ -71,12 +82,12 @@ class GaussianPriors:
 
     @property
     def n_informative(self) -> int:
-        """Number of directions in which a prior is not flat."""
+        """Number of directions in parameter space in which the prior is not flat."""
         joint = 0 if self.joint is None else self.joint.rank
         return int((self.precision > 0).sum()) + joint
 
     def pull(self, theta: Float) -> Float:
-        """Gradient of the log prior."""
+        """Gradient (D,) of the log prior at theta (D,)."""
         out = self.precision * (self.centre - theta)
         if self.joint is not None:
             G = len(self.joint.centre)
@@ -92,11 +103,11 @@ class GaussianPriors:
         return np.asarray(out)
 
     def about(self, theta: Float) -> Prior:
-        """Priors as one of all parameters, about theta (D,)."""
+        """Equivalent `Prior` on all parameters, expanded about theta (D,)."""
         return Prior(theta, self.information(len(self.precision)), self.pull(theta))
 
     def information(self, n: int) -> Float:
-        """Precision (n, n) of the first entries of theta."""
+        """Prior precision (n, n) of the first n entries of theta."""
         out = np.diag(self.precision[:n])
         if self.joint is not None:
             G = len(self.joint.centre)
@@ -104,7 +115,7 @@ class GaussianPriors:
         return out
 
     def matrix(self, model: DistortionModel, n_tail: int = 0) -> Arrow:
-        """The priors' precision as an arrow without edges."""
+        """Prior precision as an arrow matrix (with a zero edge)."""
         n, q, g = len(model.local_blocks), model.n_frame, model.n_global
         local = self.precision[g:].reshape(n, q) if n else np.zeros((0, q))
         blocks = np.einsum("nq,qr->nqr", local, np.eye(q))
@@ -115,23 +126,32 @@ class GaussianPriors:
 
 @dataclass(frozen=True, eq=False)
 class Prior:
-    """Correlated Gaussian prior of the parameters, linearised at some.
+    """Correlated Gaussian prior on all parameters, expanded about a reference point.
 
     log p = -d^T P d / 2 + r^T d with d = theta - reference.
+
+    Parameters
+    ----------
+    reference : ndarray, shape (D,)
+        Parameters near the solution, to avoid rounding errors.
+    precision : ndarray, shape (D, D)
+        The matrix P.
+    right : ndarray, shape (D,)
+        The vector r, the gradient at `reference`.
     """
 
-    reference: Float  # (D,), near the solution, so that no digits are lost
-    precision: Float  # (D, D), P
-    right: Float  # (D,), r
+    reference: Float
+    precision: Float
+    right: Float
 
     @classmethod
     def none(cls, reference: Float) -> Prior:
-        """Flat prior."""
+        """Flat prior on D parameters."""
         D = len(reference)
         return cls(reference, np.zeros((D, D)), np.zeros(D))
 
     def __add__(self, other: Prior) -> Prior:
-        """Sum of two independent pieces."""
+        """Product of two independent priors: the sum of their log densities."""
         shift = self.reference - other.reference
         return Prior(
             self.reference,
@@ -140,7 +160,7 @@ class Prior:
         )
 
     def pull(self, theta: Float) -> Float:
-        """Gradient (D,)."""
+        """Gradient (D,) of the log prior at theta (D,)."""
         return np.asarray(self.right - self.precision @ (theta - self.reference))
 
     def log_density(self, theta: Float) -> Float:

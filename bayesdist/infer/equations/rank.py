@@ -1,6 +1,7 @@
-"""Parameters that the data do not determine, by name, and the reason.
+"""Detection of parameters that the data do not determine, by name and with the reason.
 
-Checked before anything is solved, because a degenerate least-squares problem still returns numbers.
+The checks run before the equations are solved, because solving a degenerate least-squares problem
+returns numbers without any warning.
 """
 
 from __future__ import annotations
@@ -16,29 +17,29 @@ from bayesdist.infer.stars.survey import Survey
 from bayesdist.model import DistortionModel, Groups
 from bayesdist.model.frames import DEVIATIONS, FRAME_KINDS, frame_names
 
-# Eigenvalues of the unit-diagonal normal matrix below this are zero: rounding alone leaves ~1e-15
-# and a fit that loses 11 of 16 digits is no longer a measurement.
+# Eigenvalues of the unit-diagonal normal matrix below this count as zero. Rounding alone gives
+# ~1e-15, and a fit that loses 11 of 16 digits is meaningless.
 RANK_TOLERANCE = 1e-11
 
-# A polynomial over the detector is an extrapolation when its stars fill less than this of the area.
+# Smallest fraction of the chip area within the convex hull of its stars; below it, the polynomial
+# would be an extrapolation over most of the chip.
 LEAST_COVERAGE = 0.25
 
 
 @dataclass(frozen=True)
 class NullSpace:
-    """Directions in parameter space that the data leave free."""
+    """Null space of a normal matrix: directions that the data do not determine."""
 
     rank: int
     n_params: int
-    # ratio of the extreme eigenvalues of the normal matrix scaled to unit diagonal; infinite where
-    # the rank is not full
+    # condition number of the normal matrix scaled to unit diagonal; infinite if it is singular
     condition: float
-    # names of the parameters in each free direction, largest component first
+    # names of the parameters with large components in each null direction, largest first
     directions: tuple[tuple[str, ...], ...]
 
 
 def null_space(matrix: Arrow, names: tuple[str, ...]) -> NullSpace:
-    """Rank, condition and null directions of a normal matrix, with the names of its rows."""
+    """Rank, condition number and null directions of a normal matrix; `names` are its rows."""
     scale = np.sqrt(matrix.diagonal())
     dead = scale == 0
     scale[dead] = 1.0
@@ -46,7 +47,7 @@ def null_space(matrix: Arrow, names: tuple[str, ...]) -> NullSpace:
     values = np.linalg.eigvalsh(unit)
     free = values < RANK_TOLERANCE * max(values[-1], 1.0)
     directions = []
-    # mostly there are none, and vectors take twice as long as values
+    # eigenvectors take twice as long as eigenvalues and are rarely needed
     for vector in np.linalg.eigh(unit).eigenvectors[:, free].T if free.any() else ():
         size = np.abs(vector)
         parts = np.argsort(-size)[:6]
@@ -60,10 +61,9 @@ def null_space(matrix: Arrow, names: tuple[str, ...]) -> NullSpace:
 
 
 def require_full_rank(matrix: Arrow, model: DistortionModel, groups: Groups) -> NullSpace:
-    """The null space, which must be empty.
+    """Require that a normal matrix has full rank, and return its `NullSpace`.
 
-    DegenerateError with the parameters of the first free direction and, where it is known, the
-    reason.
+    Raises DegenerateError with the parameters of the first null direction and the likely reason.
     """
     space = null_space(matrix, model.names)
     if space.rank == space.n_params:
@@ -78,16 +78,16 @@ def require_full_rank(matrix: Arrow, model: DistortionModel, groups: Groups) -> 
 
 
 def _simpler_frames(matrix: Arrow, model: DistortionModel) -> str:
-    """Setting of the richest frames with which nothing is degenerate; empty where there is none."""
+    """Advice to use the most general kind of frames that is not degenerate; empty if none is."""
     dense = matrix.dense()
     for kind in reversed(FRAME_KINDS[: FRAME_KINDS.index(model.frames)]):
         names = frame_names(kind)
-        left = [
+        remaining = [
             k
             for k, p in enumerate(model.parameters)
             if p.kind != "frame" or p.name.rpartition(".")[2] in names
         ]
-        part = dense[np.ix_(left, left)]
+        part = dense[np.ix_(remaining, remaining)]
         scale = np.sqrt(part.diagonal())
         if (scale == 0).any():
             continue
@@ -137,11 +137,12 @@ def _reason(
 def check_coverage(
     model: DistortionModel, survey: Survey, n_priors: int = 0, *, known: bool = False
 ) -> None:
-    """Raise DegenerateError for data that cannot determine the model, with the plain reason.
+    """Raise DegenerateError if the data cannot determine the model.
 
-    That is: fewer numbers than parameters (each of `n_priors` priors is a number more), too few
-    stars in an exposure, stars on a line, or stars in one corner of a chip.  Where the polynomials
-    are `known` from an earlier calibration, stars may lie anywhere on a chip.
+    Refused are fewer measurements (including `n_priors` informative priors) than parameters, too
+    few stars in an exposure, a chip without stars, stars outside a chip or on a line, and stars
+    that cover too small a part of a chip.  The last two are not checked if the polynomials are
+    `known` from an earlier calibration.
     """
     n = survey.n
     if 2 * n + n_priors < model.n_params:
@@ -162,35 +163,35 @@ def check_coverage(
                     where=survey.where,
                     do=f"leave the exposure out, or set model.frames = '{kinds[-1]}'",
                 )
-    for chip, found in zip(model.chips, survey.chips, strict=True):
-        where = f"chip {chip.name}" if len(model.chips) > 1 else survey.where
-        if not found.n:
-            raise DegenerateError("no star lies on this chip", where=where, do="drop the chip")
-        if found.outside:
+    for chip, chip_survey in zip(model.chips, survey.chips, strict=True):
+        location = f"chip {chip.name}" if len(model.chips) > 1 else survey.where
+        if not chip_survey.n:
+            raise DegenerateError("no star lies on this chip", where=location, do="drop the chip")
+        if chip_survey.outside:
             raise DegenerateError(
-                found.outside,
-                where=where,
+                chip_survey.outside,
+                where=location,
                 do="correct detector.size, the columns or data.pixel_origin, or leave the row out",
             )
         if known:
             continue
-        a, b, aa, ab, bb = found.sums / found.n
+        a, b, aa, ab, bb = chip_survey.sums / chip_survey.n
         spread = np.linalg.eigvalsh([[aa - a * a, ab - a * b], [ab - a * b, bb - b * b]])
-        # variances: they lose half of the digits
-        if found.n < 3 or spread[0] < 1e-12 * spread[1]:
+        # differences of squares: half of the digits are lost
+        if chip_survey.n < 3 or spread[0] < 1e-12 * spread[1]:
             raise DegenerateError(
-                "all stars lie on a line", where=where, do="check columns x and y"
+                "all stars lie on a line", where=location, do="check columns x and y"
             )
         try:
-            covered = ConvexHull(found.corners / chip.size).volume
+            covered = ConvexHull(chip_survey.corners / chip.size).volume
         except QhullError:  # nearly collinear: no area
             covered = 0.0
         if covered < LEAST_COVERAGE:
-            x, y = found.corners.T
+            x, y = chip_survey.corners.T
             raise DegenerateError(
                 f"the stars lie within x {x.min():.0f} to {x.max():.0f}, y {y.min():.0f} to "
                 f"{y.max():.0f} and span {100 * covered:.0f} % of the detector, so that the rest "
                 "would be extrapolated",
-                where=where,
+                where=location,
                 do="add stars, or describe only the part that is measured as the detector",
             )

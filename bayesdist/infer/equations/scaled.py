@@ -1,9 +1,10 @@
-"""Algebra of covariances and normal matrices: scaled to unit diagonal on the way, on one thread.
+"""Linear algebra of covariances and normal matrices that are scaled to unit diagonal.
 
-Parameters of one model differ by many powers of ten, and scaled matrices keep their digits.  The
-chi-square of a difference between polynomials may leave some fields out.  It does not depend on how
-these were taken out: a difference and its covariance that have both gone through any linear
-projection along the same fields give one value.
+The parameters of a model differ by many orders of magnitude; scaling avoids the loss of digits.
+
+The chi-square of a difference between polynomials can exclude some fields (such as a shift).  The
+result does not depend on how these fields were removed: any linear projection along them, applied
+to the difference and to its covariance, gives the same value.
 """
 
 from __future__ import annotations
@@ -18,29 +19,28 @@ from threadpoolctl import threadpool_limits
 from bayesdist.utils.arrays import Bool, Float
 from bayesdist.utils.distributions import chi2_sf
 
-RANK = 1e-9  # eigenvalues of a correlation matrix below it are rounding
+RANK = 1e-9  # relative size below which an eigenvalue of a correlation matrix is rounding
 
 F = TypeVar("F", bound=Callable[..., Any])
 
 
 def one_thread(function: F) -> F:
-    """Decorator by which a function does all its linear algebra on one thread.
+    """Decorator that limits the linear algebra of a function to one thread.
 
-    The matrices are small: a second thread gains little on them, and loses much on a machine that
-    has other work.
+    The matrices are small: a second thread gains little, and costs much on a busy machine.
     """
     limited: F = threadpool_limits.wrap(limits=1, user_api="blas")(function)
     return limited
 
 
 def unit_diagonal(matrix: Float) -> tuple[Float, Float]:
-    """A matrix (n, n) scaled to unit diagonal, and the roots (n,) of its diagonal."""
+    """Matrix (n, n) scaled to unit diagonal, and the square roots (n,) of its diagonal."""
     scale = np.sqrt(np.diag(matrix))
     return matrix / np.outer(scale, scale), scale
 
 
 def scaled_cholesky(cov: Float) -> Float:
-    """Lower root (n, n) of a covariance; rows of zeros where there is no variance."""
+    """Lower Cholesky factor (n, n) of a covariance, with zero rows for zero variances."""
     free = np.flatnonzero(np.diag(cov) > 0)
     inner = np.ix_(free, free)
     unit, scale = unit_diagonal(cov[inner])
@@ -57,9 +57,10 @@ def scaled_inverse(matrix: Float) -> Float:
 
 
 def recolouring(before: Float, after: Float) -> Float:
-    """Linear map A (D, D) with A before A^T = after; the identity where the two are equal.
+    """Linear map A (D, D) with A before A^T = after; the identity if the two are equal.
 
-    Both are positive definite, but for parameters without variance, which A leaves as they are.
+    Both covariances must be positive definite apart from parameters of zero variance, which A
+    leaves unchanged.
     """
     free = np.flatnonzero(np.diag(before) > 0)
     inner = np.ix_(free, free)
@@ -70,15 +71,15 @@ def recolouring(before: Float, after: Float) -> Float:
 
 
 class FieldTest(NamedTuple):
-    """Chi-square of a whole field of differences."""
+    """Chi-square test of a difference between two distortion fields."""
 
     chi2: float
     dof: int  # rank of the covariance
-    p_value: float  # probability of a larger chi-square
+    p_value: float  # probability of a larger chi-square if the fields are equal
 
     @classmethod
     def of(cls, white: Float, *, shrink: float = 1.0) -> FieldTest:
-        """Test of independent standard normal numbers (dof,), their squares times `shrink`."""
+        """Test of whitened differences (dof,); the chi-square is multiplied by `shrink`."""
         chi2, dof = float(white @ white) * shrink, len(white)
         return cls(chi2, dof, float(chi2_sf(chi2, dof)))
 
@@ -91,21 +92,34 @@ def chi_square(
     norm: Float | None = None,
     draws: float = np.inf,
 ) -> FieldTest:
-    """Chi-square of a difference (n,), from which some fields may have been taken out.
+    """Chi-square test of a difference between coefficients, optionally excluding some fields.
 
-    `cov` (n, n) is the covariance before that; terms without variance are no part of the test.
-    `without` (n, q) are the fields, and `norm` (n,) the mean square of each term, which makes them
-    comparable.  `draws` is the effective number of draws from which the covariance was estimated:
-    the inverse of an estimate is too large by (n - 1) / (n - dof - 2) (Hartlap et al. 2007), which
-    is corrected.
+    Parameters
+    ----------
+    difference : ndarray, shape (n,)
+    cov : ndarray, shape (n, n)
+        Covariance of the difference, before any field is removed. Terms of zero variance are
+        excluded from the test.
+    without : ndarray, shape (n, q), optional
+        Coefficients of the fields to exclude.
+    norm : ndarray, shape (n,), optional
+        Mean square over the detector of each basis function, to weight the terms.
+    draws : float
+        Effective number of draws from which `cov` was estimated. The inverse of an estimated
+        covariance is too large by (draws - 1) / (draws - dof - 2) (Hartlap et al. 2007); this is
+        corrected.
+
+    Returns
+    -------
+    FieldTest
     """
-    known = known_terms(cov)
-    y, C = difference[known], cov[np.ix_(known, known)]
+    varying = known_terms(cov)
+    y, C = difference[varying], cov[np.ix_(varying, varying)]
     if norm is not None:
-        root = np.sqrt(norm[known])
+        root = np.sqrt(norm[varying])
         y, C = root * y, root[:, None] * C * root
     if without is not None:
-        fields = without[known] if norm is None else without[known] * root[:, None]
+        fields = without[varying] if norm is None else without[varying] * root[:, None]
         length = np.linalg.norm(fields, axis=0)
         if (length > 0).any():
             free = scipy.linalg.null_space((fields[:, length > 0] / length[length > 0]).T)
@@ -118,19 +132,20 @@ def chi_square(
 
 
 def known_terms(cov: Float) -> Bool:
-    """Boolean mask (n,) of the parameters with variance."""
+    """Boolean mask (n,) that is True for parameters of non-zero variance."""
     variance = np.diag(cov)
     return np.asarray(variance > 1e-20 * variance.max(initial=0.0))
 
 
 def determined(matrix: Float, rank: float = RANK) -> Float:
-    """Root R (n, rank) of the inverse, R R^T, of a positive semidefinite matrix where it has one.
+    """Matrix R (n, r) such that R R^T is the pseudo-inverse of a positive semidefinite matrix.
 
-    Eigenvalues below `rank` times the largest, at the level of rounding by default, count as zero.
+    The matrix is scaled to unit diagonal first; its eigenvalues below `rank` times the largest
+    count as zero.  r is the number of other eigenvalues.
     """
     diagonal = np.diag(matrix)
-    known = diagonal > 0
-    unit = np.where(known, 1.0 / np.sqrt(np.where(known, diagonal, 1.0)), 0.0)
+    positive = diagonal > 0
+    unit = np.where(positive, 1.0 / np.sqrt(np.where(positive, diagonal, 1.0)), 0.0)
     values, vectors = np.linalg.eigh(unit[:, None] * matrix * unit)
     good = values > rank * values.max(initial=1e-300)
     return np.asarray(unit[:, None] * vectors[:, good] / np.sqrt(values[good]))

@@ -1,1 +1,1 @@
-"""Exposure-to-exposure variation: frames, chip offsets, trends."""
+"""Fits of single exposures, and exposure-to-exposure variation of frames and chip offsets."""

@@ -1,8 +1,8 @@
-"""Independent fits of every exposure, in the reference gauge, and their linear terms.
+"""Independent fits of all exposures in the reference gauge, and their linear terms against time.
 
-The way of ACS ISR 2015-06 (sections 4.2 and 4.4): all chips of one exposure are fitted in the one
-system of the catalogue, rotated and shifted to the reference chip; the linear terms of all
-exposures, each with its covariance, are then a series in time.
+The method is that of ACS ISR 2015-06 (sections 4.2 and 4.4).  All chips of an exposure are fitted
+in the system of the catalogue, and the solution is rotated and shifted to the reference chip.  The
+linear terms of all exposures, with their covariances, form a time series.
 """
 
 from __future__ import annotations
@@ -29,24 +29,25 @@ from bayesdist.utils.arrays import Float
 
 @dataclass(frozen=True, eq=False)
 class ExposureSolutions:
-    """Solutions of single exposures: a series in time.
+    """Time series of the solutions of single exposures.
 
     Parameters
     ----------
     names : tuple of str, length E
-        Exposures.
+        Names of the exposures that were fitted.
     epoch : ndarray, shape (E,)
-        Decimal years.
+        Dates of the exposures in decimal years.
     labels : tuple of str, length k
-        Linear terms, as in `LinearTerms`.
+        Labels of the linear terms; see `LinearTerms`.
     values : ndarray, shape (E, k)
-        In the reference gauge; A_1, B_1 and A_3 of the reference chip are zero and have no error.
+        Linear terms in the reference gauge. A_1, B_1 and A_3 of the reference chip are zero and
+        have no error.
     cov : ndarray, shape (E, k, k)
-        Formal covariance.
+        Formal covariance of the linear terms.
     views : tuple of TransformedSolution
-        The whole solution of each exposure, in the reference gauge.
+        Solution of each exposure in the reference gauge.
     skipped : dict of str to str
-        Exposures left out, with the reason.
+        Reasons why exposures were left out, by name.
     """
 
     names: tuple[str, ...]
@@ -66,21 +67,27 @@ class ExposureSolutions:
         Parameters
         ----------
         *labels : str
+            Labels of k terms.
 
         Returns
         -------
         epoch : ndarray, shape (E,)
+            Decimal years.
         values : ndarray, shape (E, k)
         cov : ndarray, shape (E, k, k)
 
         Raises
         ------
         InputError
-            For an unknown label.
+            If a label is unknown.
         """
-        every = zip(self.values, self.cov, strict=True)
-        some = [LinearTerms(self.labels, v, c).select(*labels) for v, c in every]
-        return self.epoch, np.array([t.values for t in some]), np.array([t.cov for t in some])
+        exposures = zip(self.values, self.cov, strict=True)
+        selected = [LinearTerms(self.labels, v, c).select(*labels) for v, c in exposures]
+        return (
+            self.epoch,
+            np.array([t.values for t in selected]),
+            np.array([t.cov for t in selected]),
+        )
 
 
 @one_thread
@@ -91,19 +98,20 @@ def fit_exposures(
     chip: int = 2,
     rejection: Rejection = DEFAULT_REJECTION,
 ) -> ExposureSolutions:
-    """Fit every exposure independently; those that cannot be fitted are left out, and counted.
+    """Fit every exposure independently.
+
+    Exposures that cannot be fitted are left out and listed in the result.
 
     Parameters
     ----------
     matches : Matches
-        With errors and epochs.
+        Stars with errors and epochs.
     model : DistortionModel
-        Its order, chips and unit are those of each exposure; frames and time dependence are
-        ignored.
+        Model of each exposure; its frames and time dependence are ignored.
     chip : int
         Number of the reference chip.
     rejection : Rejection
-        As of `fit_linear`.
+        Rejection limits and weights; see `fit_linear`.
 
     Returns
     -------
@@ -112,9 +120,9 @@ def fit_exposures(
     Raises
     ------
     InputError
-        For matches without epochs.
+        If the matches have no epochs.
     DegenerateError
-        When no exposure has stars enough on each chip, well spread.
+        If no exposure has enough stars that cover each chip.
     """
     if matches.epoch is None:
         raise InputError(
@@ -159,13 +167,13 @@ def fit_exposures(
 
 
 def _require_stars(table: Matches, model: DistortionModel) -> None:
-    """Raise DegenerateError for a chip of an exposure with fewer stars than terms to be fitted."""
-    numbers, least = table.chip_number, model.n_terms
+    """Raise DegenerateError if a chip of the exposure has fewer stars than terms per axis."""
+    numbers, n_terms = table.chip_number, model.n_terms
     for chip in model.chips:
         n = int((numbers == chip.number).sum())
-        if n < least:
+        if n < n_terms:
             raise DegenerateError(
-                f"{n} stars lie on this chip, fewer than the {least} terms of an axis"
+                f"{n} stars lie on this chip, fewer than the {n_terms} terms of an axis"
                 if n
                 else "no star lies on this chip",
                 where=f"chip {chip.name}",

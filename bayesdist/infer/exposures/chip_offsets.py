@@ -1,15 +1,15 @@
-"""Constant terms of a chip whose shift varies from exposure to exposure.
+"""Constant terms of chips that shift from exposure to exposure.
 
-The constant terms of a chip and the shifts of the chip in every exposure are seen only as their
-sums, which the data determine very well.  A fit in which these shifts shall not constrain other
-parameters gives them a wide prior (see `hierarchy`), and leaves the constants as open as that
-prior.  The constants are determined here: as the mean of the sums over the exposures, with the
-error that the scatter of the shifts gives a mean,
+The data determine only the sums of a chip's constant terms and its shifts in each exposure, but
+these very well.  In the fit the shifts get a wide prior, so that they do not constrain other
+parameters (see `hierarchy`); the constants are then as uncertain as that prior.  This module
+determines the constants from the mean of the sums over the exposures, with the error that results
+from the scatter of the shifts:
 
     c -> c + G s + d      s -> s - X (G s + d)      d ~ N(0, tau^2 (X^T X)^-1)
 
-with G the least-squares regression of the shifts s on X: ones, and the steps where the drift has
-breaks.  No predicted position of any exposure changes by this.
+G is the least-squares regression of the shifts s on X, which has a column of ones and, if the drift
+has breaks, its steps.  The predicted positions of all exposures are unchanged.
 """
 
 from __future__ import annotations
@@ -27,29 +27,29 @@ AXES = ("u", "v")
 
 @dataclass(frozen=True, eq=False)
 class _Place:
-    """One axis of one chip."""
+    """Constants and shifts of one axis of one chip."""
 
-    kind: int  # of its shifts, among the kinds of deviation
+    kind: int  # index of its shifts among the kinds of deviation
     constants: Int  # indices (p,) in theta of the constant term and its steps
     shifts: Int  # indices (E,) in theta of the shifts
     design: Float  # X (E, p)
-    used: Bool  # exposures (E,) whose shifts scatter by tau
+    used: Bool  # mask (E,) of the exposures that are used for the mean
 
     @property
     def inverse(self) -> Float:
         """(X^T X)^-1, shape (p, p)."""
-        some = self.design[self.used]
-        return np.asarray(np.linalg.inv(some.T @ some))
+        design = self.design[self.used]
+        return np.asarray(np.linalg.inv(design.T @ design))
 
     def moved(self, theta: Float, d: Float) -> None:
-        """Transform parameters (..., D) in place, with given errors (..., p) of the constants."""
+        """Transform theta (..., D) in place, with errors d (..., p) of the constants."""
         shifts = theta[..., self.shifts]
         step = shifts[..., self.used] @ self.design[self.used] @ self.inverse + d
         theta[..., self.constants] += step
         theta[..., self.shifts] -= step @ self.design.T
 
     def covariance(self, n: int, tau: float) -> Float:
-        """Covariance (n, n) of theta by the errors d of the constants."""
+        """Covariance (n, n) of theta caused by the errors d of the constants, for scatter tau."""
         by = np.zeros((n, len(self.constants)))
         by[self.constants] = np.eye(len(self.constants))
         by[self.shifts] = -self.design
@@ -58,9 +58,9 @@ class _Place:
 
 @dataclass(frozen=True, eq=False)
 class Settling:
-    """Transformation from shifts with a wide prior to constants that are means."""
+    """Transformation that determines the constants of chips from the mean of their shifts."""
 
-    places: tuple[_Place, ...]  # one for each axis of every chip but the first
+    places: tuple[_Place, ...]  # one per axis of every chip except the first
 
     @classmethod
     def of(
@@ -71,24 +71,24 @@ class Settling:
         held: Bool,
         outlying: Bool,
     ) -> Settling:
-        """Transformation for the shifts of single chips among the kinds of deviation.
+        """Make the transformation for the shifts of single chips among the kinds of deviation.
 
-        The groups of the data give the chips and the epoch of each exposure; `held` (D,) are
-        parameters with a prior of their own, `outlying` (E,) exposures that went wrong.
+        `groups` of the data provide the chips and the epoch of each exposure.  `held` (D,) is True
+        for parameters with other priors, and `outlying` (E,) for outlying exposures.
         """
         names = {name: k for k, name in enumerate(model.names)}
         places = []
         for code, chip in enumerate(model.chips):
-            seen = np.zeros(len(model.exposures), bool)
+            present = np.zeros(len(model.exposures), bool)
             epoch = np.zeros(len(model.exposures))
-            here = groups.chip == code
-            seen[groups.exposure[here]] = True
-            epoch[groups.exposure[here]] = groups.epoch[here]
+            on_chip = groups.chip == code
+            present[groups.exposure[on_chip]] = True
+            epoch[groups.exposure[on_chip]] = groups.epoch[on_chip]
             for a, axis in enumerate(AXES):
                 kind = f"{chip.name}.shift_{axis}"
                 if kind not in kinds:
                     continue
-                at, X = [model.coefficient_slice(chip.number, a).start], [np.ones(len(seen))]
+                at, X = [model.coefficient_slice(chip.number, a).start], [np.ones(len(present))]
                 if model.time is not None and (axis, 0, 0) in model.time.terms:
                     weights = model.time.weights(epoch)
                     first = model.tdd_slice(chip.number).start
@@ -97,7 +97,7 @@ class Settling:
                     at += (first + np.flatnonzero(free)).tolist()
                     X += list(weights.T[free])
                 shifts = [names[f"{e}.{kind}"] for e in model.exposures]
-                used = seen & ~outlying
+                used = present & ~outlying
                 design = np.stack(X, axis=1)
                 if np.linalg.matrix_rank(design[used]) == len(at):
                     places.append(
@@ -108,21 +108,21 @@ class Settling:
         return cls(tuple(places))
 
     def mean(self, theta: Float) -> Float:
-        """Transformed parameters (..., D), without an error of the constants."""
+        """Transformed theta (..., D), with d = 0."""
         out = np.array(theta, float)
         for place in self.places:
             place.moved(out, np.zeros(len(place.constants)))
         return out
 
     def covariance(self, cov: Float, tau: Float) -> Float:
-        """Covariance (D, D) of transformed parameters, where the scatter is tau (k,)."""
+        """Covariance (D, D) of the transformed parameters, for scatter tau (k,)."""
         out = self.mean(self.mean(np.asarray(cov)).T)
         for place in self.places:
             out += place.covariance(len(out), float(tau[place.kind]))
         return np.asarray((out + out.T) / 2)
 
     def draws(self, theta: Float, tau: Float, rng: np.random.Generator) -> Float:
-        """Transformed draws (n, D), with an error of the constants each, for scatter tau (n, k)."""
+        """Transformed draws (n, D), each with a random d for its scatter tau (n, k)."""
         out = np.array(theta, float)
         for place in self.places:
             root = np.linalg.cholesky(place.inverse)

@@ -1,4 +1,4 @@
-"""Choice of frames that bring the stars of several exposures together, where a model's do not."""
+"""Recommendation of a more general kind of frames if it reduces the scatter of the exposures."""
 
 from __future__ import annotations
 
@@ -12,65 +12,65 @@ from bayesdist.infer.solution.linear import Rejection, fit_linear, residuals
 from bayesdist.model import DistortionModel
 from bayesdist.model.frames import FRAME_KINDS
 
-GAIN = 2.0  # factor by which the scatter must shrink
-FITS = 3
-MEDIAN_LENGTH = 1.1774  # standard deviations, of the length of two normal numbers
-ALIKE = 1.1  # largest scatter of the chosen frames, relative to the least of any
+GAIN = 2.0  # factor by which the scatter must decrease
+FITS = 3  # number of fits, each with the scatter of the previous one
+MEDIAN_LENGTH = 1.1774  # median of the Rayleigh distribution, in sigma
+ALIKE = 1.1  # largest scatter of the recommended frames, relative to the smallest
 
 
 @dataclass(frozen=True)
 class FrameChoice:
-    """Recommended frames, with the scatter of the residuals by them and by the model's.
+    """Recommended frames, and the scatter of the residuals with them and with the model's frames.
 
-    Both are median lengths in the unit of u, v, corrected for degrees of freedom.
+    The scatter is the median length of the residuals, corrected for degrees of freedom.
     """
 
-    frames: str
-    scatter: float
-    before: float  # with the model's frames
-    unit: str
-    instead_of: str
+    frames: str  # recommended kind of frames
+    scatter: float  # with the recommended frames
+    before: float  # with the frames of the model
+    unit: str  # unit of u, v
+    instead_of: str  # kind of frames of the model
 
     @property
     def sentence(self) -> str:
         """Recommendation with its reason."""
         return (
             f"set model.frames = '{self.frames}', with which the residuals of the exposures scatter"
-            f" by {self.scatter:.2g} {self.unit} in place of {self.before:.2g} with "
+            f" by {self.scatter:.2g} {self.unit} instead of {self.before:.2g} with "
             f"'{self.instead_of}'"
         )
 
 
 def frames_that_help(matches: Matches, model: DistortionModel) -> FrameChoice | None:
-    """Simplest frames with which stars scatter as little as with any, if that is far less.
+    """Find the simplest frames that give about the smallest scatter of the residuals.
 
-    Errors are not used: all stars count alike.  None for one exposure, and where no richer frames
-    make the scatter half as large.
+    All stars have the same weight; errors are not used.  Returns None for a single exposure, or if
+    no more general frames than those of the model reduce the scatter by at least a factor of 2.
     """
     names = matches.exposure_names
     richer = FRAME_KINDS[FRAME_KINDS.index(model.frames) + 1 :]
     if len(names) < 2 or not richer:
         return None
-    found = {}
+    scatters = {}
     for frames in (model.frames, *richer):
-        one = replace(model, frames=frames, exposures=names)
-        if one.n_params > len(matches):  # the part that the frames absorb would look like agreement
+        candidate = replace(model, frames=frames, exposures=names)
+        if candidate.n_params > len(matches):  # a good fit would be meaningless
             continue
         try:
-            found[frames] = _scatter(matches, one)
-        except InputError:  # a drift that they absorb, or too few stars
+            scatters[frames] = _scatter(matches, candidate)
+        except InputError:  # the frames absorb the drift, or there are too few stars
             continue
-    before = found.pop(model.frames, np.inf)
-    if not found or before < GAIN * min(found.values()):
+    before = scatters.pop(model.frames, np.inf)
+    if not scatters or before < GAIN * min(scatters.values()):
         return None
-    best = next(name for name, size in found.items() if size <= ALIKE * min(found.values()))
-    return FrameChoice(best, found[best], before, model.unit, model.frames)
+    best = next(name for name, size in scatters.items() if size <= ALIKE * min(scatters.values()))
+    return FrameChoice(best, scatters[best], before, model.unit, model.frames)
 
 
 def _scatter(matches: Matches, model: DistortionModel) -> float:
     """Median length of the residuals, corrected for the model's degrees of freedom.
 
-    The first fit weights all matches alike; in the next ones its scatter separates false ones.
+    The first fit rejects no matches; later ones reject them according to the previous scatter.
     """
     median = 1.0
     for _ in range(FITS):

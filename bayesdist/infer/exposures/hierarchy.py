@@ -1,19 +1,19 @@
-"""Joint fit of all exposures, with scale and shear of each scattered about the common polynomials.
+"""Joint fit of all exposures, with random deviations of scale and shear from exposure to exposure.
 
     deviation k of exposure e ~ N(0, tau_k^2)     k: scale, shear_plus, shear_cross, and with
                                                   `chip_deviations` shift, rotation, scale and shear
                                                   of every chip but the first
 
-A telescope breathes: the linear terms of its exposures scatter by more than their formal errors,
-and a joint fit that ignores this takes each star as if it were a new measurement of the detector.
-The scatter tau is estimated with everything else.
+Because of the breathing of a telescope, the linear terms of its exposures scatter by more than
+their formal errors.  A joint fit that ignores this treats every star as an independent measurement
+of the detector.  The scatter tau is estimated together with all other parameters.
 
-How the distance between chips changes with scale and shear is left open: it is no ruler, as it may
-drift by itself, and no measurement of its own (see `CAUTION`); the positions of the chips are
-computed afterwards (see `Settling`).
+The gap between chips may change together with scale and shear, or drift independently.  It is
+therefore used neither as a ruler nor as an independent measurement (see `CAUTION`).  The positions
+of the chips are computed afterwards (see `Settling`).
 
-One linear fit with a wide prior on the deviations is enough.  Its normal equations give the
-likelihood of the deviations; tau, and all parameters given tau, then follow by algebra (see
+One linear fit with a wide prior on the deviations is sufficient.  Its normal equations give the
+likelihood of the deviations; tau, and all parameters conditional on tau, follow algebraically (see
 `Scatter`).
 """
 
@@ -43,41 +43,40 @@ from bayesdist.utils.arrays import Bool, Float, Int
 from bayesdist.utils.distributions import f_sf
 from bayesdist.utils.quantities import Random, generator_of
 
-SCALE = 1e-4  # of the prior on tau: variation of the scale by velocity aberration in a year
-# A focal plane that breathes moves its chips too: then the gap's deviations repeat those of scale
-# and shear, and taken as independent they would halve the error of a drift.  At four times their
-# scatter they reduce it by 3 %.
+SCALE = 1e-4  # scale of the prior on tau: annual change of the scale by velocity aberration
+# Breathing also moves the chips of a focal plane. In that case the deviations of the gap repeat
+# those of scale and shear, and treating them as independent would halve the error of a drift.
+# Multiplying their scatter by four limits the reduction to 3 %.
 CAUTION = 4.0
-MOST_OUTLYING = 0.2  # fraction of the exposures beyond which they are the rule
-# smallest sum over E deviations of a kind of the parts that the data determine
+MOST_OUTLYING = 0.2  # with a larger fraction, exposures are not treated as outlying
+# smallest sum, over the E deviations of a kind, of the fraction determined by the data
 LEAST_DETERMINED = 0.5
-FEWEST_FREE = 3  # degrees of freedom left by the lines
+FEWEST_FREE = 3  # smallest number of degrees of freedom for a test of trends
 
 
 @dataclass(frozen=True, eq=False)
 class HierarchicalFit(Solution):
-    """A joint solution of all exposures in which scale and shear of each may deviate.
+    """Joint solution of all exposures, with random deviations of scale and shear per exposure.
 
-    Draws and mean are over the posterior of tau.  So is the covariance, but for one simplification:
-    its part within one tau is computed at the root mean square of tau.  Variances are linear in
-    tau^2 where the scatter dominates, and more concave elsewhere, so that this errs to the safe
-    side.
+    Draws, mean and covariance are marginalised over the scatter tau, with one approximation: the
+    conditional covariance for given tau is computed at the root mean square of tau.  Since
+    variances are linear in tau^2 or concave, this overestimates rather than underestimates them.
 
     Parameters
     ----------
     fit : LinearFit
-        The linear fit with tau fixed at its root mean square.
+        Linear fit with tau fixed to its root mean square.
     scatter : Scatter
         Likelihood of the deviations and prior of tau.
     tau_draws : ndarray, shape (n, k)
-        Draws of tau from its posterior.
+        Draws from the posterior of tau for k kinds of deviation.
     others : GaussianPriors
-        The priors that were given.
+        Priors on other parameters, as given to `fit_hierarchical`.
     settling : Settling
-        Transformation, made in `fit` too, of the shifts of single chips.
+        Transformation of the constants and shifts of single chips, which is also applied to `fit`.
     outlying : tuple of str
-        Exposures whose deviations are far beyond the scatter of the others.  They are fitted with a
-        wide prior, and do not enter tau.
+        Names of the exposures with deviations far beyond the scatter of the others. They are fitted
+        with a wide prior and do not contribute to tau.
     """
 
     fit: LinearFit
@@ -99,35 +98,45 @@ class HierarchicalFit(Solution):
 
     @property
     def likelihood(self) -> ClippedGaussian:
-        """Normal errors of the stars in the second pass, at the mean."""
+        """Gaussian likelihood, at the mean, of the stars used in the second pass."""
         return ClippedGaussian(self.mean, self.fit.clip)
 
     def uses(self, matches: Matches) -> Bool:
-        """Boolean mask (N,) of a table's stars that were used."""
+        """Boolean mask (N,) that is True for the stars that pass the rejection limits."""
         return self.fit.uses(matches)
 
     @property
     def tau(self) -> dict[str, float]:
-        """Posterior median of the scatter of each kind of deviation."""
+        """Posterior median of tau by kind of deviation, in the unit of the parameter."""
         median = np.median(self.tau_draws, axis=0)
         return dict(zip(self.scatter.kinds, map(float, median), strict=True))
 
     def tau_interval(self, probability: float = 0.68) -> dict[str, tuple[float, float]]:
-        """Central posterior interval of each tau."""
+        """Central credible interval of tau by kind of deviation.
+
+        Parameters
+        ----------
+        probability : float
+            Posterior probability of the interval, between 0 and 1.
+
+        Returns
+        -------
+        dict of str to (float, float)
+        """
         tail = (1 - probability) / 2
         ends = np.quantile(self.tau_draws, [tail, 1 - tail], axis=0).T
         return {k: (float(a), float(b)) for k, (a, b) in zip(self.scatter.kinds, ends, strict=True)}
 
     @property
     def priors(self) -> GaussianPriors:
-        """Given priors and those of the deviations, as arguments for `sample`."""
+        """Priors on the deviations and on other parameters, to be passed to `sample`."""
         return _with_deviations(
             self.others, self.index, self.scatter.prior(_root_mean_square(self.tau_draws))
         )
 
     @cached_property
     def _means(self) -> Float:
-        """Mean of theta for each draw of tau, shape (n, D)."""
+        """Conditional mean of theta for each draw of tau, shape (n, D)."""
         return self.settling.mean(
             np.stack([self.scatter.posterior(tau)[0] for tau in self.tau_draws])
         )
@@ -145,16 +154,16 @@ class HierarchicalFit(Solution):
 
     @one_thread
     def draws(self, n: int, rng: Random) -> Float:
-        """Parameter vectors (n, D), each drawn given a tau of its own."""
+        """Draws of theta, each conditional on a draw of tau; see `Solution.draws`."""
         generator = generator_of(rng)
-        which = np.sort(generator.integers(len(self.tau_draws), size=n))
+        tau_rows = np.sort(generator.integers(len(self.tau_draws), size=n))
         theta = generator.standard_normal((n, len(self.fit.mean)))
-        for t in np.unique(which):
-            rows = which == t
+        for t in np.unique(tau_rows):
+            rows = tau_rows == t
             mean, factor = self.scatter.posterior(self.tau_draws[t])
             theta[rows] = mean + factor.colour(theta[rows])
         return np.asarray(
-            generator.permutation(self.settling.draws(theta, self.tau_draws[which], generator))
+            generator.permutation(self.settling.draws(theta, self.tau_draws[tau_rows], generator))
         )
 
 
@@ -169,17 +178,19 @@ def _with_deviations(others: GaussianPriors, index: Int, inverse_variance: Float
 
 
 def held_in_reference(matches: Matches, model: DistortionModel, chip: int = 2) -> DistortionModel:
-    """Model in gauge 'held', with polynomials along the reference chip's axes.
+    """Convert a model to gauge 'held', with u, v along the axes of the reference chip.
 
-    The first exposure's stars on that chip are fitted alone; position and rotation of its reference
-    pixel fix the first exposure.  Frames then rotate about the reference pixel, and scale, shear
-    and drift are those of the detector, whatever the roll angles are.
+    The stars of the first exposure on that chip are fitted by themselves.  The position and the
+    rotation at the chip's reference pixel define the frame of the first exposure.  Frames then
+    rotate about the reference pixel, and scale, shear and drift refer to the detector, independent
+    of the roll angles.
 
     Parameters
     ----------
     matches : Matches
+        Stars with errors.
     model : DistortionModel
-        Of all exposures; its gauge is replaced.
+        Model of all exposures; its gauge is replaced.
     chip : int
         Number of the reference chip.
 
@@ -190,7 +201,7 @@ def held_in_reference(matches: Matches, model: DistortionModel, chip: int = 2) -
     Raises
     ------
     DegenerateError
-        When the first exposure has too few stars on that chip.
+        If the first exposure has too few stars on the reference chip.
     """
     first = model.exposures[0]
     number = model.chips[model.chip_code(chip)].number
@@ -224,29 +235,29 @@ def fit_hierarchical(
     seed: int = 1,
     rejection: Rejection = DEFAULT_REJECTION,
 ) -> HierarchicalFit:
-    """Fit all exposures jointly, with the scatter of their scale and shear.
+    """Fit all exposures jointly, with random deviations of their scale and shear.
 
     Parameters
     ----------
     matches : Matches or Shards
-        With errors.
+        Stars with errors.
     model : DistortionModel
-        Frames 'shift_rotation_scale' or 'affine', or deviations of single chips, in gauge 'held':
-        see `held_in_reference`.
+        Model with frames 'shift_rotation_scale' or 'affine', or with deviations of single chips, in
+        gauge 'held'; see `held_in_reference`.
     priors : GaussianPriors, optional
-        On other parameters.
+        Priors on other parameters; flat by default.
     scale : float
-        Of the half-Student-t prior on each tau, with 4 degrees of freedom.  It is flat for scatter
-        much below, and makes the posterior proper with few exposures.  For shifts of single chips
-        it counts at half the longest side of a chip.
+        Scale of the half-Student-t prior (4 degrees of freedom) on each tau. The prior is nearly
+        flat for a much smaller scatter, and makes the posterior proper if there are few exposures.
+        For shifts of single chips, it is multiplied by half the longest side of a chip.
     pixel : float
         Size of a pixel in the unit of u, v.
     n_tau : int
-        Draws of tau over which results are averaged.
+        Number of draws of tau over which results are averaged.
     seed : int
-        Of these draws.
+        Seed of these draws.
     rejection : Rejection
-        As of `fit_linear`.
+        Rejection limits and weights; see `fit_linear`.
 
     Returns
     -------
@@ -255,18 +266,19 @@ def fit_hierarchical(
     Raises
     ------
     InputError
-        For a model without such frames, or another gauge.
+        If the model has no such frames, or another gauge.
     DegenerateError
-        When the data do not determine the scatter, by name; else as `fit_linear`.
+        If the data do not determine a scatter (the message names it) or the model (see
+        `fit_linear`).
     """
     kinds = model.free_frame_names(0) if model.gauge == "held" else ()
     if not kinds:
         raise InputError(
-            f"frames '{model.frames}' in gauge '{model.gauge}' leave nothing that scatters",
+            f"frames '{model.frames}' in gauge '{model.gauge}' have no deviations to estimate",
             where="model.frames",
             do="choose 'shift_rotation_scale' or 'affine' in gauge 'held' (held_in_reference)",
         )
-    others = priors or GaussianPriors.none(model)
+    other_priors = priors or GaussianPriors.none(model)
     names = {name: k for k, name in enumerate(model.names)}
     index = np.array([names[f"{e}.{kind}"] for kind in kinds for e in model.exposures])
     n = len(model.exposures)
@@ -275,7 +287,7 @@ def fit_hierarchical(
     of_gap = np.array(["shift" in name for name in kinds])
     scales = scale * np.where(of_gap, half * pixel, 1.0)
     with opened(model, matches) as shards:
-        wide = _with_deviations(others, index, scales[kind] ** -2)
+        wide = _with_deviations(other_priors, index, scales[kind] ** -2)
         first = fit_linear(shards, model, rejection=rejection, priors=wide)
         equations = shards.sum(least_squares, first.mean, first.clip)
         matrix, right = equations.assemble(model, first.mean)
@@ -283,8 +295,8 @@ def fit_hierarchical(
             kinds,
             kind,
             index,
-            matrix + others.matrix(model),
-            right + others.pull(first.mean),
+            matrix + other_priors.matrix(model),
+            right + other_priors.pull(first.mean),
             first.mean,
             scales,
             np.zeros(len(index), bool),
@@ -295,43 +307,43 @@ def fit_hierarchical(
         scatter = scatter.loosened(outlying[member])
         tau_draws = scatter.draws(n_tau, np.random.default_rng(seed))
         precision = scatter.prior(_root_mean_square(tau_draws))
-        known = _with_deviations(others, index, precision)
-        fit = fit_linear(shards, model, rejection=rejection, priors=known)
-        settling = Settling.of(model, kinds, equations.groups, others.precision > 0, outlying)
+        final_priors = _with_deviations(other_priors, index, precision)
+        fit = fit_linear(shards, model, rejection=rejection, priors=final_priors)
+        settling = Settling.of(model, kinds, equations.groups, other_priors.precision > 0, outlying)
     fit = replace(
         fit,
         mean=settling.mean(fit.mean),
         cov=settling.covariance(fit.cov, _root_mean_square(tau_draws)),
     )
     names_of = tuple(model.exposures[e] for e in np.flatnonzero(outlying))
-    return HierarchicalFit(fit, scatter, tau_draws, others, settling, names_of)
+    return HierarchicalFit(fit, scatter, tau_draws, other_priors, settling, names_of)
 
 
 def _outlying(scatter: Scatter, member: Int) -> Bool:
-    """Boolean mask (E,) of exposures that went wrong, removed one by one, the worst first.
+    """Boolean mask (E,) of outlying exposures.
 
-    Tau is that of the remaining ones.  None are named where they are more than a fifth: then they
-    are the rule.
+    The most deviant exposure is removed, tau is estimated from the remaining ones, and so on.  If
+    more than a fifth of the exposures were outlying, none is marked.
     """
     n = int(member.max()) + 1
-    found = np.zeros(n, bool)
-    while found.sum() <= MOST_OUTLYING * n:
-        some = scatter.loosened(found[member])
-        odds = some.odds(np.exp(some.mode()), member)
-        odds[found] = -np.inf
+    outlying = np.zeros(n, bool)
+    while outlying.sum() <= MOST_OUTLYING * n:
+        remaining = scatter.loosened(outlying[member])
+        odds = remaining.odds(np.exp(remaining.mode()), member)
+        odds[outlying] = -np.inf
         worst = int(np.argmax(odds))
         if odds[worst] <= 0:
-            return found
-        found[worst] = True
+            return outlying
+        outlying[worst] = True
     return np.zeros(n, bool)
 
 
 def _require_determined(scatter: Scatter, model: DistortionModel) -> None:
-    """Raise DegenerateError where data hardly constrain a kind of deviation more than its prior."""
+    """Raise DegenerateError if the data hardly constrain a kind of deviation beyond its prior."""
     _, factor = scatter.posterior(scatter.scale / scatter.caution)
-    # part of each deviation that is known from the data rather than from the prior
-    known = 1 - factor.variances()[scatter.index] / scatter.scale[scatter.kind] ** 2
-    determined = np.bincount(scatter.kind, known)
+    # fraction of the information on each deviation that comes from the data rather than the prior
+    from_data = 1 - factor.variances()[scatter.index] / scatter.scale[scatter.kind] ** 2
+    determined = np.bincount(scatter.kind, from_data)
     if (determined < LEAST_DETERMINED).any():
         worst = scatter.kinds[int(np.argmin(determined))]
         n = len(scatter.kind) // len(scatter.kinds)
@@ -344,18 +356,32 @@ def _require_determined(scatter: Scatter, model: DistortionModel) -> None:
             + (
                 "drop the drift (model.tdd)"
                 if drifts
-                else "calibrate matched stars ([data] in place of [campaign], model.frames = "
+                else "calibrate matched stars ([data] instead of [campaign], model.frames = "
                 "'shift_rotation_scale')"
             ),
         )
 
 
 def trend_p_values(values: Float, epoch: Float, breaks: ArrayLike = ()) -> Float:
-    """Probability (k,) of lines in time as steep by chance, for each kind of deviation (E, k).
+    """F-test for linear trends of the deviations with time.
 
-    An F test of a line in each segment against a constant.  Its noise is the scatter of the
-    exposures about the lines, which has all noise of the deviations.  `breaks` are the dates at
-    which segments begin; 1 where there are too few exposures.
+    A line in each time segment is compared with a constant in each segment.  The noise is estimated
+    from the scatter of the exposures about the lines, which includes all noise of the deviations.
+
+    Parameters
+    ----------
+    values : ndarray, shape (E, k)
+        Deviations of E exposures, of k kinds.
+    epoch : ndarray, shape (E,)
+        Dates of the exposures in decimal years.
+    breaks : array_like
+        Dates at which the second and later segments begin.
+
+    Returns
+    -------
+    ndarray, shape (k,)
+        Chance probability of a trend at least as large, for each kind; 1 if there are too few
+        exposures.
     """
     segment = np.searchsorted(np.asarray(breaks, float), epoch, side="right")
     constant = (segment[:, None] == np.unique(segment)).astype(float)
@@ -369,7 +395,9 @@ def trend_p_values(values: Float, epoch: Float, breaks: ArrayLike = ()) -> Float
         values - design @ np.linalg.lstsq(design, values, rcond=None)[0]
         for design in (constant, np.column_stack([constant, lines]))
     )
-    left = (bent**2).sum(axis=0)
-    gain = np.maximum((flat**2).sum(axis=0) - left, 0.0)
-    ratio = np.divide(gain / lines.shape[1], left / free, out=np.zeros_like(gain), where=left > 0)
+    residual = (bent**2).sum(axis=0)
+    gain = np.maximum((flat**2).sum(axis=0) - residual, 0.0)
+    ratio = np.divide(
+        gain / lines.shape[1], residual / free, out=np.zeros_like(gain), where=residual > 0
+    )
     return np.asarray(f_sf(ratio, lines.shape[1], free))

@@ -1,8 +1,8 @@
-"""Drift of one solution in another, as for a filter with few exposures.
+"""Use of the drift of one solution in another, for example for a filter with few exposures.
 
-ACS ISR 2015-06, section 4.4.4: the time dependence is derived in one filter and applied to all.
-Rates and steps are compared in the reference gauge, so that the orientations of the two catalogues
-and first exposures do not matter.
+In ACS ISR 2015-06, section 4.4.4, the time dependence is derived in one filter and applied to all.
+Rates and steps are transformed to the reference gauge, so that the orientations of the catalogues
+and of the first exposures do not matter.
 """
 
 from __future__ import annotations
@@ -23,18 +23,18 @@ from bayesdist.utils.quantities import Random, generator_of
 
 @dataclass(frozen=True, eq=False)
 class SharedDrift(DerivedSolution):
-    """A solution, without frames, whose drift is that of another one."""
+    """Solution without frames that has the drift of another solution."""
 
     model: DistortionModel
     mean: Float
     cov: Float
-    source: Solution  # the original solution, without frames
-    reference: Solution  # solution that gives the drift
-    gain: Float  # change of the polynomials with the drift (n_polynomial, n_tdd)
-    matrix: Float  # from the reference in its gauge to this drift (n_tdd, D')
+    source: Solution  # original solution, without frames
+    reference: Solution  # solution that provides the drift, in its reference gauge
+    gain: Float  # derivative (n_polynomial, n_tdd) of the polynomials with respect to the drift
+    matrix: Float  # matrix (n_tdd, D') from the parameters of `reference` to this drift
 
     def draws(self, n: int, rng: Random) -> Float:
-        """Parameter vectors (n, D): draws of the source with draws of the reference's drift."""
+        """Draws of the source with the drift replaced by draws of the reference's drift."""
         generator = generator_of(rng)
         theta = np.array(self.source.draws(n, generator), float)
         drift = np.asarray(self.reference.draws(n, generator), float) @ self.matrix.T
@@ -47,34 +47,52 @@ class SharedDrift(DerivedSolution):
 def with_drift_of(
     solution: Solution, reference: Solution, *, chip: int = 2, formal: Solution | None = None
 ) -> SharedDrift:
-    """Solution with the drift of another one, and the polynomials that follow from it; no frames.
+    """Replace the drift of a solution by that of a reference, and adapt its polynomials.
 
-    Its own data, or priors, must determine all of its drift.  `chip` is the number of the reference
-    chip.  The covariance of `formal` gives the change of the polynomials with the drift: the linear
-    fit of a posterior, as that of a few thousand draws is noisy; the solution's own by default.
+    The polynomials are those of the Gaussian posterior, conditional on the drift of the reference.
+    They do not depend on the drift that the solution had, whether from data or from a prior; the
+    information of its data about the drift is not used.
 
-    The polynomials follow as under a Gaussian posterior: given the drift they do not depend on what
-    the solution took its drift to be, neither from its data nor from a prior.  The information of
-    its data about the drift is not used.
+    Parameters
+    ----------
+    solution : Solution
+        Solution with drift. Its data or priors must determine all drift terms.
+    reference : Solution
+        Solution that provides the drift.
+    chip : int
+        Number of the reference chip.
+    formal : Solution, optional
+        Solution with the covariance from which the dependence of the polynomials on the drift is
+        computed, such as the linear fit of a posterior, since a covariance from a few thousand
+        draws is noisy. By default `solution`.
 
-    InputError for solutions with other chips, units or reference dates, or without drift;
-    DegenerateError when the covariance of the solution's drift is singular.
+    Returns
+    -------
+    SharedDrift
+        Solution without frames.
+
+    Raises
+    ------
+    InputError
+        If the solutions have different chips, units or reference dates, or one has no drift.
+    DegenerateError
+        If the covariance of the solution's drift is singular.
     """
-    own = without_frames(solution)
-    model = own.model
+    bare = without_frames(solution)
+    model = bare.model
     gauge = reference_gauge(solution, chip).gauge
-    there, matrix = _in_gauge(reference, model, chip, gauge.rotation)
+    view, matrix = _in_gauge(reference, model, chip, gauge.rotation)
     k = model.n_polynomial
-    cov = np.asarray(own.cov, float)
+    cov = np.asarray(bare.cov, float)
     if not (np.diag(cov)[k:] > 0).all():
         raise DegenerateError(
             "the solution's drift has no error", where="model.tdd", do="fit it, or give it a prior"
         )
     exact = cov if formal is None else np.asarray(without_frames(formal).cov, float)
     gain = exact[:k, k:] @ scaled_inverse(exact[k:, k:])
-    drift = matrix @ np.asarray(there.mean, float)
-    spread = matrix @ np.asarray(there.cov, float) @ matrix.T
-    mean = np.array(own.mean, float)
+    drift = matrix @ np.asarray(view.mean, float)
+    spread = matrix @ np.asarray(view.cov, float) @ matrix.T
+    mean = np.array(bare.mean, float)
     mean[:k] += gain @ (drift - mean[k:])
     mean[k:] = drift
     total = np.empty_like(cov)
@@ -83,7 +101,7 @@ def with_drift_of(
     total[:k, k:] = gain @ spread
     total[k:, :k] = total[:k, k:].T
     total[k:, k:] = spread
-    return SharedDrift(model, mean, (total + total.T) / 2, own, there, gain, matrix)
+    return SharedDrift(model, mean, (total + total.T) / 2, bare, view, gain, matrix)
 
 
 def drift_priors(
@@ -91,18 +109,20 @@ def drift_priors(
 ) -> dict[str, tuple[float, float]]:
     """Independent priors (mean, sigma) on a model's rates and steps, by name, from a reference.
 
-    The model's polynomials lie along the reference chip's axes, as `held_in_reference` lays them.
-    InputError for solutions with other chips, units or reference dates, or without drift.
+    The polynomials of the model must be along the axes of the reference chip, as in
+    `held_in_reference`.  A remaining rotation of about 1e-5, due to the error of the first
+    exposure, changes a rate by only 1e-5 of another rate.
 
-    The reference's covariance S has strong correlations: chips drift together.  Independent priors
-    of variances k diag(S), with k the largest eigenvalue of the correlation matrix, are nowhere
-    tighter than S: k diag(S) - S has no negative eigenvalue.  All that follows from them has an
-    error that is too large rather than too small.  A rotation of the model against the reference
-    chip by some 1e-5, as the first exposure's error leaves it, changes a rate by 1e-5 of another.
+    The covariance S of the reference's drift has strong correlations, because chips drift together.
+    The independent priors have the variances k diag(S), with k the largest eigenvalue of the
+    correlation matrix.  They are not tighter than S in any direction (k diag(S) - S is positive
+    semidefinite), so that errors derived from them are too large rather than too small.
+
+    Raises InputError if the models have different chips, units or reference dates, or no drift.
     """
-    there, matrix = _in_gauge(reference, model, chip, 0.0)
-    mean = matrix @ np.asarray(there.mean, float)
-    cov = matrix @ np.asarray(there.cov, float) @ matrix.T
+    view, matrix = _in_gauge(reference, model, chip, 0.0)
+    mean = matrix @ np.asarray(view.mean, float)
+    cov = matrix @ np.asarray(view.cov, float) @ matrix.T
     correlation, sigma = unit_diagonal(cov)
     largest = float(np.linalg.eigvalsh(correlation)[-1])
     names = model.names[model.n_polynomial : model.n_distortion]
@@ -113,13 +133,13 @@ def drift_priors(
 def _in_gauge(
     reference: Solution, model: DistortionModel, chip: int, rotation: float
 ) -> tuple[Solution, Float]:
-    """Reference in its gauge, and the matrix (n_tdd, D') from there to the drift of a model.
+    """Reference in its gauge, and the matrix (n_tdd, D') from its parameters to a model's drift.
 
-    `rotation` brings the model to the gauge.
+    `rotation` (radians) is that of the transformation from the model to the gauge.
     """
     _require_alike(reference.model, model)
     view = reference_gauge(reference, chip)
-    # back by the rotation; drifts that this makes in terms that the model lacks are left out
+    # rotate back; drifts of terms that do not drift in the model are dropped
     linear = turned(view.model, np.eye(view.model.n_params), np.exp(-1j * rotation), 0.0).T
     names = turned_model(view.model).names
     wanted = model.names[model.n_polynomial : model.n_distortion]
@@ -127,33 +147,33 @@ def _in_gauge(
 
 
 def _require_alike(reference: DistortionModel, model: DistortionModel) -> None:
-    """Raise InputError for drifts of models with different chips, units, terms or dates."""
-    where = "model.tdd"
+    """Raise InputError if the models differ in chips, units, drifting terms or dates."""
+    location = "model.tdd"
     if reference.time is None or model.time is None:
         raise InputError(
             "the reference solution does not drift"
             if reference.time is None
             else "the model does not drift",
-            where=where,
+            where=location,
             do="give both the same [model.tdd]",
         )
     missing = [term for term in model.time.terms if term not in reference.time.terms]
     if missing:
         raise InputError(
             f"the term {missing[0]} does not drift in the reference solution",
-            where=f"{where}.terms",
+            where=f"{location}.terms",
             do="configure both alike",
         )
-    for what, mine, theirs in (
+    for attribute, mine, theirs in (
         ("chips", model.chips, reference.chips),
         ("units", model.unit, reference.unit),
         ("reference dates", model.time.epoch0, reference.time.epoch0),
         ("breaks", model.time.breaks, reference.time.breaks),
     ):
         if mine != theirs:
-            said = "" if what == "chips" else f": {mine} and, in the reference, {theirs}"
+            details = "" if attribute == "chips" else f": {mine} and, in the reference, {theirs}"
             raise InputError(
-                f"the {what} are not those of the reference solution{said}",
-                where=where,
+                f"the {attribute} are not those of the reference solution{details}",
+                where=location,
                 do="configure both alike",
             )

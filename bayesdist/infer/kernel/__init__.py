@@ -1,8 +1,8 @@
-"""Compiled passes over the stars: the only package that uses numba.
+"""Compiled loops (passes) over the stars; the only package that uses numba.
 
 Polynomials are evaluated on the fly by Horner's rule from the effective coefficients, so that no
-design matrix is read from memory.  Sums are taken over fixed chunks of the data and therefore do
-not depend on the number of threads.
+design matrix is stored.  Sums are accumulated over fixed chunks of the data and therefore do not
+depend on the number of threads.
 """
 
 from bayesdist.infer.kernel.cache import kept_by_content

@@ -1,7 +1,8 @@
-"""Chunks into which the stars are cut, and the threads that share them.
+"""Division of the stars into chunks, and the threads that process them.
 
-Threads are Python's.  numba's own compile each pass several times over, and do not survive a fork.
-Even to ask numba for their number starts them, and fixes how the process starts others.
+Python threads are used instead of those of numba.  The latter require several compilations of each
+pass and do not survive a fork.  Merely asking numba for their number would start them and fix the
+start method of further processes.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ from bayesdist.infer.kernel.lanes import FAST, INNER, copy
 from bayesdist.infer.kernel.vectors import whole_vectors
 from bayesdist.utils.arrays import Float, Int
 
-# how a pass is compiled: without a check for division by zero, which would exclude vectors
+# options of compiled passes; a check for division by zero would prevent vectorisation
 PASS: dict[str, Any] = {
     "cache": True,
     "no_cfunc_wrapper": True,
@@ -32,16 +33,26 @@ PASS: dict[str, Any] = {
     "error_model": "numpy",
 }
 
-BLOCK = 256  # stars whose scratch arrays stay in the first-level cache
-THREADS_PAY = 200_000  # evaluations of a star below which one thread is faster
+BLOCK = 256  # stars per block, so that the scratch arrays fit the first-level cache
+THREADS_PAY = 200_000  # with fewer evaluations (stars times draws), one thread is faster
 _threads: ContextVar[int] = ContextVar("threads", default=nb.config.NUMBA_NUM_THREADS)
-PARTS = 4  # of the work, for each thread: some are done sooner than others
+PARTS = 4  # tasks per thread, to balance the load
 
 
 def pieces_of(starts: Int, size: int) -> Int:
-    """Pieces (n, 3) of (group, first star, end), none larger than `size` or across two groups.
+    """Divide the stars into pieces of at most `size` stars, each within one group.
 
-    `starts` (G + 1,) are the first stars of the groups.
+    Parameters
+    ----------
+    starts : ndarray of int, shape (G + 1,)
+        Index of the first star of each group, and the total number.
+    size : int
+        Maximum number of stars per piece.
+
+    Returns
+    -------
+    ndarray of int, shape (n, 3)
+        Group, first star, and end of each piece.
     """
     first = [np.arange(a, b, size) for a, b in pairwise(starts)]
     group = np.repeat(np.arange(len(first)), [len(f) for f in first])
@@ -51,7 +62,7 @@ def pieces_of(starts: Int, size: int) -> Int:
 
 
 def aligned(*shape: int) -> Float:
-    """Zeros that begin where a vector does not cross lines of the cache."""
+    """Array of zeros that is aligned to the cache lines."""
     size = math.prod(shape)
     room = np.zeros(size + 8)
     first = -(room.ctypes.data // 8) % 8
@@ -59,18 +70,18 @@ def aligned(*shape: int) -> Float:
 
 
 def scratch(n: int) -> Float:
-    """Zeros (n, BLOCK), aligned."""
+    """Aligned zeros (n, BLOCK): n scratch rows for the stars of a block."""
     return aligned(n, BLOCK)
 
 
 def star_room() -> tuple[Float, Float]:
-    """Room for the stars of a block, and for a model of them."""
+    """Scratch rows for the columns of a block of stars (6), and for the model positions (2)."""
     return scratch(6), scratch(2)
 
 
 @nb.njit(**INNER)
 def put_ones(rows, n):
-    """Write ones to rows of `scratch` behind the first n stars."""
+    """Fill the rows of a scratch array with ones after the first n stars."""
     whole_vectors()
     for k in range(len(rows)):
         for s in range(n, BLOCK):
@@ -79,7 +90,7 @@ def put_ones(rows, n):
 
 @nb.njit(**INNER)
 def lay_out(columns, first, end, rows):
-    """Copy X, Y, u, v, var_u, var_v of some stars to rows of `scratch`, and ones behind them."""
+    """Copy X, Y, u, v, var_u, var_v of the stars first..end to scratch rows, followed by ones."""
     whole_vectors()
     n = end - first
     copy(columns[0], first, n, rows, 0)
@@ -97,9 +108,9 @@ def share_out(
     *arguments: Any,
     room: Callable[[], tuple[Float, ...]] = tuple,
 ) -> None:
-    """Run loop(first, end, *arguments) over range(n), in parts if there are several threads.
+    """Run loop(first, end, *arguments) over range(n), in parallel if there are several threads.
 
-    Each part has its own `room`, arrays to write to, which come before the other arguments.
+    Each task calls `room` for its scratch arrays, which are passed before the other arguments.
     """
     threads = min(get_threads(), n)
     if threads < 2:
@@ -114,7 +125,7 @@ def share_out(
 
 @cache
 def _pool(threads: int) -> ThreadPoolExecutor:
-    """Threads that wait for passes: to start them takes longer than a pass over few stars."""
+    """Thread pool, kept alive because starting threads takes longer than a pass over few stars."""
     return ThreadPoolExecutor(threads)
 
 
@@ -123,7 +134,7 @@ if hasattr(os, "register_at_fork"):  # not on Windows
 
 
 def in_turn(function: Callable[..., Any], *arguments: Iterable[Any]) -> Iterator[Any]:
-    """Results of a function that is called as by `map`, on all threads at a time."""
+    """Like `map`, but runs the calls in parallel threads; results are in the order of the input."""
     threads = get_threads()
     if threads < 2:
         yield from map(function, *arguments)
@@ -133,13 +144,13 @@ def in_turn(function: Callable[..., Any], *arguments: Iterable[Any]) -> Iterator
 
 
 def at_once(function: Callable[..., Any], *arguments: Iterable[Any]) -> list[Any]:
-    """Results as of `in_turn`, all together."""
+    """Like `in_turn`, but returns a list."""
     return list(in_turn(function, *arguments))
 
 
 @contextmanager
 def threads_for(evaluations: float) -> Iterator[None]:
-    """Context with one thread where more would wait for each other longer than they work."""
+    """Context that uses a single thread if there is too little work for several."""
     token = _threads.set(get_threads() if evaluations > THREADS_PAY else 1)
     try:
         yield
@@ -148,10 +159,23 @@ def threads_for(evaluations: float) -> Iterator[None]:
 
 
 def get_threads() -> int:
-    """Number of threads that a pass may use: at first NUMBA_NUM_THREADS, or the processors."""
+    """Maximum number of threads of a pass.
+
+    The default is that of NUMBA_NUM_THREADS, or the number of processors.
+
+    Returns
+    -------
+    int
+    """
     return _threads.get()
 
 
 def set_threads(n: int) -> None:
-    """Use at most `n` threads from now on, in passes that the calling thread starts."""
+    """Set the maximum number of threads for passes started by the calling thread.
+
+    Parameters
+    ----------
+    n : int
+        Maximum number of threads, limited to the number of processors and NUMBA_NUM_THREADS.
+    """
     _threads.set(max(1, min(n, nb.config.NUMBA_NUM_THREADS, os.cpu_count() or 1)))

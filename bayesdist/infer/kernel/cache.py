@@ -1,7 +1,7 @@
-"""Cache folder of compiled code, by the content of all sources of the kernel.
+"""Cache folder for compiled code, named after a hash of all kernel sources.
 
-numba looks at the file of the function that it compiles, not at those of the functions that this
-one calls; after a change in one of them it would use the old code.
+To decide whether its cache is valid, numba checks only the file of the compiled function, not the
+files of functions that it calls.  After a change in one of those it would use outdated code.
 """
 
 from __future__ import annotations
@@ -25,10 +25,11 @@ _private: list[tempfile.TemporaryDirectory[str]] = []  # removed when the proces
 
 @contextmanager
 def kept_by_content() -> Iterator[None]:
-    """Context in which declared functions use a cache folder by the content of the sources.
+    """Context in which numba functions must be declared to use the cache folder of these sources.
 
-    It lies beside the sources, in the user's cache where these are read-only, or else is a folder
-    of this process alone, which compiles everything anew.  NUMBA_CACHE_DIR comes before them all.
+    The folder is next to the sources, or in the user's cache if these are read-only.  If neither is
+    writable, a temporary folder of this process is used, and everything is compiled again.
+    NUMBA_CACHE_DIR takes precedence.
     """
     before = config.CACHE_DIR
     config.CACHE_DIR = before or str(_folder())
@@ -39,32 +40,32 @@ def kept_by_content() -> Iterator[None]:
 
 
 def _folder() -> Path:
-    """The first folder that may be written into."""
-    here = Path(__file__).parent
+    """First cache folder that is writable."""
+    package = Path(__file__).parent
     digest = hashlib.sha256()
-    for source in sorted(here.glob("*.py")):
+    for source in sorted(package.glob("*.py")):
         digest.update(read_bytes(source))
     name = digest.hexdigest()[:16]
-    for folder in (here / "__pycache__", *_user_cache()):
+    for folder in (package / "__pycache__", *_user_cache()):
         if _is_writable(folder / name):
             return folder / name
     log.warning(
-        "compiled code cannot be kept: each command compiles it anew; set NUMBA_CACHE_DIR to a "
-        "folder of your own that can be written into"
+        "compiled code cannot be cached, so each command compiles it again; set NUMBA_CACHE_DIR to "
+        "a writable folder"
     )
-    # code of others must not be found there: no folder that has a known name
+    # a folder with a random name, so that no code of other users can be placed in it
     _private.append(tempfile.TemporaryDirectory(prefix="bayesdist-", ignore_cleanup_errors=True))
     return Path(_private[-1].name)
 
 
 def _user_cache() -> Iterator[Path]:
-    """Folder of what a user's programs may lose; none for a user without a home."""
+    """Yield the user's cache folder; nothing if the user has no home directory."""
     with suppress(RuntimeError):
         yield Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "bayesdist"
 
 
 def _is_writable(folder: Path) -> bool:
-    """Boolean: a folder is there, made if need be, and takes files."""
+    """True if files can be written to the folder, which is created if necessary."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=folder):

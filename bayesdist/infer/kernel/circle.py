@@ -1,19 +1,21 @@
-"""Probability that a Gaussian falls in a circle, with the derivatives that Newton steps need.
+"""Probability mass of a Gaussian within a circle, with its first and second derivatives.
 
-With a Gaussian of variances A, B about the origin and a circle of radius R about d, points on the
-circle are (x, y) = d + R (cos t, sin t), and q = (x^2/A + y^2/B) / 2.  The field that points away
-from the origin and has the Gaussian as its divergence turns the integral over the disc into one
-over its edge,
+The Gaussian has variances A, B and is centred on the origin; the circle has radius R and centre d.
+Points on the circle are (x, y) = d + R (cos t, sin t), and q = (x^2/A + y^2/B) / 2.  By the
+divergence theorem, applied to the radial field with the Gaussian as its divergence, the integral
+over the disc becomes an integral over the circle,
 
     Z = R / (4 pi sqrt(A B))  integral of E(q) (R + d_u cos t + d_v sin t) dt,
-    E(q) = (1 - e^-q) / q,
+    E(q) = (1 - e^-q) / q.
 
-and derivatives by d are integrals over the edge of the Gaussian and its derivatives; those by the
-variances follow from dZ/dA = (1/2) d^2Z/dd_u^2.  Integrands are periodic and entire, so that equal
-steps in t converge faster than any power: some thirty nodes are enough for a circle of four sigma.
+Derivatives with respect to d are integrals of the Gaussian and its derivatives over the circle.
+Those with respect to the variances follow from dZ/dA = (1/2) d^2Z/dd_u^2.  The integrands are
+periodic and entire, so that the trapezoidal rule converges faster than any power: about thirty
+nodes are enough for a circle of four sigma.
 
-Outside the circle the parts of E cancel except for an exponentially small rest.  There 1/q, whose
-integral is zero then, is left out, and the largest e^-q is taken out of the sum.
+If the origin is outside the circle, the two terms of E cancel up to an exponentially small
+remainder.  In that case the term 1/q, which integrates to zero, is omitted, and the largest e^-q
+is factored out of the sum.
 """
 
 from __future__ import annotations
@@ -28,12 +30,12 @@ from bayesdist.infer.kernel.numeric import exp_negative
 from bayesdist.infer.kernel.vectors import whole_vectors
 from bayesdist.utils.arrays import Float, Int
 
-SURE = 8.6**2  # squared errors from the edge within which the probability is 1 to the last digit
-# smallest resolved squared error over radius; steeper edges are blurred to it, which concerns stars
-# within a few such errors of their edge
+SURE = 8.6**2  # squared distance from the edge in sigma at which the probability is 1 in float64
+# smallest resolved variance over R^2; smaller variances are replaced by it, which affects only
+# stars within a few such errors of the edge
 STEEP = 512.0**-2
-CANCELLED = 1e3  # sum of moduli over the sum, above which the rest is computed separately
-EDGE = 0.02  # q below which E is a series
+CANCELLED = 1e3  # sum of absolute values over the sum, above which the term 1/q is omitted
+EDGE = 0.02  # for smaller q, E is computed from its series
 
 COUNTS = (
     *(12, 16, 20, 24, 28, 32, 36, 40, 44, 48, 56, 64, 72, 80, 96, 112, 128, 160, 192, 224),
@@ -43,7 +45,7 @@ MOST = COUNTS[-1]
 
 
 def _table() -> tuple[Int, Int, Float, Float]:
-    """Numbers of nodes, the first of each set of them, and their cosines and sines."""
+    """Node counts, the index of the first node of each set, and cosines and sines of all nodes."""
     angles = np.concatenate([2 * np.pi * np.arange(n) / n for n in COUNTS])
     begin = np.concatenate([[0], np.cumsum(COUNTS)[:-1]]).astype(np.int64)
     return np.array(COUNTS, np.int64), begin, np.cos(angles), np.sin(angles)
@@ -51,12 +53,12 @@ def _table() -> tuple[Int, Int, Float, Float]:
 
 NODES = _table()
 
-# All of it is inlined, for the reason given at `numeric.exp_negative`.
+# All functions are inlined, for the reason given at `numeric.exp_negative`.
 
 
 @nb.njit(cache=True, forceinline=True, fastmath=FAST)
 def inside(du, dv, A, B, R):
-    """True if all but less than the last digit of the Gaussian lies in the circle."""
+    """True if the probability outside the circle is below the float64 precision."""
     whole_vectors()
     d2 = du * du + dv * dv
     room = R - math.sqrt(d2)
@@ -89,7 +91,7 @@ def _total(values, n):
 
 @nb.njit(cache=True, forceinline=True, fastmath=FAST)
 def _flux(e, away):
-    """Contribution of a node to the sum: E(e) times the way out."""
+    """Contribution of a node to the sum: E(e) times the outward component `away`."""
     whole_vectors()
     series = 1.0 - e * (1.0 / 2 - e * (1.0 / 6 - e * (1.0 / 24 - e * (1.0 / 120 - e / 720))))
     safe = max(e, EDGE)
@@ -98,9 +100,9 @@ def _flux(e, away):
 
 @nb.njit(cache=True, forceinline=True, fastmath=FAST)
 def _log_from_within(du, dv, A, B, R, n, first, cosine, sine, work):
-    """Logarithm of the probability where the Gaussian's centre lies in the circle.
+    """Logarithm of the probability if the centre of the Gaussian is inside the circle.
 
-    No term is negative.
+    All terms are positive in this case.
     """
     whole_vectors()
     half_a, half_b = 0.5 / A, 0.5 / B
@@ -113,21 +115,21 @@ def _log_from_within(du, dv, A, B, R, n, first, cosine, sine, work):
 
 @nb.njit(cache=True, forceinline=True, fastmath=FAST)
 def _exponents(du, dv, A, B, R, n, first, cosine, sine, q):
-    """Write q at the nodes to `q`; the least of them."""
+    """Write q at the nodes to `q` and return the smallest value."""
     whole_vectors()
     half_a, half_b = 0.5 / A, 0.5 / B
-    least = math.inf
+    q_min = math.inf
     for k in range(n):
         x, y = du + R * cosine[first + k], dv + R * sine[first + k]
         q[k] = x * x * half_a + y * y * half_b
     for k in range(n):
-        least = min(least, q[k])
-    return least
+        q_min = min(q_min, q[k])
+    return q_min
 
 
 @nb.njit(cache=True, forceinline=True, fastmath=FAST)
 def _log_from_outside(du, dv, A, B, R, n, first, cosine, sine, q, least, work):
-    """Logarithm of the probability where the centre is not in the circle, from q at the nodes."""
+    """Logarithm of the probability if the centre is outside the circle, from q at the nodes."""
     whole_vectors()
     scale = R / (2.0 * n * math.sqrt(A * B))
     for k in range(n):
@@ -145,9 +147,9 @@ def _log_from_outside(du, dv, A, B, R, n, first, cosine, sine, q, least, work):
 
 @nb.njit(cache=True, forceinline=True, fastmath=FAST)
 def log_circle(du, dv, A, B, R, nodes, q, work):
-    """Logarithm of the probability that the Gaussian about the origin falls in the circle about d.
+    """Logarithm of the probability mass within the circle about d = (du, dv).
 
-    q and work have room for `MOST` numbers.
+    `q` and `work` are scratch arrays of at least `MOST` numbers.
     """
     whole_vectors()
     if inside(du, dv, A, B, R):
@@ -158,23 +160,23 @@ def log_circle(du, dv, A, B, R, nodes, q, work):
     n, first = counts[k], begin[k]
     if du * du + dv * dv <= R * R:
         return _log_from_within(du, dv, A, B, R, n, first, cosine, sine, work)
-    least = _exponents(du, dv, A, B, R, n, first, cosine, sine, q)
-    return _log_from_outside(du, dv, A, B, R, n, first, cosine, sine, q, least, work)
+    q_min = _exponents(du, dv, A, B, R, n, first, cosine, sine, q)
+    return _log_from_outside(du, dv, A, B, R, n, first, cosine, sine, q, q_min, work)
 
 
 @nb.njit(cache=True, forceinline=True, fastmath=FAST)
 def slopes(du, dv, A, B, R, nodes, q, work, out):
     """Write `log_circle` and its derivatives to out (10,).
 
-    The logarithm; its derivatives by u, v; uu, uv, vv; by a variance that is added on both axes; by
-    that and u, by that and v; and twice by that.
+    With t a variance added on both axes, the entries are the logarithm and its derivatives with
+    respect to u, v, uu, uv, vv, t, tu, tv, tt.
     """
     whole_vectors()
     for m in range(10):
         out[m] = 0.0
     if inside(du, dv, A, B, R):
         return
-    # 0 where the variance is at its limit and does not depend on the jitter
+    # 0 if the variance is replaced by its lower limit and does not depend on the jitter
     free_a, free_b = 1.0, 1.0
     if A < STEEP * R * R:
         A, free_a = STEEP * R * R, 0.0
@@ -183,19 +185,19 @@ def slopes(du, dv, A, B, R, nodes, q, work, out):
     counts, begin, cosine, sine = nodes
     k = nodes_for(du, dv, A, B, R, counts)
     n, first = counts[k], begin[k]
-    least = _exponents(du, dv, A, B, R, n, first, cosine, sine, q)
+    q_min = _exponents(du, dv, A, B, R, n, first, cosine, sine, q)
     if du * du + dv * dv <= R * R:
         log_z = _log_from_within(du, dv, A, B, R, n, first, cosine, sine, work)
     else:
-        log_z = _log_from_outside(du, dv, A, B, R, n, first, cosine, sine, q, least, work)
+        log_z = _log_from_outside(du, dv, A, B, R, n, first, cosine, sine, q, q_min, work)
     for k in range(n):
-        work[k] = exp_negative(least - q[k])
+        work[k] = exp_negative(q_min - q[k])
     ia, ib = 1.0 / A, 1.0 / B
     u = v = uu = uv = vv = t = tu = tv = tt = 0.0
     for k in range(n):
         c, s, g = cosine[first + k], sine[first + k], work[k]
         x, y = (du + R * c) * ia, (dv + R * s) * ib
-        w = 0.5 * (free_a * (x * x - ia) + free_b * (y * y - ib))  # of g, by the variance
+        w = 0.5 * (free_a * (x * x - ia) + free_b * (y * y - ib))  # d log(g) / dt
         gc, gs = g * c, g * s
         across = free_a * gc * x + free_b * gs * y
         u += gc
@@ -207,8 +209,8 @@ def slopes(du, dv, A, B, R, nodes, q, work, out):
         tu += w * gc
         tv += w * gs
         tt -= w * across - free_a * gc * x * ia - free_b * gs * y * ib
-    # of Z over Z; t and tt had their halves left out
-    scale = R / (n * math.sqrt(A * B)) * math.exp(-least - log_z)
+    # derivatives of Z, divided by Z; the factors 1/2 of t and tt were left out of the sums
+    scale = R / (n * math.sqrt(A * B)) * math.exp(-q_min - log_z)
     u, v, uu, uv, vv = scale * u, scale * v, scale * uu, scale * uv, scale * vv
     t, tu, tv, tt = 0.5 * scale * t, scale * tu, scale * tv, 0.5 * scale * tt
     out[0], out[1], out[2] = log_z, u, v

@@ -1,10 +1,9 @@
-"""Stars side by side in the vectors of the processor, as a number type of compiled loops.
+"""SIMD vectors as a number type for numba, to process several stars at a time.
 
-`Lanes` are as many doubles as one vector holds, or those of four vectors, and arithmetic works on
-them as on one number.  A loop over them is compiled as it is written: it does not depend on what
-the compiler finds out about arrays, and no second loop takes the stars that are left over, since
-scratch arrays have room for whole vectors (`blocks.scratch`).  Four vectors are what a chain of
-multiply-adds needs to keep the processor busy.
+`Lanes` hold the doubles of one SIMD vector, or of four, and support arithmetic like a single
+number.  Loops over them are vectorised as written and do not rely on the compiler's analysis of
+arrays.  There is no remainder loop, since scratch arrays are padded to whole vectors
+(`blocks.scratch`).  Four vectors are needed to hide the latency of a chain of multiply-adds.
 """
 
 from __future__ import annotations
@@ -21,24 +20,24 @@ from numba.core.errors import TypingError
 from numba.core.typing.templates import AbstractTemplate, infer_global
 from numba.extending import intrinsic, lower_builtin, models, register_model
 
-# sums of products may be fused; nothing that would change NaN or infinity
+# allows fused multiply-adds; excludes flags that would change NaN or infinity
 FAST = {"contract", "nsz", "arcp"}
 FLAGS = tuple(sorted(FAST))
-# how a function is compiled that only compiled ones call, which keep it as a part of theirs
+# options of functions that are called from compiled functions only
 INNER: dict[str, Any] = {"no_cpython_wrapper": True, "no_cfunc_wrapper": True}
 
 _FEATURES = get_host_cpu_features() if config.CPU_FEATURES is None else config.CPU_FEATURES
 HAS_512 = "+avx512f" in _FEATURES.split(",") and config.CPU_NAME is None
 WIDTH = 8 if HAS_512 else 4
 WIDE = 4 * WIDTH
-ROWS = 3  # of a tile
-AT_MOST = 6 if HAS_512 else 4  # columns of a tile, so that its sums stay in registers
+ROWS = 3  # rows of a tile of sums
+AT_MOST = 6 if HAS_512 else 4  # maximum number of columns of a tile, so that it fits in registers
 
 Build = Callable[[Any, Any, Any, Any], Any]  # (context, builder, signature, arguments)
 
 
 class Lanes(types.Type):
-    """Type of numbers side by side."""
+    """Numba type of `width` numbers in SIMD vectors."""
 
     def __init__(self, width: int, element: Any = types.float64) -> None:
         self.width, self.element = width, element
@@ -46,8 +45,8 @@ class Lanes(types.Type):
 
 
 def _vector(width: int, element: Any = types.float64) -> Any:
-    one = ir.DoubleType() if element == types.float64 else ir.IntType(64)
-    return ir.VectorType(one, width)
+    scalar = ir.DoubleType() if element == types.float64 else ir.IntType(64)
+    return ir.VectorType(scalar, width)
 
 
 @register_model(Lanes)
@@ -57,18 +56,18 @@ class _Model(models.PrimitiveModel):
 
 
 def _order(numbers: Sequence[int]) -> Any:
-    """Operand of a shuffle."""
+    """Constant index operand of a shuffle."""
     return ir.Constant(ir.VectorType(ir.IntType(32), len(numbers)), list(numbers))
 
 
 def _all_alike(builder: Any, value: Any, width: int) -> Any:
     vector = ir.Constant(ir.VectorType(value.type, width), ir.Undefined)
-    one = builder.insert_element(vector, value, cgutils.int32_t(0))
-    return builder.shuffle_vector(one, one, _order([0] * width))
+    inserted = builder.insert_element(vector, value, cgutils.int32_t(0))
+    return builder.shuffle_vector(inserted, inserted, _order([0] * width))
 
 
 def _as_lanes(builder: Any, signature: Any, values: Any) -> list[Any]:
-    """Operands, scalars among them in all lanes."""
+    """Operands as vectors; scalars are copied to all lanes."""
     width = signature.return_type.width
     return [
         value if isinstance(kind, Lanes) else _all_alike(builder, value, width)
@@ -76,7 +75,7 @@ def _as_lanes(builder: Any, signature: Any, values: Any) -> list[Any]:
     ]
 
 
-# -- operators: of lanes with lanes, and with a scalar on either side ------------------------------
+# -- operators between lanes, or between lanes and a scalar ----------------------------------------
 
 
 def _define(operation: Callable[..., Any], on_doubles: str, on_integers: str) -> None:
@@ -114,11 +113,10 @@ for _operation, _name in (
     _define(_operation, _name, _name)
 
 
-# -- to memory and back ----------------------------------------------------------------------------
+# -- loads and stores ------------------------------------------------------------------------------
 
 
-# Arrays are written to and read from without views of their rows, whose compilation takes longer
-# than that of all the rest.
+# Arrays are accessed without views of their rows, since these would dominate the compilation time.
 
 
 def _start(context: Any, builder: Any, kind: Any, array: Any) -> Any:
@@ -133,7 +131,7 @@ def _element(context: Any, builder: Any, kind: Any, array: Any, k: Any, index: A
 
 
 def _lanes_at(builder: Any, start: Any, index: Any, width: int) -> Any:
-    """Pointer to `width` doubles from an index on."""
+    """Pointer to `width` doubles starting at an index."""
     return builder.bitcast(builder.gep(start, [index]), _vector(width).as_pointer())
 
 
@@ -150,19 +148,19 @@ def _loading(width: int) -> Any:
 
 
 def _rows(array: Any, ndim: int = 2) -> Any:
-    """The type of an array of doubles, whose rows follow each other; TypingError for others."""
+    """Return the type of a C-contiguous float64 array; raise TypingError for any other type."""
     if not (array.layout == "C" and array.dtype == types.float64 and array.ndim == ndim):
         raise TypingError(f"{array} is not a C array of float64 with {ndim} dimensions")
     return array
 
 
-# lanes of row k of an array (rows, n), from an index on
+# load lanes from row k of an array (rows, n), starting at an index
 load, load_wide = _loading(WIDTH), _loading(WIDE)
 
 
 @intrinsic
 def put(typingctx: Any, array: Any, k: Any, index: Any, lanes: Any) -> Any:
-    """Write lanes to row k of an array (rows, n), from an index on."""
+    """Store lanes in row k of an array (rows, n), starting at an index."""
 
     def build(context: Any, builder: Any, signature: Any, values: Any) -> Any:
         element = _element(context, builder, signature.args[0], *values[:3])
@@ -175,7 +173,7 @@ def put(typingctx: Any, array: Any, k: Any, index: Any, lanes: Any) -> Any:
 
 @intrinsic
 def copy(typingctx: Any, column: Any, first: Any, n: Any, array: Any, k: Any) -> Any:
-    """Copy n numbers of a column (N,), from the first on, to row k of an array."""
+    """Copy n numbers of a column (N,), starting at index `first`, to row k of an array."""
 
     def build(context: Any, builder: Any, signature: Any, values: Any) -> Any:
         column, first, n, array, k = values
@@ -185,13 +183,13 @@ def copy(typingctx: Any, column: Any, first: Any, n: Any, array: Any, k: Any) ->
         cgutils.raw_memcpy(builder, row, source, n, 8)
         return context.get_dummy_value()
 
-    whole = types.intp
-    return types.none(_rows(column, 1), whole, whole, _rows(array), whole), build
+    integer = types.intp
+    return types.none(_rows(column, 1), integer, integer, _rows(array), integer), build
 
 
 @intrinsic
 def near_inverse_root(typingctx: Any, x: Any) -> Any:
-    """1 / sqrt(x) of lanes by an instruction of AVX-512, right to 6e-5."""
+    """1 / sqrt(x) of lanes by an AVX-512 instruction, with a relative error of up to 6e-5."""
 
     def build(context: Any, builder: Any, signature: Any, values: Any) -> Any:
         vector, mask = _vector(WIDTH), ir.IntType(8)
@@ -202,7 +200,7 @@ def near_inverse_root(typingctx: Any, x: Any) -> Any:
     return x(x), build
 
 
-# -- choices, on scalars as well -------------------------------------------------------------------
+# -- selection, also for scalars -------------------------------------------------------------------
 
 
 def _choosing(relation: str) -> Any:
@@ -219,25 +217,25 @@ def _choosing(relation: str) -> Any:
     return one_of_two
 
 
-smaller, larger = _choosing("<"), _choosing(">")  # of a and b, by lanes
+smaller, larger = _choosing("<"), _choosing(">")  # minimum and maximum of a and b in each lane
 
 
 @intrinsic
 def choose(typingctx: Any, a: Any, b: Any, x: Any, y: Any) -> Any:
-    """x in lanes where a <= b, else y."""
+    """Select x in lanes where a <= b, otherwise y."""
 
     def build(context: Any, builder: Any, signature: Any, values: Any) -> Any:
         a, b, x, y = _as_lanes(builder, signature, values)
         return builder.select(builder.fcmp_ordered("<=", a, b), x, y)
 
     lanes = next(kind for kind in (a, b, x, y) if isinstance(kind, Lanes))
-    both = [kind if isinstance(kind, Lanes) else types.float64 for kind in (a, b, x, y)]
-    return lanes(*both), build
+    operands = [kind if isinstance(kind, Lanes) else types.float64 for kind in (a, b, x, y)]
+    return lanes(*operands), build
 
 
 @intrinsic
 def first_lanes(typingctx: Any, n: Any, x: Any, y: Any) -> Any:
-    """x in the first n lanes, y in the others."""
+    """Select x in the first n lanes and y in the others."""
 
     def build(context: Any, builder: Any, signature: Any, values: Any) -> Any:
         n, x, y = _as_lanes(builder, signature, values)
@@ -251,7 +249,7 @@ def first_lanes(typingctx: Any, n: Any, x: Any, y: Any) -> Any:
 
 @intrinsic
 def spread(typingctx: Any, value: Any, like: Any) -> Any:
-    """One number in all lanes, of which there are as many as in `like`."""
+    """Copy a number to all lanes; the number of lanes is that of `like`."""
 
     def build(context: Any, builder: Any, signature: Any, values: Any) -> Any:
         return _all_alike(builder, values[0], signature.return_type.width)
@@ -260,7 +258,7 @@ def spread(typingctx: Any, value: Any, like: Any) -> Any:
     return Lanes(like.width, element)(element, like), build
 
 
-# -- over all lanes --------------------------------------------------------------------------------
+# -- reductions over lanes -------------------------------------------------------------------------
 
 
 def _across(on_doubles: str, on_integers: str) -> Any:
@@ -287,11 +285,12 @@ total, product = _across("fadd", "add"), _across("fmul", "mul")
 
 
 def tile(columns: int, length: int) -> Any:
-    """Function that adds sums over n stars of weights times P_i Q_j, for so many j from one on.
+    """Make a function that adds sums over stars of weights times P_i Q_j to a tile.
 
-    function(n, weights, g, P, i, Q, j, sums): rows of the arrays have `length` numbers, and the
-    weights are the `ROWS` of group g.  Lanes of the sums are added to sums[g, i, j:], of shape
-    (groups, T, T, ROWS, WIDTH), and stay in registers until all stars are added.
+    The function has the arguments (n, weights, g, P, i, Q, j, sums).  It sums over n stars for
+    `ROWS` rows of weights, those of group g, and for `columns` values of j, starting at `j`.  Rows
+    of the arrays have `length` numbers.  The sums, one per lane, are added to sums[g, i, j:] of
+    shape (groups, T, T, ROWS, WIDTH); they stay in registers until all stars are processed.
     """
 
     @intrinsic
@@ -314,7 +313,7 @@ def tile(columns: int, length: int) -> Any:
 
             first_weight = builder.mul(g, whole(ROWS))
             zero = ir.Constant(_vector(WIDTH), [0.0] * WIDTH)
-            found = [cgutils.alloca_once_value(builder, zero) for _ in range(columns * ROWS)]
+            accumulators = [cgutils.alloca_once_value(builder, zero) for _ in range(columns * ROWS)]
             with cgutils.for_range_slice(builder, whole(0), n, whole(WIDTH)) as (s, _):
                 p = lanes(p_start, i, s)
                 rows = [builder.add(first_weight, whole(r)) for r in range(ROWS)]
@@ -322,20 +321,23 @@ def tile(columns: int, length: int) -> Any:
                 for c in range(columns):
                     q = lanes(q_start, builder.add(j, whole(c)), s)
                     for r in range(ROWS):
-                        one = found[c * ROWS + r]
-                        more = builder.fmul(weighted[r], q, flags=FLAGS)
-                        builder.store(builder.fadd(builder.load(one), more, flags=FLAGS), one)
+                        accumulator = accumulators[c * ROWS + r]
+                        product = builder.fmul(weighted[r], q, flags=FLAGS)
+                        builder.store(
+                            builder.fadd(builder.load(accumulator), product, flags=FLAGS),
+                            accumulator,
+                        )
             wide = builder.extract_value(
                 context.make_array(kinds[7])(context, builder, values[7]).shape, 1
             )
             first = builder.add(builder.mul(g, wide), i)
             first = builder.add(builder.mul(first, wide), j)
             first = builder.mul(first, whole(ROWS * WIDTH))
-            for k, one in enumerate(found):
+            for k, accumulator in enumerate(accumulators):
                 index = builder.add(first, whole(k * WIDTH))
-                where = _lanes_at(builder, sums_start, index, WIDTH)
-                before = builder.load(where, align=8)
-                builder.store(builder.fadd(before, builder.load(one)), where, align=8)
+                target = _lanes_at(builder, sums_start, index, WIDTH)
+                before = builder.load(target, align=8)
+                builder.store(builder.fadd(before, builder.load(accumulator)), target, align=8)
             return context.get_dummy_value()
 
         whole = types.intp

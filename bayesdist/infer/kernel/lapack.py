@@ -1,7 +1,7 @@
-"""Sums and factors of large symmetric matrices, in place, while other threads work.
+"""In-place operations on large symmetric matrices that release the GIL.
 
-The routines are those of SciPy's LAPACK and BLAS.  SciPy's own wrappers hold Python's lock while
-they run: two threads would take turns.  Calls by ctypes release it.
+The routines are those of SciPy's LAPACK and BLAS.  SciPy's wrappers hold the global interpreter
+lock while they run, so that threads would have to wait; calls through ctypes release it.
 """
 
 from __future__ import annotations
@@ -25,20 +25,31 @@ _TRSM, _SYRK = _routine("cython_blas", "dtrsm", 11), _routine("cython_blas", "ds
 
 
 def add_square(total: Float, rows: Float) -> None:
-    """Add R^T R of rows (m, n) to the lower triangle of a matrix (n, n): C arrays of float64."""
-    n, m, one = _order(total, total.flags.c_contiguous), ctypes.c_int(len(rows)), ctypes.c_double(1)
+    """Add R^T R to the lower triangle of a matrix (n, n), with R = `rows` (m, n).
+
+    Both are C-contiguous float64 arrays; otherwise ValueError is raised.
+    """
+    n, m, unity = (
+        _order(total, total.flags.c_contiguous),
+        ctypes.c_int(len(rows)),
+        ctypes.c_double(1),
+    )
     fits = rows.shape == (len(rows), n.value) and rows.flags.c_contiguous
     if not (fits and rows.dtype == np.float64):
         raise ValueError("rows of float64 as long as those of the matrix are expected, contiguous")
-    # as BLAS sees C arrays, the lower triangle is the upper one, and the rows are columns
-    at = (_at(one), rows.ctypes.data, _at(n), _at(one), total.ctypes.data, _at(n))
+    # BLAS reads C arrays as transposed: the lower triangle is the upper one, rows are columns
+    at = (_at(unity), rows.ctypes.data, _at(n), _at(unity), total.ctypes.data, _at(n))
     _SYRK(b"U", b"N", _at(n), _at(m), *at)
 
 
 def cholesky(matrix: Float) -> Float:
-    """Lower factor (n, n) of a symmetric matrix, which is overwritten: a C array of float64."""
+    """Lower Cholesky factor (n, n) of a symmetric matrix, computed in place.
+
+    `matrix` must be a C-contiguous float64 array and is overwritten.  Raises
+    numpy.linalg.LinAlgError if it is not positive definite.
+    """
     n, info = _order(matrix, matrix.flags.c_contiguous), ctypes.c_int()
-    # the transpose of a C array has the order of LAPACK, and the matrix is symmetric
+    # LAPACK reads the C array as its transpose, which is equal since the matrix is symmetric
     _POTRF(b"L", _at(n), matrix.ctypes.data, _at(n), _at(info))
     if info.value:
         raise np.linalg.LinAlgError("the matrix is not positive definite")
@@ -48,7 +59,7 @@ def cholesky(matrix: Float) -> Float:
 
 
 def inverse_of(factor: Float) -> Float:
-    """Lower triangle (n, n), and zeros, of (L L^T)^-1; L, from `cholesky`, is overwritten."""
+    """Lower triangle of (L L^T)^-1, with zeros above; L, from `cholesky`, is overwritten."""
     n, info = _order(factor, factor.flags.f_contiguous), ctypes.c_int()
     _POTRI(b"L", _at(n), factor.ctypes.data, _at(n), _at(info))
     if info.value:
@@ -57,18 +68,18 @@ def inverse_of(factor: Float) -> Float:
 
 
 def divided(factor: Float, values: Float) -> Float:
-    """L^-1 times values (n, n), which are overwritten; both in the order of Fortran."""
-    n, one = _order(factor, factor.flags.f_contiguous), ctypes.c_double(1.0)
+    """Solve L x = values (n, n) in place; both arrays must be Fortran-contiguous."""
+    n, unity = _order(factor, factor.flags.f_contiguous), ctypes.c_double(1.0)
     if _order(values, values.flags.f_contiguous).value != n.value:
-        raise ValueError("the values have another shape than the factor")
+        raise ValueError("the shape of the values differs from that of the factor")
     sides = (b"L", b"L", b"N", b"N")
     at = (factor.ctypes.data, _at(n), values.ctypes.data, _at(n))
-    _TRSM(*sides, _at(n), _at(n), _at(one), *at)
+    _TRSM(*sides, _at(n), _at(n), _at(unity), *at)
     return values
 
 
 def _order(matrix: Float, contiguous: bool) -> ctypes.c_int:
-    """Order of a square matrix; ValueError where LAPACK would write elsewhere than into it."""
+    """Order of a square matrix; raises ValueError unless it is contiguous and float64."""
     n = len(matrix)
     if matrix.shape != (n, n) or matrix.dtype != np.float64 or not contiguous:
         raise ValueError("a square matrix of float64 is expected, contiguous in the order stated")

@@ -1,4 +1,4 @@
-"""Log-likelihood of all stars for many parameter vectors: the pass of which sampling consists."""
+"""Log-likelihood of all stars for many parameter vectors: the pass that dominates sampling."""
 
 from __future__ import annotations
 
@@ -60,13 +60,13 @@ def _partial_sums(
                 peak, inverse = core * root, root * root
                 q_in = 0.5 * (ru * av + rv * au) * inverse
                 q_out = (ru + rv) * half + never
-                # the smaller exponent is taken out, so that exp never overflows
+                # factor out the smaller exponent, so that exp never overflows
                 low = smaller(q_in, q_out)
                 t = exp_negative(low - larger(q_in, q_out))
-                # the other product would be a denormal number for hopeless stars, which takes long
-                more = choose(q_in, q_out, peak, outlier)
-                both = more + t * choose(q_in, q_out, outlier, peak)
-                put(density, 0, s, first_lanes(n - s, both, 1.0))
+                # this order avoids a denormal (slow) product for stars far off
+                larger_density = choose(q_in, q_out, peak, outlier)
+                density_sum = larger_density + t * choose(q_in, q_out, outlier, peak)
+                put(density, 0, s, first_lanes(n - s, density_sum, 1.0))
                 exponents += first_lanes(n - s, low, 0.0)
             constant = total(exponents) + n * math.log(2 * math.pi * unit2)
             sums[b, d] = log_of_product(density) - constant
@@ -79,30 +79,44 @@ def log_likelihood(
     order: int,
     constants: Constants,
 ) -> Float:
-    """Log-likelihood (D,) of all stars for D parameter vectors.
+    """Log-likelihood of all stars for D parameter vectors.
 
-    `blocks` (n, 3) are `pieces_of` size `BLOCK`; `columns` (N,) are X, Y, u, v, var_u, var_v;
-    `coef` (D, G, 2, K) are effective coefficients of the scaled powers X^i Y^j.
+    Parameters
+    ----------
+    blocks : ndarray of int, shape (n, 3)
+        Pieces of size `BLOCK` from `pieces_of`.
+    columns : tuple of ndarray, shape (N,)
+        X, Y, u, v, var_u, var_v.
+    coef : ndarray, shape (D, G, 2, K)
+        Effective coefficients of the powers X^i Y^j of the scaled pixel coordinates, for G groups.
+    order : int
+        Polynomial order.
+    constants : Constants
+        Constants of the mixture for the D parameter vectors.
+
+    Returns
+    -------
+    ndarray, shape (D,)
     """
     rows, coef = packed(constants), np.ascontiguousarray(coef)
     out = np.empty(len(coef))
     step = max(1, SCRATCH // (8 * max(len(blocks), 1)))
     with threads_for(len(columns[0]) * len(coef)):
         for a in range(0, len(coef), step):
-            some = slice(a, a + step)
-            sums = np.empty((len(blocks), len(rows[some])))
+            draws = slice(a, a + step)
+            sums = np.empty((len(blocks), len(rows[draws])))
             share_out(
                 _partial_sums,
                 len(blocks),
                 blocks,
                 columns,
-                coef[some],
+                coef[draws],
                 order,
-                rows[some],
+                rows[draws],
                 constants.unit2,
                 sums,
                 room=lambda: (*star_room(), scratch(1)),
             )
-            # draws along the first axis: else numpy adds in another order where there is but one
-            out[some] = np.ascontiguousarray(sums.T).sum(axis=1)
+            # draws along the first axis, so that the order of summation is the same for one draw
+            out[draws] = np.ascontiguousarray(sums.T).sum(axis=1)
     return out

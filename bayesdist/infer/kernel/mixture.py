@@ -1,7 +1,7 @@
-"""Mixture of one star in the passes: constants of a parameter vector, and densities.
+"""Constants of the outlier mixture as used in the compiled loops.
 
-Densities are in units of 1 / (2 pi unit2), unit2 a typical variance, so that they are numbers of
-order one and the product of eight stays in range.
+Densities are in units of 1 / (2 pi unit2), with unit2 a typical variance.  They are then of order
+one, and the product of eight densities stays in range.
 """
 
 from __future__ import annotations
@@ -19,34 +19,51 @@ from bayesdist.infer.kernel.vectors import whole_vectors
 from bayesdist.utils.arrays import Float
 
 NO_OUTLIERS, GAUSSIAN, UNIFORM = 0, 1, 2
-NEVER = 1e300  # chi-square of an outlier where there are none
-# A product of eight within these limits has lost no digits to underflow on the way, unless its
-# factors differ by more than 1e129: errors that differ by more than 1e64.
+NEVER = 1e300  # chi-square of outliers if the model has none
+# A product of eight densities within these limits has not lost digits by underflow, unless its
+# factors differ by more than 1e129, that is, errors by more than 1e64.
 LEAST, MOST = 1e-100, 1e100
 
 
 class Constants(NamedTuple):
-    """Constants of the mixture at D parameter vectors."""
+    """Constants of the outlier mixture for D parameter vectors, in the unit of u, v.
 
-    j2: Float  # squared jitter (D,)
+    Parameters
+    ----------
+    j2 : ndarray, shape (D,)
+        Squared jitter.
+    log_f, log_1_f : ndarray, shape (D,)
+        Logarithms of the outlier fraction f and of 1 - f.
+    out : ndarray, shape (D,)
+        Variance of Gaussian outliers, or area of the match circle.
+    kind : int
+        `NO_OUTLIERS`, `GAUSSIAN` or `UNIFORM`.
+    unit2 : float
+        Typical variance, the unit of the densities.
+    radius : float
+        Radius of the match circle about nominal positions; 0 for none.
+    """
+
+    j2: Float
     log_f: Float
     log_1_f: Float
-    out: Float  # variance of Gaussian outliers, or area of the match circle (D,)
-    kind: int  # `NO_OUTLIERS`, `GAUSSIAN` or `UNIFORM`
-    unit2: float  # a typical variance
-    radius: float = 0.0  # of the match circle about nominal positions; 0 without one
+    out: Float
+    kind: int
+    unit2: float
+    radius: float = 0.0
 
     def of(self, rows: slice) -> Constants:
-        """Constants of some of the parameter vectors."""
+        """Constants of a subset of the parameter vectors."""
         j2, log_f, log_1_f, out = (c[rows] for c in self[:4])
         return Constants(j2, log_f, log_1_f, out, self.kind, self.unit2, self.radius)
 
 
 def packed(constants: Constants) -> Float:
-    """Rows (D, 7) for the compiled loops.
+    """Constants as rows (D, 7) for the compiled loops.
 
-    j^2; heights of the core (for unit variances) and of the outliers; half the inverse variance of
-    the outliers; the constant added to their half chi-square; f; their inverse variance.
+    The columns are j^2, the peak densities of the core (for unit variances) and of the outliers,
+    half the inverse variance of the outliers, the constant added to half their chi-square, f, and
+    the inverse variance of the outliers.
     """
     j2, log_f, log_1_f, out = (np.atleast_1d(c) for c in constants[:4])
     f = np.exp(log_f)
@@ -63,7 +80,7 @@ def packed(constants: Constants) -> Float:
 
 @nb.njit(**INNER)
 def log_of_product(density):
-    """Sum of the logarithms of a block (1, BLOCK); one logarithm in all."""
+    """Sum of the logarithms of a block (1, BLOCK), computed with a single logarithm."""
     whole_vectors()
     mantissa = load(density, 0, 0)
     exponent, mantissa, safe = spread(0, mantissa), spread(1.0, mantissa), spread(0.0, mantissa)
@@ -79,6 +96,6 @@ def log_of_product(density):
         # the product of mantissas is at most 2^32
         return math.log(product(mantissa)) + total(exponent) * 0.6931471805599453
     result = 0.0
-    for s in range(BLOCK):  # extreme errors or fractions: each star alone
+    for s in range(BLOCK):  # extreme errors or fractions: one logarithm per star
         result += math.log(density[0, s])
     return result

@@ -1,8 +1,8 @@
-"""Sums over the stars that second-order steps need: normal equations, gradient and Hessian.
+"""Sums over the stars for second-order methods: normal equations, gradient and Hessian.
 
-A normal matrix is a sum of w phi_k phi_l.  The product of two Legendre functions is a sum of
-others, of twice the order: so only the moments of w with those are summed over the stars, 66 for
-order 5 instead of 231 products, and the matrix follows by a fixed linear map (`product_table`).
+A normal matrix is a sum of w phi_k phi_l.  Products of two Legendre functions are sums of Legendre
+functions up to twice the order.  It is therefore enough to accumulate the moments of w with those,
+66 for order 5 instead of 231 products.  A fixed linear map (`product_table`) gives the matrix.
 """
 
 from __future__ import annotations
@@ -46,27 +46,38 @@ from bayesdist.infer.kernel.polynomial import evaluate, legendre
 from bayesdist.infer.kernel.vectors import whole_vectors
 from bayesdist.utils.arrays import Float, Int
 
-PIECE = 4096
-EVALUATIONS = 10  # cost of the sums of one star, in likelihood evaluations
+PIECE = 4096  # maximum number of stars per piece
+EVALUATIONS = 10  # cost of the sums per star, relative to one likelihood evaluation
 
-N_LEAST, N_MIXTURE = 9, 10  # scalar sums of the two passes
-COLUMNS = 12  # of the mixture: 11, and one of zeros, since they are taken by three
-N_HYPER = 3  # log j, logit f, log s_out
+N_LEAST, N_MIXTURE = 9, 10  # number of scalar sums for least squares and for the mixture
+COLUMNS = 12  # weights of the mixture: 11 and one of zeros, since they are processed in threes
+N_HYPER = 3  # hyperparameters: log j, logit f, log s_out
 
 
 @dataclass(frozen=True, eq=False)
 class Moments:
-    """Sums over the stars of each group."""
+    """Sums over the stars of each of G groups, for K polynomial terms.
 
-    weight: Float  # sum (G, 3, K, K) of w phi phi^T for the axis pairs uu, uv, vv
-    right: Float  # sum (G, 2, K) of phi times minus the gradient by the model
-    # mixed second derivatives (G, 3, 2, K) with log j, logit f, log s_out; zero in least squares
+    Parameters
+    ----------
+    weight : ndarray, shape (G, 3, K, K)
+        Sum of w phi phi^T for the axis pairs uu, uv, vv.
+    right : ndarray, shape (G, 2, K)
+        Sum of phi times d log L / d(model position).
+    cross : ndarray, shape (G, 3, 2, K)
+        Mixed second derivatives with log j, logit f, log s_out; zero for least squares.
+    scalars : ndarray
+        Sums over all groups; see the functions that compute them.
+    """
+
+    weight: Float
+    right: Float
     cross: Float
-    scalars: Float  # sums over all groups: see the functions
+    scalars: Float
 
 
 def _powers(order: int) -> tuple[Int, Int]:
-    """Exponents i, j of all terms to a total order, by total order, then descending i."""
+    """Exponents i, j of all terms up to a total order, sorted by i + j, then by descending i."""
     i, j = np.array([(t - j, j) for t in range(order + 1) for j in range(t + 1)]).T
     return i, j
 
@@ -75,36 +86,37 @@ def _powers(order: int) -> tuple[Int, Int]:
 def product_table(order: int) -> Float:
     """Legendre coefficients (K, K, M) of the products of two basis functions.
 
-    phi_k phi_l = sum_m T[k, l, m] P_i(X) P_j(Y), with (i, j) in the order of the moments: by total
-    order up to 2 `order`, then descending i.
+    phi_k phi_l = sum_m T[k, l, m] P_i(X) P_j(Y), where m enumerates the moments (i, j) with
+    i + j <= 2 `order`, sorted by i + j, then by descending i.
     """
     top = 2 * order
-    one = np.zeros((order + 1, order + 1, top + 1))
+    products = np.zeros((order + 1, order + 1, top + 1))
     for a in range(order + 1):
         for b in range(order + 1):
             coefficients = series.legmul([0] * a + [1], [0] * b + [1])
-            one[a, b, : len(coefficients)] = coefficients
+            products[a, b, : len(coefficients)] = coefficients
     i, j = _powers(order)
     mi, mj = _powers(top)
-    return one[np.ix_(i, i, mi)] * one[np.ix_(j, j, mj)]
+    return products[np.ix_(i, i, mi)] * products[np.ix_(j, j, mj)]
 
 
 def _matrices(moments: Float, order: int) -> Float:
-    """Sums of w phi phi^T (G, c, K, K) from the moments (G, c, M) of the weights."""
+    """Matrices sum w phi phi^T (G, c, K, K) from the moments (G, c, M) of the weights w."""
     table = product_table(order)
     matrices = moments @ table.reshape(-1, table.shape[-1]).T
     return np.asarray(matrices.reshape(*moments.shape[:2], *table.shape[:2]))
 
 
-# Sums of three rows with as many Legendre functions as the registers hold: one function a number.
+# Functions that sum three rows of weights with one to six Legendre functions in registers.
 _ONE, _TWO, _THREE, _FOUR, _FIVE, _SIX = (tile(n, BLOCK) for n in range(1, 7))
 
 
 def room_for(order: int, columns: int) -> tuple[Float, ...]:
-    """Room for the stars of a block, two models, columns to be summed, P, Q, lanes of the sums.
+    """Scratch arrays for the stars of a block, two models, the weights, P, Q, and the sums.
 
-    The lanes are those of the moments of three columns at a time, (columns / 3, T, T, 3, WIDTH)
-    with i + j < T; only the first three, the weights, are taken to twice the order.
+    The sums are lanes of the moments of three columns at a time, (columns / 3, T, T, 3, WIDTH),
+    with i + j < T.  Only the first three columns, those of the Hessian, are needed up to twice the
+    order.
     """
     T = 2 * order + 1
     return (
@@ -115,44 +127,45 @@ def room_for(order: int, columns: int) -> tuple[Float, ...]:
 
 @nb.njit(**INNER)
 def add_columns(columns, n, P, Q, lanes):
-    """Add the moments of some stars to lanes."""
+    """Add the moments of the n stars of a block to the sums in `lanes`."""
     whole_vectors()
     for g in range(len(lanes)):
         top = len(P) if g == 0 else (len(P) + 1) >> 1
         for i in range(top):
             j = 0
             while j < top - i:
-                left = top - i - j
-                some = left if left <= AT_MOST else min((left + 1) >> 1, AT_MOST)  # alike, rather
-                if some == 1:
+                n_left = top - i - j
+                # two tiles of similar width rather than a wide and a narrow one
+                n_columns = n_left if n_left <= AT_MOST else min((n_left + 1) >> 1, AT_MOST)
+                if n_columns == 1:
                     _ONE(n, columns, g, P, i, Q, j, lanes)
-                elif some == 2:
+                elif n_columns == 2:
                     _TWO(n, columns, g, P, i, Q, j, lanes)
-                elif some == 3:
+                elif n_columns == 3:
                     _THREE(n, columns, g, P, i, Q, j, lanes)
-                elif some == 4:
+                elif n_columns == 4:
                     _FOUR(n, columns, g, P, i, Q, j, lanes)
-                elif some == 5:
+                elif n_columns == 5:
                     _FIVE(n, columns, g, P, i, Q, j, lanes)
                 else:
                     _SIX(n, columns, g, P, i, Q, j, lanes)
-                j += some
+                j += n_columns
 
 
 @nb.njit(**INNER)
 def write_columns(lanes, out):
-    """Write moments to out (columns, M), by total order, and zeros to the lanes."""
+    """Write the moments to out (columns, M), sorted by total order, and reset the lanes to zero."""
     whole_vectors()
     T = lanes.shape[1]
     for g in range(len(lanes)):
         top = T if g == 0 else (T + 1) >> 1
         for i in range(top):
             for j in range(top - i):
-                at, one = (i + j) * (i + j + 1) // 2 + j, lanes[g, i, j]
+                at, tile_sums = (i + j) * (i + j + 1) // 2 + j, lanes[g, i, j]
                 for r in range(ROWS):
-                    sums = load(one, r, 0)
+                    sums = load(tile_sums, r, 0)
                     out[ROWS * g + r, at] = total(sums)
-                    put(one, r, 0, spread(0.0, sums))
+                    put(tile_sums, r, 0, spread(0.0, sums))
 
 
 @nb.njit(**PASS)
@@ -177,8 +190,8 @@ def _least_squares(
                 u, v = load(stars, 2, s), load(stars, 3, s)
                 iu, iv = 1.0 / load(stars, 4, s), 1.0 / load(stars, 5, s)
                 du, dv = u - load(test, 0, s), v - load(test, 1, s)
-                there = first_lanes(n - s, spread(1.0, x), 0.0)
-                near = choose(du * du + dv * dv, r2_limit, there, 0.0)
+                present = first_lanes(n - s, spread(1.0, x), 0.0)
+                near = choose(du * du + dv * dv, r2_limit, present, 0.0)
                 used = choose(du * du * iu + dv * dv * iv, chi2_limit, near, 0.0)
                 extra = 1.0 + (corner - 1.0) * 0.5 * (x * x + y * y)
                 factor = used * extra * extra if power == 2 else used * extra
@@ -188,10 +201,10 @@ def _least_squares(
                 put(weighted, 1, s, wv)
                 put(weighted, 3, s, wu * ru)
                 put(weighted, 4, s, wv * rv)
-                used_sum, far_sum = used_sum + used, far_sum + (there - near)
+                used_sum, far_sum = used_sum + used, far_sum + (present - near)
                 chi2 += used * (ru * ru * iu + rv * rv * iv)
                 uu, vv = uu + used * ru * ru, vv + used * rv * rv
-                left_out += (there - used) * (ru * ru + rv * rv)
+                left_out += (present - used) * (ru * ru + rv * rv)
                 weighted_chi2 += wu * ru * ru + wv * rv * rv
                 u_sum, v_sum = u_sum + used * ru, v_sum + used * rv
             legendre(stars, n, 2 * order, P, Q)
@@ -238,19 +251,19 @@ def _mixture(
                 eu, ev = ru * ru * iu, rv * rv * iv
                 r2 = ru * ru + rv * rv
                 q_in, q_out = 0.5 * (eu + ev), r2 * half + never
-                least = smaller(q_in, q_out)
-                t = exp_negative(least - larger(q_in, q_out))
+                q_min = smaller(q_in, q_out)
+                t = exp_negative(q_min - larger(q_in, q_out))
                 peak = core * root
-                # factors first: the product that is not needed may be denormal, which takes long
+                # select the factors first: the unused product may be a denormal number (slow)
                 d_in = peak * choose(q_in, q_out, 1.0, t)
                 d_out = outlier * choose(q_in, q_out, t, 1.0)
-                both = d_in + d_out
-                put(density, 0, s, first_lanes(n - s, both, 1.0))
-                low += first_lanes(n - s, least, 0.0)
-                whole = first_lanes(n - s, 1.0 / both, 0.0)
-                p, q = d_out * whole, d_in * whole
+                density_sum = d_in + d_out
+                put(density, 0, s, first_lanes(n - s, density_sum, 1.0))
+                low += first_lanes(n - s, q_min, 0.0)
+                inverse_sum = first_lanes(n - s, 1.0 / density_sum, 0.0)
+                p, q = d_out * inverse_sum, d_in * inverse_sum
                 pq = p * q
-                # derivatives of log core minus log outlier, by u, v, log j, logit f, log s_out
+                # derivatives of log(core / outlier) with respect to u, v, log j, log s_out
                 D_u, D_v = ru * (w - iu), rv * (w - iv)
                 D_j = j2 * ((eu - 1.0) * iu + (ev - 1.0) * iv)
                 D_s = 2.0 - r2 * w
@@ -292,14 +305,14 @@ def _mixture(
 
 
 def empty_sums(n_pieces: int, order: int, columns: int, scalars: int) -> tuple[Float, Float]:
-    """Zeros (n_pieces, columns, M) and (n_pieces, scalars) for the sums of the pieces."""
+    """Zero arrays (n_pieces, columns, M) and (n_pieces, scalars) for the sums of each piece."""
     return np.zeros((n_pieces, columns, (order + 1) * (2 * order + 1))), np.zeros(
         (n_pieces, scalars)
     )
 
 
 def _by_group(sums: Float, pieces: Int) -> Float:
-    """Moments (G, columns, M) of each group from those of its consecutive pieces."""
+    """Moments (G, columns, M) per group: sums over its consecutive pieces."""
     _, first = np.unique(pieces[:, 0], return_index=True)
     return np.asarray(np.add.reduceat(sums, first, axis=0))
 
@@ -316,17 +329,33 @@ def least_squares_moments(
     corner: float = 1.0,
     power: int = 1,
 ) -> Moments:
-    """Normal equations of weighted least squares with rejection.
+    """Sums for weighted least squares with rejection.
 
-    `pieces` (n, 3) are `pieces_of` size `PIECE`; `columns` (N,) are X, Y, u, v, var_u, var_v.
-    Residuals are taken at the effective coefficients `about` (G, 2, K) of the scaled powers, and
-    those at `test` decide on rejection: stars beyond either limit are left out.  `corner` is a
-    factor on the inverse variance in the corners, rising as the square of the radius; `power` is 1,
-    or 2 for the squared weights of a sandwich covariance.
+    Parameters
+    ----------
+    pieces : ndarray, shape (n, 3)
+        Pieces of size `PIECE` from `pieces_of`.
+    columns : tuple of ndarray, shape (N,)
+        X, Y, u, v, var_u, var_v.
+    about : ndarray, shape (G, 2, K)
+        Effective coefficients of the scaled powers at which residuals are computed.
+    test : ndarray, shape (G, 2, K)
+        Effective coefficients for the residuals that decide on rejection.
+    order : int
+        Polynomial order.
+    chi2_limit, abs_limit : float
+        Stars with a larger chi-square, or a larger radial residual, are rejected.
+    corner : float
+        Factor on the inverse variance in the corners, increasing with the square of the radius.
+    power : int
+        1, or 2 for the squared weights of a sandwich covariance.
 
-    Scalars: stars used; stars beyond `abs_limit`; chi-square of those used; their squared residuals
-    in u and in v; squared residuals of those left out; the weighted chi-square; residuals in u and
-    v of those used.
+    Returns
+    -------
+    Moments
+        Its `scalars` are: number of stars used; number beyond `abs_limit`; chi-square of the stars
+        used; sums of their squared residuals in u and in v; sum of the squared residuals of the
+        rejected stars; weighted chi-square; sums of the residuals in u and in v of the stars used.
     """
     K = (order + 1) * (order + 2) // 2
     sums, scalars = empty_sums(len(pieces), order, 6, N_LEAST)
@@ -361,16 +390,27 @@ def mixture_moments(
     *,
     em: bool = False,
 ) -> Moments:
-    """Gradient and Hessian of the mixture's log-likelihood at one parameter vector.
+    """Sums for the gradient and Hessian of the mixture log-likelihood at one parameter vector.
 
-    `coef` (G, 2, K) are effective coefficients of the scaled powers; `pieces`, `columns` and
-    `order` as in `least_squares_moments`.  With `em` the weights are those of the
-    expectation-maximisation step, which are never negative, in place of the Hessian, and `cross` is
-    zero.
+    Parameters
+    ----------
+    pieces, columns, order
+        See `least_squares_moments`.
+    coef : ndarray, shape (G, 2, K)
+        Effective coefficients of the scaled powers.
+    constants : Constants
+        Constants of the mixture for this parameter vector.
+    em : bool
+        True for the weights of the expectation-maximisation step instead of the Hessian. They are
+        never negative, and `cross` is zero.
 
-    Scalars: the log-likelihood; its derivatives by log j and, for logit f, the expected number of
-    outliers, then by log s_out; minus the Hessian by log j, logit f, log s_out: jj, jf, js, ff, fs,
-    ss.
+    Returns
+    -------
+    Moments
+        Its `scalars` are: the log-likelihood; its derivative with respect to log j; the expected
+        number of outliers, which enters the derivative with respect to logit f; the derivative with
+        respect to log s_out; minus the Hessian in (log j, logit f, log s_out): jj, jf, js, ff, fs,
+        ss.
     """
     sums, scalars = empty_sums(len(pieces), order, COLUMNS, N_MIXTURE)
     with threads_for(EVALUATIONS * len(columns[0])):
@@ -392,7 +432,7 @@ def mixture_moments(
 
 
 def mixture_sums(total: Float, scalars: Float, order: int, em: bool) -> Moments:
-    """Moments of a mixture from sums (G, COLUMNS, M) over the stars of each group."""
+    """`Moments` of a mixture from sums (G, COLUMNS, M) over the stars of each group."""
     K = (order + 1) * (order + 2) // 2
     weight = _matrices(total[:, :3], order)
     cross = total[:, 5:11, :K].reshape(len(total), N_HYPER, 2, K).copy()

@@ -1,8 +1,8 @@
-"""Scalar functions, of a number or of lanes.
+"""Elementary functions of scalars and lanes.
 
-exp is a branch-free polynomial, since that of the library is called once for each star.  The
-logarithm of a product is split into exponents, which are integers in the bits of a double and are
-added, and mantissas, which are multiplied.
+exp is a branch-free polynomial, since the library function cannot be vectorised.  The logarithm of
+a product is computed from the exponents, read from the bits of the doubles and added, and the
+mantissas, which are multiplied.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from bayesdist.infer.kernel.lanes import HAS_512, INNER, Lanes, larger, near_inv
 
 
 def _same_bits(element: Any) -> Any:
-    """Intrinsic that reads the bits of a number, or of lanes, as another type."""
+    """Intrinsic that reinterprets the bits of a number, or of lanes, as another type."""
 
     @intrinsic
     def same(typingctx: Any, x: Any) -> Any:
@@ -32,24 +32,24 @@ def _same_bits(element: Any) -> Any:
 bits_of, from_bits = _same_bits(types.int64), _same_bits(types.float64)
 
 
-LOWEST = -700.0  # exp of less is 1e-304: negligible compared with the larger branch of a mixture
+LOWEST = -700.0  # exp(-700) = 1e-304 is negligible compared with the larger term of a mixture
 ROUND = 6755399441055744.0  # 1.5 * 2^52: adding it leaves the nearest integer in the low bits
 LOG2_E = 1.4426950408889634
 # ln 2 in two parts, the first with trailing zeros, so that n times it is exact (Cody and Waite)
 LN2_HIGH, LN2_LOW = 6.93147180369123816490e-01, 1.90821492927058770002e-10
 
 
-# Inlined by LLVM, not by numba: inside a loop that may reorder its sums, adding and subtracting
-# ROUND must stay as it is. And always: a function that is called is compiled twice, and which
-# version is used, hence the last bit of a sum, would depend on whether the cache was warm.
+# Inlined by LLVM rather than by numba: adding and subtracting ROUND must not be reordered in a loop
+# that may reorder its sums. Always inlined: a function that is called is compiled twice, and which
+# version is used (hence the last bit of a sum) would depend on whether the cache was warm.
 @nb.njit(**INNER, forceinline=True, fastmath={"contract"})
 def exp_negative(x):
-    """exp(x) for x <= 0, within two units of the last digit; below -700 as at -700."""
+    """exp(x) for x <= 0, accurate to two units in the last place; exp(-700) for x < -700."""
     x = larger(x, LOWEST)
     shifted = x * LOG2_E + ROUND
     n = shifted - ROUND
     r = (x - n * LN2_HIGH) - n * LN2_LOW
-    # of degree 11, closest to exp on |r| <= ln(2) / 2: off by 3e-18
+    # best polynomial approximation of degree 11 to exp on |r| <= ln(2) / 2; error 3e-18
     p = 2.5110049204818658e-08
     p = p * r + 2.763265472252779e-07
     p = p * r + 2.755724088722987e-06
@@ -68,7 +68,7 @@ def exp_negative(x):
 
 @nb.njit(**INNER, forceinline=True, fastmath={"contract"})
 def _nearer(x, r):
-    """1 / sqrt(x) from r, whose relative error is raised to the fourth power."""
+    """Improve an approximation r of 1 / sqrt(x): raises its relative error to the 4th power."""
     e = 1.0 - (x * r) * r
     return r + r * (e * (0.5 + e * (0.375 + e * 0.3125)))
 
@@ -83,15 +83,15 @@ else:
 
     @nb.njit(**INNER, forceinline=True)
     def _near(x):
-        # halving and negating the exponent is right to 3.5 %
+        # halving and negating the exponent gives an accuracy of 3.5 %
         return _nearer(x, from_bits(0x5FE6EB50C7B537A9 - (bits_of(x) >> 1)))
 
 
 @nb.njit(**INNER, forceinline=True)
 def inverse_root(x):
-    """1 / sqrt(x) of lanes, positive in the normal range, within two units of the last digit.
+    """1 / sqrt(x) of positive normal lanes, accurate to two units in the last place.
 
-    Division and root share one unit of the processor, which would be busy for longer than all the
-    other arithmetic of a star.
+    Division and square root share one unit of the processor and would take longer than all other
+    arithmetic of a star.
     """
     return _nearer(x, _near(x))

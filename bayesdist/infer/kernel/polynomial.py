@@ -1,4 +1,4 @@
-"""Polynomials of a block of stars: values by Horner's rule, and Legendre functions."""
+"""Polynomials at the stars of a block: values by Horner's rule, and Legendre functions."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ from bayesdist.infer.kernel.vectors import whole_vectors
 
 @nb.njit(**INNER, fastmath=FAST)
 def evaluate(coef, order, stars, n, out):
-    """Write sums of c_ij X^i Y^j with i + j <= order for both axes to out (2, BLOCK).
+    """Write the sums of c_ij X^i Y^j with i + j <= order, for both axes, to out (2, BLOCK).
 
-    `coef` (2, K) are sorted as `polynomial_terms`; X and Y are the first rows of `stars`.
+    `coef` (2, K) are in the order of `polynomial_terms`; X and Y are the first two rows of `stars`.
     """
     whole_vectors()
     cu, cv = coef[0], coef[1]
@@ -32,7 +32,10 @@ def evaluate(coef, order, stars, n, out):
 
 @nb.njit(**INNER, fastmath=FAST)
 def legendre(stars, n, top, P, Q):
-    """P[k, s] = P_k(X[s]) for k <= top, and Q of Y; X and Y are the first rows of `stars`."""
+    """Write the Legendre polynomials P[k, s] = P_k(X[s]) and Q[k, s] = P_k(Y[s]) for k <= top.
+
+    X and Y are the first two rows of `stars`.
+    """
     whole_vectors()
     for s in range(0, n, WIDE):
         x, y = load_wide(stars, 0, s), load_wide(stars, 1, s)

@@ -1,7 +1,7 @@
-"""Sky positions of detections by a model, and detector positions of stars.
+"""Sky positions of detections according to a model, and detector positions of stars.
 
-Polynomials are sums of powers of scaled pixels, by Horner's rule, or of Legendre products; terms
-are sorted by total order, then by descending power of x.
+Polynomials are sums of powers of scaled pixel coordinates (by Horner's rule) or of Legendre
+products.  Terms are sorted by total order, then by descending power of x.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from bayesdist.utils.arrays import Float, Int
 
 @nb.njit(cache=True, forceinline=True, fastmath=FAST)
 def legendre(x, y, order, px, py, phi):
-    """All basis functions of one position, by total order, then by descending power of x."""
+    """Write all Legendre products at position (x, y) to `phi`; px and py are scratch arrays."""
     whole_vectors()
     px[0] = py[0] = 1.0
     if order > 0:
@@ -35,7 +35,7 @@ def legendre(x, y, order, px, py, phi):
 
 @nb.njit(cache=True, forceinline=True, fastmath=FAST)
 def powers(coef, order, x, y):
-    """Sums u, v of c_ij x^i y^j by Horner's rule from coefficients (2, K), sorted as the basis."""
+    """Sums u, v of c_ij x^i y^j by Horner's rule, with coefficients (2, K)."""
     whole_vectors()
     u = v = 0.0
     for i in range(order, -1, -1):
@@ -50,7 +50,7 @@ def powers(coef, order, x, y):
 
 @nb.njit(cache=True, forceinline=True, fastmath=FAST)
 def powers_and_slopes(coef, order, x, y):
-    """Sums u, v as of `powers`, and their derivatives u_x, u_y, v_x, v_y."""
+    """Sums u, v (see `powers`) and their derivatives u_x, u_y, v_x, v_y."""
     whole_vectors()
     u = ux = uy = v = vx = vy = 0.0
     for i in range(order, -1, -1):
@@ -73,7 +73,24 @@ def _positions(first, end, group, X, Y, coef, order, out):
 
 
 def positions(group: Int, X: Float, Y: Float, coef: Float, order: int) -> Float:
-    """Sky positions (N, 2) of detections from coefficients (G, 2, K) of the scaled powers."""
+    """Sky positions of detections.
+
+    Parameters
+    ----------
+    group : ndarray of int, shape (N,)
+        Group of each detection.
+    X, Y : ndarray, shape (N,)
+        Scaled pixel coordinates.
+    coef : ndarray, shape (G, 2, K)
+        Coefficients of the powers of X and Y.
+    order : int
+        Polynomial order.
+
+    Returns
+    -------
+    ndarray, shape (N, 2)
+        Positions u, v.
+    """
     out = np.empty((len(X), 2))
     share_out(_positions, len(X), group, X, Y, coef, order, out)
     return out
@@ -88,7 +105,18 @@ def _slopes(first, end, group, X, Y, coef, order, out):
 
 
 def slopes(group: Int, X: Float, Y: Float, coef: Float, order: int) -> Float:
-    """Derivatives (N, 2, 2) of sky positions by X and Y; arguments as of `positions`."""
+    """Derivatives of sky positions with respect to X and Y.
+
+    Parameters
+    ----------
+    group, X, Y, coef, order
+        See `positions`.
+
+    Returns
+    -------
+    ndarray, shape (N, 2, 2)
+        Rows u, v; columns X, Y.
+    """
     out = np.empty((len(X), 2, 2))
     share_out(_slopes, len(X), group, X, Y, coef, order, out)
     return out
@@ -125,14 +153,32 @@ def linearised(
     half: Float,
     order: int,
 ) -> tuple[Float, Float, Float, Float]:
-    """Positions of stars on the detector by a solution, and the linearised model about them.
+    """Detector positions of stars predicted by a solution, and the linearised model there.
 
-    Scaled positions of the detections are `seen` (2, N), those of their stars as far as
-    known X, Y (N,), and the stars' sky positions `places` (N, 2).  `coef` (G, 2, K): of the scaled
-    powers; `half` (G, 2): the size of X = 1 and Y = 1 in pixels.
+    Parameters
+    ----------
+    group : ndarray, shape (N,)
+        Group of each detection.
+    seen : ndarray, shape (2, N)
+        Scaled pixel coordinates of the detections.
+    X, Y : ndarray, shape (N,)
+        Current estimates of the scaled pixel coordinates of the detections' stars.
+    places : ndarray, shape (N, 2)
+        Sky positions of the detections' stars.
+    coef : ndarray, shape (G, 2, K)
+        Coefficients of the scaled powers.
+    half : ndarray, shape (G, 2)
+        Size in pixels of one unit of X and Y.
+    order : int
 
-    Returns X, Y (N,) one Newton step further; the offset (N, 2), J times the pixels from there to
-    the detection; and W (N, 3), uu, uv, vv of the inverse of J J^T.
+    Returns
+    -------
+    X, Y : ndarray, shape (N,)
+        Scaled pixel coordinates of the stars after one more Newton step.
+    offset : ndarray, shape (N, 2)
+        J times the displacement in pixels from the star to the detection, with J the Jacobian.
+    W : ndarray, shape (N, 3)
+        Elements uu, uv, vv of the inverse of J J^T.
     """
     n = len(X)
     out = np.empty(n), np.empty(n), np.empty((n, 2)), np.empty((n, 3))

@@ -1,7 +1,7 @@
-"""Passes over very many small covariances: those of the exposures of a series, chain by chain.
+"""Operations on many small covariances, those of the exposures of a series, for several chains.
 
-The innermost loops run over the exposures, so that they fill vectors whatever the number k of
-coefficients; the work of a chain stays in the cache.
+C is the number of chains, k the number of coefficients, E the number of exposures.  The innermost
+loops run over the exposures and are thus vectorised for any k; the data of a chain fit the cache.
 """
 
 from __future__ import annotations
@@ -23,14 +23,14 @@ SUMS = PASS | {"fastmath": FAST | {"reassoc"}}
 
 @nb.njit(cache=True)
 def _factor(formal, sigma, L):
-    """Lower Cholesky factors (k, k, E) of formal + sigma, with inverse diagonals."""
+    """Write to L the lower Cholesky factors (k, k, E) of formal + sigma, with inverse diagonals."""
     whole_vectors()
     k, _, n = formal.shape
     for j in range(k):
         for i in range(j, k):
-            row, given, more = L[i, j], formal[i, j], sigma[i, j]
+            row, formal_row, added = L[i, j], formal[i, j], sigma[i, j]
             for e in range(n):
-                row[e] = given[e] + more
+                row[e] = formal_row[e] + added
             for m in range(j):
                 a, b = L[i, m], L[j, m]
                 for e in range(n):
@@ -64,7 +64,7 @@ def _precisions(formal, sigma, precision):
                     row[e] *= d[e]
         for i in range(k):
             for j in range(i + 1):
-                out, same = precision[c, i, j], precision[c, j, i]
+                out, mirrored = precision[c, i, j], precision[c, j, i]
                 for e in range(n):
                     out[e] = 0.0
                 for m in range(i, k):
@@ -72,11 +72,23 @@ def _precisions(formal, sigma, precision):
                     for e in range(n):
                         out[e] += a[e] * b[e]
                 for e in range(n):
-                    same[e] = out[e]
+                    mirrored[e] = out[e]
 
 
 def precisions(formal: Float, sigma: Float) -> Float:
-    """Inverses (C, k, k, E) of formal (k, k, E) + sigma (C, k, k), both positive."""
+    """Inverses of the total covariances of the exposures, formal + sigma.
+
+    Parameters
+    ----------
+    formal : ndarray, shape (k, k, E)
+        Formal covariances.
+    sigma : ndarray, shape (C, k, k)
+        Intrinsic covariances. The sums must be positive definite.
+
+    Returns
+    -------
+    ndarray, shape (C, k, k, E)
+    """
     out = np.empty((*sigma.shape, formal.shape[-1]))
     _precisions(formal, np.ascontiguousarray(sigma), out)
     return out
@@ -121,11 +133,28 @@ def _densities(formal, sigma, residual, fraction, kappa2, density, distance, odd
 def densities(
     formal: Float, sigma: Float, residual: Float, fraction: Float, kappa2: Float
 ) -> tuple[Float, Float, Float]:
-    """Log densities, squared distances, and outlier probabilities (C, E) of exposures.
+    """Log densities and outlier probabilities of the exposures.
 
-    `formal` (k, k, E) + `sigma` (C, k, k) is the covariance of an exposure that does not lie off,
-    and the metric of the distance; a `fraction` (C,) has `kappa2` (C,) times that covariance.
-    `residual` is (C, k, E).
+    Parameters
+    ----------
+    formal : ndarray, shape (k, k, E)
+        Formal covariances.
+    sigma : ndarray, shape (C, k, k)
+        Intrinsic covariances. The covariance of a normal exposure is `formal` + `sigma`.
+    residual : ndarray, shape (C, k, E)
+    fraction : ndarray, shape (C,)
+        Fraction of outlying exposures.
+    kappa2 : ndarray, shape (C,)
+        Factor on the covariance of outlying exposures.
+
+    Returns
+    -------
+    density : ndarray, shape (C, E)
+        Log densities.
+    distance : ndarray, shape (C, E)
+        Squared Mahalanobis distances.
+    probability : ndarray, shape (C, E)
+        Outlier probabilities.
     """
     out = np.empty((3, len(sigma), formal.shape[-1]))
     density, distance, probability = out
@@ -167,10 +196,25 @@ def _deviations(sigma, root, precision, residual, noise, deviation):
 def draw_deviations(
     sigma: Float, root: Float, precision: Float, residual: Float, rng: np.random.Generator
 ) -> Float:
-    """Draws (C, k, E) of the intrinsic part of residuals (C, k, E).
+    """Draw the intrinsic part of residuals.
 
-    By Matheron: a draw from the prior, corrected for its part of the residual.  `root` (k, k, E) is
-    that of the formal covariance, `precision` (C, k, k, E) as `precisions`.
+    Uses Matheron's rule: a draw from the prior, corrected with the difference between the residual
+    and a simulated residual.
+
+    Parameters
+    ----------
+    sigma : ndarray, shape (C, k, k)
+        Intrinsic covariances.
+    root : ndarray, shape (k, k, E)
+        Cholesky factors of the formal covariances.
+    precision : ndarray, shape (C, k, k, E)
+        Result of `precisions`.
+    residual : ndarray, shape (C, k, E)
+    rng : numpy.random.Generator
+
+    Returns
+    -------
+    ndarray, shape (C, k, E)
     """
     sigma = np.ascontiguousarray(sigma)
     out = np.linalg.cholesky(sigma) @ rng.standard_normal(residual.shape)
@@ -180,9 +224,9 @@ def draw_deviations(
 
 @nb.njit(**SUMS)
 def _gaussian(matrix, x, noise):
-    """Draw in place of x from exp(x'y - y' matrix y / 2), and the log of its integral over y.
+    """Replace x by a draw y from exp(x'y - y' matrix y / 2); return the log of its integral.
 
-    The integral is up to a constant, and NaN where the matrix is not positive.
+    The integral over y is up to a constant, and NaN if the matrix is not positive definite.
     """
     whole_vectors()
     k, value = len(x), 0.0
@@ -210,10 +254,20 @@ def _gaussians(matrix, x, noise, value):
 
 
 def gaussians(matrix: Float, right: Float, noise: Float) -> tuple[Float, Float]:
-    """Draws y (C, q) from densities exp(right'y - y' matrix y / 2), and logs of their integrals.
+    """Draws y from densities exp(right'y - y' matrix y / 2), and logs of their integrals.
 
-    `matrix` is (C, q, q), `right` (C, q), `noise` (C, q) standard normal.  The integrals (C,) are
-    up to a constant, and NaN where a matrix is not positive.
+    Parameters
+    ----------
+    matrix : ndarray, shape (C, q, q)
+    right : ndarray, shape (C, q)
+    noise : ndarray, shape (C, q)
+        Standard normal random numbers.
+
+    Returns
+    -------
+    draws : ndarray, shape (C, q)
+    value : ndarray, shape (C,)
+        Log integrals, up to a constant; NaN if a matrix is not positive definite.
     """
     draws, value = right.copy(), np.empty(len(right))
     _gaussians(matrix.copy(), draws, noise, value)
@@ -222,7 +276,7 @@ def gaussians(matrix: Float, right: Float, noise: Float) -> tuple[Float, Float]:
 
 @nb.njit(**SUMS)
 def _pull(weight, r, u, out):
-    """Row of the formal precision, `weight` (k, E), times residuals less deviations."""
+    """Multiply a row of the formal precision, `weight` (k, E), by residuals minus deviations."""
     whole_vectors()
     k, n = r.shape
     for e in range(n):
@@ -235,14 +289,15 @@ def _pull(weight, r, u, out):
 
 @nb.njit(**SUMS)
 def _share(i, u, r, inverse, P, D, seen, noise, matrix, pull, part):
-    """Add a part of the others' deviations to those of coefficient i.
+    """Add multiples of the other coefficients' deviations to those of coefficient i.
 
-    With D given the log density is quadratic in the parts: u becomes Lambda u, and the precision P
-    of the covariance Lambda^-T P Lambda^-1, whose diagonal its prior weights with D^2.
+    For fixed D the log density is quadratic in these multiples: u becomes Lambda u, and the
+    precision P of the covariance becomes Lambda^-T P Lambda^-1.  The prior weights the diagonal of
+    P with D^2.
     """
     whole_vectors()
     k, n = u.shape
-    x, row, own, a = np.empty(k), P[i].copy(), u[i], inverse[i, i]
+    x, row, target, a = np.empty(k), P[i].copy(), u[i], inverse[i, i]
     _pull(inverse[i], r, u, pull)
     for j in range(k):
         v, total = u[j], 0.0
@@ -256,7 +311,7 @@ def _share(i, u, r, inverse, P, D, seen, noise, matrix, pull, part):
                 total += part[e] * a[e] * v[e]
             matrix[j, m] = total
         matrix[j, j] += D[j] ** 2 * row[i]
-    for j in range(k):  # nothing of its own
+    for j in range(k):  # no multiple of coefficient i itself
         matrix[max(i, j), min(i, j)] = 1.0 if i == j else 0.0
     if math.isnan(_gaussian(matrix, x, noise)):
         return
@@ -264,21 +319,21 @@ def _share(i, u, r, inverse, P, D, seen, noise, matrix, pull, part):
     for j in range(k):
         v = u[j]
         for e in range(n):
-            own[e] += x[j] * v[e]
+            target[e] += x[j] * v[e]
         for m in range(k):
             P[j, m] += row[i] * x[j] * x[m] - x[j] * row[m] - row[j] * x[m]
 
 
 @nb.njit(**SUMS)
 def _stretch(i, u, r, inverse, P, D, seen, dof, normal, luck, pull, part):
-    """Stretch by s what is left of the deviations of coefficient i given the others.
+    """Scale by s the part of the deviations of coefficient i that is independent of the others.
 
-    s is proposed as the residuals ask for; its prior density, with those of the covariance and of
-    the group of stretches, is s^-(dof + k) exp(-tail / s^2).
+    s is proposed from its likelihood given the residuals.  Its prior density, including that of the
+    covariance and the measure of the group of scalings, is s^-(dof + k) exp(-tail / s^2).
     """
     whole_vectors()
     k, n = u.shape
-    row, own, a = P[i].copy(), u[i], inverse[i, i]
+    row, target, a = P[i].copy(), u[i], inverse[i, i]
     _pull(inverse[i], r, u, pull)
     for e in range(n):
         part[e] = 0.0
@@ -297,7 +352,7 @@ def _stretch(i, u, r, inverse, P, D, seen, dof, normal, luck, pull, part):
     s = 1.0 + total / size + normal / math.sqrt(size)
     if luck < tail * (1.0 - 1.0 / s**2) - (dof + k) * math.log(abs(s)):
         for e in range(n):
-            own[e] += (s - 1.0) * part[e]
+            target[e] += (s - 1.0) * part[e]
         for j in range(k):
             for m in range(k):
                 P[j, m] += (1.0 / s**2 - 1.0) * row[j] * row[m] / row[i]
@@ -305,7 +360,7 @@ def _stretch(i, u, r, inverse, P, D, seen, dof, normal, luck, pull, part):
 
 @nb.njit(**SUMS)
 def _rescale(u, r, inverse, D, seen, variance, noise, matrix, pull, part):
-    """Draw the scales D, of which the deviations are multiples, from their Gaussian density."""
+    """Draw the scales D from their Gaussian density, with the deviations proportional to them."""
     whole_vectors()
     k, n = u.shape
     x = np.empty(k)
@@ -363,15 +418,36 @@ def shear(
     included: Float,
     rng: np.random.Generator,
 ) -> tuple[Float, Float]:
-    """Deviations (C, k, E) sheared and stretched together with their covariance, and new scales.
+    """Move the deviations jointly with their covariance; return new deviations and scales.
 
-    The covariance is inverse Wishart with scale matrix diag(scale^2), `scale` (C, k) normal;
-    `prior` has the variance of the scales and the degrees of freedom.  In turn each coefficient
-    gets a part of the others' deviations, and what is left of it given them another size; then all
-    get another scale.  All that is as the residuals (C, k, E) ask for, of which `inverse` (k, k, E)
-    is the formal precision.  So the covariance moves by as much as the residuals leave open, and
-    not only by what the present deviations leave open, which is little where formal errors are
-    large.
+    Parameters
+    ----------
+    deviation : ndarray, shape (C, k, E)
+        Intrinsic deviations of the exposures.
+    residual : ndarray, shape (C, k, E)
+    inverse : ndarray, shape (k, k, E)
+        Formal precision of the residuals.
+    sigma : ndarray, shape (C, k, k)
+        Intrinsic covariance. Its prior is inverse Wishart with scale matrix diag(scale^2).
+    scale : ndarray, shape (C, k)
+        Scales, with a normal prior.
+    prior : tuple of float
+        Prior variance of the scales, and degrees of freedom of the inverse Wishart.
+    included : ndarray, shape (C, E)
+        1 for exposures that are used, otherwise 0.
+    rng : numpy.random.Generator
+
+    Returns
+    -------
+    deviation : ndarray, shape (C, k, E)
+    scale : ndarray, shape (C, k)
+
+    Notes
+    -----
+    For each coefficient in turn, a multiple of the other coefficients' deviations is added, and the
+    part that is independent of them is scaled.  Then all scales are drawn.  Each move is drawn, or
+    accepted, according to the residuals.  The covariance can therefore move as far as the residuals
+    allow.  Updates that keep the deviations fixed move little if formal errors are large.
     """
     n_chains, k, _ = deviation.shape
     out, scale = deviation.copy(), scale.copy()

@@ -1,13 +1,13 @@
-"""Stars of unknown position, integrated out for many draws of the model at once.
+"""Marginal densities of stars of unknown position, for many draws of the model at once.
 
-Draws lie side by side in the vectors of the processor: a detection's own numbers are read once for
-all of them, and sums over the detections of a star need nothing from other lanes.  Where a search
-for a star's mode does not go straight to its end, that draw is left to `to_mode`.
+The draws are processed in SIMD lanes.  The data of a detection are read once for all of them, and
+sums over the detections of a star are independent between lanes.  If the Newton search for the mode
+of a star does not converge directly for a draw, `to_mode` handles that draw.
 
-Where it is doubtful which detections belong to the star, its position has several modes, which come
-and go as the model changes, and an expansion about one of them jumps.  The product over the
-detections is then written out: each choice of members is one Gaussian in the position, whose
-integral is known, and these are added.
+If it is doubtful which detections belong to a star, its position has several modes, which appear
+and disappear as the model changes, so that an expansion about one of them would be discontinuous.
+In this case the product over the detections is expanded: each choice of members gives a Gaussian in
+the position with a known integral, and the integrals are added.
 """
 
 from __future__ import annotations
@@ -39,24 +39,25 @@ from bayesdist.utils.arrays import Float
 
 Flags = NDArray[np.int8]
 
-# state of a detection, where the members of its star are chosen
+# state of a detection: member of its star, doubtful, or false
 MEMBER, DOUBTFUL, FALSE = range(3)
-MOST_DOUBTFUL = 6  # most detections of a star over whose membership is summed
-PIECES = 8  # number of separate sums, whatever the number of threads
-STEPS = 4  # evaluations after which a search has not gone straight to its end
-LEAST = 1e-300  # factor of a product, which is a number of full length
+MOST_DOUBTFUL = 6  # maximum number of doubtful detections of a star
+PIECES = 8  # number of partial sums, independent of the number of threads
+STEPS = 4  # maximum number of Newton steps before a draw is passed to `to_mode`
+LEAST = 1e-300  # smallest factor of a product, to avoid denormal numbers
 LN2 = 0.6931471805599453
 LOG_2_PI = math.log(2.0 * math.pi)
 
-# rows of a step of the search, each of as many draws as there are lanes
+# rows of the results of a Newton step, with one draw per lane
 GAIN, FAR, MANTISSA, EXPONENT, DET = range(5)
-# of sums over members, and of each doubtful one: curvature uu, uv, vv, gradient u, v, square
+# rows of sums over members, and of each doubtful detection: curvature uu, uv, vv, gradient u, v,
+# squared residual
 C00, C10, C11, G0, G1, SQUARE = range(6)
 
 
 @nb.njit(cache=True, forceinline=True)
 def _place(coef, start, phi, offset_u, offset_v):
-    """offset + sum of phi_k coef_k in lanes, of coefficients in 2 K rows (WIDTH,) from one on."""
+    """Position offset + sum phi_k coef_k in lanes; the 2 K coefficient rows begin at `start`."""
     whole_vectors()
     K = len(phi)
     u, v = load(coef, start, 0) * phi[0] + offset_u, load(coef, start + K, 0) * phi[0] + offset_v
@@ -68,7 +69,7 @@ def _place(coef, start, phi, offset_u, offset_v):
 
 @nb.njit(cache=True, forceinline=True)
 def _times(mantissa, exponent, factor):
-    """Product with one more factor; mantissas from one to two, and exponents."""
+    """Multiply a product, kept as mantissas in [1, 2) and exponents, by one more factor."""
     whole_vectors()
     bits = bits_of(mantissa * larger(factor, LEAST))
     # an integer below 2^52 in the low bits of 2^52
@@ -78,12 +79,12 @@ def _times(mantissa, exponent, factor):
 
 @nb.njit(cache=True)
 def _newton(n, a, W, var, at, d, constants, centre, precision, p, least, found):
-    """Newton step of a star at rest in lanes: moves p (2, WIDTH) and writes `found`.
+    """Newton step for a star without proper motion, in lanes; moves p (2, WIDTH).
 
-    What is found is the log density of the prior, with half the decrement of the step; the larger
-    one of its decrement and its square, in their limits, or infinity where the curvature is not
-    positive, or the step long; the product of the densities of the detections; the determinant of
-    the curvature.
+    Writes to `found` (5, WIDTH): GAIN, the log prior density plus half the decrement of the step;
+    FAR, the larger of the decrement and the squared step relative to their limits, or infinity if
+    the curvature is not positive or the step is long; MANTISSA and EXPONENT of the product of the
+    densities of the detections; DET, the determinant of the curvature.
     """
     whole_vectors()
     jitter, far_odds = load(constants, 0, d), load(constants, 1, d)
@@ -113,32 +114,33 @@ def _newton(n, a, W, var, at, d, constants, centre, precision, p, least, found):
     gain = (du * g0 + dv * g1) * -0.5
     a00, a10, a11 = a00 + precision[0, 0], a10 + precision[1, 0], a11 + precision[1, 1]
     b0, b1 = b0 + g0, b1 + g1
-    rest = a11 - a10 * a10 / a00
+    schur = a11 - a10 * a10 / a00
     z1 = b1 - a10 * b0 / a00
-    dv = z1 / rest
+    dv = z1 / schur
     du = (b0 - a10 * dv) / a00
-    left = b0 * b0 / a00 + z1 * dv
+    decrement = b0 * b0 / a00 + z1 * dv
     square = du * du * W[a, 0] + du * dv * (2.0 * W[a, 1]) + dv * dv * W[a, 2]
-    far = larger(left / CLOSE, square / ((jitter + var[a]) * STILL))
-    far = choose(NEAR, left, math.inf, far)
+    far = larger(decrement / CLOSE, square / ((jitter + var[a]) * STILL))
+    far = choose(NEAR, decrement, math.inf, far)
     far = choose(a00, least * least, math.inf, far)
-    far = choose(rest, least * least, math.inf, far)
+    far = choose(schur, least * least, math.inf, far)
     put(p, 0, 0, pu + du)
     put(p, 1, 0, pv + dv)
-    put(found, GAIN, 0, gain + left * 0.5)
+    put(found, GAIN, 0, gain + decrement * 0.5)
     put(found, FAR, 0, far)
     put(found, MANTISSA, 0, mantissa)
     put(found, EXPONENT, 0, exponent)
-    put(found, DET, 0, a00 * rest)
+    put(found, DET, 0, a00 * schur)
 
 
 @nb.njit(cache=True)
 def _members(n, a, W, var, at, d, constants, state, centre, precision, p, members, doubtful):
-    """Sums over the members of a star at rest, in lanes, at p (2, WIDTH); the number of doubtful.
+    """Sums over the members of a star without proper motion, in lanes, at p (2, WIDTH).
 
-    Written to `members` (8, WIDTH): the sums, then mantissas and exponents of the product of the
-    densities of members where they are largest, each times 2 pi.  Those of each doubtful one are
-    written to `doubtful` (7 k rows or more, WIDTH), its density last.
+    Writes to `members` (8, WIDTH) the sums, and mantissas and exponents of the product of the peak
+    densities of the members times 2 pi.  Writes to `doubtful` seven rows (WIDTH,) per doubtful
+    detection: its terms of the sums and its peak density.  Returns the number of doubtful
+    detections.
     """
     whole_vectors()
     jitter = load(constants, 0, d)
@@ -157,7 +159,7 @@ def _members(n, a, W, var, at, d, constants, state, centre, precision, p, member
         u, v = load(at, 2 * i, 0) - pu, load(at, 2 * i + 1, 0) - pv
         uu, uv, vv = inverse * W[a + i, 0], inverse * W[a + i, 1], inverse * W[a + i, 2]
         by_u, by_v = u * uu + v * uv, u * uv + v * vv
-        more = u * by_u + v * by_v
+        square_term = u * by_u + v * by_v
         if state[a + i] == DOUBTFUL:
             row = 7 * k
             put(doubtful, row + C00, 0, uu)
@@ -165,12 +167,12 @@ def _members(n, a, W, var, at, d, constants, state, centre, precision, p, member
             put(doubtful, row + C11, 0, vv)
             put(doubtful, row + G0, 0, by_u)
             put(doubtful, row + G1, 0, by_v)
-            put(doubtful, row + SQUARE, 0, more)
+            put(doubtful, row + SQUARE, 0, square_term)
             put(doubtful, row + 6, 0, inverse)
             k += 1
             continue
         c00, c10, c11 = c00 + uu, c10 + uv, c11 + vv
-        g0, g1, square = g0 + by_u, g1 + by_v, square + more
+        g0, g1, square = g0 + by_u, g1 + by_v, square + square_term
         mantissa, exponent = _times(mantissa, exponent, inverse)
     put(members, C00, 0, c00)
     put(members, C10, 0, c10)
@@ -185,10 +187,10 @@ def _members(n, a, W, var, at, d, constants, state, centre, precision, p, member
 
 @nb.njit(cache=True)
 def _over_choices(members, doubtful, k, l, log_norm, log_out, least):
-    """Log density of the draw in lane l, integrated over position, of all 2^k choices of members.
+    """Log marginal density of the draw in lane l, summed over all 2^k choices of members.
 
-    Apart from a factor of 2 pi it equals the expansion about a mode: density less `log_root`.
-    Without members and prior the star is somewhere in the match circle.
+    Up to a factor of 2 pi it has the same normalisation as the Laplace approximation, log density
+    minus `log_root`.  A star without members and prior may be anywhere in the match circle.
     """
     whole_vectors()
     top, total, floor = -math.inf, 0.0, 2.0 * math.log(least)
@@ -223,9 +225,9 @@ def _over_choices(members, doubtful, k, l, log_norm, log_out, least):
 
 @nb.njit(cache=True)
 def _at_modes(n, a, W, var, at, d, constants, centre, precision, place, least, found, value):
-    """Write log densities of a star at rest, integrated over position (Laplace), in lanes.
+    """Write log marginal densities of a star without proper motion (Laplace), in lanes, to `value`.
 
-    The search for the mode begins at `place`, which is moved.  NaN where it does not go straight.
+    The search for the mode starts at `place`, which is changed.  NaN if it does not converge.
     """
     whole_vectors()
     value[:] = math.nan
@@ -258,7 +260,7 @@ def _log_marginals(
         S, A, b = np.zeros((2, MOST_STAR)), np.zeros((MOST_STAR, MOST_STAR)), np.zeros(MOST_STAR)
         px, py, p = np.empty(order + 1), np.empty(order + 1), np.empty(q)
         first, place, value = np.empty((2, WIDTH)), np.empty((2, WIDTH)), np.empty(WIDTH)
-        found, members = np.empty((5, WIDTH)), np.empty((8, WIDTH))
+        newton_rows, members = np.empty((5, WIDTH)), np.empty((8, WIDTH))
         doubtful = np.empty((7 * MOST_DOUBTFUL, WIDTH))
         phi, at = np.empty((16, K)), np.empty((32, WIDTH))
         for s in range(piece * step, min((piece + 1) * step, len(stars))):
@@ -300,17 +302,20 @@ def _log_marginals(
                     place[:] = first
                     _at_modes(
                         n, a, W, var, at, d, constants, centre[s], precision[s], place, least,
-                        found, value,
+                        newton_rows, value,
                     )  # fmt: skip
                 for l in range(min(WIDTH, n_draws - d)):
                     if not math.isfinite(value[l]):
-                        own = own_rows(W, var, a, a + n)
+                        rows = own_rows(W, var, a, a + n)
                         for i in range(n):
-                            own[PLACE_U, i], own[PLACE_V, i] = at[2 * i, l], at[2 * i + 1, l]
+                            rows[PLACE_U, i], rows[PLACE_V, i] = (
+                                at[2 * i, l],
+                                at[2 * i + 1, l],
+                            )
                         p[:] = stars[s]
                         p[0], p[1] = first[0, l], first[1, l]
                         value[l], _ = to_mode(
-                            own, n, constants[0, d + l], constants[2, d + l], constants[3, d + l],
+                            rows, n, constants[0, d + l], constants[2, d + l], constants[3, d + l],
                             time[a : a + n] if q >= 4 else time,
                             factor[a : a + n] if q == 5 else factor,
                             centre[s], precision[s], p, S, A, b, True, least,
@@ -323,24 +328,43 @@ def log_marginals(
     detections: tuple[Any, ...], stars: Float, middles: Float, response: Float, state: Flags,
     coef: Float, order: int, rows: Float, least: float,
 ) -> Float:  # fmt: skip
-    """Log densities (PIECES, D) of stars, their parameters integrated out (Laplace).
+    """Log densities of the detections for D draws, with the parameters of S stars integrated out.
 
-    `detections` are starts, group, X, Y, offset, W, var, time, factor, centre and precision.
-    Summed over all choices of members where some are doubtful: state (N,), `MEMBER`, `DOUBTFUL` or
-    `FALSE`.
+    The integral is a Laplace approximation.  For stars with doubtful detections it is the sum over
+    all choices of members.
 
-    middles (S, 2), response (N, 2, 2): a star moves as its detections do, each times its response,
-    and lies at `stars` where the sum of these is `middles`.
-    coef (D, G, 2, K): of the Legendre products.
-    rows (D, 3): squared jitter, log of the core's fraction, log density of outliers.
-    least: root of the least curvature that a star's position may have.
+    Parameters
+    ----------
+    detections : tuple
+        Arrays starts, group, X, Y, offset, W, var, time, factor, centre and precision.
+    stars : ndarray, shape (S, q)
+        Parameters of the stars at the reference solution.
+    middles : ndarray, shape (S, 2)
+        Sum of response times detection position over a star's detections, at the reference.
+    response : ndarray, shape (N, 2, 2)
+        Derivative of a star's position with respect to the position of a detection. It predicts
+        where the search starts for a draw: stars + sum(response * position) - middles.
+    state : ndarray of int8, shape (N,)
+        `MEMBER`, `DOUBTFUL` or `FALSE` for each detection.
+    coef : ndarray, shape (D, G, 2, K)
+        Coefficients of the Legendre products.
+    order : int
+    rows : ndarray, shape (D, 3)
+        Squared jitter, log of the core fraction, log density of outliers.
+    least : float
+        Square root of the smallest curvature allowed for the position of a star.
+
+    Returns
+    -------
+    ndarray, shape (PIECES, D)
+        Partial sums over the stars.
     """
     D, G, _, K = coef.shape
     blocks = -(-D // WIDTH)
     in_lanes = np.zeros((blocks, G, 2, K, WIDTH))
     for block in range(blocks):
-        some = coef[block * WIDTH : (block + 1) * WIDTH]
-        in_lanes[block, ..., : len(some)] = np.moveaxis(some, 0, -1)
+        block_coef = coef[block * WIDTH : (block + 1) * WIDTH]
+        in_lanes[block, ..., : len(block_coef)] = np.moveaxis(block_coef, 0, -1)
     j2, log_core, log_out = np.pad(rows, ((0, -D % WIDTH), (0, 0)), mode="edge").T
     constants = np.stack([j2, 2 * np.pi * np.exp(log_out - log_core), log_core, log_out])
     sums = np.zeros((PIECES, D))

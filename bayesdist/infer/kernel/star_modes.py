@@ -1,18 +1,18 @@
-"""One star of unknown position: its most probable position, and its log density there.
+"""Most probable position of a star from its detections, and the log density there.
 
-The residual of detection i is r = z - S p: its sky position z by the model, less that of its star,
-S the derivative of a star's position by its parameters p (position, then motion, then parallax).
-Errors are round on the detector: with W = (J J^T)^-1, J the derivative of z by the pixel, r^T W r
-is in square pixels.
+The residual of detection i is r = z - S p.  Here z is its sky position according to the model, p
+are the parameters of the star (position, then proper motion, then parallax), and S is the
+derivative of the star's position with respect to p.  Errors are isotropic on the detector: with
+W = (J J^T)^-1, and J the derivative of z with respect to the pixel, r^T W r is in square pixels.
 
     log p = sum_i log[ (1 - f) / (2 pi s_i^2) exp(-r^T W r / (2 s_i^2)) + f / (pi R^2) ]
 
-with s_i^2 the detection's variance, jitter included, in square pixels.  With e_i the exponential
-and o_i the term of false detections, the membership is e_i / (e_i + o_i), and the logarithms are
-those of products: a detection takes one exponential.
+s_i^2 is the variance of the detection, including jitter, in square pixels.  With e_i the
+exponential and o_i the term of false detections, the membership probability is e_i / (e_i + o_i).
+Logarithms are taken of products, so that a detection needs one exponential only.
 
-The detections of a star are one array (ROWS, n), a row for each quantity: sums over them are then
-vector instructions.
+The detections of a star are stored as one array (ROWS, n), with a row per quantity, so that sums
+over them are vectorised.
 """
 
 from __future__ import annotations
@@ -26,12 +26,12 @@ from bayesdist.infer.kernel.lanes import FAST, WIDTH
 from bayesdist.infer.kernel.numeric import exp_negative
 from bayesdist.infer.kernel.vectors import whole_vectors
 
-MOST_STAR = 5  # parameters of a star
-MOST_STEPS = 60
-CLOSE = 1e-8  # decrement at which one more Newton step is the last
-STILL = 1e-6  # square of that step, in errors, at most
-NEAR = 1.0  # decrement below which the curvature of the mixture is used
-RANGE = 1e150  # of products before their logarithm is taken
+MOST_STAR = 5  # maximum number of parameters of a star
+MOST_STEPS = 60  # maximum number of Newton steps
+CLOSE = 1e-8  # the search ends after a step with a smaller decrement
+STILL = 1e-6  # limit on the square of that step, in units of the variance
+NEAR = 1.0  # decrement below which the curvature of the mixture is used instead of EM weights
+RANGE = 1e150  # products beyond this range are converted to logarithms
 
 # rows of a star's detections: sky position, W (uu, uv, vv), variance, e + o
 PLACE_U, PLACE_V, UU, UV, VV, VAR, TERM = range(7)
@@ -40,22 +40,23 @@ ROWS = 7
 
 @nb.njit(cache=True, forceinline=True)
 def own_rows(W, var, a, e):
-    """Detections a..e of a star without their positions, and others that say nothing of it.
+    """Array (ROWS, n) of the detections a..e of a star, without their positions.
 
-    (ROWS, n): n fills whole vectors, since what is left over would take as long as a vector each.
+    It is padded with detections of zero weight to whole SIMD vectors, since a remainder loop would
+    take as long per detection as a vector.
     """
     whole_vectors()
-    own = np.zeros((ROWS, -(-(e - a) // WIDTH) * WIDTH))
-    own[VAR] = 1.0
+    padded = np.zeros((ROWS, -(-(e - a) // WIDTH) * WIDTH))
+    padded[VAR] = 1.0
     for i in range(a, e):
-        own[UU, i - a], own[UV, i - a], own[VV, i - a] = W[i, 0], W[i, 1], W[i, 2]
-        own[VAR, i - a] = var[i]
-    return own
+        padded[UU, i - a], padded[UV, i - a], padded[VV, i - a] = W[i, 0], W[i, 1], W[i, 2]
+        padded[VAR, i - a] = var[i]
+    return padded
 
 
 @nb.njit(cache=True, forceinline=True)
 def cholesky(A, q):
-    """Lower Cholesky factor in place; False where the matrix is not positive."""
+    """Replace A (q, q) by its lower Cholesky factor; return False if it is not positive."""
     whole_vectors()
     for i in range(q):
         for j in range(i + 1):
@@ -90,7 +91,10 @@ def _solve(L, b, q):
 
 @nb.njit(cache=True, forceinline=True)
 def design(S, q, i, time, factor):
-    """Derivative (2, q) of a star's position by its parameters at the date of detection i."""
+    """Write to S (2, q) the derivative of a star's position with respect to its parameters.
+
+    It is evaluated at the date of detection i.
+    """
     whole_vectors()
     S[0, 0] = S[1, 1] = 1.0
     S[0, 1] = S[1, 0] = 0.0
@@ -103,7 +107,7 @@ def design(S, q, i, time, factor):
 
 @nb.njit(cache=True, forceinline=True)
 def residual(i, own, S, p, q):
-    """W times the residual, and its square in square pixels."""
+    """W times the residual r (two numbers), and r^T W r in square pixels."""
     whole_vectors()
     ru, rv = own[PLACE_U, i], own[PLACE_V, i]
     for k in range(q):
@@ -115,14 +119,14 @@ def residual(i, own, S, p, q):
 
 @nb.njit(cache=True, forceinline=True)
 def far_odds(log_core, log_out):
-    """Density of false detections over that of true ones, without the factor s^2 / e."""
+    """Ratio of the densities of false and true detections, apart from the factor s^2 / e."""
     whole_vectors()
     return 2.0 * math.pi * math.exp(log_out - log_core)
 
 
 @nb.njit(cache=True, forceinline=True)
 def membership(odds, square, s2):
-    """Probability that a detection belongs to its star; `odds` as of `far_odds`."""
+    """Probability that a detection belongs to its star; `odds` is the result of `far_odds`."""
     whole_vectors()
     near = exp_negative(-0.5 * square / s2)
     return near / (near + odds * s2)
@@ -130,7 +134,7 @@ def membership(odds, square, s2):
 
 @nb.njit(cache=True, forceinline=True)
 def add_curvature(A, S, q, h0, h1, h2):
-    """Add S^T H S, lower half."""
+    """Add the lower triangle of S^T H S to A, with H = (h0, h1, h2) = (uu, uv, vv)."""
     whole_vectors()
     for k in range(q):
         a = h0 * S[0, k] + h1 * S[1, k]
@@ -141,7 +145,10 @@ def add_curvature(A, S, q, h0, h1, h2):
 
 @nb.njit(cache=True, forceinline=True)
 def hessian(i, own, wu, wv, s2, w, observed):
-    """Curvature (3 numbers) of a detection by position: of the mixture, or with its EM weight."""
+    """Minus the second derivatives (uu, uv, vv) of a detection's log density in position.
+
+    They are exact if `observed` is True, otherwise those with the EM weight.
+    """
     whole_vectors()
     core = w / s2
     tie = w * (1.0 - w) / (s2 * s2) if observed else 0.0
@@ -154,7 +161,7 @@ def hessian(i, own, wu, wv, s2, w, observed):
 
 @nb.njit(cache=True, forceinline=True)
 def _start(centre, precision, p, A, b):
-    """Prior of a star: curvature, gradient, log density."""
+    """Write curvature A and gradient b of a star's prior at p; return its log density."""
     whole_vectors()
     value = 0.0
     for k in range(len(p)):
@@ -168,7 +175,10 @@ def _start(centre, precision, p, A, b):
 
 @nb.njit(cache=True, forceinline=True, fastmath=FAST | {"reassoc"})
 def _sums(own, j2, odds, pu, pv, share):
-    """Curvature and gradient of a star without motion at (pu, pv); `share` as of `_expanded`."""
+    """Curvature and gradient of the detections of a star without proper motion at (pu, pv).
+
+    `share` is 1 for the curvature of the mixture, 0 for that with EM weights.
+    """
     whole_vectors()
     a00 = a10 = a11 = b0 = b1 = 0.0
     for i in range(own.shape[1]):
@@ -192,7 +202,11 @@ def _sums(own, j2, odds, pu, pv, share):
 
 @nb.njit(cache=True)
 def _expanded(own, n, j2, odds, time, factor, centre, precision, p, S, A, b, observed):
-    """Log density of one star with its prior, gradient b and lower half of the curvature A."""
+    """Write the gradient b and the lower triangle of the curvature A of a star at p.
+
+    Both include the prior; its log density is returned.  The densities of the detections are
+    written to the row TERM of `own` (see `_log_density`).
+    """
     whole_vectors()
     q, value = len(p), _start(centre, precision, p, A, b)
     for i in range(n):
@@ -212,7 +226,7 @@ def _expanded(own, n, j2, odds, time, factor, centre, precision, p, S, A, b, obs
 
 @nb.njit(cache=True)
 def _log_density(own, n, j2, log_core):
-    """Log density of the detections of a star, from the terms of its last expansion."""
+    """Log density of the detections of a star, from the row TERM of its last expansion."""
     whole_vectors()
     value, product = 0.0, 1.0
     scale = own[VAR, 0] + j2  # keeps products near one
@@ -226,24 +240,29 @@ def _log_density(own, n, j2, log_core):
 
 @nb.njit(cache=True, forceinline=True)
 def _expanded_at_rest(own, j2, odds, c0, c1, p00, p10, p11, pu, pv, observed):
-    """As `_expanded`, at (pu, pv): value, gradient and factor, whose first number is 0 if none."""
+    """Like `_expanded`, for a star without proper motion at (pu, pv).
+
+    Returns the log prior density, the gradient (2 numbers) and the Cholesky factor of the curvature
+    (3 numbers); the first of the latter is 0 if the curvature is not positive.
+    """
     whole_vectors()
     a00, a10, a11, b0, b1 = _sums(own, j2, odds, pu, pv, 1.0 if observed else 0.0)
     du, dv = c0 - pu, c1 - pv
     g0, g1 = p00 * du + p10 * dv, p10 * du + p11 * dv
     a00, a10, a11 = a00 + p00, a10 + p10, a11 + p11
-    rest = a11 - a10 * a10 / a00 if a00 > 0.0 else -1.0
-    l00, l11 = (math.sqrt(a00), math.sqrt(rest)) if rest > 0.0 else (0.0, 1.0)
-    l10 = a10 / l00 if rest > 0.0 else 0.0
+    schur = a11 - a10 * a10 / a00 if a00 > 0.0 else -1.0
+    l00, l11 = (math.sqrt(a00), math.sqrt(schur)) if schur > 0.0 else (0.0, 1.0)
+    l10 = a10 / l00 if schur > 0.0 else 0.0
     return -0.5 * (du * g0 + dv * g1), b0 + g0, b1 + g1, l00, l10, l11
 
 
 @nb.njit(cache=True)
 def _to_mode_at_rest(own, n, j2, odds, log_core, c0, c1, p00, p10, p11, pu, pv, seen, least):
-    """`to_mode` of a star without motion in numbers alone, which takes half as long.
+    """`to_mode` for a star without proper motion, with scalars only, which takes half as long.
 
-    c0, c1 are the centre of its prior, p00, p10, p11 the precision, pu, pv the start.  Returns the
-    log density, whether the curvature is the mixture's, the mode, and the factor of the curvature.
+    c0, c1 are the centre of the prior, p00, p10, p11 its precision, pu, pv the starting point.
+    Returns the log density, True if the curvature is that of the mixture, the mode, and the
+    Cholesky factor of the curvature.
     """
     whole_vectors()
     observed, failed = True, False
@@ -258,8 +277,8 @@ def _to_mode_at_rest(own, n, j2, odds, log_core, c0, c1, p00, p10, p11, pu, pv, 
             continue
         z0 = b0 / l00
         z1 = (b1 - l10 * z0) / l11
-        left = z0 * z0 + z1 * z1
-        if observed and left > NEAR:
+        decrement = z0 * z0 + z1 * z1
+        if observed and decrement > NEAR:
             observed = False
             continue
         if l00 < least:
@@ -269,12 +288,12 @@ def _to_mode_at_rest(own, n, j2, odds, log_core, c0, c1, p00, p10, p11, pu, pv, 
         pu, pv = pu + du, pv + dv
         # a step may be long and gain little; the curvature at its end is different
         moved = own[UU, 0] * du * du + 2.0 * own[UV, 0] * du * dv + own[VV, 0] * dv * dv
-        if left < CLOSE and moved < STILL * (own[VAR, 0] + j2):
-            if observed == seen:  # the last step changes the curvature by next to nothing
-                value += _log_density(own, n, j2, log_core) + 0.5 * left
+        if decrement < CLOSE and moved < STILL * (own[VAR, 0] + j2):
+            if observed == seen:  # the last step hardly changes the curvature
+                value += _log_density(own, n, j2, log_core) + 0.5 * decrement
                 return value, observed, pu, pv, l00, l10, l11
             break
-        observed = left < NEAR and not failed
+        observed = decrement < NEAR and not failed
     observed = seen
     value, b0, b1, l00, l10, l11 = _expanded_at_rest(
         own, j2, odds, c0, c1, p00, p10, p11, pu, pv, observed
@@ -291,16 +310,17 @@ def _to_mode_at_rest(own, n, j2, odds, log_core, c0, c1, p00, p10, p11, pu, pv, 
 def to_mode(
     own, n, j2, log_core, log_out, time, factor, centre, precision, p, S, A, b, seen, least
 ):  # fmt: skip
-    """Move p to the mode of one star; leaves the factor of the curvature there in A.
+    """Move p to the mode of a star, and write the Cholesky factor of the curvature to A.
 
-    own: n detections as of `own_rows`, with positions.  `least` is the root of the least curvature
-    that its position may have: a star without members has less, and is not moved.
+    `own` has the n detections (`own_rows`), with positions.  `least` is the square root of the
+    smallest curvature allowed for the position; a star with less has no members and is not moved.
+    `seen` is True to request the curvature of the mixture, False for EM weights.
 
-    Returns the log density, and whether the curvature is the mixture's, or with EM weights: as
-    requested by `seen`, or where necessary.
+    Returns the log density, and True if the curvature is that of the mixture.  EM weights are also
+    used if the curvature of the mixture is not positive.
     """
     whole_vectors()
-    q, observed, failed, value, left = len(p), True, False, 0.0, 1.0
+    q, observed, failed, value, decrement = len(p), True, False, 0.0, 1.0
     odds = far_odds(log_core, log_out)
     if q == 2:  # most stars have no motion
         value, observed, p[0], p[1], A[0, 0], A[1, 0], A[1, 1] = _to_mode_at_rest(
@@ -315,8 +335,8 @@ def to_mode(
                 break  # nothing known: a star without members
             observed, failed = False, True
             continue
-        left = _solve(A, b, q)
-        if observed and left > NEAR:
+        decrement = _solve(A, b, q)
+        if observed and decrement > NEAR:
             observed = False
             continue
         if A[0, 0] < least:
@@ -325,11 +345,11 @@ def to_mode(
             p[k] += b[k]
         # a step may be long and gain little; the curvature at its end is different
         moved = own[UU, 0] * b[0] ** 2 + 2.0 * own[UV, 0] * b[0] * b[1] + own[VV, 0] * b[1] ** 2
-        if left < CLOSE and moved < STILL * (own[VAR, 0] + j2):
-            if observed == seen:  # the last step changes the curvature by next to nothing
-                return value + _log_density(own, n, j2, log_core) + 0.5 * left, observed
+        if decrement < CLOSE and moved < STILL * (own[VAR, 0] + j2):
+            if observed == seen:  # the last step hardly changes the curvature
+                return value + _log_density(own, n, j2, log_core) + 0.5 * decrement, observed
             break
-        observed = left < NEAR and not failed
+        observed = decrement < NEAR and not failed
     for attempt in range(2):
         observed = seen and attempt == 0
         value = _expanded(own, n, j2, odds, time, factor, centre, precision, p, S, A, b, observed)
@@ -340,10 +360,10 @@ def to_mode(
 
 @nb.njit(cache=True, forceinline=True)
 def log_root(A, q, least):
-    """Half the log determinant of the curvature with the factor A.
+    """Half the log determinant of the curvature, from its Cholesky factor A.
 
-    Without members a star's position would be unlimited; it is not, for its detections lie in one
-    circle.
+    The curvature in position is at least `least` squared, since even a star without members is
+    confined to the match circle.
     """
     whole_vectors()
     total = 0.0

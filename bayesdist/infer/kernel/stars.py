@@ -1,4 +1,4 @@
-"""Passes that give a number for each star: residuals, and outlier probabilities."""
+"""Passes with results per star: residuals and outlier probabilities."""
 
 from __future__ import annotations
 
@@ -28,10 +28,22 @@ def _residuals(first, end, stars, model, blocks, columns, coef, order, out):
 
 
 def residuals(blocks: Int, columns: tuple[Float, ...], coef: Float, order: int) -> Float:
-    """Data minus model (N, 2).
+    """Residuals of the stars: data minus model.
 
-    `blocks` (n, 3) are `pieces_of` size `BLOCK`; `columns` (N,) are X, Y, u, v and more; `coef` (G,
-    2, K) are effective coefficients of the scaled powers.
+    Parameters
+    ----------
+    blocks : ndarray of int, shape (n, 3)
+        Pieces of size `BLOCK` from `pieces_of`.
+    columns : tuple of ndarray, shape (N,)
+        X, Y, u, v, var_u, var_v.
+    coef : ndarray, shape (G, 2, K)
+        Effective coefficients of the scaled powers.
+    order : int
+        Polynomial order.
+
+    Returns
+    -------
+    ndarray, shape (N, 2)
     """
     out = np.empty((len(columns[0]), 2))
     with threads_for(len(out)):
@@ -84,10 +96,22 @@ def memberships(
     constants: Constants,
     each: int,
 ) -> Float:
-    """Outlier probability, log-likelihood and its square (D / each, 3, N) of each star.
+    """Outlier probability, log-likelihood and its square for each star, averaged over draws.
 
-    They are averaged over `each` draws at a time.  `coef` (D, G, 2, K) and the constants are those
-    of D draws; other arguments as in `residuals`.
+    Parameters
+    ----------
+    blocks, columns, order
+        See `residuals`.
+    coef : ndarray, shape (D, G, 2, K)
+        Effective coefficients of the scaled powers for D draws.
+    constants : Constants
+        Constants of the mixture for the D draws.
+    each : int
+        Number of consecutive draws over which the results are averaged.
+
+    Returns
+    -------
+    ndarray, shape (D / each, 3, N)
     """
     out = np.zeros((len(coef) // each, 3, len(columns[0])))
     with threads_for(4 * out.shape[2] * len(coef)):

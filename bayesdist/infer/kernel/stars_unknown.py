@@ -1,9 +1,10 @@
-"""Detections of stars of unknown position, which is solved for, and eliminated, in one pass.
+"""Solve for the unknown positions of stars and eliminate them, in one pass over the detections.
 
-Detections are sorted by star.  The model is evaluated at the star's position by a current solution,
-the pixel x', and not where it was detected: z = z(x') + J (x - x').  J may then be constant, for
-z(x') - S p is as small as the solution is good.  At the detection itself it would be as large as
-the error is, and a model that made pixels smaller would make errors smaller.
+Detections are sorted by star.  The model is evaluated at the pixel x' where the current solution
+predicts the star, not at the detection x: z = z(x') + J (x - x').  J can then be kept constant,
+because z(x') - S p vanishes as the solution converges.  With the model evaluated at the detection,
+this difference would be as large as the measurement error, and a model with a smaller pixel scale
+would appear to have smaller errors.
 """
 
 from __future__ import annotations
@@ -45,18 +46,18 @@ def _weighted_stars(
     S, A, b = np.zeros((2, MOST_STAR)), np.zeros((MOST_STAR, MOST_STAR)), np.zeros(MOST_STAR)
     for s in range(first, end):
         a, e = starts[s], starts[s + 1]
-        own = own_rows(W, var, a, e)
+        obs = own_rows(W, var, a, e)
         for i in range(a, e):
-            own[PLACE_U, i - a], own[PLACE_V, i - a] = z[i, 0], z[i, 1]
+            obs[PLACE_U, i - a], obs[PLACE_V, i - a] = z[i, 0], z[i, 1]
         when = time[a:e] if q >= 4 else time
-        where = factor[a:e] if q == 5 else factor
+        parallax = factor[a:e] if q == 5 else factor
         to_mode(
-            own, e - a, j2, log_core, log_out, when, where, centre[s], precision[s], stars[s], S,
+            obs, e - a, j2, log_core, log_out, when, parallax, centre[s], precision[s], stars[s], S,
             A, b, False, least,
         )  # fmt: skip
         for i in range(a, e):
-            design(S, q, i - a, when, where)
-            _, _, square = residual(i - a, own, S, stars[s], q)
+            design(S, q, i - a, when, parallax)
+            _, _, square = residual(i - a, obs, S, stars[s], q)
             member[i] = membership(odds, square, var[i] + j2)
 
 
@@ -64,7 +65,36 @@ def weighted_stars(
     starts: Int, z: Float, W: Float, var: Float, j2: float, log_core: float, log_out: float,
     time: Float, factor: Float, centre: Float, precision: Float, least: float, stars: Float,
 ) -> Float:  # fmt: skip
-    """Move stars (n, q) to their modes for sky positions z (N, 2); memberships (N,)."""
+    """Move stars to their modes for given sky positions of their N detections.
+
+    Parameters
+    ----------
+    starts : ndarray of int, shape (n + 1,)
+        Index of the first detection of each star, and the number N.
+    z : ndarray, shape (N, 2)
+        Sky positions of the detections.
+    W : ndarray, shape (N, 3)
+        Elements uu, uv, vv of the matrix that converts sky residuals to squared pixels.
+    var : ndarray, shape (N,)
+        Squared quoted errors in square pixels.
+    j2, log_core, log_out : float
+        Squared jitter, log of the core fraction, log density of outliers.
+    time : ndarray, shape (N,)
+        Years since the reference epoch; empty if stars have no proper motion.
+    factor : ndarray, shape (N, 2)
+        Parallax factors; empty without parallax.
+    centre, precision : ndarray, shape (n, q) and (n, q, q)
+        Gaussian priors of the stars.
+    least : float
+        Square root of the smallest curvature allowed for the position of a star.
+    stars : ndarray, shape (n, q)
+        Parameters of the stars, which are changed.
+
+    Returns
+    -------
+    ndarray, shape (N,)
+        Probability that each detection belongs to its star.
+    """
     member = np.zeros(len(z))
     share_out(
         _weighted_stars, len(stars), starts, z, W, var, j2, log_core, log_out, time, factor,
@@ -75,7 +105,7 @@ def weighted_stars(
 
 @nb.njit(cache=True, forceinline=True)
 def _dot(coef, at, phi, row, n):
-    """Sum of the first n products of two rows; n fills whole vectors."""
+    """Dot product of the first n entries of two rows, rounded up to whole vectors."""
     whole_vectors()
     lanes = load(coef, at, 0) * load(phi, row, 0)
     for k in range(WIDTH, n, WIDTH):
@@ -85,7 +115,7 @@ def _dot(coef, at, phi, row, n):
 
 @nb.njit(cache=True, forceinline=True)
 def _add(out, at, phi, row, n, factor):
-    """Add so many times the first n numbers of a row to one of `out`; n fills whole vectors."""
+    """Add `factor` times a row of `phi` to a row of `out`: n entries, rounded up to vectors."""
     whole_vectors()
     for k in range(0, n, WIDTH):
         put(out, at, k, load(out, at, k) + load(phi, row, k) * factor)
@@ -110,7 +140,7 @@ def _eliminate_stars(
             basis = np.zeros((2 * (e - a), top))
         mine = own_rows(W, var, a, e)
         when = time[a:e] if q >= 4 else time
-        where = factor[a:e] if q == 5 else factor
+        parallax = factor[a:e] if q == 5 else factor
         for i in range(a, e):
             g = group[i]
             legendre(X[i], Y[i], 2 * order, px, py, basis[i - a])
@@ -118,7 +148,7 @@ def _eliminate_stars(
             mine[PLACE_V, i - a] = offset[i, 1] + _dot(coef, 2 * g + 1, basis, i - a, low)
         p = stars[s]
         value, observed = to_mode(
-            mine, e - a, j2, log_core, log_out, when, where, centre[s], precision[s], p, S, A, b,
+            mine, e - a, j2, log_core, log_out, when, parallax, centre[s], precision[s], p, S, A, b,
             seen, least,
         )  # fmt: skip
         scalars[0] += value - log_root(A, q, least)
@@ -130,7 +160,7 @@ def _eliminate_stars(
         dense[:] = 0.0
         for i in range(a, e):
             g, phi = group[i], i - a
-            design(S, q, i - a, when, where)
+            design(S, q, i - a, when, parallax)
             wu, wv, square = residual(i - a, mine, S, p, q)
             s2 = var[i] + j2
             w = membership(odds, square, s2)
@@ -148,7 +178,7 @@ def _eliminate_stars(
                     by[axis, n] = _dot(extra, 2 * (g * m + n) + axis, basis, phi, low)
             for k in range(q):
                 hu, hv = S[0, k] * h0 + S[1, k] * h1, S[0, k] * h1 + S[1, k] * h2
-                # by coefficients before the frame, and by its parameters
+                # derivatives with respect to the coefficients before the frame, then its parameters
                 for axis in range(2):
                     along = hu * linear[g, 0, axis] + hv * linear[g, 1, axis]
                     at = 2 * (k * n_chips + chip[g]) + axis
@@ -160,16 +190,16 @@ def _eliminate_stars(
             for c in range(2 * n_chips):
                 for l in range(K):
                     rows[row + k, c * K + l] += dense[2 * k * n_chips + c, l]
-        # of these terms exactly, else directions that detections leave free would not be free:
-        # those of the last step but one are slightly different
-        same = cholesky(A, q)
+        # factor exactly the sum of these terms: the curvature at the last Newton step is slightly
+        # different, and directions that the detections leave free would not be free
+        positive = cholesky(A, q)
         for k in range(q):
             for l in range(k + 1):
-                if same:
+                if positive:
                     factors[s - first, k, l] = A[k, l]
                 else:
                     A[k, l] = factors[s - first, k, l]
-        # L^-1 of them: elimination subtracts their square
+        # multiply by L^-1: the elimination subtracts the square of the result
         for k in range(q):
             for l in range(k):
                 below = A[k, l]
@@ -180,19 +210,28 @@ def _eliminate_stars(
 
 
 class EliminationSums(NamedTuple):
-    """Sums of a second-order expansion by group, in whole vectors: what is beyond is no sum.
+    """Sums of a second-order expansion by group; rows are padded to whole SIMD vectors.
 
-    With the Legendre functions up to twice the order, by which products of two are sums
-    (`product_table`).
+    The curvature is summed with Legendre functions up to twice the order; `product_table` converts
+    these to sums with products of two basis functions.  Padding entries are meaningless.
+
+    Parameters
+    ----------
+    weights : ndarray, shape (G, 3, M or more)
+        Curvature uu, uv, vv in position times Legendre functions.
+    pulls : ndarray, shape (G, 2, K or more)
+        Gradient in position times Legendre functions.
+    scalars : ndarray, shape (3,)
+        Log density, sum of w, sum of w times squared normalised residual.
     """
 
-    weights: Float  # (G, 3, M or more) of the curvature uu, uv, vv by position
-    pulls: Float  # (G, 2, K or more) of its gradient
-    scalars: Float  # (3,) log density, sums of w, and of w times the squared normalised residual
+    weights: Float
+    pulls: Float
+    scalars: Float
 
     @classmethod
     def zero(cls, n_groups: int, order: int) -> EliminationSums:
-        """Sums over no star."""
+        """Sums that are zero."""
         K, M = (order + 1) * (order + 2) // 2, (order + 1) * (2 * order + 1)
         shapes = (n_groups, 3, M + -M % WIDTH), (n_groups, 2, K + -K % WIDTH), (3,)
         return cls(*map(np.zeros, shapes))
@@ -203,16 +242,44 @@ def eliminate_stars(
     coef: Float, chip: Int, linear: Float, extra: Float, columns: Int, n_params: int, order: int,
     j2: float, log_core: float, log_out: float, least: float, seen: bool, sums: EliminationSums,
 ) -> tuple[Float, Float]:  # fmt: skip
-    """Move stars first..last to their modes and add to the sums of a second-order expansion.
+    """Move stars first..last to their modes, and add their terms of a second-order expansion.
 
-    `detections` are starts, group, X, Y, offset, W, var, time, factor, centre and precision.
-    coef (G, 2, K): of the Legendre products; of each group its chip (G,), the linear part (G, 2, 2)
-    of its frame, the derivatives (G, m, 2, K) by its other parameters and the indices of these
-    (G, m), -1 for none.
-    least: root of the least curvature that a star's position may have.
-    seen: curvature of the mixture itself.
+    Parameters
+    ----------
+    first, last : int
+        Range of S stars.
+    detections : tuple
+        Arrays starts, group, X, Y, offset, W, var, time, factor, centre and precision.
+    stars : ndarray, shape (n, q)
+        Parameters of all stars; those in the range are changed.
+    coef : ndarray, shape (G, 2, K)
+        Coefficients of the Legendre products.
+    chip : ndarray, shape (G,)
+        Chip of each group.
+    linear : ndarray, shape (G, 2, 2)
+        Linear part of the frame of each group.
+    extra : ndarray, shape (G, m, 2, K)
+        Derivatives of `coef` with respect to the other parameters of a group.
+    columns : ndarray, shape (G, m)
+        Indices of these parameters; -1 for none.
+    n_params : int
+        Number D of model parameters.
+    order : int
+    j2, log_core, log_out : float
+        Squared jitter, log of the core fraction, log density of outliers.
+    least : float
+        Square root of the smallest curvature allowed for the position of a star.
+    seen : bool
+        True for the curvature of the mixture, False for EM weights.
+    sums : EliminationSums
+        Sums to which the terms are added.
 
-    Returns rows (S q, D): L^-1 B of each star; factors (S, q, q): L.
+    Returns
+    -------
+    rows : ndarray, shape (S q, D)
+        L^-1 B of each star, with B the mixed second derivatives.
+    factors : ndarray, shape (S, q, q)
+        Cholesky factors L of the curvature of each star.
     """
     q = stars.shape[1]
     rows, factors = np.zeros(((last - first) * q, n_params)), np.zeros((last - first, q, q))
@@ -225,7 +292,7 @@ def eliminate_stars(
 
 
 def _in_vectors(coefficients: Float) -> Float:
-    """Rows of coefficients (..., K) with zeros behind them that fill whole vectors."""
+    """Coefficients (..., K) as rows, padded with zeros to whole SIMD vectors."""
     K = coefficients.shape[-1]
     out = np.zeros((*coefficients.shape[:-1], K + -K % WIDTH))
     out[..., :K] = coefficients
@@ -233,5 +300,5 @@ def _in_vectors(coefficients: Float) -> Float:
 
 
 def _rows(array: Float) -> Float:
-    """Rows (..., n) below each other, as a view."""
+    """View of an array (..., n) as a two-dimensional array of rows."""
     return array.reshape(-1, array.shape[-1])

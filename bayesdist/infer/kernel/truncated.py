@@ -1,13 +1,13 @@
-"""Passes over stars that are matched only within a circle about a nominal position.
+"""Passes for stars that are matched only within a circle about a nominal position.
 
     p(r | matched) = (1 - f) N(r) / Z + f p_out(r) / Z_out
 
-Z and Z_out are the probabilities of either part to fall in the circle, which depend on the model's
-position, on the jitter and on the scale of the outliers: see `circle`.  f is the fraction of false
-matches among those in the circle.  Uniform outliers fill the circle, and their Z_out is 1.
+Z and Z_out are the probabilities that a true match and an outlier fall within the circle.  They
+depend on the model's position, on the jitter and on the scale of the outliers; see `circle`.  f is
+the fraction of false matches within the circle.  Uniform outliers fill the circle: Z_out is 1.
 
-These passes are separate from those without a circle, which stay as fast as they are: here a star
-costs an integral.
+These passes are separate from those without a circle, because they need an integral per star and
+are much slower.
 """
 
 from __future__ import annotations
@@ -46,17 +46,17 @@ from bayesdist.infer.kernel.vectors import whole_vectors
 from bayesdist.utils.arrays import Float, Int
 
 SCRATCH = 16_000_000  # bytes of partial sums in memory at a time
-INTEGRAL = 30  # cost of a star, in likelihood evaluations without a circle
-N_TERMS = COLUMNS + N_MIXTURE  # columns and scalars of one star
+INTEGRAL = 30  # cost per star, relative to a likelihood evaluation without a circle
+N_TERMS = COLUMNS + N_MIXTURE  # number of terms (columns and scalars) per star
 
 
-# In the loops `stars` are the columns X, Y, u, v, var_u, var_v, off_u, off_v; `circle` is True for
-# Gaussian outliers, then the radius, then the `NODES` of the integral.
+# In the loops, `stars` are the columns X, Y, u, v, var_u, var_v, off_u, off_v.  `circle` is a tuple
+# of True for Gaussian outliers, the radius, and the `NODES` of the integral.
 
 
 @nb.njit(cache=True, forceinline=True, fastmath=FAST)
 def _residual(stars, i, model, s, j2):
-    """Residual of a star, its distance from the nominal position, and its variances."""
+    """Residual of a star, nominal minus model position, and its variances (all in u and v)."""
     whole_vectors()
     ru, rv = stars[2][i] - model[0, s], stars[3][i] - model[1, s]
     return ru, rv, ru + stars[6][i], rv + stars[7][i], stars[4][i] + j2, stars[5][i] + j2
@@ -64,7 +64,10 @@ def _residual(stars, i, model, s, j2):
 
 @nb.njit(cache=True, forceinline=True, fastmath=FAST)
 def _parts(star, row, circle, q, work):
-    """Densities of both parts, in the unit of `mixture`, and half the chi-square taken out."""
+    """Densities of core and outliers, in the unit of `mixture`, without a common exponential.
+
+    The third value is the exponent (half a chi-square) that was factored out.
+    """
     whole_vectors()
     ru, rv, du, dv, au, av = star
     gaussian, radius, nodes = circle[0], circle[1], circle[2:]
@@ -88,7 +91,10 @@ def _parts(star, row, circle, q, work):
 def _evaluated(
     first, end, places, model, blocks, stars, coef, order, rows, unit2, circle, sums, out
 ):
-    """Log-likelihood (n, D) of each block; averages by star to out (D / each, 3, N) if any."""
+    """Write the log-likelihood (n, D) of each block to `sums`.
+
+    If `out` (D / each, 3, N) is not empty, averages per star are written to it; see `memberships`.
+    """
     whole_vectors()
     n_draws, wanted = len(rows), len(out) > 0
     each = n_draws // len(out) if wanted else 1
@@ -104,8 +110,8 @@ def _evaluated(
             total = 0.0
             for i in range(a, e):
                 star = _residual(stars, i, model, i - a, rows[d, 0])
-                d_in, d_out, least = _parts(star, rows[d], circle, q, work)
-                value = math.log(d_in + d_out) - least
+                d_in, d_out, q_min = _parts(star, rows[d], circle, q, work)
+                value = math.log(d_in + d_out) - q_min
                 total += value
                 if wanted:
                     mean = out[d // each]
@@ -119,7 +125,7 @@ def _evaluated(
 def _terms(star, row, circle, wavering, q, work, zc, zo, out):
     """Write the terms of one star to out (N_TERMS,): columns and scalars of `mixture_moments`.
 
-    `wavering` is 1, or 0 at fixed memberships.
+    `wavering` is 1, or 0 for fixed memberships (EM).
     """
     whole_vectors()
     ru, rv, du, dv, au, av = star
@@ -129,7 +135,8 @@ def _terms(star, row, circle, wavering, q, work, zc, zo, out):
     iu, iv = 1.0 / au, 1.0 / av
     eu, ev, r2 = ru * ru * iu, rv * rv * iv, ru * ru + rv * rv
     q_in, q_out = 0.5 * (eu + ev) + zc[0], r2 * row[3] + row[4]
-    # of the logarithms of both parts: by residual, log j, log s_out, then second ones
+    # first and second derivatives of the logarithms of both densities with respect to the residual,
+    # log j and log s_out
     k = 2.0 * j2
     in_u, in_v = -ru * iu - zc[1], -rv * iv - zc[2]
     in_uu, in_uv, in_vv = -iu - zc[3], -zc[4], -iv - zc[5]
@@ -154,8 +161,8 @@ def _terms(star, row, circle, wavering, q, work, zc, zo, out):
     peak = row[1] * math.sqrt(iu * iv)
     d_in = peak if is_core else peak * t
     d_out = row[2] * t if is_core else row[2]
-    whole = 1.0 / (d_in + d_out)
-    p, m = d_out * whole, d_in * whole
+    inverse_sum = 1.0 / (d_in + d_out)
+    p, m = d_out * inverse_sum, d_in * inverse_sum
     D_u, D_v = in_u - out_u, in_v - out_v
     pq = p * m * wavering
     out[0] = -(m * in_uu + p * out_uu) - pq * D_u * D_u
@@ -186,7 +193,7 @@ def _moments(
 ):  # fmt: skip
     whole_vectors()
     q, work, zc, zo = np.empty(MOST), np.empty(MOST), np.empty(10), np.empty(10)
-    one = np.empty(N_TERMS)
+    terms = np.empty(N_TERMS)
     wavering, log_unit = 0.0 if em else 1.0, math.log(2 * math.pi * unit2)
     for b in range(start, stop):
         g, first, end = pieces[b]
@@ -199,11 +206,11 @@ def _moments(
             weighted[:] = 0.0
             for s in range(n):
                 star = _residual(stars, a + s, model, s, row[0])
-                _terms(star, row, circle, wavering, q, work, zc, zo, one)
+                _terms(star, row, circle, wavering, q, work, zc, zo, terms)
                 for k in range(len(weighted)):
-                    weighted[k, s] = one[k]
+                    weighted[k, s] = terms[k]
                 for k in range(N_MIXTURE):
-                    scalars[b, k] += one[COLUMNS + k]
+                    scalars[b, k] += terms[COLUMNS + k]
             scalars[b, 0] -= n * log_unit
             add_columns(weighted, n, P, Q, lanes)
         write_columns(lanes, sums[b])
@@ -215,15 +222,15 @@ def _scores(first, end, places, model, blocks, stars, coef, order, row, circle, 
     for b in range(first, end):
         g, a, e = blocks[b]
         q, work, zc, zo = np.empty(MOST), np.empty(MOST), np.empty(10), np.empty(10)
-        one = np.empty(N_TERMS)
+        terms = np.empty(N_TERMS)
         lay_out(stars, a, e, places)
         evaluate(coef[g], order, places, e - a, model)
         for i in range(a, e):
             star = _residual(stars, i, model, i - a, row[0])
-            _terms(star, row, circle, 1.0, q, work, zc, zo, one)
-            out[0, i], out[1, i] = one[3], one[4]
+            _terms(star, row, circle, 1.0, q, work, zc, zo, terms)
+            out[0, i], out[1, i] = terms[3], terms[4]
             for k in range(3):
-                out[2 + k, i] = one[k]
+                out[2 + k, i] = terms[k]
 
 
 def _circle(constants: Constants) -> tuple[Any, ...]:
@@ -238,10 +245,20 @@ def truncated_log_likelihood(
     order: int,
     constants: Constants,
 ) -> Float:
-    """Log-likelihood (D,) of all stars for D parameter vectors.
+    """Log-likelihood of all stars for D parameter vectors, with match circles.
 
-    `offsets` (N,) are nominal position minus data, in u and v; the radius of the constants is that
-    of the circle; other arguments as in `log_likelihood`.
+    Parameters
+    ----------
+    blocks, columns, coef, order
+        See `log_likelihood`.
+    offsets : tuple of ndarray, shape (N,)
+        Nominal positions minus the data, in u and in v.
+    constants : Constants
+        Constants of the mixture, including the radius of the circle.
+
+    Returns
+    -------
+    ndarray, shape (D,)
     """
     rows, coef = packed(constants), np.ascontiguousarray(coef)
     stars, circle, nothing = (*columns, *offsets), _circle(constants), np.empty((0, 3, 0))
@@ -249,24 +266,24 @@ def truncated_log_likelihood(
     step = max(1, SCRATCH // (8 * max(len(blocks), 1)))
     with threads_for(INTEGRAL * len(columns[0]) * len(coef)):
         for a in range(0, len(coef), step):
-            some = slice(a, a + step)
-            sums = np.empty((len(blocks), len(rows[some])))
+            draws = slice(a, a + step)
+            sums = np.empty((len(blocks), len(rows[draws])))
             share_out(
                 _evaluated,
                 len(blocks),
                 blocks,
                 stars,
-                coef[some],
+                coef[draws],
                 order,
-                rows[some],
+                rows[draws],
                 constants.unit2,
                 circle,
                 sums,
                 nothing,
                 room=star_room,
             )
-            # as in `log_likelihood`
-            out[some] = np.ascontiguousarray(sums.T).sum(axis=1)
+            # order of summation as in `log_likelihood`
+            out[draws] = np.ascontiguousarray(sums.T).sum(axis=1)
     return out
 
 
@@ -279,9 +296,18 @@ def truncated_memberships(
     constants: Constants,
     each: int,
 ) -> Float:
-    """Outlier probability, log-likelihood and its square (D / each, 3, N) of each star.
+    """Outlier probability, log-likelihood and its square for each star, with match circles.
 
-    `offsets` (N,) are nominal position minus data, in u and v; other arguments as in `memberships`.
+    Parameters
+    ----------
+    blocks, columns, coef, order, constants, each
+        See `memberships`.
+    offsets : tuple of ndarray, shape (N,)
+        Nominal positions minus the data, in u and in v.
+
+    Returns
+    -------
+    ndarray, shape (D / each, 3, N)
     """
     out = np.empty((len(coef) // each, 3, len(columns[0])))
     with threads_for(INTEGRAL * out.shape[2] * len(coef)):
@@ -312,12 +338,22 @@ def truncated_moments(
     *,
     em: bool = False,
 ) -> Moments:
-    """Gradient and Hessian of the mixture's log-likelihood, with the scalars of `mixture_moments`.
+    """Sums for the gradient and Hessian of the mixture log-likelihood, with match circles.
 
-    `offsets` (N,) are nominal position minus data, in u and v; other arguments as in
-    `mixture_moments`.  With `em` the curvature is that at fixed memberships, in place of the
-    Hessian, and `cross` is zero.  It is the covariance of a truncated Gaussian times two inverse
-    variances, and never negative.
+    Parameters
+    ----------
+    pieces, columns, coef, order, constants
+        See `mixture_moments`.
+    offsets : tuple of ndarray, shape (N,)
+        Nominal positions minus the data, in u and in v.
+    em : bool
+        True for the curvature for fixed memberships instead of the Hessian. It is the covariance of
+        a truncated Gaussian times two inverse variances, and never negative; `cross` is zero.
+
+    Returns
+    -------
+    Moments
+        Its `scalars` are those of `mixture_moments`.
     """
     sums, scalars = empty_sums(len(pieces), order, COLUMNS, N_MIXTURE)
     with threads_for(INTEGRAL * len(columns[0])):
@@ -347,10 +383,23 @@ def truncated_scores(
     order: int,
     constants: Constants,
 ) -> Float:
-    """Gradient of each star's log-likelihood by u and v, and minus its uu, uv, vv curvature (5, N).
+    """Derivatives of each star's log-likelihood with respect to the model position.
 
-    `offsets` (N,) are nominal position minus data, in u and v; `coef` is (G, 2, K), for the
-    constants of one parameter vector; other arguments as in `residuals`.
+    Parameters
+    ----------
+    blocks, columns, order
+        See `residuals`.
+    offsets : tuple of ndarray, shape (N,)
+        Nominal positions minus the data, in u and in v.
+    coef : ndarray, shape (G, 2, K)
+        Effective coefficients of the scaled powers.
+    constants : Constants
+        Constants of the mixture for one parameter vector.
+
+    Returns
+    -------
+    ndarray, shape (5, N)
+        First derivatives in u and v, and minus the second derivatives uu, uv, vv.
     """
     out = np.empty((5, len(columns[0])))
     with threads_for(INTEGRAL * out.shape[1]):

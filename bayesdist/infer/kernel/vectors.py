@@ -1,7 +1,7 @@
-"""Width of the vectors that the passes are compiled for.
+"""SIMD vector width for which the passes are compiled.
 
-LLVM takes half the width of the vectors of AVX-512, lest a program that uses them now and then
-slows the processor down.  The passes are nothing but vectors, and a third faster with all of it.
+By default LLVM uses half the vector width of AVX-512, because occasional use of full vectors can
+reduce the clock rate.  The passes consist of vector code and are a third faster with full width.
 """
 
 from __future__ import annotations
@@ -13,20 +13,20 @@ from numba.extending import intrinsic
 
 from bayesdist.infer.kernel.lanes import HAS_512
 
-WHOLE = HAS_512 and config.CPU_FEATURES is None  # the user's own choice comes first
+WHOLE = HAS_512 and config.CPU_FEATURES is None  # a choice by the user takes precedence
 
 
 @intrinsic
 def whole_vectors(typingctx: Any) -> Any:
-    """Compile the function that calls this for vectors of the whole width.
+    """Compile the calling function for the full vector width.
 
-    An attribute of one function: numba's configuration, and with it the code of all other
-    functions of the process and the names of their caches, stays as it is.
+    This sets an attribute of that function only.  The configuration of numba, and with it the
+    code and cache of all other functions in the process, is unchanged.
     """
 
     def build(context: Any, builder: Any, signature: Any, values: Any) -> Any:
         if WHOLE:
-            # llvmlite writes attributes out as they are, but its `add` refuses those with a value
+            # bypasses the `add` of llvmlite, which refuses attributes with a value
             set.add(builder.function.attributes, '"prefer-vector-width"="512"')
         return context.get_dummy_value()
 

@@ -1,7 +1,7 @@
-"""Look-up tables from residuals: node values, their errors, and the polynomial that goes with them.
+"""Look-up tables from residuals: node values and their errors, fitted together with a polynomial.
 
-`field_table` models the nodes as a Gaussian random field, `binned_table` is the way of ACS ISR
-2015-06; `fit_with_tables` runs either in turn with the polynomial fit.
+`field_table` models the node values as a Gaussian random field; `binned_table` averages residuals
+in bins as in ACS ISR 2015-06. `fit_with_tables` alternates either of them with the polynomial fit.
 """
 
 import lazy_loader

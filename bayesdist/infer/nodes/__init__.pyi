@@ -1,4 +1,4 @@
-"""Names of the package, each with the module where it is at home; loaded when first used."""
+"""Public names and the modules that define them; each module is imported on first use."""
 
 from .binned import (
     binned_table as binned_table,

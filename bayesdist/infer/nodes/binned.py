@@ -1,10 +1,10 @@
 """Look-up table after ACS ISR 2015-06: bins, iterative sigma clipping, smoothing.
 
 ACS ISR 2015-06, section 4.3.1: residuals are averaged in bins of 64 x 64 pixels with iterative
-sigma clipping, then each grid point is smoothed with a 5 x 5 quadratic kernel: the value of a node
-becomes that of the quadratic surface through the 25 values around it, all of equal weight (Anderson
-and King 2000, PASP 112, 1360).  Away from edges and empty bins this is their fixed kernel, 27/175
-in the middle.  Near an edge or an empty bin the surface is fitted to the values that exist.
+sigma clipping.  The grid is then smoothed with a 5 x 5 quadratic kernel: each node gets the value
+of a quadratic surface fitted with equal weights to the 25 values around it (Anderson and King 2000,
+PASP 112, 1360).  Away from edges and empty bins this equals their fixed kernel, with 27/175 at the
+centre.  Near an edge or an empty bin the surface is fitted to the available values.
 """
 
 from __future__ import annotations
@@ -23,10 +23,10 @@ from bayesdist.model import Chip
 from bayesdist.model.lookup import LookupTable
 from bayesdist.utils.arrays import Bool, Float, Int
 
-PASSES = 20  # of the clipping, at most
-OWN_SCATTER = 5  # stars from which on a bin's error is from its own scatter
+PASSES = 20  # maximum number of clipping iterations
+OWN_SCATTER = 5  # with fewer stars, the error of a bin is computed from the pooled scatter
 HALF_WIDTH = 2  # nodes: the kernel is 5 x 5
-# values for each coefficient of the surface: the 3 x 3 of a corner determine a quadratic
+# values per coefficient of the surface: the 3 x 3 values at a corner determine a quadratic
 ENOUGH = 1.5
 
 
@@ -42,39 +42,41 @@ def binned_table(
     filter: str = "",
     step: tuple[float, float] = STEP,
 ) -> LookupTable:
-    """Table of clipped means in bins, smoothed.
+    """Make a look-up table from clipped mean shifts in bins, smoothed.
 
     Parameters
     ----------
     x, y : array_like, shape (N,)
-        Raw pixels.
+        Raw pixel coordinates.
     shift : array_like, shape (N, 2)
-        Corrections to be added to them, pixels.
+        Corrections to be added to x and y, in pixels.
     chip : Chip
     order : int, optional
-        Subtract the part that a polynomial of this order describes; left in by default, as in the
-        report.
+        Remove the polynomial of this order from the node values. By default it is not removed, as
+        in the ISR.
     clip : float
-        Stars beyond this many standard deviations of their bin's, on either axis, are left out.
+        Stars that deviate from the mean of their bin by more than this many standard deviations,
+        on either axis, are rejected.
     smooth : bool
-        True to apply the 5 x 5 kernel: `quadratic_smoother`.
+        True to smooth the nodes with the 5 x 5 kernel.
     filter : str
+        Filter of the table; '' for the detector's table.
     step : tuple of float
-        Size of the bins, pixels.
+        Size of the bins along x and y, in pixels.
 
     Returns
     -------
     LookupTable
-        With the standard error of each node, propagated from the errors of the bins' means.  It
-        does not include what smoothing removes of the pattern itself.  A node with no star within
-        the kernel is zero, and the rms of the others is its error.
+        Node values with standard errors, propagated from the errors of the bin means.  They do not
+        include the bias of smoothing.  A node without stars within its kernel gets the value zero,
+        with the rms of the other nodes as its error.
 
     Raises
     ------
     InputError
-        For arrays of other shapes, or a clip that is not positive.
+        If arrays have inconsistent shapes or invalid values, or `clip` is not positive.
     DegenerateError
-        When no bin holds two stars.
+        If no bin contains two stars.
     """
     if not clip > 0:
         raise InputError(f"stars are clipped at {clip} sigma", do="give a positive number")
@@ -113,7 +115,7 @@ def binned_table(
 
 
 def _clipped(bins: Int, r: Float, n: int, clip: float) -> Bool:
-    """Boolean mask (N,) of the stars left when clipping changes nothing any more."""
+    """Boolean mask (N,) that is True for the stars that survive iterative sigma clipping."""
     centre, scale = _robust(bins, r, n)
     inlier: Bool = np.ones(len(r), bool)
     for _ in range(PASSES):
@@ -126,7 +128,7 @@ def _clipped(bins: Int, r: Float, n: int, clip: float) -> Bool:
 
 
 def _robust(bins: Int, r: Float, n: int) -> tuple[Float, Float]:
-    """Median and scaled median absolute deviation (n, 2), from which the clipping starts."""
+    """Median and scaled median absolute deviation (n, 2) per bin, to start the clipping."""
     centre, scale = np.zeros((n, 2)), np.zeros((n, 2))
     filled = np.unique(bins)
     for a in (0, 1):
@@ -137,7 +139,7 @@ def _robust(bins: Int, r: Float, n: int) -> tuple[Float, Float]:
 
 
 def _moments(bins: Int, r: Float, n: int) -> tuple[Int, Float, Float]:
-    """Number (n,), mean and standard deviation (n, 2) of stars in a bin; zero where undefined."""
+    """Number (n,), mean and standard deviation (n, 2) of the stars per bin; 0 if undefined."""
     count = np.bincount(bins, minlength=n)
     mean, square = np.zeros((n, 2)), np.zeros((n, 2))
     for a in (0, 1):
@@ -147,11 +149,18 @@ def _moments(bins: Int, r: Float, n: int) -> tuple[Int, Float, Float]:
 
 
 def quadratic_smoother(filled: Bool) -> scipy.sparse.csr_array:
-    """Sparse linear map (n_nodes, n_nodes) from node values to smooth ones.
+    """Sparse matrix (n_nodes, n_nodes) that smooths node values with the quadratic kernel.
 
-    `filled` (ny, nx) marks nodes with a value; columns of empty nodes are zero.  A node whose
-    window holds few values gets a plane or their mean; one whose window holds none gets a row of
-    zeros.
+    Parameters
+    ----------
+    filled : ndarray of bool, shape (ny, nx)
+        True for nodes with a value.
+
+    Returns
+    -------
+    scipy.sparse.csr_array
+        Columns of empty nodes are zero. With too few values in its window, a node gets the value
+        of a fitted plane, or their mean. The row of a node without values in its window is zero.
     """
     ny, nx = filled.shape
     rows, columns, entries = [], [], []
@@ -170,13 +179,13 @@ def quadratic_smoother(filled: Bool) -> scipy.sparse.csr_array:
     shape = (ny * nx, ny * nx)
     if not rows:
         return scipy.sparse.csr_array(shape)
-    where = (np.concatenate(rows), np.concatenate(columns))
-    return scipy.sparse.coo_array((np.concatenate(entries), where), shape).tocsr()
+    indices = (np.concatenate(rows), np.concatenate(columns))
+    return scipy.sparse.coo_array((np.concatenate(entries), indices), shape).tocsr()
 
 
 @lru_cache(maxsize=4096)
 def _kernel(dx: tuple[int, ...], dy: tuple[int, ...]) -> Float:
-    """Weights of values at offsets (m,) in the surface's value at zero."""
+    """Weights (m,) of values at offsets dx, dy (m,) in the fitted surface at offset zero."""
     x, y = np.array(dx, float), np.array(dy, float)
     quadratic = np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], axis=1)
     for n in (6, 3, 1):

@@ -1,4 +1,4 @@
-"""Look-up table as a Gaussian random field, measured by every star through bilinear weights."""
+"""Look-up table modelled as a Gaussian random field that the stars sample bilinearly."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ from bayesdist.infer.nodes.sums import BLOCK, NodeSums, node_sums
 from bayesdist.model import Chip
 from bayesdist.utils.arrays import Float
 
-STEADY = 1e-5  # change of the stars' typical variance that is small against any error of the jitter
+STEADY = 1e-5  # relative change of the variance at which the jitter counts as converged
 MAX_ITERATIONS = 6
 SEARCHES = ("chip", "tiles", "none")
 
 
-# a factorisation of this size is no faster on two threads: the two axes have one each
+# a second thread does not speed up a factorisation of this size; the two axes run in parallel
 @one_thread
 def field_table(
     x: ArrayLike,
@@ -44,42 +44,42 @@ def field_table(
     earlier: TablePosterior | None = None,
     search: str = "chip",
 ) -> TablePosterior:
-    """Posterior of a table from the residuals of one chip.
+    """Compute the posterior of a look-up table from the residuals of one chip.
 
         shift = W d + polynomial + noise,  noise variance = quoted variance + jitter^2
 
-    The node values d are a Matern field without its polynomial part.  The polynomial is integrated
-    out under a flat prior, so that a table from the residuals of any earlier polynomial fit is the
-    table of the joint solution.  Amplitude, length and smoothness maximise the marginal likelihood,
-    separately for each axis: a defect of columns is seen in x alone, and a common value would save
-    no time.  The two are made at the same time where there are threads.
+    W are bilinear weights.  The node values d are a Matern field without its polynomial part.  The
+    polynomial is integrated out under a flat prior.  The result is therefore the table of the joint
+    solution of table and polynomial, whichever polynomial was used for the residuals.  Amplitude,
+    correlation length and smoothness of the field maximise the marginal likelihood, separately for
+    each axis, since column defects appear in x only.
 
     Parameters
     ----------
     x, y : array_like, shape (N,)
-        Raw pixels.
+        Raw pixel coordinates.
     shift : array_like, shape (N, 2)
-        Corrections to be added to them, pixels: see `pixel_shifts`.
+        Corrections to be added to x and y, in pixels; see `pixel_shifts`.
     variance : array_like, shape (N, 2)
-        Square of its error, square pixels.
+        Variances of the shifts, in square pixels.
     chip : Chip
     order : int
-        Of the polynomial that goes with the table.
+        Order of the polynomial that is fitted together with the table.
     weight : array_like, shape (N,), optional
-        Probability of being a true match.
+        Probability that each star is a true match; 1 by default.
     filter : str
-        The table's filter; '' for the detector's own.
+        Filter of the table; '' for the detector's table.
     step : tuple of float
-        Pixels between nodes.
+        Distance of the nodes along x and y, in pixels.
     smoothness : sequence of float
-        Matern smoothness to choose from.
+        Values of the Matern smoothness to try; a subset of 0.5, 1.5, 2.5.
     earlier : TablePosterior, optional
-        Table of nearly the same stars on the same grid from an earlier iteration: it gives the
-        first jitter, and the hyperparameters where they are not searched.
+        Table from an earlier iteration, of nearly the same stars on the same grid. It provides the
+        initial jitter and, with ``search='none'``, the hyperparameters.
     search : str
-        Of the hyperparameters.  'chip': all that are likely on independent tiles are tried on the
-        whole chip; 'tiles': those of the tiles are taken, which are near; 'none': the earlier
-        table's are held.
+        How the hyperparameters are optimised. 'tiles': on independent tiles of the chip, which is
+        fast and a good approximation; 'chip': on tiles, then on the entire chip; 'none': those of
+        the earlier table are kept.
 
     Returns
     -------
@@ -88,10 +88,10 @@ def field_table(
     Raises
     ------
     InputError
-        For arrays of other shapes, values that are not finite, an unknown smoothness or search, no
-        search and no earlier table, or an earlier table on another grid.
+        If arrays have inconsistent shapes or invalid values, `smoothness` or `search` is unknown,
+        or the earlier table has another grid or is missing with ``search='none'``.
     DegenerateError
-        When the stars do not determine the polynomial.
+        If the stars do not determine the polynomial.
     """
     bad = [nu for nu in smoothness if nu not in SMOOTHNESS]
     if bad or not smoothness:
@@ -111,7 +111,7 @@ def field_table(
                 f"the earlier table of chip {earlier.grid.chip.number} has another grid",
                 do="give one of the same chip, order and step",
             )
-        grid = earlier.grid  # with what is known of it
+        grid = earlier.grid  # its cached properties are reused
 
     def sums_at(j2: float) -> tuple[NodeSums, NodeSums]:
         return node_sums(grid, px, py, r, w[:, None] / (var + j2))
@@ -131,7 +131,7 @@ def field_table(
     else:
         evidences = [Evidence(grid, s) for s in sums]
         if earlier is None:
-            # a first value without any smoothing: there are no hyperparameters yet
+            # no hyperparameters yet: estimate the jitter from unsmoothed node values
             nodes = at_once(lambda evidence: evidence.rough, evidences)
             n = float(sum(np.count_nonzero(s.nodes.diagonal()) for s in sums))
         else:
@@ -150,7 +150,7 @@ def field_table(
             break
         j2, sums = new, sums_at(new)
         axes = at_once(AxisField.at_same_prior, axes, sums)
-    # standard error of j where j is large; where it is zero, its possible size
+    # the standard error of a large jitter; for a jitter of zero an upper limit
     jitter = float(np.sqrt(j2))
     spread = float(np.sqrt(j2 + error)) - jitter
     return TablePosterior(grid, (axes[0], axes[1]), filter, jitter, spread, float(w.sum()))
@@ -164,31 +164,31 @@ def checked_stars(
     weight: ArrayLike | None,
     chip: Chip,
 ) -> tuple[Float, Float, Float, Float, Float]:
-    """Stars as arrays of float64.
+    """Convert the columns of the stars to float64 arrays and check them.
 
-    InputError for other shapes, no stars, values that are not finite, variances that are not
-    positive, or weights outside 0..1.
+    Raises InputError if shapes are inconsistent, there are no stars, values are not finite,
+    variances are not positive, or weights are outside 0 to 1.
     """
-    where = f"look-up table of chip {chip.number}"
+    location = f"look-up table of chip {chip.number}"
     px = np.atleast_1d(np.asarray(x, float))
     n = len(px)
-    given = {
+    columns = {
         "y": np.atleast_1d(np.asarray(y, float)),
         "shift": np.asarray(shift, float),
         "variance": np.asarray(variance, float),
         "weight": np.ones(n) if weight is None else np.asarray(weight, float),
     }
     if n == 0:
-        raise InputError("there are no stars", where=where, do="give matches on this chip")
-    for name, array in given.items():
+        raise InputError("there are no stars", where=location, do="give matches on this chip")
+    for name, array in columns.items():
         wanted = (n, 2) if name in ("shift", "variance") else (n,)
         if array.shape != wanted:
             raise InputError(
                 f"'{name}' has shape {array.shape} and {wanted} is expected",
-                where=where,
+                where=location,
                 do="give one row for each star",
             )
-    for name, array in {"x": px, **given}.items():
+    for name, array in {"x": px, **columns}.items():
         good = np.isfinite(array)
         if name == "variance":
             good &= array > 0
@@ -198,10 +198,10 @@ def checked_stars(
             k = tuple(np.argwhere(~good)[0])
             raise InputError(
                 f"'{name}' is {array[k]:g}",
-                where=f"{where}, star {k[0] + 1}",
+                where=f"{location}, star {k[0] + 1}",
                 do="give finite values, positive variances and weights from 0 to 1",
             )
-    return px, given["y"], given["shift"], given["variance"], given["weight"]
+    return px, columns["y"], columns["shift"], columns["variance"], columns["weight"]
 
 
 def _residual(
@@ -212,7 +212,7 @@ def _residual(
     sums: Sequence[NodeSums],
     nodes: Sequence[Float],
 ) -> Float:
-    """Shifts minus node values of both axes and the polynomials that go with them."""
+    """Shifts (N, 2) minus the table with these node values and the corresponding polynomial."""
     values = np.stack(nodes, axis=1)
     polynomial = np.stack([s.polynomial_of(d) for s, d in zip(sums, nodes, strict=True)], axis=1)
     out = np.empty_like(shift)

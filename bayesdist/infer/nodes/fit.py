@@ -1,12 +1,12 @@
-"""Polynomial and look-up tables fitted in turn, until both converge.
+"""Alternating fit of a polynomial and look-up tables until both converge.
 
-Each iteration corrects the pixels by the tables of the last one, fits the polynomial, and makes the
-tables anew from *all* that the polynomial leaves: residuals, with the last tables' own shifts added
-back.  Nothing is smoothed twice, and the iterations end at the joint solution of both.
+Each iteration corrects the pixels by the previous tables, fits the polynomial, and makes new tables
+from the residuals with the shifts of the previous tables added back.  Nothing is smoothed twice,
+and the iterations converge to the joint solution of polynomial and tables.
 
-The detector's tables come from a filter whose own irregularities are the smallest, and are then
-fixed; each other filter has its own polynomial, and tables of the residuals of both (ACS ISR
-2015-06, section 4.3).
+The detector's tables are made from the filter with the smallest irregularities and are then fixed.
+Every other filter gets a polynomial and a table of the remaining residuals (ACS ISR 2015-06,
+section 4.3).
 """
 
 from __future__ import annotations
@@ -32,12 +32,13 @@ from bayesdist.model import DistortionModel
 from bayesdist.model.lookup import LookupTable
 from bayesdist.utils.arrays import Bool, Float
 
-LIKELY = 0.5  # stars that are less likely true matches are left out
-# of the hyperparameters, as of `field_table`, in the first iterations; in later ones they are held
+LIKELY = 0.5  # stars with a smaller probability of being true matches are left out
+# how the hyperparameters are searched in the first iterations (see `field_table`); then they are
+# fixed
 SEARCHES = ("tiles", "chip")
 
 
-# all large matrices are factored here, one at a time: see `field_table`
+# all large matrices are factored in here; see the comment at `field_table`
 @one_thread
 def fit_with_tables(
     matches: Matches,
@@ -53,53 +54,54 @@ def fit_with_tables(
     start: TableFit | None = None,
     report: Callable[[Iteration], None] | None = None,
 ) -> TableFit:
-    """Fit the polynomial and the look-up tables of one filter in turn.
+    """Fit the polynomial and the look-up tables of one filter, alternating until both converge.
 
     Parameters
     ----------
     matches : Matches
-        At raw pixels, with errors, of one filter.
+        Stars of one filter at raw pixel coordinates, with errors.
     model : DistortionModel
-        It is cut to the exposures of the matches.
+        Model of the polynomials. Exposures without matches are dropped.
     filter : str
-        Filter of the new tables; '' makes them the detector's.
+        Filter of the new tables; '' for the detector's tables.
     beneath : sequence of LookupTable or TablePosterior
-        The detector's tables where they are known: they are fixed, and applied first.  The error
-        of a posterior counts as far as the new tables do not absorb it, that of a plain table by
-        its upper bound.
+        Tables of the detector, if known. They are applied first and kept fixed. The error of a
+        `TablePosterior` is propagated except for the part that the new tables absorb; for a
+        `LookupTable` an upper bound of its error is used.
     method : str
-        'field': a Gaussian random field, with the covariance of its nodes; 'binned': clipped means
-        in bins, smoothed, as ACS ISR 2015-06.  Either is made orthogonal to the polynomial.
+        'field' for a Gaussian random field, which provides the covariance of its nodes; 'binned'
+        for smoothed means in bins as in ACS ISR 2015-06. Both are made orthogonal to the
+        polynomial.
     max_iterations : int
+        Maximum number of iterations.
     tolerance : float
-        Change of every node, pixels, below which the iterations end.
+        The iterations end when no node changes by more than this, in pixels.
     step : tuple of float
-        Pixels between nodes.
+        Distance of the nodes along x and y, in pixels.
     smoothness : sequence of float
-        Matern smoothness to choose from, for 'field'.
+        Values of the Matern smoothness to try, for 'field'.
     start : TableFit, optional
-        Fit of the same matches, perhaps with other errors, whose iterations are continued: from the
-        third on the hyperparameters are held.
+        Earlier fit of the same matches, possibly with other errors, to continue. The
+        hyperparameters are fixed from the third iteration on, counting those of `start`.
     report : callable, optional
-        Called with each iteration.
+        Called with the `Iteration` after each iteration.
 
     Returns
     -------
     TableFit
-        `converged` is True if the tables converged.
 
     Raises
     ------
     InputError
-        For an unknown method, no iterations, a tolerance that is not positive, matches of several
-        filters, matches without the exposure that holds the gauge, a table of a filter among the
-        detector's, or a start of other chips or by another method.
+        If `method` is unknown, `max_iterations` or `tolerance` is not positive, the matches are
+        of several filters or lack the exposure that defines the gauge, `beneath` contains a table
+        of a filter, or `start` has other chips or another method.
     DegenerateError
-        When the matches do not determine the model.
+        If the matches do not determine the model.
 
     Notes
     -----
-    The detector's tables come from one filter, and each other one lies over them::
+    Make the detector's tables from one filter, then those of each other filter on top of them::
 
         base = fit_with_tables(matches.select(matches.filter == 0), model)
         other = matches.select(matches.filter == 1)
@@ -109,22 +111,22 @@ def fit_with_tables(
     matches, model = _with_own_exposures(matches, model)
     chips = [c for k, c in enumerate(matches.chip_numbers) if (matches.chip == k).any()]
     numbers = matches.chip_number
-    lower = corrected_matches([shifts_of(one) for one in beneath], matches)
+    lower = corrected_matches([shifts_of(lower_table) for lower_table in beneath], matches)
     x, y = lower.x, lower.y
     progress: list[Iteration] = []
     fitted: dict[int, LookupTable | TablePosterior] = {}
-    own = np.zeros((len(x), 2))
+    own_shift = np.zeros((len(x), 2))
     if start is not None:
         _check_start(start, chips, method)
         progress += start.progress
         fitted |= zip(chips, start.fitted, strict=True)
         for c, table in fitted.items():
             rows = numbers == c
-            own[rows] = shifts_of(table).evaluate(x[rows], y[rows])
-    searched = dict(fitted)  # those whose hyperparameters are held
+            own_shift[rows] = shifts_of(table).evaluate(x[rows], y[rows])
+    searched = dict(fitted)  # tables from the last search, with the hyperparameters to keep
 
     def solved(moved: Matches, mixture: ResidualMixture, pixel: float) -> LinearFit:
-        """Polynomial fit for fixed tables; `pixel` is the size of one in u, v."""
+        """Fit the polynomial with the tables fixed; `pixel` is the pixel size in u, v."""
         jitter = np.full(len(x), mixture.jitter)
         for chip, table in fitted.items():
             if isinstance(table, TablePosterior):
@@ -135,13 +137,13 @@ def fit_with_tables(
     def new_table(
         chip: int, rows: Bool, shift: Float, variance: Float, search: str
     ) -> LookupTable | TablePosterior:
-        where = model.chips[model.chip_code(chip)]
+        chip_model = model.chips[model.chip_code(chip)]
         if method == "binned":
             return binned_table(
                 x[rows],
                 y[rows],
                 shift[rows],
-                chip=where,
+                chip=chip_model,
                 order=model.order,
                 filter=filter,
                 step=step,
@@ -152,7 +154,7 @@ def fit_with_tables(
             y[rows],
             shift[rows],
             variance[rows],
-            chip=where,
+            chip=chip_model,
             order=model.order,
             weight=weight[rows],
             filter=filter,
@@ -163,7 +165,7 @@ def fit_with_tables(
         )
 
     def corrected_by_all() -> Matches:
-        return matches.with_columns(x=x + own[:, 0], y=y + own[:, 1])
+        return matches.with_columns(x=x + own_shift[:, 0], y=y + own_shift[:, 1])
 
     moved = corrected_by_all()
     solution = fit_linear(on_the_chips(moved, model), model)
@@ -174,7 +176,7 @@ def fit_with_tables(
         mixture = fit_mixture(shifts.shift, shifts.variance)
         weight = np.where(mixture.probability >= LIKELY, mixture.probability, 0.0)
         rms = float(np.sqrt((weight[:, None] * shifts.shift**2).sum() / (2 * weight.sum())))
-        total = shifts.shift + own
+        total = shifts.shift + own_shift
         change = 0.0
         for c in chips:
             rows = numbers == c
@@ -184,7 +186,7 @@ def fit_with_tables(
             change = max(change, float(np.abs(new.values - before).max()))
             if search != "none":
                 searched[c] = fitted[c]
-            own[rows] = new.evaluate(x[rows], y[rows])
+            own_shift[rows] = new.evaluate(x[rows], y[rows])
         progress.append(
             Iteration(number=number, moved=change, rms=rms, false_fraction=mixture.fraction)
         )
@@ -212,7 +214,7 @@ def _check(
     max_iterations: int,
     tolerance: float,
 ) -> None:
-    """Refuse arguments that make no fit, as `fit_with_tables` has them."""
+    """Raise InputError if arguments of `fit_with_tables` are invalid."""
     if method not in ("field", "binned"):
         raise InputError(f"there is no method {method!r} for tables", do="choose field or binned")
     if max_iterations < 1 or not tolerance > 0:
@@ -231,17 +233,17 @@ def _check(
     if len(present) > 1:
         raise InputError(
             f"the matches are of filters {', '.join(map(repr, present))}",
-            do="give those of one: matches.select(matches.filter == k)",
+            do="give those of one filter: matches.select(matches.filter == k)",
         )
 
 
 def _check_start(start: TableFit, chips: Sequence[int], method: str) -> None:
-    """Refuse a start whose tables are of other chips, or were made by another method."""
-    known = [shifts_of(table).chip for table in start.fitted]
+    """Raise InputError if the start has tables of other chips or was made by another method."""
+    chip_numbers = [shifts_of(table).chip for table in start.fitted]
     fields = all(isinstance(table, TablePosterior) for table in start.fitted)
-    if known != list(chips) or fields != (method == "field"):
+    if chip_numbers != list(chips) or fields != (method == "field"):
         raise InputError(
-            f"the start has tables of chips {known}, {'fields' if fields else 'bins'}",
+            f"the start has tables of chips {chip_numbers}, {'fields' if fields else 'bins'}",
             where="start",
             do=f"give a fit of chips {list(chips)} by the method {method!r}",
         )
@@ -250,20 +252,21 @@ def _check_start(start: TableFit, chips: Sequence[int], method: str) -> None:
 def _with_own_exposures(
     matches: Matches, model: DistortionModel
 ) -> tuple[Matches, DistortionModel]:
-    """Matches with the exposures that have stars only, and the model with these."""
+    """Matches and model without the exposures that have no stars."""
     names = matches.exposures
     if model.n_frame and model.gauge != "first" and names[0] != model.exposures[0]:
         raise InputError(
             f"no match is of exposure {model.exposures[0]!r}, which holds the gauge",
-            do="give the filter a model of its own",
+            do="give the filter a separate model",
         )
     return matches.with_exposure_names(names), replace(model, exposures=names)
 
 
 def _with_memberships(matches: Matches, mixture: ResidualMixture, jitter: Float) -> Matches:
-    """Likely true matches, with errors that give the polynomial the weights of the tables.
+    """Select the likely true matches and adapt their errors.
 
-    A star of probability p counts p times: its variance is divided by p.
+    Errors include the jitter.  The variance of a star with probability p of being a true match is
+    divided by p, as in the fit of the tables.
     """
     sigma_u, sigma_v = matches.column("sigma_u"), matches.column("sigma_v")
     likely = mixture.probability >= LIKELY

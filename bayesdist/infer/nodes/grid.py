@@ -1,8 +1,8 @@
-"""Nodes of one chip's look-up table, and the part of it that the polynomial already describes.
+"""Nodes of a chip's look-up table, and removal of the part that the polynomial describes.
 
-A table and a polynomial of the pixel overlap: a common part can be in either.  It goes to the
-polynomial: node values are orthogonal to every polynomial of the model's order, summed over the
-nodes, each of which represents an equal part of the detector.
+A table and a polynomial overlap: a smooth pattern could be part of either.  It is assigned to the
+polynomial by making the node values orthogonal to all polynomials of the model's order.  The inner
+product is the sum over the nodes, which represent equal areas of the detector.
 """
 
 from __future__ import annotations
@@ -18,19 +18,31 @@ from bayesdist.model import Chip, PolynomialBasis
 from bayesdist.model.lookup import LookupTable
 from bayesdist.utils.arrays import Float, Int
 
-STEP = (64.0, 64.0)  # pixels: the grid of D2IMFILE and NPOLFILE
+STEP = (64.0, 64.0)  # node distance in pixels, as in D2IMFILE and NPOLFILE
 
 
 @dataclass(frozen=True)
 class NodeGrid:
-    """Nodes at the centres of equal bins of a chip.
+    """Grid of nodes at the centres of equal bins of a chip.
 
-    InputError when there are too few nodes to represent more than the polynomial.
+    Parameters
+    ----------
+    chip : Chip
+    order : int
+        Order of the polynomial that is fitted together with the table.
+    step : tuple of float
+        Size of a bin along x and y in pixels.
+
+    Raises
+    ------
+    InputError
+        If the step is not positive, or if there are too few nodes to represent more than the
+        polynomial.
     """
 
     chip: Chip
-    order: int  # of the polynomial that goes with the table
-    step: tuple[float, float] = STEP  # size of a bin along x and y, pixels
+    order: int
+    step: tuple[float, float] = STEP
 
     def __post_init__(self) -> None:
         if not min(self.step) > 0:
@@ -55,17 +67,17 @@ class NodeGrid:
 
     @property
     def n_nodes(self) -> int:
-        """Number of nodes of one axis."""
+        """Number of nodes, nx * ny."""
         ny, nx = self.shape
         return ny * nx
 
     @property
     def basis(self) -> PolynomialBasis:
-        """Polynomials over the chip."""
+        """Polynomial basis over the chip."""
         return PolynomialBasis(self.order, self.chip.size, self.chip.reference_pixel)
 
     def table(self, values: Float, sigma: Float | None = None, *, filter: str = "") -> LookupTable:
-        """Table with values and errors (2, n_nodes) or (2, ny, nx) on these nodes."""
+        """Look-up table with values and errors (2, n_nodes) or (2, ny, nx), in pixels."""
         shape = (2, *self.shape)
         first = (self.step[0] + 1) / 2, (self.step[1] + 1) / 2
         spread = None if sigma is None else np.reshape(sigma, shape)
@@ -74,11 +86,11 @@ class NodeGrid:
 
     @cached_property
     def blank(self) -> LookupTable:
-        """Table of zeros, which has the weights of the nodes at any pixel."""
+        """Look-up table of zeros, used for its node positions and interpolation weights."""
         return self.table(np.zeros((2, self.n_nodes)))
 
     def interpolation(self, x: Float, y: Float) -> scipy.sparse.csr_array:
-        """Bilinear weights (N, n_nodes) of all nodes at pixels (N,), four in a row."""
+        """Bilinear weights (N, n_nodes) of the nodes at pixels (N,): four entries per row."""
         index, weight = self.blank.weights(x, y)
         starts = np.arange(0, index.size + 1, 4)
         shape = (len(x), self.n_nodes)
@@ -86,13 +98,13 @@ class NodeGrid:
 
     @cached_property
     def positions(self) -> tuple[Float, Float]:
-        """Pixels x, y (n_nodes,) of the nodes."""
+        """Pixel coordinates x, y (n_nodes,) of the nodes."""
         x, y = np.meshgrid(*self.blank.nodes())
         return x.ravel(), y.ravel()
 
     @cached_property
     def polynomials(self) -> Float:
-        """Orthonormal polynomials (n_nodes, K) at the nodes."""
+        """Orthonormal basis (n_nodes, K) of the polynomials at the nodes."""
         return np.linalg.qr(self.basis.evaluate(*self.positions))[0]
 
     def without_polynomials(self, values: Float) -> Float:
@@ -101,20 +113,22 @@ class NodeGrid:
         return values - Q @ (Q.T @ values)
 
     def without_their_polynomials(self, matrix: Float) -> Float:
-        """Symmetric matrix (n_nodes, n_nodes) over nodes without polynomials, in place.
+        """Project a symmetric matrix (n_nodes, n_nodes) orthogonally to the polynomials.
 
-        What is left of node values with this covariance, or of information about them.
+        Gives the covariance of node values without their polynomial part if `matrix` is the
+        covariance of the node values, and likewise for an information matrix.  The matrix is
+        modified in place and returned.
         """
         Q = self.polynomials
         MQ = matrix @ Q
         Z = MQ - 0.5 * Q @ (Q.T @ MQ)
-        left, right = np.concatenate([Z, Q], axis=1), np.concatenate([Q, Z], axis=1)
-        matrix -= left @ right.T
+        ZQ, QZ = np.concatenate([Z, Q], axis=1), np.concatenate([Q, Z], axis=1)
+        matrix -= ZQ @ QZ.T
         return matrix
 
     @cached_property
     def lag(self) -> Int:
-        """Entry of `lags` for each pair of nodes (n_nodes, n_nodes)."""
+        """Index into `lags` for each pair of nodes, shape (n_nodes, n_nodes)."""
         ny, nx = self.shape
         row, column = np.divmod(np.arange(ny * nx), nx)
         along_y = np.abs(row[:, None] - row)
@@ -122,12 +136,12 @@ class NodeGrid:
 
     @cached_property
     def lags(self) -> Float:
-        """Distances (n_nodes,) in pixels between the first node and each."""
+        """Distances (n_nodes,) of all nodes from the first node, in pixels."""
         x, y = self.positions
         return np.hypot(x - x[0], y - y[0])
 
     @cached_property
     def polynomials_by_lag(self) -> Float:
-        """Projection on the polynomials, summed over the pairs of nodes of each lag (n_nodes,)."""
+        """Projector on the polynomials, summed over all pairs of nodes with the same lag."""
         Q = self.polynomials
         return np.bincount(self.lag.ravel(), (Q @ Q.T).ravel(), self.n_nodes).astype(float)

@@ -1,9 +1,9 @@
-"""Matern field of the node values: its marginal likelihood, and the most probable one.
+"""Matern field of the node values: marginal likelihood and most probable hyperparameters.
 
-With the polynomial integrated out (REML) the stars give on each axis a rough estimate of the node
-values, d = B b, that scatters about the truth with covariance B.  The truth is a field with
-covariance C, so d is Gaussian with covariance C + B: one Cholesky factor for each set of
-hyperparameters, however many the stars.
+With the polynomial integrated out (REML), the stars give a rough estimate d = B b of the node
+values on each axis, with covariance B about the true values.  The true values are a field with
+covariance C, so d is Gaussian with covariance C + B.  Each set of hyperparameters therefore needs
+one Cholesky factorisation, independent of the number of stars.
 """
 
 from __future__ import annotations
@@ -23,32 +23,42 @@ from bayesdist.utils.arrays import Float, Int
 
 SMOOTHNESS = (0.5, 1.5, 2.5)
 
-# Fraction of the variance that each node has independently: a field that is very smooth on the grid
-# has a covariance that no computer can factor. 1e-9 is 3e-5 of the amplitude.
+# Independent fraction of the variance of each node. Without it the covariance of a field that is
+# very smooth on the grid is numerically singular. 1e-9 is 3e-5 of the amplitude.
 NUGGET = 1e-9
-# A bin without stars is given one observation of zero, 1e4 times worse than the typical bin's: it
-# does not constrain a pattern of any size and keeps B finite.
+# Information added to each node, relative to a typical bin: an observation of zero with 1e4 times
+# the typical error. It keeps B finite for empty bins without constraining the pattern.
 EMPTY = 1e-8
-TILE = 16  # nodes: the search starts on independent tiles of the chip
+TILE = 16  # nodes per side of the independent tiles on which the search starts
 LOG_LENGTH = (np.log(2.0), 1.0)  # prior of log(length / step): mean, standard deviation
-SETTLED = 0.02  # gain in log density at which the search stops
-STEPS = 30  # far more than it takes
-RULED_OUT = 10.0  # a smoothness so much worse on the tiles is not tried again
-UNFORESEEN = 5.0  # far more than the ratio of a gain in log density to what a step promises
+SETTLED = 0.02  # expected gain in log density at which the search stops
+STEPS = 30  # maximum number of Newton steps; far fewer are needed
+RULED_OUT = 10.0  # a smoothness worse by this log density on the tiles is not tried on the chip
+UNFORESEEN = 5.0  # generous upper limit on the ratio of actual to predicted gain of a step
 
 
 @dataclass(frozen=True)
 class Matern:
-    """Stationary Gaussian random field (Rasmussen and Williams 2006, Equation 4.14)."""
+    """Stationary Gaussian random field (Rasmussen and Williams 2006, Equation 4.14).
 
-    amplitude: float  # standard deviation, pixels
-    length: float  # correlation length, pixels
-    smoothness: float  # 1/2, 3/2 or 5/2: a rough field, one with a slope, one with a curvature
+    Parameters
+    ----------
+    amplitude : float
+        Standard deviation in pixels.
+    length : float
+        Correlation length in pixels.
+    smoothness : float
+        1/2 (not differentiable), 3/2 (once) or 5/2 (twice).
+    """
+
+    amplitude: float
+    length: float
+    smoothness: float
 
     def by_lag(self, distance: Float) -> tuple[Float, Float]:
-        """Covariance of nodes (n,) pixels apart, and its derivative by the logarithm of the length.
+        """Covariance (n,) at distances (n,) in pixels, and its derivative (n,).
 
-        The first distance is zero.
+        The derivative is with respect to the log length.  The first distance must be zero.
         """
         t = np.sqrt(2 * self.smoothness) * np.asarray(distance, float) / self.length
         scale = self.amplitude**2 * np.exp(-t)
@@ -59,7 +69,7 @@ class Matern:
         return covariance, scale * slope
 
     def covariance(self, grid: NodeGrid) -> Float:
-        """Covariance (n_nodes, n_nodes) of free node values."""
+        """Covariance (n_nodes, n_nodes) of the node values, including their polynomial part."""
         return self.by_lag(grid.lags)[0][grid.lag]
 
     def restricted(self, grid: NodeGrid) -> Float:
@@ -69,14 +79,17 @@ class Matern:
 
 @dataclass(frozen=True, eq=False)
 class FittedField:
-    """Log density of one axis at some hyperparameters, and the field that goes with them."""
+    """Log density of the hyperparameters of one axis at one point, and the node values there.
+
+    Derivatives are with respect to log amplitude and log length.
+    """
 
     prior: Matern
     log_evidence: float  # log density of amplitude and length, up to a constant
-    slope: Float  # of it by log amplitude and log length (2,)
-    curvature: Float  # minus its second derivatives, nearly (2, 2)
-    mean: Float  # most probable node values (n,); of tiles, one after the other
-    n_effective: float  # number of nodes that the stars determine
+    slope: Float  # gradient (2,) of the log density
+    curvature: Float  # minus the Hessian (2, 2), approximately
+    mean: Float  # most probable node values (n,); concatenated over the tiles if there are several
+    n_effective: float  # effective number of nodes that the stars determine
 
     @property
     def point(self) -> Float:
@@ -93,13 +106,13 @@ class Evidence:
 
     @cached_property
     def _typical(self) -> float:
-        """Median information about a node that has stars."""
+        """Median information (inverse variance) of the nodes that have stars."""
         information = self.sums.nodes.diagonal()
         return float(np.median(information[information > 0]))
 
     @cached_property
     def noise(self) -> Float:
-        """Covariance B (n, n) of the rough node values: its lower triangle, and zeros."""
+        """Covariance B (n, n) of the rough node values; only the lower triangle is filled."""
         Q, A = self.grid.polynomials, self.sums.information
         A = self.grid.without_their_polynomials(A)
         A += self._typical * (Q @ Q.T)
@@ -108,23 +121,23 @@ class Evidence:
 
     @cached_property
     def rough(self) -> Float:
-        """Rough node values (n,), without any smoothing."""
+        """Rough node values (n,), that is, without smoothing by the prior."""
         return _product(self.noise, self.grid.without_polynomials(self.sums.marginal_right))
 
     def at(self, prior: Matern) -> FittedField:
-        """Log density of hyperparameters, and the field with them."""
+        """Log density of the hyperparameters, and the node values, for the field `prior`."""
         grid = self.grid
         out = _Parts(prior, grid)
         V = np.ascontiguousarray(prior.restricted(grid))
         bent = partial(_bent, grid, out.slope_by_lag)
         out.add(V, bent, self.noise, self.rough, grid.lag)
-        # the field has no polynomials, of which the inverse of V has as much as that of B
+        # subtract the polynomial part of V^-1 (equal to that of B^-1), which the field lacks
         out.weights -= (1.0 + EMPTY) * self._typical * grid.polynomials_by_lag
         return out.field(_log_prior(grid, prior))
 
     @cached_property
     def _tiles(self) -> Int:
-        """Nodes (T, m) of equal tiles that cover the chip except for a margin."""
+        """Indices (T, m) of the nodes of T equal tiles that cover the chip except for a margin."""
         ny, nx = self.grid.shape
         my, mx = min(TILE, ny), min(TILE, nx)
         nodes = np.arange(ny * nx).reshape(ny, nx)
@@ -133,14 +146,14 @@ class Evidence:
 
     @cached_property
     def _tile_parts(self) -> tuple[Int, list[Float], Float]:
-        """Lags of a tile (m, m), and B (m, m) and rough values (T, m) of all tiles."""
+        """Lag indices (m, m) in a tile, B (m, m) of each tile, and their rough values (T, m)."""
         tiles = self._tiles
         lag = self.grid.lag[np.ix_(tiles[0], tiles[0])]
         noise = [np.asfortranarray(self.noise[np.ix_(tile, tile)]) for tile in tiles]
         return lag, noise, self.rough[tiles]
 
     def at_tiles(self, prior: Matern) -> FittedField:
-        """As `at`, of independent tiles: a good start at a hundredth of the cost."""
+        """Approximate `at` by treating tiles as independent, at a hundredth of the cost."""
         lag, noise, rough = self._tile_parts
         out = _Parts(prior, self.grid)
         bent = partial(np.matmul, out.slope_by_lag[lag])
@@ -152,18 +165,18 @@ class Evidence:
     def start(self) -> tuple[float, float]:
         """Starting log amplitude and log length, from the scatter of the rough values."""
         noise = np.diag(self.noise)
-        known = noise < 100 * np.median(noise)
-        excess = np.mean(self.rough[known] ** 2) - np.mean(noise[known])
-        amplitude = np.sqrt(max(float(excess), 0.01 * float(np.mean(noise[known]))))
+        constrained = noise < 100 * np.median(noise)
+        excess = np.mean(self.rough[constrained] ** 2) - np.mean(noise[constrained])
+        amplitude = np.sqrt(max(float(excess), 0.01 * float(np.mean(noise[constrained]))))
         return float(np.log(amplitude)), float(np.log(2 * np.sqrt(np.prod(self.grid.step))))
 
 
 class _Parts:
-    """Sums over the parts of a chip that are taken to be independent.
+    """Accumulates the log density and its derivatives over independent parts of a chip.
 
-    With V = C + B and a = V^-1 b the slopes are (a^T V_k a - tr V^-1 V_k) / 2, and the curvature
-    is the average information a^T V_k V^-1 V_l a / 2 (Gilmour, Thompson and Cullis 1995).  As
-    C depends on the lag of two nodes alone, the trace is a sum over lags.
+    With V = C + B and a = V^-1 d, the gradient is (a^T V_k a - tr V^-1 V_k) / 2, and the curvature
+    is the average information a^T V_k V^-1 V_l a / 2 (Gilmour, Thompson and Cullis 1995).  Since
+    C depends only on the lag between two nodes, the trace is a sum over lags.
     """
 
     def __init__(self, prior: Matern, grid: NodeGrid) -> None:
@@ -171,13 +184,18 @@ class _Parts:
         self.by_lag, self.slope_by_lag = prior.by_lag(grid.lags)
         self.value = 0.0
         self.slope, self.curvature = np.zeros(2), np.zeros((2, 2))
-        self.weights = np.zeros(grid.n_nodes)  # sums of V^-1 over pairs of nodes of one lag
+        self.weights = np.zeros(grid.n_nodes)  # sums of V^-1 over pairs of nodes with equal lag
         self.means: list[Float] = []
 
     def add(
         self, V: Float, bent: Callable[[Float], Float], noise: Float, rough: Float, lag: Int
     ) -> None:
-        """Add a part of covariance V, which is overwritten; `bent` is V_2 times a vector."""
+        """Add a part of the chip.
+
+        `V` (m, m) is the covariance C of its field and is overwritten; `noise` is B and `rough` are
+        the rough values.  `bent` multiplies a vector by the derivative of C with respect to log
+        length.  `lag` (m, m) are the lag indices.
+        """
         V += noise.T
         L = cholesky(V)
         z = scipy.linalg.solve_triangular(L, rough, lower=True, check_finite=False)
@@ -189,20 +207,22 @@ class _Parts:
         mean = rough - _product(noise, a)
         moved = np.array([2 * mean, bent(a)])
         self.slope += 0.5 * moved @ a
-        self.curvature += 0.5 * moved @ np.array([_product(inverse, one) for one in moved]).T
+        self.curvature += 0.5 * moved @ np.array([_product(inverse, vector) for vector in moved]).T
         self.means.append(mean)
 
     def field(self, log_prior: tuple[float, Float, Float]) -> FittedField:
-        """Log density, with that of the prior and its slope and curvature."""
+        """Fitted field; `log_prior` is the log prior, its gradient and curvature."""
         value, slope, curvature = log_prior
         informed = float(self.by_lag @ self.weights)
-        own = self.slope - 0.5 * np.array([2 * informed, self.slope_by_lag @ self.weights])
-        # of a likelihood in the square of the amplitude, expressed by its logarithm
-        curvature[0, 0] += max(0.0, -2 * own[0])
+        likelihood_slope = self.slope - 0.5 * np.array(
+            [2 * informed, self.slope_by_lag @ self.weights]
+        )
+        # the likelihood is a function of amplitude^2; second-derivative term of the logarithm
+        curvature[0, 0] += max(0.0, -2 * likelihood_slope[0])
         return FittedField(
             self.prior,
             self.value + value,
-            own + slope,
+            likelihood_slope + slope,
             self.curvature + curvature,
             np.concatenate(self.means),
             informed,
@@ -210,22 +230,23 @@ class _Parts:
 
 
 def _bent(grid: NodeGrid, by_lag: Float, vector: Float) -> Float:
-    """Product of a field's covariance (n, n), of which that by lag is given, with a vector."""
+    """Multiply a vector by the field's covariance, given by lag, without the polynomials."""
     return grid.without_polynomials(by_lag[grid.lag] @ vector)
 
 
 def _product(lower: Float, vector: Float) -> Float:
-    """Product of a symmetric matrix, of which the lower triangle is given, with a vector."""
+    """Multiply a vector by a symmetric matrix that is given by its lower triangle."""
     out: Float = scipy.linalg.blas.dsymv(1.0, lower, vector, lower=1)
     return out
 
 
 def _log_prior(grid: NodeGrid, prior: Matern) -> tuple[float, Float, Float]:
-    """Log prior density of log amplitude and log length, up to a constant; slope and curvature.
+    """Log prior density of log amplitude and log length, its gradient and curvature.
 
-    The density of the amplitude itself rises in proportion to it: this keeps the most probable
-    value from zero, where it would claim certainty (Chung et al. 2013, Psychometrika 78, 685).
-    The length is about a few steps: it matters only where there is hardly any pattern.
+    The prior density of the amplitude is proportional to the amplitude.  This keeps the most
+    probable value away from zero, where the errors would vanish (Chung et al. 2013, Psychometrika
+    78, 685).  The prior of the length is centred on about two node distances; it matters only if
+    there is hardly any pattern.
     """
     mean, sd = LOG_LENGTH
     step = float(np.sqrt(np.prod(grid.step)))
@@ -235,30 +256,34 @@ def _log_prior(grid: NodeGrid, prior: Matern) -> tuple[float, Float, Float]:
 
 
 def fitted_field(evidence: Evidence, smoothness: Sequence[float], *, thorough: bool) -> FittedField:
-    """Most probable amplitude, length and smoothness of the given ones.
+    """Find the most probable amplitude and length, and the best of the given `smoothness` values.
 
-    They are searched on tiles, and if `thorough` on the whole chip from there.
+    The search uses tiles.  If `thorough` is True, it continues on the entire chip from there.
     """
     starts = [evidence.at_tiles(_prior_at(evidence.start, nu)) for nu in smoothness]
     tiles = [_summit(evidence, evidence.at_tiles, start) for start in starts]
-    best = max(one.log_evidence for one in tiles)
-    likely = [one for one in tiles if one.log_evidence > best - RULED_OUT]
+    best = max(fit.log_evidence for fit in tiles)
+    likely = [fit for fit in tiles if fit.log_evidence > best - RULED_OUT]
     if not thorough:
-        return evidence.at(max(likely, key=lambda one: one.log_evidence).prior)
-    whole = sorted((evidence.at(one.prior) for one in likely), key=lambda one: -one.log_evidence)
-    found = _summit(evidence, evidence.at, whole[0])
-    others = (_summit(evidence, evidence.at, one, found.log_evidence) for one in whole[1:])
-    return max((found, *others), key=lambda one: one.log_evidence)
+        return evidence.at(max(likely, key=lambda fit: fit.log_evidence).prior)
+    candidates = sorted(
+        (evidence.at(fit.prior) for fit in likely), key=lambda fit: -fit.log_evidence
+    )
+    best_fit = _summit(evidence, evidence.at, candidates[0])
+    alternatives = (
+        _summit(evidence, evidence.at, fit, best_fit.log_evidence) for fit in candidates[1:]
+    )
+    return max((best_fit, *alternatives), key=lambda fit: fit.log_evidence)
 
 
 def _prior_at(point: Sequence[float] | Float, nu: float) -> Matern:
-    """Prior of a log amplitude and log length."""
+    """Matern field from log amplitude and log length."""
     amplitude, length = np.exp(point)
     return Matern(float(amplitude), float(length), nu)
 
 
 def _bounds(evidence: Evidence) -> tuple[Float, Float]:
-    """Bounds of log amplitude and log length: far beyond the range that a grid can show."""
+    """Lower and upper bounds of log amplitude and log length, wider than a grid can constrain."""
     amplitude, _ = evidence.start
     step = np.log(np.sqrt(np.prod(evidence.grid.step)))
     extent = np.log(max(evidence.grid.chip.size))
@@ -271,10 +296,10 @@ def _summit(
     here: FittedField,
     best: float = -np.inf,
 ) -> FittedField:
-    """Most probable amplitude and length for one smoothness, from `here` on by Newton's method.
+    """Find the most probable amplitude and length for one smoothness by a quasi-Newton search.
 
-    The curvature is corrected along the last step, by what the slope has changed there.  The search
-    ends early where it will not come near the log density `best`.
+    The search starts from `here`.  The curvature is updated with the change of the gradient along
+    the last step.  The search stops early if it cannot reach the log density `best`.
     """
     low, high = _bounds(evidence)
     longest = 1.0
@@ -285,10 +310,10 @@ def _summit(
         gain = here.slope @ step - 0.5 * step @ curvature @ step
         if gain < SETTLED or here.log_evidence + UNFORESEEN * gain < best:
             break
-        there = density(_prior_at(here.point + step, here.prior.smoothness))
-        change = here.slope - there.slope
-        if there.log_evidence > here.log_evidence:
-            here, longest = there, 1.0
+        candidate = density(_prior_at(here.point + step, here.prior.smoothness))
+        change = here.slope - candidate.slope
+        if candidate.log_evidence > here.log_evidence:
+            here, longest = candidate, 1.0
         else:
             longest = 0.5 * float(np.abs(step).max())
         curvature = _corrected(here.curvature, step, change)
@@ -296,15 +321,18 @@ def _summit(
 
 
 def _step(curvature: Float, slope: Float, low: Float, high: Float) -> Float:
-    """Newton's step (2,) within bounds: at one of them, the best along it."""
+    """Newton step (2,) that maximises the quadratic model within bounds."""
     root = np.linalg.cholesky(curvature)
     target = scipy.linalg.solve_triangular(root, slope, lower=True)
-    found = scipy.optimize.lsq_linear(root.T, target, (low, high), method="bvls")
-    return np.asarray(found.x, float)
+    optimum = scipy.optimize.lsq_linear(root.T, target, (low, high), method="bvls")
+    return np.asarray(optimum.x, float)
 
 
 def _corrected(curvature: Float, step: Float, change: Float) -> Float:
-    """Curvature (2, 2) with the measured change of the slope along a step, if concave (BFGS)."""
+    """BFGS update of the curvature (2, 2); unchanged if the density is not concave on the step.
+
+    `change` is the decrease of the gradient along `step`.
+    """
     if change @ step <= 0:
         return curvature
     along = curvature @ step

@@ -1,4 +1,4 @@
-"""Matches at the pixels that tables have corrected, and residuals of (u, v) as pixel shifts."""
+"""Matches at pixels corrected by look-up tables, and residuals converted to pixel shifts."""
 
 from __future__ import annotations
 
@@ -15,26 +15,48 @@ from bayesdist.model import DistortionModel
 from bayesdist.model.lookup import LookupTable, corrected
 from bayesdist.utils.arrays import Bool, Float
 
-FOLDED = 1e-6  # area of a pixel's image over the square of its sides
+FOLDED = 1e-6  # determinant of the Jacobian over its squared norm, below which it is singular
 
 
 @dataclass(frozen=True, eq=False)
 class PixelShifts:
-    """Residuals of matched stars in pixels of the detector."""
+    """Residuals of matched stars in pixels of the detector.
 
-    shift: Float  # (N, 2), to be added to x and y, pixels
-    # (N, 2), square of the quoted error of each, square pixels. The correlation that a skewed
-    # polynomial makes between the two (some per cent) is left out
+    Parameters
+    ----------
+    shift : ndarray, shape (N, 2)
+        Corrections to be added to x and y, in pixels.
+    variance : ndarray, shape (N, 2)
+        Variances of the shifts from the quoted errors, in square pixels. The correlation of a few
+        per cent between x and y that a skewed polynomial causes is neglected.
+    """
+
+    shift: Float
     variance: Float
 
 
 def pixel_shifts(solution: Solution, matches: Matches) -> PixelShifts:
-    """Residuals of matches, mapped to the detector by the inverse of the local Jacobian.
+    """Convert residuals in u, v to pixel shifts with the inverse of the local Jacobian.
 
-    `matches`: with errors, in the solution's unit. Result: to first order in the residual: at 0.2
-    pixels and the curvature of ACS/WFC the second one is below 1e-5 pixels. InputError for matches
-    without errors or in another unit. DegenerateError where the polynomial folds over: its Jacobian
-    is singular at a star.
+    Parameters
+    ----------
+    solution : Solution
+        Its mean is used.
+    matches : Matches
+        N stars with errors, in the unit of the solution.
+
+    Returns
+    -------
+    PixelShifts
+        Accurate to first order in the residual. The second-order term is below 1e-5 pixels for
+        residuals of 0.2 pixels and the curvature of ACS/WFC.
+
+    Raises
+    ------
+    InputError
+        If the matches have no errors or another unit than the model.
+    DegenerateError
+        If the Jacobian of the polynomial is singular at a star.
     """
     sigma_u, sigma_v = errors_of(matches)
     model, groups = solution.model, groups_of(solution.model, matches)
@@ -60,23 +82,56 @@ def pixel_shifts(solution: Solution, matches: Matches) -> PixelShifts:
 
 
 def corrected_matches(tables: Sequence[LookupTable], matches: Matches) -> Matches:
-    """Matches at the pixels to which tables of the detector and of one filter move them."""
+    """Apply look-up tables to the pixel coordinates of matches.
+
+    Parameters
+    ----------
+    tables : sequence of LookupTable
+        Tables of the detector and of at most one filter.
+    matches : Matches
+        Stars at raw pixel coordinates.
+
+    Returns
+    -------
+    Matches
+        The same stars at corrected pixel coordinates.
+    """
     filter = next((table.filter for table in tables if table.filter), "")
     x, y = corrected(tables, matches.x, matches.y, chip=matches.chip_number, filter=filter)
     return matches.with_columns(x=x, y=y)
 
 
 def on_the_chips(matches: Matches, model: DistortionModel) -> Matches:
-    """Matches without the few at the edge that a table has moved off the chip.
+    """Remove the few matches that a table has moved off their chip.
 
-    There the polynomial is not defined.  They count in the tables all the same.
+    The polynomial is not defined outside the chip; the tables still use these stars.
+
+    Parameters
+    ----------
+    matches : Matches
+        Stars at corrected pixel coordinates.
+    model : DistortionModel
+
+    Returns
+    -------
+    Matches
     """
     inside = inside_chips(matches, model)
     return matches if inside.all() else matches.select(inside, reason="moved off the chip")
 
 
 def inside_chips(matches: Matches, model: DistortionModel) -> Bool:
-    """Boolean mask (N,) of the matches whose pixels lie on their chip."""
+    """Boolean mask that is True for matches on their chip.
+
+    Parameters
+    ----------
+    matches : Matches
+    model : DistortionModel
+
+    Returns
+    -------
+    ndarray of bool, shape (N,)
+    """
     size = np.array([model.chips[model.chip_code(c)].size for c in matches.chip_numbers])
     nx, ny = size[matches.chip].T
     x, y = matches.x, matches.y

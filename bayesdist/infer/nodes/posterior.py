@@ -1,4 +1,4 @@
-"""Posterior of a look-up table: node values, their covariance, errors in between."""
+"""Posterior of a look-up table: node values, covariance, and errors of interpolated shifts."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ from bayesdist.infer.nodes.sums import NodeSums
 from bayesdist.model.lookup import LookupTable
 from bayesdist.utils.arrays import Float
 
-BLOCK = 2048  # pixels whose rows over all nodes are in memory at once
-COLUMNS = 512  # of a symmetric product, of which no more than one triangle is made
-SOLVED = 1e-10  # relative error of nodes that follow a change of the stars' weights
+BLOCK = 2048  # pixels processed at a time, with dense rows over all nodes
+COLUMNS = 512  # block size for computing only one triangle of a symmetric product
+SOLVED = 1e-10  # relative tolerance of node values that are updated for new weights of the stars
 
 
 @dataclass(frozen=True, eq=False)
 class NodeCovariance:
-    """Posterior covariance of the node values of one axis, the polynomial being integrated out."""
+    """Posterior covariance of the node values of one axis, with the polynomial integrated out."""
 
     grid: NodeGrid
     sums: NodeSums  # normal equations of the stars
@@ -32,10 +32,10 @@ class NodeCovariance:
 
     @cached_property
     def root(self) -> Float:
-        """R (n, n) with R R^T the covariance.
+        """Matrix R (n, n) such that R R^T is the covariance.
 
-        With d = L z, z ~ N(0, 1) and L the polynomial-free part of the Cholesky factor of the
-        prior, the precision of z is 1 + L^T A L: never singular, whatever bins are empty.
+        With d = L z, z ~ N(0, 1), and L the polynomial-free part of the Cholesky factor of the
+        prior, the precision of z is 1 + L^T A L.  It is never singular, even with empty bins.
         """
         L = self.grid.without_polynomials(cholesky(self.prior.covariance(self.grid)))
         informed = self.sums.informed(L)
@@ -47,14 +47,14 @@ class NodeCovariance:
         M[np.diag_indices_from(M)] += 1.0
         # R^T = K^-1 L^T with K K^T = M
         root = divided(cholesky(M), np.asfortranarray(L.T)).T
-        # the prior's factor has rounding errors of 1e-16 of its size in the polynomial space
+        # the factor of the prior has relative rounding errors of 1e-16 in the polynomial space
         return self.grid.without_polynomials(root)
 
     def mean(self, sums: NodeSums) -> Float | None:
-        """Node values (n,) from sums of nearly the same stars; None where they differ too much.
+        """Node values (n,) for slightly different sums; None if they differ too much.
 
-        With d = R z the precision of z is 1 + R^T dA R, dA being the change of the information:
-        near 1, so that a few products with R are enough.
+        With d = R z, the precision of z is 1 + R^T dA R, where dA is the change of the information.
+        It is close to the identity, so that conjugate gradients need only a few products with R.
         """
         R = self.root
 
@@ -69,77 +69,91 @@ class NodeCovariance:
 
 @dataclass(frozen=True, eq=False)
 class AxisField:
-    """Posterior of the node values of one axis: Gaussian, the polynomial being integrated out."""
+    """Gaussian posterior of the node values of one axis, with the polynomial integrated out.
+
+    Parameters
+    ----------
+    covariance : NodeCovariance
+    field : FittedField
+        Hyperparameters and their log density.
+    mean : ndarray, shape (n,)
+        Node values in pixels.
+    n_effective : float
+        Effective number of fitted parameters (nodes and polynomial).
+    """
 
     covariance: NodeCovariance
-    field: FittedField  # hyperparameters
-    mean: Float  # (n,) pixels
-    n_effective: float  # number of parameters, nodes and polynomial, that the stars determine
+    field: FittedField
+    mean: Float
+    n_effective: float
 
     @classmethod
     def of(cls, evidence: Evidence, field: FittedField) -> AxisField:
-        """Posterior at the hyperparameters of a field of the same stars."""
+        """Posterior for the hyperparameters of `field`, which must be fitted to the same stars."""
         sums = evidence.sums
         n = len(sums.polynomial) + field.n_effective
         return cls(NodeCovariance(evidence.grid, sums, field.prior), field, field.mean, n)
 
     def at_same_prior(self, sums: NodeSums) -> AxisField:
-        """Posterior from other sums, at these hyperparameters."""
+        """Posterior from other sums with the same hyperparameters."""
         evidence = Evidence(self.covariance.grid, sums)
         return AxisField.of(evidence, evidence.at(self.field.prior))
 
     def following(self, sums: NodeSums) -> AxisField:
-        """Posterior from sums of nearly the same stars, at these hyperparameters.
+        """Posterior from slightly different sums with the same hyperparameters.
 
-        Its covariance stays: the weights of the stars change by a part in a thousand.
+        Only the mean is updated; the covariance is kept, since the weights of the stars change by
+        about a part in a thousand.
         """
         mean = self.covariance.mean(sums)
         return self.at_same_prior(sums) if mean is None else replace(self, mean=mean)
 
     @property
     def sums(self) -> NodeSums:
-        """Normal equations of the stars that the covariance is from."""
+        """Normal equations from which the covariance was computed."""
         return self.covariance.sums
 
     @property
     def root(self) -> Float:
-        """R (n, n) with R R^T the covariance."""
+        """Matrix R (n, n) such that R R^T is the covariance."""
         return self.covariance.root
 
     @property
     def sigma(self) -> Float:
-        """Standard error (n,) of each node, pixels."""
+        """Standard error (n,) of each node in pixels."""
         return np.sqrt(np.einsum("ij,ij->i", self.root, self.root))
 
     @property
     def cov(self) -> Float:
-        """Covariance (n, n), square pixels."""
+        """Covariance (n, n) of the node values in square pixels."""
         return self.root @ self.root.T
 
     def gain(self, rows: Float) -> Float:
-        """Part of an error beneath this table that it absorbs: rows (N, n) times S A, (N, n)."""
+        """Part of the errors of an underlying table that this table absorbs.
+
+        `rows` (N, n) are derivatives with respect to the node values.  Returns rows S A (N, n),
+        with the covariance S of this table and the information A of the stars.
+        """
         return self.sums.informed(self.root @ (self.root.T @ rows.T)).T
 
 
 @dataclass(frozen=True, eq=False)
 class TablePosterior:
-    """Posterior of one look-up table.
-
-    The two axes are independent.
+    """Posterior of one look-up table; its two axes are independent.
 
     Parameters
     ----------
     grid : NodeGrid
     axes : tuple of AxisField
-        Of the x and of the y plane.
+        Posteriors of the x and y planes.
     filter : str
-        The table's filter; '' for the detector's own.
+        Filter of the table; '' for the detector's table.
     jitter : float
-        Error of the stars beyond the quoted ones, pixels.
+        Additional error of the stars in excess of the quoted errors, in pixels.
     jitter_sigma : float
-        Its standard error, pixels.
+        Standard error of the jitter in pixels.
     n_stars : float
-        Number of stars, each counted by its weight.
+        Sum of the weights of the stars.
     """
 
     grid: NodeGrid
@@ -151,7 +165,7 @@ class TablePosterior:
 
     @property
     def means(self) -> LookupTable:
-        """Table of the posterior means, without their errors, which take time."""
+        """Table of the posterior means, without errors (see `table`), which take time."""
         return self.grid.table(np.stack([axis.mean for axis in self.axes]), filter=self.filter)
 
     @cached_property
@@ -162,12 +176,12 @@ class TablePosterior:
 
     @property
     def priors(self) -> tuple[Matern, Matern]:
-        """Prior fields of the two planes."""
+        """Hyperparameters of the x and y planes."""
         return self.axes[0].field.prior, self.axes[1].field.prior
 
     @property
     def cov(self) -> Float:
-        """Covariance (2, n_nodes, n_nodes) of the node values, square pixels."""
+        """Covariance (2, n_nodes, n_nodes) of the node values in square pixels."""
         return np.stack([axis.cov for axis in self.axes])
 
     def position_sigma(self, x: ArrayLike, y: ArrayLike, *, refitted: bool = False) -> Float:
@@ -176,17 +190,16 @@ class TablePosterior:
         Parameters
         ----------
         x, y : array_like, shape (N,)
-            Raw pixels.
+            Raw pixel coordinates.
         refitted : bool
-            True for the part that is left after the polynomial has followed the table's errors.
-            Its square, and the square of the formal error of a polynomial that was fitted with the
-            table fixed, add up to the total variance: exactly, not only where the two are nearly
-            independent.
+            True for the error that remains after the polynomial is refitted to compensate errors
+            of the table. Added in quadrature to the formal error of a polynomial that was fitted
+            with the table fixed, it gives exactly the total error.
 
         Returns
         -------
         ndarray, shape (N, 2)
-            Pixels.
+            Standard errors along x and y in pixels.
         """
         x, y = (np.atleast_1d(np.asarray(p, float)) for p in (x, y))
         out = np.empty((len(x), 2))
@@ -202,14 +215,20 @@ class TablePosterior:
         return out
 
     def rows(self, x: Float, y: Float, axis: int, *, refitted: bool = False) -> Float:
-        """Derivatives (N, n_nodes) of the shift along an axis by the node values.
+        """Derivatives of the interpolated shift along an axis with respect to the node values.
 
         Parameters
         ----------
         x, y : ndarray, shape (N,)
+            Raw pixel coordinates.
         axis : int
+            0 for x, 1 for y.
         refitted : bool
-            As in `position_sigma`.
+            See `position_sigma`.
+
+        Returns
+        -------
+        ndarray, shape (N, n_nodes)
         """
         out: Float = self.grid.interpolation(x, y).toarray()
         if refitted:

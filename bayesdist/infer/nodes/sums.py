@@ -1,8 +1,9 @@
-"""Normal equations of the nodes and the polynomial of one chip: sums over the stars.
+"""Normal equations of the nodes and the polynomial of one chip, accumulated over the stars.
 
-    r = W d + Phi c + noise        r: shifts of the pixel, W: bilinear weights, Phi: polynomials
+    r = W d + Phi c + noise
 
-The sums are small whatever the number of stars, and each star is read once.
+r are pixel shifts, W bilinear weights, d node values, Phi the polynomials and c their coefficients.
+Each star is read once, and the size of the sums does not depend on the number of stars.
 """
 
 from __future__ import annotations
@@ -19,14 +20,14 @@ from bayesdist.infer.nodes.grid import NodeGrid
 from bayesdist.infer.stars.sums import Sums
 from bayesdist.utils.arrays import Float
 
-BLOCK = 65_536  # stars at once: their polynomials take 11 MB at order 5
+BLOCK = 65_536  # stars processed at a time; their polynomials take 11 MB at order 5
 
 
 @dataclass(frozen=True, eq=False)
 class NodeSums(Sums):
-    """Normal equations of one axis."""
+    """Normal equations of one axis, for n nodes and K polynomial terms; N is the noise variance."""
 
-    nodes: scipy.sparse.csr_array  # W^T N^-1 W (n, n), nine entries in a row
+    nodes: scipy.sparse.csr_array  # W^T N^-1 W (n, n), nine entries per row
     cross: Float  # Phi^T N^-1 W (K, n)
     polynomial: Float  # Phi^T N^-1 Phi (K, K)
     right: Float  # W^T N^-1 r (n,)
@@ -39,43 +40,43 @@ class NodeSums(Sums):
 
     @cached_property
     def absorbed(self) -> Float:
-        """Part (K, n) of each node that the polynomial absorbs; its response is minus this."""
+        """Minus the derivatives (K, n) of the polynomial coefficients with respect to the nodes."""
         return scipy.linalg.cho_solve(self._factor, self.cross)
 
     @cached_property
     def polynomial_root(self) -> Float:
-        """R (K, K) with R R^T the covariance of the polynomial for fixed nodes."""
+        """Matrix R (K, K) such that R R^T is the covariance of the polynomial for fixed nodes."""
         L, _ = self._factor
         return scipy.linalg.solve_triangular(L, np.eye(len(L)), lower=True).T
 
     def polynomial_of(self, values: Float) -> Float:
-        """Polynomial (K,) that goes with node values (n,)."""
+        """Best-fitting polynomial coefficients (K,) for given node values (n,)."""
         free: Float = scipy.linalg.cho_solve(self._factor, self.right_polynomial)
         return free - self.absorbed @ values
 
     @cached_property
     def marginal_right(self) -> Float:
-        """Right-hand side (n,) of the nodes where the polynomial is free to follow them."""
+        """Right-hand side (n,) of the node equations after eliminating the polynomial."""
         return self.right - self.absorbed.T @ self.right_polynomial
 
     def informed(self, values: Float) -> Float:
-        """Information about the nodes, for a free polynomial, times values (n, ...)."""
+        """Multiply node values (n, ...) by `information`, without forming that matrix."""
         return self.nodes @ values - self.cross.T @ (self.absorbed @ values)
 
     @property
     def information(self) -> Float:
-        """Information (n, n) about the nodes, for a polynomial that is free to follow them."""
+        """Information matrix (n, n) of the nodes after eliminating the polynomial."""
         return self.nodes.toarray() - self.cross.T @ self.absorbed
 
 
 def node_sums(
     grid: NodeGrid, x: Float, y: Float, shift: Float, precision: Float
 ) -> tuple[NodeSums, NodeSums]:
-    """Sums over the stars of one chip, for x and for y.
+    """Accumulate the normal equations of one chip, for the x and the y axis.
 
-    `shift` (N, 2) is to be added to the raw pixels x, y (N,); `precision` (N, 2) are inverse
-    variances, zero for a star that does not count.  DegenerateError when the stars do not determine
-    the polynomial.
+    `x`, `y` (N,) are raw pixel coordinates, `shift` (N, 2) the corrections to be added to them, and
+    `precision` (N, 2) the inverse variances, zero for stars to ignore.  Raises DegenerateError if
+    the stars do not determine the polynomial.
     """
     total = _block(grid, x[:BLOCK], y[:BLOCK], shift[:BLOCK], precision[:BLOCK])
     for start in range(BLOCK, len(x), BLOCK):

@@ -1,4 +1,4 @@
-"""Polynomial and look-up tables of one filter: corrected pixels, and their errors."""
+"""Fitted polynomial and look-up tables of one filter, and the errors of corrected pixels."""
 
 from __future__ import annotations
 
@@ -17,23 +17,34 @@ from bayesdist.infer.solution.linear import LinearFit
 from bayesdist.model.lookup import LookupTable, corrected
 from bayesdist.utils.arrays import Float
 
-BLOCK = 1024  # positions whose rows over all nodes are in memory at once
+BLOCK = 1024  # positions processed at a time, with dense rows over all nodes
 
 
 @dataclass(frozen=True)
 class Iteration:
-    """Statistics of one iteration."""
+    """Statistics of one iteration of `fit_with_tables`.
 
-    number: int  # from 1
-    moved: float  # largest change of a node, pixels
-    # rms residual of an axis before the new tables, stars weighted by their probability of being
-    # true matches, pixels
+    Parameters
+    ----------
+    number : int
+        Number of the iteration, starting from 1.
+    moved : float
+        Largest change of a node in pixels.
+    rms : float
+        Rms residual per axis in pixels, before the new tables were made. Stars are weighted by
+        their probability of being true matches.
+    false_fraction : float
+        Fraction of false matches.
+    """
+
+    number: int
+    moved: float
     rms: float
-    false_fraction: float  # of the matches
+    false_fraction: float
 
 
 def shifts_of(table: LookupTable | TablePosterior) -> LookupTable:
-    """The table, of a posterior its means without their errors."""
+    """Look-up table, or the means of a table posterior, without errors."""
     return table.means if isinstance(table, TablePosterior) else table
 
 
@@ -44,19 +55,20 @@ class TableFit:
     Parameters
     ----------
     filter : str
-        Filter of the fitted tables.  '' for the detector's: these contain the own pattern of the
-        filter that they come from, which one filter alone cannot separate from the detector's.
+        Filter of the fitted tables; '' for the detector's tables. The latter include the pattern
+        of the filter from which they were made, since a single filter cannot separate the two.
     solution : LinearFit
-        The polynomial, fitted last, with these tables fixed.
+        The polynomial, fitted last with the tables fixed.
     beneath : tuple of LookupTable or TablePosterior
-        The detector's tables that were given.
+        Tables of the detector that were given and kept fixed.
     fitted : tuple of LookupTable or TablePosterior
-        One for each chip; binned ones have no posterior.
+        Fitted tables, one per chip; `LookupTable` for the method 'binned'.
     mixture : ResidualMixture
-        Memberships of the matches, in their order.
+        Outlier mixture, with membership probabilities in the order of the matches.
     progress : tuple of Iteration
+        Statistics of all iterations.
     converged : bool
-        True if the tables moved less than the tolerance in the last iteration.
+        True if no node changed by more than the tolerance in the last iteration.
     """
 
     filter: str
@@ -69,78 +81,86 @@ class TableFit:
 
     @property
     def tables(self) -> tuple[LookupTable, ...]:
-        """All tables, the detector's first."""
-        every = (*self.beneath, *self.fitted)
-        return tuple(one.table if isinstance(one, TablePosterior) else one for one in every)
+        """All tables, starting with those of the detector."""
+        tables = (*self.beneath, *self.fitted)
+        return tuple(
+            table.table if isinstance(table, TablePosterior) else table for table in tables
+        )
 
     @property
     def posteriors(self) -> tuple[TablePosterior, ...]:
-        """Posteriors of the fitted tables; empty for binned ones."""
-        return tuple(one for one in self.fitted if isinstance(one, TablePosterior))
+        """Posteriors of the fitted tables; empty for binned tables."""
+        return tuple(table for table in self.fitted if isinstance(table, TablePosterior))
 
     def corrected(self, matches: Matches) -> Matches:
-        """Matches of the filter at the pixels that the tables have corrected.
+        """Apply all tables to the pixel coordinates of matches of this filter.
 
         Parameters
         ----------
         matches : Matches
-            At raw pixels.
+            Stars at raw pixel coordinates.
 
         Returns
         -------
         Matches
-            The few that are moved off their chip are left out, and counted in `rejected`.
+            Stars at corrected pixel coordinates. The few that are moved off their chip are left
+            out and counted in `rejected`.
         """
-        tables = [shifts_of(one) for one in (*self.beneath, *self.fitted)]
+        tables = [shifts_of(table) for table in (*self.beneath, *self.fitted)]
         return on_the_chips(corrected_matches(tables, matches), self.solution.model)
 
     def shift_variance(self, x: ArrayLike, y: ArrayLike, *, chip: int) -> Float:
-        """Variance of the tables' shift, less what the polynomial follows.
+        """Variance of the shift by the tables, after refitting the polynomial.
 
-        The formal covariance of the fit is that of the polynomial for fixed tables; with this
-        variance, projected by the slopes of the polynomial, it adds up to that of the joint
-        solution.  The error of the detector's table counts in another filter only as far as that
-        filter's own table does not absorb it; the polynomial is not assumed to follow plain tables
-        beneath (`held_sigma`).
+        The formal covariance of `solution` is that of the polynomial for fixed tables.  Adding this
+        variance, projected with the Jacobian of the polynomial, gives the variance of the joint
+        solution.  The error of the detector's table counts only as far as the filter's table does
+        not absorb it.  If the detector's table is a `LookupTable`, neither table nor polynomial
+        is assumed to absorb its error, for which `held_sigma` gives an upper bound.
 
         Parameters
         ----------
         x, y : array_like, shape (N,)
-            FITS 1-based raw pixels.
+            Raw pixel coordinates (FITS convention, 1-based).
         chip : int
+            Chip number.
 
         Returns
         -------
         ndarray, shape (N, 2)
-            Square pixels.
+            Variances along x and y in square pixels.
 
         Raises
         ------
         InputError
-            For binned tables, whose nodes have no covariance.
+            If the tables are binned, so that the covariance of the nodes is unknown, or if the
+            chip has no table.
         """
         x, y = np.broadcast_arrays(np.atleast_1d(np.asarray(x, float)), np.asarray(y, float))
-        own = self._posterior(chip)
+        posterior = self._posterior(chip)
         blocks = [slice(start, start + BLOCK) for start in range(0, len(x), BLOCK)]
-        return np.concatenate([self._variance(own, x[rows], y[rows], chip) for rows in blocks])
+        return np.concatenate(
+            [self._variance(posterior, x[rows], y[rows], chip) for rows in blocks]
+        )
 
     def _posterior(self, chip: int) -> TablePosterior:
         """Posterior of the fitted table of a chip."""
         if not self.posteriors:
             raise InputError(
-                "binned tables know no covariance of their nodes", do="choose method 'field'"
+                "the covariance of the nodes of binned tables is unknown",
+                do="choose method 'field'",
             )
         for posterior in self.posteriors:
             if posterior.grid.chip.number == chip:
                 return posterior
         raise InputError(
             f"there is no table for chip {chip}",
-            do=f"there are those for {', '.join(str(p.grid.chip.number) for p in self.posteriors)}",
+            do=f"choose among {', '.join(str(p.grid.chip.number) for p in self.posteriors)}",
         )
 
     def _variance(self, own: TablePosterior, x: Float, y: Float, chip: int) -> Float:
-        """Variance (N, 2) of the tables' shift where the polynomial follows, square pixels."""
-        lower = next((one for one in self.beneath if shifts_of(one).chip == chip), None)
+        """`shift_variance` (N, 2) from the posterior `own` of the chip's fitted table."""
+        lower = next((table for table in self.beneath if shifts_of(table).chip == chip), None)
         if lower is None:
             return own.position_sigma(x, y, refitted=True) ** 2
         px, py = corrected([shifts_of(lower)], x, y, chip=chip)
@@ -150,18 +170,32 @@ class TableFit:
         out = np.empty((len(x), 2))
         for a, axis in enumerate(own.axes):
             rows = own.rows(px, py, a, refitted=True)
-            # the filter's polynomial and its table both follow an error of the detector's table
-            left = rows - axis.gain(rows)
+            # the filter's polynomial and table both absorb errors of the detector's table
+            remainder = rows - axis.gain(rows)
             out[:, a] = ((rows @ axis.root) ** 2).sum(axis=1)
-            out[:, a] += ((left @ lower.axes[a].root) ** 2).sum(axis=1)
+            out[:, a] += ((remainder @ lower.axes[a].root) ** 2).sum(axis=1)
         return out
 
 
 def held_sigma(tables: Sequence[LookupTable], x: ArrayLike, y: ArrayLike, *, chip: int) -> Float:
-    """Standard error (N, 2), pixels, of the shift by held tables, from the errors of their nodes.
+    """Upper bound on the standard error of the shift by fixed tables, from their node errors.
 
-    Zero where the chip has no table, or the table no errors.  With the nodes' covariance unknown
-    this is its upper bound: the errors of neighbouring nodes are taken as fully correlated.
+    Since the covariance of the nodes is unknown, errors of neighbouring nodes are assumed to be
+    fully correlated.
+
+    Parameters
+    ----------
+    tables : sequence of LookupTable
+    x, y : array_like, shape (N,)
+        Raw pixel coordinates.
+    chip : int
+        Chip number.
+
+    Returns
+    -------
+    ndarray, shape (N, 2)
+        Standard errors along x and y in pixels; zero if the chip has no table or the table has no
+        errors.
     """
     x, y = np.broadcast_arrays(np.atleast_1d(np.asarray(x, float)), np.asarray(y, float))
     for table in tables:

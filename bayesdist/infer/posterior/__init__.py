@@ -1,4 +1,4 @@
-"""The posterior as a result, and what it says of each star."""
+"""Posterior draws with their diagnostics and files, and the outlier probability of each star."""
 
 from bayesdist.infer.posterior.posterior import Certificate, Posterior, SamplerInfo
 

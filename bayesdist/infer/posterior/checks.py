@@ -1,4 +1,4 @@
-"""Checks of a fit and of a posterior: convergence, chi-square, what was left out."""
+"""Checks of a fit and of a posterior: chi-square, rejected rows, condition, convergence."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ RESIDUALS_TOO_LARGE = "they are too small, which the jitter takes up, or the mod
 
 
 def scatter_too_small(total: float, dof: float) -> bool:
-    """True if residuals with this chi-square scatter less than their quoted errors."""
+    """True if chi-square is significantly too small: residuals scatter less than quoted errors."""
     by_chance = float(chi2_cdf(total, max(dof, 1)))
     return total < CHI2_TOO_SMALL.value * dof and by_chance < CHI2_TOO_SMALL_CHANCE.value
 
@@ -42,12 +42,24 @@ def fit_checks(
     things: str = "stars",
     chooser: str = "least-squares fit",
 ) -> tuple[Check, ...]:
-    """Checks of chi-square, of the rows left out and of the condition of a fit.
+    """Checks of a fit: chi-square, fraction of rows left out, and condition number.
 
-    `in_circle` if the likelihood accounts for the circles that stars were matched in;
-    `false_matches` if a posterior explains residuals that are too large by false matches, with
-    quoted errors that are right; `things` are what is fitted, one row each, and `chooser` leaves
-    out rows that are far off.
+    Parameters
+    ----------
+    fit : LinearFit
+    in_circle : bool
+        True if the likelihood accounts for the match circle that truncates the residuals.
+    false_matches : bool
+        True if the posterior attributes residuals that are too large to false matches and finds
+        the quoted errors correct.
+    things : str
+        Plural noun for the rows that are fitted, as printed.
+    chooser : str
+        Name of the step that leaves rows out, as printed.
+
+    Returns
+    -------
+    tuple of Check
     """
     ratio = fit.chi2 / fit.dof if fit.dof > 0 else float("nan")
     left_out = fit.n_rejected / fit.n_rows
@@ -81,7 +93,7 @@ def fit_checks(
 
 
 def _of_chi2(fit: LinearFit, small: bool, *, in_circle: bool, false_matches: bool) -> str:
-    """Sentence on a chi-square that is not about one; empty where it is."""
+    """Explain a chi-square per degree of freedom that is not near one; empty if it is."""
     ratio = fit.chi2 / max(fit.dof, 1)
     if small and in_circle:
         return (
@@ -109,7 +121,7 @@ def _of_chi2(fit: LinearFit, small: bool, *, in_circle: bool, false_matches: boo
 
 
 def pixel_doubt(solution: Solution) -> str:
-    """Doubt about u and v that are called pixels and are not, as a clause; empty without one."""
+    """Warning if u and v are declared as pixels but the fitted scale contradicts it; else empty."""
     model = solution.model
     if model.unit != "pix":
         return ""
@@ -124,7 +136,7 @@ def pixel_doubt(solution: Solution) -> str:
 
 
 def convergence_check(c: Convergence) -> Check:
-    """Check that the draws can be relied on at all."""
+    """Check that the posterior is converged; lists the criteria that failed."""
     sentence = ""
     if not c.converged:
         why = "; ".join(c.reasons)
@@ -136,7 +148,7 @@ def convergence_check(c: Convergence) -> Check:
 
 
 def sampling_checks(posterior: Posterior | None) -> tuple[Check, ...]:
-    """Checks of the draws; that there are none, for a fit alone."""
+    """Checks of the posterior draws; a single warning "not sampled" if `posterior` is None."""
     if posterior is None:
         return (Check(SAMPLING, "Posterior", "not sampled", "sampled and converged", "warn"),)
     c = posterior.convergence
@@ -146,7 +158,7 @@ def sampling_checks(posterior: Posterior | None) -> tuple[Check, ...]:
         mcse = float(np.nanmax(np.where(sd > 0, c.mcse_mean[:D] / sd, 0.0), initial=0.0))
     label = posterior.approximation
     method = [Check(SAMPLING, "Method", level="warn", sentence=label)] if label else []
-    # what only advises does not fail by itself: the limits of R-hat and ESS decide
+    # R-hat and ESS decide; the other diagnostics are advisory and only warn
     return (
         *method,
         convergence_check(c),

@@ -1,9 +1,11 @@
-"""Solutions as netCDF files, written whole or not at all, and read with one clear error.
+"""Read and write solutions as netCDF files.
 
-fit.nc holds a linear fit, posterior.nc a posterior, as a tree that ArviZ and xarray open: groups
-posterior, sample_stats, diagnostics; for tables in memory also observed_data, constant_data and,
-where that is not too large, log_likelihood. Values for each star of larger data are in separate
-files, in the parts of `stars/`.
+Files are replaced atomically; any problem in reading raises a single `FormatError`.
+
+fit.nc holds a linear fit. posterior.nc holds a posterior as a tree that ArviZ and xarray can open,
+with the groups posterior, sample_stats and diagnostics. For tables in memory it also has
+observed_data, constant_data and, unless it would be too large, log_likelihood. Values per star of
+larger data are written to separate files in `stars/`.
 """
 
 from __future__ import annotations
@@ -40,9 +42,9 @@ from bayesdist.utils.arguments import takes
 if TYPE_CHECKING:
     import xarray
 
-MOST_STARS = 1_000_000  # with more stars their data are not repeated in the file
-LARGEST = 16_000_000  # bytes of log-likelihood that are stored star by star and draw by draw
-LEAST_RHAT = 0.5  # chains of four draws have 0.87 at least
+MOST_STARS = 1_000_000  # the file repeats the data of at most this many stars
+LARGEST = 16_000_000  # bytes; a larger log-likelihood (per star and draw) is not stored
+LEAST_RHAT = 0.5  # plausibility limit; even chains of four draws have at least 0.87
 FIT_NUMBERS = ("n_rows", "n_used", "rms_u", "rms_v", "rms_rejected", "chi2", "dof", "condition")
 
 
@@ -60,16 +62,17 @@ def save_posterior(
     ----------
     posterior : Posterior
     matches : Matches or None
-        The data it was made from; None, or more than a million stars, leaves them out.
+        The data from which the posterior was sampled. They are stored in the file, except for
+        more than a million stars; None omits them.
     path : path
-        Replaced atomically.
+        Output file, replaced atomically.
     provenance : mapping, optional
-        JSON-able facts about the run, stored as an attribute.
+        Facts about the run that JSON can represent, stored as an attribute.
 
     Raises
     ------
     InputError
-        When the system refuses to write.
+        If the file cannot be written.
 
     Examples
     --------
@@ -97,11 +100,13 @@ def posterior_datatree(
     Parameters
     ----------
     posterior, matches, provenance
-        As for `save_posterior`.
+        See `save_posterior`.
 
     Returns
     -------
     xarray.DataTree
+        Groups posterior, sample_stats and diagnostics; with `matches` also observed_data,
+        constant_data and, unless it is too large, log_likelihood.
 
     Raises
     ------
@@ -119,16 +124,16 @@ def _groups(
     if matches is not None and len(matches) <= MOST_STARS:
         groups["observed_data"] = Group({"u": (("star",), matches.u), "v": (("star",), matches.v)})
         groups["constant_data"] = _constants(posterior, matches)
-        # of one draw only where the stars' positions are unknowns too
-        few = posterior.log_prob.size * len(matches) * 8 <= LARGEST
-        if few and not posterior.own_places:
+        # omitted if the stars' positions are unknowns too: they are given at a single draw only
+        is_small = posterior.log_prob.size * len(matches) * 8 <= LARGEST
+        if is_small and not posterior.own_places:
             values = star_log_likelihood(posterior, matches)
             groups["log_likelihood"] = Group({"uv": (("chain", "draw", "star"), values)})
     return groups
 
 
 def _constants(posterior: Posterior, matches: Matches) -> Group:
-    """Columns of the matches that the posterior was made from."""
+    """Group constant_data: columns of the matches from which the posterior was sampled."""
     columns = {
         "x": matches.x,
         "y": matches.y,
@@ -149,12 +154,12 @@ def _constants(posterior: Posterior, matches: Matches) -> Group:
 
 
 def load_posterior(path: str | Path) -> Posterior:
-    """Posterior from a file.
+    """Read a posterior from a netCDF file.
 
     Parameters
     ----------
     path : path
-        A posterior.nc, or a run directory that holds one.
+        A file written by `save_posterior`, or a run directory that contains posterior.nc.
 
     Returns
     -------
@@ -163,7 +168,7 @@ def load_posterior(path: str | Path) -> Posterior:
     Raises
     ------
     FormatError
-        When the file is missing or is not such a file.
+        If the file is missing, damaged, or not a posterior.
 
     Examples
     --------
@@ -196,8 +201,8 @@ def load_posterior(path: str | Path) -> Posterior:
         hyper = {str(name): draws[name] for name in ("j", "f", "s_out") if name in draws}
         shape = (*theta.shape[:2], len(model.names))
         _refuse_other_shape(theta, shape)
-        for one in (log_prob, *hyper.values()):
-            _refuse_other_shape(one, shape[:2])
+        for values in (log_prob, *hyper.values()):
+            _refuse_other_shape(values, shape[:2])
         for check in DIAGNOSTICS:  # NaN where a parameter does not move
             _refuse_other_shape(np.nan_to_num(checks[check]), checks["sampled"].shape)
         if (checks["rhat"] < LEAST_RHAT).any():  # False for NaN
@@ -229,7 +234,7 @@ def load_posterior(path: str | Path) -> Posterior:
 
 
 def _tangent_point(attrs: Mapping[str, Any]) -> tuple[float, float] | None:
-    """RA and Dec of the plane of u, v; None if the file does not state them."""
+    """RA and Dec (deg) of the tangent point of u, v; None if the file does not state them."""
     point = _tree(attrs["tangent_point"]) if "tangent_point" in attrs else None
     return None if point is None else (float(point[0]), float(point[1]))
 
@@ -239,17 +244,17 @@ def _certificate(fields: dict[str, Any] | None) -> Certificate | None:
 
 
 def _refuse_other_shape(values: NDArray[Any], shape: tuple[int, ...]) -> None:
-    """Refuse (ValueError) an array of another shape, or with values that are no finite numbers."""
+    """Raise ValueError if an array has a different shape or contains non-finite values."""
     if values.shape != shape:
-        raise ValueError(f"an array has the shape {values.shape} in place of {shape}")
+        raise ValueError(f"an array has the shape {values.shape} instead of {shape}")
     if values.dtype.kind not in "fiu" or not np.isfinite(values).all():
         raise ValueError("an array has values that are not finite")
 
 
 def _tree(text: object) -> Any:
-    """Tree of an attribute that holds JSON."""
+    """Parse an attribute that holds JSON."""
     if not isinstance(text, str):
-        raise TypeError("an attribute is no text")
+        raise TypeError("an attribute is not a string")
     return json_of(text, "")
 
 
@@ -258,7 +263,19 @@ def _plain(value: object) -> object:
 
 
 def save_fit(fit: LinearFit, path: str | Path) -> None:
-    """Write a linear fit to a netCDF file, which is replaced atomically."""
+    """Write a linear fit to a netCDF file.
+
+    Parameters
+    ----------
+    fit : LinearFit
+    path : path
+        Output file, replaced atomically.
+
+    Raises
+    ------
+    InputError
+        If the file cannot be written.
+    """
     names = fit.model.names
     data = Group(
         {
@@ -282,12 +299,21 @@ def save_fit(fit: LinearFit, path: str | Path) -> None:
 
 
 def load_fit(path: str | Path) -> LinearFit:
-    """Linear fit from a file.
+    """Read a linear fit from a netCDF file.
+
+    Parameters
+    ----------
+    path : path
+        A file written by `save_fit`.
+
+    Returns
+    -------
+    LinearFit
 
     Raises
     ------
     FormatError
-        When the file is missing or is not such a file.
+        If the file is missing, damaged, or not a fit.
     """
     path = Path(path)
     with _reading(path, "a fit", "fit"):
@@ -313,9 +339,9 @@ def load_fit(path: str | Path) -> LinearFit:
 
 
 def _write(groups: Mapping[str, Group], path: str | Path) -> None:
-    """Write the groups of a file, '' at its top, replaced atomically.
+    """Write the groups to a file, which is replaced atomically; '' is the root group.
 
-    The file is built in memory: on a full disk HDF5 itself would crash when it is closed.
+    The file is built in memory because HDF5 crashes when it closes a file on a full disk.
     """
     buffer = io.BytesIO()
     with h5netcdf.File(buffer, "w") as file:
@@ -326,22 +352,22 @@ def _write(groups: Mapping[str, Group], path: str | Path) -> None:
 
 
 def _fill(target: h5netcdf.Group, group: Group) -> None:
-    """Write one group of a file."""
+    """Write the attributes, dimensions and variables of a group."""
     target.attrs.update(group.attrs)
     for name, (along, content) in group.variables.items():
         values = np.asarray(content)
         if values.dtype.kind == "U":
             values = values.astype(h5py.string_dtype())
-        for one, size in zip(along, values.shape, strict=True):
-            target.dimensions.setdefault(one, size)
+        for dimension, size in zip(along, values.shape, strict=True):
+            target.dimensions.setdefault(dimension, size)
         target.create_variable(name, along, values.dtype, values)
 
 
 @contextmanager
 def _reading(path: Path, what: str, stage: str) -> Iterator[None]:
-    """Turn any exception while a file is read into one FormatError.
+    """Convert any exception raised while a file is read to a FormatError.
 
-    `what` names the expected content ('a posterior', 'a fit'), `stage` the stage that makes it.
+    `what` names the expected content ('a posterior', 'a fit'), `stage` the stage that produces it.
     """
     if not path.exists():
         raise FormatError(

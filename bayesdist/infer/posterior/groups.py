@@ -1,4 +1,4 @@
-"""Groups of a posterior's variables, as posterior.nc and the data trees of ArviZ have them."""
+"""Groups of variables, as in posterior.nc and in the data trees of ArviZ."""
 
 from __future__ import annotations
 
@@ -13,21 +13,24 @@ from bayesdist.errors import InputError
 if TYPE_CHECKING:
     import xarray
 
-SAMPLED = ("chain", "draw")  # dimensions that count from 0
+SAMPLED = ("chain", "draw")  # dimensions that are numbered from 0
 
 
 @dataclass(frozen=True, eq=False)
 class Group:
-    """A group of a netCDF file: variables with the names of their dimensions, and attributes."""
+    """Group of a netCDF file.
+
+    `variables` maps each name to (names of its dimensions, values); `attrs` are the attributes.
+    """
 
     variables: Mapping[str, tuple[tuple[str, ...], Any]] = field(default_factory=dict)
     attrs: Mapping[str, Any] = field(default_factory=dict)
 
 
 def datatree_of(groups: Mapping[str, Group]) -> xarray.DataTree:
-    """Tree of groups, the top group under ''; chains and draws are numbered from 0.
+    """Convert groups to a data tree; '' is the root group, chains and draws are numbered from 0.
 
-    InputError if xarray is not installed.
+    Raises InputError if xarray is not installed.
     """
     try:
         import xarray

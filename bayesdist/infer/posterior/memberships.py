@@ -1,4 +1,4 @@
-"""Probabilities of stars to be false matches, averaged over posterior draws."""
+"""Probability that each star is a false match, averaged over posterior draws."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ from bayesdist.utils.arguments import takes
 from bayesdist.utils.arrays import Float, Int
 
 MOST_DRAWS, LEAST_DRAWS = 64, 8
-AT_A_TIME = 1_000_000  # log-likelihoods of a star that are in memory beside the result
-EVALUATIONS = 200_000_000  # largest number of evaluations of a star for the average
+AT_A_TIME = 1_000_000  # log-likelihoods (stars times draws) that are computed at a time
+EVALUATIONS = 200_000_000  # limit on stars times draws that are averaged
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,12 +28,13 @@ class Memberships:
     Parameters
     ----------
     outlier_probability : ndarray, shape (N,)
+        Probability that a star is a false match, averaged over the draws.
     log_likelihood : ndarray, shape (N,)
         Mean over the draws.
     log_likelihood_variance : ndarray, shape (N,)
-        Over the draws.
+        Variance over the draws.
     draws : int
-        Number of draws averaged.
+        Number of posterior draws that were averaged.
     """
 
     outlier_probability: Float
@@ -42,7 +43,7 @@ class Memberships:
     draws: int
 
     def in_table_order(self, order: Int) -> Memberships:
-        """Values reordered from prepared stars to their table."""
+        """Memberships reordered to the rows of the table; `order` is that of `prepare`."""
         return Memberships(
             in_table_order(self.outlier_probability, order),
             in_table_order(self.log_likelihood, order),
@@ -52,7 +53,7 @@ class Memberships:
 
 
 def some_draws(theta: Float, h: Float, n_stars: int) -> tuple[Float, Float]:
-    """Draws spread evenly over all: fewer for more stars, whose posterior is narrower."""
+    """Evenly spaced subset of the draws: fewer if there are more stars (narrower posterior)."""
     n = int(np.clip(EVALUATIONS // n_stars, LEAST_DRAWS, MOST_DRAWS))
     rows = np.linspace(0, len(theta) - 1, min(n, len(theta))).astype(int)
     return theta[rows], h[rows]
@@ -66,17 +67,17 @@ def memberships(posterior: Posterior, matches: Matches) -> Memberships:
     ----------
     posterior : Posterior
     matches : Matches
-        The stars that the posterior was made from, or some of them.
+        The stars from which the posterior was sampled, or a subset.
 
     Returns
     -------
     Memberships
-        In the order of the table.
+        In the order of the rows of `matches`.
 
     Raises
     ------
     InputError
-        For matches without errors, in another unit than the model's, or on other chips.
+        If the matches have no errors, another unit than the model, or other chips.
 
     Examples
     --------
@@ -95,19 +96,20 @@ def memberships(posterior: Posterior, matches: Matches) -> Memberships:
 
 
 def memberships_of(posterior: Posterior, stars: Stars) -> Memberships:
-    """`memberships` of stars that are prepared for the posterior's model, in their own order."""
+    """Memberships of stars that are already prepared for the posterior's model, in their order."""
     theta, constants = averaged_draws(posterior)
     p, mean, square = star_averages(stars, theta, constants)
     return Memberships(p, mean, np.maximum(square - mean**2, 0.0), len(theta))
 
 
 def averaged_draws(posterior: Posterior) -> tuple[Float, Constants]:
-    """Draws over which memberships are averaged: theta (n, D), and the mixture at each.
+    """Draws over which memberships are averaged: theta (n, D), and the mixture at each draw.
 
-    Only the mean where the stars' positions are unknowns: at other draws they would be different.
+    If the stars' positions are unknowns too, only the mean is used: the positions of the stars are
+    those of the mean and would differ at any other draw.
     """
     if posterior.own_places:
-        theta, h = (one.mean(axis=0, keepdims=True) for one in posterior.sampled_points)
+        theta, h = (points.mean(axis=0, keepdims=True) for points in posterior.sampled_points)
     else:
         theta, h = some_draws(*posterior.sampled_points, posterior.n_stars)
     return theta, posterior.bound_mixture.constants(h)
@@ -128,9 +130,9 @@ def star_log_likelihood(posterior: Posterior, matches: Matches) -> Float:
 
 
 def count_outliers(shards: Shards, hyper: Hyper, theta: Float, h: Float) -> tuple[int, float]:
-    """Number of stars that are more likely false than not, and the expected number of false ones.
+    """Number of stars with outlier probability above 0.5, and expected number of false matches.
 
-    `theta` (n, D) and `h` (n, n_hyper) are all draws; some of them are used.
+    `theta` (n, D) and `h` (n, n_hyper) are all posterior draws; a subset of them is averaged.
     """
     theta, h = some_draws(theta, h, len(shards))
     flagged, expected = shards.sum(_count, theta, hyper.constants(h))

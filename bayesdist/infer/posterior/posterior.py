@@ -1,4 +1,4 @@
-"""The posterior as a result: draws, their moments, convergence, and how they were made."""
+"""The posterior: draws, their moments, convergence diagnostics, and a record of the sampling."""
 
 from __future__ import annotations
 
@@ -22,20 +22,24 @@ from bayesdist.utils.quantities import Random, generator_of
 if TYPE_CHECKING:
     import xarray
 
-SCHEMA = 2  # of posterior.nc
+SCHEMA = 2  # version of the layout of posterior.nc
 POSTERIOR_NUMBERS = ("n_stars", "n_flagged", "n_false", "reference_sigma")
 
 
 @dataclass(frozen=True)
 class SamplerInfo:
-    """Record of how the draws were made.
+    """Record of the sampling.
 
     Parameters
     ----------
     method : str
         Moves that were used.
-    ensembles, walkers, steps : int
-        Steps of each ensemble, warm-up included.
+    ensembles : int
+        Number of independent ensembles.
+    walkers : int
+        Walkers per ensemble.
+    steps : int
+        Steps of each ensemble, including warm-up.
     warmup : int
         Steps dropped from each ensemble.
     passes : int
@@ -43,10 +47,10 @@ class SamplerInfo:
     acceptance : float
         Fraction of accepted proposals.
     wall_s : float
-        Seconds of this session.
+        Wall-clock time of this session in seconds.
     seed : int
     exact : bool
-        False where draws are those of a surrogate.
+        False if the draws were made from a surrogate of the posterior.
     """
 
     method: str
@@ -63,29 +67,57 @@ class SamplerInfo:
 
 @dataclass(frozen=True)
 class Certificate:
-    """Distance of a surrogate s from the posterior p, by pilots that were not used to make it.
+    """Bounds on the difference between a surrogate s and the posterior p.
 
-    Each pilot is one pass over the data.
+    They are computed from pilots (exact evaluations of the posterior at draws of the proposal q)
+    that were held out when the surrogate was built.  Each pilot takes one pass over the data.
+
+    Parameters
+    ----------
+    n_train, n_held_out : int
+        Number of pilots to which the surrogate was fitted, and number of held-out pilots.
+    n_outside : int
+        Number of pilots where the posterior density is zero.
+    raw_sd : float
+        Standard deviation of log p - log q, that is, without the surrogate.
+    remainder_sd, remainder_max : float
+        Standard deviation and largest absolute value of log p - log s over the held-out pilots,
+        with p and s normalised.
+    raw_efficiency : float
+        Effective fraction of draws of q, weighted by p / q, from all pilots.
+    efficiency : float
+        Effective fraction of draws of s, weighted by p / s, from the held-out pilots: 1 / (1 +
+        chi2).
+    pareto_k : float
+        Pareto shape of p / q; a heavy tail means that q misses a part of p.
+    chi2, chi2_upper : float
+        Estimate of the chi-square divergence chi2(p || s), and its upper limit.
+    mean_shift_bound : float
+        Bound on the error of any posterior mean in posterior standard deviations, from
+        `chi2_upper`.
+    tv_bound : float
+        Bound on the total variation distance, the error of any probability, from `chi2_upper`.
+    unseen : float
+        Upper limit (95 %) on the probability under q of a region that no pilot has hit.
+    reasons : tuple of str
+        Reasons why the certificate is refused; empty if it is granted.
     """
 
     n_train: int
     n_held_out: int
-    n_outside: int  # pilots where the posterior density is zero
-    raw_sd: float  # standard deviation of log p - log q: without a surrogate
-    remainder_sd: float  # standard deviation of log p - log s, over the pilots held out
-    remainder_max: float  # the largest of these, with p and s normalised
-    raw_efficiency: float  # effective fraction of draws of q, weighted by p / q; over all pilots
-    # effective fraction of draws of s, weighted by p / s; over the pilots held out: 1 / (1 + chi2)
+    n_outside: int
+    raw_sd: float
+    remainder_sd: float
+    remainder_max: float
+    raw_efficiency: float
     efficiency: float
-    pareto_k: float  # tail of p / q: where it is heavy, q misses a part of p that no pilot shows
-    chi2: float  # estimate of chi2(p || s) (module docstring)
-    chi2_upper: float  # upper limit of it
-    # no posterior mean is off by more than this many standard deviations; from `chi2_upper`
+    pareto_k: float
+    chi2: float
+    chi2_upper: float
     mean_shift_bound: float
-    # bound of the total variation: no probability is off by more; from `chi2_upper`
     tv_bound: float
-    unseen: float  # largest probability under q of a region that all held-out pilots missed (95 %)
-    reasons: tuple[str, ...]  # of a refusal; empty when it is granted
+    unseen: float
+    reasons: tuple[str, ...]
 
     @property
     def granted(self) -> bool:
@@ -94,7 +126,7 @@ class Certificate:
 
     @property
     def statement(self) -> str:
-        """Scope and limits of the certificate, in words."""
+        """Scope and limits of the certificate as a sentence."""
         if not self.granted:
             return f"certificate refused: {'; '.join(self.reasons)}"
         return (
@@ -115,29 +147,32 @@ class Posterior(Solution):
     model : DistortionModel
     mixture : OutlierMixture
     theta : ndarray, shape (chains, draws, D)
-        One chain for each independent ensemble; its draws are those of the first walker, then of
-        the second, and so on.
+        Draws of the distortion parameters, in the order of `model.names`. Each chain is one
+        independent ensemble, with the draws of its walkers one after the other.
     hyper : dict of str to ndarray, shape (chains, draws)
-        Sampled ones of 'f', 'j' and 's_out', in natural form.
+        Draws of the hyperparameters that were sampled: outlier fraction 'f', jitter 'j' and
+        outlier scale 's_out' (the last two in the model's unit), not their logarithms.
     log_prob : ndarray, shape (chains, draws)
         Log posterior density, up to a constant.
-    n_stars, n_flagged : int
-        Number of all stars, and of those that are more likely false matches than not.
+    n_stars : int
+        Number of stars.
+    n_flagged : int
+        Number of stars with an outlier probability above 0.5.
     n_false : float
-        Expected number of false matches: the sum of the probabilities.
+        Expected number of false matches: the sum of the outlier probabilities.
     reference_sigma : float
-        Median quoted error, in which the priors of the mixture are scaled.
+        Median quoted error; the priors of the mixture are scaled by it.
     convergence : Convergence
     sampler : SamplerInfo
     certificate : Certificate, optional
-        Of the surrogate, where one was made.
+        Accuracy of the surrogate; None if the draws were not made from a surrogate.
     own_places : bool
-        True if the stars' positions are unknowns of the solution, as in a self-calibration: the
-        matches then have the positions of the mean, which are those of no other draw.
+        True if the stars' positions are unknowns of the solution, as in a self-calibration. The
+        positions in the matches are then those of the posterior mean, not of the single draws.
     tangent_point : tuple of float, optional
-        RA and Dec in degrees of the plane of u, v: `LinearFit.tangent_point` of the fit.
+        RA and Dec in degrees of the tangent point of u, v; see `LinearFit.tangent_point`.
     matches_digest : str
-        `Matches.digest` of the stars; empty if it is not known, as in a file.
+        `Matches.digest` of the stars; empty if it is unknown, as for a posterior from a file.
 
     Examples
     --------
@@ -181,7 +216,7 @@ class Posterior(Solution):
 
     @property
     def approximation(self) -> str:
-        """Warning for every output that the draws are not exact; empty where they are."""
+        """Warning that the draws come from a surrogate; empty if they are exact."""
         if self.sampler.exact or self.certificate is None:
             return ""
         return self.certificate.statement
@@ -198,8 +233,8 @@ class Posterior(Solution):
 
     @cached_property
     def cov(self) -> Float:
-        """Posterior covariance of theta, shape (D, D); zero for parameters that a gauge fixes."""
-        # from one of the draws: the mean of equal numbers is rounded, their difference is not
+        """Posterior covariance of theta, shape (D, D); zero for parameters fixed by a gauge."""
+        # relative to a draw: fixed parameters then give exactly zero, in spite of rounding
         return np.atleast_2d(np.cov(self.flat - self.flat[0], rowvar=False))
 
     @property
@@ -208,41 +243,54 @@ class Posterior(Solution):
         return self.flat.std(axis=0, ddof=1)
 
     def interval(self, probability: float) -> Float:
-        """Central interval of every entry of theta, shape (D, 2).
+        """Central credible interval of every parameter.
 
         Parameters
         ----------
         probability : float
-            Between 0 and 1.
+            Posterior probability of the interval, between 0 and 1.
+
+        Returns
+        -------
+        ndarray, shape (D, 2)
+            Lower and upper end, in the order of theta.
         """
         tail = (1 - probability) / 2
         return np.quantile(self.flat, [tail, 1 - tail], axis=0).T
 
     def draws(self, n: int, rng: Random) -> Float:
-        """Random draws (n, D) of theta, without replacement as long as there are enough.
+        """Random subset of the posterior draws.
 
         Parameters
         ----------
         n : int
-            How many.
+            Number of draws. They are taken without replacement if at least n exist.
         rng : int or numpy.random.Generator
-            Seed, or source of the random numbers.
+            Seed or random generator.
+
+        Returns
+        -------
+        ndarray, shape (n, D)
         """
         theta, rows = self.drawn_rows(n, rng)
         return theta[rows]
 
     def drawn_rows(self, n: int, rng: Random) -> tuple[Float, Int]:
-        """All draws of theta (m, D), and the rows (n,) among them that `draws` gives."""
+        """All draws of theta (m, D), and indices (n,) of the rows that `draws` returns."""
         total = len(self.flat)
         return self.flat, generator_of(rng).choice(total, size=n, replace=n > total)
 
     def groups(self, provenance: Mapping[str, object] | None = None) -> dict[str, Group]:
-        """Groups of variables by name, as posterior.nc has them; the top group is ''.
+        """Groups of variables by name, as stored in posterior.nc; '' is the root group.
 
         Parameters
         ----------
         provenance : mapping, optional
-            JSON-able facts about the run.
+            Facts about the run that JSON can represent.
+
+        Returns
+        -------
+        dict of str to Group
         """
         c = self.convergence
         names, units = self.model.names, self.model.units
@@ -296,9 +344,9 @@ class Posterior(Solution):
         Returns
         -------
         xarray.DataTree
-            Groups posterior (`theta` by chain, draw and parameter, whose names are a coordinate
-            and whose units are the attribute `units`; f, j, s_out), sample_stats (`lp`, the log
-            density) and diagnostics.
+            Groups posterior (`theta` by chain, draw and parameter; f, j, s_out), sample_stats
+            (`lp`, the log density) and diagnostics. The names of the parameters are the
+            coordinate "parameter", their units the attribute `units` of the group.
 
         Raises
         ------
@@ -317,30 +365,35 @@ class Posterior(Solution):
 
     @property
     def sampled_points(self) -> tuple[Float, Float]:
-        """All draws as theta (n, D) and hyperparameters (n, h) in sampled coordinates."""
+        """All draws: theta (n, D), and the hyperparameters (n, h) in sampled coordinates."""
         h = self.bound_mixture.point({k: self.hyper[k].ravel() for k in self.mixture.hyper})
         return self.flat, h.reshape(len(self.flat), len(self.mixture.hyper))
 
     @property
     def bound_mixture(self) -> Hyper:
-        """Mixture with its priors in the unit of the data."""
+        """Mixture with its priors scaled to the unit of the data."""
         return self.mixture.bind(self.reference_sigma)
 
     @property
     def likelihood(self) -> MixtureAt:
-        """Mixture at the mean of theta and of the sampled coordinates of the hyperparameters.
+        """Mixture at the posterior mean of theta and of the sampled hyperparameter coordinates.
 
-        Location and scale of a symmetric density are nearly independent.
+        Both means may be taken separately, since location and scale of a symmetric density are
+        nearly independent.
         """
         _, h = self.sampled_points
         return MixtureAt(self.mean, self.bound_mixture.constants(h.mean(axis=0)[None]))
 
     def mapped(self, matrix: Float) -> Posterior:
-        """Posterior whose deviations from the mean are mapped by a matrix (D, D).
+        """Posterior with the deviations of theta from its mean multiplied by a matrix.
 
         Parameters
         ----------
         matrix : ndarray, shape (D, D)
-            Of all parameters, in the order of the model's names.
+            Rows and columns in the order of `model.names`.
+
+        Returns
+        -------
+        Posterior
         """
         return replace(self, theta=self.mean + (self.theta - self.mean) @ matrix.T)

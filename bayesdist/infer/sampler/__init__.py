@@ -1,1 +1,1 @@
-"""Sampling the posterior: moves, ensembles, convergence, checkpoints."""
+"""Sampling of the posterior: moves, ensembles, stopping rule, checkpoints."""

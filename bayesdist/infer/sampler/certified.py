@@ -1,9 +1,10 @@
-"""Sampling with few passes: a surrogate from pilots, its certificate, and an exact second stage.
+"""Sampling with few passes over the data: a surrogate, its certificate, and an exact second stage.
 
-The surrogate (`certificate`) is a proposal better than the one that it was made from.  As long as
-there is time its draws are therefore accepted or rejected by exact evaluations: delayed acceptance,
-of which rejection from the first proposal is the first stage.  Beyond that its draws represent the
-posterior, as an approximation with a certificate.
+The surrogate (see `surrogate`) is built from pilots and is a better proposal than the one from
+which the pilots were drawn.  If exact evaluations are affordable, they accept or reject its draws.
+This is delayed acceptance, with rejection from the first proposal as the first stage.  Otherwise
+the draws of the surrogate represent the posterior approximately, and the certificate bounds their
+error.
 """
 
 from __future__ import annotations
@@ -26,15 +27,15 @@ from bayesdist.infer.sampler.whitening import Whitening
 from bayesdist.utils.arrays import Float
 
 SECOND_STAGES = ("auto", "always", "never")
-PILOTS = 400  # passes that the certificate costs
-AFFORDABLE = 1e11  # evaluations of a star that the second stage may cost, four minutes on two cores
-LEAST_DRAWS = 1000  # approximate draws of each ensemble, which need no pass
-KEY = (1_000_000,)  # of the pilots' random numbers
+PILOTS = 400  # number of pilots, each of which takes one pass over the data
+AFFORDABLE = 1e11  # limit of stars times passes for the second stage; four minutes on two cores
+LEAST_DRAWS = 1000  # minimum number of surrogate draws per ensemble; they need no pass
+KEY = (1_000_000,)  # spawn key of the random numbers of the pilots
 
 
 @dataclass(frozen=True, eq=False)
 class SurrogateProposal:
-    """Surrogate as a proposal: q exp(g), to be drawn from and evaluated."""
+    """Surrogate density q exp(g) as a proposal that can be sampled and evaluated."""
 
     first: GridProposal  # q
     whitening: Whitening
@@ -42,7 +43,7 @@ class SurrogateProposal:
 
     @property
     def best(self) -> Node:
-        """Best node of the first proposal."""
+        """Most probable node of the first proposal."""
         return self.first.best
 
     def draw(self, n: int, rng: Random) -> Float:
@@ -50,7 +51,7 @@ class SurrogateProposal:
         return self.accepted(n, rng)[0]
 
     def accepted(self, n: int, rng: Random) -> tuple[Float, float]:
-        """Points (n, D), and the fraction of the first proposal's that was accepted."""
+        """Points (n, D) in sampled coordinates, and the accepted fraction of draws of q."""
         return draw_surrogate(self.first.draw, self.whitening.to_white, self.surrogate, n, rng)
 
     def log_density(self, psi: Float) -> Float:
@@ -59,9 +60,9 @@ class SurrogateProposal:
 
 
 def has_second_stage(choice: str, passes: int, n_stars: int) -> bool:
-    """True if exact evaluations follow the surrogate.
+    """True if an exact second stage follows the surrogate.
 
-    `choice` is one of `SECOND_STAGES`; `passes` is their expected number.
+    `choice` is one of `SECOND_STAGES`, and `passes` the expected number of passes over the data.
     """
     affordable = float(passes) * n_stars <= AFFORDABLE
     return choice == "always" or (choice == "auto" and affordable)
@@ -70,12 +71,14 @@ def has_second_stage(choice: str, passes: int, n_stars: int) -> bool:
 def run_certified(
     target: Target, proposal: GridProposal, settings: Settings, second_stage: str = "auto"
 ) -> tuple[Chains, Certificate, bool]:
-    """Chains by way of a surrogate, its certificate, and True if a second stage made them exact.
+    """Sample by means of a surrogate.
 
-    The second stage is 'always', 'never', or 'auto': where its expected passes are affordable.
-    Without it the draws have converged only when the certificate is granted.  InputError for an
-    unknown second stage, and as `certify`; DegenerateError and NotConvergedError as `run_chains`
-    and `draw_surrogate`.
+    The second stage is used 'always', 'never', or ('auto') if the expected number of passes is
+    affordable.  Without it, the draws count as converged only if the certificate is granted.
+    Returns the chains, the certificate, and True if a second stage made the draws exact.
+
+    Raises InputError if `second_stage` is unknown or there are too few pilots; see also
+    `run_chains` (DegenerateError) and `draw_surrogate` (NotConvergedError).
     """
     if second_stage not in SECOND_STAGES:
         raise InputError(
@@ -98,7 +101,7 @@ def run_certified(
 
     passes = expected_passes(len(target.names), s.n_stars, s.limits, E)
     if has_second_stage(second_stage, passes, s.n_stars):
-        # a poor surrogate is no better proposal either
+        # without a certificate the surrogate is not a better proposal
         chains = run_chains(target, better if certificate.granted else proposal, s)
         method = f"delayed acceptance ({chains.plan.method} second stage)"
         plan = replace(chains.plan, method=method)
@@ -117,7 +120,7 @@ def _approximate(
     batch: ProposalBatch,
     s: Settings,
 ) -> Chains:
-    """Independent draws of the surrogate, as chains of one walker each."""
+    """Independent draws of the surrogate, arranged as ensembles of one walker."""
     n = max(LEAST_DRAWS, int(2 * s.limits.ess))
     psi, shares = [], []
     for seed in s.seeds:

@@ -1,8 +1,8 @@
-"""Chains until convergence: pilot, plan, blocks, verdicts, and a restart if the proposal is poor.
+"""Sampling until convergence: pilot, choice of moves, blocks of steps, checks, and restarts.
 
-The proposal is judged by the importance weights of everything that was proposed, again after every
-block.  When it is worse than the pilot showed, the chains start again with moves that do not depend
-on it.
+The quality of the proposal is estimated from the importance weights of all proposals so far, and
+updated after every block.  If it is worse than the pilot indicated, the chains are restarted with
+moves that depend less on the proposal.
 """
 
 from __future__ import annotations
@@ -60,23 +60,23 @@ if TYPE_CHECKING:
 
 log = logging.getLogger("bayesdist")
 
-LEAST_ROWS = 10  # rows of a chain that diagnostics need at least
-HARDEST = 30  # parameters that are judged before all of them are
+LEAST_ROWS = 10  # minimum number of stored steps for convergence diagnostics
+HARDEST = 30  # number of worst parameters that are checked before all parameters are
 
 
 @dataclass(frozen=True)
 class Settings:
     """Settings of a sampling run."""
 
-    seeds: tuple[int, ...]  # one for each ensemble
-    n_stars: int  # cost of a pass
-    walkers: int | None = None  # of one ensemble; None leaves it to the plan
-    limits: Limits = field(default_factory=Limits)
-    max_steps: int = 20_000
-    checkpoint_every: int = 200
-    folder: Path | None = None
-    fingerprint: str = ""
-    progress: Callable[[int, int], None] | None = None
+    seeds: tuple[int, ...]  # one per ensemble
+    n_stars: int  # number of stars, which determines the cost of a pass
+    walkers: int | None = None  # walkers per ensemble; None to choose them with the moves
+    limits: Limits = field(default_factory=Limits)  # convergence criteria
+    max_steps: int = 20_000  # maximum number of steps of each ensemble
+    checkpoint_every: int = 200  # maximum number of steps between checkpoints
+    folder: Path | None = None  # folder of the checkpoints; None for no checkpoints
+    fingerprint: str = ""  # hash of data and settings, stored in the checkpoints
+    progress: Callable[[int, int], None] | None = None  # called with (steps, max_steps)
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,14 +87,14 @@ class Chains:
     log_prob: Float  # (ensembles, steps stored, walkers)
     verdict: Convergence
     plan: Plan
-    steps: int  # of each ensemble, in all
-    warmup: int  # steps that were dropped
-    passes: int  # evaluations of the posterior density
-    acceptance: float
+    steps: int  # total number of steps of each ensemble, including warm-up
+    warmup: int  # number of warm-up steps, which are not in `psi`
+    passes: int  # number of evaluations of the posterior density
+    acceptance: float  # accepted fraction of the proposals
 
     @property
     def draws(self) -> Float:
-        """Draws (ensembles, walkers * steps stored, D), walker after walker."""
+        """Draws (ensembles, walkers * steps stored, D), ordered walker by walker."""
         E, T, W, D = self.psi.shape
         return np.swapaxes(self.psi, 1, 2).reshape(E, W * T, D)
 
@@ -104,7 +104,7 @@ class Chains:
         return np.swapaxes(self.log_prob, 1, 2).reshape(len(self.log_prob), -1)
 
     def info(self, seed: int, started: float, *, exact: bool = True) -> SamplerInfo:
-        """Record of the run, which began at `started` by `time.monotonic`."""
+        """Record of the run; `started` is its start according to `time.monotonic`."""
         method = self.plan.method
         return SamplerInfo(
             method=f"emcee {method}" if exact else method,
@@ -121,7 +121,7 @@ class Chains:
 
 
 def ensemble_seeds(seed: int, ensembles: int) -> tuple[int, ...]:
-    """Seed of each ensemble; InputError for fewer than two, which cannot show convergence."""
+    """Seed of each ensemble; raises InputError for fewer than two, which cannot be compared."""
     if ensembles < 2:
         raise InputError(
             f"{ensembles} ensemble cannot show convergence", where="sampler.ensembles", do="use 4"
@@ -131,7 +131,7 @@ def ensemble_seeds(seed: int, ensembles: int) -> tuple[int, ...]:
 
 @dataclass(eq=False)
 class _History:
-    """Blocks of one plan since its first step."""
+    """Accumulated blocks of the ensembles since the first step of a plan."""
 
     runs: Ensembles
     begin: int
@@ -148,7 +148,7 @@ class _History:
         rest: ProposalBatch,
         s: Settings,
     ) -> Iterator[tuple[StepRange, list[Block]]]:
-        """Steps and blocks of all ensembles one after another, as they are made and added."""
+        """Advance the ensembles over a schedule; yield each range of steps with its blocks."""
         for span in schedule:
             blocks = self.runs.advance(states, span, rest)
             states = [block.end for block in blocks]
@@ -162,13 +162,13 @@ class _History:
             yield span, blocks
 
     def after(self, warmup: int) -> tuple[Float, Float]:
-        """Draws and log densities after some rows."""
+        """Draws and log densities without the first `warmup` stored steps."""
         psi = np.concatenate(self.psi, axis=1)[:, warmup:]
         return psi, np.concatenate(self.log_prob, axis=1)[:, warmup:]
 
     def chains(self, warmup: int, verdict: Convergence, passes: int) -> Chains:
         plan, (psi, log_prob) = self.runs.plan, self.after(warmup)
-        made = len(self.runs.seeds) * plan.walkers * self.rows
+        n_proposals = len(self.runs.seeds) * plan.walkers * self.rows
         return Chains(
             psi=psi,
             log_prob=log_prob,
@@ -177,15 +177,15 @@ class _History:
             steps=self.end,
             warmup=self.begin + warmup * plan.thin,
             passes=passes,
-            acceptance=self.accepted / made,
+            acceptance=self.accepted / n_proposals,
         )
 
 
 def run_chains(density: Density, proposal: Proposal, settings: Settings) -> Chains:
-    """Sample until the targets are met or the steps are used up.
+    """Sample until the convergence criteria are met or the maximum number of steps is reached.
 
-    DegenerateError when hardly a proposal falls inside the support; InputError for checkpoints that
-    cannot be read or written.
+    Raises DegenerateError if hardly any proposal is inside the support, and InputError if
+    checkpoints cannot be read or written.
     """
     from bayesdist.infer.sampler.ensembles import Ensembles  # emcee takes a second to import
 
@@ -224,20 +224,20 @@ def run_chains(density: Density, proposal: Proposal, settings: Settings) -> Chai
 
 
 def pilot_of(target: Density, proposal: Proposal, s: Settings) -> ProposalBatch:
-    """First batch of proposals of a run with these settings; see `pilot_batch`."""
+    """Draw and evaluate the first batch of proposals of a run; see `pilot_batch`."""
     walkers = s.walkers or walkers_for(s.n_stars)
     n = walkers * (pilot_steps(len(s.seeds), walkers) + 1)
     return pilot_batch(target, proposal, s.seeds, n, s.folder, s.fingerprint)
 
 
 def plan_of(target: Density, quality: Quality, s: Settings) -> Plan:
-    """Moves for a posterior of which the proposal is known to have this quality."""
+    """Choose the moves for a proposal of the given quality."""
     q, n_proposals = quality, len(quality.log_weights) + quality.n_outside
     return plan_moves(q.efficiency, q.k, len(target.names), s.n_stars, s.walkers, n_proposals)
 
 
 def _given_up(chains: Chains) -> Chains:
-    """Chains whose verdict says that no move reaches the posterior in reasonable time."""
+    """Mark the chains as not converged, because no move samples the posterior efficiently."""
     v = chains.verdict
     draws = min(v.ess_bulk_min, v.ess_tail_min)
     reason = (
@@ -250,7 +250,7 @@ def _given_up(chains: Chains) -> Chains:
 
 
 def _too_slow(verdict: Convergence, steps: int, max_steps: int) -> Convergence:
-    """Verdict that says why sampling ended before the last step."""
+    """Diagnostics with the reason why sampling was stopped before the maximum number of steps."""
     v = verdict
     draws = min(v.ess_bulk_min, v.ess_tail_min)
     reason = (
@@ -263,7 +263,7 @@ def _too_slow(verdict: Convergence, steps: int, max_steps: int) -> Convergence:
 
 
 def _not_converged(verdict: Convergence, reason: str) -> Convergence:
-    """Verdict of sampling that is given up for a reason, which is logged."""
+    """Mark diagnostics as not converged for a reason, which is also logged."""
     log.warning("sample: %s", reason)
     return replace(verdict, converged=False, reasons=(reason, *verdict.reasons))
 
@@ -271,14 +271,15 @@ def _not_converged(verdict: Convergence, reason: str) -> Convergence:
 def _drawn_ahead(
     target: Density, runs: Ensembles, s: Settings, passes: int
 ) -> tuple[Chains | None, Quality, int, int]:
-    """Chains by pure independence, or None when the proposal is worse than the pilot showed.
+    """Sample with independence moves only.
 
-    Also the quality of the proposal as known then, and the passes and steps made.
+    Returns the chains, or None if the proposal is worse than the pilot indicated; the updated
+    quality of the proposal; and the numbers of passes and steps so far.
     """
     pilot, W, total = runs.pilot, runs.plan.walkers, len(s.seeds) * runs.plan.walkers
     first = pilot.psi.shape[1] // W - 1
-    states, taken, further = runs.starts()
-    rest = pilot.without(taken, first * W)
+    states, used_as_start, further = runs.starts()
+    unused = pilot.without(used_as_start, first * W)
     history, weights = _History(runs, 0), [pilot.log_weights]
     worst: tuple[str, ...] = ()
     passes += further
@@ -287,26 +288,26 @@ def _drawn_ahead(
     wanted = first_check(s.limits, cost, len(target.names), len(s.seeds), W)
     wanted = max(wanted, total * LEAST_ROWS)
     schedule = block_schedule(first, s.checkpoint_every, s.max_steps, s.n_stars)
-    for span, blocks in history.walk(states, schedule, rest, s):
+    for span, blocks in history.walk(states, schedule, unused, s):
         if span.begin >= first:
             weights.append(np.array([block.log_weights for block in blocks]))
             passes += int((~np.isnan(weights[-1])).sum())
-        # judged at each block for any targets: a resumed run may have others
+        # checked at each block independent of the criteria, which may differ in a resumed run
         quality = quality_of(np.concatenate(weights, axis=1))
         last = span.end == s.max_steps
         if not plan_of(target, quality, s).independent and not last:
             return None, quality, passes, span.end
         dropped = min(warmup, history.rows // 2)
-        made = total * (history.rows - dropped)
+        n_draws = total * (history.rows - dropped)
         trusted = quality.efficiency > EFFICIENT and quality.k < PARETO_K.value
-        if (made < wanted or not trusted) and not last:
+        if (n_draws < wanted or not trusted) and not last:
             continue
         verdict = _verdict(target, history, dropped, quality, s.limits, () if last else worst)
         if not trusted:
             verdict = _distrusted(verdict, quality)
         if verdict.converged or last:
             break
-        wanted, worst = next_check(made, verdict, s.n_stars, total), verdict.worst(HARDEST)
+        wanted, worst = next_check(n_draws, verdict, s.n_stars, total), verdict.worst(HARDEST)
     return history.chains(dropped, verdict, passes), quality, passes, history.end
 
 
@@ -321,11 +322,11 @@ def _distrusted(verdict: Convergence, quality: Quality) -> Convergence:
 def _state_dependent(
     target: Density, runs: Ensembles, s: Settings, quality: Quality, passes: int, begin: int
 ) -> tuple[Chains, bool]:
-    """Chains by moves that are evaluated one by one, and whether Crank-Nicolson moves mix.
+    """Sample with moves that depend on the state; the first half of the steps is warm-up.
 
-    The first half of the steps is warm-up.
+    Returns the chains, and False if Crank-Nicolson moves turned out not to mix.
     """
-    if s.max_steps - begin < 10 * runs.plan.thin:  # too few steps to leave any out
+    if s.max_steps - begin < 10 * runs.plan.thin:  # too few steps for thinning
         runs = replace(runs, plan=replace(runs.plan, thin=1))
     plan, total = runs.plan, len(s.seeds) * runs.plan.walkers
     mixed = mixing_steps(len(target.names))
@@ -337,12 +338,12 @@ def _state_dependent(
     for span, _ in history.walk(states, schedule, nothing, s):
         passes += total * (span.end - span.begin)
         warmup, last = history.rows // 2, span.end + plan.thin > s.max_steps
-        made = total * (history.rows - warmup)
-        # at the same step for any targets, as a resumed run may have others
+        n_draws = total * (history.rows - warmup)
+        # at a step independent of the criteria, which may differ in a resumed run
         trial = not plan.coupled and span.begin < begin + mixed <= span.end
         quarter = begin + JUDGED_AFTER * (s.max_steps - begin)
         judged = trial or span.begin < quarter <= span.end
-        if made < max(wanted, total * LEAST_ROWS) and not last and not judged:
+        if n_draws < max(wanted, total * LEAST_ROWS) and not last and not judged:
             continue
         verdict = _verdict(
             target, history, warmup, quality, s.limits, () if last or judged else worst
@@ -356,7 +357,7 @@ def _state_dependent(
         hopeless = is_hopeless(len(target.names), s.n_stars, len(s.seeds))
         if trial and not has_mixed(ess, len(target.names), total, hopeless=hopeless):
             return history.chains(warmup, verdict, passes), False
-        wanted, worst = next_check(made, verdict, s.n_stars, total), verdict.worst(HARDEST)
+        wanted, worst = next_check(n_draws, verdict, s.n_stars, total), verdict.worst(HARDEST)
     return history.chains(warmup, verdict, passes), True
 
 
@@ -368,10 +369,11 @@ def _verdict(
     limits: Limits,
     worst: tuple[str, ...],
 ) -> Convergence:
-    """Convergence after some rows.
+    """Convergence diagnostics without the first `warmup` stored steps.
 
-    `worst`: parameters that were farthest from it before. Where these are not converged yet, it is
-    theirs alone: judging thousands of parameters costs more than their draws.
+    `worst` are the parameters that were farthest from convergence at the last check.  As long as
+    they have not converged, only they are checked, since the diagnostics of thousands of parameters
+    take longer than sampling.
     """
     draws = history.after(warmup)[0]
 
@@ -386,7 +388,7 @@ def _verdict(
         )
 
     if 0 < len(worst) < len(target.names):
-        found = of(worst, draws[..., [target.names.index(name) for name in worst]])
-        if not found.converged:
-            return found
+        of_worst = of(worst, draws[..., [target.names.index(name) for name in worst]])
+        if not of_worst.converged:
+            return of_worst
     return of(target.names, draws)

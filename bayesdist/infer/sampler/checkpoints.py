@@ -1,4 +1,4 @@
-"""Checkpoints of chains for resumed runs, block by block of their steps."""
+"""Checkpoints of the chains for resumed runs, in blocks of steps."""
 
 from __future__ import annotations
 
@@ -11,31 +11,31 @@ from bayesdist.files.faults import restoring
 from bayesdist.files.hdf5 import read_arrays, write_arrays
 from bayesdist.utils.arrays import Float
 
-CHECKPOINT = "a checkpoint"  # what its file has to be
+CHECKPOINT = "a checkpoint"  # kind of file in error messages
 BLOCK_ARRAYS = ("coords", "log_prob", "accepted", "log_weights")
 END_ARRAYS = ("log_q", "random_keys", "random_state")
 
 
 @dataclass(frozen=True, eq=False)
 class Walkers:
-    """State of an ensemble."""
+    """State of the walkers of an ensemble."""
 
-    coords: Float  # (walkers, D) psi where proposals are drawn ahead, otherwise whitened
-    log_prob: Float
-    log_q: Float  # log proposal density (walkers,); NaN where no move needs it
-    random: tuple  # state of emcee's random numbers, from `numpy.random.RandomState.get_state`
+    coords: Float  # (walkers, D): psi for independence moves only, otherwise whitened coordinates
+    log_prob: Float  # log posterior density (walkers,)
+    log_q: Float  # log proposal density (walkers,); NaN if no move needs it
+    random: tuple  # state of emcee's random generator, from `numpy.random.RandomState.get_state`
 
 
 @dataclass(frozen=True, eq=False)
 class Block:
-    """Some steps of one ensemble."""
+    """Consecutive steps of one ensemble."""
 
     coords: Float  # (steps stored, walkers, D) in the coordinates of `Walkers`
     log_prob: Float  # (steps stored, walkers)
-    accepted: Float  # number (walkers,) of accepted moves of each walker among the steps stored
-    # log importance weights (proposals,) of proposals drawn ahead; NaN outside the support
+    accepted: Float  # number (walkers,) of accepted moves
+    # log importance weights (proposals,) for independence moves; NaN outside the support
     log_weights: Float
-    end: Walkers  # after the last step
+    end: Walkers  # state after the last step
 
     def write(self, path: Path, mark: str) -> None:
         """Write the block to a file; `mark` identifies the run."""
@@ -46,17 +46,17 @@ class Block:
 
     @classmethod
     def read(cls, path: Path, mark: str) -> Block:
-        """Block from a file; InputError when it cannot be read, or has another mark."""
+        """Read a block; raises InputError if the file cannot be read or has another mark."""
         do = "delete it and resume: its steps are run again"
         stored = read_arrays(path, mark, CHECKPOINT, (*BLOCK_ARRAYS, *END_ARRAYS), do=do)
         with restoring(path, CHECKPOINT, do=do):
             log_q, keys, (position, has_gauss, gauss) = (stored.pop(name) for name in END_ARRAYS)
             random = ("MT19937", keys, int(position), int(has_gauss), float(gauss))
-            np.random.RandomState().set_state(random)  # refuses what is no such state
+            np.random.RandomState().set_state(random)  # raises if the state is invalid
             end = Walkers(stored["coords"][-1], stored["log_prob"][-1], log_q, random)
             return cls(**stored, end=end)
 
 
 def block_path(folder: Path, ensemble: int, end: int) -> Path:
-    """File of the block of an ensemble (from 0) that ends at a step."""
+    """Path of the block of an ensemble (numbered from 0) that ends at step `end`."""
     return folder / f"chain-{ensemble + 1}-{end:06d}.h5"

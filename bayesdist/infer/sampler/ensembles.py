@@ -1,14 +1,15 @@
-"""Exact sampling: independent emcee ensembles, in psi or in whitened coordinates.
+"""Exact sampling with independent emcee ensembles, in psi or in whitened coordinates.
 
-Three moves, all built on `emcee.moves.MHMove` or taken from emcee:
+There are three moves, built on `emcee.moves.MHMove` or taken from emcee:
 
-- independence: the grid proposal, accepted by its importance weight;
-- preconditioned Crank-Nicolson: q = sqrt(1 - b^2) x + b xi, corrected for its reference measure;
-- differential evolution (`emcee.moves.DEMove`), which needs no good proposal.
+- independence: draws of the grid proposal, accepted according to their importance weights;
+- preconditioned Crank-Nicolson (pCN): q = sqrt(1 - b^2) x + b xi, with a correction because the
+  posterior is not the standard Gaussian;
+- differential evolution (`emcee.moves.DEMove`), which does not need a good proposal.
 
-Proposals of independence alone do not depend on the walkers.  Then all proposals of a block are
-evaluated in one pass over the data and numbered; emcee walks over the numbers, and log density and
-ratio of proposal densities of a number are looked up.
+If only independence moves are used, proposals do not depend on the walkers.  All proposals of a
+block are then evaluated in one pass over the data and numbered.  emcee walks over these numbers,
+and log densities and proposal ratios are looked up.
 
 `emcee.moves.DESnookerMove` is never used: in emcee 3.1.6 its acceptance factor is wrong.
 """
@@ -33,11 +34,11 @@ from bayesdist.infer.sampler.proposal_batch import ProposalBatch, draw_batch
 from bayesdist.infer.sampler.whitening import Whitening
 from bayesdist.utils.arrays import Bool, Float, Int
 
-START_BATCHES = 20  # further batches of proposals that are searched for starts of walkers
+START_BATCHES = 20  # maximum number of additional batches drawn to find starting points
 
 
 class _Replay:
-    """Proposals by number: first the positions of the walkers, then those of each step in turn."""
+    """Evaluated proposals by number: the current walkers, then the proposals of each step."""
 
     def __init__(self, start: Walkers, batch: ProposalBatch, ensemble: int) -> None:
         log_prob, log_q = batch.log_prob[ensemble], batch.log_q[ensemble]
@@ -48,14 +49,14 @@ class _Replay:
         self.used = len(start.coords)
 
     def propose(self, numbers: Float, random: np.random.RandomState) -> tuple[Float, Float]:
-        """Next proposals, and the log ratio of their proposal densities."""
+        """Numbers of the next proposals, and log ratios of old to new proposal densities."""
         old = self._index(numbers)
         new = np.arange(self.used, self.used + len(old))
         self.used += len(old)
         return new[:, None].astype(float), self.log_q[old] - self.log_q[new]
 
     def log_density(self, numbers: Float) -> Float:
-        """Log posterior density of proposals."""
+        """Log posterior density of proposals given by number."""
         return self.log_prob[self._index(numbers)]
 
     @staticmethod
@@ -64,24 +65,24 @@ class _Replay:
 
 
 def replay(start: Walkers, batch: ProposalBatch, ensemble: int) -> Block:
-    """Block of Metropolis-Hastings steps over proposals that have been evaluated.
+    """Run Metropolis-Hastings steps over proposals that have already been evaluated.
 
-    The batch has proposals (ensembles, steps * walkers, D), step after step.
+    The batch has proposals (ensembles, steps * walkers, D), ordered by step.
     """
-    known, W = _Replay(start, batch, ensemble), len(start.coords)
+    proposals, W = _Replay(start, batch, ensemble), len(start.coords)
     sampler = emcee.EnsembleSampler(
-        W, 1, known.log_density, moves=MHMove(known.propose), vectorize=True
+        W, 1, proposals.log_density, moves=MHMove(proposals.propose), vectorize=True
     )
     state = emcee.State(np.arange(W, dtype=float)[:, None], log_prob=start.log_prob.copy())
     state.random_state = start.random
     steps = batch.psi.shape[1] // W
     sampler.run_mcmc(state, steps, skip_initial_state_check=True)
     index = sampler.get_chain()[..., 0].astype(np.int64)
-    log_q = known.log_q[index[-1]]
-    log_prob = known.log_prob[index]
-    end = Walkers(known.psi[index[-1]], log_prob[-1], log_q, sampler.random_state)
+    log_q = proposals.log_q[index[-1]]
+    log_prob = proposals.log_prob[index]
+    end = Walkers(proposals.psi[index[-1]], log_prob[-1], log_q, sampler.random_state)
     accepted = sampler.backend.accepted.astype(float)
-    return Block(known.psi[index], log_prob, accepted, batch.log_weights[ensemble].copy(), end)
+    return Block(proposals.psi[index], log_prob, accepted, batch.log_weights[ensemble].copy(), end)
 
 
 def _independence(proposal: Proposal, whitening: Whitening) -> MHMove:
@@ -89,9 +90,9 @@ def _independence(proposal: Proposal, whitening: Whitening) -> MHMove:
         psi = proposal.draw(len(coords), random)
         lost = ~np.all(np.isfinite(psi), axis=1)  # outside the support: target density zero
         white = np.where(np.asarray(lost)[:, None], coords, whitening.to_white(np.nan_to_num(psi)))
-        # evaluated through the same coordinates on both sides, so that ratios are exact
-        both = proposal.log_density(whitening.to_psi(np.concatenate([coords, white])))
-        return white, np.where(lost, -np.inf, both[: len(coords)] - both[len(coords) :])
+        # both densities are evaluated through the same coordinates, so that ratios are exact
+        log_q = proposal.log_density(whitening.to_psi(np.concatenate([coords, white])))
+        return white, np.where(lost, -np.inf, log_q[: len(coords)] - log_q[len(coords) :])
 
     return MHMove(propose)
 
@@ -101,7 +102,7 @@ def _crank_nicolson(step: float) -> MHMove:
 
     def propose(coords: Float, random: np.random.RandomState) -> tuple[Float, Float]:
         new = keep * coords + step * random.standard_normal(coords.shape)
-        # reversible for the standard Gaussian, which the posterior is not
+        # the move is reversible for the standard Gaussian; correct for the difference
         return new, 0.5 * ((new**2).sum(axis=1) - (coords**2).sum(axis=1))
 
     return MHMove(propose)
@@ -109,23 +110,25 @@ def _crank_nicolson(step: float) -> MHMove:
 
 @dataclass(frozen=True, eq=False)
 class Ensembles:
-    """Independent ensembles that advance block by block and write a file for each block."""
+    """Independent ensembles that advance in blocks of steps, with a checkpoint per block."""
 
     target: Density
     proposal: Proposal
     pilot: ProposalBatch  # first proposals of each ensemble
-    whitening: Whitening  # coordinates of moves that depend on the state
+    whitening: Whitening  # coordinates for moves that depend on the state
     plan: Plan
-    seeds: tuple[int, ...]  # one for each ensemble
-    folder: Path | None = None  # for the blocks; None keeps them in memory
-    fingerprint: str = ""  # of data and settings; stored in each block
+    seeds: tuple[int, ...]  # one per ensemble
+    folder: Path | None = None  # folder of the checkpoints; None for no checkpoints
+    fingerprint: str = ""  # hash of data and settings, stored in each checkpoint
 
-    # -- where the walkers start ------------------------------------------------------------------
+    # -- starting points --------------------------------------------------------------------------
 
     def starts(self) -> tuple[list[Walkers], Bool, int]:
-        """First states from the pilot, mask (ensembles, n) of used proposals, number of new ones.
+        """Initial states of the walkers, taken from the pilot.
 
-        Where the pilot is too short for so many walkers, further proposals are evaluated.
+        If the pilot has too few proposals for the walkers, additional ones are evaluated.  Returns
+        the states, the mask (ensembles, n) of pilot proposals that were used, and the number of
+        additional evaluations.
         """
         batches, W = [self.pilot], self.plan.walkers
         while (fewest := min(len(_usable(batches, e)) for e in range(len(self.seeds)))) < W:
@@ -134,7 +137,7 @@ class Ensembles:
             key = (0, len(batches))
             batches.append(draw_batch(self.target, self.proposal, self.seeds, key, W - fewest))
         n = self.pilot.psi.shape[1]
-        states, taken = [], np.zeros((len(self.seeds), n), bool)
+        states, used_as_start = [], np.zeros((len(self.seeds), n), bool)
         for e, seed in enumerate(self.seeds):
             rows = _usable(batches, e)[:W]
             psi, log_prob, log_q = (
@@ -143,30 +146,31 @@ class Ensembles:
             )
             random = tuple(np.random.RandomState(seed).get_state(legacy=True))
             coords = psi if self.plan.independent else self.whitening.to_white(psi)
-            taken[e, rows[rows < n]] = True
+            used_as_start[e, rows[rows < n]] = True
             states.append(Walkers(coords, log_prob, log_q, random))
-        return states, taken, sum(batch.n_evaluated for batch in batches[1:])
+        return states, used_as_start, sum(batch.n_evaluated for batch in batches[1:])
 
     # -- steps ------------------------------------------------------------------------------------
 
     def advance(
         self, states: Sequence[Walkers], span: StepRange, rest: ProposalBatch
     ) -> list[Block]:
-        """One block of every ensemble from its state at `span.begin`, read from a file or run.
+        """Advance every ensemble from its state at `span.begin`, or read the block from a file.
 
-        `rest` are pilot proposals that were not taken as starts, for the first steps.
+        `rest` are the pilot proposals that were not used as starting points; they are used for the
+        first steps.
         """
         paths: list[Path | None] = [None] * len(self.seeds)
         if self.folder is not None:
             paths = [block_path(self.folder, e, span.end) for e in range(len(self.seeds))]
         mark = f"{self.fingerprint} {self.plan.method} {span.begin}"
-        known = [Block.read(p, mark) if p is not None and p.exists() else None for p in paths]
-        # always for all ensembles, so that the numbers do not depend on how many are known already
+        stored = [Block.read(p, mark) if p is not None and p.exists() else None for p in paths]
+        # always drawn for all ensembles, so that results do not depend on which files exist
         batch = None
-        if self.plan.independent and any(block is None for block in known):
+        if self.plan.independent and any(block is None for block in stored):
             batch = self._batch(span, rest)
         out = []
-        for e, (block, path) in enumerate(zip(known, paths, strict=True)):
+        for e, (block, path) in enumerate(zip(stored, paths, strict=True)):
             if block is None:
                 steps = span.end - span.begin
                 block = (
@@ -222,5 +226,5 @@ class Ensembles:
 
 
 def _usable(batches: Sequence[ProposalBatch], ensemble: int) -> Int:
-    """Numbers, through the batches, of an ensemble's proposals with a density above zero."""
+    """Indices, counted through the batches, of an ensemble's proposals with non-zero density."""
     return np.flatnonzero(np.isfinite(np.concatenate([p.log_prob[ensemble] for p in batches])))

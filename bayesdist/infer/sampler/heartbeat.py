@@ -1,4 +1,4 @@
-"""Lines in the log that show how far sampling is, at most one every ten seconds."""
+"""Progress of the sampling in the log, at most one line every ten seconds."""
 
 from __future__ import annotations
 
@@ -17,16 +17,16 @@ EVERY_S = 10.0  # seconds between two lines
 
 @dataclass(eq=False)
 class Heartbeat:
-    """Density that counts its evaluations and reports them in the log every ten seconds.
+    """Wrapper of a density that counts its evaluations and logs them every ten seconds.
 
-    All moves evaluate the density, so that no move stays silent. Values are those of `density`.
+    Since all moves evaluate the density, progress is reported for each of them.
     """
 
     density: Density
     n_stars: int
     clock: Callable[[], float] = time.monotonic  # seconds
     method: str = "pilot"  # moves of the current plan
-    passes: int = 0  # points that were evaluated
+    passes: int = 0  # number of points evaluated
     _started: float = field(init=False)
     _last: float = field(init=False)
 
@@ -35,7 +35,7 @@ class Heartbeat:
 
     @property
     def n_theta(self) -> int:
-        """Number of parameters that are no hyperparameters."""
+        """Number of parameters in theta, that is, without the hyperparameters."""
         return self.density.n_theta
 
     @property
@@ -44,7 +44,7 @@ class Heartbeat:
         return self.density.names
 
     def log_density(self, psi: Float) -> Float:
-        """Log density of points (n, D); minus infinity outside the support."""
+        """Log density (n,) of points (n, D); minus infinity outside the support."""
         values = self.density.log_density(psi)
         self.passes += len(psi)
         now = self.clock()

@@ -1,7 +1,7 @@
-"""Schedule of sampling: moves, walkers, and the steps at which blocks end and are judged.
+"""Schedule of the sampling: moves, walkers, lengths of blocks, and times of convergence checks.
 
-All of it follows from the number of stars, from the importance weights and from the settings, never
-from measured times: a run that is repeated or resumed makes identical steps.
+The schedule depends on the number of stars, the importance weights and the settings, but not on
+measured times, so that a repeated or resumed run makes identical steps.
 """
 
 from __future__ import annotations
@@ -15,40 +15,40 @@ from bayesdist.infer.convergence import Convergence, Limits
 from bayesdist.utils.distributions import chi2_isf
 from bayesdist.utils.limits import DRAWS_PER_WALKER, PARETO_K
 
-FIRST_CHECK = 50  # steps after which state-dependent moves are first judged
-PILOT = 512  # smallest number of proposals that judge the proposal
-MOST_PILOT = 4096
-WORTH = 40_000_000  # evaluations of one star that cost about as much as one diagnosis: 0.1 s
-DEAR = 200_000  # stars above which passes are counted one by one
+FIRST_CHECK = 50  # steps before the first convergence check of state-dependent moves
+PILOT = 512  # minimum number of pilot proposals
+MOST_PILOT = 4096  # maximum number of passes between two convergence checks
+WORTH = 40_000_000  # stars times passes that take as long as one convergence check (0.1 s)
+DEAR = 200_000  # number of stars above which a pass is expensive
 FEWEST_WALKERS, MOST_WALKERS = 8, 64
 
-EFFICIENT, USABLE = 0.5, 0.05  # importance efficiency
-NO_MEAN = 1.0  # Pareto k beyond which weights have no mean: the proposal misses the posterior
-# parameters from which differential evolution, with two walkers for each, mixes later than
-# Crank-Nicolson moves do from next to any proposal
+EFFICIENT, USABLE = 0.5, 0.05  # limits of the importance efficiency for the choice of moves
+NO_MEAN = 1.0  # Pareto k above which the weights have no mean: the proposal misses the posterior
+# number of parameters above which differential evolution, with its two walkers per parameter,
+# mixes more slowly than Crank-Nicolson moves with almost any proposal
 MANY = 50
-# evaluations of one star, about a minute's: beyond them differential evolution of many parameters
-# is not begun
+# limit of stars times passes (about a minute) above which differential evolution is not started if
+# there are many parameters
 MOST_WORK = 600 * WORTH
-JUDGED_AFTER = 0.25  # fraction of the steps after which the rate of effective draws is judged
+JUDGED_AFTER = 0.25  # fraction of the steps after which the rate of effective draws is checked
 TOO_SLOW = 5.0  # factor by which that rate may be too low
-PROBATION = 2048  # proposals below which k scatters too much (by about 0.2 at 512) to reject one
+PROBATION = 2048  # with fewer proposals, k is too uncertain (0.2 for 512) to reject a proposal
 
 
 @dataclass(frozen=True)
 class Plan:
-    """Plan of sampling, chosen from the quality of the proposal and never from its acceptance."""
+    """Moves and walkers of the sampling, chosen from the quality of the proposal."""
 
     method: str  # name in reports
-    # fractions of independence, Crank-Nicolson and differential evolution
+    # fractions of independence, Crank-Nicolson and differential-evolution moves
     weights: tuple[float, float, float]
-    walkers: int  # of one ensemble
+    walkers: int  # walkers per ensemble
     step: float  # b of the Crank-Nicolson move
-    thin: int = 1  # one in so many steps is stored: slow moves would only fill the memory
+    thin: int = 1  # only every `thin`-th step is stored, to save memory with slow moves
 
     @property
     def independent(self) -> bool:
-        """True if no proposal depends on the walkers, so that they can be drawn ahead."""
+        """True if proposals do not depend on the walkers and can be drawn in advance."""
         return self.weights[0] == 1.0
 
     @property
@@ -65,46 +65,47 @@ def plan_moves(
     walkers: int | None = None,
     n_proposals: int = PROBATION,
 ) -> Plan:
-    """Moves chosen from the importance efficiency and the Pareto k of the proposal.
+    """Choose the moves from the importance efficiency and the Pareto k of the proposal.
 
-    Acceptance is not used: it looks fine on proposals that miss a tail.  `n_proposals` gave
-    efficiency and k; while they are few, a k above its limit is checked by further proposals, which
-    cost less than the other moves.  An efficiency of zero stands for a proposal from which
-    Crank-Nicolson moves do not mix.
+    The acceptance rate is not used, because it looks good even if the proposal misses a tail.
+    `n_proposals` is the number of draws from which efficiency and k were estimated.  If there are
+    few, a k above its limit does not yet exclude independence moves, since more proposals are
+    cheaper than other moves.  An efficiency of zero means that Crank-Nicolson moves do not mix.
     """
     step = min(0.5, 2.0 / np.sqrt(n_params))
-    dear = n_stars > DEAR  # every step counts, and there are few of them
+    dear = n_stars > DEAR  # few steps are affordable, so all of them are stored
     if efficiency > EFFICIENT and (k < PARETO_K.value or n_proposals < PROBATION):
         return Plan("independence", (1.0, 0.0, 0.0), walkers or walkers_for(n_stars), step)
-    # local moves compensate for a tail that the proposal reaches too seldom
+    # local moves compensate for a tail that the proposal rarely reaches
     if efficiency > USABLE and (k < NO_MEAN or n_proposals < PROBATION):
         return Plan("independence + pCN", (0.6, 0.4, 0.0), walkers or 32, step, 1 if dear else 5)
     if n_params > MANY and efficiency > 0:
-        # the log weight, of variance -log(efficiency) if it is normal, then changes by sqrt(2), and
-        # two of five moves are accepted
+        # If the log weight is normal, its variance is -log(efficiency). With this step it changes
+        # by sqrt(2), and two of five moves are accepted.
         step = float(np.clip(1 / np.sqrt(-np.log(efficiency)), step, 0.5))
         thin = 1 if dear else 5
         return Plan("pCN + independence", (0.2, 0.8, 0.0), walkers or 20, step, thin)
-    # emcee's red-blue moves need two walkers for each parameter
-    least = max(2 * (n_params + 1), 32)
-    walkers, thin = max(walkers or 0, least), 1 if dear else 10
+    # the red-blue moves of emcee need two walkers per parameter
+    min_walkers = max(2 * (n_params + 1), 32)
+    walkers, thin = max(walkers or 0, min_walkers), 1 if dear else 10
     return Plan("DE + pCN + independence", (0.2, 0.3, 0.5), walkers, step, thin)
 
 
 def mixing_steps(n_params: int) -> int:
-    """Steps after which `has_mixed` is asked of Crank-Nicolson moves.
+    """Number of steps after which the mixing of Crank-Nicolson moves is checked (`has_mixed`).
 
-    A walker is independent after some n_params / 2 of them, the step being what it is.
+    With the step size of `plan_moves`, a walker decorrelates within about n_params / 2 steps.
     """
     return max(500, 10 * n_params)
 
 
 def has_mixed(ess: float, n_params: int, walkers: int, *, hopeless: bool = False) -> bool:
-    """True if Crank-Nicolson moves are to go on: every walker has made enough effective draws.
+    """True if Crank-Nicolson moves mix well enough: each walker has made enough effective draws.
 
-    Of many parameters one is enough, since the other moves make fewer in as many passes.  Where
-    these are `hopeless` it is two: with fewer, sampling would take more than about a minute.
-    `walkers` are those of all ensembles together.
+    With many parameters, one effective draw per walker is enough, since differential evolution
+    would make fewer in the same number of passes.  If that is `hopeless`, two are required, because
+    sampling would otherwise take more than about a minute.  `walkers` is the total number of
+    walkers of all ensembles.
     """
     if n_params <= MANY:
         return ess >= DRAWS_PER_WALKER.value * walkers
@@ -112,10 +113,10 @@ def has_mixed(ess: float, n_params: int, walkers: int, *, hopeless: bool = False
 
 
 def is_hopeless(n_params: int, n_stars: int, ensembles: int) -> bool:
-    """True if differential evolution is too slow to help where Crank-Nicolson moves do not mix.
+    """True if differential evolution would be too slow to replace Crank-Nicolson moves.
 
-    It forgets in three steps for each parameter, and every one of its walkers, two for each
-    parameter, makes five effective draws after as many steps of warm-up.
+    It decorrelates within three steps per parameter.  It has two walkers per parameter, each of
+    which needs five effective draws and an equally long warm-up.
     """
     steps = 2 * DRAWS_PER_WALKER.value * 3 * n_params
     work = ensembles * 2 * (n_params + 1) * steps * n_stars
@@ -123,41 +124,41 @@ def is_hopeless(n_params: int, n_stars: int, ensembles: int) -> bool:
 
 
 def is_too_slow(verdict: Convergence, made: int, most: int) -> bool:
-    """True if the targets are far out of reach within `most` steps, judged after `made` steps.
+    """True if the criteria cannot be met within `most` steps, as estimated after `made` steps.
 
-    The rate of effective draws rises while walkers forget their start. It is therefore judged after
-    a quarter of the steps, and only a rate five times too low ends a run: what may still converge
-    goes on.
+    The rate of effective draws increases while the walkers forget their starting points.  It is
+    therefore checked only after a quarter of the steps, and a run ends only if the rate is at least
+    five times too low.
     """
     ess = min(verdict.ess_bulk_min, verdict.ess_tail_min)
     return made >= most * JUDGED_AFTER and ess * most / made < verdict.limits.ess / TOO_SLOW
 
 
-# -- independence: sizes --------------------------------------------------------------------------
+# -- independence moves: sizes --------------------------------------------------------------------
 
 
 def _worth(n_stars: int) -> int:
-    """Number of passes that cost about as much as one diagnosis."""
+    """Number of passes that take about as long as one convergence check."""
     return int(min(WORTH // max(n_stars, 1), MOST_PILOT))
 
 
 def walkers_for(n_stars: int) -> int:
-    """Walkers of one ensemble of independence chains.
+    """Number of walkers per ensemble for independence moves.
 
-    Many where a pass is cheap, so that emcee's loop is shared by many; few where it is expensive,
-    as each walker needs a start, a warm-up and five effective draws.
+    There are many walkers if a pass is cheap, to reduce the overhead of emcee's loop, and few if it
+    is expensive, because each walker needs a start, a warm-up and five effective draws.
     """
     return int(np.clip(_worth(n_stars) // 64, FEWEST_WALKERS, MOST_WALKERS))
 
 
 def pilot_steps(ensembles: int, walkers: int) -> int:
-    """Steps for which the pilot's proposals suffice, after one of them for each walker's start."""
+    """Number of steps for which the pilot provides proposals, besides the starting points."""
     return max(15, -(-PILOT // (ensembles * walkers)) - 1)
 
 
 @dataclass(frozen=True)
 class StepRange:
-    """Steps from `begin` to `end`; without the limit `max_steps` they would end at `full`."""
+    """Range of steps from `begin` to `end`; `full` is the end without the limit `max_steps`."""
 
     begin: int
     end: int
@@ -165,10 +166,11 @@ class StepRange:
 
 
 def block_schedule(pilot: int, every: int, max_steps: int, n_stars: int) -> Iterator[StepRange]:
-    """Blocks of the independence plan, independent of the targets.
+    """Yield the blocks of steps for independence moves.
 
-    The pilot is cut into pieces of `every` steps at most; then blocks grow with the steps made, by
-    1/8 where passes are expensive and 1/4 where they are cheap, up to `every`.
+    The pilot is divided into blocks of at most `every` steps.  Later blocks are 1/8 (expensive
+    passes) or 1/4 (cheap passes) of the number of steps so far, but at most `every`.  The schedule
+    does not depend on the convergence criteria.
     """
     growth = 1 / 8 if n_stars > DEAR else 1 / 4
     begin = 0
@@ -179,13 +181,13 @@ def block_schedule(pilot: int, every: int, max_steps: int, n_stars: int) -> Iter
         begin = full
 
 
-# -- independence: when to look -------------------------------------------------------------------
+# -- independence moves: when to check convergence ------------------------------------------------
 
 
 def _chance_rhat(limits: Limits, n_params: int, ensembles: int) -> float:
-    """Independent draws after which R-hat of all parameters is below its limit by chance.
+    """Number of independent draws for which the R-hat of all parameters is below its limit.
 
-    With c split chains of n draws R-hat - 1 is (chi2_(c-1) / (c-1) - 1) / 2n.
+    With c split chains of n draws, R-hat - 1 is distributed as (chi2_(c-1) / (c-1) - 1) / 2n.
     """
     chains = 2 * ensembles
     worst = float(chi2_isf(1 / (2 * n_params), chains - 1)) / (chains - 1)
@@ -193,8 +195,8 @@ def _chance_rhat(limits: Limits, n_params: int, ensembles: int) -> float:
 
 
 def first_check(limits: Limits, cost: float, n_params: int, ensembles: int, walkers: int) -> float:
-    """Draws after warm-up at the first check of convergence; `cost` is draws per effective draw."""
-    slack = 1.05 + 3 / np.sqrt(max(limits.ess, 1.0))  # the estimate of the ESS scatters
+    """Number of draws after warm-up at the first check; `cost` is draws per effective draw."""
+    slack = 1.05 + 3 / np.sqrt(max(limits.ess, 1.0))  # allows for the scatter of estimated ESS
     return max(
         slack * cost * limits.ess,
         1.1 * cost * DRAWS_PER_WALKER.value * ensembles * walkers,
@@ -203,9 +205,10 @@ def first_check(limits: Limits, cost: float, n_params: int, ensembles: int, walk
 
 
 def next_check(made: int, verdict: Convergence, n_stars: int, walkers: int) -> float:
-    """Draws at which to judge again, from the distance of the last verdict from its targets.
+    """Number of draws at the next check, from the last diagnostics and the criteria.
 
-    `made` draws were judged; `walkers` are those of all ensembles together.
+    `made` is the number of draws at the last check, and `walkers` the total number of walkers of
+    all ensembles.
     """
     ess = max(min(verdict.ess_bulk_min, verdict.ess_tail_min), 1e-3)
     lacking = max(
@@ -213,12 +216,12 @@ def next_check(made: int, verdict: Convergence, n_stars: int, walkers: int) -> f
         DRAWS_PER_WALKER.value * walkers / ess,
         (verdict.rhat_max - 1) / max(verdict.limits.rhat - 1, 1e-6),
     )
-    # a little early: another check costs less than passes that were not needed
+    # slightly early, because another check is cheaper than unnecessary passes
     return max(made + _worth(n_stars), min(0.85 * lacking, 2.0) * made)
 
 
 def expected_passes(n_params: int, n_stars: int, limits: Limits, ensembles: int = 4) -> int:
-    """Passes of a run with a good proposal, including pilot, start and warm-up."""
+    """Expected number of passes of a run with a good proposal, including pilot and warm-up."""
     walkers = walkers_for(n_stars)
     draws = first_check(limits, 1.1, n_params, ensembles, walkers)
     draws = max(draws, 1.1 * _chance_rhat(limits, n_params, ensembles))
@@ -230,13 +233,14 @@ def expected_passes(n_params: int, n_stars: int, limits: Limits, ensembles: int 
 
 
 def doubling_schedule(begin: int, every: int, max_steps: int, thin: int = 1) -> Iterator[StepRange]:
-    """Blocks that end 50, 100, 200, ... then every `every` steps after `begin`, up to `max_steps`.
+    """Yield blocks that end 50, 100, 200, ... steps after `begin`, then every `every` steps.
 
-    All have a multiple of `thin` steps, so that every stored row represents as many.
+    The number of steps of each block is a multiple of `thin`; the last block ends at or before
+    `max_steps`.
     """
-    last, made = (max_steps - begin) // thin * thin, 0
-    while made < last:
-        step = min(max(made, FIRST_CHECK), every)
-        end = min(made + step + -step % thin, last)
-        yield StepRange(begin + made, begin + end, begin + end)
-        made = end
+    last, n_done = (max_steps - begin) // thin * thin, 0
+    while n_done < last:
+        step = min(max(n_done, FIRST_CHECK), every)
+        end = min(n_done + step + -step % thin, last)
+        yield StepRange(begin + n_done, begin + end, begin + end)
+        n_done = end

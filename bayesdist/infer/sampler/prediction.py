@@ -1,4 +1,4 @@
-"""Cost of sampling, predicted from the pilot with which the run itself begins."""
+"""Prediction of the cost of sampling from the pilot of the run."""
 
 from __future__ import annotations
 
@@ -18,28 +18,40 @@ from bayesdist.infer.stars.mixture import OutlierMixture
 from bayesdist.infer.stars.shards import Shards
 from bayesdist.utils.limits import PARETO_K
 
-# importance efficiency and distance of Pareto k from its limit within which further proposals
-# may still lead to other moves; k scatters by about 0.1 with 2000 proposals
+# With a smaller efficiency, or Pareto k closer to its limit, more proposals may still lead to other
+# moves; the uncertainty of k is about 0.1 for 2000 proposals.
 SURE_EFFICIENCY = 0.6
 K_MARGIN = 0.1
 
 
 @dataclass(frozen=True)
 class Prediction:
-    """Moves that a run will begin with, and the passes that it takes."""
+    """Predicted moves and number of passes of a run.
+
+    Parameters
+    ----------
+    plan : Plan
+        Moves and walkers of the run.
+    quality : Quality
+        Quality of the proposal.
+    passes : int or None
+        Expected number of passes over the data; None if it cannot be predicted.
+    most_passes : int
+        Number of passes if the run continues to `max_steps`.
+    """
 
     plan: Plan
     quality: Quality
-    passes: int | None  # None if the number cannot be known before sampling
-    most_passes: int  # after which `max_steps` ends the run
+    passes: int | None
+    most_passes: int
 
 
 def predict(target: Density, proposal: Proposal, settings: Settings) -> Prediction:
-    """Prediction by the pilot of a run with these settings; nothing is written.
+    """Predict the cost of a run with these settings; no files are written.
 
-    The pilot's proposals are those of the run, so that it begins with the same moves. Passes can be
-    predicted only for independence moves: the number of steps in which other moves forget their
-    start depends on the shape of the posterior.
+    The pilot is that of the run, which will therefore start with the same moves.  Passes can be
+    predicted for independence moves only, since the autocorrelation of other moves depends on the
+    shape of the posterior.
     """
     s, ensembles = settings, len(settings.seeds)
     quality = quality_of(pilot_of(target, proposal, s).log_weights)
@@ -48,8 +60,8 @@ def predict(target: Density, proposal: Proposal, settings: Settings) -> Predicti
     passes = None
     if plan.independent and sure:
         passes = expected_passes(len(target.names), s.n_stars, s.limits, ensembles)
-    most = ensembles * plan.walkers * s.max_steps
-    return Prediction(plan, quality, passes, most)
+    most_passes = ensembles * plan.walkers * s.max_steps
+    return Prediction(plan, quality, passes, most_passes)
 
 
 @one_thread
@@ -65,9 +77,9 @@ def predict_sampling(
     limits: Limits,
     max_steps: int,
 ) -> Prediction:
-    """Prediction of what `sample` costs with the same arguments.
+    """Predict the cost of `sample` with the same arguments.
 
-    DegenerateError if no posterior mode is found, as `sample`.
+    Raises DegenerateError if no posterior mode is found, like `sample`.
     """
     model = fit.model
     target = Target(shards, outliers.in_unit(model.unit), priors or GaussianPriors.none(model))

@@ -1,8 +1,8 @@
-"""Independence proposals, drawn and evaluated many at a time.
+"""Independence proposals, drawn and evaluated in large batches.
 
 They do not depend on the walkers, so that one pass over the data serves many steps of all
-ensembles.  Each ensemble has its own stream of random numbers for each batch of proposals, which
-makes the draws independent of how they are evaluated.
+ensembles.  Each ensemble and batch has a separate stream of random numbers, so that the draws do
+not depend on how they are evaluated.
 """
 
 from __future__ import annotations
@@ -38,15 +38,15 @@ class ProposalBatch:
 
     @property
     def n_evaluated(self) -> int:
-        """Number of proposals that lie in the support."""
+        """Number of proposals inside the support, for which the density was evaluated."""
         return int((~np.isnan(self.log_prob)).sum())
 
     def __getitem__(self, rows: slice) -> ProposalBatch:
-        """Batch with some of the proposals of each ensemble."""
+        """Batch with a slice of the proposals of each ensemble."""
         return ProposalBatch(self.psi[:, rows], self.log_prob[:, rows], self.log_q[:, rows])
 
     def without(self, taken: Bool, n: int) -> ProposalBatch:
-        """Batch of the first n proposals of each ensemble that are not among those taken."""
+        """First n proposals of each ensemble that are False in the mask `taken` (ensembles, m)."""
         rows = np.array([np.flatnonzero(~t)[:n] for t in taken])
         each = np.arange(len(rows))[:, None]
         return ProposalBatch(
@@ -62,10 +62,11 @@ def draw_batch(
     n: int,
     n_used: int | None = None,
 ) -> ProposalBatch:
-    """Batch of n proposals of each ensemble, drawn and evaluated.
+    """Draw and evaluate n proposals per ensemble.
 
-    `key` of the batch and the ensemble's seed fix the random numbers.  Only the first `n_used` are
-    returned; they do not depend on this number.
+    The random numbers are determined by the seed of the ensemble and the `key` of the batch.  If
+    `n_used` is given, only the first `n_used` proposals are evaluated and returned; they are the
+    same for any `n_used`.
     """
     psi = _drawn(proposal, seeds, key, n)[:, :n_used]
     flat = psi.reshape(-1, psi.shape[-1])
@@ -93,16 +94,17 @@ def pilot_batch(
     name: str = "pilot",
     key: tuple[int, ...] = (0,),
 ) -> ProposalBatch:
-    """First batch, which judges the proposal and then starts the chains.
+    """Draw and evaluate the first batch, used to rate the proposal and to start the chains.
 
-    A file stores the result of its evaluation; the proposals themselves are drawn again.
-    InputError when the file cannot be read or written, or belongs to other data or settings.
+    If `folder` is given, the densities are stored in a file and read from it by a resumed run; the
+    proposals themselves are drawn again.  Raises InputError if the file cannot be read or written,
+    or belongs to other data or settings.
     """
     path = None if folder is None else folder / f"chain-0-{name}.h5"
     if path is not None and path.exists():
         do = "delete it and resume: its proposals are evaluated again"
-        known = read_arrays(path, fingerprint, CHECKPOINT, ("log_prob", "log_q"), do=do)
-        return ProposalBatch(_drawn(proposal, seeds, key, n), **known)
+        stored = read_arrays(path, fingerprint, CHECKPOINT, ("log_prob", "log_q"), do=do)
+        return ProposalBatch(_drawn(proposal, seeds, key, n), **stored)
     batch = draw_batch(target, proposal, seeds, key, n)
     if path is not None:
         write_arrays(path, fingerprint, {"log_prob": batch.log_prob, "log_q": batch.log_q})

@@ -1,4 +1,4 @@
-"""From a linear fit to a posterior: mode, proposal, ensembles, and the stopping rule."""
+"""Sampling of the posterior, starting from a linear fit."""
 
 from __future__ import annotations
 
@@ -34,10 +34,10 @@ from bayesdist.utils.arguments import takes
 from bayesdist.utils.memory import require_memory
 from bayesdist.utils.quantities import whole_number
 
-STEPS_KEPT = 100  # at least, of each walker
+STEPS_KEPT = 100  # steps per walker assumed for the check of the available memory
 METHODS = ("exact", "certified")
-FORMAT = 3  # of the checkpoints
-ENGINES = ("emcee", "numba", "numpy", "scipy")  # another version may compute other bits
+FORMAT = 3  # version of the checkpoint files
+ENGINES = ("emcee", "numba", "numpy", "scipy")  # results may depend on the versions of these
 
 
 @takes(fit=LinearFit, matches=(Matches, Shards), outliers=OutlierMixture, compute=Compute)
@@ -66,48 +66,52 @@ def sample(
     Parameters
     ----------
     fit : LinearFit
-        Of the same matches; the search for the mode starts there.
+        Linear fit to the same matches, at which the search for the posterior mode starts.
     matches : Matches or Shards
-        All stars: none is clipped.
+        All stars, including those that the fit rejected.
     outliers : OutlierMixture, optional
-        Gaussian outliers by default.  If it has no match radius, that of the matches is used.
+        Outlier model; Gaussian outliers by default. If it has no match radius, that of the matches
+        is used.
     priors : GaussianPriors, optional
+        Gaussian priors on the distortion parameters; flat by default.
     seed : int
-        All random numbers follow from it.
+        Seed of all random numbers.
     ensembles : int
-        Independent ensembles, over which convergence is judged; 2 or more.
+        Number of independent ensembles (at least 2), which are compared to assess convergence.
     walkers : int, optional
-        Walkers of one ensemble; chosen with the moves by default.
+        Walkers per ensemble; chosen together with the moves by default.
     target_ess, target_rhat : float
-        The run stops when every parameter has reached them.
+        Convergence criteria. Sampling stops when the bulk and tail effective sample sizes of all
+        parameters are at least `target_ess` and their R-hat is at most `target_rhat`.
     max_steps : int
-        Largest total of steps of each ensemble, also over resumed runs.
+        Maximum number of steps of each ensemble, including those before a resume.
     checkpoint_every : int
-        Most steps between two checkpoints.
+        Maximum number of steps between two checkpoints.
     method : str
-        'exact', or 'certified': by way of a surrogate that costs few passes.
+        'exact', or 'certified' for draws from a surrogate that needs few passes over the data.
     second_stage : str
-        With 'certified': exact evaluations accept or reject the surrogate's draws always
-        ('always'), never ('never'), or where that is affordable ('auto'); see `certified`.
+        For 'certified': whether exact evaluations accept or reject the draws of the surrogate:
+        'always', 'never', or 'auto' (if affordable).
     folder : path, optional
-        For checkpoints.  Blocks found there are read instead of run, so that an interrupted run is
-        resumed bit for bit.
+        Folder for checkpoints. Existing checkpoints are read instead of computing the steps again;
+        the results are bit for bit the same.
     progress : callable, optional
-        Called with (steps made, `max_steps`).
+        Called with (number of steps, `max_steps`) after each block of steps.
     compute : Compute, optional
-        Where the work is done; one process with threads by default.
+        Computing engine; threads of this process by default.
 
     Returns
     -------
     Posterior
-        `convergence.converged` is True if the targets were reached.
+        Its `convergence.converged` is True if the criteria were met.
 
     Raises
     ------
     DegenerateError
-        When no posterior mode is found.
+        If no posterior mode is found.
     InputError
-        For checkpoints of other data or settings, or a disk that is full.
+        If an argument is invalid, the checkpoints belong to other data or settings, or files cannot
+        be written.
 
     Examples
     --------
@@ -128,7 +132,7 @@ def sample(
         8.0 * ensembles * (walkers or 1) * len(fit.model.names) * STEPS_KEPT,
         f"the draws of {ensembles} ensembles",
         where="sampler.ensembles",
-        do="ask for fewer ensembles or walkers",
+        do="use fewer ensembles or walkers",
     )
     seeds = ensemble_seeds(seed, ensembles)
     if method not in METHODS:
@@ -146,8 +150,8 @@ def sample(
         priors = priors or GaussianPriors.none(fit.model)
         target = Target(shards, mixture, priors)
         folder = None if folder is None else Path(folder)
-        known = _fingerprint(target, seed, ensembles, walkers, checkpoint_every, method)
-        proposal = _proposal(target, fit, folder, known)
+        fingerprint = _fingerprint(target, seed, ensembles, walkers, checkpoint_every, method)
+        proposal = _proposal(target, fit, folder, fingerprint)
         settings = Settings(
             seeds=seeds,
             n_stars=len(shards),
@@ -156,7 +160,7 @@ def sample(
             max_steps=max_steps,
             checkpoint_every=checkpoint_every,
             folder=folder,
-            fingerprint=known,
+            fingerprint=fingerprint,
             progress=progress,
         )
         certificate, exact = None, True
@@ -186,7 +190,7 @@ def sample(
 
 
 def _fingerprint(target: Target, *settings: object) -> str:
-    """Fingerprint of everything that must not change between a run and its resumption."""
+    """Hash of the data, model, settings and library versions, which a resumed run must share."""
     digest = hashlib.sha256()
     digest.update("".join(target.shards.sum(_digest)).encode())
     digest.update(repr([(name, metadata.version(name)) for name in ENGINES]).encode())
@@ -216,7 +220,7 @@ def _digest(stars: Stars) -> tuple[str]:
 def _proposal(
     target: Target, fit: LinearFit, folder: Path | None, fingerprint: str
 ) -> GridProposal:
-    """Proposal, stored in a file so that a resumed run has exactly this one."""
+    """Build the proposal, or read it from a file, so that a resumed run uses exactly the same."""
     path = None if folder is None else folder / "chain-0-proposal.h5"
     if path is not None and path.exists():
         arrays = read_arrays(path, fingerprint, CHECKPOINT, do="start again with --force")

@@ -1,29 +1,30 @@
-"""Draws without a pass over the data, and a certificate of their quality.
+"""Surrogate of the posterior that can be sampled without the data, and its certificate.
 
 With many stars the proposal q is so close to the posterior p that the log importance weight log p -
-log q is small and smooth.  A few hundred exact weights (pilots) are regressed on features of low
-order, g, and the surrogate is s = q exp(g).  Pilots that were not used in the regression then show
-how far s is from p.
+log q is small and smooth.  A regression g on low-order features is fitted to the exact weights of a
+few hundred draws of q (pilots), and the surrogate is s = q exp(g).  Pilots that are held out from
+the regression show how much s differs from p.
 
 **What is certified.**  With d = log p - log s, known up to a constant, and expectations over s,
 
-    chi2(p || s) = E[e^2d] / E[e^d]^2 - 1,
+    chi2(p || s) = E[e^2d] / E[e^d]^2 - 1.
 
-and for any function f of the parameters, because E_p f - E_s f = E_s[(p/s - 1) (f - E_s f)], Cauchy
-and Schwarz give
+For any function f of the parameters, E_p f - E_s f = E_s[(p/s - 1) (f - E_s f)], so that by the
+Cauchy-Schwarz inequality
 
     |E_p f - E_s f| <= sd_s(f) sqrt(chi2),        total variation <= sqrt(chi2) / 2.
 
-So every mean, also that of a square or of the indicator of an interval, is off by at most
-sqrt(chi2) of its own standard deviation.  The pilots are draws of q, hence E[.] is a mean weighted
-by e^g.
+Hence the error of any mean, including that of a square or of the indicator of an interval, is at
+most sqrt(chi2) times the standard deviation of the averaged quantity.  Since the pilots are draws
+of q, E[.] is a mean weighted by e^g.
 
-**What is not.**  The inequality is exact, chi2 is an estimate.  Its upper limit allows for what the
-pilots could have missed: three more of them (the rule of three: a region of more than 3/n of q's
-probability is hit with 95 %), each with twice the worst remainder seen.  Normal theory or the
-bootstrap are too low here, since remainders have the tails of a cubic.  All values hold for the
-region that the pilots reach.  The outermost tails of q and all beyond, such as a second mode far
-away, are not covered.
+**What is not certified.**  The inequality is exact, but chi2 is an estimate.  Its upper limit
+allows for a region that the pilots may have missed.  By the rule of three, a region with more than
+3/n of the probability of q is hit with 95 % confidence; three pilots are therefore added, each with
+twice the largest remainder observed.  Normal theory and the bootstrap would give limits that are
+too low, since the remainders have the tails of a cubic.  All values hold for the region that the
+pilots cover.  The outermost tails of q and everything beyond them, such as a distant second mode,
+are not covered.
 """
 
 from __future__ import annotations
@@ -44,45 +45,46 @@ from bayesdist.infer.sampler.move_schedule import EFFICIENT
 from bayesdist.utils.arrays import Float
 from bayesdist.utils.limits import PARETO_K
 
-DEGREE = 3  # of the polynomial in the hyperparameters
-LEAST_TRAINING = 20
-LEAST_HELD_OUT = 100  # fewer leave more than 3 % of the probability unseen
-MOST_REMAINDER = 0.1
-MOST_SHIFT = 0.1  # posterior standard deviations: the Monte-Carlo error of 100 draws
-MISSED = 3  # pilots that may have been missed, by the rule of three
-MISSED_FACTOR = 2.0  # factor by which an unseen remainder may exceed the worst that was seen
-ROUNDING = 1e-6  # of log densities of 1e7 and more
-LARGEST = 300.0  # of a log weight: its square must not overflow
-BATCH = 4096  # proposals drawn at a time; draws depend on it
-LEAST_ACCEPTED = 1e-3
+DEGREE = 3  # degree of the polynomial in the hyperparameters
+LEAST_TRAINING = 20  # minimum number of pilots for the regression
+LEAST_HELD_OUT = 100  # minimum number of held-out pilots; fewer may miss 3 % of the probability
+MOST_REMAINDER = 0.1  # largest standard deviation of log p - log s for a certificate
+MOST_SHIFT = 0.1  # largest error of a mean in posterior sd: the Monte-Carlo error of 100 draws
+MISSED = 3  # number of pilots that may have been missed, by the rule of three
+MISSED_FACTOR = 2.0  # assumed ratio of a missed remainder to the largest observed one
+ROUNDING = 1e-6  # rounding error of log densities of 1e7 and more
+LARGEST = 300.0  # limit of a log weight, to avoid overflow of its square
+BATCH = 4096  # proposals drawn at a time; the draws depend on it
+LEAST_ACCEPTED = 1e-3  # smallest accepted fraction before sampling is given up
 
-SHARES = np.concatenate([[0.0], np.geomspace(1e-4, 1.0, 9)])  # prior sd: linear terms over core
-STRENGTHS = np.geomspace(1e-9, 1e5, 43)  # of the ridge, for each pilot
-LEAST_FREE = 1e-6  # of a pilot's residual, from which it counts as predicted by the others
+# ratios to try of the prior sd of the linear terms to that of the core features
+SHARES = np.concatenate([[0.0], np.geomspace(1e-4, 1.0, 9)])
+STRENGTHS = np.geomspace(1e-9, 1e5, 43)  # ridge strengths per pilot to try
+LEAST_FREE = 1e-6  # smallest leave-one-out factor of a pilot that is not interpolated exactly
 
 
 @dataclass(frozen=True, eq=False)
 class Surrogate:
-    """Approximate log importance weight, as a bounded function of whitened coordinates.
+    """Approximate log importance weight g, a bounded function of whitened coordinates.
 
-    Its features are orthonormal (Hermite) polynomials under the proposal: up to third degree in the
-    hyperparameters u; S = sum_k (t_k^2 - 1) over the coefficients t, with S u and S^2, since the
-    hyperparameters scale the errors of all coefficients together; and each t_k separately.  The
-    hyperparameters u = root @ (w - centre) have mean zero and unit covariance.
+    The features are polynomials that are orthonormal under the proposal (Hermite polynomials): up
+    to third degree in the hyperparameters u; S = sum_k (t_k^2 - 1) over the coefficients t, S u and
+    S^2, since the hyperparameters scale the errors of all coefficients together; and each t_k by
+    itself.  The hyperparameters u = root @ (w - centre) have mean zero and unit covariance.
 
-    The log weight has bounds: a cubic has none, and q exp(cubic) would be no density; `upper` also
-    is the exact envelope of rejection sampling.
+    The log weight is clipped to bounds, because q exp(cubic) could not be normalised; `upper` is
+    also the envelope for rejection sampling.
     """
 
-    centre: Float  # (h,) of the hyperparameters, which are the last h coordinates
-    root: Float  # (h, h)
+    centre: Float  # mean (h,) of the hyperparameters, which are the last h coordinates
+    root: Float  # whitening matrix (h, h) of the hyperparameters
     constant: float
-    coefficients: Float  # (p,)
-    lower: float
+    coefficients: Float  # regression coefficients (p,)
+    lower: float  # bounds of the log weight
     upper: float
 
     def log_weight(self, white: Float) -> Float:
-        """Log s - log q (n,), up to the constant of the exact ones, at points (n, D)."""
+        """Log s - log q (n,) at whitened points (n, D), with the constant of the exact weights."""
         core, linear = _features(white, self.centre, self.root)
         c = core.shape[1]
         value = self.constant + core @ self.coefficients[:c] + linear @ self.coefficients[c:]
@@ -92,12 +94,28 @@ class Surrogate:
 def certify(
     white: Float, log_weights: Float, n_hyper: int, *, rng: np.random.Generator
 ) -> tuple[Surrogate, Certificate]:
-    """Surrogate fitted to half of the pilots, and its certificate by the others.
+    """Fit a surrogate to half of the pilots and certify it with the other half.
 
-    `white` (n, D) are independent draws of the proposal q inside its support, in coordinates about
-    standard normal under q, the last `n_hyper` of them hyperparameters; `log_weights` (n,) are
-    exact log p - log q, up to a constant, minus infinity where p is zero.  `rng` splits the pilots.
-    InputError for too few of them.
+    Parameters
+    ----------
+    white : ndarray, shape (n, D)
+        Pilots: independent draws of the proposal q inside the support, in whitened coordinates. The
+        last `n_hyper` coordinates are hyperparameters.
+    log_weights : ndarray, shape (n,)
+        Exact log p - log q up to a constant; minus infinity if p is zero.
+    n_hyper : int
+    rng : numpy.random.Generator
+        Random generator that splits the pilots.
+
+    Returns
+    -------
+    Surrogate
+    Certificate
+
+    Raises
+    ------
+    InputError
+        If there are too few pilots.
     """
     order = rng.permutation(len(log_weights))
     n_test = round(len(order) / 2)
@@ -105,12 +123,12 @@ def certify(
     train = train[np.isfinite(log_weights[train])]
     if len(train) < LEAST_TRAINING or not np.isfinite(log_weights[test]).any():
         raise InputError(
-            f"{len(train)} pilots to learn from and {n_test} to judge by are too few",
+            f"{len(train)} pilots for the regression and {n_test} held-out pilots are too few",
             where="certificate",
             do="draw a few hundred pilots",
         )
     surrogate = _fit(white[train], log_weights[train], n_hyper)
-    # the tail of rounding errors means nothing
+    # k is meaningless if the weights differ by rounding errors only
     flat = np.ptp(log_weights[np.isfinite(log_weights)]) < ROUNDING
     k = float("-inf") if flat else pareto_k(log_weights)
     guess = surrogate.log_weight(white[test])
@@ -124,15 +142,32 @@ def draw_surrogate(
     n: int,
     rng: Random,
 ) -> tuple[Float, float]:
-    """Independent draws (n, D) of the surrogate by rejection, and the fraction accepted.
+    """Draw from the surrogate by rejection sampling.
 
-    The surrogate is bounded, so its bound is an envelope and the draws, all of weight one, follow
-    it exactly; resampled draws would repeat themselves.  Draws of one generator begin alike,
-    however many there are.
+    Since g is bounded, the draws are independent and follow the surrogate exactly, without repeated
+    draws as in resampling.  The first draws from a generator do not depend on `n`.
 
-    `propose` (m, rng) gives draws of q (m, D), whose rows are not finite outside the support;
-    `whiten` maps draws to the coordinates of the pilots.  NotConvergedError when next to no
-    proposal is accepted.
+    Parameters
+    ----------
+    propose : callable
+        Function (m, rng) that returns draws (m, D) of q; rows outside the support are not finite.
+    whiten : callable
+        Function that transforms draws to the whitened coordinates of the pilots.
+    surrogate : Surrogate
+    n : int
+        Number of draws.
+    rng : numpy.random.Generator
+
+    Returns
+    -------
+    draws : ndarray, shape (n, D)
+    acceptance : float
+        Accepted fraction of the proposals.
+
+    Raises
+    ------
+    NotConvergedError
+        If hardly any proposal is accepted.
     """
     accepted: list[Float] = []
     n_kept = tried = 0
@@ -158,7 +193,7 @@ def draw_surrogate(
 
 
 def _features(white: Float, centre: Float, root: Float) -> tuple[Float, Float]:
-    """Core features (n, c), and the coefficients themselves (n, D - h)."""
+    """Core features (n, c), and linear features (n, D - h): the coefficients t themselves."""
     h = len(centre)
     t, u = white[:, : white.shape[1] - h], (white[:, white.shape[1] - h :] - centre) @ root.T
     hermite = [
@@ -185,7 +220,7 @@ def _fit(white: Float, log_weights: Float, n_hyper: int) -> Surrogate:
     fitted = np.concatenate([core, linear], axis=1) @ coefficients
     constant = float(log_weights.mean() - fitted.mean())
     fitted += constant
-    # half the range more on either side: about five standard deviations
+    # bounds: the range of fitted values, extended by half of it on either side (about 5 sigma)
     margin = np.ptp(fitted) / 2
     return Surrogate(
         centre,
@@ -198,27 +233,27 @@ def _fit(white: Float, log_weights: Float, n_hyper: int) -> Surrogate:
 
 
 def _ridge(core: Float, linear: Float, y: Float) -> Float:
-    """Ridge coefficients, whose two strengths (core, linear terms) are chosen by leave-one-out."""
+    """Ridge regression coefficients; two ridge strengths are chosen by leave-one-out errors."""
     n = len(y)
     y = y - y.mean()
     core, linear = core - core.mean(axis=0), linear - linear.mean(axis=0)
-    least, best = np.inf, np.zeros(core.shape[1] + linear.shape[1])
+    smallest_error, best = np.inf, np.zeros(core.shape[1] + linear.shape[1])
     for share in SHARES:
-        # in the space of the pilots: there may be more features than pilots
+        # dual form, since there may be more features than pilots
         values, U = np.linalg.eigh(core @ core.T + share**2 * (linear @ linear.T))
         values, along = np.maximum(values, 0.0), U.T @ y
         strengths = n * STRENGTHS
-        left = strengths / (values[:, None] + strengths)
-        free = U**2 @ left - 1 / n  # of each residual; the constant is fitted too
-        misses = (U @ (left * along[:, None])) / np.maximum(free, LEAST_FREE)
+        shrinkage = strengths / (values[:, None] + strengths)
+        free = U**2 @ shrinkage - 1 / n  # leave-one-out factors; the constant is fitted too
+        misses = (U @ (shrinkage * along[:, None])) / np.maximum(free, LEAST_FREE)
         errors = (misses**2).sum(axis=0)
-        # a pilot that determines its own value gives no information about others
+        # exclude strengths for which a pilot is interpolated exactly
         errors[free.min(axis=0) < LEAST_FREE] = np.inf
         k = int(np.argmin(errors))
-        if errors[k] < least:
+        if errors[k] < smallest_error:
             dual = U @ (along / (values + strengths[k]))
             best = np.concatenate([core.T @ dual, share**2 * (linear.T @ dual)])
-            least = float(errors[k])
+            smallest_error = float(errors[k])
     return best
 
 
@@ -226,17 +261,17 @@ def _ridge(core: Float, linear: Float, y: Float) -> Float:
 
 
 def _judge(log_weights: Float, exact: Float, guess: Float, n_train: int, k: float) -> Certificate:
-    """Certificate from all log weights and, over pilots held out, exact and approximate ones."""
+    """Certificate from all log weights, and the exact and approximate ones of held-out pilots."""
     finite = np.isfinite(exact)
     n_outside = int((~np.isfinite(log_weights)).sum())
     weight = np.exp(guess - guess.max())
-    weight /= weight.sum()  # means over s from draws of q
+    weight /= weight.sum()  # weights of draws of q for means over s
     remainder = exact - guess
     top = remainder.max()
     d = remainder - top - np.log(weight @ np.exp(remainder - top))  # E_s[e^d] = 1
     worst = float(np.abs(d[finite]).max())
     chi2 = _chi2(weight, d)
-    # the unseen part, at the weight of an average pilot
+    # add the pilots that may have been missed, with the weight of an average pilot
     n = len(exact)
     share = MISSED / (n + MISSED)
     missed = min(MISSED_FACTOR * worst, LARGEST)
@@ -249,7 +284,7 @@ def _judge(log_weights: Float, exact: Float, guess: Float, n_train: int, k: floa
     if n < LEAST_HELD_OUT:
         reasons.append(f"{n} pilots held out are fewer than {LEAST_HELD_OUT}")
     if n_outside:
-        reasons.append(f"{n_outside} pilots lie where the posterior is zero")
+        reasons.append(f"the posterior is zero at {n_outside} pilots")
     if not k < PARETO_K.value:
         reasons.append(f"Pareto k {k:.3f} of the proposal is not below {PARETO_K.value}")
     if not efficiency > EFFICIENT:
@@ -278,8 +313,8 @@ def _judge(log_weights: Float, exact: Float, guess: Float, n_train: int, k: floa
 
 
 def _chi2(weight: Float, d: Float) -> float:
-    """Variance of e^d over its squared mean, for weights that add up to one."""
+    """Variance of e^d divided by its squared mean, for normalised weights."""
     b = np.exp(d)
     mean = weight @ b
-    # centred: E[b^2] - 1 would lose all digits where the remainder is 1e-8
+    # subtract the mean first: E[b^2] - 1 would lose all digits for remainders of 1e-8
     return float(weight @ (b - mean) ** 2 / mean**2)

@@ -1,4 +1,4 @@
-"""Coordinates in which moves that depend on the state are made."""
+"""Whitened coordinates, in which state-dependent moves are made."""
 
 from __future__ import annotations
 
@@ -14,15 +14,15 @@ from bayesdist.utils.arrays import Float
 
 @dataclass(frozen=True, eq=False)
 class Whitening:
-    """Coordinates in which the posterior is close to a standard Gaussian."""
+    """Transformation to coordinates in which the posterior is close to a standard Gaussian."""
 
-    centre: Float
-    factor: ArrowFactor  # of the curvature of the distortion parameters
+    centre: Float  # psi (D,) at the origin of the whitened coordinates
+    factor: ArrowFactor  # factor of the precision of the distortion parameters
     scale: Float  # standard deviations (h,) of the hyperparameters
 
     @classmethod
     def of(cls, target: Density, proposal: Proposal, draws: Float) -> Whitening:
-        """Whitening by the proposal's best node, and by the hyperparameters of draws (n, D)."""
+        """Whitening from the best node of a proposal and the hyperparameters of draws (n, D)."""
         n = target.n_theta
         factor = proposal.best.factor.matrix.without_tail().factor()
         hyper = draws[:, n:]
@@ -35,12 +35,12 @@ class Whitening:
         return self.factor.matrix.size
 
     def to_psi(self, w: Float) -> Float:
-        """Sampled coordinates (n, D) from whitened ones."""
+        """Convert whitened coordinates (n, D) to sampled coordinates psi (n, D)."""
         n = self.n_theta
         parts = [self.factor.colour(w[:, :n]), w[:, n:] * self.scale]
         return self.centre + np.concatenate(parts, axis=1)
 
     def to_white(self, psi: Float) -> Float:
-        """Whitened coordinates (n, D) from sampled ones."""
+        """Convert sampled coordinates psi (n, D) to whitened coordinates (n, D)."""
         n, shift = self.n_theta, psi - self.centre
         return np.concatenate([self.factor.whiten(shift[:, :n]), shift[:, n:] / self.scale], axis=1)

@@ -1,22 +1,21 @@
-"""Self-calibration: distortion, exposures' frames and stars' positions from detections alone.
+"""Self-calibration: distortion, exposure frames and star positions from detections alone.
 
-The stars' parameters are eliminated star by star, so that nothing is dense in their number; what
-is left are the parameters of a `DistortionModel`.
+The parameters of the stars are eliminated star by star, so that no matrix grows with their number.
+The remaining parameters are those of a `DistortionModel`.
 
     problem     detections sorted by star, linearised about a solution
-    elimination one pass: normal equations with the stars eliminated, or log densities of draws
-    sky_moves   moves of the whole sky, as changes of the parameters
-    prior       from other sources: commanded offsets, ties, reference stars
-    gauge       directions that detections leave free, by name, and what fixes them
-    mode        of everything together, and the directions that are free there: one decision
-    tangent     the exposures' tangent planes, mapped to one
-    start       start of the search
-    calibrate   grouping and solving in turn; errors of detections, by magnitude
-    pieces      detections in pieces of whole stars, here or on a cluster
-    posterior   density, proposal and draws
-    relative    solutions without their gauge
-    catalogue   the stars
-    expected    covariance before any exposure is taken
+    elimination normal equations with the stars eliminated, and marginal densities of draws
+    sky_moves   moves of the entire sky as changes of the parameters; errors without them
+    prior       information from other sources: commanded offsets, ties, reference stars
+    gauge       directions that the detections do not determine, with names and constraints
+    mode        joint mode of all parameters, with the gauge that is determined there
+    tangent     mapping of the exposures' tangent planes to a common plane
+    start       starting point of the search
+    calibrate   alternating grouping and solution; errors of detections by magnitude
+    pieces      division of the detections into pieces, in this process or on a cluster
+    posterior   posterior density, proposal and draws
+    catalogue   positions of the stars with their covariances
+    expected    expected covariance for planned exposures
 """
 
 from bayesdist.infer.equations.priors import Prior

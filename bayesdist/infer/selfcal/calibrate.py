@@ -1,4 +1,4 @@
-"""Detections grouped into stars, solved, grouped again: until nothing changes."""
+"""Self-calibration: group detections into stars and solve, in turn, until the groups are stable."""
 
 from __future__ import annotations
 
@@ -24,14 +24,14 @@ from bayesdist.utils.arrays import Float, Int
 
 MAX_ITERATIONS = 12
 SHRINK = 0.5  # smallest factor on the linking length from one iteration to the next
-REACH = 12.0  # errors below which the linking length does not shrink
-MAX_CHANGED = 1e-3  # fraction of the detections that may change their star,
-MIN_CHANGED = 4  # or this number: two at the edge of the linking length, each with its successor
-ALIKE = 0.02  # change of the number of detections by which the errors hardly change
-GUESS = 0.02  # pixels: error where none is quoted, until it is measured
-MIN_IN_BIN = 200  # detections of one magnitude
+REACH = 12.0  # the linking length is at least this many errors
+MAX_CHANGED = 1e-3  # convergence: largest fraction of the detections that change their star,
+MIN_CHANGED = 4  # or this number (two at the edge of the linking length, and their successors)
+ALIKE = 0.02  # relative change of the number of detections that leaves the errors about the same
+GUESS = 0.02  # pixels: assumed error before it is measured, if none is quoted
+MIN_IN_BIN = 200  # detections per magnitude bin
 MAX_BINS = 20
-# of a residual's variance: a star with as many parameters as detections absorbs it all
+# largest fraction of a residual's variance that the star's parameters are assumed to absorb
 MOST_TAKEN = 0.99
 
 References = Callable[[Problem, Float], StarPriors]
@@ -39,37 +39,50 @@ References = Callable[[Problem, Float], StarPriors]
 
 @dataclass(frozen=True, eq=False)
 class SelfCalibration:
-    """A mode with its gauge and the last grouping of detections."""
+    """Result of a self-calibration.
+
+    Parameters
+    ----------
+    mode : SelfCalibrationMode
+        The solution.
+    gauge : Gauge
+        Properties that the detections do not determine, and their constraints.
+    friends : Friends
+        Last grouping; its `star` refers to the input detections.
+    detections : Detections
+        Detections with star codes and errors, on a common tangent plane if requested.
+    iterations : int
+        Number of iterations.
+    """
 
     mode: SelfCalibrationMode
     gauge: Gauge
-    friends: Friends  # of the last iteration; its `star` is of the detections given
-    # with star codes and errors, on one tangent plane where that is requested
+    friends: Friends
     detections: Detections
     iterations: int
 
 
 @dataclass(frozen=True, eq=False)
 class _Iteration:
-    """What the next iteration takes from one: no detections."""
+    """Results of an iteration that the next one uses as starting values."""
 
-    n_detections: int  # of stars
+    n_detections: int  # number of detections that belong to stars
     mixture: Mixture
     decision: Decision | None
 
     @classmethod
     def of(cls, mode: SelfCalibrationMode) -> _Iteration:
-        """What is taken from a mode."""
+        """Extract the starting values from a mode."""
         return cls(len(mode.problem), mode.mixture, mode.decision)
 
     def is_near(self, problem: Problem) -> bool:
-        """True where errors and free directions are those of the next problem at first.
+        """True if errors and free directions are good starting values for the next problem.
 
-        Nearly the same detections: new ones may lie far from their positions by the solution.
-        Stars with motions start at rest, and then the first errors have to be large.
+        This requires nearly the same detections, since new ones may be far from their predicted
+        positions.  Stars with proper motions start at rest and need large initial errors.
         """
-        same = abs(len(problem) / self.n_detections - 1.0) < ALIKE
-        return same and problem.n_star == 2
+        similar = abs(len(problem) / self.n_detections - 1.0) < ALIKE
+        return similar and problem.n_star == 2
 
 
 def self_calibrate(
@@ -96,33 +109,44 @@ def self_calibrate(
     Parameters
     ----------
     model : DistortionModel
+        Model of the distortion and the exposure frames, with D parameters.
     detections : Detections
-        Without errors these are measured, by magnitude where magnitudes are given.
+        Detections in E exposures. If they have no errors, the errors are measured, by magnitude if
+        magnitudes are given.
     theta : ndarray, shape (D,)
-        A start by which detections of a star lie closer than `start_radius`.
+        Starting parameters, accurate enough that the detections of a star are closer than
+        `start_radius` to each other on the sky.
     prior_at : callable, optional
-        Prior from other sources than the detections, linearised at parameters (D,).
+        Function that returns a `Prior` from other information than the detections, linearised at
+        given parameters (D,).
     match_radius : float
-        Linking length of the last iteration, pixels: the largest distance of false detections.
+        Linking length of the last iteration in pixels, which is also the largest distance of a
+        false detection from a star.
     start_radius : float, optional
-        Linking length of the first iteration.
+        Linking length of the first iteration in pixels; `match_radius` by default.
     min_detections : int
-        Of a star.
-    motion, parallax_factors
-        As `prepare`.
+        Minimum number of detections of a star.
+    motion : str
+        Parameters of the stars in addition to positions: 'none', 'proper_motion', or 'parallax'
+        (which includes proper motion).
+    parallax_factors : ndarray, shape (E, 2), optional
+        Parallax factors of the exposures along u and v; required for 'parallax'.
     dilation : ndarray, shape (E,), optional
-        VAFACTOR of each exposure.
+        Known scale of the sky in each exposure (VAFACTOR).
     jitter : float, optional
-        Fixed value, pixels.
+        Additional error of the detections in pixels; fitted by default.
     references : callable, optional
-        Priors of the stars of a problem at parameters (D,).
+        Function of a `Problem` and parameters (D,) that returns `StarPriors`, such as
+        `ReferenceStars`.
     plane : TangentPlane, optional
-        To which the tangent planes of all exposures are mapped; the sky counts as flat by default.
+        Common plane to which the tangent planes of the exposures are mapped. By default the sky is
+        treated as flat.
     max_iterations : int
+        Maximum number of iterations.
     log : callable, optional
-        Called with a sentence for each iteration.
+        Called with a message after each iteration.
     compute : Compute, optional
-        Where detections are grouped and the passes over them are made; in this process by default.
+        Computing engine; this process by default.
 
     Returns
     -------
@@ -130,10 +154,12 @@ def self_calibrate(
 
     Raises
     ------
-    InputError, DegenerateError
-        As `prepare` and `solve`.
+    InputError
+        If no star has enough detections, or dates or parallax factors are missing.
+    DegenerateError
+        If the detections do not determine the parameters.
     NotSettledError
-        When the groups do not converge.
+        If the groups of detections or the solution do not converge.
     """
     theta = np.array(theta, float)
     prior_at = prior_at or Prior.none
@@ -142,7 +168,7 @@ def self_calibrate(
     detections = replace(detections, sigma=sigma)
     radius = max(start_radius or match_radius, match_radius)
     pixel = model.pixel_size(theta)
-    few = max(MAX_CHANGED * len(detections), MIN_CHANGED)
+    max_changed = max(MAX_CHANGED * len(detections), MIN_CHANGED)
     last = False
     before: _Iteration | None = None
     solved: tuple[Friends, SelfCalibrationMode] | None = None
@@ -152,8 +178,9 @@ def self_calibrate(
         friends = friends_of_friends(
             places_of(model, flat, theta, dilation), flat.exposure, radius * pixel, each=each
         )
-        # references and priors are linearised at the start of a solution: the first one's is far
-        if solved is not None and turn > 1 and last and _changed(solved[0], friends) <= few:
+        # References and priors are linearised at the start of a solution, which is not accurate in
+        # the first iteration: at least two are needed.
+        if solved is not None and turn > 1 and last and _changed(solved[0], friends) <= max_changed:
             friends, mode = solved
             if measured:  # with the errors of the last iteration
                 problem = replace(mode.problem, var=sigma[mode.problem.rows] ** 2)
@@ -168,17 +195,17 @@ def self_calibrate(
                     compute=compute,
                 )
             gauge = gauge_of(mode.problem, mode.theta, prior_at(mode.theta), mode)
-            found = replace(flat, star=friends.star)
-            return SelfCalibration(mode, gauge, friends, found, turn)
+            grouped = replace(flat, star=friends.star)
+            return SelfCalibration(mode, gauge, friends, grouped, turn)
         if turn == max_iterations:
             break
         if solved is not None:
             before = _Iteration.of(solved[1])
-            solved = None  # else two problems are held
-        found = replace(flat, star=friends.star)
+            solved = None  # release memory: do not keep two problems
+        grouped = replace(flat, star=friends.star)
         problem = prepare(
             model,
-            found,
+            grouped,
             theta,
             match_radius=radius,
             min_detections=min_detections,
@@ -209,23 +236,25 @@ def self_calibrate(
             detections = replace(detections, sigma=sigma)
         scatter, solved = mode.error, (friends, mode)
         radius = max(match_radius, min(radius, max(SHRINK * radius, REACH * scatter)))
-        del flat, found, problem, mode  # else two problems are held as the next is made
+        del flat, grouped, problem, mode  # release memory: do not keep two problems
     if last:
         raise NotSettledError(
             f"stars and solution still change after {max_iterations} iterations",
             where="self-calibration",
-            do="give a better start, another match radius, or a lower order",
+            do="give a better start (selfcal.initial_distortion), another match radius or a lower "
+            "order",
         )
     raise NotSettledError(
-        f"after {max_iterations} iterations the detections still ask for a linking length of "
+        f"after {max_iterations} iterations the detections still require a linking length of "
         f"{radius:.3g} pix, since they scatter by {scatter:.3g} pix",
         where="self-calibration",
-        do="give a higher order, a better start, or a larger match radius",
+        do="give a higher order, a better start (selfcal.initial_distortion) or a larger match "
+        "radius",
     )
 
 
 def _errors_of(detections: Detections, mode: SelfCalibrationMode) -> Float:
-    """Errors (N,) in pixels: by magnitude, or one for all."""
+    """Errors (N,) in pixels as a function of magnitude, or a common one without magnitudes."""
     problem = mode.problem
     mag = np.zeros(len(detections)) if detections.mag is None else detections.mag
     middles, sigma = scatter_by_magnitude(
@@ -235,9 +264,9 @@ def _errors_of(detections: Detections, mode: SelfCalibrationMode) -> Float:
 
 
 def _changed(before: Friends, after: Friends) -> int:
-    """Number of detections that follow another one in their star than before.
+    """Number of detections with a different predecessor in their star than before.
 
-    Codes of stars would not do: they shift where a star comes or goes.
+    Star codes cannot be compared, because they change when a star appears or disappears.
     """
     return int(np.sum(_previous(before.star) != _previous(after.star)))
 
@@ -245,32 +274,35 @@ def _changed(before: Friends, after: Friends) -> int:
 def _previous(star: Int) -> Int:
     """Index of the previous detection (N,) of the same star, or -1."""
     order = np.argsort(star, kind="stable")
-    same = (star[order[1:]] == star[order[:-1]]) & (star[order[1:]] >= 0)
+    same_star = (star[order[1:]] == star[order[:-1]]) & (star[order[1:]] >= 0)
     out = np.full(len(star), -1)
-    out[order[1:]] = np.where(same, order[:-1], -1)
+    out[order[1:]] = np.where(same_star, order[:-1], -1)
     return out
 
 
 def scatter_by_magnitude(
     problem: Problem, theta: Float, mixture: Mixture, stars: Float, mag: Float
 ) -> tuple[Float, Float]:
-    """Median magnitude of each bin (bins,), and error on one axis there in pixels (bins,).
+    """Estimate the errors of the detections in bins of magnitude.
 
-    A star's position is that of its own detections; the scatter is corrected for this.  `mag` (N,)
-    is in the order of the problem.
+    Returns the median magnitude of each bin (bins,) and the error per axis in pixels (bins,).  The
+    scatter is corrected for the degrees of freedom that the stars' positions absorb.  `mag` (N,) is
+    in the order of the problem.
     """
     w = memberships(problem, theta, mixture, stars)
     precision = w / (problem.var + mixture.jitter**2)
     total = np.bincount(problem.star, precision, minlength=problem.n_stars)[problem.star]
-    # on each axis a star takes q / 2 degrees of freedom, shared by weight
-    left = 1.0 - np.minimum(precision / np.maximum(total, 1e-300) * problem.n_star / 2, MOST_TAKEN)
+    # a star absorbs q / 2 degrees of freedom per axis, distributed according to the weights
+    remaining = 1.0 - np.minimum(
+        precision / np.maximum(total, 1e-300) * problem.n_star / 2, MOST_TAKEN
+    )
     square = problem.squares(theta, stars)
     n_bins = int(np.clip(len(mag) // MIN_IN_BIN, 1, MAX_BINS))
-    # equal magnitudes, as in lists without any, leave fewer bins
+    # equal magnitudes (as in lists without magnitudes) give fewer bins
     edges = np.unique(np.quantile(mag, np.linspace(0, 1, n_bins + 1)))
     n_bins = max(len(edges) - 1, 1)
     bin_of = np.clip(np.searchsorted(edges, mag, side="right") - 1, 0, n_bins - 1)
-    number = np.bincount(bin_of, w * left, n_bins)
+    number = np.bincount(bin_of, w * remaining, n_bins)
     variance = np.bincount(bin_of, w * square, n_bins) / (2 * np.maximum(number, 1e-9))
     middles = np.array([np.median(mag[bin_of == k]) for k in range(n_bins)])
     return middles, np.sqrt(variance)

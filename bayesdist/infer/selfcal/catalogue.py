@@ -1,4 +1,4 @@
-"""The stars of a self-calibration, with the covariance of their parameters."""
+"""Catalogue of the stars of a self-calibration, with the covariances of their parameters."""
 
 from __future__ import annotations
 
@@ -15,15 +15,15 @@ from bayesdist.utils.arrays import Float, Int
 
 @dataclass(frozen=True, eq=False)
 class StarCatalogue:
-    """Stars on the sky of the solution."""
+    """Parameters of S stars in the coordinate system of the solution."""
 
-    values: Float  # (S, q), position at `epoch`, then motion per year, then parallax
-    cov: Float  # (S, q, q), with the errors of distortion and frames, in the gauge of the solution
-    own: Float  # (S, q, q), without these: by the star's own detections alone
-    n: Int  # (S,), detections
-    n_members: Float  # (S,), expected number of true detections among these
-    epoch: float
-    unit: str
+    values: Float  # (S, q): position at `epoch`, then proper motion per year, then parallax
+    cov: Float  # (S, q, q): covariance including the errors of distortion and frames
+    own: Float  # (S, q, q): covariance for exactly known distortion and frames
+    n: Int  # number (S,) of detections
+    n_members: Float  # expected number (S,) of true detections
+    epoch: float  # date of the positions in decimal years
+    unit: str  # unit of u, v
 
     def __len__(self) -> int:
         return len(self.values)
@@ -32,13 +32,22 @@ class StarCatalogue:
 def star_catalogue(
     solution: SelfCalibrationMode, cov: Float | None = None, *, compute: Compute | None = None
 ) -> StarCatalogue:
-    """Stars at their modes, with Laplace covariances.
+    """Make a catalogue of the stars at their modes, with covariances (Laplace approximation).
 
-    The covariance of a star is that by its own detections for a known distortion, plus that by
-    the error of the distortion: A^-1 + A^-1 B Sigma B^T A^-1.
+    The covariance of a star is the sum of that for a known distortion, from the star's detections,
+    and that caused by the error of the distortion: A^-1 + A^-1 B Sigma B^T A^-1.
 
-    `cov` (D, D): sigma; that of the solution by default. `compute`: where the passes over the
-    detections are made; in this process by default.
+    Parameters
+    ----------
+    solution : SelfCalibrationMode
+    cov : ndarray, shape (D, D), optional
+        Covariance Sigma of the parameters of the model; that of the solution by default.
+    compute : Compute, optional
+        Computing engine; this process by default.
+
+    Returns
+    -------
+    StarCatalogue
     """
     problem = solution.problem
     root = np.zeros((len(solution.theta), len(solution.free)))
@@ -50,17 +59,17 @@ def star_catalogue(
         root[solution.free] = scale[:, None] * np.linalg.cholesky(inner)
     with in_pieces(problem, solution.stars, compute) as pieces:
         parts = list(pieces.each(_covariances, solution.theta, solution.mixture, root))
-    total, own, members = (np.concatenate(columns) for columns in zip(*parts, strict=True))
-    # a star without members is somewhere in the match circle
+    total, star_cov, members = (np.concatenate(columns) for columns in zip(*parts, strict=True))
+    # a star without true detections may be anywhere in the match circle
     widest = problem.least_root**-2
-    lost = (members < 0.5) & (np.trace(own[:, :2, :2], axis1=1, axis2=2) > 2 * widest)
-    for matrices in (own, total):
+    lost = (members < 0.5) & (np.trace(star_cov[:, :2, :2], axis1=1, axis2=2) > 2 * widest)
+    for matrices in (star_cov, total):
         matrices[lost, :2] = matrices[lost, :, :2] = 0.0
         matrices[lost, :2, :2] = widest * np.eye(2)
     return StarCatalogue(
         solution.stars,
         total,
-        own,
+        star_cov,
         problem.counts,
         members,
         problem.epoch0,
@@ -71,18 +80,18 @@ def star_catalogue(
 def _covariances(
     piece: StarPiece, theta: Float, mixture: Mixture, root: Float
 ) -> tuple[Float, Float, Float]:
-    """Covariances (S, q, q) of the stars of a piece, in all and of their own; members (S,).
+    """Total covariances, covariances for a known distortion (S, q, q each), and members (S,).
 
-    `root` (D, F) is a square root of the covariance of the parameters.
+    `root` (D, F) is a matrix square root of the covariance of the parameters.
     """
     p, stars = piece.problem, piece.stars
     S, q = p.n_stars, p.n_star
-    total, own = np.empty((S, q, q)), np.empty((S, q, q))
-    for some, rows, factors in eliminated_rows(p, theta, mixture, stars):
+    total, star_cov = np.empty((S, q, q)), np.empty((S, q, q))
+    for selection, rows, factors in eliminated_rows(p, theta, mixture, stars):
         back = np.linalg.inv(np.tril(factors))  # L^-1
-        own[some] = np.swapaxes(back, 1, 2) @ back
+        star_cov[selection] = np.swapaxes(back, 1, 2) @ back
         # A^-1 B = L^-T (L^-1 B)
         spread = np.swapaxes(back, 1, 2) @ (rows @ root)
-        total[some] = own[some] + spread @ np.swapaxes(spread, 1, 2)
+        total[selection] = star_cov[selection] + spread @ np.swapaxes(spread, 1, 2)
     w = memberships(p, theta, mixture, stars)
-    return total, own, np.asarray(np.bincount(p.star, w, minlength=S), float)
+    return total, star_cov, np.asarray(np.bincount(p.star, w, minlength=S), float)

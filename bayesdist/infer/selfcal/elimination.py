@@ -1,12 +1,13 @@
 """Normal equations of the distortion with the stars eliminated.
 
-For star s, with A_s the curvature of the log density by its own parameters and B_s that by its own
-and the distortion's, elimination leaves
+For star s, let A_s be minus the second derivatives of the log density with respect to the star's
+parameters, and B_s the mixed ones with respect to those and the parameters of the model.  The
+elimination of all stars gives
 
     N = sum_i J_i^T H_i J_i - sum_s B_s^T A_s^-1 B_s
 
-dense in the parameters of the distortion and of the exposures alone.  B_s of some thousand stars at
-a time is one matrix, so that the second sum is a product of matrices.
+for the parameters of distortion and exposures.  The B_s of about a thousand stars at a time form a
+matrix, so that the second sum is a matrix product.
 """
 
 from __future__ import annotations
@@ -25,24 +26,24 @@ from bayesdist.infer.selfcal.problem import Problem
 from bayesdist.infer.stars.sums import Sums
 from bayesdist.utils.arrays import Float, Int
 
-STARS = 1024  # eliminated at a time
-PARTS = 8  # of the stars, whose sums are made separately whatever the number of threads
-ELIMINATION = 40  # evaluations of a polynomial that last as long as a detection's part in it
-SURE, NEVER = 0.99, 1e-6  # memberships beyond which no other choice is considered
-MODE = 10  # evaluations of a polynomial that last as long as the search for a star's mode
-NO_MODE = 1e-6  # relative determinant of a curvature that says nothing of where the mode is
-SCRATCH = 2_000_000  # bytes of coefficients of draws at a time: the cache of a core
+STARS = 1024  # number of stars that are eliminated at a time
+PARTS = 8  # number of partial sums over the stars, independent of the number of threads
+ELIMINATION = 40  # cost of the elimination per detection, in evaluations of a polynomial
+SURE, NEVER = 0.99, 1e-6  # membership probabilities beyond which a detection is not doubtful
+MODE = 10  # cost of the search for a star's mode per detection, in evaluations of a polynomial
+NO_MODE = 1e-6  # relative determinant of a curvature that does not determine a star's position
+SCRATCH = 2_000_000  # bytes of coefficients of draws processed at a time: the cache of a core
 
 
 @dataclass(frozen=True)
 class Mixture:
-    """Distribution of detections about their stars."""
+    """Parameters of the distribution of detections about their stars."""
 
-    jitter: float = 0.0  # pixels, in addition to the quoted errors
-    fraction: float = 0.01  # of false detections
+    jitter: float = 0.0  # error in pixels in addition to the quoted errors
+    fraction: float = 0.01  # fraction of false detections
 
     def constants(self, log_outlier: float) -> tuple[float, float, float]:
-        """Squared jitter, log of the core's fraction, log density of false detections."""
+        """Squared jitter, log of the fraction of true detections, log density of false ones."""
         with np.errstate(divide="ignore"):
             core, false = np.log([1.0 - self.fraction, self.fraction])
         return self.jitter**2, float(core), float(max(false + log_outlier, -1e300))
@@ -50,74 +51,76 @@ class Mixture:
 
 @dataclass(frozen=True, eq=False)
 class PlaceDerivatives:
-    """Dependence of sky positions on the parameters, linearised at a solution.
+    """Derivatives of sky positions with respect to the parameters, linearised at a solution.
 
-    By the coefficients of a chip's polynomials, M (kron) phi; by everything else, `extra` phi.
+    Those with respect to the polynomial coefficients of a chip are M (kron) phi; those with respect
+    to other parameters are `extra` phi.
     """
 
     coef: Float  # effective coefficients (G, 2, K)
     linear: Float  # M (G, 2, 2)
-    # derivatives (G, m, 2, K) by drift and frames; zero where a group has fewer than m of them
+    # derivatives (G, m, 2, K) with respect to drift and frame parameters; zero if there are fewer
     extra: Float
     columns: Int  # indices (G, m) of these parameters; -1 for none
-    jacobian: list[tuple[Int, Float]]  # as of `DistortionModel.effective_jacobian`
+    jacobian: list[tuple[Int, Float]]  # result of `Problem.effective_jacobian`
 
     @classmethod
     def at(cls, problem: Problem, theta: Float) -> PlaceDerivatives:
-        """PlaceDerivatives of a problem at theta (D,)."""
+        """Linearise a problem at theta (D,)."""
         groups, K = problem.groups, problem.model.n_terms
-        found = problem.effective_jacobian(theta)
-        m = max(len(columns) for columns, _ in found) - 2 * K
+        jacobian = problem.effective_jacobian(theta)
+        m = max(len(columns) for columns, _ in jacobian) - 2 * K
         extra, columns = np.zeros((len(groups), m, 2, K)), np.full((len(groups), m), -1)
         linear = np.empty((len(groups), 2, 2))
-        for g, (which, derivative) in enumerate(found):
+        for g, (indices, derivative) in enumerate(jacobian):
             linear[g] = derivative[:, 0, [0, K]]
-            n = len(which) - 2 * K
-            columns[g, :n] = which[2 * K :]
+            n = len(indices) - 2 * K
+            columns[g, :n] = indices[2 * K :]
             extra[g, :n] = np.moveaxis(derivative[..., 2 * K :], 2, 0)
-        return cls(problem.effective(theta), linear, extra, columns, found)
+        return cls(problem.effective(theta), linear, extra, columns, jacobian)
 
 
 @dataclass(frozen=True, eq=False)
 class Expansion(Sums):
-    """Second-order expansion of the log density at a solution, the stars eliminated."""
+    """Second-order expansion of the log density at a solution, with the stars eliminated."""
 
     value: float  # log density with the stars integrated out (Laplace), up to a constant
-    gradient: Float  # (D,) at the stars' modes
+    gradient: Float  # gradient (D,) at the modes of the stars
     curvature: Float  # minus the Hessian (D, D)
     n_members: float  # expected number of true detections
-    chi2: float  # sum of w times the squared normalised residual
+    chi2: float  # sum of membership probability times squared normalised residual
 
 
 def expand(
     problem: Problem, theta: Float, mixture: Mixture, stars: Float, *, observed: bool = True
 ) -> tuple[Expansion, Float]:
-    """Expansion at theta (D,) and the stars' modes (S, q), by one pass over the detections.
+    """Expand the log density at theta (D,), and find the modes (S, q) of the stars, in one pass.
 
-    The search for the modes starts at `stars` (S, q).  If `observed` the curvature is that
-    of the mixture itself; otherwise that with EM weights, which is never indefinite.
+    The search for the modes starts at `stars` (S, q).  If `observed` is True, the curvature is that
+    of the mixture; otherwise EM weights are used, with which it is never indefinite.  Returns the
+    expansion and the modes.
     """
     structure, D = PlaceDerivatives.at(problem, theta), problem.model.n_params
     order, K = problem.model.order, problem.model.n_terms
     sums = kernel.EliminationSums.zero(len(problem.groups), order)
     curvature, gradient = np.zeros((D, D)), np.zeros(D)
-    found = stars.copy()
+    modes = stars.copy()
 
     def part(first: int, last: int) -> tuple[kernel.EliminationSums, Float]:
         mine = kernel.EliminationSums.zero(len(problem.groups), order)
         absorbed = np.zeros((D, D))
-        for _, rows, _ in _passes(problem, structure, mixture, found, observed, first, last, mine):
+        for _, rows, _ in _passes(problem, structure, mixture, modes, observed, first, last, mine):
             add_square(absorbed, rows)
         return mine, absorbed
 
     edges = np.arange(PARTS + 1) * problem.n_stars // PARTS
     with threads_for(ELIMINATION * len(problem)):
         for mine, absorbed in in_turn(part, edges[:-1], edges[1:]):
-            for total, more in zip(sums, mine, strict=True):
-                total += more
+            for total, term in zip(sums, mine, strict=True):
+                total += term
             curvature -= absorbed
-            del absorbed  # as large as the curvature, while the next parts are summed
-    curvature += np.tril(curvature, -1).T  # squares are lower triangles
+            del absorbed  # release memory: it is as large as the curvature
+    curvature += np.tril(curvature, -1).T  # `add_square` fills lower triangles only
     table = product_table(order)
     weights, pulls = sums.weights[..., : table.shape[-1]], sums.pulls[..., :K]
     squares = np.einsum("gcm,klm->gckl", weights, table, optimize=True)
@@ -128,21 +131,21 @@ def expand(
     curvature += curvature.T
     curvature /= 2
     value, members, chi2 = sums.scalars
-    return Expansion(float(value), gradient, curvature, members, chi2), found
+    return Expansion(float(value), gradient, curvature, members, chi2), modes
 
 
 def eliminated_rows(
     problem: Problem, theta: Float, mixture: Mixture, stars: Float
 ) -> Iterator[tuple[slice, Float, Float]]:
-    """Coupling of stars to the distortion, some stars at a time.
+    """Yield the coupling of the stars to the parameters of the model, in batches of stars.
 
-    Yields the stars, L^-1 B (n, q, D) of each, A = L L^T, and L (n, q, q).
+    Each item has the slice of n stars, L^-1 B (n, q, D), and L (n, q, q), with A = L L^T.
     """
     structure, D, q = PlaceDerivatives.at(problem, theta), problem.model.n_params, problem.n_star
     sums = kernel.EliminationSums.zero(len(problem.groups), problem.model.order)
-    whole = stars.copy(), True, 0, problem.n_stars, sums
-    for some, rows, factors in _passes(problem, structure, mixture, *whole):
-        yield some, rows.reshape(len(factors), q, D), factors
+    arguments = stars.copy(), True, 0, problem.n_stars, sums
+    for batch, rows, factors in _passes(problem, structure, mixture, *arguments):
+        yield batch, rows.reshape(len(factors), q, D), factors
 
 
 def _passes(
@@ -155,14 +158,14 @@ def _passes(
     last: int,
     sums: kernel.EliminationSums,
 ) -> Iterator[tuple[slice, Float, Float]]:
-    """Some of the stars first..last at a time, with the results of `kernel.eliminate_stars`."""
+    """Yield slices of the stars first..last with the results of `kernel.eliminate_stars`."""
     p = problem
     j2, log_core, log_out = mixture.constants(p.log_outlier)
     for begin in range(first, last, STARS):
-        some = slice(begin, min(begin + STARS, last))
-        found = kernel.eliminate_stars(
-            some.start,
-            some.stop,
+        batch = slice(begin, min(begin + STARS, last))
+        results = kernel.eliminate_stars(
+            batch.start,
+            batch.stop,
             p.columns,
             stars,
             structure.coef,
@@ -179,16 +182,16 @@ def _passes(
             observed,
             sums,
         )
-        yield some, *found
+        yield batch, *results
 
 
 def memberships(problem: Problem, theta: Float, mixture: Mixture, stars: Float) -> Float:
-    """Probability (N,) that a detection belongs to its star."""
+    """Probability (N,) that each detection belongs to its star."""
     p = problem
     j2, log_core, log_out = mixture.constants(p.log_outlier)
     places = p.places(theta)
     with threads_for(MODE * len(p)):
-        found = kernel.weighted_stars(
+        probability = kernel.weighted_stars(
             p.starts,
             places,
             p.W,
@@ -203,21 +206,21 @@ def memberships(problem: Problem, theta: Float, mixture: Mixture, stars: Float) 
             p.least_root,
             stars.copy(),
         )
-    return np.asarray(found)
+    return np.asarray(probability)
 
 
 @dataclass(frozen=True, eq=False)
 class StarModes:
-    """Modes of the stars at a solution, and their response to their detections from there."""
+    """Modes of the stars at a solution, and their linear response to changes of the parameters."""
 
-    stars: Float
-    response: Float  # (N, 2, 2) of a star's position to its detections'
-    middles: Float  # mean positions (S, 2) of the detections at the solution, by these
-    state: NDArray[np.int8]  # of each detection (N,): `kernel.MEMBER`, `DOUBTFUL` or `FALSE`
+    stars: Float  # parameters (S, q) at the modes
+    response: Float  # derivatives (N, 2, 2) of a star's position with respect to its detections
+    middles: Float  # sums (S, 2) of response times position of the detections, at the solution
+    state: NDArray[np.int8]  # state (N,) of the detections: MEMBER, DOUBTFUL or FALSE of `kernel`
 
     @classmethod
     def at(cls, problem: Problem, theta: Float, mixture: Mixture, stars: Float) -> StarModes:
-        """Modes of a problem at theta (D,), where `stars` are the modes."""
+        """Compute the response for a problem at theta (D,), where `stars` (S, q) are the modes."""
         p, z = problem, problem.places(theta)
         member = memberships(problem, theta, mixture, stars)
         s2 = p.var + mixture.jitter**2
@@ -225,14 +228,14 @@ class StarModes:
         return cls(stars, response, _means(p, response, z), _states(p, member))
 
     def moved(self, problem: Problem, theta: Float) -> Float:
-        """Stars (S, q), moved as their detections are by theta (D,): start of a search there."""
+        """Predicted modes (S, q) at other parameters theta (D,), as start of a search there."""
         out = self.stars.copy()
         out[:, :2] += _means(problem, self.response, problem.places(theta)) - self.middles
         return out
 
 
 def _curvatures(problem: Problem, residual: Float, member: Float, s2: Float) -> Float:
-    """Curvature uu, uv, vv (3, N) of each detection by the position of its star."""
+    """Minus the second derivatives uu, uv, vv (3, N) with respect to the position of the star."""
     (u, v), (uu, uv, vv) = residual.T, problem.W.T
     along = np.sqrt(member * (1.0 - member)) / s2
     gu, gv = along * (uu * u + uv * v), along * (uv * u + vv * v)
@@ -241,15 +244,20 @@ def _curvatures(problem: Problem, residual: Float, member: Float, s2: Float) -> 
 
 
 def _response(problem: Problem, curvature: Float) -> Float:
-    """Response (N, 2, 2) of a star to each of its detections: to their mean if it has no mode."""
-    star, counts, known = problem.star, problem.counts, problem.priors.precision
+    """Derivatives (N, 2, 2) of a star's position with respect to the position of each detection.
+
+    If a star has no well-defined mode, its position is taken to be the mean of its detections.
+    """
+    star, counts, prior_precision = problem.star, problem.counts, problem.priors.precision
     uu, uv, vv = (
-        np.bincount(star, one, minlength=len(counts)) + known[:, a, b]
-        for one, (a, b) in zip(curvature, ((0, 0), (0, 1), (1, 1)), strict=True)
+        np.bincount(star, element, minlength=len(counts)) + prior_precision[:, a, b]
+        for element, (a, b) in zip(curvature, ((0, 0), (0, 1), (1, 1)), strict=True)
     )
     det = uu * vv - uv * uv
     lost = ~((det > NO_MODE * uu * vv) & (uu > 0))
-    uu, uv, vv = (np.where(lost, 0.0, one / np.where(lost, 1.0, det))[star] for one in (uu, uv, vv))
+    uu, uv, vv = (
+        np.where(lost, 0.0, element / np.where(lost, 1.0, det))[star] for element in (uu, uv, vv)
+    )
     a, b, c = curvature
     rows = [[vv * a - uv * b, vv * b - uv * c], [uu * b - uv * a, uu * c - uv * b]]
     out = np.stack([np.stack(row, axis=1) for row in rows], axis=1)
@@ -259,57 +267,59 @@ def _response(problem: Problem, curvature: Float) -> Float:
 
 
 def _means(problem: Problem, response: Float, places: Float) -> Float:
-    """Mean positions (S, 2) of the detections of each star, by their response (N, 2, 2)."""
+    """Sums (S, 2) over the detections of each star of response (N, 2, 2) times position (N, 2)."""
     moves = np.einsum("nab,nb->na", response, places)
     return np.stack([np.bincount(problem.star, moves[:, axis]) for axis in (0, 1)], axis=1)
 
 
 def _states(problem: Problem, member: Float) -> NDArray[np.int8]:
-    """States (N,) of detections; doubtful memberships are summed over, for stars without motion.
+    """States (N,) of the detections: MEMBER, DOUBTFUL or FALSE of `kernel`.
 
-    All detections of a star with few are doubtful if one is: another one may have the right
-    members.
+    Only stars without proper motion have doubtful detections.  If a star with few detections has a
+    doubtful one, all its detections are doubtful, since the true members may be other ones.
     """
     out = np.where(member > 0.5, kernel.MEMBER, kernel.FALSE).astype(np.int8)
     if problem.n_star > 2:
         return out
     doubtful = member < SURE
-    few = problem.counts <= kernel.MOST_DOUBTFUL
+    has_few = problem.counts <= kernel.MOST_DOUBTFUL
     open_stars = np.bincount(problem.star, doubtful) > 0
-    out[(few & open_stars)[problem.star]] = kernel.DOUBTFUL
-    # of many detections the most doubtful ones
-    rest = np.flatnonzero(doubtful & (member > NEVER) & ~few[problem.star])
-    rest = rest[np.lexsort((np.abs(member[rest] - 0.5), problem.star[rest]))]
-    star = problem.star[rest]
-    rank = np.arange(len(rest)) - np.searchsorted(star, star)
-    out[rest[rank < kernel.MOST_DOUBTFUL]] = kernel.DOUBTFUL
+    out[(has_few & open_stars)[problem.star]] = kernel.DOUBTFUL
+    # for stars with many detections only the most doubtful ones
+    candidates = np.flatnonzero(doubtful & (member > NEVER) & ~has_few[problem.star])
+    candidates = candidates[
+        np.lexsort((np.abs(member[candidates] - 0.5), problem.star[candidates]))
+    ]
+    star = problem.star[candidates]
+    rank = np.arange(len(candidates)) - np.searchsorted(star, star)
+    out[candidates[rank < kernel.MOST_DOUBTFUL]] = kernel.DOUBTFUL
     return out
 
 
 def log_marginal(problem: Problem, theta: Float, mixtures: Float, modes: StarModes) -> Float:
-    """Log densities (n,) of theta (n, D), the stars integrated out (Laplace), up to a constant.
+    """Log densities (n,) of theta (n, D) with the stars integrated out (Laplace).
 
-    `mixtures` (n, 2) are jitter in pixels and fraction of false detections; the search for the
-    stars' modes starts from `modes`, of a solution near by.
+    They are up to a constant.  `mixtures` (n, 2) are the jitter in pixels and the fraction of false
+    detections.  `modes` of a nearby solution provide the starting points for the stars' modes.
     """
     p = problem
     rows = np.array([Mixture(j, f).constants(p.log_outlier) for j, f in mixtures])
     out = np.empty(len(theta))
-    # a multiple of eight, as in a vector instruction
+    # a multiple of eight draws, to fill SIMD vectors
     step = max(8, SCRATCH // (16 * p.model.n_terms * len(p.groups)) // 8 * 8)
     for a in range(0, len(theta), step):
-        some = slice(a, a + step)
-        with threads_for(MODE * len(p) * len(theta[some])):
+        draws = slice(a, a + step)
+        with threads_for(MODE * len(p) * len(theta[draws])):
             sums = kernel.log_marginals(
                 p.columns,
                 modes.stars,
                 modes.middles,
                 modes.response,
                 modes.state,
-                p.effective(theta[some]),
+                p.effective(theta[draws]),
                 p.model.order,
-                rows[some],
+                rows[draws],
                 p.least_root,
             )
-        out[some] = sums.sum(axis=0)
+        out[draws] = sums.sum(axis=0)
     return out

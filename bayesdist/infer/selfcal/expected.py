@@ -1,7 +1,7 @@
-"""Information of exposures before any is taken: the Fisher information at a truth.
+"""Expected covariance for planned exposures: the Fisher information at assumed true parameters.
 
-Only the positions of the stars matter: residuals enter the curvature of the log density only
-through memberships, and here every detection lies on its star.
+The information depends only on the positions of the stars.  Residuals would enter it only through
+the membership probabilities, and here all detections are at the positions of their stars.
 """
 
 from __future__ import annotations
@@ -21,44 +21,44 @@ from bayesdist.model import DistortionModel
 from bayesdist.utils.arrays import Float
 from bayesdist.utils.quantities import Random, generator_of
 
-BOUNDED = 1e-3  # fraction of a free direction that the others may leave unexplained
+BOUNDED = 1e-3  # largest unexplained fraction of a free direction for bounded errors
 NONE_FALSE = Mixture(jitter=0.0, fraction=1e-300)
 
 
 @dataclass(frozen=True, eq=False)
 class ExpectedSolution(Solution):
-    """Expected solution without noise: its mean is the truth."""
+    """Expected solution: its mean is the assumed truth, its covariance the expected one."""
 
     model: DistortionModel
-    mean: Float  # the truth (D,)
-    cov: Float  # (D, D) zero for parameters that the gauge fixes
+    mean: Float  # true parameters (D,)
+    cov: Float  # covariance (D, D); zero for parameters that the gauge fixes
     gauge: Gauge
     problem: Problem  # detections that would be used, sorted by star
 
     def draws(self, n: int, rng: Random) -> Float:
-        """Parameter vectors (n, D)."""
+        """Draws (n, D) from the Gaussian with this mean and covariance; see `Solution.draws`."""
         generator = generator_of(rng)
         return np.asarray(generator.multivariate_normal(self.mean, self.cov, n, method="eigh"))
 
     def up_to(self, directions: Float) -> Float:
-        """Covariance (D, D) without the errors along directions (D, d), as of `gauge_free_matrix`.
+        """Covariance (D, D) without errors along the directions (D, d); see `gauge_free_matrix`.
 
-        No number of it means anything unless these directions bound the errors.
+        It is meaningful only if `bounded_by` is True for these directions.
         """
         S = gauge_free_matrix(self.model, self.mean, directions)
         return np.asarray(S @ self.cov @ S.T)
 
     def bounded_by(self, directions: Float) -> bool:
-        """Boolean: no directions are open but these (D, d); else nothing bounds the errors."""
+        """True if errors are bounded apart from those along the given directions (D, d)."""
         free, model = self.gauge.open, self.model
         if not free.shape[1]:
             return True
-        left = gauge_free_matrix(model, self.mean, directions) @ free
-        return _largest(left, model) <= BOUNDED * _largest(free, model)
+        remainder = gauge_free_matrix(model, self.mean, directions) @ free
+        return _largest(remainder, model) <= BOUNDED * _largest(free, model)
 
 
 def _largest(change: Float, model: DistortionModel) -> float:
-    """Largest coefficient of the polynomials in some changes (D, k) of the parameters."""
+    """Largest absolute change of a polynomial coefficient in changes (D, k) of the parameters."""
     return float(np.abs(change[: model.n_polynomial]).max())
 
 
@@ -70,13 +70,13 @@ def expected_solution(
     *,
     min_detections: int = 2,
 ) -> ExpectedSolution:
-    """Covariance that a self-calibration would have, its stars marginalised.
+    """Compute the expected covariance of a self-calibration, marginalised over the stars.
 
-    `detections` have the positions of stars, their codes and errors, and no noise; `prior` is from
-    other sources; `min_detections` are those of a star.  InputError when no star is
-    seen often enough.
+    `truth` (D,) are the true parameters.  `detections` are the noise-free positions of stars, with
+    star codes and errors; `prior` is information from other sources; `min_detections` is the
+    minimum number of detections of a star.  Raises InputError if no star has enough detections.
     """
-    # false detections are not drawn, so that their largest distance does not matter
+    # there are no false detections, so the match radius does not matter
     problem = prepare(model, detections, truth, match_radius=1.0, min_detections=min_detections)
     stars = problem.mean_places(truth)
     problem = problem.at(truth, stars)

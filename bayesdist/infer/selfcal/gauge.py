@@ -1,9 +1,9 @@
-"""Directions in which detections alone leave the solution free, and their names.
+"""Gauge: directions in parameter space that the detections do not determine, with their names.
 
-Stars that move as the model moves leave every residual unchanged.  A linear map of the whole sky is
-such a move as far as the exposures can follow it: shift, rotation and scale always, skew where all
-exposures have one roll angle.  Free directions are found from the current curvature, and they are
-named by the moves that can be written down.
+If the stars move together with the model, all residuals are unchanged.  A linear map of the entire
+sky is such a move if the exposures can follow it: always for a shift, a rotation or a change of
+scale, and for a skew if all exposures have the same roll angle.  Free directions are found from
+the curvature of the log density, and are named by comparing them with such moves.
 """
 
 from __future__ import annotations
@@ -28,78 +28,108 @@ from bayesdist.infer.selfcal.sky_moves import (
 from bayesdist.model import DistortionModel
 from bayesdist.utils.arrays import Float, Int
 
-NULL = 1e-10  # of the largest eigenvalue: no information
-ROUNDING = 1e-13  # of the largest eigenvalue: less is only rounding
-FREE_PIX = 10.0  # error at the detector's edge above which a direction counts as free
-WEAK_PIX = 0.1  # error at the detector's edge above which a direction counts as nearly free
-FAR = 3.0  # times the final error: information no better than this does not fix a direction
-EXPLAINED = 1e-2  # fraction of a free direction that its names may leave out
-SAME_ROLL = np.radians(0.1)
-TIE = 0.02  # relative preference for the first of nearly equal parameters over the last
-MIN_PIVOT = 0.02
-HIDDEN = 1e-5  # of a property that lies along undetermined directions: it is free
+NULL = 1e-10  # relative eigenvalue below which a direction has no information
+ROUNDING = 1e-13  # relative eigenvalue that is due to rounding only
+FREE_PIX = 10.0  # error in pixels at the detector's edge above which a direction counts as free
+WEAK_PIX = 0.1  # error in pixels at the detector's edge above which it counts as nearly free
+FAR = 3.0  # other information must be better than the detections by this factor to fix a property
+EXPLAINED = 1e-2  # largest fraction of a free direction that named moves may leave unexplained
+SAME_ROLL = np.radians(0.1)  # roll angles that differ by less count as equal
+TIE = 0.02  # relative preference for the first of nearly equivalent parameters over the last
+MIN_PIVOT = 0.02  # smallest pivot for which a parameter is fixed
+HIDDEN = 1e-5  # fraction of a property along undetermined directions above which it is free
 
 
 @dataclass(frozen=True, eq=False)
 class NamedDirection:
-    """A property of the solution, and its error."""
+    """A property of the solution, such as its scale or rotation, with its error.
 
-    # of `GENERATORS`, relative; 'zero_point_u', 'zero_point_v'; of another chip against the first
-    # with its name before: 'WFC1.shift_u', 'WFC1.rotation',
+    Parameters
+    ----------
+    name : str
+        A key of `GENERATORS` (relative changes); 'zero_point_u', 'zero_point_v'; or a property of
+        another chip relative to the first one, such as 'WFC1.shift_u' or 'WFC1.rotation'.
+    unit : str
+    sigma : float
+        Error from the detections alone; infinite if they do not determine it.
+    sigma_fixed : float
+        Error with information from other sources; infinite if the gauge fixes it by convention.
+    edge_pix : float
+        Displacement in pixels at the detector's edge for one unit of the property.
+    """
+
     name: str
     unit: str
-    sigma: float  # from the detections alone; infinite where these do not determine it
-    # with information from other sources; infinite where the gauge fixes it by convention
+    sigma: float
     sigma_fixed: float
-    edge_pix: float  # displacement by one unit of it at the edge of the detector, pixels
+    edge_pix: float
 
     @property
     def free(self) -> bool:
-        """True if the detections do not determine it."""
+        """True if the detections do not determine the property."""
         return not np.isfinite(self.sigma)
 
     @property
     def weak(self) -> bool:
-        """True if the detections hardly determine it."""
+        """True if the detections hardly determine the property, or not at all."""
         return self.free or self.sigma * self.edge_pix > WEAK_PIX
 
     @property
     def by_detections(self) -> bool:
-        """True if no other information makes it much better known than the detections."""
-        known = np.isfinite(self.sigma) and np.isfinite(self.sigma_fixed)
-        return bool(known and self.sigma < FAR * self.sigma_fixed)
+        """True if other information does not improve the property by at least a factor of 3."""
+        finite = np.isfinite(self.sigma) and np.isfinite(self.sigma_fixed)
+        return bool(finite and self.sigma < FAR * self.sigma_fixed)
 
 
 @dataclass(frozen=True, eq=False)
 class Decision:
-    """Directions taken as free and parameters fixed by convention, stored with a solution.
+    """Number of free directions and the parameters fixed by convention, stored with a solution.
 
-    The error of a direction depends on where it is evaluated, and near a limit two answers would
-    differ: then parameters would be fixed, and so have no error, that belong to no free direction.
+    The error of a direction depends on the parameters at which it is evaluated.  Close to a limit,
+    a second evaluation might differ, and parameters would be fixed (and have no error) that do not
+    belong to a free direction.
     """
 
-    n_null: int  # directions that the detections leave free
-    n_open: int  # of those, directions that are free even with information from other sources
-    held: Int  # parameters (n_open,) that are fixed
+    n_null: int  # number of directions that the detections do not determine
+    n_open: int  # number of these that are free even with information from other sources
+    held: Int  # indices (n_open,) of the parameters that are fixed
 
 
 @dataclass(frozen=True, eq=False)
 class Gauge:
-    """The free directions of a problem, and what fixes them."""
+    """Free directions of a problem, and the constraints that fix them.
 
-    null: Float  # (D, d), basis of the directions that detections leave free
-    # (D, k), of those, directions that are free even with information from other sources
+    Parameters
+    ----------
+    null : ndarray, shape (D, d)
+        Basis of the directions that the detections do not determine.
+    open : ndarray, shape (D, k)
+        Basis of the directions that are free even with information from other sources.
+    held : ndarray of int, shape (k,)
+        Indices of the parameters that are fixed to determine the others.
+    directions : tuple of NamedDirection
+    unnamed : tuple of str
+        Names of the largest parameters in free directions that no `NamedDirection` describes.
+    weakest : ndarray, shape (w, 2)
+        Error in pixels of each nearly free combination of parameters, and the index of its largest
+        parameter.
+    spread : float
+        Largest difference of two roll angles in radians, modulo half a turn.
+    whole : tuple of str
+        Linear maps of the entire sky that are free, from `GENERATORS`.
+    rates : tuple of str
+        Moves of the entire sky with time that are free if stars have proper motions, from `RATES`
+        and `PARALLAX`.
+    """
+
+    null: Float
     open: Float
-    held: Int  # (k,), parameters that are fixed, so that the others are determined
+    held: Int
     directions: tuple[NamedDirection, ...]
-    # largest parameters in free directions which the names do not describe
     unnamed: tuple[str, ...]
-    # (w, 2), of each nearly free combination of parameters: its error in pixels, and index of the
-    # largest parameter in it
     weakest: Float
-    spread: float  # largest difference of two roll angles, radians, a half turn counted as none
-    whole: tuple[str, ...] = ()  # moves of the whole sky that are free, of `GENERATORS`
-    # where stars move: moves of the whole sky with time that are free, of `RATES`, and `PARALLAX`
+    spread: float
+    whole: tuple[str, ...] = ()
     rates: tuple[str, ...] = ()
 
     @property
@@ -109,28 +139,33 @@ class Gauge:
 
     @property
     def free_names(self) -> tuple[str, ...]:
-        """Names of the properties that detections leave free."""
-        return tuple(one.name for one in self.directions if one.free)
+        """Names of the properties that the detections do not determine."""
+        return tuple(direction.name for direction in self.directions if direction.free)
 
     @property
     def sentences(self) -> tuple[str, ...]:
-        """Sentences on each undetermined property, its reason and its constraint."""
+        """Sentences about each undetermined property, the reason, and its constraint."""
         return tuple(text for text, _ in self._remarks)
 
     @property
     def settled(self) -> tuple[str, ...]:
-        """Those of `sentences` on what no detection can determine and the gauge fixes.
+        """Subset of `sentences` about properties that detections can never determine.
 
-        Scale, rotation and zero point on the sky are free without a catalogue, and common motions
-        with them: the gauge is a choice, and nothing is wrong with the data.
+        Scale, rotation, zero point and common motions on the sky are free without a catalogue.
+        They are fixed by convention and do not indicate a problem with the data.
         """
         return tuple(text for text, is_settled in self._remarks if is_settled)
 
     @property
+    def unsettled(self) -> tuple[str, ...]:
+        """Those of `sentences` on what other data or priors would determine."""
+        return tuple(text for text, is_settled in self._remarks if not is_settled)
+
+    @property
     def _remarks(self) -> list[tuple[str, bool]]:
-        """Each of `sentences`, and True if it is `settled`."""
+        """Each of `sentences`, with True if it belongs to `settled`."""
         out, free = list[tuple[str, bool]](), set(self.free_names)
-        # the degeneracy with a skew of the sky is reported at once
+        # the degeneracy with a skew of the sky is reported in one sentence
         skew = {"skew_plus", "skew_cross"}
         named = set(POINTS) | (skew if skew & set(self.whole) else set())
         if skew <= named and skew <= free and self.spread < SAME_ROLL:
@@ -142,22 +177,28 @@ class Gauge:
         elif skew <= named:
             text = "a linear skew of the distortion cannot be told from one of the sky"
             out.append((text, False))
-        for one in self.directions:
-            if one.free and one.name == "scale":
-                out.append((f"scale: not determined by the detections; {_fixed(one)}", True))
-            elif one.free and one.name == "rotation":
-                out.append((f"rotation on the sky: free; {_fixed(one)}", True))
-            elif one.free and one.name not in named:
-                out.append((f"{one.name}: not determined by the detections; {_fixed(one)}", False))
-            elif one.weak and not one.free:
+        for direction in self.directions:
+            if direction.free and direction.name == "scale":
+                out.append((f"scale: not determined by the detections; {_fixed(direction)}", True))
+            elif direction.free and direction.name == "rotation":
+                out.append((f"rotation on the sky: free; {_fixed(direction)}", True))
+            elif direction.free and direction.name not in named:
+                out.append(
+                    (
+                        f"{direction.name}: not determined by the detections; {_fixed(direction)}",
+                        False,
+                    )
+                )
+            elif direction.weak and not direction.free:
                 text = (
-                    f"{one.name}: nearly free, {one.sigma:.2g} {one.unit} from the detections alone"
-                    f" ({one.sigma * one.edge_pix:.2g} pix at the edge); {_fixed(one)}"
+                    f"{direction.name}: nearly free, {direction.sigma:.2g} {direction.unit} from "
+                    f"the detections alone ({direction.sigma * direction.edge_pix:.2g} pix at the "
+                    f"edge); {_fixed(direction)}"
                 )
                 out.append((text, False))
         if set(POINTS) <= free:
-            points = [one for one in self.directions if one.name in POINTS]
-            worst = max(points, key=lambda one: one.sigma_fixed)
+            points = [direction for direction in self.directions if direction.name in POINTS]
+            worst = max(points, key=lambda direction: direction.sigma_fixed)
             text = (
                 f"zero point on the sky: free; {_fixed(worst)}"
                 if np.isfinite(worst.sigma_fixed)
@@ -197,21 +238,22 @@ def find_gauge(
     known: Float | None = None,
     decision: Decision | None = None,
 ) -> Gauge:
-    """Free directions of a problem at a solution.
+    """Find the free directions of a problem at a solution theta (D,).
 
-    `curvature` (D, D) is that of the detections, with EM weights: indefinite only by rounding.
-    `known` (D, D) includes the priors of the stars; it equals `curvature` by default.  Without a
-    `decision` on the free directions it is made here.
+    `curvature` (D, D) is minus the Hessian for the detections alone, with EM weights, so that it is
+    indefinite only by rounding.  `known` (D, D) includes the priors of the stars; it equals
+    `curvature` by default.  The number of free directions is taken from `decision` or, if it is
+    None, determined here.
     """
     model = problem.model
     years = float(np.ptp(problem.groups.epoch)) or 1.0
     scale = parameter_scale(model, theta, years)
-    both = (curvature if known is None else known) + prior.precision
+    informed = (curvature if known is None else known) + prior.precision
     alone, fixed = (
         _Spectrum.of(H * np.outer(scale, scale), n)
         for H, n in (
             (curvature, None if decision is None else decision.n_null),
-            (both, None if decision is None else decision.n_open),
+            (informed, None if decision is None else decision.n_open),
         )
     )
     null, open_ = alone.free, fixed.free
@@ -219,10 +261,10 @@ def find_gauge(
     directions = _directions(model, theta, scale, alone, fixed)
     named = moves(model, theta)
     moving = _rates_of(problem, theta)
-    known_moves = np.stack(  # in pixels at the edge
+    known_moves = np.stack(  # in pixels at the detector's edge
         [row / scale for row in (named | moving).values()], axis=1
     )
-    # a spin bends the paths of stars that move, negligibly
+    # compare with nearly free directions too, since a spin slightly bends the paths of moving stars
     loose = alone.vectors[:, alone.values < WEAK_PIX**-2]
     weak = np.flatnonzero(alone.values[alone.n :] < WEAK_PIX**-2) + alone.n
     weakest = np.array(
@@ -242,16 +284,16 @@ def find_gauge(
 
 
 def _rates_of(problem: Problem, theta: Float) -> dict[str, Float]:
-    """Moves with time of the stars' sky; none where stars do not move."""
+    """Moves (D,) of the entire sky with time, by name; empty if stars have no proper motion."""
     if problem.n_star < 4:
         return {}
     exposure, E = problem.groups.exposure[problem.groups.index], len(problem.model.exposures)
-    seen = np.maximum(np.bincount(exposure, minlength=E), 1)
-    when = np.bincount(exposure, problem.time, E) / seen
+    n_detections = np.maximum(np.bincount(exposure, minlength=E), 1)
+    when = np.bincount(exposure, problem.time, E) / n_detections
     out = rates(problem.model, theta, when - when[0])
-    if problem.n_star == 5:  # exposures are shifted as all stars are
+    if problem.n_star == 5:  # a common parallax shifts the exposures
         out[PARALLAX] = np.zeros(len(theta))
-        of_each = [np.bincount(exposure, f, E) / seen for f in problem.factor.T]
+        of_each = [np.bincount(exposure, f, E) / n_detections for f in problem.factor.T]
         for e in range(1, E):
             block = problem.model.frame_slice(e)
             if block.stop - block.start >= 2:
@@ -260,14 +302,17 @@ def _rates_of(problem: Problem, theta: Float) -> dict[str, Float]:
 
 
 def _within(row: Float, null: Float) -> bool:
-    """True if a move is one of the free directions."""
-    left = row - null @ (null.T @ row)
-    return bool(np.linalg.norm(left) < EXPLAINED * np.linalg.norm(row))
+    """True if a move (D,) is within the space of the free directions (D, d)."""
+    remainder = row - null @ (null.T @ row)
+    return bool(np.linalg.norm(remainder) < EXPLAINED * np.linalg.norm(row))
 
 
 @dataclass(frozen=True, eq=False)
 class _Spectrum:
-    """Information by its directions, in pixels at the edge; the first `n` of them count as free."""
+    """Eigenvalues and eigenvectors of the information, in pixels at the detector's edge.
+
+    The first `n` directions count as free.
+    """
 
     values: Float
     vectors: Float
@@ -275,10 +320,10 @@ class _Spectrum:
 
     @classmethod
     def of(cls, scaled: Float, n: int | None) -> _Spectrum:
-        """Spectrum of an information (D, D); by default it decides how many directions are free."""
+        """Spectrum of an information matrix (D, D); if `n` is None, eigenvalues determine it."""
         values, vectors = np.linalg.eigh((scaled + scaled.T) / 2)
-        least = max(NULL * float(values[-1]), FREE_PIX**-2)
-        return cls(values, vectors, int((values < least).sum()) if n is None else n)
+        smallest = max(NULL * float(values[-1]), FREE_PIX**-2)
+        return cls(values, vectors, int((values < smallest).sum()) if n is None else n)
 
     @property
     def free(self) -> Float:
@@ -286,10 +331,10 @@ class _Spectrum:
         return self.vectors[:, : self.n]
 
     def sigma(self, row: Float, edge_pix: float) -> float:
-        """Error of a property, `row` (D,) times the parameters; infinite where it is free.
+        """Error of the property `row` (D,) @ parameters; infinite if it is free.
 
-        A direction that is free though some information on it exists is not exactly one move of the
-        sky: properties in which it has next to no part are determined in spite of it.
+        A free direction about which there is some information is not exactly a move of the sky.
+        Properties to which it contributes very little are determined in spite of it.
         """
         along = self.vectors.T @ row
         unknown = self.values < ROUNDING * self.values[-1]
@@ -304,7 +349,7 @@ class _Spectrum:
 
 
 def _pivots(model: DistortionModel, null: Float) -> Int:
-    """Parameters that leave nothing free once fixed: of the lowest degrees, where possible."""
+    """Indices of parameters to fix so that no direction is free, of lowest degree if possible."""
     d = null.shape[1]
     if not d:
         return np.zeros(0, np.int64)
@@ -318,20 +363,20 @@ def _pivots(model: DistortionModel, null: Float) -> Int:
         ]
     )
     held: list[int] = []
-    left = null.copy()
+    remaining = null.copy()
     for level in np.unique(degree):
         rows = np.flatnonzero(degree == level)
-        if left.shape[1] == 0:
+        if remaining.shape[1] == 0:
             break
-        # u and v have equal shares in a rotation: the first is taken, and rounding does not choose
+        # u and v contribute equally to a rotation: prefer the first, independent of rounding
         tilt = 1.0 - TIE * np.arange(len(rows)) / len(rows)
-        _, R, order = qr(left[rows].T * tilt, pivoting=True, mode="economic")
+        _, R, order = qr(remaining[rows].T * tilt, pivoting=True, mode="economic")
         size = np.abs(np.diag(R))
         take = rows[order[: int((size > MIN_PIVOT).sum())]]
         held += list(take)
-        # still free once these are fixed
+        # directions that are still free with these parameters fixed
         _, s, Vt = np.linalg.svd(null[held])
-        left = null @ Vt[int((s > 1e-9).sum()) :].T
+        remaining = null @ Vt[int((s > 1e-9).sum()) :].T
     return np.array(sorted(held), np.int64)
 
 
@@ -344,19 +389,19 @@ def _directions(
     for name, row in functionals(model, theta).items():
         length = "shift" in name or "zero_point" in name
         edge = 1.0 / pixel if length else half
-        sigma, sigma_fixed = (one.sigma(row * scale, edge) for one in (alone, fixed))
+        sigma, sigma_fixed = (spectrum.sigma(row * scale, edge) for spectrum in (alone, fixed))
         unit = model.unit if length else ""
         out.append(NamedDirection(name, unit, sigma, sigma_fixed, edge))
     return tuple(out)
 
 
 def _unnamed(model: DistortionModel, null: Float, known: Float) -> tuple[str, ...]:
-    """Largest parameters in the part of the free directions that no move of the sky describes."""
+    """Names of the largest parameters in free directions that no move of the sky describes."""
     if not null.shape[1]:
         return ()
     Q, _ = np.linalg.qr(np.concatenate([known, _chip_moves(model)], axis=1))
-    left = null - Q @ (Q.T @ null)
-    U, s, _ = np.linalg.svd(left, full_matrices=False)
+    remainder = null - Q @ (Q.T @ null)
+    U, s, _ = np.linalg.svd(remainder, full_matrices=False)
     out = []
     for k in np.flatnonzero(s > EXPLAINED):
         for at in np.argsort(-np.abs(U[:, k]))[:2]:
@@ -365,7 +410,7 @@ def _unnamed(model: DistortionModel, null: Float, known: Float) -> tuple[str, ..
 
 
 def _chip_moves(model: DistortionModel) -> Float:
-    """Shifts and linear maps (D, n) of each further chip, free if no star ties it to the first."""
+    """Shifts and linear maps (D, n) of all chips but the first; free without common stars."""
     starts = [
         model.coefficient_slice(c.number, axis).start for c in model.chips[1:] for axis in (0, 1)
     ]

@@ -1,9 +1,9 @@
-"""The mode of distortion, frames, stars and memberships, with the parameters fixed by convention.
+"""Joint mode of distortion, frames, stars and memberships, in a gauge that is decided there.
 
-Free directions are found at a solution, and a solution needs the fixed parameters.  With the errors
-of a start more seems free than at the mode; where rolls hardly differ the two answers differ.  So
-the question is asked again at the mode, and the answer is stored with the solution for all later
-uses.
+Free directions are determined at a solution, but finding a solution requires that parameters are
+fixed.  With the large errors of a starting point, more directions seem free than at the mode; for
+example if roll angles hardly differ.  The free directions are therefore determined again at the
+mode, and the decision is stored with the solution for later use.
 """
 
 from __future__ import annotations
@@ -26,46 +26,67 @@ from bayesdist.infer.stars.likelihood import Clip
 from bayesdist.infer.stars.shards import Compute, MappedPieces
 from bayesdist.utils.arrays import Float, Int
 
-PriorAt = Callable[[Float], Prior]  # linearised at parameters (D,)
+PriorAt = Callable[[Float], Prior]  # prior linearised at given parameters (D,)
 
 MAX_PASSES = 80
-MAX_DECREMENT = 1e-5  # decrement (expected gain in log density) at which the mode is found
-NEAR = 1.0  # decrement below which the curvature of the mixture is used
+MAX_DECREMENT = 1e-5  # decrement (expected gain in log density) at convergence
+NEAR = 1.0  # decrement below which the curvature of the mixture is used instead of EM weights
 MAX_CHANGE = 1e-4  # relative change of errors and of the fraction of false detections
-MIN_FRACTION = 1e-5
-# times the robust scatter: errors begin as large as this, so that no star is lost
+MIN_FRACTION = 1e-5  # smallest fraction of false detections
+# initial errors as a multiple of the robust scatter, large enough that no star is lost
 START_SCALE = 3.0
-REJECTED = 25.0  # chi-square of both axes beyond which a detection counts as rejected
+REJECTED = 25.0  # chi-square (sum over both axes) above which a detection counts as rejected
 
 
 @dataclass(frozen=True, eq=False)
 class SelfCalibrationMode:
-    """Mode of a self-calibration."""
+    """Mode of the posterior of a self-calibration.
 
-    problem: Problem  # linearised there
-    theta: Float  # (D,)
-    stars: Float  # (S, q)
-    mixture: Mixture  # errors by moments; fraction of false detections at its mode
-    free: Int  # (F,), parameters that were fitted; the others are fixed by the gauge
+    Parameters
+    ----------
+    problem : Problem
+        Detections, linearised at the mode.
+    theta : ndarray, shape (D,)
+        Parameters of the model.
+    stars : ndarray, shape (S, q)
+        Parameters of the stars.
+    mixture : Mixture
+        Jitter (by moments) and fraction of false detections.
+    free : ndarray of int, shape (F,)
+        Indices of the parameters that were fitted; the gauge fixes the others.
+    expansion : Expansion
+        Expansion of the log density at the mode.
+    curvatures : tuple of ndarray, shape (D, D)
+        Curvatures with EM weights, which are never indefinite: for the detections alone, and
+        including the priors of the stars.
+    prior : Prior
+        Information from other sources than the detections.
+    decision : Decision, optional
+        Free directions; None if only `free` was specified.
+    """
+
+    problem: Problem
+    theta: Float
+    stars: Float
+    mixture: Mixture
+    free: Int
     expansion: Expansion
-    # (D, D), with EM weights, hence never indefinite: by the detections alone, and with the priors
-    # of the stars
     curvatures: tuple[Float, Float]
     prior: Prior
-    decision: Decision | None = None  # directions taken as free; None where only `free` was given
+    decision: Decision | None = None
 
     @property
     def precision(self) -> Float:
-        """Curvature (F, F) of the free parameters, with information from other sources."""
+        """Precision (F, F) of the free parameters, including information from other sources."""
         total = self.expansion.curvature + self.prior.precision
         return np.asarray(total[np.ix_(self.free, self.free)])
 
     @property
     def cov(self) -> Float:
-        """Covariance (D, D); zero for fixed parameters."""
+        """Covariance (D, D) of the parameters of the model; zero for fixed parameters."""
         precision = self.precision
         scale = 1.0 / np.sqrt(np.diag(precision))
-        # a square of roots stays positive where a nearly free direction dwarfs all others
+        # the product of roots stays positive definite even if a nearly free direction dominates
         factor = np.linalg.cholesky(precision * np.outer(scale, scale))
         root = np.linalg.inv(factor).T * scale[:, None]
         out = np.zeros((len(self.theta),) * 2)
@@ -74,32 +95,34 @@ class SelfCalibrationMode:
 
     @property
     def distortion_information(self) -> Float:
-        """Information (d, d) of the detections about polynomials and drift; zero for fixed ones.
+        """Information (d, d) of the detections about polynomials and drift.
 
-        Stars and frames are eliminated.
+        Stars and frames are eliminated.  Rows and columns of fixed parameters are zero.
         """
         n, H = self.problem.model.n_distortion, self.expansion.curvature
-        own, frames = self.free[self.free < n], self.free[self.free >= n]
-        left = H[np.ix_(own, own)]
+        distortion, frames = self.free[self.free < n], self.free[self.free >= n]
+        information = H[np.ix_(distortion, distortion)]
         if frames.size:
-            local, cross = H[np.ix_(frames, frames)], H[np.ix_(own, frames)]
+            local, cross = H[np.ix_(frames, frames)], H[np.ix_(distortion, frames)]
             scale = 1.0 / np.sqrt(np.diag(local))
             half = cross * scale
-            left = left - half @ np.linalg.solve(local * np.outer(scale, scale), half.T)
+            information = information - half @ np.linalg.solve(
+                local * np.outer(scale, scale), half.T
+            )
         out = np.zeros((n, n))
-        out[np.ix_(own, own)] = (left + left.T) / 2
+        out[np.ix_(distortion, distortion)] = (information + information.T) / 2
         return out
 
     @property
     def error(self) -> float:
-        """Typical error of a detection on one axis, pixels."""
+        """Typical error of a detection per axis in pixels."""
         return float(np.sqrt(np.median(self.problem.var) + self.mixture.jitter**2))
 
     @cached_property
     def solution(self) -> LinearFit:
-        """Solution of distortion and frames, with the statistics of the detections' residuals.
+        """Solution for distortion and frames, with the statistics of the residuals.
 
-        The covariance is that of the curvature, with the stars eliminated.
+        Its covariance is the inverse of the curvature with the stars eliminated.
         """
         p, theta = self.problem, self.theta
         wider = 1.0 + self.mixture.jitter**2 / p.sigma**2
@@ -144,13 +167,39 @@ def solve(
     jitter: float | None = None,
     compute: Compute | None = None,
 ) -> SelfCalibrationMode:
-    """Mode by Newton's method with the stars eliminated in each pass.
+    """Find the mode by Newton's method, eliminating the stars in each pass.
 
-    Errors begin as large as the scatter of the start and shrink with it, so that a start that is
-    far off loses no star.  `jitter` is fitted by default; so are `stars` (S, q) and `mixture`,
-    which are starting values.  `compute` is where the passes over the detections are made, in this
-    process by default.  DegenerateError when the parameters `free` are not determined;
-    NotSettledError when it does not converge.
+    The initial errors are as large as the scatter at the start and decrease with it, so that no
+    star is lost if the start is inaccurate.
+
+    Parameters
+    ----------
+    problem : Problem
+    theta : ndarray, shape (D,)
+        Starting parameters.
+    free : ndarray of int, shape (F,)
+        Indices of the parameters to fit.
+    prior : Prior
+        Information from other sources than the detections.
+    stars : ndarray, shape (S, q), optional
+        Starting values of the stars; by default the medians of their detections.
+    mixture : Mixture, optional
+        Starting values of jitter and fraction of false detections.
+    jitter : float, optional
+        Fixed jitter in pixels; fitted by default.
+    compute : Compute, optional
+        Computing engine; this process by default.
+
+    Returns
+    -------
+    SelfCalibrationMode
+
+    Raises
+    ------
+    DegenerateError
+        If the free parameters are not determined.
+    NotSettledError
+        If the search does not converge.
     """
     with _loaded(problem, stars, compute) as loaded:
         begin = _Begun(loaded, theta, mixture, medians=stars is None)
@@ -159,17 +208,17 @@ def solve(
 
 @dataclass(frozen=True, eq=False)
 class _Begun:
-    """Start of a search."""
+    """Starting point of a search."""
 
     pieces: MappedPieces
     theta: Float
-    mixture: Mixture | None = None  # wide errors by default
-    medians: bool = False  # begin with the stars at the medians of their detections
+    mixture: Mixture | None = None  # None to start with large errors
+    medians: bool = False  # True to start with the stars at the medians of their detections
 
 
 @dataclass(frozen=True, eq=False)
 class _Found:
-    """End of a search."""
+    """Result of a search."""
 
     pieces: MappedPieces
     theta: Float
@@ -182,20 +231,27 @@ class _Found:
 
     @property
     def again(self) -> _Begun:
-        """Start of another search from here."""
+        """Starting point of another search from this result."""
         return _Begun(self.pieces, self.theta, self.mixture)
 
     def mode(self, problem: Problem) -> SelfCalibrationMode:
-        """The mode, with all detections in this process."""
-        whole = of.gathered(problem, self.pieces)
-        rest = self.mixture, self.free, self.expansion, self.curvatures, self.prior, self.decision
-        return SelfCalibrationMode(whole.problem, self.theta, whole.stars, *rest)
+        """Collect all detections in this process and return the mode."""
+        gathered = of.gathered(problem, self.pieces)
+        remaining = (
+            self.mixture,
+            self.free,
+            self.expansion,
+            self.curvatures,
+            self.prior,
+            self.decision,
+        )
+        return SelfCalibrationMode(gathered.problem, self.theta, gathered.stars, *remaining)
 
 
 def _loaded(
     problem: Problem, stars: Float | None, compute: Compute | None
 ) -> AbstractContextManager[MappedPieces]:
-    """Context with the pieces of a problem, at given stars (S, q) or at none yet."""
+    """Context with the pieces of a problem, with stars (S, q) or, if None, stars at zero."""
     places = np.zeros((problem.n_stars, problem.n_star)) if stars is None else stars
     return of.in_pieces(problem, places, compute)
 
@@ -208,9 +264,9 @@ def _solved(
     mixture = begin.mixture or wide_mixture(pieces, theta)
     for _ in range(MAX_PASSES):
         at_modes = pieces.map(of.at_modes, theta, mixture, near)
-        found = at_modes.sum(of.expansion_of)
-        gradient = found.gradient + prior.pull(theta)
-        step = newton_step(found.curvature + prior.precision, gradient, free)
+        expansion = at_modes.sum(of.expansion_of)
+        gradient = expansion.gradient + prior.pull(theta)
+        step = newton_step(expansion.curvature + prior.precision, gradient, free)
         if step is None and near:
             near, pieces = False, at_modes
             continue
@@ -223,25 +279,28 @@ def _solved(
         decrement = float(gradient @ step)
         pieces = at_modes.map(of.moved, theta, theta + step)
         theta = theta + step
-        after = _mixture(problem, mixture, found, len(free), jitter)
+        after = _mixture(problem, mixture, expansion, len(free), jitter)
         change = abs(after.fraction / mixture.fraction - 1.0) + abs(
             (problem.var + after.jitter**2).mean() / (problem.var + mixture.jitter**2).mean() - 1.0
         )
         if near and decrement < MAX_DECREMENT and change < MAX_CHANGE:
             pieces = pieces.map(of.at_modes, theta, mixture, True)
-            found, both = pieces.sum(of.expansion_of), curvatures(problem, pieces, theta, mixture)
-            return _Found(pieces, theta, mixture, free, found, both, prior)
+            expansion, at_solution = (
+                pieces.sum(of.expansion_of),
+                curvatures(problem, pieces, theta, mixture),
+            )
+            return _Found(pieces, theta, mixture, free, expansion, at_solution, prior)
         near = decrement < NEAR and change < 0.1
         mixture = after
     raise NotSettledError(
         f"the solution still moves after {MAX_PASSES} passes",
         where="self-calibration",
-        do="give a better start, or lower the order",
+        do="give a better start (selfcal.initial_distortion), or lower the order",
     )
 
 
 def newton_step(curvature: Float, gradient: Float, free: Int) -> Float | None:
-    """Step (D,) of the free parameters; None where the curvature is not positive."""
+    """Newton step (D,) of the free parameters; None if the curvature is not positive definite."""
     H = curvature[np.ix_(free, free)]
     if not (np.diag(H) > 0).all():
         return None
@@ -257,7 +316,7 @@ def newton_step(curvature: Float, gradient: Float, free: Int) -> Float | None:
 
 
 def wide_mixture(pieces: MappedPieces, theta: Float) -> Mixture:
-    """Mixture with errors as large as those of a start."""
+    """Mixture with large errors, estimated from the scatter at a starting point."""
     square = np.concatenate(list(pieces.each(of.squares, theta)))
     # the median of r^2 is 1.386 sigma^2
     return Mixture(START_SCALE * float(np.sqrt(np.median(square) / (2 * np.log(2)))), 0.02)
@@ -266,19 +325,19 @@ def wide_mixture(pieces: MappedPieces, theta: Float) -> Mixture:
 def _mixture(
     problem: Problem, mixture: Mixture, found: Expansion, n_free: int, jitter: float | None
 ) -> Mixture:
-    """Mixture with the fraction of false detections by EM, and the jitter by chi-square."""
+    """Update the mixture: fraction of false detections by EM, jitter by chi-square."""
     n = len(problem)
     fraction = float(np.clip((n - found.n_members) / n, MIN_FRACTION, 0.9))
     if jitter is not None:
         return replace(mixture, fraction=fraction, jitter=jitter)
-    lost = (problem.n_star * problem.n_stars + n_free) / n  # of each detection's two numbers
+    lost = (problem.n_star * problem.n_stars + n_free) / n  # fitted parameters per detection
     dof = max((2.0 - lost) * found.n_members, 1.0)
     s2 = problem.var + mixture.jitter**2
-    # chi-square changes by jitter^2 as the mean of 1 / s^2 does
+    # the derivative of chi-square with respect to jitter^2 is that of the mean of 1 / s^2
     new = mixture.jitter**2 + (found.chi2 / dof - 1.0) / float(np.mean(1.0 / s2))
-    # errors shrink to half at most: as they do, so do the distances of detections from their stars
-    least = (mixture.jitter**2 - 3 * problem.sigma**2) / 4
-    new = min(max(new, least), 4 * mixture.jitter**2 + float(np.median(s2)))
+    # errors are at most halved per step, since the residuals decrease together with them
+    lower = (mixture.jitter**2 - 3 * problem.sigma**2) / 4
+    new = min(max(new, lower), 4 * mixture.jitter**2 + float(np.median(s2)))
     floor = (1e-2 * problem.sigma) ** 2
     return Mixture(float(np.sqrt(max(new, floor))), fraction)
 
@@ -294,13 +353,14 @@ def solve_in_gauge(
     jitter: float | None = None,
     compute: Compute | None = None,
 ) -> SelfCalibrationMode:
-    """Mode of a problem, with the parameters fixed by convention as decided there.
+    """Find the mode of a problem, and determine at the mode which parameters the gauge fixes.
 
-    The search starts at theta (D,), with a `decision` on the free directions that was made near by,
-    or with that at the start; `prior_at` gives information from other sources than the detections,
-    linearised at parameters (D,).  Where the detections determine more at the mode than
-    at the start, that is fitted; where it then turns out to be free after all, it stays fixed.
-    Other arguments, DegenerateError and NotSettledError as `solve`.
+    The search starts at theta (D,) with the free directions of a `decision` from a nearby solution
+    or, if it is None, with those at the start.  Parameters that are determined at the mode but were
+    fixed at the start are then fitted as well, unless they turn out to be free after all.
+
+    `prior_at` returns information from other sources than the detections, linearised at given
+    parameters (D,).  See `solve` for the other arguments and for exceptions.
     """
     prior = prior_at(theta)
 
@@ -309,35 +369,35 @@ def solve_in_gauge(
         return replace(_solved(problem, begin, free, prior, jitter), decision=decision)
 
     def asked_at(found: _Found) -> Decision:
-        alone, known = found.curvatures
-        there = prior_at(found.theta)
-        return find_gauge(problem, found.theta, alone, there, known=known).decision
+        alone, informed = found.curvatures
+        prior_there = prior_at(found.theta)
+        return find_gauge(problem, found.theta, alone, prior_there, known=informed).decision
 
     with _loaded(problem, stars, compute) as loaded:
         begin = _Begun(loaded, theta, mixture, medians=stars is None)
         try:
-            taken = decision or _gauge_at_start(problem, loaded, theta, prior).decision
-            found = solved(taken, begin)
+            current = decision or _gauge_at_start(problem, loaded, theta, prior).decision
+            found = solved(current, begin)
         except (DegenerateError, NotSettledError):
             if decision is None:
                 raise
-            # the detections determine less than those of the decision
-            taken = _gauge_at_start(problem, loaded, theta, prior).decision
-            found = solved(taken, begin)
+            # these detections determine less than those for which the decision was made
+            current = _gauge_at_start(problem, loaded, theta, prior).decision
+            found = solved(current, begin)
         at_mode = asked_at(found)
-        if at_mode.held.size > taken.held.size:
+        if at_mode.held.size > current.held.size:
             return solved(at_mode, found.again).mode(problem)
-        while at_mode.held.size < taken.held.size:
+        while at_mode.held.size < current.held.size:
             try:
                 freer = solved(at_mode, found.again)
             except (DegenerateError, NotSettledError):
                 return found.mode(problem)
-            taken, at_mode = at_mode, asked_at(freer)
-            if at_mode.held.size > taken.held.size:
+            current, at_mode = at_mode, asked_at(freer)
+            if at_mode.held.size > current.held.size:
                 return found.mode(problem)
             found = freer
-        # as many are fixed: the choice of the parameters is arbitrary
-        return replace(found, decision=replace(at_mode, held=taken.held)).mode(problem)
+        # the same number is fixed; keep the parameters, since their choice is arbitrary
+        return replace(found, decision=replace(at_mode, held=current.held)).mode(problem)
 
 
 def mode_at(
@@ -351,39 +411,44 @@ def mode_at(
     *,
     compute: Compute | None = None,
 ) -> SelfCalibrationMode:
-    """Mode that was found before, from its parameters: `problem` is linearised there."""
+    """Restore a mode from its parameters; `problem` must be linearised there."""
     with of.in_pieces(problem, stars, compute) as loaded:
         pieces = loaded.map(of.at_modes, theta, mixture, True)
-        found, both = pieces.sum(of.expansion_of), curvatures(problem, pieces, theta, mixture)
-        return _Found(pieces, theta, mixture, free, found, both, prior, decision).mode(problem)
+        expansion, at_solution = (
+            pieces.sum(of.expansion_of),
+            curvatures(problem, pieces, theta, mixture),
+        )
+        return _Found(pieces, theta, mixture, free, expansion, at_solution, prior, decision).mode(
+            problem
+        )
 
 
 def gauge_of(
     problem: Problem, theta: Float, prior: Prior, solution: SelfCalibrationMode | None = None
 ) -> Gauge:
-    """Free directions of a problem, and what fixes them.
+    """Find the free directions of a problem and their constraints.
 
-    Before there is a solution, stars lie at the means of their detections.  The solution's decision
-    on the free directions is used.
+    If `solution` is given, its decision on the number of free directions is used.  Otherwise the
+    stars are assumed to be at the means of their detections.
     """
     if solution is None:
         with _loaded(problem, None, None) as loaded:
             return _gauge_at_start(problem, loaded, theta, prior)
-    alone, known = solution.curvatures
-    return find_gauge(problem, theta, alone, prior, known=known, decision=solution.decision)
+    alone, informed = solution.curvatures
+    return find_gauge(problem, theta, alone, prior, known=informed, decision=solution.decision)
 
 
 def _gauge_at_start(problem: Problem, loaded: MappedPieces, theta: Float, prior: Prior) -> Gauge:
     pieces = loaded.map(of.at_means, theta)
-    alone, known = curvatures(problem, pieces, theta, wide_mixture(pieces, theta))
-    return find_gauge(problem, theta, alone, prior, known=known)
+    alone, informed = curvatures(problem, pieces, theta, wide_mixture(pieces, theta))
+    return find_gauge(problem, theta, alone, prior, known=informed)
 
 
 def curvatures(
     problem: Problem, pieces: MappedPieces, theta: Float, mixture: Mixture
 ) -> tuple[Float, Float]:
-    """Curvature (D, D) by the detections alone, and with the priors of the stars."""
-    known = pieces.sum(of.expansion, theta, mixture, False, True).curvature
+    """Curvatures (D, D) for the detections alone, and including the priors of the stars."""
+    informed = pieces.sum(of.expansion, theta, mixture, False, True).curvature
     if not problem.priors.informed.any():
-        return known, known
-    return pieces.sum(of.expansion, theta, mixture, False, False).curvature, known
+        return informed, informed
+    return pieces.sum(of.expansion, theta, mixture, False, False).curvature, informed

@@ -1,8 +1,8 @@
-"""Detections in pieces of whole stars, for all passes over them: here or on a cluster.
+"""Division of the detections into pieces, in this process or on a cluster, for the passes.
 
-A piece has its stars at a current solution.  Its next state and its part of every sum depend on the
-piece and on the parameters alone: so no star travels, and a piece that is lost is made again from
-its detections.
+A piece contains all detections of some stars, and the stars at the current solution.  Its next
+state and its contribution to any sum depend only on the piece and on the parameters.  Therefore
+stars are not transferred, and a lost piece can be computed again from its detections.
 """
 
 from __future__ import annotations
@@ -25,23 +25,23 @@ from bayesdist.infer.selfcal.problem import Problem, StarPriors
 from bayesdist.infer.stars.shards import Compute, MappedPieces, Task
 from bayesdist.utils.arrays import Float
 
-PIECE = 2**17  # detections: some tenths of a second for the draws that are evaluated together
+PIECE = 2**17  # detections per piece: a few tenths of a second for a batch of draws
 
 
 @dataclass(frozen=True, eq=False)
 class StarPiece:
-    """Some stars with all their detections."""
+    """Stars with all their detections."""
 
     problem: Problem  # linearised at the stars of the last step
-    stars: Float  # (S, q)
+    stars: Float  # parameters (S, q) of the stars
 
     def __sizeof__(self) -> int:
-        """Bytes of all columns, without which Dask would move a piece as if it were nothing."""
+        """Size of all columns in bytes, which Dask uses to estimate the cost of moving a piece."""
         columns = (*self.problem.columns, self.problem.seen, self.stars)
         return sum(column.nbytes for column in columns)
 
     def split(self, detections: int) -> Iterator[StarPiece]:
-        """Pieces of consecutive stars with about so many detections."""
+        """Divide into pieces of consecutive stars with about `detections` detections each."""
         p = self.problem
         ends = np.searchsorted(p.starts, np.arange(detections, len(p), detections))
         for stars in np.split(np.arange(p.n_stars), np.unique(ends)):
@@ -52,7 +52,7 @@ class StarPiece:
 
 @dataclass(frozen=True, eq=False)
 class Expanded(StarPiece):
-    """Stars at their modes, with the expansion there."""
+    """Stars at their modes, with the expansion of the log density there."""
 
     expansion: Expansion
 
@@ -61,7 +61,7 @@ class Expanded(StarPiece):
 
 
 def at_stars(piece: StarPiece, theta: Float) -> StarPiece:
-    """Piece linearised at theta (D,) and its own stars."""
+    """Piece linearised at theta (D,) and at its current stars."""
     return StarPiece(piece.problem.at(theta, piece.stars), piece.stars)
 
 
@@ -76,13 +76,16 @@ def at_medians(piece: StarPiece, theta: Float) -> StarPiece:
 
 
 def at_modes(piece: StarPiece, theta: Float, mixture: Mixture, observed: bool) -> Expanded:
-    """Piece with the stars at their modes, lost ones found again, and its expansion as `expand`."""
-    found, stars = expand(piece.problem, theta, mixture, piece.stars, observed=observed)
-    return Expanded(piece.problem, piece.problem.found_again(theta, stars), found)
+    """Piece with the stars at their modes, and the expansion there (see `expand`).
+
+    Stars that have moved away from all their detections are reset.
+    """
+    result, stars = expand(piece.problem, theta, mixture, piece.stars, observed=observed)
+    return Expanded(piece.problem, piece.problem.found_again(theta, stars), result)
 
 
 def moved(piece: StarPiece, before: Float, after: Float) -> StarPiece:
-    """Piece at other parameters (D,), the stars moved as the means of their detections are."""
+    """Piece at other parameters (D,), with stars shifted like the means of their detections."""
     p, stars = piece.problem, piece.stars.copy()
     stars[:, :2] += p.shifts(before, after)
     return StarPiece(p.at(after, stars), stars)
@@ -90,19 +93,19 @@ def moved(piece: StarPiece, before: Float, after: Float) -> StarPiece:
 
 @dataclass(frozen=True, eq=False)
 class ModePiece(StarPiece):
-    """Stars at the modes of a solution, and how they follow their detections from there."""
+    """Stars at the modes of a solution, with their response to changes of the parameters."""
 
     modes: StarModes
 
     def __sizeof__(self) -> int:
-        """As `StarPiece`."""
+        """Size of all columns in bytes; see `StarPiece`."""
         m = self.modes
         return super().__sizeof__() + sum(c.nbytes for c in (m.response, m.middles, m.state))
 
 
 def to_sample(piece: StarPiece, theta: Float, mixture: Mixture) -> ModePiece:
-    """Piece of a solution, for densities of draws about it."""
-    # of a star's detections nothing is needed but the columns of the passes
+    """Prepare a piece of a solution for computing the densities of draws near it."""
+    # only the columns that the passes use are needed
     p = replace(piece.problem, seen=np.empty((2, 0)))
     return ModePiece(p, piece.stars, StarModes.at(p, theta, mixture, piece.stars))
 
@@ -111,14 +114,14 @@ def to_sample(piece: StarPiece, theta: Float, mixture: Mixture) -> ModePiece:
 
 
 def expansion_of(piece: Expanded) -> Expansion:
-    """Expansion of a piece that has one."""
+    """Expansion that is stored with a piece."""
     return piece.expansion
 
 
 def expansion(
     piece: StarPiece, theta: Float, mixture: Mixture, observed: bool, priors: bool
 ) -> Expansion:
-    """Expansion as of `expand`, with or without the priors of the stars."""
+    """Expansion of the log density (see `expand`), with or without the priors of the stars."""
     p = piece.problem
     if not priors:
         p = replace(p, priors=StarPriors.none(p.n_stars, p.n_star))
@@ -126,21 +129,21 @@ def expansion(
 
 
 def log_density(piece: ModePiece, theta: Float, mixtures: Float) -> Float:
-    """Log densities (n,) as of `log_marginal`."""
+    """Log densities (n,) of theta (n, D); see `log_marginal`."""
     return log_marginal(piece.problem, theta, mixtures, piece.modes)
 
 
 def slope(piece: ModePiece, theta: Float, mixture: Mixture, observed: bool) -> Expansion:
-    """Expansion at theta (D,) as of `expand`."""
+    """Expansion of the log density at theta (D,); see `expand`."""
     stars = piece.modes.moved(piece.problem, theta)
     return expand(piece.problem, theta, mixture, stars, observed=observed)[0]
 
 
-# -- results of each piece ------------------------------------------------------------------------
+# -- results per piece ----------------------------------------------------------------------------
 
 
 def squares(piece: StarPiece, theta: Float) -> Float:
-    """Squared distances (N,) of detections from their stars."""
+    """Squared distances (N,) of the detections from their stars, in square pixels."""
     return piece.problem.squares(theta, piece.stars)
 
 
@@ -150,7 +153,7 @@ def _state(piece: StarPiece) -> tuple[Float, ...]:
 
 
 def gathered(problem: Problem, pieces: MappedPieces) -> StarPiece:
-    """All stars of a problem as one piece, in the state of its pieces."""
+    """Collect the pieces of a problem in a single piece."""
     states = pieces.each(_state)
     X, Y, offset, W, stars = (
         columns[0] if len(columns) == 1 else np.concatenate(columns)
@@ -159,24 +162,24 @@ def gathered(problem: Problem, pieces: MappedPieces) -> StarPiece:
     return StarPiece(replace(problem, X=X, Y=Y, offset=offset, W=W), stars)
 
 
-# -- where they are -------------------------------------------------------------------------------
+# -- location of the pieces -----------------------------------------------------------------------
 
 
 @contextmanager
 def in_pieces(
     problem: Problem, stars: Float, compute: Compute | None = None
 ) -> Iterator[MappedPieces]:
-    """Context with detections and stars (S, q): one piece in this process, or many on a cluster.
+    """Context with the detections and stars (S, q) as a single piece here or many on a cluster.
 
-    InputError as `ClusterPieces`.
+    Raises InputError like `ClusterPieces`.
     """
-    whole = StarPiece(problem, stars)
-    pieces: MappedPieces = _Whole(whole)
+    piece = StarPiece(problem, stars)
+    pieces: MappedPieces = _Whole(piece)
     if compute is not None and compute.engine == "dask":
-        # dask is imported where it is asked for
+        # dask is imported only if its engine is requested
         from bayesdist.infer.stars.cluster import ClusterPieces
 
-        pieces = ClusterPieces(_same, whole.split(PIECE), compute)
+        pieces = ClusterPieces(_same, piece.split(PIECE), compute)
     try:
         yield pieces
     finally:
@@ -184,21 +187,21 @@ def in_pieces(
 
 
 def each_of(compute: Compute | None, function: Task, sources: Iterable[Any]) -> Iterable[Any]:
-    """Results of a function of each source, in their order: one at a time here, or on a cluster.
+    """Results of a function for each source, in their order, computed here or on a cluster.
 
-    InputError as `ClusterPieces`.
+    Raises InputError like `ClusterPieces`.
     """
     if compute is None or compute.engine != "dask":
         return map(function, sources)
     from bayesdist.infer.stars.cluster import ClusterPieces
 
-    with closing(ClusterPieces(function, sources, compute)) as made:
-        return list(made.each(_same))
+    with closing(ClusterPieces(function, sources, compute)) as pieces:
+        return list(pieces.each(_same))
 
 
 @contextmanager
 def one_cluster(compute: Compute | None) -> Iterator[Compute | None]:
-    """Context in which all `in_pieces` of its compute share one cluster, where that is one."""
+    """Context in which all calls of `in_pieces` with the yielded compute share one cluster."""
     if compute is None or compute.engine != "dask":
         yield compute
         return
@@ -209,7 +212,7 @@ def one_cluster(compute: Compute | None) -> Iterator[Compute | None]:
 
 
 class _Whole(MappedPieces):
-    """One piece in this process, whose passes use its threads."""
+    """A single piece in this process; passes use its threads."""
 
     def __init__(self, piece: Any) -> None:
         self._piece = piece
@@ -219,17 +222,17 @@ class _Whole(MappedPieces):
         return task(self._piece, *args)
 
     def each(self, task: Task, *args: Any) -> tuple[Any]:
-        """Result of the task, alone."""
+        """Result of the task as a tuple of one item."""
         return (task(self._piece, *args),)
 
     def map(self, task: Task, *args: Any) -> Self:
-        """Piece that the task makes."""
+        """New piece from the task."""
         return type(self)(task(self._piece, *args))
 
     def close(self) -> None:
-        """Nothing is to be released."""
+        """Do nothing, as there is nothing to release."""
 
 
 def _same(piece: Any) -> Any:
-    """On a worker: the piece as it was sent, to be kept there; or as it was made, to be fetched."""
+    """Return the piece (runs on a worker), to keep it there or to fetch it."""
     return piece

@@ -1,8 +1,8 @@
-"""Posterior of a self-calibration, the stars integrated out: density, proposal and draws.
+"""Posterior of a self-calibration with the stars integrated out: density, proposal and draws.
 
-The proposal is Laplace approximations at several jitters, as for matched stars (`GridProposal`),
-but with nodes that are found in few passes: with the stars eliminated a pass is expensive, and many
-detections leave the jitter little room.
+The proposal consists of Laplace approximations at several values of the jitter, as for matched
+stars (`GridProposal`).  Its nodes are found in few passes, because a pass with elimination of the
+stars is expensive, and many detections determine the jitter well.
 """
 
 from __future__ import annotations
@@ -34,27 +34,27 @@ from bayesdist.infer.stars.mixture import Hyper, OutlierMixture
 from bayesdist.infer.stars.shards import Compute, Pieces
 from bayesdist.utils.arrays import Float
 
-DROP = 18.0  # distance (in log density) below the top to which the nodes extend
-N_NODES = 13  # 9 lose 0.2 % of the draws where the jitter has no lower end, 25 gain nothing
-# relative change of the squared errors from the first node to the last, below which the nodes are
-# interpolated between so many
+DROP = 18.0  # the nodes extend to this log density below the maximum
+N_NODES = 13  # 9 nodes lose 0.2 % of the draws if the jitter may be zero; 25 gain nothing
+# if the squared errors change by less than LINEAR from the first node to the last, nodes are
+# interpolated between N_EXACT modes
 LINEAR, N_EXACT = 0.1, 4
-MAX_DECREMENT = 1e-4  # decrement at which a node is found
-MAX_STEPS = 12
-MAX_ITERATIONS = 10  # in each of which the mesh of log j is narrowed by seven: to 1e-8
-MIN_EFFECT = 0.02  # change of the log density beyond which the jitter has an effect
-MIN_JITTER = 1e-3  # of the median error: no jitter
-# cost of a detection in a pass, in matched stars: its star's mode is found anew each time
+MAX_DECREMENT = 1e-4  # decrement at which the mode of a node has converged
+MAX_STEPS = 12  # maximum number of Newton steps per node
+MAX_ITERATIONS = 10  # refinements of the mesh of log j, each by a factor of seven
+MIN_EFFECT = 0.02  # change of the log density above which the jitter has an effect
+MIN_JITTER = 1e-3  # jitter relative to the median error that is negligible
+# cost of a detection relative to that of a matched star, because the star's mode must be found
 RELATIVE_COST = 60
 
 
 @dataclass(frozen=True, eq=False)
 class SelfTarget:
-    """Density of psi = (free parameters, log j, logit f); j in pixels."""
+    """Posterior density of psi = (free parameters, log j, logit f), with the jitter j in pixels."""
 
-    solution: SelfCalibrationMode  # the mode; parameters that it fixes stay there
+    solution: SelfCalibrationMode  # the mode; fixed parameters keep their values there
     pieces: Pieces  # its detections
-    outliers: OutlierMixture | None = None  # in pixels; as by `mixture` by default
+    outliers: OutlierMixture | None = None  # in pixels; default: see `mixture`
 
     @property
     def problem(self) -> Problem:
@@ -68,12 +68,12 @@ class SelfTarget:
 
     @cached_property
     def mixture(self) -> OutlierMixture:
-        """Mixture with uniform false detections, in pixels."""
+        """Outlier model in pixels; by default uniform false detections."""
         return self.outliers or OutlierMixture("uniform", self.problem.match_radius)
 
     @cached_property
     def hyper(self) -> Hyper:
-        """Priors of jitter and fraction of false detections."""
+        """Priors of the jitter and the fraction of false detections."""
         return self.mixture.bind(self.problem.sigma)
 
     @property
@@ -88,19 +88,19 @@ class SelfTarget:
         return (*(all_names[k] for k in self.solution.free), *self.hyper.names)
 
     def theta(self, free: Float) -> Float:
-        """Parameters (..., D) from free ones (..., F)."""
+        """All parameters (..., D) from the free parameters (..., F)."""
         out = np.tile(self.solution.theta, (*free.shape[:-1], 1))
         out[..., self.solution.free] = free
         return out
 
     def mixtures(self, hyper: Float) -> Float:
-        """Jitter and fraction of false detections (n, 2) of sampled coordinates."""
+        """Jitter in pixels and fraction of false detections (n, 2) from sampled coordinates."""
         values = self.hyper.values(hyper)
         j = values.get("j", np.full(len(hyper), self.mixture.jitter or 0.0))
         return np.stack([j, values["f"]], axis=1)
 
     def log_density(self, psi: Float) -> Float:
-        """Log posterior (n,) of points (n, F + h); minus infinity outside the support."""
+        """Log posterior (n,) of points psi (n, F + h); minus infinity outside the support."""
         ok = np.isfinite(psi).all(axis=1)
         out = np.full(len(psi), -np.inf)
         if not ok.any():
@@ -127,13 +127,31 @@ def sample_selfcal(
     progress: Callable[[int, int], None] | None = None,
     compute: Compute | None = None,
 ) -> Posterior:
-    """Sample distortion, frames, jitter and fraction of false detections.
+    """Sample the posterior of a self-calibration, with the stars integrated out.
 
-    `outliers`: in pixels; uniform within the match radius by default. `seed`, `ensembles`,
-    `target_ess`, `target_rhat`, `max_steps`, `checkpoint_every`, `folder`, `progress`: as `sample`.
-    `compute`: where the passes over the detections are made; in this process by default. Result:
-    with errors in the unit of u, v. Parameters that the gauge fixes have one value in all draws and
-    are not judged. DegenerateError, InputError as `sample`.
+    Parameters
+    ----------
+    solution : SelfCalibrationMode
+    outliers : OutlierMixture, optional
+        Outlier model in pixels; by default false detections are uniform within the match radius.
+    seed, ensembles, target_ess, target_rhat, max_steps, checkpoint_every, folder, progress
+        See `bayesdist.sample`.
+    compute : Compute, optional
+        Computing engine; this process by default.
+
+    Returns
+    -------
+    Posterior
+        Draws of distortion, frames, jitter and fraction of false detections, with the jitter in the
+        unit of u, v. Parameters that the gauge fixes are constant and are not checked for
+        convergence.
+
+    Raises
+    ------
+    DegenerateError
+        If the detections do not determine the free parameters.
+    InputError
+        If the checkpoints belong to other data or settings, or files cannot be written.
     """
     seeds = ensemble_seeds(seed, ensembles)
     started = time.monotonic()
@@ -171,7 +189,7 @@ def sample_selfcal(
 
 
 def _in_unit(posterior: Posterior, pixel: float) -> Posterior:
-    """Posterior whose errors are pixels, with errors in the unit of u, v like all others."""
+    """Convert the errors of a posterior from pixels to the unit of u, v."""
     m, hyper = posterior.mixture, dict(posterior.hyper)
     if "j" in hyper:
         hyper["j"] = pixel * hyper["j"]
@@ -190,7 +208,7 @@ def _in_unit(posterior: Posterior, pixel: float) -> Posterior:
 
 
 def _fingerprint(solution: SelfCalibrationMode, *settings: object) -> str:
-    """Fingerprint of everything that must not change between a run and its resumption."""
+    """Hash of the data, model and settings, which a resumed run must share."""
     p, digest = solution.problem, hashlib.sha256()
     for column in (p.seen, p.var, p.starts, p.groups.index, solution.theta):
         digest.update(np.ascontiguousarray(column).data)
@@ -199,17 +217,17 @@ def _fingerprint(solution: SelfCalibrationMode, *settings: object) -> str:
 
 
 def propose(target: SelfTarget) -> GridProposal:
-    """Proposal with nodes over all but 1e-8 of the posterior of the jitter.
+    """Build the grid proposal; its nodes cover all but 1e-8 of the posterior of the jitter.
 
-    DegenerateError when a node has no mode.
+    Raises DegenerateError if no mode is found at a node.
     """
     split = Split(
         target.n_theta, target.mixture.hyper, tuple(k for k in target.mixture.hyper if k == "j")
     )
     if not split.held:
         z, bend = _fraction(target, split, np.zeros(0))
-        known = target.mixture.jitter or 0.0
-        return _grid(target, split, np.zeros((1, 0)), [_mode(target, known, z)], z, bend)
+        jitter = target.mixture.jitter or 0.0
+        return _grid(target, split, np.zeros((1, 0)), [_mode(target, jitter, z)], z, bend)
     at, top = _nodes_at(target)
     z, bend = _fraction(target, split, np.array([top]))
     modes = _modes(target, np.exp(2 * at), z)
@@ -217,10 +235,11 @@ def propose(target: SelfTarget) -> GridProposal:
 
 
 def _fraction(target: SelfTarget, split: Split, at: Float) -> tuple[float, float]:
-    """Cube root of the most probable fraction of false detections, and its curvature.
+    """Cube root of the most probable fraction of false detections, and the curvature there.
 
-    From the density with the stars integrated out: at their modes the fraction would be biased low,
-    for a detection that may be false leaves its star more room.  It hardly depends on the jitter.
+    It is computed with the stars integrated out.  At the stars' modes the fraction would be biased
+    low, because a star is less well determined if one of its detections may be false.  The fraction
+    hardly depends on the jitter.
     """
     solution = target.solution
     n = len(target.problem)
@@ -232,7 +251,7 @@ def _fraction(target: SelfTarget, split: Split, at: Float) -> tuple[float, float
         psi = split.to_psi(y, np.tile(at, (5, 1)))
         value = target.log_density(psi) + split.log_jacobian(y)
         a, b, _ = np.polyfit(mesh - z, value - value[2], 2)
-        if a >= 0:  # still on the slope
+        if a >= 0:  # not yet near the maximum
             z = float(mesh[int(np.argmax(value))])
             continue
         move = float(np.clip(-b / (2 * a), -2 * step, 2 * step))
@@ -243,14 +262,14 @@ def _fraction(target: SelfTarget, split: Split, at: Float) -> tuple[float, float
 
 
 def _nodes_at(target: SelfTarget) -> tuple[Float, float]:
-    """Nodes in log j, and the most probable one, from the density along it, all else fixed."""
+    """Nodes in log j and its most probable value, with all other parameters fixed."""
     solution = target.solution
-    rest = solution.theta[solution.free]
+    free = solution.theta[solution.free]
     f = solution.mixture.fraction
     logit = np.log(f) - np.log1p(-f)
 
     def along(log_j: Float) -> Float:
-        psi = np.column_stack([np.tile(rest, (len(log_j), 1)), log_j, np.full(len(log_j), logit)])
+        psi = np.column_stack([np.tile(free, (len(log_j), 1)), log_j, np.full(len(log_j), logit)])
         return target.log_density(psi)
 
     sigma = target.problem.sigma
@@ -267,7 +286,7 @@ def _nodes_at(target: SelfTarget) -> tuple[Float, float]:
     fine = np.linspace(mesh[begin], mesh[end], 400)
     open_end = begin == 0 and mesh[0] <= low + 1e-9
     if open_end:
-        # at the left end is only the prior's tail: one node in it is enough
+        # the left end is the tail of the prior, in which a single node is enough
         likelihood = value - value[0] - (mesh - mesh[0])
         felt = np.flatnonzero(np.abs(likelihood) > MIN_EFFECT)
         if len(felt):
@@ -276,22 +295,23 @@ def _nodes_at(target: SelfTarget) -> tuple[Float, float]:
 
 
 def _modes(target: SelfTarget, square: Float, z: float) -> list[_Mode]:
-    """Mode at each squared jitter (n,), in ascending order, for a given fraction.
+    """Modes for each squared jitter (n,), ascending, at a given fraction of false detections.
 
-    Where the jitter changes the errors by little, modes and curvatures are linear in its square.
+    If the jitter changes the errors only slightly, modes and curvatures are interpolated linearly
+    in its square.
     """
     change = (square[-1] - square[0]) * float(np.mean(1 / (target.problem.var + square[0])))
     if change > LINEAR:
         return [_mode(target, np.sqrt(x), z) for x in square]
-    few = np.linspace(square[0], square[-1], N_EXACT)
-    found = [_mode(target, np.sqrt(x), z) for x in few]
-    weights = np.stack([np.interp(square, few, one) for one in np.eye(len(few))], axis=1)
-    return [_mixed(found, w) for w in weights]
+    exact = np.linspace(square[0], square[-1], N_EXACT)
+    exact_modes = [_mode(target, np.sqrt(x), z) for x in exact]
+    weights = np.stack([np.interp(square, exact, unit) for unit in np.eye(len(exact))], axis=1)
+    return [_mixed(exact_modes, w) for w in weights]
 
 
 @dataclass(frozen=True, eq=False)
 class _Mode:
-    """Free parameters (F,) at the mode for one jitter, and the curvature (F, F) there."""
+    """Free parameters (F,) at the mode for a given jitter, and the curvature (F, F) there."""
 
     theta: Float
     curvature: Float
@@ -299,26 +319,28 @@ class _Mode:
 
 def _mixed(found: Sequence[_Mode], weights: Float) -> _Mode:
     """Weighted mean of modes."""
-    parts = [(w, one) for w, one in zip(weights, found, strict=True) if w > 0]
-    return _Mode(sum(w * one.theta for w, one in parts), sum(w * one.curvature for w, one in parts))
+    parts = [(w, mode) for w, mode in zip(weights, found, strict=True) if w > 0]
+    return _Mode(
+        sum(w * mode.theta for w, mode in parts), sum(w * mode.curvature for w, mode in parts)
+    )
 
 
 def _grid(
     target: SelfTarget, split: Split, at: Float, modes: Sequence[_Mode], z: float, bend: float
 ) -> GridProposal:
-    """Proposal with nodes at the given coordinates (n, k), for a given fraction."""
-    y = np.array([np.append(one.theta, z) for one in modes])
-    # of the density itself: that of the expansion has one choice of members
+    """Proposal with nodes at the given grid coordinates (n, k), for a given fraction."""
+    y = np.array([np.append(mode.theta, z) for mode in modes])
+    # the density itself, since the expansion considers a single choice of members only
     values = target.log_density(split.to_psi(y, at)) + split.log_jacobian(y)
     nodes = []
-    for x, mode, one, value in zip(at, y, modes, values, strict=True):
-        factor = _arrow(one.curvature, bend).factor()
-        nodes.append(Node(x, mode, factor, float(value) - 0.5 * factor.logdet))
+    for x, y_mode, mode, value in zip(at, y, modes, values, strict=True):
+        factor = _arrow(mode.curvature, bend).factor()
+        nodes.append(Node(x, y_mode, factor, float(value) - 0.5 * factor.logdet))
     return GridProposal(split, tuple(nodes))
 
 
 def _arrow(curvature: Float, bend: float) -> Arrow:
-    """Curvature of the free parameters, and that of the fraction."""
+    """Arrow matrix of the curvature of the free parameters (F, F) and that of the fraction."""
     n = len(curvature)
     H = np.zeros((n + 1, n + 1))
     H[:-1, :-1], H[-1, -1] = curvature, bend
@@ -326,18 +348,18 @@ def _arrow(curvature: Float, bend: float) -> Arrow:
 
 
 def _mode(target: SelfTarget, jitter: float, z: float) -> _Mode:
-    """Mode and curvature of everything else at one jitter, for a given fraction."""
+    """Mode and curvature of the free parameters for a given jitter and fraction z^3."""
     solution, free = target.solution, target.solution.free
     theta = solution.theta.copy()
     observed = True
     for _ in range(MAX_STEPS):
-        found = target.pieces.sum(slope, theta, Mixture(float(jitter), z**3), observed)
-        gradient = (found.gradient + target.prior.pull(theta))[free]
-        curvature = (found.curvature + target.prior.precision)[np.ix_(free, free)]
+        expansion = target.pieces.sum(slope, theta, Mixture(float(jitter), z**3), observed)
+        gradient = (expansion.gradient + target.prior.pull(theta))[free]
+        curvature = (expansion.curvature + target.prior.precision)[np.ix_(free, free)]
         try:
             factor = _arrow(curvature, 1.0).factor()
         except np.linalg.LinAlgError as error:
-            if observed:  # a star between two modes: with EM weights the curvature is positive
+            if observed:  # a star is between two modes; EM weights give a positive curvature
                 observed = False
                 continue
             raise DegenerateError(

@@ -1,7 +1,8 @@
-"""Priors from other sources than the detections, which fix free directions.
+"""Priors from other sources than the detections, which constrain free directions.
 
-Commanded offsets and rolls, scales and ties are Gaussian in the parameters, linearised at a
-solution; reference stars of known position, with errors and motions, are priors of the stars.
+Commanded offsets, roll angles, scales and ties are Gaussian priors on the parameters, linearised at
+a solution.  Reference stars with known positions, errors and proper motions are priors on the
+stars.
 """
 
 from __future__ import annotations
@@ -21,15 +22,28 @@ from bayesdist.infer.selfcal.problem import Problem, StarPriors
 from bayesdist.model import DistortionModel
 from bayesdist.utils.arrays import Float, Int
 
-MIN_REFERENCE_STARS = 2  # reference stars that fix position, rotation and scale
-MAX_DISTANCE = 5.0  # times the median from the map: not the reference star, but a neighbour
-MIN_MEDIAN = 0.01  # pixels: smallest median distance in this limit
+MIN_REFERENCE_STARS = 2  # minimum number that determines position, rotation and scale
+MAX_DISTANCE = 5.0  # limit on the distance of a reference star in medians, to exclude neighbours
+MIN_MEDIAN = 0.01  # smallest median used for this limit, as a fraction of the search radius
 
 
 def tie(reference: Float, row: Float, value: float, sigma: float) -> Prior:
-    """Prior of one measured linear combination of the parameters.
+    """Prior from a measurement of a linear combination of the parameters.
 
-    `reference`: (D,). `row`: (D,). `value`: measured `row @ (theta - reference)`.
+    Parameters
+    ----------
+    reference : ndarray, shape (D,)
+        Parameters about which the prior is expanded.
+    row : ndarray, shape (D,)
+        Coefficients of the linear combination.
+    value : float
+        Measured value of ``row @ (theta - reference)``.
+    sigma : float
+        Standard error of the measurement.
+
+    Returns
+    -------
+    Prior
     """
     return Prior(reference, np.outer(row, row) / sigma**2, row * value / sigma**2)
 
@@ -43,14 +57,30 @@ def pointing_prior(
     group: Int | None = None,
     pixels: Sequence[tuple[int, float, float]] | None = None,
 ) -> Prior:
-    """Prior of commanded offsets: sky positions of the first chip's reference pixel.
+    """Prior from commanded offsets of the pointing.
 
-    The pointings of a group of exposures have one unknown origin and independent errors.
+    The pointings of a group of exposures have a common unknown origin and independent errors.
 
-    `theta` (D,): at which it is linearised. `offsets` (E, 2): along u and v; NaN where there is
-    none. `sigma` (E,): error of each on one axis. `group` (E,): exposures with the same guide
-    stars; all of them by default. `pixels`: chip number, x and y of some pixels: their mean
-    position is pointed, in place of the reference pixel.
+    Parameters
+    ----------
+    model : DistortionModel
+    theta : ndarray, shape (D,)
+        Parameters at which the prior is linearised.
+    offsets : ndarray, shape (E, 2)
+        Commanded positions of the reference pixel of the first chip along u and v, relative to the
+        origin of the group; NaN if unknown.
+    sigma : ndarray, shape (E,)
+        Standard error of each offset per axis, in the unit of u, v.
+    group : ndarray of int, shape (E,), optional
+        Group of each exposure, such as exposures with the same guide stars; by default a single
+        group.
+    pixels : sequence of (int, float, float), optional
+        Chip numbers, x and y of pixels. The offsets then refer to the mean position of these
+        pixels instead of the reference pixel of the first chip.
+
+    Returns
+    -------
+    Prior
     """
     E, first = len(model.exposures), model.chips[0]
     pixels = pixels or [(first.number, *first.reference_pixel)]
@@ -62,60 +92,81 @@ def pointing_prior(
         rows += model.jacobian(theta, np.full(E, x), np.full(E, y), **at) / len(pixels)
         places += model.predict(theta, np.full(E, x), np.full(E, y), **at) / len(pixels)
     precision, right = np.zeros((model.n_params,) * 2), np.zeros(model.n_params)
-    known = np.isfinite(offsets).all(axis=1)
+    available = np.isfinite(offsets).all(axis=1)
     group = np.zeros(E, np.int64) if group is None else group
-    for one in np.unique(group[known]):
-        here = np.flatnonzero(known & (group == one))
-        weight = np.diag(sigma[here] ** -2.0)
+    for number in np.unique(group[available]):
+        members = np.flatnonzero(available & (group == number))
+        weight = np.diag(sigma[members] ** -2.0)
         mean = weight.sum(axis=1)
-        weight -= np.outer(mean, mean) / mean.sum()  # the origin is unknown
+        weight -= np.outer(mean, mean) / mean.sum()  # eliminates the unknown origin
         for axis in range(2):
-            J = rows[here, axis]
+            J = rows[members, axis]
             precision += J.T @ weight @ J
-            right += J.T @ weight @ (offsets[here, axis] - places[here, axis])
+            right += J.T @ weight @ (offsets[members, axis] - places[members, axis])
     return Prior(np.array(theta, float), precision, right)
 
 
 def frame_prior(
     model: DistortionModel, theta: Float, name: str, values: Float, sigma: float
 ) -> Prior:
-    """Prior on one property of the exposures' frames ('rotation', 'scale').
+    """Prior on a frame parameter ('rotation', 'scale') of the exposures, up to a common offset.
 
-    Commanded rolls, each with its error, or scales that scatter about one; their common zero point
-    stays free.  `values` (E,) are NaN where there is none; the first exposure's is that of
-    the polynomials.
+    It describes commanded roll angles with errors `sigma`, or scales that scatter by `sigma`.
+    `values` (E,) are NaN if unknown; that of the first exposure refers to the polynomials.  The
+    prior is linearised at theta (D,).
     """
-    known = np.flatnonzero(np.isfinite(values))
-    rows, now = np.zeros((len(known), model.n_params)), np.zeros(len(known))
-    for r, e in enumerate(known):
+    available = np.flatnonzero(np.isfinite(values))
+    rows, now = np.zeros((len(available), model.n_params)), np.zeros(len(available))
+    for r, e in enumerate(available):
         names = model.free_frame_names(int(e))
         if name in names:
             at = model.frame_slice(int(e)).start + names.index(name)
             rows[r, at], now[r] = 1.0, theta[at]
-    weight = (np.eye(len(known)) - 1.0 / len(known)) / sigma**2
-    right = rows.T @ weight @ (values[known] - now)
+    weight = (np.eye(len(available)) - 1.0 / len(available)) / sigma**2
+    right = rows.T @ weight @ (values[available] - now)
     return Prior(np.array(theta, float), rows.T @ weight @ rows, right)
 
 
 @dataclass(frozen=True, eq=False)
 class ReferenceStars:
-    """Catalogue that gives priors to the stars of a problem."""
+    """Priors on the positions of stars from a reference catalogue.
 
-    catalog: ReferenceCatalog  # with errors, on the plane and in the unit of the solution
-    radius: float  # largest distance, in pixels, of a star from its reference star
+    Parameters
+    ----------
+    catalog : ReferenceCatalog
+        Reference stars with errors, on the tangent plane and in the unit of the solution.
+    radius : float
+        Largest distance in pixels between a star and its reference star.
+    """
+
+    catalog: ReferenceCatalog
+    radius: float
 
     def __call__(self, problem: Problem, theta: Float) -> StarPriors:
-        """Priors of the stars of a problem at a solution theta (D,).
+        """Identify the stars of a problem in the catalogue and return their priors.
 
-        The stars are mapped to the catalogue by a linear map first: free directions must not decide
-        the identification.  A star that lies far from its reference star, compared with the others,
-        has none.
+        The stars are first mapped to the catalogue by a linear map, so that free directions do not
+        affect the identification.  Stars that are much farther from their reference star than most
+        others get no prior.
 
-        InputError when hardly a star is found again.
+        Parameters
+        ----------
+        problem : Problem
+        theta : ndarray, shape (D,)
+            Parameters of the current solution.
+
+        Returns
+        -------
+        StarPriors
+
+        Raises
+        ------
+        InputError
+            If fewer than two stars are identified.
         """
         catalog = self.catalog.at(problem.epoch0) if problem.epoch0 else self.catalog
         places = problem.middles(theta)
-        rows, which = self._pairs(problem, catalog, places)
+        rows, matched = self._pairs(problem, catalog, places)
         if len(rows) < MIN_REFERENCE_STARS:
             raise InputError(
                 f"{len(rows)} of its {len(catalog)} stars are among the {problem.n_stars} detected "
@@ -127,20 +178,21 @@ class ReferenceStars:
         centre, precision = none.centre.copy(), none.precision.copy()
         moving = problem.n_star >= 4 and catalog.pm_u is not None and catalog.sigma_pm_u is not None
         for axis, name in enumerate("uv"):
-            sigma = getattr(catalog, f"sigma_{name}")[which]
-            centre[rows, axis] = getattr(catalog, name)[which]
+            sigma = getattr(catalog, f"sigma_{name}")[matched]
+            centre[rows, axis] = getattr(catalog, name)[matched]
             if not moving:
                 precision[rows, axis, axis] += sigma**-2.0
                 continue
-            # at its own epoch a catalogue's positions and motions are independent; here, years
-            # later, a position is the one plus years times the other
-            sigma = getattr(self.catalog, f"sigma_{name}")[which]
-            motion = getattr(self.catalog, f"sigma_pm_{name}")[which]
+            # Errors of positions and proper motions are independent at the epoch of the catalogue.
+            # Here, `years` later, the position is the sum of the position and `years` times the
+            # proper motion.
+            sigma = getattr(self.catalog, f"sigma_{name}")[matched]
+            motion = getattr(self.catalog, f"sigma_pm_{name}")[matched]
             years = (
                 problem.epoch0
-                - np.broadcast_to(np.asarray(self.catalog.epoch, float), len(self.catalog))[which]
+                - np.broadcast_to(np.asarray(self.catalog.epoch, float), len(self.catalog))[matched]
             )
-            centre[rows, 2 + axis] = getattr(catalog, f"pm_{name}")[which]
+            centre[rows, 2 + axis] = getattr(catalog, f"pm_{name}")[matched]
             precision[rows, axis, axis] += sigma**-2.0
             precision[rows, axis, 2 + axis] -= years * sigma**-2.0
             precision[rows, 2 + axis, axis] -= years * sigma**-2.0
@@ -148,20 +200,20 @@ class ReferenceStars:
         return replace(none, centre=centre, precision=precision)
 
     def _pairs(self, problem: Problem, catalog: ReferenceCatalog, places: Float) -> tuple[Int, Int]:
-        """Numbers of stars and of their reference stars."""
+        """Indices of the identified stars, and of their reference stars."""
         radius = self.radius * problem.pixel
-        known = np.column_stack([catalog.u, catalog.v])
+        reference = np.column_stack([catalog.u, catalog.v])
         middle = places.mean(axis=0)
         start = LinearMap(np.eye(2), np.zeros(2), middle)
-        tree = cKDTree(known)
-        laid = iterated_map(places, known, tree, start, radius, radius) or start
+        tree = cKDTree(reference)
+        laid = iterated_map(places, reference, tree, start, radius, radius) or start
         moved = laid(places)
         distance, nearest = tree.query(moved, distance_upper_bound=radius)
         near = np.isfinite(distance)
         if near.sum() > MIN_PAIRS:
             typical = max(float(np.median(distance[near])), MIN_MEDIAN * radius)
             near &= distance <= MAX_DISTANCE * typical
-        # of two stars the nearer one
+        # if two stars match the same reference star, keep the nearer one
         order = np.flatnonzero(near)[np.argsort(distance[near], kind="stable")]
         _, first = np.unique(nearest[order], return_index=True)
         rows = np.sort(order[first])

@@ -1,4 +1,4 @@
-"""Detections sorted by star, with all arrays that a pass over them needs."""
+"""Detections sorted by star, with all arrays that the passes need."""
 
 from __future__ import annotations
 
@@ -16,53 +16,53 @@ from bayesdist.model import DistortionModel
 from bayesdist.model.grouping import Groups
 from bayesdist.utils.arrays import Bool, Float, Int
 
-MIN_DETECTIONS = 2  # of a star that gives information about the distortion
-MOTIONS = {"none": 2, "proper_motion": 4, "parallax": 5}
-# precision, in the unit of u, v, that makes a star's matrix positive and is no information
+MIN_DETECTIONS = 2  # minimum number of detections for information about the distortion
+MOTIONS = {"none": 2, "proper_motion": 4, "parallax": 5}  # number of parameters of a star
+# negligible prior precision (unit of u, v) that keeps the matrix of a star positive definite
 VAGUE = 1e-12
 
 
 @dataclass(frozen=True, eq=False)
 class StarPriors:
-    """Gaussian priors of the stars: reference stars with their errors."""
+    """Gaussian priors on the parameters of the stars, such as those of reference stars."""
 
-    centre: Float
-    precision: Float  # (S, q, q) zero for stars without a prior
+    centre: Float  # prior means (S, q)
+    precision: Float  # inverse covariances (S, q, q); negligible for stars without a prior
 
     @classmethod
     def none(cls, n: int, q: int) -> StarPriors:
-        """Priors without information on any star."""
+        """Priors without information, for n stars with q parameters."""
         return cls(np.zeros((n, q)), np.tile(VAGUE * np.eye(q), (n, 1, 1)))
 
     @property
     def informed(self) -> Bool:
-        """Boolean mask (S,) of stars with a prior."""
+        """Boolean mask (S,) that is True for stars with a prior."""
         return np.asarray(np.trace(self.precision, axis1=1, axis2=2) > 10 * VAGUE)
 
 
 @dataclass(frozen=True, eq=False)
 class Problem:
-    """Detections sorted by star."""
+    """N detections of S stars, sorted by star, with the model linearised about a solution."""
 
     model: DistortionModel
-    groups: Groups  # of equal effective coefficients; `index` is that of each detection here
-    starts: Int  # first detection (S + 1,) of each star
-    seen: Float  # scaled positions (2, N) of the detections
-    # scaled position (N,) of the star by a current solution, at which the model is evaluated
+    groups: Groups  # detections of equal effective coefficients; `index` (N,): group of each
+    starts: Int  # index (S + 1,) of the first detection of each star, and the number N
+    seen: Float  # scaled pixel coordinates (2, N) of the detections
+    # scaled pixel coordinates (N,) at the current solution, where the model is evaluated
     X: Float
     Y: Float
-    offset: Float  # (N, 2) from there to the detection, on the sky
-    # (N, 3) uu, uv, vv of the matrix that converts residuals on the sky into squared pixels
+    offset: Float  # displacement (N, 2) on the sky from there to the detection
+    # elements uu, uv, vv (N, 3) of the matrix that converts sky residuals to squared pixels
     W: Float
-    var: Float  # square (N,) of the quoted errors, square pixels
-    time: Float  # years (N,) since `epoch0`; empty where stars do not move
+    var: Float  # squared quoted errors (N,) in square pixels
+    time: Float  # years (N,) since `epoch0`; empty if stars have no proper motion
     factor: Float  # parallax factors (N, 2); empty without parallax
     priors: StarPriors
     rows: Int  # input row (N,) of each detection
-    match_radius: float  # pixels: largest distance of detections of one star, and of false ones
+    match_radius: float  # largest distance in pixels of a detection from its star
     pixel: float  # median size of a pixel on the sky at the start, in the unit of u, v
-    epoch0: float = 0.0  # date of the stars' positions
-    # known scale (E,) of the sky in each exposure, about the frames' origin: VAFACTOR
+    epoch0: float = 0.0  # date of the stars' positions in decimal years
+    # known scale (E,) of the sky in each exposure about the origin of the frames (VAFACTOR)
     dilation: Float | None = None
 
     def __len__(self) -> int:
@@ -70,7 +70,7 @@ class Problem:
 
     @property
     def columns(self) -> tuple[Int | Float, ...]:
-        """Arrays of detections and stars for the compiled passes, in their order."""
+        """Arrays of detections and stars in the order of the arguments of the compiled passes."""
         return (
             *(self.starts, self.groups.index, self.X, self.Y, self.offset, self.W, self.var),
             *(self.time, self.factor, self.priors.centre, self.priors.precision),
@@ -83,7 +83,7 @@ class Problem:
 
     @property
     def n_star(self) -> int:
-        """Number of parameters of a star."""
+        """Number of parameters of a star: 2, 4 or 5."""
         return self.priors.centre.shape[1]
 
     @property
@@ -98,17 +98,17 @@ class Problem:
 
     @property
     def log_outlier(self) -> float:
-        """Log density of a false detection per square pixel, without the fraction of such."""
+        """Log density of false detections per square pixel, without their fraction."""
         return -float(np.log(np.pi * self.match_radius**2))
 
     @property
     def least_root(self) -> float:
-        """Root of the curvature of a star whose position is unknown within its match circle."""
+        """Square root of the smallest curvature allowed for a star, set by its match circle."""
         return float(np.sqrt(2.0) / (self.match_radius * self.pixel))
 
     @cached_property
     def sigma(self) -> float:
-        """Median quoted error, pixels."""
+        """Median quoted error in pixels."""
         return float(np.sqrt(np.median(self.var)))
 
     @cached_property
@@ -119,7 +119,7 @@ class Problem:
         return np.asarray(self.dilation[self.groups.exposure], float)
 
     def effective(self, theta: Float) -> Float:
-        """Effective Legendre coefficients (..., G, 2, K), the sky's dilation included."""
+        """Effective Legendre coefficients (..., G, 2, K), including the dilation."""
         out = self.model.effective(theta, self.groups)
         if self.dilation is None:
             return out
@@ -129,37 +129,39 @@ class Problem:
         return out
 
     def effective_jacobian(self, theta: Float) -> list[tuple[Int, Float]]:
-        """Derivatives of `effective`, as in `DistortionModel.effective_jacobian`."""
-        found = self.model.effective_jacobian(theta, self.groups)
-        return [(columns, k * d) for (columns, d), k in zip(found, self._factors, strict=True)]
+        """Derivatives of `effective` in the form of `DistortionModel.effective_jacobian`."""
+        jacobian = self.model.effective_jacobian(theta, self.groups)
+        return [(columns, k * d) for (columns, d), k in zip(jacobian, self._factors, strict=True)]
 
     def powers(self, theta: Float) -> Float:
-        """Effective coefficients (..., G, 2, K) of the scaled powers."""
+        """Effective coefficients (..., G, 2, K) of the powers of X and Y."""
         basis = self.model.basis(self.model.chips[0].number)
         return basis.to_scaled_powers(self.effective(theta))
 
     def places(self, theta: Float) -> Float:
-        """Sky position (N, 2) of each detection by the model."""
+        """Sky position (N, 2) of each detection according to the model."""
         powers = self.powers(theta)
         with threads_for(len(self.X)):
-            found = kernel.positions(self.groups.index, self.X, self.Y, powers, self.model.order)
-        return np.asarray(found + self.offset)
+            positions = kernel.positions(
+                self.groups.index, self.X, self.Y, powers, self.model.order
+            )
+        return np.asarray(positions + self.offset)
 
     @cached_property
     def _half(self) -> Float:
-        """Half the detector's sides in pixels, of each group (G, 2)."""
+        """Half the sides of the chip of each group in pixels, shape (G, 2)."""
         chips = [self.model.chips[c].number for c in self.groups.chip]
         return np.array([self.model.basis(chip).half_size for chip in chips])
 
     def jacobians(self, theta: Float, rows: slice) -> Float:
-        """Derivatives (n, 2, 2) of positions of some detections by their pixels."""
+        """Derivatives (n, 2, 2) of the sky positions of some detections with respect to pixels."""
         g = self.groups.index[rows]
         with threads_for(len(g)):
             by = kernel.slopes(g, self.X[rows], self.Y[rows], self.powers(theta), self.model.order)
         return np.asarray(by / self._half[g, None])
 
     def star_places(self, stars: Float) -> Float:
-        """Sky position (N, 2) of the star of each detection at its date."""
+        """Sky position (N, 2) of the star of each detection at the date of the detection."""
         out = stars[self.star, :2]
         if self.n_star >= 4:
             out = out + stars[self.star, 2:4] * self.time[:, None]
@@ -175,46 +177,46 @@ class Problem:
         )
 
     def middles(self, theta: Float) -> Float:
-        """Mean position (S, 2) of each star's detections."""
+        """Mean sky position (S, 2) of the detections of each star."""
         return self._means(self.places(theta))
 
     def shifts(self, before: Float, after: Float) -> Float:
-        """Mean shift (S, 2) of each star's detections from parameters (D,) to others."""
+        """Mean shift (S, 2) of the detections of each star if parameters (D,) change."""
         change = self.powers(after) - self.powers(before)
         with threads_for(len(self.X)):
             z = kernel.positions(self.groups.index, self.X, self.Y, change, self.model.order)
         return self._means(z)
 
     def _means(self, values: Float) -> Float:
-        """Means (S, 2) of numbers (N, 2) over the detections of each star."""
+        """Means (S, 2) of values (N, 2) over the detections of each star."""
         sums = [np.bincount(self.star, values[:, axis]) / self.counts for axis in (0, 1)]
         return np.stack(sums, axis=1)
 
     def mean_places(self, theta: Float) -> Float:
-        """Stars (S, q) at the means of their detections, as start of a search."""
+        """Stars (S, q) at the means of their detections, as the start of a search."""
         out = np.zeros((self.n_stars, self.n_star))
         out[:, :2] = self.middles(theta)
         return out
 
     def median_places(self, theta: Float) -> Float:
-        """Stars (S, q) at the medians of their detections, which a few false ones do not move."""
+        """Stars (S, q) at the medians of their detections, which are robust against false ones."""
         out, z = np.zeros((self.n_stars, self.n_star)), self.places(theta)
         for axis in (0, 1):
             out[:, axis] = self.medians(z[:, axis])
         return out
 
     def medians(self, values: Float) -> Float:
-        """Medians (S,) of numbers (N,) over the detections of each star."""
+        """Medians (S,) of values (N,) over the detections of each star."""
         return np.asarray(ndimage.median(values, self.star, np.arange(self.n_stars)))
 
     def found_again(self, theta: Float, stars: Float) -> Float:
-        """Stars (S, q), those far from all their detections moved back to the mean of these."""
+        """Stars (S, q); those outside their match circle are reset to the mean detection."""
         middles = self.middles(theta)
-        # of stars at rest their position
-        own = stars if self.n_star == 2 else self._means(self.star_places(stars))
-        # the match circle, for which a star's least curvature stands, limits its offset
+        # position of the star averaged over the dates of its detections
+        position = stars if self.n_star == 2 else self._means(self.star_places(stars))
+        # the radius of the match circle, from the smallest curvature of a star
         reach = np.sqrt(2.0) / self.least_root
-        lost = np.hypot(*(own - middles).T) > reach
+        lost = np.hypot(*(position - middles).T) > reach
         if not lost.any():
             return stars
         out = stars.copy()
@@ -223,7 +225,7 @@ class Problem:
         return out
 
     def at(self, theta: Float, stars: Float) -> Problem:
-        """Problem linearised about a solution: theta (D,) and stars (S, q)."""
+        """Linearise the problem about a solution theta (D,) and stars (S, q)."""
         groups, half = self.groups, self._half
         places, powers = self.star_places(stars), self.powers(theta)
         with threads_for(5 * len(self.X)):
@@ -240,7 +242,7 @@ class Problem:
         return replace(self, X=X, Y=Y, offset=offset, W=W)
 
     def of_stars(self, which: Int) -> Problem:
-        """Problem with some of the stars only, by their numbers in ascending order."""
+        """Problem with a subset of the stars, given by ascending indices."""
         counts = self.counts[which]
         starts = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
         rows = np.repeat(self.starts[which] - starts[:-1], counts) + np.arange(starts[-1])
@@ -272,28 +274,53 @@ def prepare(
     dilation: Float | None = None,
     min_detections: int = MIN_DETECTIONS,
 ) -> Problem:
-    """Problem from detections, sorted for the passes.
+    """Sort detections by star and prepare the arrays for the passes.
 
-    Detections without star codes, and stars with fewer than `min_detections`, are left out; the
-    model's exposures are those of the detections.  `theta` is good enough for the size and shape of
-    pixels on the sky; `match_radius` is in pixels; `motion`, one of `MOTIONS`, gives the parameters
-    of a star, whose position is that at the mean date of the exposures; `parallax_factors` (E, 2),
-    along u and v, are needed by 'parallax'; `dilation` (E,) is VAFACTOR.
+    Detections without star codes, and stars with fewer than `min_detections` detections, are left
+    out.
 
-    InputError when no star is left, for a motion without dates, or parallax without factors.
+    Parameters
+    ----------
+    model : DistortionModel
+        Its exposures must be those of the detections.
+    detections : Detections
+        Detections with star codes and errors.
+    theta : ndarray, shape (D,)
+        Parameters that are accurate enough for the size and shape of the pixels on the sky.
+    match_radius : float
+        Largest distance of a detection from its star in pixels.
+    motion : str
+        Key of `MOTIONS`, which determines the parameters of a star. Positions refer to the mean
+        date of the exposures.
+    parallax_factors : ndarray, shape (E, 2), optional
+        Parallax factors along u and v; required for 'parallax'.
+    dilation : ndarray, shape (E,), optional
+        VAFACTOR of each exposure.
+    min_detections : int
+        Minimum number of detections of a star.
+
+    Returns
+    -------
+    Problem
+
+    Raises
+    ------
+    InputError
+        If no star has enough detections, or errors, dates or parallax factors are missing.
     """
     q = MOTIONS[motion]
     counts = np.bincount(detections.star[detections.star >= 0], minlength=1)
     used = (detections.star >= 0) & (counts[detections.star] >= max(min_detections, MIN_DETECTIONS))
     if not used.any():
         raise InputError(
-            f"no star is seen {max(min_detections, MIN_DETECTIONS)} times",
+            f"no star is detected {max(min_detections, MIN_DETECTIONS)} times",
             where=detections.source,
-            do="give exposures that overlap, a better start, or a larger match radius",
+            do="give exposures that overlap, a better start (selfcal.initial_distortion) or a "
+            "larger match radius",
         )
     if detections.sigma is None:
         raise InputError(
-            "the detections carry no errors", where=detections.source, do="give sigma in pixels"
+            "the detections have no errors", where=detections.source, do="give sigma in pixels"
         )
     rows = np.flatnonzero(used)
     rows = rows[np.argsort(detections.star[rows], kind="stable")]
@@ -304,7 +331,7 @@ def prepare(
     if q > 2 or model.time is not None:
         if detections.epoch is None:
             raise InputError(
-                "the exposures have no dates, and stars or detector move",
+                "the exposures have no dates, but stars or the distortion move with time",
                 where=detections.source,
                 do="give an exposure log with epochs",
             )
@@ -317,9 +344,9 @@ def prepare(
         factor = np.asarray(parallax_factors, float)[exposure]
     groups = model.groups(len(rows), epoch=when, exposure=exposure, chip=chip)
     X, Y = np.empty(len(rows)), np.empty(len(rows))
-    for one in model.chips:
-        of_chip = chip == one.number
-        scaled = model.basis(one.number).scaled(
+    for chip_model in model.chips:
+        of_chip = chip == chip_model.number
+        scaled = model.basis(chip_model.number).scaled(
             detections.x[rows[of_chip]], detections.y[rows[of_chip]]
         )
         X[of_chip], Y[of_chip] = scaled

@@ -1,4 +1,4 @@
-"""Moves of the whole sky as changes of a solution's parameters, and solutions without them."""
+"""Moves of the entire sky as changes of the parameters, and errors without such moves."""
 
 from __future__ import annotations
 
@@ -10,20 +10,20 @@ from bayesdist.infer.solution.solution import Solution
 from bayesdist.model import DistortionModel
 from bayesdist.utils.arrays import Float
 
-# of the linear maps of the sky
+# generators of linear maps of the sky
 GENERATORS = {
     "scale": np.array([[1.0, 0.0], [0.0, 1.0]]),
     "rotation": np.array([[0.0, -1.0], [1.0, 0.0]]),
     "skew_plus": np.array([[1.0, 0.0], [0.0, -1.0]]),
     "skew_cross": np.array([[0.0, 1.0], [1.0, 0.0]]),
 }
-RATES = ("drift_u", "drift_v", "spin", "expansion")  # of the sky, where stars move
-PARALLAX = "parallax"  # of the whole sky, where stars have one
+RATES = ("drift_u", "drift_v", "spin", "expansion")  # motions of the sky with time
+PARALLAX = "parallax"  # parallax common to all stars
 POINTS = ("zero_point_u", "zero_point_v")
 
 
 def parameter_scale(model: DistortionModel, theta: Float, years: float = 1.0) -> Float:
-    """Change (D,) of each parameter that equals a pixel at the edge of the detector."""
+    """Change (D,) of each parameter that moves positions at the detector's edge by one pixel."""
     pixel = model.pixel_size(theta)
     half = max(max(c.size) for c in model.chips) / 2
     out = np.empty(model.n_params)
@@ -38,11 +38,11 @@ def parameter_scale(model: DistortionModel, theta: Float, years: float = 1.0) ->
 
 
 def moves(model: DistortionModel, theta: Float) -> dict[str, Float]:
-    """Moves of the whole sky as changes of the parameters, each (D,).
+    """Changes (D,) of the parameters that correspond to moves of the entire sky, by name.
 
-    For shift t and linear map 1 + L about the frames' origin: those changes of polynomials and
-    frames by which every detection moves as the sky does, exactly where L commutes with the
-    exposures' rotations, and nearly where it does not.
+    The moves are shifts and linear maps 1 + L about the origin of the frames.  With these changes
+    of polynomials and frames, the detections follow the sky: exactly if L commutes with the
+    rotations of the exposures, otherwise approximately.
     """
     o = np.asarray(model.origin)
     E = len(model.exposures)
@@ -70,9 +70,10 @@ def moves(model: DistortionModel, theta: Float) -> dict[str, Float]:
 
 
 def rates(model: DistortionModel, theta: Float, years: Float) -> dict[str, Float]:
-    """Moves of the whole sky that grow with time, as changes (D,) of the exposures' frames.
+    """Changes (D,) of the frames that correspond to moves of the sky that grow with time, by name.
 
-    Stars follow them where they have motions; `years` (E,) are since the first exposure.
+    Stars with proper motions can follow such moves.  `years` (E,) are the dates of the exposures
+    relative to the first one.
     """
     out = {name: np.zeros(model.n_params) for name in RATES}
     for e in range(1, len(model.exposures)):
@@ -95,7 +96,7 @@ def rates(model: DistortionModel, theta: Float, years: Float) -> dict[str, Float
 
 
 def functionals(model: DistortionModel, theta: Float) -> dict[str, Float]:
-    """Properties of a solution as rows (D,): their change is row @ change of theta."""
+    """Rows (D,) such that row @ (change of theta) is the change of a property, by name."""
     out: dict[str, Float] = {}
     first = model.chips[0]
     maps = {c.number: _sky_map(model, theta, c.number) for c in model.chips}
@@ -104,7 +105,7 @@ def functionals(model: DistortionModel, theta: Float) -> dict[str, Float]:
         out[name] = places[first.number][axis]
     out |= _parts(maps[first.number])
     for chip in model.chips[1:]:
-        # position of the other chip when the first one has been moved back
+        # position of the other chip after undoing the linear map of the first one
         G = maps[first.number]
         gap = np.array([places[chip.number][a] - places[first.number][a] for a in (0, 1)])
         between = gap @ theta
@@ -117,7 +118,10 @@ def functionals(model: DistortionModel, theta: Float) -> dict[str, Float]:
 
 
 def _linear_part(model: DistortionModel, chip: int | None = None) -> Float:
-    """Rows (2, 2, D): derivatives of u and v by x and y at a chip's reference pixel."""
+    """Rows (2, 2, D) that give the derivatives of u and v with respect to x and y.
+
+    They are evaluated at the reference pixel of the chip.
+    """
     basis = model.basis(chip)
     by = basis.monomial_matrix[1:3]
     out = np.zeros((2, 2, model.n_params))
@@ -127,14 +131,14 @@ def _linear_part(model: DistortionModel, chip: int | None = None) -> Float:
 
 
 def _sky_map(model: DistortionModel, theta: Float, chip: int) -> Float:
-    """Rows (2, 2, D) of the linear map of the sky that a change of the chip's linear part makes."""
+    """Rows (2, 2, D) that give the linear map of the sky for a change of a chip's linear part."""
     G = _linear_part(model, chip)
     now = G @ theta
     return np.asarray(np.einsum("abd,bc->acd", G, np.linalg.inv(now)))
 
 
 def _place(model: DistortionModel, chip: int) -> Float:
-    """Rows (2, D) of the position of a chip's reference pixel."""
+    """Rows (2, D) that give the position of a chip's reference pixel."""
     at = model.basis(chip).monomial_matrix[0]
     out = np.zeros((2, model.n_params))
     for axis in range(2):
@@ -152,7 +156,7 @@ def _parts(L: Float) -> dict[str, Float]:
 
 
 def largest_roll_difference(model: DistortionModel, theta: Float) -> float:
-    """Largest difference of two roll angles, radians; a half turn counts as none."""
+    """Largest difference of two roll angles in radians, modulo half a turn."""
     angles = []
     for e in range(len(model.exposures)):
         M, _ = model.frame(theta, e)
@@ -165,15 +169,15 @@ def largest_roll_difference(model: DistortionModel, theta: Float) -> float:
 
 
 def gauge_free_matrix(model: DistortionModel, theta: Float, null: Float) -> Float:
-    """Matrix S (D, D) that removes from a change of the parameters its part along free directions.
+    """Matrix S (D, D) that removes the part along free directions from a change of the parameters.
 
-    Two solutions of the same detections in different gauges differ by a move along directions that
-    detections leave free.  Without it, errors are common to all gauges (an S-transformation: Baarda
-    1973; Teunissen 1985).
+    Solutions of the same detections in different gauges differ by a move along directions that the
+    detections do not determine.  Without such moves, errors are the same in all gauges; this is an
+    S-transformation (Baarda 1973; Teunissen 1985).
 
-    S null = 0, `null` (D, d) being `Gauge.null`: the positions of all chips in the first exposure
-    that S d makes are those of d without the combination of free directions that is nearest to
-    them, by least squares over the area of the chips.
+    `null` (D, d) are the free directions, such as `Gauge.null`; S null = 0.  For a change d of the
+    parameters, S d is d minus the combination of free directions that best fits the change of the
+    positions, by least squares over the area of all chips in the first exposure.
     """
     D = model.n_params
     if not null.shape[1]:
@@ -181,18 +185,27 @@ def gauge_free_matrix(model: DistortionModel, theta: Float, null: Float) -> Floa
     rows = []
     for chip in model.chips:
         x, y, area = chip.quadrature(model.order + 1)  # exact for squares of the polynomials
-        where = {"exposure": np.zeros(len(x), np.int64), "chip": np.full(len(x), chip.number)}
+        identity = {"exposure": np.zeros(len(x), np.int64), "chip": np.full(len(x), chip.number)}
         if model.time is not None:
-            where["epoch"] = np.full(len(x), model.time.epoch0[0])
-        J = model.jacobian(theta, x, y, **where)
+            identity["epoch"] = np.full(len(x), model.time.epoch0[0])
+        J = model.jacobian(theta, x, y, **identity)
         rows.append((np.sqrt(area)[:, None, None] * J).reshape(-1, D))
     J = np.concatenate(rows)
     return np.asarray(np.eye(D) - null @ np.linalg.pinv(J @ null) @ J)
 
 
 def gauge_free(solution: Solution, null: Float) -> Solution:
-    """Solution whose errors are those of relative positions on the detector; its mean stays.
+    """Solution with errors of relative positions only, and the same mean.
 
-    `null` (D, d) are the free directions at it.
+    Parameters
+    ----------
+    solution : Solution
+    null : ndarray, shape (D, d)
+        Directions that the detections do not determine, such as `Gauge.null`.
+
+    Returns
+    -------
+    Solution
+        Its errors do not include moves along these directions.
     """
     return solution.mapped(gauge_free_matrix(solution.model, solution.mean, null))

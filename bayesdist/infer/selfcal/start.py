@@ -1,6 +1,7 @@
-"""Start of a self-calibration: a known distortion, or none, and exposures that lie on the sky.
+"""Starting parameters of a self-calibration: an approximate distortion, and exposure frames.
 
-A start is good enough when detections of a star come to lie within the first linking length.
+They are accurate enough if the detections of a star are within the first linking length of each
+other on the sky.
 """
 
 from __future__ import annotations
@@ -18,9 +19,10 @@ Start = Callable[[Float, Float, int], Float]
 
 
 def undistorted(chips: Sequence[Chip], pixel: float) -> Start:
-    """Start of pixels about each chip's reference pixel: x, y and chip number to positions (N, 2).
+    """Start without distortion: positions are pixel offsets from the chip's reference pixel.
 
-    `pixel` is the size of a pixel in the unit of u, v.
+    Returns a function of x, y (N,) and a chip number that returns positions (N, 2).  `pixel` is the
+    size of a pixel in the unit of u, v.
     """
     reference = {chip.number: chip.reference_pixel for chip in chips}
 
@@ -33,29 +35,30 @@ def undistorted(chips: Sequence[Chip], pixel: float) -> Start:
 def chips_side_by_side(
     start: Start, chips: Sequence[Chip], frames: MutualFrames, exposure: Int, number: Int
 ) -> Start:
-    """Start in which the relative positions of the chips are those of their stars.
+    """Start with relative positions of the chips that were derived from their stars.
 
-    `start` is that of each chip alone; `frames` are those of lists, each of one chip of one
-    exposure, with exposure and chip number (lists,).  On the plane of the first chip; a chip that
-    no exposure has together with the first one stays.
+    `start` is the start of each chip by itself.  `frames` are the frames of lists of detections,
+    each of one chip in one exposure; `exposure` and `number` (lists,) are the exposure and the chip
+    number of each list.  Positions are on the plane of the first chip.  A chip that is never
+    observed together with the first chip is unchanged.
     """
     maps = {}
     for chip in chips[1:]:
-        found = []
-        for one in np.unique(exposure):
+        relative = []
+        for code in np.unique(exposure):
             rows = [
-                np.flatnonzero((exposure == one) & (number == n))
+                np.flatnonzero((exposure == code) & (number == n))
                 for n in (chips[0].number, chip.number)
             ]
             if all(len(r) for r in rows):
                 (a,), (b,) = rows
                 back = np.linalg.inv(frames.matrices[a])
                 matrix = back @ frames.matrices[b]
-                found.append(
+                relative.append(
                     np.column_stack([matrix, back @ (frames.shifts[b] - frames.shifts[a])])
                 )
-        if found:
-            maps[chip.number] = np.median(found, axis=0)
+        if relative:
+            maps[chip.number] = np.median(relative, axis=0)
 
     def moved(x: Float, y: Float, chip: int) -> Float:
         plane = start(x, y, chip)
@@ -69,9 +72,10 @@ def chips_side_by_side(
 def fitted_polynomials(
     start: Start, chips: Sequence[Chip], order: int, onto: LinearMap | None = None
 ) -> Float:
-    """Legendre coefficients (chips, 2, K) of a start, by quadrature over each chip.
+    """Legendre coefficients (chips, 2, K) that approximate a start, by quadrature over each chip.
 
-    `start` maps x, y and the number of a chip to positions (N, 2), `onto` is applied to these.
+    `start` is a function of x, y and a chip number that returns positions (N, 2).  If the map
+    `onto` is given, it is applied to these positions.
     """
     out = []
     for chip in chips:
@@ -87,10 +91,10 @@ def fitted_polynomials(
 def start_parameters(
     model: DistortionModel, coefficients: Float, frames: MutualFrames, middles: Float
 ) -> Float:
-    """Parameters (D,) for exposures with the given frames onto the plane of the first exposure.
+    """Parameters (D,) from polynomials and the frames of the exposures relative to the first one.
 
-    The frame is exact at `middles` (E, 2), the middle of each exposure's detections on its own
-    plane.
+    Frames of the model may be simpler than the given ones; they agree at `middles` (E, 2), the
+    centre of the detections of each exposure on the plane of that exposure.
     """
     theta = np.zeros(model.n_params)
     for chip, of_chip in zip(model.chips, coefficients, strict=True):

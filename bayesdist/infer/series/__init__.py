@@ -1,4 +1,4 @@
-"""Coefficients of many exposures against time: lines, breaks, scatter, predictions."""
+"""Trends of coefficients of many exposures with time: lines, breaks, scatter, predictions."""
 
 from bayesdist.infer.series.compare import (
     Comparison,

@@ -1,4 +1,4 @@
-"""Many chains in parallel: start, warm-up, and draws."""
+"""Markov chains run in parallel: starting states, warm-up, and draws."""
 
 from __future__ import annotations
 
@@ -15,39 +15,39 @@ from bayesdist.infer.series.scatter import FRACTION_PRIOR, KAPPA_RATE, MAX_FRACT
 from bayesdist.infer.series.series import MAD_TO_SIGMA
 from bayesdist.utils.arrays import Float
 
-ENSEMBLES = 4  # the chains are judged in as many groups
-N_SCANS = 10  # sweeps of the warm-up in which breaks are drawn among all gaps
-EQUAL_WEIGHTS = np.zeros(25)  # no proposal, no importance weights
+ENSEMBLES = 4  # number of groups of chains that are compared to assess convergence
+N_SCANS = 10  # number of warm-up sweeps in which breaks are drawn from all gaps
+EQUAL_WEIGHTS = np.zeros(25)  # log importance weights, which a Gibbs sampler does not have
 
 
 @dataclass(frozen=True, eq=False)
 class Engine:
-    """Problem and moves of a sweep, fixed while draws are made."""
+    """Problem and moves of a sweep, which are fixed after warm-up."""
 
     problem: Problem
     moves: BreakMoves | None
 
     def step(self, state: State, rng: np.random.Generator, included: Float | None = None) -> State:
-        """Next state of all chains."""
+        """Next state of all chains; see `sweep` for `included`."""
         return sweep(self.problem, state, rng, included=included, moves=self.moves)
 
 
 @dataclass(frozen=True, eq=False)
 class Draws:
-    """Draws of T sweeps of C chains, in units of the spread."""
+    """Draws from T sweeps of C chains, in units of the spread of the series."""
 
-    b: Float  # (C, T, k, p)
-    sigma: Float  # (C, T, k, k)
-    fraction: Float  # (C, T)
-    kappa2: Float  # (C, T)
-    breaks: Float  # (C, T, B)
-    drift: Float  # (C, T, k)
-    outlier_probability: Float  # (E,)
+    b: Float  # parameters (C, T, k, p) of the columns of the trend
+    sigma: Float  # intrinsic covariance (C, T, k, k)
+    fraction: Float  # fraction of outliers (C, T)
+    kappa2: Float  # factor (C, T) on the covariance of outliers
+    breaks: Float  # dates of breaks to be found (C, T, B)
+    drift: Float  # amplitude (C, T, k) of the random part of the trend
+    outlier_probability: Float  # mean outlier probability (E,) of the exposures
 
     def state(self, draws: slice) -> State:
-        """State of some draws, of all chains one after another, as if chains were there.
+        """Selected draws (of all chains, concatenated) as the state of as many chains.
 
-        It has no memberships.
+        The state has no memberships.
         """
 
         def some(values: Float) -> Float:
@@ -67,7 +67,7 @@ class Draws:
         )
 
     def judged(self, problem: Problem, limits: Limits) -> Convergence:
-        """Convergence of every reported quantity."""
+        """Convergence diagnostics of all reported quantities."""
         n_chains, n_steps = self.fraction.shape
         names = problem.series.coefficients
         k = len(names)
@@ -103,10 +103,10 @@ class Draws:
 def starting_state(
     problem: Problem, moves: BreakMoves | None, n_chains: int, rng: np.random.Generator
 ) -> State:
-    """Chains that start far apart in the scatter and in the outliers.
+    """Starting states that are widely dispersed in the scatter and in the outliers.
 
-    The scatter starts from differences of successive exposures, which breaks and slopes hardly
-    affect.
+    The scatter is estimated from differences between consecutive exposures, which are insensitive
+    to breaks and slopes.
     """
     k, n = problem.y.shape
     order = np.argsort(problem.series.epoch, kind="stable")
@@ -140,7 +140,7 @@ def starting_state(
 def warm_up(
     problem: Problem, n_chains: int, sweeps: int, rng: np.random.Generator
 ) -> tuple[Engine, State]:
-    """Chains that have forgotten their start, and moves that are fixed from now on."""
+    """Run the warm-up; return the engine, with moves that are fixed from now on, and the state."""
     moves = BreakMoves(problem.design) if problem.design.trend.find else None
     state = starting_state(problem, moves, n_chains, rng)
     for t in range(sweeps):
@@ -161,10 +161,10 @@ def run(
     most: int,
     limits: Limits,
 ) -> tuple[Engine, State, Draws, Convergence]:
-    """Warm up, then draw twice as much each time until the limits are reached.
+    """Warm up, then sample until the convergence criteria are met.
 
-    `warmup` sweeps warm the chains up, `sweeps` are drawn first and at most `most` at last.  What
-    was drawn before counts as warm-up.
+    `warmup` is the number of sweeps of the warm-up and `sweeps` that of the first attempt.  Each
+    further attempt has twice as many sweeps, but at most `most`; earlier attempts count as warm-up.
     """
     engine, state = warm_up(problem, chains, warmup, rng)
     while True:

@@ -1,13 +1,14 @@
-"""Choice of the trend of a series, by predictive densities of held-out exposures.
+"""Selection of the trend of a series by the predictive density of held-out exposures.
 
-A difference counts where it is at least 4 and at least as many of its standard errors as Student's
-t needs for 95 %: below 4 standard errors are too small themselves (Sivula et al. 2020).  Where the
-exposures are correlated in time, whole blocks of them are held out: an exposure's neighbours would
-predict it, and an irregular drift would pass for a line.
+A difference is significant if it is at least 4, and significant at 95 % according to Student's t
+with its standard error.  For differences below 4, the standard errors are too small (Sivula et al.
+2020).  If the exposures are correlated in time, blocks of consecutive exposures are held out.
+Otherwise the neighbours of an exposure would predict it, and an irregular drift would look like a
+line.
 
-Filters (ACS ISR 2015-06, section 4.4.4) are compared by common slopes with an offset for each,
-against slopes of their own: each further filter's slope differs from that of the first by one
-amount in all segments.
+To test whether the drift depends on the filter (ACS ISR 2015-06, section 4.4.4), common slopes with
+an offset per filter are compared with a slope per filter.  The slope of each other filter differs
+from that of the first one by the same amount in all segments.
 """
 
 from __future__ import annotations
@@ -31,27 +32,31 @@ from bayesdist.infer.series.trend import KINDS, TrendModel
 from bayesdist.utils.arrays import Float, Int
 from bayesdist.utils.distributions import t_ppf
 
-MIN_DIFFERENCE = 4.0
-CONFIDENCE = 0.95
-# lag-1 correlation, in its standard errors, from which exposures count as correlated
+MIN_DIFFERENCE = 4.0  # smallest significant difference of log predictive densities
+CONFIDENCE = 0.95  # confidence level of a significant difference
+# lag-1 correlation, in its standard errors, above which exposures count as correlated
 MIN_SERIAL_CORRELATION = 2.33
+# minimum number of blocks, and length of a block in correlation lengths
 MIN_BLOCKS, CORRELATION_LENGTHS = 6, 3
 
 
 @dataclass(frozen=True, eq=False)
 class Comparison:
-    """Trends of one series, with their predictions of held-out exposures.
+    """Trends fitted to a series, with their predictions of held-out exposures.
 
     Parameters
     ----------
     trends : tuple of TrendModel
-        The simplest first.
+        Trends, starting with the simplest.
     posteriors : tuple of SeriesPosterior
+        Posterior of each trend.
     scores : tuple of HeldOut
+        Predictions of each trend.
     scheme : str
-        How they were held out: 'exposures' by themselves, or whole 'blocks'.
+        'exposures' if single exposures are the independent items of the comparison, 'blocks' if
+        blocks of consecutive exposures were held out.
     correlation : float
-        Lag-1 correlation of the residuals of the trend that leaves least.
+        Smallest lag-1 correlation of the residuals from any trend without random part.
     """
 
     trends: tuple[TrendModel, ...]
@@ -61,10 +66,20 @@ class Comparison:
     correlation: float
 
     def difference(self, a: int, b: int) -> tuple[float, float]:
-        """Score of trend a minus that of trend b, and its standard error."""
+        """Score of trend a minus that of trend b, with its standard error.
+
+        Parameters
+        ----------
+        a, b : int
+            Indices of the trends.
+
+        Returns
+        -------
+        value, error : float
+        """
         each = self.scores[a].log_density - self.scores[b].log_density
         fold = self.scores[a].fold
-        # where whole blocks are held out they are the independent items, else the exposures
+        # the independent items are the blocks if blocks were held out, otherwise the exposures
         items = np.bincount(fold, each) if self.scheme == "blocks" else each
         return float(each.sum()), float(np.sqrt(len(items)) * items.std(ddof=1))
 
@@ -83,10 +98,11 @@ class Comparison:
 
     @property
     def selected(self) -> int:
-        """Index of the simplest trend that beats the constant and that the best does not beat.
+        """Index of the simplest trend that is better than the constant and not worse than the best.
 
-        The constant's index where nothing beats it.  A break that was found, and not given, has to
-        predict held-out exposures better than drifts without one: a break can follow any drift.
+        If no trend is significantly better than the constant, this is the index of the constant.  A
+        break at an unknown date must also predict held-out exposures better than smooth or
+        irregular drifts, since a break can imitate any drift.
         """
         constant = next(i for i, c in enumerate(self.trends) if c.kind == "constant")
         drifts = [s.total for c, s in zip(self.trends, self.scores, strict=True) if c.drifts]
@@ -98,11 +114,14 @@ class Comparison:
         return constant
 
     def table(self) -> Table:
-        """Table with one row for each trend, the best first.
+        """Table with one row per trend, starting with the best.
 
-        Columns: trend, score, its difference to the best with standard error, Monte-Carlo error,
-        fraction of measurements in the 68 % and 95 % predictive intervals, and convergence of the
-        posterior.
+        Returns
+        -------
+        astropy.table.Table
+            Columns trend, score, difference (to the best), standard_error, mc_error (Monte-Carlo
+            error), covered_68 and covered_95 (fraction of measurements in the predictive
+            intervals), converged.
         """
         order = sorted(range(len(self.trends)), key=lambda i: -self.scores[i].total)
         gaps = [self.difference(i, self.best) for i in order]
@@ -124,28 +143,30 @@ class Comparison:
 
 
 def compare(series: Series, candidates: Sequence[TrendModel], *, seed: int = 1) -> Comparison:
-    """Compare trends by their predictive densities of held-out exposures.
+    """Compare trends by the predictive density of held-out exposures.
 
-    They are held out in 30 groups, neighbours in different ones; successive ones together where the
-    residuals of every trend but the drifting ones are correlated in time.
+    The exposures are held out in 30 groups, with neighbours in different groups.  If the residuals
+    from all trends without random part are correlated in time, blocks of consecutive exposures are
+    held out instead.
 
     Parameters
     ----------
     series : Series
     candidates : sequence of TrendModel
-        The constant is added, and to every trend with breaks and slopes the one without slopes:
-        without them a slope could not be distinguished from none.
+        Trends to compare. A constant is added and, for each trend with breaks and slopes, the same
+        trend without slopes, which are needed to assess the significance of a slope.
     seed : int
+        Seed of the random numbers.
 
     Returns
     -------
     Comparison
-        Without trends whose one break, at any date, gains less likelihood from the very exposures
-        that it is fitted to than held-out ones would have to show.
+        Trends with one unknown break are omitted if the break cannot be significant: at the best
+        date, the gain in likelihood is smaller than a significant difference.
     """
     trends, posteriors = _fitted(series, _completed(candidates), seed)
-    found = [serial_correlation(p) for p in posteriors if not p.trend.drifts]
-    correlation = min(found, key=abs)
+    correlations = [serial_correlation(p) for p in posteriors if not p.trend.drifts]
+    correlation = min(correlations, key=abs)
     if correlation * np.sqrt(len(series)) > MIN_SERIAL_CORRELATION:
         breaks = tuple(sorted({b for c in trends for b in c.breaks}))
         scheme, fold = "blocks", _blocks(series, breaks, correlation)
@@ -158,9 +179,9 @@ def compare(series: Series, candidates: Sequence[TrendModel], *, seed: int = 1) 
 def _fitted(
     series: Series, candidates: tuple[TrendModel, ...], seed: int
 ) -> tuple[tuple[TrendModel, ...], tuple[SeriesPosterior, ...]]:
-    """Trends, and the posterior of each, without breaks that cannot be significant."""
+    """Fit the trends, except for those with a break that cannot be significant."""
     fitted = {c: fit_series(series, c, seed=seed) for c in candidates if c.find != 1}
-    # no trend of these can be beaten by a break that gains less over each
+    # a break that gains too little over each of these trends cannot be better than the best of them
     plain = [p for c, p in fitted.items() if not (c.n_breaks or c.drifts)]
     for trend in candidates:
         if trend.find == 1 and max(_gain(trend, p) for p in plain) >= MIN_DIFFERENCE:
@@ -170,10 +191,10 @@ def _fitted(
 
 
 def _gain(trend: TrendModel, plain: SeriesPosterior) -> float:
-    """Gain in log likelihood of a break over a trend without one, at the best date of all.
+    """Gain in log likelihood of a break at the best date, relative to a trend without break.
 
-    With the scatter about the trend without a break, or as much less as the chi-square is less,
-    and exposures that lie off it counted little or in full, whichever gains most.
+    It is an upper limit: the largest gain for a fixed or a rescaled scatter, and for outliers that
+    are weighted down or not.
     """
     problem = plain.engine.problem
     design = Design(trend, problem.series)
@@ -196,14 +217,14 @@ def _gain(trend: TrendModel, plain: SeriesPosterior) -> float:
 
 
 def _explained(problem: Problem, precision: Float, columns: Float) -> Float:
-    """Part of the chi-square that columns (M, E, p) explain, each with its best parameters."""
+    """Decrease of chi-square (M,) by columns (M, E, p) with their best-fitting parameters."""
     matrix, right = normal_equations(precision, problem.y, columns[None])
     matrix = matrix + WIDE**-2 * np.eye(matrix.shape[-1])
     return (right * np.linalg.solve(matrix, right[..., None])[..., 0]).sum(axis=-1)[0]
 
 
 def _completed(candidates: Sequence[TrendModel]) -> tuple[TrendModel, ...]:
-    """Trends with those that a claim has to be compared with, the simplest first."""
+    """Add the trends needed for comparison to the candidates, and sort by simplicity."""
     out = list(dict.fromkeys(candidates))
     groups = out[0].groups if out else "offsets"
     if not any(c.kind == "constant" for c in out):
@@ -221,27 +242,35 @@ def _completed(candidates: Sequence[TrendModel]) -> tuple[TrendModel, ...]:
 
 
 def _blocks(series: Series, breaks: tuple[float, ...], correlation: float) -> Int:
-    """Blocks (E,) of successive exposures, longer than their correlation where there are enough."""
+    """Blocks (E,) of consecutive exposures, longer than the correlation length if possible."""
     rho = float(np.clip(correlation, 0.0, 0.95))
     length = int(np.ceil(CORRELATION_LENGTHS * (1 + rho) / (1 - rho)))
     return block_folds(series.epoch, breaks, max(1, min(length, len(series) // MIN_BLOCKS)))
 
 
 def serial_correlation(posterior: SeriesPosterior) -> float:
-    """Correlation of the residuals of successive exposures, the mean over the coefficients.
+    """Lag-1 correlation of the residuals of consecutive exposures, averaged over the coefficients.
 
-    Exposures that lie off are weighted down by their probability.  Without correlation it scatters
-    by at most 1 / sqrt(E).
+    Outliers are weighted down according to their probability.  For uncorrelated exposures, the
+    standard deviation of the result is at most 1 / sqrt(E).
+
+    Parameters
+    ----------
+    posterior : SeriesPosterior
+
+    Returns
+    -------
+    float
     """
     series = posterior.series
     b = posterior.raw.b.mean(axis=(0, 1))
     if posterior.trend.find:
-        # the parameters belong to draws of the breaks: average the trend, not its parameters
+        # average the trend rather than its parameters, which depend on the break dates
         sweeps = np.linspace(0, posterior.raw.b.shape[1] - 1, 20).astype(int)
-        some = posterior.raw.b[:, sweeps].reshape(-1, *b.shape)
-        dates = posterior.raw.breaks[:, sweeps].reshape(len(some), -1)
+        sample = posterior.raw.b[:, sweeps].reshape(-1, *b.shape)
+        dates = posterior.raw.breaks[:, sweeps].reshape(len(sample), -1)
         columns = posterior.design.matrix(series.epoch, series.group_code, dates)
-        fitted = (columns @ np.swapaxes(some, 1, 2)).mean(axis=0)
+        fitted = (columns @ np.swapaxes(sample, 1, 2)).mean(axis=0)
     else:
         columns = posterior.design.matrix(series.epoch, series.group_code)[0]
         fitted = columns @ b.T
@@ -255,17 +284,18 @@ def serial_correlation(posterior: SeriesPosterior) -> float:
 
 @dataclass(frozen=True, eq=False)
 class FilterDependence:
-    """Comparison of common slopes with a slope for each filter.
+    """Comparison of common slopes with a slope per filter.
 
     Parameters
     ----------
     names : tuple of str
-        Filters; the first has most exposures, and the others are compared with it.
+        Filters. The first one has most exposures; the others are compared with it.
     all_slopes : Change
-        Differences of the slopes, per year, in one vector, filter by filter.
+        Differences of the slopes per year from those of the first filter, concatenated.
     common, separate : SeriesPosterior
+        Posteriors with common slopes, and with a slope per filter.
     comparison : Comparison
-        Held-out scores of the two, in this order.
+        Comparison of these two, and of the trends added by `compare`.
     """
 
     names: tuple[str, ...]
@@ -276,21 +306,22 @@ class FilterDependence:
 
     @property
     def depends(self) -> bool:
-        """True if own slopes predict significantly better."""
+        """True if a slope per filter predicts held-out exposures significantly better."""
         posteriors = self.comparison.posteriors
         return self.comparison.beats(posteriors.index(self.separate), posteriors.index(self.common))
 
 
 def filter_dependence(series: Series, trend: TrendModel, *, seed: int = 1) -> FilterDependence:
-    """Compare common slopes with a slope for each filter.
+    """Compare common slopes with a slope per filter.
 
     Parameters
     ----------
     series : Series
-        With filters as its groups.
+        Series with the filters as its groups.
     trend : TrendModel
-        With slopes.
+        Trend with slopes.
     seed : int
+        Seed of the random numbers.
 
     Returns
     -------
@@ -299,24 +330,24 @@ def filter_dependence(series: Series, trend: TrendModel, *, seed: int = 1) -> Fi
     Raises
     ------
     InputError
-        For a series of one filter, and a trend without slopes.
+        If the series has fewer than two filters, or the trend has no slopes.
     DegenerateError
-        For a filter with fewer than three exposures, or of one date only.
+        If a filter has fewer than three exposures, or exposures of a single date.
     """
     names = series.group_names
     if len(names) < 2:
         raise InputError(
-            "there are no two filters to compare",
+            "the series has fewer than two filters to compare",
             where=series.source,
             do="give the filter of each exposure as its group",
         )
     if not trend.has_slope:
         raise InputError(
-            f"trend {trend.name!r} has no slopes", where=series.source, do="ask for lines"
+            f"trend {trend.name!r} has no slopes", where=series.source, do="choose lines"
         )
-    both = (replace(trend, groups="offsets"), replace(trend, groups="slopes"))
-    comparison = compare(series, both, seed=seed)
-    places = [comparison.trends.index(c) for c in both]
+    alternatives = (replace(trend, groups="offsets"), replace(trend, groups="slopes"))
+    comparison = compare(series, alternatives, seed=seed)
+    places = [comparison.trends.index(c) for c in alternatives]
     common, separate = (comparison.posteriors[i] for i in places)
     slopes = separate.group_slope
     return FilterDependence(

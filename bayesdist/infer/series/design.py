@@ -1,10 +1,10 @@
-"""Columns of a trend for one series, and the meaning of their parameters.
+"""Design matrix of a trend for a series, and the meaning of its parameters.
 
-An irregular or a smooth drift is a Wiener process, plain or integrated once, seen at knots.  With a
-free level (and, integrated, a free slope) in addition, the date at which such a process starts does
-not matter; here it is the middle of the series.  Given its values at the knots the process is known
-exactly there, and its conditional mean runs between them: linear or cubic.  The integrated process
-is the smoothing spline of Wahba (1978).
+An irregular drift is a Wiener process, a smooth drift an integrated Wiener process; the latter is
+the smoothing spline of Wahba (1978).  Both are represented by their values at knots, between which
+the conditional mean is linear or cubic.  Since the level (and, for a smooth drift, the slope) is a
+free parameter in addition, the date at which the process starts does not matter; here it is the
+middle of the series.
 """
 
 from __future__ import annotations
@@ -24,18 +24,18 @@ from bayesdist.utils.arrays import Float, Int
 
 @dataclass(frozen=True, eq=False)
 class Drift:
-    """A process of unit amplitude: about one at the ends of the series."""
+    """Random process of unit amplitude, with a variance of about one at the ends of the series."""
 
-    origin: float  # middle of the series
-    years: float  # half its span
-    knots: Float  # (Q,) in units of half the span from the middle, none of them zero
-    smooth: bool  # integrated once
+    origin: float  # date of the middle of the series
+    years: float  # half the span of the series
+    knots: Float  # positions (Q,) in units of half the span from the middle, all non-zero
+    smooth: bool  # True for the integrated Wiener process
 
     @classmethod
     def over(cls, epoch: Float, n_knots: int, *, smooth: bool) -> Drift:
-        """Process over a series.
+        """Make a process for a series with these epochs (E,).
 
-        A smooth one has its knots at even distances, an irregular one where the exposures are.
+        A smooth process has equidistant knots; those of an irregular one follow the exposures.
         """
         first, last = epoch.min(), epoch.max()
         origin, years = (first + last) / 2, (last - first) / 2
@@ -52,17 +52,18 @@ class Drift:
         return len(self.knots)
 
     def kernel(self, a: Float, b: Float) -> Float:
-        """Covariance (..., n, m) of the process at dates (n,) and (m,), in half spans."""
-        same = np.sign(a)[:, None] == np.sign(b)
+        """Covariance (n, m) of the process between dates (n,) and (m,), in half spans."""
+        same_side = np.sign(a)[:, None] == np.sign(b)
         x, y = np.abs(a)[:, None], np.abs(b)
         low, high = np.minimum(x, y), np.maximum(x, y)
         values = 3 * low**2 * (high - low / 3) / 2 if self.smooth else low
-        return np.where(same, values, 0.0)
+        return np.where(same_side, values, 0.0)
 
     def columns(self, epoch: ArrayLike) -> Float:
-        """Columns (E, Q) whose parameters are independent and of one variance.
+        """Columns (E, Q) of the design matrix for parameters with independent, equal variances.
 
-        Their sum with such parameters is the conditional mean given the process at the knots.
+        The sum of the columns times such parameters is the conditional mean of the process, given
+        its values at the knots.
         """
         places = (np.asarray(epoch, float) - self.origin) / self.years
         factor = np.linalg.cholesky(self.kernel(self.knots, self.knots))
@@ -71,7 +72,7 @@ class Drift:
 
 @dataclass(frozen=True, eq=False)
 class Design:
-    """Columns of a trend for one series.
+    """Design matrix of a trend for a series.
 
     Parameters
     ----------
@@ -81,8 +82,8 @@ class Design:
     Raises
     ------
     DegenerateError
-        Where a segment or a group has too few exposures, or exposures of one date only, for the
-        parameters of the trend.
+        If a segment or a group has too few exposures for the parameters of the trend, or exposures
+        of a single date.
     """
 
     trend: TrendModel
@@ -97,7 +98,7 @@ class Design:
                     raise DegenerateError(
                         f"{len(epoch)} exposures of group {name!r} do not determine its slope",
                         where=self.series.source,
-                        do="leave the group out, or let the groups share their slopes",
+                        do="leave the group out, or use common slopes for all groups",
                     )
 
         if not self.trend.find and self.n_groups > 1:
@@ -107,14 +108,14 @@ class Design:
                     f"the groups ({', '.join(self.series.group_names)}) cannot be told from the "
                     f"trend {self.trend.name!r}: some of them have exposures in one segment only",
                     where=self.series.source,
-                    do="leave groups out, or take a break away",
+                    do="leave groups out, or remove a break",
                 )
 
     def _check_segments(self) -> None:
         trend, series = self.trend, self.series
         if np.ptp(series.epoch) == 0 and trend.kind != "constant":
             raise DegenerateError(
-                "all exposures have one date", where=series.source, do="ask for a constant"
+                "all exposures have the same date", where=series.source, do="choose a constant"
             )
         if trend.find:
             need = MIN_EXPOSURES_FOUND * trend.n_segments
@@ -136,14 +137,14 @@ class Design:
                     f"the segment from {first:g} to {last:g} has {len(epoch)} exposures of "
                     f"{len(np.unique(epoch))} dates, and trend {trend.kind!r} needs {need}",
                     where=series.source,
-                    do="take this break away",
+                    do="remove this break",
                 )
 
     # -- scales -----------------------------------------------------------------------------------
 
     @cached_property
     def reference(self) -> Float:
-        """Reference date (S,) of each segment."""
+        """Reference date (S,) of each segment in decimal years."""
         trend, epoch = self.trend, self.series.epoch
         if trend.reference:
             return np.broadcast_to(np.array(trend.reference, float), (trend.n_segments,)).copy()
@@ -154,12 +155,12 @@ class Design:
 
     @cached_property
     def years(self) -> float:
-        """Unit of time of the columns: half the span of the series, in years."""
+        """Unit of time of the columns in years: half the span of the series."""
         return float(np.ptp(self.series.epoch)) / 2 or 1.0
 
     @cached_property
     def drift(self) -> Drift | None:
-        """Random part of the trend, or None."""
+        """Random part of the trend; None if it has none."""
         form = self.trend.form
         if not form.knots:
             return None
@@ -167,39 +168,52 @@ class Design:
 
     @property
     def n_groups(self) -> int:
-        """Number of groups of the series; one without groups."""
+        """Number of groups of the series; 1 if it has no groups."""
         return max(len(self.series.group_names), 1)
 
     @property
     def n_fixed(self) -> int:
-        """Number of columns whose parameters have a vague prior: the trend, then the groups."""
+        """Number of columns with a vague prior on their parameters: trend, then groups."""
         each = 2 if self.trend.groups == "slopes" else 1
         return self.trend.n_columns + each * (self.n_groups - 1)
 
     @property
     def n_columns(self) -> int:
-        """Number of all columns: the fixed ones, then those of the random part."""
+        """Total number of columns: the fixed ones, then those of the random part."""
         return self.n_fixed + (self.drift.n_columns if self.drift else 0)
 
     # -- columns ----------------------------------------------------------------------------------
 
     def given_breaks(self) -> Float:
-        """Given breaks as one row (1, B)."""
+        """Dates of the given breaks, shape (1, B)."""
         return np.array(self.trend.breaks, float)[None]
 
     def segment(self, epoch: Float, breaks: Float | None = None) -> Int:
-        """Segment (..., E) of each epoch (E,) for breaks (..., B)."""
+        """Segment number (..., E) of each epoch (E,).
+
+        Parameters
+        ----------
+        epoch : ndarray, shape (E,)
+            Decimal years.
+        breaks : ndarray, shape (..., B), optional
+            Dates of the breaks; the given ones by default.
+
+        Returns
+        -------
+        ndarray of int, shape (..., E)
+        """
         rows = self.given_breaks() if breaks is None else breaks
         return (epoch >= rows[..., :, None]).sum(axis=-2)
 
     def matrix(self, epoch: ArrayLike, group: Int, breaks: Float | None = None) -> Float:
-        """Columns at epochs.
+        """Design matrix at given epochs.
 
         Parameters
         ----------
         epoch : array_like, shape (E,)
-        group : ndarray, shape (E,)
-            Codes of the groups.
+            Decimal years.
+        group : ndarray of int, shape (E,)
+            Index of each exposure's group.
         breaks : ndarray, shape (..., B), optional
             Dates of the breaks, possibly fewer than the trend has; the given ones by default.
 
@@ -212,26 +226,26 @@ class Design:
         segment = self.segment(t, rows)
         n = rows.shape[-1] + 1
         inside = (segment[..., None] == np.arange(n)).astype(float)
-        one = np.ones((*segment.shape, 1))
+        constant = np.ones((*segment.shape, 1))
         since = ((t - self.reference[segment]) / self.years)[..., None]
         form = self.trend.form
-        parts = [inside if form.levels else one]
+        parts = [inside if form.levels else constant]
         if form.slopes == "one":
             parts.append(since)
         elif form.slopes == "each":
             parts.append(inside * since)
         elif form.slopes == "kinks":
             after = np.maximum(t[:, None] - rows[..., None, :], 0.0) / self.years
-            whole = ((t - self.reference[0]) / self.years)[:, None] * one
-            parts += [whole, after]
+            since_start = ((t - self.reference[0]) / self.years)[:, None] * constant
+            parts += [since_start, after]
         if self.n_groups > 1:
             member = (group[:, None] == np.arange(1, self.n_groups)).astype(float)
-            parts.append(member * one)
+            parts.append(member * constant)
             if self.trend.groups == "slopes":
                 middle = self.series.epoch.mean()
-                parts.append(member * one * ((t - middle) / self.years)[:, None])
+                parts.append(member * constant * ((t - middle) / self.years)[:, None])
         if self.drift:
-            parts.append(self.drift.columns(t) * one)
+            parts.append(self.drift.columns(t) * constant)
         return np.concatenate(parts, axis=-1)
 
     def lines(self, b: Float, breaks: Float) -> tuple[Float, Float]:
@@ -242,11 +256,12 @@ class Design:
         b : ndarray, shape (n, k, p)
             Parameters of the columns.
         breaks : ndarray, shape (n, B) or (1, B)
+            Dates of the breaks.
 
         Returns
         -------
         level, slope : ndarray, shape (n, S, k)
-            Of the first group; of a trend with a random part, without it.
+            Values for the first group, without the random part of the trend.
         """
         s, n, slopes = self.trend.n_segments, self.trend.n_levels, self.trend.form.slopes
         rows = np.swapaxes(b, 1, 2)  # (n, p, k)
@@ -254,11 +269,11 @@ class Design:
         if slopes == "none":
             return rows[:, :n].copy(), flat
         if slopes != "kinks":
-            own = rows[:, n : n + (s if slopes == "each" else 1)]
-            return rows[:, :n].copy(), flat + own / self.years
+            per_segment = rows[:, n : n + (s if slopes == "each" else 1)]
+            return rows[:, :n].copy(), flat + per_segment / self.years
         slope = np.cumsum(rows[:, 1 : s + 1], axis=1) / self.years
         level = flat + rows[:, :1]
-        # the first segment's line at each reference date, then each kink's part from its date on
+        # line of the first segment at each reference date, plus the contribution of each kink
         level += slope[:, :1] * (self.reference - self.reference[0])[:, None]
         for k in range(s - 1):
             kink = (slope[:, k + 1] - slope[:, k])[:, None]

@@ -1,4 +1,4 @@
-"""From a series to its posterior."""
+"""Sampling of the posterior of a series."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from bayesdist.infer.series.problem import Problem
 from bayesdist.infer.series.series import Series
 from bayesdist.infer.series.trend import TrendModel
 
-CHAINS, WARMUP, SWEEPS = 32, 50, 50
+CHAINS, WARMUP, SWEEPS = 32, 50, 50  # number of chains; sweeps of the warm-up; first sweeps
 
 
 @one_thread
@@ -30,55 +30,57 @@ def fit_series(
     target_rhat: float = 1.01,
     max_sweeps: int = 1600,
 ) -> SeriesPosterior:
-    """Posterior of a trend with time, of the scatter of the exposures, and of outliers.
+    """Sample the posterior of a trend with time, the scatter of the exposures, and outliers.
 
     Parameters
     ----------
     series : Series
     trend : TrendModel
     seed : int
+        Seed of the random numbers.
     scatter : array_like, shape (k, k), optional
-        Intrinsic covariance where it is known; it is a parameter by default.
+        Intrinsic covariance of the coefficients, if known; fitted by default.
     outliers : bool
-        True if exposures may lie off the trend.
+        True if exposures may be outliers.
     target_ess, target_rhat : float
-        Limits of convergence, for every parameter.
+        Convergence criteria for all parameters.
     max_sweeps : int
-        Draws of each chain at most; convergence is judged of 50, then of 100 further ones, and so
-        on.
+        Maximum number of draws per chain. Convergence is checked after 50 draws, then after 100
+        new draws, and so on.
 
     Returns
     -------
     SeriesPosterior
-        `convergence` shows if the limits were reached.
+        Its `convergence.converged` is True if the criteria were met.
 
     Raises
     ------
     DegenerateError
-        Where the exposures do not determine the trend (see `Design`), or have no error at all.
+        If the exposures do not determine the trend (see `Design`), or have neither formal errors
+        nor scatter.
     InputError
-        For a scatter of another shape.
+        If `scatter` is not a finite matrix of shape (k, k).
     """
-    known = None
+    intrinsic = None
     if scatter is not None:
-        known = np.asarray(scatter, float)
+        intrinsic = np.asarray(scatter, float)
         k = series.n_coefficients
-        if known.shape != (k, k) or not np.all(np.isfinite(known)):
+        if intrinsic.shape != (k, k) or not np.all(np.isfinite(intrinsic)):
             raise InputError(
-                f"scatter has shape {known.shape} or is not finite, and must be a finite matrix "
-                f"{(k, k)}",
+                f"scatter has shape {intrinsic.shape} or is not finite, and must be a finite "
+                f"matrix {(k, k)}",
                 where=series.source,
                 do="give the covariance of the coefficients",
             )
         unit = series.spread[:, None] * series.spread
-        if np.linalg.eigvalsh((series.cov + known) / unit).min() <= 1e-12:
+        if np.linalg.eigvalsh((series.cov + intrinsic) / unit).min() <= 1e-12:
             raise DegenerateError(
                 "with the given scatter some exposures have no error at all",
                 where=series.source,
                 do="give formal errors or a scatter above zero",
             )
     design = Design(trend, series)
-    problem = Problem.of(series, design, known, outliers=outliers)
+    problem = Problem.of(series, design, intrinsic, outliers=outliers)
     engine, last, draws, convergence = run(
         problem,
         np.random.default_rng(seed),

@@ -1,8 +1,9 @@
 """Predictive densities of held-out exposures.
 
-The exposures are cut into folds, and each is predicted from the rest: by the draws of the whole
-series with importance weights where these are reliable, else by exact refits.  The chains of all
-refits run in parallel from the last state of the whole series' chains.
+The exposures are divided into folds, and each fold is predicted from the others.  This is done with
+importance weights for the draws of the complete series if the weights are reliable, otherwise by
+sampling without the fold.  The chains of all such refits run in parallel, starting from the last
+state for the complete series.
 """
 
 from __future__ import annotations
@@ -20,24 +21,25 @@ from bayesdist.infer.series.problem import State
 from bayesdist.utils.arrays import Float, Int
 from bayesdist.utils.limits import PARETO_K
 
+# per fold that is sampled again: number of chains, of warm-up sweeps and of sweeps after these
 CHAINS, WARMUP, SWEEPS = 6, 30, 60
-CHAINS_AT_ONCE = 192
-DRAWS_AT_ONCE = 1024
-N_FOLDS = 30
+CHAINS_AT_ONCE = 192  # largest number of chains in parallel
+DRAWS_AT_ONCE = 1024  # number of posterior draws per block of the predictive densities
+N_FOLDS = 30  # default number of folds
 
 
 @dataclass(frozen=True, eq=False)
 class HeldOut:
-    """Predictive density of each exposure from the others.
+    """Predictive densities of held-out exposures.
 
     Parameters
     ----------
     log_density : ndarray, shape (E,)
-        Log predictive density of all k coefficients together, in units of the spread.
+        Joint log predictive density of all k coefficients, in units of the spread.
     rank : ndarray, shape (E, k)
-        Predictive probability below the measured value; uniform if the trend is right.
-    fold : ndarray, shape (E,)
-        Code of the exposures that were held out together.
+        Predictive probability of a value below the measured one; uniform if the trend is adequate.
+    fold : ndarray of int, shape (E,)
+        Number of the fold; exposures of a fold were held out together.
     mc_error : float
         Monte-Carlo standard error of the sum of `log_density`.
     """
@@ -49,48 +51,74 @@ class HeldOut:
 
     @property
     def total(self) -> float:
-        """Sum of the log densities: the larger, the better."""
+        """Sum of the log densities (score); larger values are better."""
         return float(self.log_density.sum())
 
     def covered(self, probability: float) -> Float:
-        """Fraction of measurements (k,) inside the central predictive interval of a probability."""
+        """Fraction of the measurements inside the central predictive interval.
+
+        Parameters
+        ----------
+        probability : float
+            Probability of the interval, between 0 and 1.
+
+        Returns
+        -------
+        ndarray, shape (k,)
+        """
         tail = (1 - probability) / 2
         return ((self.rank > tail) & (self.rank < 1 - tail)).mean(axis=0)
 
 
 def exposure_folds(epoch: Float, groups: int = N_FOLDS) -> Int:
-    """Folds (E,) of exposures dealt out by date to so many groups, or one to each."""
+    """Assign exposures to folds in turn, in the order of their dates.
+
+    Parameters
+    ----------
+    epoch : ndarray, shape (E,)
+        Dates of the exposures.
+    groups : int
+        Number of folds, if there are enough exposures.
+
+    Returns
+    -------
+    ndarray of int, shape (E,)
+        Fold of each exposure.
+    """
     out = np.empty(len(epoch), np.int64)
     out[np.argsort(epoch, kind="stable")] = np.arange(len(epoch)) % min(len(epoch), groups)
     return out
 
 
 def block_folds(epoch: Float, breaks: tuple[float, ...], length: int) -> Int:
-    """Blocks of successive exposures, cut where the gaps in time are longest.
+    """Divide exposures into blocks of consecutive exposures, at the longest gaps in time.
 
     Parameters
     ----------
     epoch : ndarray, shape (E,)
+        Dates of the exposures.
     breaks : tuple of float
-        Given breaks; blocks end there, and a segment of two or more exposures has several blocks.
+        Dates of given breaks, where blocks end. A segment with at least two exposures has several
+        blocks.
     length : int
-        Least number of exposures in a block, where the segments allow it.
+        Minimum number of exposures in a block, if the segments allow it.
 
     Returns
     -------
     ndarray of int, shape (E,)
+        Block of each exposure.
     """
     order = np.argsort(epoch, kind="stable")
     t = epoch[order]
     n = len(t)
     cuts = {0, n, *(int(np.searchsorted(t, b)) for b in breaks)}
     for first, last in zip(sorted(cuts)[:-1], sorted(cuts)[1:], strict=True):
-        least = min(length, (last - first) // 2)
+        min_length = min(length, (last - first) // 2)
         inner = sorted(range(first + 1, last), key=lambda i: t[i - 1] - t[i])
         for i in inner:
             below = max(c for c in cuts if c < i)
             above = min((c for c in cuts if c > i), default=n)
-            if least and i in range(below + least, above - least + 1):
+            if min_length and i in range(below + min_length, above - min_length + 1):
                 cuts.add(i)
     out = np.empty(n, np.int64)
     out[order] = np.searchsorted(sorted(cuts), np.arange(n), side="right") - 1
@@ -99,19 +127,20 @@ def block_folds(epoch: Float, breaks: tuple[float, ...], length: int) -> Int:
 
 @one_thread
 def held_out(posterior: SeriesPosterior, fold: Int, *, seed: int = 1) -> HeldOut:
-    """Predict each fold from the rest.
+    """Predict the exposures of each fold from the other folds.
 
-    The draws of the whole series are used, weighted by 1 / (density of the fold) with the tail of
-    the weights smoothed (Vehtari, Gelman & Gabry 2017).  Where the weights have no such tail
-    (Pareto k above 0.7), and a fold matters too much for that, the posterior is drawn anew without
-    it.
+    The draws for the complete series are weighted by 1 / (density of the fold), with
+    Pareto-smoothed weights (Vehtari, Gelman & Gabry 2017).  If the weights are unreliable (Pareto k
+    above 0.7), the posterior is sampled again without the fold.
 
     Parameters
     ----------
     posterior : SeriesPosterior
-        Of the whole series.
+        Posterior of the complete series.
     fold : ndarray of int, shape (E,)
+        Fold of each exposure.
     seed : int
+        Seed of the random numbers.
 
     Returns
     -------
@@ -137,9 +166,9 @@ def held_out(posterior: SeriesPosterior, fold: Int, *, seed: int = 1) -> HeldOut
         rank[rows] = np.tensordot(weight, below[:, rows], 1)
     at_once = max(1, CHAINS_AT_ONCE // CHAINS)
     for start in range(0, len(refitted), at_once):
-        some = np.array(refitted[start : start + at_once])
-        density, below = _without(posterior, fold, some, rng)
-        for i, code in enumerate(some):
+        codes = np.array(refitted[start : start + at_once])
+        density, below = _without(posterior, fold, codes, rng)
+        for i, code in enumerate(codes):
             rows = fold == code
             chains = density[i * CHAINS : (i + 1) * CHAINS, rows]
             top = chains.max(axis=0)
@@ -151,7 +180,7 @@ def held_out(posterior: SeriesPosterior, fold: Int, *, seed: int = 1) -> HeldOut
 
 
 def _of_all_draws(posterior: SeriesPosterior) -> tuple[Float, Float]:
-    """Log density (n, E) of exposures at draws, and probability (n, E, k) below their values."""
+    """Log density (n, E) and probability below the measured value (n, E, k) for all draws."""
     n_draws = posterior.raw.fraction.size
     pieces = [
         predictive(posterior, posterior.raw.state(slice(first, first + DRAWS_AT_ONCE)))
@@ -163,28 +192,28 @@ def _of_all_draws(posterior: SeriesPosterior) -> tuple[Float, Float]:
 def _without(
     posterior: SeriesPosterior, fold: Int, codes: Int, rng: np.random.Generator
 ) -> tuple[Float, Float]:
-    """Log density (C, E) and probability below (C, E, k), drawn anew without some folds.
+    """Log density (C, E) and probability below the measured value (C, E, k) without some folds.
 
-    Mean over the draws of each chain, `CHAINS` chains for each fold.
+    They are averaged over the draws of each chain, with `CHAINS` chains per fold in `codes`.
     """
     engine, last = posterior.engine, posterior.last
-    own = np.repeat(codes, CHAINS)
-    included = (own[:, None] != fold).astype(float)
-    state = last.take(rng.integers(0, len(last.fraction), len(own)))
+    excluded = np.repeat(codes, CHAINS)
+    included = (excluded[:, None] != fold).astype(float)
+    state = last.take(rng.integers(0, len(last.fraction), len(excluded)))
     for _ in range(WARMUP):
         state = engine.step(state, rng, included)
     density = np.full(included.shape, -np.inf)
     below = np.zeros((*included.shape, posterior.series.n_coefficients))
     for _ in range(SWEEPS):
         state = engine.step(state, rng, included)
-        log_density, less = predictive(posterior, state)
+        log_density, probability = predictive(posterior, state)
         density = np.logaddexp(density, log_density)
-        below += less
+        below += probability
     return density - np.log(SWEEPS), below / SWEEPS
 
 
 def predictive(posterior: SeriesPosterior, state: State) -> tuple[Float, Float]:
-    """Log density (C, E) of exposures at a draw, and probability (C, E, k) below their values."""
+    """Log density (C, E) and probability below the measured value (C, E, k) for a state."""
     problem = posterior.engine.problem
     columns = problem.columns(state.breaks)
     residual = problem.residual(state.b, columns)

@@ -1,4 +1,4 @@
-"""Posterior of a series: draws of its trend and scatter, predictions, changes at breaks."""
+"""Posterior of a series: draws of trend and scatter, predictions, and changes at breaks."""
 
 from __future__ import annotations
 
@@ -21,12 +21,14 @@ from bayesdist.utils.arrays import Float
 
 @dataclass(frozen=True, eq=False)
 class Change:
-    """Difference of a set of coefficients, with covariance.
+    """Change of k coefficients, with its covariance.
 
     Parameters
     ----------
     value : ndarray, shape (k,)
+        Change of each coefficient.
     cov : ndarray, shape (k, k)
+        Covariance of the changes.
     """
 
     value: Float
@@ -34,42 +36,56 @@ class Change:
 
     @classmethod
     def of(cls, draws: Float) -> Change:
-        """Change from draws (n, k) of a difference."""
+        """Compute mean and covariance from draws.
+
+        Parameters
+        ----------
+        draws : ndarray, shape (n, k)
+            Draws of the change.
+
+        Returns
+        -------
+        Change
+        """
         return cls(draws.mean(axis=0), np.atleast_2d(np.cov(draws, rowvar=False)))
 
     @property
     def sigma(self) -> Float:
-        """Standard deviations (k,)."""
+        """Standard deviation (k,) of each change."""
         return np.sqrt(np.diag(self.cov))
 
     @property
     def significance(self) -> Float:
-        """Value over sigma (k,) of each; 0 for those that cannot differ, as slopes of a step."""
+        """Change divided by its error (k,); 0 if the trend does not allow a change."""
         return np.divide(
             self.value, self.sigma, out=np.zeros_like(self.value), where=self.sigma > 0
         )
 
     @property
     def p_value(self) -> float:
-        """Probability of a larger chi-square of all that can differ, where nothing does.
+        """Probability of a larger chi-square if there is no change.
 
-        Of a Gaussian: with few exposures the posterior has heavier tails, and this is too small.
+        It assumes a Gaussian posterior.  With few exposures, the posterior has heavier tails, and
+        this value is too small.
         """
         return chi_square(self.value, self.cov).p_value
 
 
 @dataclass(frozen=True, eq=False)
 class Prediction:
-    """The coefficients at M epochs.
+    """Predicted coefficients at M epochs.
 
     Parameters
     ----------
     epoch : ndarray, shape (M,)
+        Decimal years.
     mean : ndarray, shape (M, k)
+        Posterior mean of the trend.
     cov : ndarray, shape (M, k, k)
-        Of the trend.
+        Covariance of the trend.
     cov_new : ndarray, shape (M, k, k)
-        Of an exposure that is no outlier and has no formal error: the trend's and the intrinsic.
+        Covariance of the coefficients of a new exposure that is not an outlier and has no formal
+        errors: that of the trend plus the intrinsic covariance.
     """
 
     epoch: Float
@@ -79,28 +95,30 @@ class Prediction:
 
     @property
     def sigma(self) -> Float:
-        """Standard deviations (M, k) of the trend."""
+        """Standard deviation (M, k) of the trend."""
         return np.sqrt(np.diagonal(self.cov, axis1=1, axis2=2))
 
     @property
     def sigma_new(self) -> Float:
-        """Standard deviations (M, k) of a new exposure."""
+        """Standard deviation (M, k) of a new exposure without formal errors."""
         return np.sqrt(np.diagonal(self.cov_new, axis1=1, axis2=2))
 
 
 @dataclass(frozen=True, eq=False)
 class SeriesPosterior:
-    """Posterior of a trend and of the scatter about it.
+    """Posterior of a trend and of the scatter of the exposures about it.
 
     Parameters
     ----------
     series : Series
     trend : TrendModel
     design : Design
+        Design matrix of the trend.
     raw : Draws
-        In units of the spread.
+        Draws in units of the spread of the series.
     convergence : Convergence
     engine : Engine
+        Sampler, to continue the chains.
     last : State
         Last state of the chains.
     """
@@ -115,7 +133,7 @@ class SeriesPosterior:
 
     @property
     def _parameters(self) -> Float:
-        """Draws (n, k, p) of the columns' parameters."""
+        """Draws (n, k, p) of the parameters of the columns."""
         return self.raw.b.reshape(-1, *self.raw.b.shape[2:])
 
     @cached_property
@@ -126,24 +144,24 @@ class SeriesPosterior:
 
     @cached_property
     def _breaks(self) -> Float:
-        """Breaks (n, B); one row where they are given."""
+        """Draws (n, B) of the break dates; a single row if they are given."""
         if not self.trend.find:
             return self.design.given_breaks()
         return self.raw.breaks.reshape(self.raw.fraction.size, self.trend.find)
 
     @property
     def reference(self) -> Float:
-        """Reference date (S,) of each segment."""
+        """Reference date (S,) of each segment in decimal years."""
         return self.design.reference
 
     @property
     def alpha(self) -> Float:
-        """Draws (n, S, k) of the coefficients at the reference dates, of the first group."""
+        """Draws (n, S, k) of the coefficients at the reference dates, for the first group."""
         return self._lines[0]
 
     @property
     def beta(self) -> Float:
-        """Draws (n, S, k) of the slopes per year; zero where the trend has none."""
+        """Draws (n, S, k) of the slopes per year; zero if the trend has no slopes."""
         return self._lines[1]
 
     @cached_property
@@ -160,33 +178,33 @@ class SeriesPosterior:
 
     @property
     def breaks(self) -> Float:
-        """Draws (n, B) of the breaks that were found."""
+        """Draws (n, B) of the dates of unknown breaks, in decimal years."""
         return self.raw.breaks.reshape(-1, self.trend.find)
 
     @property
     def outlier_probability(self) -> Float:
-        """Outlier probability (E,) of each exposure."""
+        """Posterior outlier probability (E,) of each exposure."""
         return self.raw.outlier_probability
 
     @cached_property
     def group_offset(self) -> Float:
-        """Draws (n, G - 1, k) of each further group's offset."""
+        """Draws (n, G - 1, k) of the offsets of the other groups from the first group."""
         return self._group_columns(self.trend.n_columns) * self.series.spread
 
     @cached_property
     def group_slope(self) -> Float:
-        """Draws (n, G - 1, k) of each further group's difference in slope, per year.
+        """Draws (n, G - 1, k) of the slopes of the other groups minus that of the first, per year.
 
         Raises
         ------
         InputError
-            Where the groups share their slopes.
+            If the groups have common slopes.
         """
         if self.trend.groups != "slopes":
             raise InputError(
-                "the groups share their slopes",
+                "the groups have common slopes",
                 where=self.series.source,
-                do="ask for a trend with groups='slopes'",
+                do="fit a trend with groups='slopes'",
             )
         first = self.trend.n_columns + self.design.n_groups - 1
         return self._group_columns(first) * self.series.spread / self.design.years
@@ -196,17 +214,23 @@ class SeriesPosterior:
         return np.swapaxes(self._parameters[..., columns], 1, 2)
 
     def change(self, number: int = 0) -> tuple[Change, Change]:
-        """Changes at a break: of the coefficients at its date, and of their slopes.
+        """Changes of the coefficients and of their slopes at a break.
 
         Parameters
         ----------
         number : int
-            Of the break, from 0.
+            Number of the break, starting from 0.
 
         Returns
         -------
         level, slope : Change
-            After minus before.  Where slopes cannot change, theirs is zero with no sigma.
+            Values after the break minus those before it, at the date of the break. If the trend
+            does not allow the slopes to change, their change is zero with zero error.
+
+        Raises
+        ------
+        InputError
+            If the trend has no such break.
         """
         if not 0 <= number < self.trend.n_breaks:
             raise InputError(
@@ -221,14 +245,14 @@ class SeriesPosterior:
     # -- prediction -------------------------------------------------------------------------------
 
     def predict(self, epoch: ArrayLike, *, group: str | None = None) -> Prediction:
-        """Coefficients at epochs from the first to the last exposure.
+        """Predict the coefficients at epochs between the first and the last exposure.
 
         Parameters
         ----------
         epoch : array_like, shape (M,)
             Decimal years.
         group : str, optional
-            The group with most exposures by default.
+            Name of the group; by default that with most exposures.
 
         Returns
         -------
@@ -237,7 +261,7 @@ class SeriesPosterior:
         Raises
         ------
         InputError
-            For an epoch outside every segment, and an unknown group.
+            If an epoch is outside the range of the exposures, or the group is unknown.
         """
         t = np.atleast_1d(np.asarray(epoch, float))
         trend = self._trend_draws(t, group)
@@ -247,13 +271,13 @@ class SeriesPosterior:
         return Prediction(t, mean, cov, cov + self.scatter.mean(axis=0))
 
     def _trend_draws(self, t: Float, group: str | None) -> Float:
-        """Draws (n, M, k) of the trend."""
+        """Draws (n, M, k) of the trend at epochs t (M,)."""
         first, last = self.series.span
         outside = ~((t >= first) & (t <= last))
         if outside.any():
             raise InputError(
-                f"epoch {t[int(np.argmax(outside))]:g} lies outside every segment: the exposures "
-                f"are of {first:.2f} to {last:.2f}",
+                f"epoch {t[int(np.argmax(outside))]:g} is outside the range of the exposures, "
+                f"{first:.2f} to {last:.2f}",
                 where=self.series.source,
                 do="give another epoch",
             )

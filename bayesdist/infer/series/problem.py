@@ -1,4 +1,4 @@
-"""A series in units of its spread, the state of its chains, and its normal equations."""
+"""Series in units of its spread, state of the chains, and normal equations of the trend."""
 
 from __future__ import annotations
 
@@ -13,28 +13,28 @@ from bayesdist.infer.series.design import Design
 from bayesdist.infer.series.series import Series
 from bayesdist.utils.arrays import Bool, Float, Int
 
-WIDE = 100.0  # prior standard deviation of the trend's parameters
-CANDIDATES_AT_ONCE = 8
-MIN_EIGENVALUE = 1e-10  # of a formal covariance, as a fraction of the largest, that is inverted
+WIDE = 100.0  # prior standard deviation of the trend's parameters, in units of the spread
+CANDIDATES_AT_ONCE = 8  # number of candidate break dates that are evaluated at a time
+MIN_EIGENVALUE = 1e-10  # smallest relative eigenvalue of a formal covariance to be inverted
 
 
 @dataclass(frozen=True, eq=False)
 class Problem:
-    """A series in units of its spread, with its trend and noise model."""
+    """Series in units of its spread, with its trend and noise model."""
 
     series: Series
     design: Design
-    y: Float  # (k, E)
-    formal: Float  # formal covariance (k, k, E)
-    root: Float  # a square root of it (k, k, E)
-    sigma: Float | None = None  # intrinsic covariance (k, k) where it is known
-    outliers: bool = True  # True if exposures may lie off the trend
+    y: Float  # coefficients (k, E) minus their medians
+    formal: Float  # formal covariances (k, k, E)
+    root: Float  # matrix square roots (k, k, E) of the formal covariances
+    sigma: Float | None = None  # intrinsic covariance (k, k), if it is known
+    outliers: bool = True  # True if exposures may be outliers
 
     @classmethod
     def of(
         cls, series: Series, design: Design, scatter: Float | None = None, *, outliers: bool = True
     ) -> Problem:
-        """Problem in units of the spread; `scatter` (k, k) is a known intrinsic covariance."""
+        """Convert a series to units of its spread; `scatter` (k, k) is the intrinsic covariance."""
         unit = series.spread
         square = unit[:, None] * unit
         formal = series.cov / square
@@ -52,7 +52,7 @@ class Problem:
 
     @cached_property
     def inverse(self) -> Float | None:
-        """Inverse (k, k, E) of the formal covariance; None where some exposure's is singular."""
+        """Inverse (k, k, E) of the formal covariances; None if any of them is singular."""
         formal = np.moveaxis(self.formal, -1, 0)
         values = np.linalg.eigvalsh(formal)
         if not (values[:, 0] > MIN_EIGENVALUE * values[:, -1]).all():
@@ -60,44 +60,44 @@ class Problem:
         return np.ascontiguousarray(np.moveaxis(np.linalg.inv(formal), 0, -1))
 
     def residual(self, b: Float, columns: Float) -> Float:
-        """Values less the trend (C, k, E) of parameters (C, k, p) and columns (C or 1, E, p)."""
+        """Residuals (C, k, E) from the trend: parameters b (C, k, p), columns (C or 1, E, p)."""
         return self.y - b @ np.swapaxes(columns, -1, -2)
 
     def columns(self, breaks: Float) -> Float:
-        """Columns (C or 1, E, p) of the trend at the exposures, for breaks (..., B)."""
+        """Design matrix (C or 1, E, p) of the trend at the exposures, for breaks (C, B)."""
         if not self.design.trend.find:
             return self._given_columns
         return self.design.matrix(self.series.epoch, self.series.group_code, breaks)
 
     @cached_property
     def _given_columns(self) -> Float:
-        """Columns (1, E, p) of a trend whose breaks are given."""
+        """Design matrix (1, E, p) for given breaks."""
         return self.design.matrix(self.series.epoch, self.series.group_code)
 
 
 @dataclass(frozen=True, eq=False)
 class State:
-    """State of C chains."""
+    """State of C chains, in units of the spread of the series."""
 
-    b: Float  # (C, k, p)
-    sigma: Float  # (C, k, k)
-    off: Bool  # outliers (C, E)
-    probability: Float  # of an outlier (C, E), given everything else
-    fraction: Float  # (C,)
-    kappa2: Float  # (C,)
-    breaks: Float  # (C, B) those to be found
-    drift: Float  # amplitude (C, k) of the random part
+    b: Float  # parameters (C, k, p) of the columns of the trend
+    sigma: Float  # intrinsic covariance (C, k, k)
+    off: Bool  # mask (C, E) of outliers
+    probability: Float  # outlier probability (C, E), conditional on the other quantities
+    fraction: Float  # fraction of outliers (C,)
+    kappa2: Float  # factor (C,) on the covariance of outliers
+    breaks: Float  # dates of unknown breaks (C, B)
+    drift: Float  # amplitude (C, k) of the random part of the trend
 
     def take(self, chains: Int) -> State:
-        """State of some of the chains, possibly several times."""
-        return State(**{one.name: getattr(self, one.name)[chains] for one in fields(self)})
+        """State of selected chains, which may be repeated."""
+        return State(**{item.name: getattr(self, item.name)[chains] for item in fields(self)})
 
 
 def normal_equations(precision: Float, y: Float, columns: Float) -> tuple[Float, Float]:
-    """Normal matrices (..., k p, k p) and right-hand sides (..., k p).
+    """Normal matrices (..., k p, k p) and right-hand sides (..., k p) of the trend's parameters.
 
-    `precision` (C, k, k, E) is the inverse covariance of each exposure, `y` (k, E), `columns` (C or
-    1, E, p) or (C, M, E, p).
+    `precision` (C, k, k, E) is the inverse covariance of each exposure, `y` (k, E) are the data,
+    and `columns` is the design matrix (C or 1, E, p) or (C, M, E, p).
     """
     k = len(y)
     *_, n, p = columns.shape
@@ -121,10 +121,10 @@ def normal_equations(precision: Float, y: Float, columns: Float) -> tuple[Float,
 def trend_equations(
     problem: Problem, precision: Float, columns: Float, drift: Float
 ) -> tuple[Float, Float]:
-    """Precision (C, k p, k p) of the parameters b given everything else, and that times their mean.
+    """Conditional precision (C, k p, k p) of the parameters b, and precision times mean (C, k p).
 
-    `precision` (C, k, k, E) is the inverse covariance of each exposure, `columns` (C or 1, E, p),
-    `drift` (C, k).
+    `precision` (C, k, k, E) is the inverse covariance of each exposure, `columns` (C or 1, E, p)
+    the design matrix, and `drift` (C, k) the amplitude of the random part.
     """
     matrix, right = normal_equations(precision, problem.y, columns)
     design = problem.design
@@ -135,7 +135,7 @@ def trend_equations(
 
 
 def break_likelihood(problem: Problem, precision: Float) -> Likelihood:
-    """Function of dates (C, M, B): log likelihood (C, M) with b integrated out."""
+    """Make a function of dates (C, M, B) that returns log likelihoods (C, M), integrated over b."""
 
     def some(breaks: Float) -> Float:
         columns = problem.columns(breaks)
@@ -146,7 +146,7 @@ def break_likelihood(problem: Problem, precision: Float) -> Likelihood:
         return gaussians(square, flat, np.zeros_like(flat))[1].reshape(right.shape[:-1])
 
     def of(breaks: Float) -> Float:
-        # a few candidates at a time: all their columns would not fit into the cache, or into memory
+        # a few candidates at a time, because their columns would exceed the cache or the memory
         places = range(0, breaks.shape[1], CANDIDATES_AT_ONCE)
         return np.concatenate([some(breaks[:, i : i + CANDIDATES_AT_ONCE]) for i in places], axis=1)
 

@@ -1,4 +1,4 @@
-"""Coefficients of many exposures against time, from fits of single exposures."""
+"""Time series of coefficients from fits of single exposures."""
 
 from __future__ import annotations
 
@@ -12,21 +12,21 @@ from numpy.typing import ArrayLike
 from bayesdist.errors import DegenerateError, InputError
 from bayesdist.utils.arrays import Float, Int
 
-MAD_TO_SIGMA = 1.4826
+MAD_TO_SIGMA = 1.4826  # standard deviation over median absolute deviation of a Gaussian
 
 
 @dataclass(frozen=True, eq=False)
 class Series:
-    """k coefficients of E exposures, each with its date and formal covariance.
+    """Time series of k coefficients of E exposures, with formal covariances.
 
     Parameters
     ----------
     epoch : ndarray, shape (E,)
-        Decimal years, in any order.
+        Dates of the exposures in decimal years, in any order.
     values : ndarray, shape (E, k)
-        The coefficients.
+        Coefficients of the exposures.
     cov : ndarray, shape (E, k, k)
-        Their formal covariance; zero where no formal errors are known.
+        Formal covariances of the coefficients; zero if formal errors are unknown.
     coefficients : tuple of str
         Names of the coefficients, such as 'A_2'.
     names : tuple of str, optional
@@ -34,16 +34,16 @@ class Series:
     group : tuple of str, optional
         Group of each exposure, such as its filter.
     source : str
-        Origin of the series, for messages.
+        Origin of the series, for error messages.
 
     Raises
     ------
     InputError
-        For shapes that do not fit, values that are not finite, repeated names, and covariances that
-        are not symmetric or have negative eigenvalues.
+        If shapes are inconsistent, values are not finite, names are repeated, or a covariance is
+        not symmetric or has a negative eigenvalue.
     DegenerateError
-        For fewer than three exposures, and a coefficient that neither varies nor has a formal
-        error (such as the A_3 of the chip that defines the frame).
+        If there are fewer than three exposures, or a coefficient neither varies nor has a formal
+        error (such as A_3 of the reference chip).
     """
 
     epoch: Float
@@ -66,20 +66,20 @@ class Series:
                     f"{name} has shape {getattr(self, name).shape}, but {n} epochs and {k} "
                     f"coefficients need {shape}",
                     where=self.source,
-                    do="give one row for each exposure",
+                    do="give one row per exposure",
                 )
-        for label, given in (("names", self.names), ("group", self.group)):
-            if given and len(given) != n:
+        for label, labels in (("names", self.names), ("group", self.group)):
+            if labels and len(labels) != n:
                 raise InputError(
-                    f"{len(given)} {label} for {n} exposures",
+                    f"{len(labels)} {label} for {n} exposures",
                     where=self.source,
-                    do="give one for each exposure",
+                    do="give one per exposure",
                 )
         for label, unique in (("coefficient", self.coefficients), ("exposure", self.names)):
             if len(set(unique)) < len(unique):
-                twice = next(v for v in unique if unique.count(v) > 1)
+                repeated = next(v for v in unique if unique.count(v) > 1)
                 raise InputError(
-                    f"{label} {twice!r} stands twice", where=self.source, do="name each once"
+                    f"{label} {repeated!r} is repeated", where=self.source, do="name each once"
                 )
         self._check_numbers()
         if n < 3:
@@ -113,7 +113,7 @@ class Series:
                 )
         size = np.abs(self.cov).max(axis=(1, 2))
         skew = np.abs(self.cov - np.swapaxes(self.cov, 1, 2)).max(axis=(1, 2))
-        # formal variances of different coefficients may differ by many powers of ten
+        # formal variances of different coefficients may differ by many orders of magnitude
         sigma = np.sqrt(np.maximum(np.diagonal(self.cov, axis1=1, axis2=2), 0.0))
         unit = np.where(sigma > 0, sigma, 1.0)
         scaled = self.cov / (unit[:, :, None] * unit[:, None, :])
@@ -138,29 +138,36 @@ class Series:
         group: Sequence[str] = (),
         source: str = "series",
     ) -> Series:
-        """Series with uncorrelated formal errors.
+        """Make a series with uncorrelated formal errors.
 
         Parameters
         ----------
         epoch : array_like, shape (E,)
+            Dates of the exposures in decimal years.
         values : array_like, shape (E, k) or (E,)
+            Coefficients of the exposures.
         sigma : array_like, optional
-            Formal errors, of a shape that broadcasts to that of the values; none are known by
+            Formal errors, with a shape that can be broadcast to that of the values; unknown by
             default.
         coefficients, names, group, source
-            As for `Series`.
+            See `Series`.
 
         Returns
         -------
         Series
+
+        Raises
+        ------
+        InputError
+            If a formal error is negative; see also `Series`.
         """
         rows = np.asarray(values, float)
         rows = rows[:, None] if rows.ndim == 1 else rows
         errors = np.zeros_like(rows)
         if sigma is not None:
-            given = np.asarray(sigma, float)
-            given = given[:, None] if given.ndim == 1 and rows.shape[1] == 1 else given
-            errors = np.broadcast_to(given, rows.shape)
+            formal = np.asarray(sigma, float)
+            formal = formal[:, None] if formal.ndim == 1 and rows.shape[1] == 1 else formal
+            errors = np.broadcast_to(formal, rows.shape)
         if np.any(errors < 0):
             bad = int(np.argmax((errors < 0).any(axis=1)))
             raise InputError(
@@ -197,15 +204,15 @@ class Series:
 
     @cached_property
     def centre(self) -> Float:
-        """Median (k,) of each coefficient, which is subtracted before anything is computed."""
+        """Median (k,) of each coefficient, which is subtracted in all computations."""
         return np.median(self.values, axis=0)
 
     @cached_property
     def spread(self) -> Float:
-        """Robust spread (k,) of each coefficient, the unit in which priors are scaled.
+        """Robust spread (k,) of each coefficient, by which priors are scaled.
 
-        The median absolute deviation from the median as a standard deviation, or the median formal
-        error, whichever is larger; the plain standard deviation where both vanish.
+        It is the larger of the standard deviation from the median absolute deviation and the median
+        formal error; if both are zero, the ordinary standard deviation.
         """
         mad = MAD_TO_SIGMA * np.median(np.abs(self.values - self.centre), axis=0)
         out = np.maximum(mad, np.median(self.sigma, axis=0))
@@ -213,32 +220,57 @@ class Series:
 
     @property
     def group_names(self) -> tuple[str, ...]:
-        """Groups, the one with most exposures first; empty where there are none."""
+        """Names of the groups, starting with that with most exposures; empty without groups."""
         counts = {name: self.group.count(name) for name in sorted(set(self.group))}
         return tuple(sorted(counts, key=lambda name: -counts[name]))
 
     @property
     def group_code(self) -> Int:
-        """Index (E,) of each exposure's group in `group_names`; zeros without groups."""
+        """Index (E,) in `group_names` of the group of each exposure; zero without groups."""
         if not self.group:
             return np.zeros(len(self), np.int64)
         place = {name: i for i, name in enumerate(self.group_names)}
         return np.array([place[name] for name in self.group], np.int64)
 
     def take(self, rows: ArrayLike) -> Series:
-        """Series of the exposures of a mask (E,) or of row numbers."""
-        which = np.arange(len(self))[np.asarray(rows)]
+        """Select exposures.
+
+        Parameters
+        ----------
+        rows : array_like
+            Boolean mask (E,) or indices of the exposures.
+
+        Returns
+        -------
+        Series
+        """
+        selected = np.arange(len(self))[np.asarray(rows)]
         return replace(
             self,
-            epoch=self.epoch[which],
-            values=self.values[which],
-            cov=self.cov[which],
-            names=tuple(self.names[i] for i in which),
-            group=tuple(self.group[i] for i in which) if self.group else (),
+            epoch=self.epoch[selected],
+            values=self.values[selected],
+            cov=self.cov[selected],
+            names=tuple(self.names[i] for i in selected),
+            group=tuple(self.group[i] for i in selected) if self.group else (),
         )
 
     def only(self, *coefficients: str) -> Series:
-        """Series of some of the coefficients, in the order of the arguments."""
+        """Select coefficients by name.
+
+        Parameters
+        ----------
+        *coefficients : str
+            Names, in the order of the result.
+
+        Returns
+        -------
+        Series
+
+        Raises
+        ------
+        InputError
+            If a name is unknown.
+        """
         for name in coefficients:
             if name not in self.coefficients:
                 raise InputError(

@@ -1,4 +1,4 @@
-"""A series in words: a line, no line, a break; never more than the comparison supports."""
+"""Description of the trend of a series in words, limited to what the comparison supports."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from bayesdist.infer.series.series import Series
 from bayesdist.infer.series.trend import TrendModel
 from bayesdist.utils.arrays import Float
 
-MIN_SIGNIFICANCE = 3.0  # sigma from which a coefficient's own slope or step is named
+MIN_SIGNIFICANCE = 3.0  # significance (sigma) above which the slope of a coefficient is mentioned
 CLAIMS = {
     "constant": "no line",
     "line": "line",
@@ -27,22 +27,23 @@ CLAIMS = {
 
 @dataclass(frozen=True, eq=False)
 class Verdict:
-    """Verdict on the trend of a series.
+    """Description of the trend of a series.
 
     Parameters
     ----------
     claim : str
-        'no line', 'line', or 'break at 2009.41', with the form of the segments.
+        Short description: 'no line', 'line', or 'break at 2009.41' with the form of the segments.
     text : str
         The claim in full sentences, with its evidence.
     comparison : Comparison
+        Comparison of all candidates.
     posterior : SeriesPosterior
-        Of the selected trend.
+        Posterior of the selected trend.
     breaks : ndarray, shape (B, 3)
-        Median and central 68 % interval of each break of that trend.
+        Median and central 68 % interval of the date of each break of the selected trend.
     rivals : tuple of str
-        Names of drifts that predict as well: a spline or a random walk can follow a line, so that
-        one of these in addition to a claimed slope means that the slope need not go on.
+        Names of smooth or irregular drifts that predict equally well. Since these can follow a
+        line, a slope need not continue beyond the data if there are rivals.
     """
 
     claim: str
@@ -54,7 +55,18 @@ class Verdict:
 
 
 def default_candidates(breaks: tuple[float, ...] = ()) -> tuple[TrendModel, ...]:
-    """Trends to compare: with the given breaks, or with one break that is to be found."""
+    """Trends to compare by default.
+
+    Parameters
+    ----------
+    breaks : tuple of float
+        Dates of breaks in decimal years; by default one break at an unknown date.
+
+    Returns
+    -------
+    tuple of TrendModel
+        A constant, a line, trends with breaks, a smooth and an irregular drift.
+    """
     search = 0 if breaks else 1
     broken = ("step", "line+step", "lines")
     return (
@@ -79,11 +91,11 @@ def describe(
     ----------
     series : Series
     candidates : tuple of TrendModel, optional
-        By default a constant, a line, steps and lines with a break, a smooth and an irregular
-        drift.
+        Trends to compare; those of `default_candidates` by default.
     breaks : tuple of float
-        Given breaks of the default candidates; one is to be found where none are given.
+        Dates of breaks of the default candidates; by default one break at an unknown date.
     seed : int
+        Seed of the random numbers.
 
     Returns
     -------
@@ -100,11 +112,11 @@ def describe(
 
 
 def _rivals(comparison: Comparison) -> tuple[str, ...]:
-    here = comparison.selected
+    selected = comparison.selected
     return tuple(
         c.name
         for i, c in enumerate(comparison.trends)
-        if i != here and c.drifts and not comparison.beats(here, i)
+        if i != selected and c.drifts and not comparison.beats(selected, i)
     )
 
 
@@ -131,13 +143,13 @@ def _text(
 ) -> str:
     trends = comparison.trends
     constant = next(i for i, c in enumerate(trends) if c.kind == "constant")
-    here = comparison.selected
-    n_folds = len(np.unique(comparison.scores[here].fold))
+    selected = comparison.selected
+    n_folds = len(np.unique(comparison.scores[selected].fold))
     held = "blocks of successive exposures" if comparison.scheme == "blocks" else "exposures"
     parts = [f"{claim[0].upper()}{claim[1:]}."]
-    if here == constant:
-        others = [i for i in range(len(trends)) if i != constant]
-        best = max(others, key=lambda i: comparison.scores[i].total)
+    if selected == constant:
+        candidates = [i for i in range(len(trends)) if i != constant]
+        best = max(candidates, key=lambda i: comparison.scores[i].total)
         value, error = comparison.difference(best, constant)
         parts.append(
             f"The best other trend ({_plain(trends[best].name)}) predicts held-out {held} "
@@ -145,7 +157,7 @@ def _text(
             "density, which is not enough."
         )
     else:
-        value, error = comparison.difference(here, constant)
+        value, error = comparison.difference(selected, constant)
         parts.append(
             f"It predicts held-out {held} ({n_folds} folds) better than a constant by "
             f"{value:.1f} +- {error:.1f} in log density."
@@ -160,7 +172,7 @@ def _text(
     if comparison.scheme == "blocks":
         parts.append(
             f"Successive exposures are correlated ({comparison.correlation:.2f}); sigmas of slopes "
-            "and steps that take them for independent are too small."
+            "and steps that assume independent exposures are too small."
         )
     if not posterior.convergence.converged:
         parts.append(f"The draws have not converged: {'; '.join(posterior.convergence.reasons)}.")
@@ -168,12 +180,12 @@ def _text(
 
 
 def _plain(names: str) -> str:
-    """Names of trends as words."""
+    """Names of trends with spaces instead of underscores."""
     return names.replace("_", " ")
 
 
 def _named_slopes(posterior: SeriesPosterior) -> list[str]:
-    """Names of the coefficients that drift, for a trend that claims a drift."""
+    """Sentences with the significant slopes of the coefficients; empty if the trend has none."""
     trend = posterior.trend
     if not trend.has_slope or trend.drifts:
         return []

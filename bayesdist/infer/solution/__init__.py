@@ -1,1 +1,1 @@
-"""Solutions: parameters with their covariance; the linear fit, and transformed ones."""
+"""Solutions (parameters with covariance and draws): the linear fit and transformed solutions."""

@@ -1,4 +1,4 @@
-"""Geometry of a chip as it was fitted: scales, orientation, parity, skew and distortion."""
+"""Geometry of a chip in a solution: scales, orientation, parity, skew and distortion."""
 
 from __future__ import annotations
 
@@ -15,45 +15,45 @@ from bayesdist.utils.numbers import number
 
 __all__ = ["Geometry", "geometry_of"]
 
-MAS = {"deg": 3.6e6, "arcsec": 1000.0, "mas": 1.0}  # in one unit of u, v
+MAS = {"deg": 3.6e6, "arcsec": 1000.0, "mas": 1.0}  # milliarcseconds per unit of u, v
 GRID = 21  # positions per axis at which the distortion is evaluated
-LARGEST_ANISOTROPY = 0.05  # ratio of the scales of the two axes, less 1: square pixels on the sky
-LARGEST_SKEW = 0.1  # rad: ACS, with the strongest tilt of a focal plane in use, has 0.09
-LARGEST_DISTORTION = 0.05  # of half the diagonal of the chip
-LARGEST_SCALE_ERROR = 0.02  # of a stated pixel scale
-RADIANS = 0.01  # relative distance from the stretch of radians within which they are named
-# Right ascensions in hours that are read as degrees shrink one direction of the sky by 15.
+LARGEST_ANISOTROPY = 0.05  # ratio of the scales of the axes minus 1, for square pixels on the sky
+LARGEST_SKEW = 0.1  # rad; ACS, with the most tilted focal plane in use, has 0.09
+LARGEST_DISTORTION = 0.05  # fraction of half the diagonal of the chip
+LARGEST_SCALE_ERROR = 0.02  # relative deviation from the stated pixel scale
+RADIANS = 0.01  # relative tolerance on the stretch caused by radians that are read as degrees
+# Stretch caused by right ascensions in hours that are read as degrees: a factor of about 15.
 HOURS = (12.0, 18.0)
 
 
 @dataclass(frozen=True)
 class Geometry:
-    """Linear part of the map of one chip, and its largest distortion.
+    """Linear part of the mapping of one chip, and its largest distortion.
 
-    Drift and the frames of exposures are left out.
+    Drift and exposure frames are not included.
     """
 
     chip: int
-    unit: str  # of u, v
-    scale_x: float  # units of u, v per pixel along x and y, at the reference pixel
-    scale_y: float
-    position_angle: float  # degrees from +v towards +u of the direction of +y
+    unit: str  # unit of u, v
+    scale_x: float  # scale along x at the reference pixel, in the unit of u, v per pixel
+    scale_y: float  # scale along y
+    position_angle: float  # degrees: direction of +y, measured from +v towards +u
     parity: int  # -1 if u, v is a mirror image of x, y, otherwise 1
-    skew: float  # radians: the angle from the image of x to that of y is 90 degrees plus this
+    skew: float  # radians: the angle from the x axis to the y axis in u, v, minus 90 degrees
     stretch: float  # ratio of the largest to the smallest scale over all directions
-    mean_scale: float  # square root of the pixel's area in the best linear map of the chip
+    mean_scale: float  # square root of the pixel area in the best linear map of the chip
     distortion: float  # pixels: largest deviation from the best linear map
     half_diagonal: float  # pixels
 
     @property
     def anisotropy(self) -> float:
-        """Ratio of the larger to the smaller of the scales along x and y, less 1."""
+        """Ratio of the larger to the smaller of the scales along x and y, minus 1."""
         low, high = sorted((self.scale_x, self.scale_y))
         return high / low - 1.0
 
     @property
     def scales(self) -> tuple[str, str, str]:
-        """Scales along x and y as texts, and their unit."""
+        """Scales along x and y, formatted, and their unit."""
         factor, unit = 1.0, f"{self.unit}/px"
         if self.unit in MAS:
             factor, unit = MAS[self.unit], "mas/px"
@@ -61,7 +61,7 @@ class Geometry:
 
     @property
     def sentence(self) -> str:
-        """Scales, orientation, parity and largest distortion in one line."""
+        """Scales, orientation, parity and largest distortion as one line of text."""
         x, y, unit = self.scales
         return (
             f"scale {x} x {y} {unit}, +y at {self.position_angle:.2f} degrees from +v towards +u, "
@@ -70,9 +70,9 @@ class Geometry:
 
     @property
     def mirrored(self) -> str:
-        """Sentence about a chip that shows the sky mirrored; empty if it does not.
+        """Warning that the chip shows a mirror image of the sky; empty if it does not.
 
-        It holds if u, v are a tangent plane, on which u increases to the east.
+        It is valid only if u, v are on a tangent plane with u increasing to the east.
         """
         if self.parity < 0:
             return ""
@@ -84,7 +84,7 @@ class Geometry:
 
     @property
     def warnings(self) -> list[str]:
-        """Sentences about values that few detectors have."""
+        """Warnings about an anisotropy, skew or distortion that is unusual for a detector."""
         x, y, unit = self.scales
         out = []
         if self.anisotropy > LARGEST_ANISOTROPY:
@@ -107,11 +107,12 @@ class Geometry:
 
 
 def geometry_of(solution: Solution, chip: int | None = None) -> Geometry:
-    """Geometry of a chip in a solution.
+    """Compute the geometry of a chip.
 
     Parameters
     ----------
     solution : Solution
+        Fit or posterior; its mean is used.
     chip : int, optional
         Chip number; the first chip by default.
 
@@ -157,9 +158,10 @@ def geometries(solution: Solution) -> list[Geometry]:
 
 
 def _in_radians(stretch: float, ra: float, dec: float) -> bool:
-    """True if square pixels would be stretched as they are by radians that are read as degrees.
+    """True if the stretch of the pixels suggests that RA and Dec are in radians, not degrees.
 
-    Near the equator of degrees the factor cos(dec) of the east-west direction is missing.
+    `ra` and `dec` are the field's position as read.  Radians read as degrees put the field near
+    the equator, so that the factor cos(dec) in the east-west direction is missing.
     """
     possible = 0 <= ra <= 2 * np.pi and abs(dec) < np.pi / 2
     missing = np.cos(np.radians(dec)) / np.cos(dec) if possible else 1.0
@@ -173,10 +175,11 @@ def refuse_geometry(
     tangent_point: tuple[float, float] | None,
     where: str,
 ) -> None:
-    """Refuse right ascensions in hours, radians, and a stated pixel scale that the fit contradicts.
+    """Raise InputError if the fitted geometry shows that the input has wrong units or scale.
 
-    `tangent_point` is RA and Dec in degrees, None if u, v are on no tangent plane.  InputError with
-    the way out.
+    Detects right ascensions in hours, coordinates in radians, and a pixel scale `scale_mas` that
+    differs from the fitted one.  `tangent_point` is RA and Dec in degrees, or None if u, v are not
+    on a tangent plane.
     """
     first = chips[0]
     if first.unit not in MAS:
@@ -184,7 +187,7 @@ def refuse_geometry(
     x, y, unit = first.scales
     if tangent_point is not None and _in_radians(first.stretch, *tangent_point):
         raise InputError(
-            f"the pixel is {x} x {y} {unit}, and the field lies at ra {tangent_point[0]:.4g}, dec "
+            f"the pixel is {x} x {y} {unit}, and the field is at ra {tangent_point[0]:.4g}, dec "
             f"{tangent_point[1]:.4g}: square pixels have this shape if both are in radians and are "
             "read as degrees",
             where=where,

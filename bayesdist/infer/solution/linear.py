@@ -1,8 +1,8 @@
 """Weighted linear fit: two passes with rejection, relinearised frames, formal covariance.
 
-The procedure of the WISE programme gnDSTR (WSDC D-T033, section 3): fit, drop matches whose
-residual chi-square or absolute residual is beyond a limit, fit again; optional extra weight towards
-the corners.
+The procedure follows the WISE programme gnDSTR (WSDC D-T033, section 3): fit, reject matches with
+a residual or a chi-square above a limit, and fit again.  Stars near the corners can get additional
+weight.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ from bayesdist.utils.arguments import takes
 from bayesdist.utils.arrays import Bool, Float
 from bayesdist.utils.quantities import Random, generator_of, value_in, values_in
 
-MEDIAN_STARS = 1_000_000  # largest number of stars whose median is taken
+MEDIAN_STARS = 1_000_000  # medians are taken over at most about this many stars
 MEDIAN_CHI2_2 = 2 * np.log(2)  # median of chi-square with two degrees of freedom
 
 
@@ -46,12 +46,14 @@ class Rejection:
     Parameters
     ----------
     clip_chi2 : float
-        Stars with a first-pass chi-square (both axes) above this are left out of the second pass.
-        Where the errors are too small as a whole, the limit is scaled by the median chi-square.
+        Limit on the chi-square (sum over both axes) of a star in the first pass; stars above it
+        are left out of the second pass. If the quoted errors are too small in general, the limit
+        is scaled up with the median chi-square.
     clip_abs : float, Quantity or None
-        Stars with a first-pass residual above this many pixels are left out too.
+        Limit on the absolute residual of a star in the first pass, in pixels; None for no limit.
     radial_weight : float
-        Factor on the inverse variance in the corners, rising as the square of the radius.
+        Factor on the inverse variance in the corners; it increases with the square of the radius
+        from 1 at the centre.
 
     Examples
     --------
@@ -88,26 +90,29 @@ class LinearFit(Solution):
     ----------
     model : DistortionModel
     mean : ndarray, shape (D,)
-        Estimated parameters.
+        Estimated parameters, in the order of `model.names`.
     cov : ndarray, shape (D, D)
-        Formal covariance; with extra corner weights the sandwich form, which stays a covariance.
+        Formal covariance. With additional weight in the corners it has the sandwich form, which
+        remains valid although the weights differ from the inverse variances.
     clip : Clip
-        Limits beyond which stars were left out of the second pass.
+        Rejection limits of the second pass, and the parameters at which residuals are compared
+        with them.
     n_rows, n_used : int
-        Number of all stars, and of the stars in the second pass.
+        Number of all stars, and of the stars used in the second pass.
     rms_u, rms_v : float
         Rms residuals of the stars used, in the unit of u, v.
     rms_rejected : float
-        Rms residual, of both axes, of the stars left out; 0 where there are none.
+        Rms residual per axis of the rejected stars, in the unit of u, v; 0 if none were rejected.
     rejected : dict of str to int
-        Number of stars left out of the second pass, by reason.
+        Number of rejected stars by reason.
     chi2 : float
-        Of the stars used, with the quoted errors.
+        Chi-square of the stars used, with the quoted errors.
     dof : int
+        Degrees of freedom.
     condition : float
         Condition number of the normal matrix scaled to unit diagonal.
     tangent_point : tuple of float, optional
-        RA and Dec in degrees of the plane of u, v: `Matches.tangent_point` of the stars.
+        RA and Dec in degrees of the tangent point of u, v; see `Matches.tangent_point`.
 
     Examples
     --------
@@ -146,21 +151,25 @@ class LinearFit(Solution):
 
     @property
     def likelihood(self) -> ClippedGaussian:
-        """Normal errors of the stars in the second pass, at the mean."""
+        """Gaussian likelihood, at the mean, of the stars used in the second pass."""
         return ClippedGaussian(np.asarray(self.mean), self.clip)
 
     @property
     def n_rejected(self) -> int:
-        """Number of stars left out of the second pass."""
+        """Number of rejected stars."""
         return self.n_rows - self.n_used
 
     def uses(self, matches: Matches) -> Bool:
-        """Boolean mask (N,) of a table's stars that the second pass uses.
+        """Boolean mask that is True for the stars that pass the rejection limits.
 
         Parameters
         ----------
         matches : Matches
-            Those that were fitted, or others of the same exposures.
+            The N stars that were fitted, or other stars of the same exposures.
+
+        Returns
+        -------
+        ndarray of bool, shape (N,)
         """
         return self.clip.keeps(self.model, matches)
 
@@ -169,24 +178,32 @@ class LinearFit(Solution):
         return scaled_cholesky(self.cov)  # parameters fixed by a gauge have no error
 
     def draws(self, n: int, rng: Random) -> Float:
-        """Parameter vectors (n, D) from the Gaussian with this mean and covariance.
+        """Draw parameter vectors from the Gaussian with this mean and covariance.
 
         Parameters
         ----------
         n : int
-            How many.
+            Number of draws.
         rng : int or numpy.random.Generator
-            Seed, or source of the random numbers.
+            Seed or random generator.
+
+        Returns
+        -------
+        ndarray, shape (n, D)
         """
         return self.mean + generator_of(rng).standard_normal((n, len(self.mean))) @ self._root.T
 
     def mapped(self, matrix: Float) -> LinearFit:
-        """Fit whose deviations from the mean are mapped by a matrix (D, D).
+        """Fit with the deviations from the mean multiplied by a matrix.
 
         Parameters
         ----------
         matrix : ndarray, shape (D, D)
-            Of all parameters, in the order of the model's names.
+            Rows and columns in the order of `model.names`.
+
+        Returns
+        -------
+        LinearFit
         """
         return replace(self, cov=matrix @ self.cov @ matrix.T)
 
@@ -203,7 +220,7 @@ def build_model(
     frames: str = "none",
     time: TimeDependence | None = None,
 ) -> DistortionModel:
-    """Distortion model that fits a table: its chips, exposures and unit.
+    """Build a distortion model for a table of matches, with its chips, exposures and unit.
 
     Parameters
     ----------
@@ -211,15 +228,19 @@ def build_model(
     order : int
         Polynomial order, 1 to 12.
     size : tuple of float or Quantity, optional
-        Columns and rows of a single chip; give this or `chips`.
+        Number of columns and rows in pixels, for a detector with a single chip. Give either this
+        or `chips`.
     reference_pixel : tuple of float, optional
-        Zero point; the detector's centre by default.
+        Zero point (x, y) of the polynomials in pixels, for a single chip; its centre by default.
     name : str
         Name of the single chip.
     chips : tuple of Chip
+        Chips of the detector.
     frames : str
-        Transformation of each exposure.
+        Transformation of each exposure: 'none', 'shift', 'shift_rotation', 'shift_rotation_scale'
+        or 'affine'.
     time : TimeDependence, optional
+        Polynomial terms that depend on time; none by default.
 
     Returns
     -------
@@ -228,7 +249,8 @@ def build_model(
     Raises
     ------
     InputError
-        When neither a size nor chips are given, or an epoch is needed and missing.
+        If neither a size nor chips are given, if the matches are on several chips but one chip is
+        described, or if time-dependent terms are requested for matches without epochs.
 
     Examples
     --------
@@ -249,8 +271,8 @@ def build_model(
         chips = (Chip(number, name or f"chip {number}", size, reference_pixel or centre),)
     if len(chips) == 1 and len(matches.chip_numbers) > 1:
         raise InputError(
-            f"the matches lie on chips {', '.join(map(str, matches.chip_numbers))} "
-            "and one chip is described",
+            f"the matches are on chips {', '.join(map(str, matches.chip_numbers))} "
+            "but only one chip is described",
             where="chip",
             do="give one [[chip]] block for each, or select one chip",
         )
@@ -260,7 +282,7 @@ def build_model(
             where="data.columns",
             do="map column 'epoch' or drop model.tdd",
         )
-    some = matches.sample(MEDIAN_STARS)
+    sample = matches.sample(MEDIAN_STARS)
     return DistortionModel(
         order=order,
         chips=chips,
@@ -268,7 +290,7 @@ def build_model(
         time=time,
         frames=frames,
         exposures=matches.exposure_names,
-        origin=(float(np.median(some.u)), float(np.median(some.v))),
+        origin=(float(np.median(sample.u)), float(np.median(sample.v))),
     )
 
 
@@ -281,19 +303,19 @@ def fit_linear(
     priors: GaussianPriors | None = None,
     compute: Compute | None = None,
 ) -> LinearFit:
-    """Two-pass weighted least squares.
+    """Fit a distortion model by weighted least squares in two passes, with rejection in between.
 
     Parameters
     ----------
     matches : Matches or Shards
-        With errors.
+        Stars with position errors.
     model : DistortionModel
     rejection : Rejection
-        Limits beyond which stars are left out, and extra weight in the corners.
+        Rejection limits, and additional weight in the corners.
     priors : GaussianPriors, optional
-        Gaussian priors on named parameters.
+        Gaussian priors on parameters; flat by default.
     compute : Compute, optional
-        Where the work is done; one process with threads by default.
+        Computing engine; threads of this process by default.
 
     Returns
     -------
@@ -302,7 +324,10 @@ def fit_linear(
     Raises
     ------
     DegenerateError
-        When the data do not determine the model: see `check_coverage` and `require_full_rank`.
+        If the data do not determine the model: too few stars, stars that cover too little of a
+        chip, or degenerate parameters.
+    InputError
+        If the matches have no errors, another unit than the model, or other chips.
 
     Examples
     --------
@@ -329,8 +354,8 @@ def _fitted(
     refuse_absorbed_drift(first, theta, model, priors)
     theta = gauss_newton(first, theta, model, priors)
 
-    every = max(1, len(shards) // MEDIAN_STARS)
-    typical = float(np.median(np.concatenate(shards.sum(_some_chi2, theta, every))))
+    stride = max(1, len(shards) // MEDIAN_STARS)
+    typical = float(np.median(np.concatenate(shards.sum(_some_chi2, theta, stride))))
     clip = Clip(
         theta,
         chi2_limit=rejection.clip_chi2 * max(1.0, typical / MEDIAN_CHI2_2),
@@ -344,7 +369,7 @@ def _fitted(
     if n_used * 2 + priors.n_informative < model.n_params or n_used < 0.05 * len(shards):
         raise DegenerateError(
             f"{n_rejected} of {len(shards)} rows are beyond the rejection limits: half of the "
-            f"residuals exceed {_median_residual(shards, theta, every, model.unit)}",
+            f"residuals exceed {_median_residual(shards, theta, stride, model.unit)}",
             where="fit",
             do="check the match (another field, wrong pairs, or radians or hours in place of "
             "degrees), the errors, and fit.clip_chi2 and fit.clip_abs",
@@ -357,7 +382,7 @@ def _fitted(
     space = require_full_rank(matrix, model, second.groups)
     factor = matrix.factor()
     cov = factor.covariance()
-    # at the solution: the statistics, and the squared weights that a sandwich needs
+    # statistics at the solution, and the sums of squared weights for the sandwich covariance
     final = shards.sum(least_squares, theta, clip, radial_weight, 2)
     if radial_weight != 1.0:
         meat, _ = final.assemble(model, theta)
@@ -381,7 +406,7 @@ def _fitted(
 
 
 def _median_residual(shards: Shards, theta: Float, every: int, unit: str) -> str:
-    """Median distance of stars from the fit, in arcsec or in pixels, as text."""
+    """Median residual of the stars, formatted in arcsec or pixels."""
     median = float(np.median(np.concatenate(shards.sum(_some_residuals, theta, every))))
     if unit == "pix":
         return f"{median:.3g} px"
@@ -389,12 +414,12 @@ def _median_residual(shards: Shards, theta: Float, every: int, unit: str) -> str
 
 
 def _some_residuals(stars: Stars, theta: Float, every: int) -> tuple[Float, ...]:
-    """Distance of every n-th star from the fit."""
+    """Residuals (radial) of every `every`-th star."""
     return (np.hypot(*stars.residuals(theta)[::every].T),)
 
 
 def _some_chi2(stars: Stars, theta: Float, every: int) -> tuple[Float, ...]:
-    """Chi-square of every n-th star, both axes."""
+    """Chi-square (sum over both axes) of every `every`-th star."""
     residual = stars.residuals(theta)[::every]
     var = np.stack([stars.var_u[::every], stars.var_v[::every]], axis=1)
     return ((residual**2 / var).sum(axis=1),)
@@ -402,7 +427,7 @@ def _some_chi2(stars: Stars, theta: Float, every: int) -> tuple[Float, ...]:
 
 @takes(solution=Solution, matches=Matches)
 def residuals(solution: Solution, matches: Matches) -> Float:
-    """Data minus the model at a solution's mean.
+    """Residuals of the matches: data minus model at the mean of a solution.
 
     Parameters
     ----------
@@ -412,12 +437,12 @@ def residuals(solution: Solution, matches: Matches) -> Float:
     Returns
     -------
     ndarray, shape (N, 2)
-        In the unit of u and v.
+        Residuals in u and v, in the unit of u, v.
 
     Raises
     ------
     InputError
-        For matches without errors, in another unit than the model's, or on other chips.
+        If the matches have no errors, another unit than the model, or other chips.
 
     Examples
     --------

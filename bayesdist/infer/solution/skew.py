@@ -1,11 +1,11 @@
-"""Skew of the gnDSTR model, the angle between the detector's axes on the sky, as a constraint.
+"""Skew of a solution: the angle between the detector's axes on the sky, minus 90 degrees.
 
-WSDC D-T033, section 1: a polynomial for each axis "plus a skew factor applied to Y", constrained to
-zero. With all linear terms in both polynomials the skew is no additional parameter: a solution (u,
-v) = S(skew) w, whose w has perpendicular axes at the reference pixel, is again a polynomial of the
-same order. The skew is a function of four linear coefficients.
+The model of gnDSTR (WSDC D-T033, section 1) has a polynomial for each axis "plus a skew factor
+applied to Y", constrained to zero. Since both polynomials have all linear terms here, the skew is
+not an additional parameter: applying a skew to a polynomial with perpendicular axes gives another
+polynomial of the same order. The skew is therefore a function of the four linear coefficients.
 
-For e_x, e_y, the images of one pixel along x and along y at the reference pixel::
+If one pixel along x and along y at the reference pixel maps to the vectors e_x and e_y, then::
 
     sin(skew) = - e_x . e_y / (|e_x| |e_y|)         the angle from e_x to e_y is 90 degrees + skew
 """
@@ -30,7 +30,7 @@ class Skew:
     Parameters
     ----------
     value, sigma : float
-        Radians.
+        Skew and its standard error in radians.
     """
 
     value: float
@@ -38,27 +38,27 @@ class Skew:
 
     @property
     def significance(self) -> float:
-        """The value in units of its error; infinite where the axes are known exactly."""
+        """Skew divided by its error; infinite if the error is zero."""
         return self.value / self.sigma if self.sigma > 0 else float("inf")
 
 
 def skew_of(solution: Solution, *, chip: int | None = None) -> Skew:
-    """Skew in a solution's linear terms, with its error.
+    """Skew of a chip at its reference pixel, with its error.
 
     Parameters
     ----------
     solution : Solution
-        The error of a fit with extra weight in the corners is that of its sandwich covariance.
+        Fit or posterior. The error is propagated from its covariance.
     chip : int, optional
         Chip number; the first chip by default.
 
     Returns
     -------
     Skew
-        At the reference pixel; drift and exposure frames are left out.
+        Skew of the polynomials, without drift and exposure frames.
     """
     value, gradient = _skew(solution.model, solution.mean, chip)
-    # rounding may leave the variance of what was imposed below zero
+    # if the skew is constrained by a prior, rounding may make its variance slightly negative
     return Skew(value, float(np.sqrt(max(float(gradient @ solution.cov @ gradient), 0.0))))
 
 
@@ -67,7 +67,7 @@ def _skew(model: DistortionModel, theta: Float, chip: int | None) -> tuple[float
     basis = model.basis(chip)
     slices = [model.coefficient_slice(chip, axis) for axis in (0, 1)]
     rows = basis.monomial_matrix[[basis.terms.index((1, 0)), basis.terms.index((0, 1))]]
-    # columns of J: images of the two axes
+    # the columns of J are e_x and e_y
     J = np.stack([rows @ theta[part] for part in slices])
     (a, b), (c, d) = J
     n_x, n_y = np.hypot(a, c), np.hypot(b, d)

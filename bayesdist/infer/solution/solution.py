@@ -1,4 +1,4 @@
-"""A solution: a distortion model with values of its parameters, their covariance, and draws."""
+"""Solutions: a distortion model with its parameters, their covariance, and draws."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from bayesdist.model import DistortionModel
 from bayesdist.utils.arrays import Bool, Float, Int
 from bayesdist.utils.quantities import Random
 
-if TYPE_CHECKING:  # a file is inspected without what they import
+if TYPE_CHECKING:  # not imported at run time, so that inspecting a file stays fast
     from bayesdist.data.matches import Matches
     from bayesdist.infer.convergence import Convergence
     from bayesdist.infer.stars.likelihood import Likelihood
@@ -22,29 +22,32 @@ if TYPE_CHECKING:  # a file is inspected without what they import
 
 
 def root_of_diagonal(cov: Float) -> Float:
-    """Standard deviations (D,), 0 where rounding leaves a fixed parameter's variance negative."""
+    """Standard deviations (D,) from a covariance; variances that rounding made negative give 0."""
     return np.sqrt(np.maximum(np.diag(cov), 0.0))
 
 
 class Solution(ABC):
-    """A fit or a posterior of a distortion model, or one made from either.
+    """Base class of fits and posteriors, and of solutions derived from them.
 
-    A subclass has at least the three attributes without a default, and `draws`.
+    A subclass must define `model`, `mean`, `cov` and `draws`.
 
     Attributes
     ----------
     model : DistortionModel
     mean : ndarray, shape (D,)
+        Best-fitting or mean parameters, in the order of `model.names`.
     cov : ndarray, shape (D, D)
+        Covariance of the parameters.
     convergence : Convergence or None
-        Of the sampler, where draws are those of a sampler.
+        Convergence diagnostics of the sampler; None for a solution that was not sampled.
     mixture : OutlierMixture or None
-        Where false matches were modelled.
+        Model of the false matches; None if they were not modelled.
     tangent_point : tuple of float or None
-        RA and Dec in degrees of (u, v) = (0, 0), if u increases to the east and v to the north.
+        RA and Dec in degrees of (u, v) = (0, 0) if u, v are on a tangent plane with u increasing
+        to the east and v to the north; otherwise None.
     """
 
-    if TYPE_CHECKING:  # read-only: fields of some subclasses, computed by others
+    if TYPE_CHECKING:  # read-only: dataclass fields in some subclasses, properties in others
 
         @property
         def model(self) -> DistortionModel: ...
@@ -74,7 +77,9 @@ class Solution(ABC):
         Parameters
         ----------
         n : int
+            Number of draws.
         rng : int or numpy.random.Generator
+            Seed or random generator.
 
         Returns
         -------
@@ -82,7 +87,7 @@ class Solution(ABC):
         """
 
     def drawn_rows(self, n: int, rng: Random) -> tuple[Float, Int]:
-        """Parameter vectors (m, D), and the rows (n,) among them that `draws` gives."""
+        """Parameter vectors (m, D), and indices (n,) of the rows that `draws` returns."""
         return np.asarray(self.draws(n, rng), float), np.arange(n)
 
     @property
@@ -97,40 +102,42 @@ class Solution(ABC):
 
     @property
     def kind(self) -> str:
-        """'posterior' for draws of a sampler, else 'least squares'."""
+        """'posterior' if the solution was sampled, otherwise 'least squares'."""
         return "least squares" if self.convergence is None else "posterior"
 
     @property
     def approximation(self) -> str:
-        """Warning for every output that the draws are not exact; empty where they are."""
+        """Warning that the draws come from a surrogate; empty if they are exact."""
         return ""
 
     @property
     def likelihood(self) -> Likelihood | None:
-        """Likelihood of a star by its position, at the mean; None for a transformed solution."""
+        """Likelihood of a star's residual at the mean; None for a transformed solution."""
         return None
 
     def uses(self, matches: Matches) -> Bool:
-        """Boolean mask (N,) of a table's stars that were not left out; all by default."""
+        """Boolean mask (N,) that is False for stars that the fit rejects; all True by default."""
         return np.ones(len(matches), bool)
 
     def mapped(self, matrix: Float) -> Solution:
-        """Solution whose deviations from the mean are mapped by a matrix (D, D)."""
+        """Solution with the deviations from the mean multiplied by a matrix (D, D)."""
         mean = np.asarray(self.mean, float)
         return self.transformed(self.model, lambda theta: mean + (theta - mean) @ matrix.T, matrix)
 
     def transformed(
         self, model: DistortionModel, transform: Callable[[Float], Float], jacobian: Float
     ) -> TransformedSolution:
-        """Solution of another model, by a transformation of the parameters.
+        """Transform the parameters to those of another model.
 
         Parameters
         ----------
         model : DistortionModel
+            Model of the result, with D' parameters.
         transform : callable
-            From parameters (..., D) of this solution to (..., D') of the other.
+            Function that maps parameters (..., D) of this solution to (..., D') of the result.
         jacobian : ndarray, shape (D', n)
-            Its derivatives at the mean by the first n parameters; the others have no effect.
+            Derivatives of `transform`, at the mean, with respect to the first n parameters. The
+            other parameters must have no effect.
 
         Returns
         -------
@@ -143,35 +150,38 @@ class Solution(ABC):
 
 
 def likelihood_of(solution: Solution) -> Likelihood:
-    """Likelihood of a fit or a posterior; InputError for a solution that was made from another."""
+    """Likelihood of a fit or a posterior; raises InputError for a transformed solution."""
     likelihood = solution.likelihood
     if likelihood is None:
         raise InputError(
-            f"a {type(solution).__name__} does not say how it was fitted",
+            f"a {type(solution).__name__} has no likelihood",
             where="solution",
-            do="give the fit or the posterior itself, and make views of the result",
+            do="give the fit or the posterior itself, and transform the result",
         )
     return likelihood
 
 
 @dataclass(frozen=True)
 class ReferenceGauge:
-    """Rotation and shift that bring one chip to the reference gauge.
+    """Rotation and shift that transform a solution to the reference gauge of one chip.
 
         (u', v') = R(rotation) ((u, v) - shift)
 
     Parameters
     ----------
     chip : int
+        Number of the reference chip.
     epoch : float or None
-        Where the polynomials depend on time: the date at which the gauge holds.
+        Date (decimal years) at which the gauge holds; None if the polynomials do not depend on
+        time.
     rotation : float
-        Radians, from u towards v.
+        Angle in radians, from u towards v.
     shift : tuple of float
-        In the unit of u, v.
+        Shift in u and v, in their unit.
     sigma_rotation : float
+        Standard error of the rotation in radians.
     sigma_shift : tuple of float
-        How well the data determine them.
+        Standard errors of the shift.
     """
 
     chip: int
@@ -183,7 +193,7 @@ class ReferenceGauge:
 
 
 class DerivedSolution(Solution):
-    """Base of solutions made from another one, whose sampler diagnostics they report."""
+    """Base class of solutions derived from another solution; they report its diagnostics."""
 
     source: Solution
 
@@ -194,23 +204,24 @@ class DerivedSolution(Solution):
 
     @property
     def approximation(self) -> str:
-        """Warning that the draws of the source are not exact."""
+        """Warning that the draws of the source come from a surrogate; empty if they are exact."""
         return self.source.approximation
 
 
 @dataclass(frozen=True, eq=False)
 class TransformedSolution(DerivedSolution):
-    """A solution transformed from another one.
+    """Solution of one model whose parameters are computed from those of another solution.
 
     Parameters
     ----------
     model : DistortionModel
     mean : ndarray, shape (D,)
-        The source's mean, transformed.
+        Transformed mean of the source.
     cov : ndarray, shape (D, D)
+        Covariance, propagated from the source.
     source : Solution
     transform : callable
-        From parameters (..., D') of the source to (..., D).
+        Function that maps parameters (..., D') of the source to parameters (..., D) of `model`.
     """
 
     model: DistortionModel
@@ -220,13 +231,13 @@ class TransformedSolution(DerivedSolution):
     transform: Callable[[Float], Float]
 
     def draws(self, n: int, rng: Random) -> Float:
-        """Parameter vectors, shape (n, D): draws of the source, each transformed."""
+        """Draws of the source, transformed; see `Solution.draws`."""
         return self.transform(np.asarray(self.source.draws(n, rng), float))
 
 
 @dataclass(frozen=True, eq=False)
 class LinearMap:
-    """Linear map of parameters (..., n) by a matrix (m, n); it can be pickled."""
+    """Multiply the first n of the parameters (..., D) by a matrix (m, n); can be pickled."""
 
     matrix: Float
 
@@ -236,6 +247,6 @@ class LinearMap:
 
 @dataclass(frozen=True, eq=False)
 class GaugedSolution(TransformedSolution):
-    """A solution rotated and shifted to the reference gauge."""
+    """Solution that was rotated and shifted to the reference gauge."""
 
     gauge: ReferenceGauge  # rotation and shift that were applied

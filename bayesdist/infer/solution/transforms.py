@@ -1,7 +1,7 @@
-"""Transformed solutions: in the reference gauge, in one segment, term by term.
+"""Transformations of a solution: reference gauge, one exposure, one time segment, linear terms.
 
-The result is a solution again: its draws are those of its source, transformed one by one, and its
-covariance is the source's through the exact Jacobian of that transformation at the mean.
+The draws of a transformed solution are the transformed draws of its source.  Its covariance is
+propagated with the exact Jacobian of the transformation at the mean.
 """
 
 from __future__ import annotations
@@ -24,24 +24,27 @@ from bayesdist.model.grouping import Groups
 from bayesdist.model.similarity import turned, turned_model
 from bayesdist.utils.arrays import Complex, Float
 
-# constant, x and y of both axes as ACS ISR 2015-06 numbers them (Equations 1-2)
+# constant, x and y terms of both axes, numbered as in ACS ISR 2015-06 (Equations 1-2)
 LINEAR_TERMS = ("A_1", "A_2", "A_3", "B_1", "B_2", "B_3")
-MAX_NAMES = 12  # exposures that an error message lists
+MAX_NAMES = 12  # number of exposures listed in an error message
 
 
 @dataclass(frozen=True, eq=False)
 class LinearTerms:
-    """Monomial coefficients with their covariance, in the notation of ACS ISR 2015-06.
+    """Constant and linear monomial coefficients with their covariance.
 
     Parameters
     ----------
     labels : tuple of str
-        'A_1' is the constant of u, 'A_2' its term in x, 'A_3' in y; ``B_...`` are those of v.  The
-        chip's name stands before it where there are several chips; '.alpha' (value at the reference
-        date) or '.beta' (rate) stands after it.
+        Names in the notation of ACS ISR 2015-06: 'A_1' is the constant term of u, 'A_2' its
+        coefficient of x, 'A_3' that of y; 'B_1', 'B_2' and 'B_3' belong to v. If there are several
+        chips, the chip's name is prepended ('WFC1.A_2'). The suffix '.alpha' denotes the value at
+        the reference date, '.beta' the rate.
     values : ndarray, shape (k,)
-        In the unit of u, v, per pixel, per year.
+        Coefficients: in the unit of u, v for constants, per pixel for linear terms, and per year
+        for rates.
     cov : ndarray, shape (k, k)
+        Covariance of `values`.
     """
 
     labels: tuple[str, ...]
@@ -50,16 +53,25 @@ class LinearTerms:
 
     @property
     def sigma(self) -> Float:
-        """Standard deviation of each term."""
+        """Standard deviation (k,) of each term."""
         return root_of_diagonal(self.cov)
 
     def select(self, *labels: str) -> LinearTerms:
-        """Selected terms, in the order of the labels given.
+        """Select terms by label.
+
+        Parameters
+        ----------
+        *labels : str
+            Labels of the terms, in the order of the result.
+
+        Returns
+        -------
+        LinearTerms
 
         Raises
         ------
         InputError
-            For an unknown label.
+            If a label is unknown.
         """
         unknown = [label for label in labels if label not in self.labels]
         if unknown:
@@ -71,7 +83,7 @@ class LinearTerms:
 
 
 def bare_model(model: DistortionModel) -> DistortionModel:
-    """Model of the polynomials alone, whose parameters are the first ones of the full model."""
+    """Model with the polynomials and their drift only: the first parameters of the full model."""
     return replace(
         model,
         frames="none",
@@ -84,7 +96,7 @@ def bare_model(model: DistortionModel) -> DistortionModel:
 
 
 def without_frames(solution: Solution) -> TransformedSolution:
-    """The polynomials and their drift alone.
+    """Remove the exposure frames from a solution.
 
     Parameters
     ----------
@@ -93,8 +105,8 @@ def without_frames(solution: Solution) -> TransformedSolution:
     Returns
     -------
     TransformedSolution
-        Of the polynomials as they are before the frames: those of the first exposure in gauge
-        'first', those from which all exposures deviate in gauge 'held'.
+        The polynomials and their drift. With gauge 'first' these are the polynomials of the first
+        exposure, with gauge 'held' those from which all exposures deviate.
     """
     n = solution.model.n_distortion
     return solution.transformed(bare_model(solution.model), _FirstParameters(n), np.eye(n))
@@ -107,7 +119,7 @@ def at_exposure(
     epoch: float | None = None,
     chips: Sequence[int] | None = None,
 ) -> TransformedSolution:
-    """Polynomials of one exposure at one date, with the frame of the exposure applied to them.
+    """Polynomials of one exposure at one date, with its frame applied.
 
     Parameters
     ----------
@@ -115,25 +127,25 @@ def at_exposure(
     exposure : str, optional
         Name of an exposure of the model.  By default no frame is applied.
     epoch : float, optional
-        Decimal years; needed by a model with time dependence.
+        Date in decimal years; required if the model depends on time.
     chips : sequence of int, optional
         Numbers of the chips of the result; all chips by default.
 
     Returns
     -------
     TransformedSolution
-        Solution of a model without frames and without time dependence.  Its covariance contains
-        that of the frame, and its draws are those of `solution`.
+        Solution of a model without frames and time dependence.  Its covariance includes the
+        uncertainty of the frame, and its draws correspond to those of `solution`.
 
     Raises
     ------
     InputError
-        If there is no such exposure or chip, or the epoch is missing.
+        If the exposure or chip does not exist, or if the epoch is missing.
     """
     model = solution.model
     if exposure is not None and (not model.n_frame or exposure not in model.exposures):
-        names, more = model.exposures[:MAX_NAMES], len(model.exposures) - MAX_NAMES
-        listed = ", ".join(names) + (f" and {more} more" if more > 0 else "")
+        names, n_unlisted = model.exposures[:MAX_NAMES], len(model.exposures) - MAX_NAMES
+        listed = ", ".join(names) + (f" and {n_unlisted} more" if n_unlisted > 0 else "")
         raise InputError(
             f"there is no exposure {exposure!r}",
             where="exposure",
@@ -165,7 +177,7 @@ def at_exposure(
 
 @dataclass(frozen=True)
 class _FirstParameters:
-    """The first n parameters.  A class, because a function inside a function cannot be pickled."""
+    """Select the first n parameters.  A class, because nested functions cannot be pickled."""
 
     n: int
 
@@ -175,10 +187,10 @@ class _FirstParameters:
 
 @dataclass(frozen=True, eq=False)
 class _EffectivePolynomials:
-    """Effective coefficients of groups of stars, one after the other."""
+    """Compute the effective coefficients of groups of stars and concatenate them."""
 
     model: DistortionModel
-    groups: tuple[Groups, ...]  # each of one chip
+    groups: tuple[Groups, ...]  # one per chip
 
     def __call__(self, theta: Float) -> Float:
         parts = [self.model.effective(theta, group) for group in self.groups]
@@ -187,23 +199,23 @@ class _EffectivePolynomials:
 
 
 def segment(solution: Solution, s: int) -> TransformedSolution:
-    """One segment of the time dependence, as a model without breaks, as one IDCTAB holds it.
+    """Convert one segment of the time dependence to a model without breaks, as in an IDCTAB.
 
     Parameters
     ----------
     solution : Solution
     s : int
-        Number of the segment, from 0.
+        Number of the segment, starting from 0.
 
     Returns
     -------
     TransformedSolution
-        Without frames; its coefficients are those at the segment's reference date.
+        Solution without frames; its coefficients are those at the segment's reference date.
 
     Raises
     ------
     InputError
-        When the model has no such segment.
+        If the segment does not exist.
     """
     model = solution.model
     time = model.time
@@ -235,9 +247,9 @@ def reference_gauge(
 ) -> GaugedSolution:
     """Rotate and shift (u, v) so that one chip has A_1 = B_1 = 0 and A_3 = 0.
 
-    The gauge of ACS ISR 2015-06, section 4.2: at the chip's reference pixel there is neither an
-    offset nor a rotation of the column direction against v.  All other chips are carried along, so
-    that gap and rotation between them are in their coefficients.
+    This is the gauge of ACS ISR 2015-06, section 4.2: the reference pixel of the chip maps to the
+    origin, and there its columns are parallel to v.  All other chips are rotated and shifted with
+    it, so that their coefficients contain the gap and the rotation between the chips.
 
     Parameters
     ----------
@@ -245,19 +257,19 @@ def reference_gauge(
     chip : int
         Number of the reference chip.
     epoch : float, optional
-        Where the polynomials depend on time: the date at which the gauge holds, the reference date
-        of the first segment by default.
+        Date (decimal years) at which the gauge holds, if the polynomials depend on time; by default
+        the reference date of the first segment.
 
     Returns
     -------
     GaugedSolution
-        Without frames; `gauge` has the rotation and shift.  A rotation makes a term that drifted on
-        one axis drift on both, so both are in the model of the view.
+        Solution without frames; its attribute `gauge` has the rotation and shift.  If a term drifts
+        on one axis, the rotated model lets it drift on both axes.
 
     Raises
     ------
     InputError
-        For an unknown chip.
+        If the chip does not exist.
     """
     model = bare_model(solution.model)
     time = model.time
@@ -268,7 +280,7 @@ def reference_gauge(
     n = model.n_params
 
     def pose(theta: Float) -> tuple[Float, Complex]:
-        """Rotation (...) and shift (...) that bring the polynomials to the gauge."""
+        """Rotation (...) in radians and complex shift u + i v (...) to the reference gauge."""
         at = basis.to_monomials(model.effective(theta, group)[..., 0, :, :])
         return np.arctan2(at[..., 0, 2], at[..., 1, 2]), at[..., 0, 0] + 1j * at[..., 1, 0]
 
@@ -307,16 +319,18 @@ def reference_gauge(
 def linear_terms(
     solution: Solution, chip: int | None = None, *, epoch: float | None = None
 ) -> LinearTerms:
-    """Constant and linear terms at a date, as monomials of the pixel offsets.
+    """Constant and linear monomial coefficients at a date.
+
+    Monomials are powers of the pixel offsets from the chip's reference pixel.
 
     Parameters
     ----------
     solution : Solution
-        Only its polynomials are used, without frames.
+        Only its polynomials are used, without exposure frames.
     chip : int, optional
-        Chip number; all chips by default, with their names before the labels.
+        Chip number. By default all chips, with their names prepended to the labels.
     epoch : float, optional
-        Decimal years; needed by a model with time dependence.
+        Date in decimal years; required if the model depends on time.
 
     Returns
     -------
@@ -326,40 +340,41 @@ def linear_terms(
     Raises
     ------
     InputError
-        For an unknown chip or a missing epoch.
+        If the chip does not exist or the epoch is missing.
     """
     labels, jacobian = _linear_jacobian(solution.model, chip, epoch)
     return _linear(solution, labels, jacobian)
 
 
 def lines(solution: Solution, s: int = 0, *, chip: int | None = None) -> LinearTerms:
-    """Linear terms as lines in time: values at the reference date, and rates.
+    """Constant and linear monomial coefficients as straight lines in time.
 
     Parameters
     ----------
     solution : Solution
     s : int
-        Number of the segment, from 0.
+        Number of the segment, starting from 0.
     chip : int, optional
-        Chip number; all chips by default.
+        Chip number. By default all chips, with their names prepended to the labels.
 
     Returns
     -------
     LinearTerms
-        'A_2.alpha' and 'A_2.beta' of each term, as in Tables 1-3 of ACS ISR 2015-06; terms that
-        do not drift have a rate of zero.
+        Value at the reference date ('A_2.alpha') and rate per year ('A_2.beta') of each
+        coefficient, as in Tables 1-3 of ACS ISR 2015-06. Coefficients that do not drift have a
+        rate of zero.
 
     Raises
     ------
     InputError
-        For an unknown chip or segment.
+        If the chip or segment does not exist.
     """
     view = segment(solution, s)
     t0 = required(view.model.time, "the model has no drift").epoch0[0]
     labels, alpha = _linear_jacobian(view.model, chip, t0)
     _, later = _linear_jacobian(view.model, chip, t0 + 1.0)
-    both = tuple(f"{label}.{part}" for part in ("alpha", "beta") for label in labels)
-    return _linear(view, both, np.vstack([alpha, later - alpha]))
+    line_labels = tuple(f"{label}.{part}" for part in ("alpha", "beta") for label in labels)
+    return _linear(view, line_labels, np.vstack([alpha, later - alpha]))
 
 
 def _linear(solution: Solution, labels: tuple[str, ...], jacobian: Float) -> LinearTerms:
@@ -375,15 +390,19 @@ def _linear_jacobian(
     bare = bare_model(model)
     labels: list[str] = []
     rows = []
-    for one in bare.chips:
-        if chip is not None and bare.chip_code(chip) != bare.chip_code(one.number):
+    for bare_chip in bare.chips:
+        if chip is not None and bare.chip_code(chip) != bare.chip_code(bare_chip.number):
             continue
-        group = bare.groups(1, epoch=epoch if bare.time is not None else None, chip=one.number)
-        # linear in the parameters, whatever their values
+        group = bare.groups(
+            1, epoch=epoch if bare.time is not None else None, chip=bare_chip.number
+        )
+        # the terms are linear in the parameters, so the derivatives hold for any values
         [(columns, d)] = bare.effective_jacobian(np.zeros(bare.n_params), group)
         row = np.zeros((2, 3, bare.n_params))
-        row[:, :, columns] = np.einsum("kl,alm->akm", bare.basis(one.number).monomial_matrix[:3], d)
+        row[:, :, columns] = np.einsum(
+            "kl,alm->akm", bare.basis(bare_chip.number).monomial_matrix[:3], d
+        )
         rows.append(row.reshape(6, -1))
         named = chip is None and len(bare.chips) > 1
-        labels += [f"{one.name}.{term}" if named else term for term in LINEAR_TERMS]
+        labels += [f"{bare_chip.name}.{term}" if named else term for term in LINEAR_TERMS]
     return tuple(labels), np.vstack(rows)

@@ -1,1 +1,1 @@
-"""Matched stars as columns of a model: in memory, on disk, in a cluster; and their likelihood."""
+"""Matched stars prepared for a model (in memory, on disk or on a cluster), and their likelihood."""

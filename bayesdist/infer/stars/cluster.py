@@ -1,14 +1,13 @@
-"""The Dask engine: pieces of the data stay on the workers that made them, and only sums travel.
+"""The Dask engine: pieces of the data stay on the workers, and only sums are transferred.
 
-Each piece is the result of one task, and stays on the worker that ran it.  A pass is one
-map-reduce: a task for each piece, run on its worker, whose results are added in the order of the
-pieces, by the tree by which threads add them.  Workers add until few are left, which come back.  So
-it is however many workers there are and whatever happens to them: a worker that is lost takes its
-pieces along, and Dask makes them again elsewhere.  The result of a kernel for one piece is
-reproducible up to rounding: code that was compiled for another processor may differ in the last
-bits.
+Each piece is the result of a task and stays on the worker that computed it.  A pass is a map-reduce
+operation: one task per piece, run on its worker, with the results added in the order of the pieces,
+by the same tree as with threads.  Most additions are done on the workers.  The order of summation
+does not depend on the number of workers.  If a worker is lost, Dask computes its pieces again on
+another one.  Results for a piece are reproducible up to rounding, since code that was compiled for
+a different processor may differ in the last bits.
 
-The only module that uses dask and distributed; it is imported when the engine is requested.
+This is the only module that uses dask and distributed; it is imported when the engine is requested.
 """
 
 from __future__ import annotations
@@ -61,31 +60,33 @@ except ModuleNotFoundError as error:
 
 log = logging.getLogger("bayesdist")
 
-CONNECT = 10.0  # seconds to find the scheduler
-PATIENCE = 60.0  # seconds without any worker after which none is expected any more
+CONNECT = 10.0  # timeout in seconds for connecting to the scheduler
+PATIENCE = 60.0  # seconds without any worker before giving up
 POLL = 1.0  # seconds between two checks for workers
-ALLOWED_FAILURES = 10  # workers that a piece may lose before it counts as their killer
-LARGE = 50_000  # bytes of arguments from which one worker passes them on to the others
-TOGETHER = 256  # results that are fetched at a time
+ALLOWED_FAILURES = 10  # number of workers that may die while processing the same piece
+LARGE = 50_000  # larger arguments (bytes) are sent once and distributed by a worker
+TOGETHER = 256  # number of results that are fetched at a time
 
 _one_pass = threading.Lock()  # a pass uses all threads of its process
 
 
 class _Lease:
-    """Held by all pieces on a cluster: without any it is closed."""
+    """Token shared by all pieces on a cluster, which is closed when no piece holds it any more."""
 
 
 class ClusterPieces(MappedPieces):
-    """Pieces on the workers of a Dask cluster, made there by one function.
+    """Pieces on the workers of a Dask cluster, made there from sources by a function.
 
-    With a `scheduler` in `compute`, the cluster is that one; the version of bayesdist must be the
-    same on its workers.  Otherwise `workers` processes are started here and ended by `close`, or
-    when this object or the program goes; a script that does so needs the usual
-    ``if __name__ == "__main__":``.  With a `scratch` in `compute` the sources, which are records
-    then, are files below it until `close`; else the scheduler stores them.
+    If `compute` has a `scheduler`, that cluster is used; its workers must have the same version of
+    bayesdist.  Otherwise `workers` processes are started on this machine.  They are ended by
+    `close`, or when this object is deleted or the program ends.  A script that starts them needs
+    the usual ``if __name__ == "__main__":``.  If `compute` has a `scratch` folder, the sources
+    (which must be records) are written to files in it until `close`; otherwise the scheduler keeps
+    them in memory.
 
-    InputError when the cluster cannot be reached or started, has no workers, or has workers with
-    another version of bayesdist; when the scratch folder cannot be written to, or be read there.
+    Raises InputError if the cluster cannot be reached or started, has no workers, or has workers
+    with another version of bayesdist, or if the scratch folder cannot be written here or read by
+    the workers.
     """
 
     def __init__(self, make: Task, sources: Iterable[Any], compute: Compute) -> None:
@@ -122,11 +123,11 @@ class ClusterPieces(MappedPieces):
             raise
 
     def sum(self, task: Task, *args: Any) -> Any:
-        """Sum over the pieces of ``task(piece, *args)``, in their order.
+        """Sum of ``task(piece, *args)`` over the pieces, added in their order.
 
-        InputError when there are no workers any more, or when they die of the task; else any
-        exception that the task raises on the first piece, in their order, that it fails on; of more
-        than `BRANCHES` pieces, on one of the first branch.
+        Raises InputError if there are no workers any more, or if workers die while they run the
+        task.  Otherwise an exception of the task is raised: that of the first piece that fails or,
+        with more than `BRANCHES` pieces, of a piece in the first branch that fails.
         """
         with _large_graphs():
             parts = self._tasks(task, args)
@@ -138,14 +139,15 @@ class ClusterPieces(MappedPieces):
             return total(self._results(parts))
 
     def each(self, task: Task, *args: Any) -> Iterator[Any]:
-        """Results ``task(piece, *args)`` in the order of the pieces; errors as `sum`."""
+        """Yield ``task(piece, *args)`` in the order of the pieces; see `sum` for exceptions."""
         with _large_graphs():
             yield from self._results(self._tasks(task, args))
 
     def map(self, task: Task, *args: Any) -> Self:
-        """Pieces ``task(piece, *args)``, each on the worker that has the piece.
+        """New pieces ``task(piece, *args)``, each on the worker that has the piece.
 
-        They are made again from the first ones where a worker is lost.  Errors as `sum`.
+        If a worker is lost, they are computed again from the original pieces.  See `sum` for
+        exceptions.
         """
         out = copy.copy(self)
         with _large_graphs():
@@ -156,21 +158,22 @@ class ClusterPieces(MappedPieces):
         return out
 
     def close(self) -> None:
-        """Release the data, and the cluster where it was started for them."""
+        """Release the data, and shut down the cluster if it was started here."""
         self._pieces = []
         self._end()
 
     def _tasks(self, task: Task, args: tuple[Any, ...]) -> list[Future]:
-        """A task on each piece."""
+        """Submit a task for each piece."""
         work: _Work | Future = _Work(task, args)
         if len(pickle.dumps(args, protocol=5)) > LARGE:
-            # sent once; a task's result, unlike scattered data, outlives its worker
+            # sent once, as the result of a task, which unlike scattered data survives its worker
             work = self._client.submit(_same, work, pure=False)
         return self._on_each(_pass, work=work)
 
     def _on_each(self, function: Task, **options: Any) -> list[Future]:
-        # Tied to some workers, loosely.  Tasks that are not, and few, count as roots of a graph:
-        # Dask then spreads them without regard to the positions of the pieces, which would travel.
+        # Restrict the tasks loosely to the workers. Without a restriction, Dask would treat a small
+        # number of tasks as roots of a graph and distribute them regardless of where the pieces
+        # are, so that the pieces would have to be transferred.
         workers = sorted(self._workers()) or None
         return self._client.map(
             function,
@@ -182,13 +185,13 @@ class ClusterPieces(MappedPieces):
         )
 
     def _results(self, futures: Sequence[Future]) -> Iterator[Any]:
-        """Results in the order of the pieces, or the first error in that order."""
+        """Yield results in the order of the pieces; raise the first error in that order."""
         try:
             for k in range(0, len(futures), TOGETHER):
                 yield from self._awaited(futures[k : k + TOGETHER])
         except KilledWorker as error:
             raise InputError(
-                "workers die again and again while they work on the same stars",
+                "workers die repeatedly while they process the same stars",
                 where=f"cluster {self._where}",
                 do="look into their logs, and give them more memory",
             ) from error
@@ -199,33 +202,33 @@ class ClusterPieces(MappedPieces):
                 do="start it and the run again",
             ) from error
         finally:
-            # after an error the rest of the pass would go on as long as its traceback exists
+            # after an error, the remaining tasks would continue as long as the traceback exists
             unfinished = [future for future in futures if not future.done()]
             if unfinished and self._client.status == "running":
                 self._client.cancel(unfinished, force=True)
 
     def _awaited(self, futures: Sequence[Future]) -> list[Any]:
-        """Results of tasks, waited for as long as there are workers."""
+        """Wait for the results of tasks as long as there are workers."""
         loop = self._client.loop.asyncio_loop
         results = asyncio.run_coroutine_threadsafe(_in_order(self._client, futures), loop)
-        seen = monotonic()
+        last_seen = monotonic()
         try:
             while True:
                 try:
                     return results.result(timeout=POLL)
                 except TimeoutError:
-                    if results.done():  # the task's own
+                    if results.done():  # raised by the task
                         raise
                 workers = self._workers()
                 if workers:
-                    seen = monotonic()
+                    last_seen = monotonic()
                     if self._loading and not self._loading & workers:
                         raise InputError(
                             "all workers were lost while they read the stars",
                             where=f"cluster {self._where}",
                             do="look into their logs, give them more memory, and start again",
                         )
-                elif monotonic() - seen > PATIENCE:
+                elif monotonic() - last_seen > PATIENCE:
                     raise InputError(
                         f"has had no workers for {PATIENCE:g} seconds",
                         where=f"cluster {self._where}",
@@ -237,14 +240,14 @@ class ClusterPieces(MappedPieces):
     def _workers(self) -> set[str]:
         try:
             return set(self._client.nthreads())
-        except OSError:  # the scheduler is gone: tasks will be cancelled
+        except OSError:  # the scheduler is gone, so tasks will be cancelled
             return set()
 
     def _settle(self) -> None:
-        """Untie the pieces from the workers over which they were spread.
+        """Remove the restriction of the pieces to the workers on which they were placed.
 
-        Dask takes no other worker for a tied task when, for a moment, there was none at all: it
-        would wait for the lost one for ever.
+        If all workers are temporarily lost, Dask would otherwise wait for the original worker
+        forever, even though other workers are allowed.
         """
         free: dict[Any, list[str]] = {piece.key: [] for piece in self._pieces}
         self._client.sync(self._client.scheduler.set_restrictions, worker=free)
@@ -254,10 +257,10 @@ class ClusterPieces(MappedPieces):
 class ClusterShards(ClusterPieces, Shards):
     """Shards on the workers of a Dask cluster.
 
-    Batches of stars in memory are sent; those on disk are read by the workers, which have to see
-    the files under the same absolute paths.
+    Batches of stars in memory are sent to the workers.  Batches on disk are read by the workers,
+    which must see the files under the same absolute paths.
 
-    InputError as `ClusterPieces`, `prepare` and `BatchReader.load`.
+    Raises InputError for the reasons given at `ClusterPieces`, `prepare` and `BatchReader.load`.
     """
 
     def __init__(self, model: DistortionModel, matches: Matches, compute: Compute) -> None:
@@ -273,23 +276,23 @@ class ClusterShards(ClusterPieces, Shards):
             raise
 
     def sum(self, task: Task, *args: Any) -> Any:
-        """As `ClusterPieces.sum`, of ``task(stars, *args)``."""
+        """Sum of ``task(stars, *args)`` over the shards; see `ClusterPieces.sum`."""
         return super().sum(_of_stars, task, *args)
 
 
 def _survey(shard: tuple[Stars, Survey]) -> Survey:
-    """On a worker: survey of a shard."""
+    """Survey of a shard (runs on a worker)."""
     return shard[1]
 
 
 def _of_stars(shard: tuple[Stars, Survey], task: Task, *args: Any) -> Any:
-    """On a worker: result of a task on the stars of a shard."""
+    """Result of a task for the stars of a shard (runs on a worker)."""
     return task(shard[0], *args)
 
 
 @dataclass(frozen=True, eq=False)
 class _Work:
-    """A task and its arguments, hidden from Dask."""
+    """A task and its arguments, wrapped so that Dask does not inspect them."""
 
     task: Task
     args: tuple[Any, ...]
@@ -297,20 +300,20 @@ class _Work:
 
 @dataclass(frozen=True)
 class _Written:
-    """A record in a file that workers read."""
+    """Path of a record that the workers read."""
 
     path: Path
 
     @classmethod
     def as_number(cls, k: int, record: Any, folder: Path) -> _Written:
-        """The record of a number, written to a folder."""
+        """Write a record to a folder under the number `k`."""
         path = folder / f"{k:06d}.h5"
         write_record(path, record)
         return cls(path)
 
     def read(self) -> Any:
-        """The record; InputError where the file is not seen, FormatError where it is damaged."""
-        do = "resume the run, which writes it anew, and check the disk of compute.scratch"
+        """Read the record; raises InputError if the file is missing, FormatError if damaged."""
+        do = "resume the run, which writes it again, and check the disk of compute.scratch"
         try:
             return read_record(self.path, object, "a part of the data", do=do)
         except FormatError:
@@ -321,23 +324,23 @@ class _Written:
 
 
 def _made_from(make: Task, source: Any) -> Any:
-    """On a worker: the piece of a source, which may be in a file."""
+    """Make a piece from a source, which may be in a file (runs on a worker)."""
     return make(source.read() if isinstance(source, _Written) else source)
 
 
 def _made(_: Any) -> None:
-    """On a worker: nothing of a piece, once it has been made."""
+    """Return None once a piece has been made (runs on a worker)."""
 
 
 def _same(work: _Work) -> _Work:
-    """On a worker: arguments, to be fetched by the others."""
+    """Return the arguments, so that other workers can fetch them (runs on a worker)."""
     return work
 
 
 def _pass(piece: Any, work: _Work) -> Any:
-    """On a worker: result of a task on one piece."""
+    """Result of a task for a piece (runs on a worker)."""
     with _one_pass:
-        # of this thread, which may be another one each time
+        # the setting belongs to the thread, which may differ from call to call
         kernel.set_threads(get_worker().state.nthreads)
         return work.task(piece, *work.args)
 
@@ -351,9 +354,9 @@ async def _in_order(client: Any, futures: Sequence[Future]) -> list[Any]:
 
 @contextmanager
 def one_cluster(compute: Compute) -> Iterator[Compute]:
-    """Context with one cluster for all pieces of its compute, started here where none is given.
+    """Context with a single cluster for all pieces, started here if `compute` has no scheduler.
 
-    InputError as `ClusterPieces`.
+    Yields a `Compute` with the address of the scheduler.  Raises InputError like `ClusterPieces`.
     """
     if compute.scheduler is not None:
         yield compute
@@ -363,21 +366,21 @@ def one_cluster(compute: Compute) -> Iterator[Compute]:
 
 
 def _local_cluster(workers: int | None) -> LocalCluster:
-    """Processes of this machine that share its cores evenly."""
+    """Cluster of processes on this machine that share its cores evenly."""
     workers = CPU_COUNT if workers is None else workers
     if workers < 1:
         raise InputError(
-            f"{workers} workers do no work", where="compute.workers", do="give 1 or more"
+            f"the number of workers is {workers}", where="compute.workers", do="give 1 or more"
         )
     with dask.config.set({"distributed.scheduler.allowed-failures": ALLOWED_FAILURES}):
         try:
             return LocalCluster(
                 n_workers=workers,
                 threads_per_worker=max(1, CPU_COUNT // workers),
-                host="127.0.0.1",  # whoever reaches a scheduler runs code there: nobody else does
+                host="127.0.0.1",  # local only, since a scheduler runs any code that it receives
                 processes=True,
                 memory_limit=0,
-                dashboard_address="127.0.0.1:0",  # None is port 8787, which may be taken
+                dashboard_address="127.0.0.1:0",  # None means port 8787, which may be in use
                 scheduler_kwargs={"dashboard": False},
                 silence_logs=logging.CRITICAL,
             )
@@ -385,15 +388,15 @@ def _local_cluster(workers: int | None) -> LocalCluster:
             raise InputError(
                 f"{workers} worker processes do not start",
                 where="compute.workers",
-                do="ask for fewer, and begin a script of your own with if __name__ == '__main__'",
+                do="use fewer, and protect the code of a script with if __name__ == '__main__'",
             ) from error
 
 
 def _connected(compute: Compute) -> tuple[Any, LocalCluster | None]:
-    """Client, and the cluster where it is our own."""
+    """Client, and the cluster if it was started here."""
     if compute.scheduler is not None:
         try:
-            # a client that fails on a bad address would never be closed
+            # check the address first: a client that fails on it could not be closed
             resolve_address(compute.scheduler)
             return Client(compute.scheduler, timeout=CONNECT, set_as_default=False), None
         except (OSError, ValueError, TypeError) as error:
@@ -411,7 +414,7 @@ def _connected(compute: Compute) -> tuple[Any, LocalCluster | None]:
 
 
 def _places(client: Any) -> list[str]:
-    """Addresses of the workers, each as often as it has threads, in turn."""
+    """Addresses of the workers, each repeated once per thread, in round-robin order."""
     if not client.nthreads():
         log.warning(
             "cluster %s has no workers yet: waiting for %g seconds",
@@ -433,49 +436,49 @@ def _places(client: Any) -> list[str]:
             do="start it and the run again",
         ) from error
     threads = sorted(client.nthreads().items())
-    most = max(n for _, n in threads)
-    return [address for k in range(most) for address, n in threads if k < n]
+    max_threads = max(n for _, n in threads)
+    return [address for k in range(max_threads) for address, n in threads if k < n]
 
 
 def _require_version(client: Any) -> None:
-    """Raise InputError for workers with another version of bayesdist."""
+    """Raise InputError if a worker has another version of bayesdist."""
 
-    def version() -> str:  # a local function travels whole, and needs no bayesdist over there
+    def version() -> str:  # a local function is sent by value and does not need bayesdist there
         try:
             from bayesdist.version import __version__
         except ImportError:
             return "none"
         return __version__
 
-    for address, found in sorted(client.run(version).items()):
-        if found != __version__:
+    for address, worker_version in sorted(client.run(version).items()):
+        if worker_version != __version__:
             raise InputError(
-                f"has bayesdist {found}, and here it is {__version__}",
+                f"has bayesdist {worker_version}, and here it is {__version__}",
                 where=f"worker {address}",
                 do="install one version everywhere",
             )
 
 
 def _large_graphs() -> Any:
-    """Context without the warning of data inside graphs, where they must be to be made again."""
+    """Context without Dask's warning about data in graphs, which is needed to redo lost pieces."""
     return dask.config.set({"distributed.admin.large-graph-warning-threshold": "1 PB"})
 
 
 def _folder_in(scratch: str, files: ExitStack) -> Path:
-    """New folder in the scratch folder, which `files` removes."""
+    """New folder in the scratch folder; it is removed when `files` is closed."""
     try:
-        made = tempfile.TemporaryDirectory(prefix="bayesdist-", dir=scratch)
-        return Path(files.enter_context(made))
+        folder = tempfile.TemporaryDirectory(prefix="bayesdist-", dir=scratch)
+        return Path(files.enter_context(folder))
     except OSError as error:
         raise InputError(
-            f"no folder can be made in {scratch} ({error.strerror})",
+            f"no folder can be created in {scratch} ({error.strerror})",
             where="compute.scratch",
-            do="name a folder that can be written to, and that all workers see",
+            do="name a writable folder that all workers see",
         ) from error
 
 
 def _end(client: Any, cluster: LocalCluster | None, files: ExitStack) -> None:
-    """Close the client and its own cluster, and remove the files of the sources."""
+    """Close the client and, if any, the cluster, and remove the files of the sources."""
 
     def close() -> None:
         client.close()
@@ -483,7 +486,7 @@ def _end(client: Any, cluster: LocalCluster | None, files: ExitStack) -> None:
             cluster.close()
         files.close()
 
-    # garbage may be collected in the thread that closing has to wait for
+    # avoid a deadlock: garbage collection may run in the thread for which closing waits
     if client.loop.asyncio_loop is _running_loop():
         threading.Thread(target=close).start()
     else:

@@ -1,4 +1,4 @@
-"""How a star counts at a solution: after rejection in least squares, or in a mixture."""
+"""Likelihood of single stars at a solution: Gaussian with rejection, or outlier mixture."""
 
 from __future__ import annotations
 
@@ -16,17 +16,20 @@ from bayesdist.utils.arrays import Bool, Float
 
 
 class Likelihood(Protocol):
-    """Likelihood of a star by its position in the model, at one parameter vector."""
+    """Likelihood of single stars at one parameter vector."""
 
     @property
     def theta(self) -> Float:
         """The parameter vector (D,)."""
 
     def scores(self, stars: Stars) -> Float:
-        """Gradient by the model's u and v, and minus the second derivatives uu, uv, vv: (5, N)."""
+        """Derivatives of the log-likelihood with respect to the model position, shape (5, N).
+
+        The rows are the first derivatives in u and v, and minus the second derivatives uu, uv, vv.
+        """
 
     def inliers(self, stars: Stars) -> Float:
-        """Probability (N,) of each star to be a true match."""
+        """Probability (N,) that each star is a true match."""
 
     def variances(self, stars: Stars) -> Float:
         """Variances (2, N) of true matches along u and v."""
@@ -34,19 +37,19 @@ class Likelihood(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class Clip:
-    """Limits on the residuals of the first pass, beyond which stars are left out of the second."""
+    """Rejection limits for the residuals from the first pass of a fit."""
 
-    theta: Float  # of the first pass
-    chi2_limit: float
-    abs_limit: float  # in the unit of u, v
+    theta: Float  # parameters (D,) of the first pass
+    chi2_limit: float  # largest chi-square of a star (sum over both axes)
+    abs_limit: float  # largest radial residual, in the unit of u, v
 
     def keeps(self, model: DistortionModel, matches: Matches) -> Bool:
-        """Boolean mask (N,) of a table's stars within both limits."""
+        """Boolean mask (N,) that is True for matches within both limits, in table order."""
         stars, order = prepare(model, matches)
         return in_table_order(self.keeps_of(stars), order).astype(bool)
 
     def keeps_of(self, stars: Stars) -> Bool:
-        """Boolean mask (N,) of prepared stars within both limits, in their own order."""
+        """Boolean mask (N,) that is True for prepared stars within both limits."""
         residual = stars.residuals(self.theta)
         chi2 = residual[:, 0] ** 2 / stars.var_u + residual[:, 1] ** 2 / stars.var_v
         r2 = (residual**2).sum(axis=1)
@@ -55,36 +58,36 @@ class Clip:
 
 @dataclass(frozen=True, eq=False)
 class ClippedGaussian:
-    """Normal errors of the stars within the limits of a two-pass fit."""
+    """Gaussian likelihood of the stars within the rejection limits of a two-pass fit."""
 
     theta: Float
     clip: Clip
 
     def scores(self, stars: Stars) -> Float:
-        """As `Likelihood.scores`; zero for stars that are left out."""
+        """Derivatives of the log-likelihood (see `Likelihood.scores`); zero for rejected stars."""
         r = stars.residuals(self.theta).T
         used = self.clip.keeps_of(stars)
         w_u, w_v = used / stars.var_u, used / stars.var_v
         return np.stack([w_u * r[0], w_v * r[1], w_u, np.zeros(len(stars)), w_v])
 
     def inliers(self, stars: Stars) -> Float:
-        """1 for stars within the limits, else 0."""
+        """1 for stars within the limits, 0 for rejected stars; shape (N,)."""
         return self.clip.keeps_of(stars).astype(float)
 
     def variances(self, stars: Stars) -> Float:
-        """Quoted variances (2, N)."""
+        """Variances (2, N) from the quoted errors."""
         return np.stack([stars.var_u, stars.var_v])
 
 
 @dataclass(frozen=True, eq=False)
 class MixtureAt:
-    """Mixture of true and false matches, with one set of hyperparameters."""
+    """Outlier mixture with one set of hyperparameters."""
 
     theta: Float
     constants: Constants
 
     def scores(self, stars: Stars) -> Float:
-        """As `Likelihood.scores`."""
+        """Derivatives of the log-likelihood; see `Likelihood.scores`."""
         if circle := stars.circle(self.constants):
             return kernel.truncated_scores(
                 stars.blocks,
@@ -100,31 +103,30 @@ class MixtureAt:
         outlier = 1 / out if self.constants.kind == GAUSSIAN else 0.0
         w = np.stack([1 / (stars.var_u + j2), 1 / (stars.var_v + j2)])
         mean = (1 - p) * w + p * outlier
-        # derivative of the membership by position
+        # derivative of log(core / outlier) with respect to the residual
         turn = (outlier - w) * r
         uu, vv = mean - p * (1 - p) * turn**2
         return np.stack([*(mean * r), uu, -p * (1 - p) * turn[0] * turn[1], vv])
 
     def inliers(self, stars: Stars) -> Float:
-        """Membership (N,) of each star in the core of the mixture."""
+        """Probability (N,) that each star belongs to the core of the mixture."""
         return 1.0 - star_averages(stars, self.theta[None], self.constants)[0]
 
     def variances(self, stars: Stars) -> Float:
-        """Quoted variances with the jitter (2, N)."""
+        """Variances (2, N) from the quoted errors and the jitter."""
         return np.stack([stars.var_u, stars.var_v]) + self.constants.j2[0]
 
 
 def star_averages(stars: Stars, theta: Float, constants: Constants) -> Float:
-    """Outlier probability, log-likelihood and its square (3, N), averaged over draws.
+    """Outlier probability, log-likelihood and its square per star (3, N), averaged over n draws.
 
-    `theta` is (n, D), and `constants` are those of the n draws.  With a sum over the stars it makes
-    a task for `Shards.sum`.
+    `theta` is (n, D), and `constants` belong to the n draws.
     """
     return np.asarray(_by_star(stars, theta, constants, len(theta))[0])
 
 
 def star_log_likelihoods(stars: Stars, theta: Float, constants: Constants) -> Float:
-    """Log-likelihood (n, N) of each star at draws (n, D), whose constants are given."""
+    """Log-likelihood (n, N) of each star for draws theta (n, D) with the given constants."""
     return np.asarray(_by_star(stars, theta, constants, 1)[:, 1])
 
 
@@ -138,16 +140,16 @@ def _by_star(stars: Stars, theta: Float, constants: Constants, each: int) -> Flo
 
 
 def log_densities(square: Float, var: Float, f: float, wide: float) -> tuple[Float, Float]:
-    """Log densities (N,), up to a constant, of stars as good and as false matches.
+    """Log densities (N,) of the stars as true matches and as false matches, up to a constant.
 
-    `square` (2, N) are squared residuals, `var` (2, N) the variances of good matches; a fraction
-    `f` is false, of variance `wide` on each axis.
+    `square` (2, N) are squared residuals and `var` (2, N) the variances of true matches.  A
+    fraction `f` of the matches is false, with the variance `wide` on each axis.
     """
     log_good = np.log1p(-f) - 0.5 * (square / var + np.log(var)).sum(axis=0)
     return log_good, np.log(f) - 0.5 * (square / wide).sum(axis=0) - np.log(wide)
 
 
 def good_probability(square: Float, var: Float, f: float, wide: float) -> Float:
-    """Probability (N,) that each star is a good match; arguments as of `log_densities`."""
+    """Probability (N,) that each star is a true match; see `log_densities` for the arguments."""
     log_good, log_bad = log_densities(square, var, f, wide)
     return np.asarray(0.5 * (1.0 + np.tanh(0.5 * (log_good - log_bad))))

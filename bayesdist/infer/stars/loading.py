@@ -1,4 +1,4 @@
-"""Shards of a model, in this process or on a cluster, from matches."""
+"""Loading of matches as shards of a model, in this process or on a cluster."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from bayesdist.model import DistortionModel
 def opened(
     model: DistortionModel, matches: Matches | Shards, compute: Compute | None = None
 ) -> Iterator[Shards]:
-    """Context with the data as shards, as of `load`; shards loaded here are closed at the end."""
+    """Context that loads the data as shards (see `load`) and closes them at the end."""
     shards = load(model, matches, compute)
     try:
         yield shards
@@ -33,8 +33,9 @@ def load(
     ----------
     model : DistortionModel
     matches : Matches or Shards
-        Shards are returned unchanged.
+        Stars with errors. Shards of the same model are returned unchanged.
     compute : Compute, optional
+        Computing engine; threads of this process by default.
 
     Returns
     -------
@@ -43,7 +44,9 @@ def load(
     Raises
     ------
     InputError
-        As `prepare`; for a full scratch folder; when there is no cluster.
+        If the matches have no errors, another unit than the model, or lack required epochs; if
+        shards belong to another model; if the scratch folder is full; or if the cluster cannot be
+        reached.
     """
     if isinstance(matches, Shards):
         if matches.model != model:
@@ -53,13 +56,13 @@ def load(
         return matches
     if not isinstance(matches, Matches):
         raise InputError(
-            f"{type(matches).__name__} holds no matches",
+            f"{type(matches).__name__} does not contain matches",
             do="give what read_matches, open_matches or load returned",
         )
     compute = compute or Compute()
     if compute.engine == "threads":
         return LocalShards(model, matches, compute.memory_mb)
-    # dask is imported where it is asked for
+    # dask is imported only if its engine is requested
     from bayesdist.infer.stars.cluster import ClusterShards
 
     return ClusterShards(model, matches, compute)

@@ -1,24 +1,26 @@
-"""Outlier mixture: probabilities of false matches, and the error of the quoted errors.
+"""Outlier mixture: a model of false matches and of errors that exceed the quoted errors.
 
     p(r) = (1 - f) N(r_u; 0, s_u^2 + j^2) N(r_v; 0, s_v^2 + j^2) + f p_out(r)
 
-One membership for each star, shared by both axes.  p_out is a round Gaussian of scale s_out, or
-uniform on the match circle.  The Gaussian is never narrower than the core: with s the median quoted
-error, s_out^2 = s^2 + j^2 + w^2, and w is sampled.  Otherwise quoted errors that are far too small
-let the components change places, and most stars be "outliers" of the narrow one.
+f is the fraction of false matches and j the jitter, an additional error of all stars.  A star is a
+false match in both axes or in neither.  p_out is an isotropic Gaussian of scale s_out, or uniform
+on the match circle.  The Gaussian is always wider than the core: s_out^2 = s^2 + j^2 + w^2, with s
+the median quoted error, and w is sampled.  Otherwise, with quoted errors that are far too small,
+the two components could be exchanged, and most stars would be "outliers" of the narrow one.
 
-Where stars were matched within a circle about nominal positions that are known, both parts are
-normalised on it, and f is the fraction of false matches in it.  Sampled are log j, logit f and log
-w; the priors are proper:
+If stars were matched within a circle about known nominal positions, both densities are normalised
+on this circle, and f is the fraction of false matches within it.  The sampled coordinates are
+log j, logit f and log w.  The priors are proper:
 
     f      Beta(a, b)
-    j      half-Student-t, four degrees of freedom, scale: the median quoted error by default
-    w      inverse gamma on w^2, shape 1; log w is most probable at five times the core's
-           sqrt(s^2 + j^2) by default: an undetermined second component stays apart from it
+    j      half-Student-t with four degrees of freedom; the scale is by default the median quoted
+           error
+    w      inverse gamma on w^2 with shape 1; by default the mode of log w is at five times the
+           core's sqrt(s^2 + j^2), which keeps an undetermined second component separate
 
-All three leave tails in the sampled coordinates that fall at least exponentially, so that the
-posterior stays proper where the data are uninformative: on j when the quoted errors are right, on w
-when there are no outliers.
+The tails of all three priors fall at least exponentially in the sampled coordinates.  The posterior
+is therefore proper even if the data are uninformative: on j if the quoted errors are correct, on w
+if there are no outliers.
 """
 
 from __future__ import annotations
@@ -40,42 +42,43 @@ from bayesdist.utils.quantities import value_in
 
 HYPER_NAMES = {"j": "log j", "f": "logit f", "s_out": "log s_out"}
 KINDS = {"none": kernel.NO_OUTLIERS, "gaussian": kernel.GAUSSIAN, "uniform": kernel.UNIFORM}
-T_DOF = 4.0
-OUTLIER_SHAPE = 1.0
-OUTLIER_MODE = 5.0
-LEAST_EXCESS = 1e-9  # of w^2 over the core's variance: files round
-# smallest a of Beta(a, b): at 1/3 and below the posterior of f^(1/3) may have no mode
+T_DOF = 4.0  # degrees of freedom of the prior on j
+OUTLIER_SHAPE = 1.0  # shape of the inverse-gamma prior on w^2
+OUTLIER_MODE = 5.0  # default mode of log w: this multiple of the core's standard deviation
+LEAST_EXCESS = 1e-9  # lower limit of w^2 over the core's variance, for values rounded in files
+# smallest a of Beta(a, b); for a <= 1/3 the posterior of f^(1/3) may have no mode
 LEAST_SHAPE = 0.5
-# limit for uninformative data on log j or log w, and the slope of the log prior there
+# side of the axis (log j, log w) on which data may be uninformative, and the prior's slope there
 TAILS = {"j": ("left", 1.0), "s_out": ("right", -2.0 * OUTLIER_SHAPE)}
 
 
 @dataclass(frozen=True)
 class OutlierMixture:
-    """Likelihood of one star and the priors of its parameters.
+    """Model of false matches, and priors of its parameters.
 
     Parameters
     ----------
     model : str
-        'gaussian', 'uniform' or 'none'.
+        Distribution of the false matches: 'gaussian', 'uniform' on the match circle, or 'none' for
+        no false matches.
     match_radius : float or Quantity, optional
-        Radius of the match circle in the unit of u, v; needed by 'uniform'.  With matches that have
-        nominal positions, the likelihood is that of stars selected within it.
+        Radius of the match circle in the unit of u, v; required for 'uniform'. For matches with
+        nominal positions, the likelihood accounts for the selection of stars within the circle.
     jitter : float, Quantity or None
-        Extra error j in the unit of u, v; None samples it.
+        Additional error j of all stars in the unit of u, v; None to fit it.
     fraction_prior : tuple of float
-        Parameters (a, b) of the Beta prior of f.
+        Parameters (a, b) of the Beta prior of the fraction f of false matches.
     jitter_scale : float or Quantity, optional
         Scale of the prior of j in the unit of u, v; by default the median quoted error.
     outlier_scale : float or Quantity, optional
-        Most probable w of 'gaussian' outliers beforehand, in the unit of u, v: their scale s_out
-        beyond that of the core; by default five times the core's.
+        Prior mode of w for 'gaussian' outliers, in the unit of u, v, where w^2 is the variance of
+        the outliers minus that of the core; by default five times the scale of the core.
 
     Raises
     ------
     InputError
-        For an unknown model, a missing radius, a negative jitter, an improper prior, or the prior
-        of a parameter that is not sampled.
+        If the model is unknown, the radius is missing, the jitter is negative, a prior is improper,
+        or a prior is given for a parameter that is not fitted.
 
     Examples
     --------
@@ -139,7 +142,7 @@ class OutlierMixture:
 
     @property
     def hyper(self) -> tuple[str, ...]:
-        """Sampled ones of 'j', 'f', 's_out', in this order."""
+        """Names of the hyperparameters that are fitted, in the order 'j', 'f', 's_out'."""
         out: tuple[str, ...] = () if self.jitter is not None else ("j",)
         if self.model != "none":
             out += ("f",)
@@ -148,17 +151,21 @@ class OutlierMixture:
         return out
 
     def in_unit(self, unit: str) -> OutlierMixture:
-        """Mixture whose lengths are plain numbers.
+        """Convert all Quantities to plain numbers.
 
         Parameters
         ----------
         unit : str
-            Unit of u and v, to which Quantities are converted.
+            Unit of u and v.
+
+        Returns
+        -------
+        OutlierMixture
 
         Raises
         ------
         InputError
-            If a Quantity cannot be converted.
+            If a Quantity cannot be converted to this unit.
         """
         lengths: dict[str, Any] = {
             name: value_in(length, unit, name, where=f"outliers.{name}")
@@ -168,36 +175,40 @@ class OutlierMixture:
         return replace(self, **lengths) if lengths else self
 
     def bind(self, scale: float) -> Hyper:
-        """Mixture with its priors scaled to the data.
+        """Scale the priors to the data.
 
         Parameters
         ----------
         scale : float
-            Median quoted error.
+            Median quoted error in the unit of u, v.
+
+        Returns
+        -------
+        Hyper
         """
         return Hyper(self, scale)
 
 
 def _number(length: Any) -> Any:
-    """Number of a Quantity, whose unit is compared with that of u and v later."""
+    """Value of a Quantity or number; units are checked later by `OutlierMixture.in_unit`."""
     number = getattr(length, "value", length)
     if number is not None and not isinstance(number, Real):
         raise InputError(
-            f"{length!r} is no length", where="outliers", do="give a number or a Quantity"
+            f"{length!r} is not a length", where="outliers", do="give a number or a Quantity"
         )
     return number
 
 
 @dataclass(frozen=True)
 class Hyper:
-    """An `OutlierMixture` with the scale of the data: likelihood terms and priors.
+    """Likelihood terms and priors of an `OutlierMixture` whose priors are scaled to the data.
 
-    A point is a vector h in the order of `mixture.hyper`: log j, logit f, log w.  Proposals may lie
-    where numbers overflow: there the density is zero or NaN.
+    Points h are in sampled coordinates (log j, logit f, log w), in the order of `mixture.hyper`.
+    At points where numbers overflow, the density is zero or NaN.
     """
 
     mixture: OutlierMixture
-    scale: float  # median quoted error, of the priors where the mixture gives none
+    scale: float  # median quoted error, which is the default scale of the priors
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -206,7 +217,7 @@ class Hyper:
 
     @np.errstate(over="ignore", invalid="ignore")
     def values(self, h: Float) -> dict[str, Float]:
-        """j, f and s_out of points (..., n_hyper), in natural form."""
+        """Convert points h (..., n_hyper) to values (...) of j, f and s_out."""
         out = {}
         for k, name in enumerate(self.mixture.hyper):
             t = h[..., k]
@@ -217,7 +228,7 @@ class Hyper:
         return out
 
     def point(self, values: Mapping[str, ArrayLike]) -> Float:
-        """Sampled coordinates (..., n_hyper) of natural values (...)."""
+        """Convert values (...) of j, f and s_out to sampled coordinates (..., n_hyper)."""
         natural = {k: np.asarray(values[k], float) for k in self.mixture.hyper}
         core = self.scale**2 + natural.get("j", np.asarray(self.mixture.jitter or 0.0)) ** 2
         columns = []
@@ -230,16 +241,17 @@ class Hyper:
 
     @np.errstate(over="ignore", invalid="ignore")
     def core(self, h: Float) -> Float:
-        """Variance (...) of true matches on an axis, with the median quoted error."""
+        """Variance (...) per axis of true matches with the median quoted error."""
         if self.mixture.jitter is None:
             return np.asarray(self.scale**2 + np.exp(2 * h[..., 0]))
         return np.full(h.shape[:-1], self.scale**2 + self.mixture.jitter**2)
 
     def chained(self, h: Float, gradient: Float, curvature: Float) -> tuple[Float, Float, Float]:
-        """Gradient (n_hyper,) and minus Hessian by h, from those by log j, logit f and log s_out.
+        """Transform derivatives from (log j, logit f, log s_out) to h by the chain rule.
 
-        The third result (n_hyper, n_hyper) are the derivatives of log j, logit f and log s_out
-        (rows) by h.
+        `gradient` (n_hyper,) and `curvature` (n_hyper, n_hyper), which is minus the Hessian, are
+        given with respect to log j, logit f and log s_out.  Returns both with respect to h, and the
+        derivatives (n_hyper, n_hyper) of log j, logit f and log s_out (rows) with respect to h.
         """
         names = self.mixture.hyper
         by = np.eye(len(h))
@@ -259,7 +271,7 @@ class Hyper:
 
     @np.errstate(over="ignore", invalid="ignore")
     def constants(self, h: Float) -> Constants:
-        """Constants of the likelihood at points (n, n_hyper)."""
+        """Constants of the likelihood for points h (n, n_hyper)."""
         n = len(h)
         fixed = self.mixture.jitter
         j2 = np.full(n, 0.0 if fixed is None else fixed**2)
@@ -281,7 +293,7 @@ class Hyper:
 
     @np.errstate(over="ignore", invalid="ignore")
     def log_prior(self, h: Float) -> Float:
-        """Log prior density of points (..., n_hyper) in sampled coordinates, normalised."""
+        """Normalised log prior density (...) of points h (..., n_hyper)."""
         out = np.zeros(h.shape[:-1])
         for k, name in enumerate(self.mixture.hyper):
             t = h[..., k]
@@ -305,13 +317,17 @@ class Hyper:
         return self.mixture.jitter_scale or self.scale
 
     def _outlier_rate(self, h: Float) -> Float:
-        """Rate (...) of the inverse gamma of w^2."""
-        given = self.mixture.outlier_scale
-        square = np.full(h.shape[:-1], given**2) if given else OUTLIER_MODE**2 * self.core(h)
+        """Rate (...) of the inverse-gamma prior of w^2."""
+        outlier_scale = self.mixture.outlier_scale
+        square = (
+            np.full(h.shape[:-1], outlier_scale**2)
+            if outlier_scale
+            else OUTLIER_MODE**2 * self.core(h)
+        )
         return np.asarray(OUTLIER_SHAPE * square)
 
     def prior_terms(self, h: Float) -> tuple[Float, Float]:
-        """Gradient (n_hyper,) and minus the Hessian (n_hyper, n_hyper) of the log prior."""
+        """Gradient (n_hyper,) and minus the Hessian (n_hyper, n_hyper) of the log prior at h."""
         gradient, curvature = np.zeros(len(h)), np.zeros((len(h), len(h)))
         for k, name in enumerate(self.mixture.hyper):
             if name == "f":
@@ -328,7 +344,7 @@ class Hyper:
                 gradient[k] += -2 * OUTLIER_SHAPE + 2 * e
                 curvature[k, k] += 4 * e
                 if "j" in self.mixture.hyper and not self.mixture.outlier_scale:
-                    # the rate is proportional to the core, which depends on j: log rate by log j
+                    # the rate is proportional to the core's variance, which depends on j
                     j = self.mixture.hyper.index("j")
                     by_j = 2 * np.exp(2 * h[j]) / float(self.core(h))
                     gradient[j] += by_j * (OUTLIER_SHAPE - e)

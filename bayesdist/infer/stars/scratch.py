@@ -1,4 +1,4 @@
-"""Storage of shards: in memory as far as the budget allows, in a scratch file beyond it."""
+"""Storage of shards in memory up to a limit, and beyond it in a scratch file."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ COLUMNS, OFFSETS = ("X", "Y", "u", "v", "var_u", "var_v"), ("off_u", "off_v")
 
 
 class Store:
-    """Shards in the order in which they were added; at most `budget` bytes of columns in memory."""
+    """Sequence of shards, with at most `budget` bytes of columns in memory."""
 
     def __init__(self, budget: float) -> None:
         self._left = budget
@@ -30,15 +30,15 @@ class Store:
         return len(self._kept)
 
     def add(self, stars: Stars) -> None:
-        """Store a shard; InputError when the disk is full."""
+        """Append a shard; raises InputError if the disk is full."""
         if stars.nbytes <= self._left:
             self._left -= stars.nbytes
             self._kept.append((stars, None))
             return
-        stars.blocks, stars.pieces  # noqa: B018  worked out once, kept with the frame of the shard
+        stars.blocks, stars.pieces  # noqa: B018  computed once and kept in memory
         try:
             if self._file is None:
-                # without a name: it disappears with the process, however that ends
+                # an unnamed file, which is removed when the process ends for any reason
                 self._file = tempfile.TemporaryFile(buffering=0, prefix="bayesdist-")  # noqa: SIM115
                 self._closed = weakref.finalize(self, self._file.close)
             place = (self._file, self._file.seek(0, 2))
@@ -48,7 +48,7 @@ class Store:
             raise InputError(
                 f"the stars do not fit into the scratch folder ({error.strerror})",
                 where=_folder(),
-                do="set TMPDIR to a folder with more room, or raise compute.memory_mb",
+                do="set TMPDIR to a folder with more space, or increase compute.memory_mb",
             ) from error
         none: dict[str, Any] = dict.fromkeys(COLUMNS + OFFSETS[: len(stars.offsets)], EMPTY)
         frame = replace(stars, **none)
@@ -56,7 +56,7 @@ class Store:
         self._kept.append((frame, place))
 
     def close(self) -> None:
-        """Drop the shards and free the disk."""
+        """Release the shards and the scratch file."""
         self._kept = []
         if self._file is not None:
             self._closed()
@@ -75,7 +75,7 @@ class Store:
         while done < len(view):
             got = file.readinto(view[done:])
             if not got:
-                raise InputError("the scratch file has become shorter", do="start again")
+                raise InputError("the scratch file has been truncated", do="start again")
             done += got
         read: dict[str, Any] = dict(zip(names, columns, strict=True))
         stars = replace(frame, **read)
@@ -84,13 +84,13 @@ class Store:
 
 
 def _write(file: io.FileIO, view: memoryview) -> None:
-    """Write all of it: a disk that is nearly full takes a part, and refuses only the next one."""
+    """Write all bytes, repeatedly, since a write to an almost full disk may be partial."""
     while len(view):
         view = view[file.write(view) :]
 
 
 def _folder() -> str:
-    """Path of the scratch folder; without one the variable that should name it."""
+    """Path of the scratch folder, or "TMPDIR" if none is usable."""
     try:
         return tempfile.gettempdir()
     except OSError:

@@ -1,8 +1,8 @@
-"""The data in pieces, and the one operation on them: a task on each, and the sum.
+"""Data in pieces, and the operation on them: apply a task to each piece and sum the results.
 
-All passes over matched stars go through `Shards.sum`, where the pieces are called shards.  Results
-add up by a tree in the order of the shards, which is that of the data, so that they depend neither
-on the threads nor on the engine.
+All passes over matched stars use `Shards.sum`; the pieces are called shards.  Results are added by
+a tree in the order of the shards, which is that of the data.  They depend neither on the number of
+threads nor on the engine.
 """
 
 from __future__ import annotations
@@ -25,27 +25,35 @@ from bayesdist.utils.memory import release_memory
 
 Task = Callable[..., Any]
 
-BRANCHES = 16  # of the tree by which results add up
-SAMPLE = 1_000_000  # stars from whose errors the median error is computed
+BRANCHES = 16  # number of branches of the summation tree
+SAMPLE = 1_000_000  # number of stars used to compute the median error
 
 
 @dataclass(frozen=True)
 class Compute:
-    """Engine and resources of the passes over the data.
+    """Engine and resources for passes over the data.
 
     Parameters
     ----------
     engine : str
-        'threads', or 'dask'.
+        'threads' for threads of this process, or 'dask' for a Dask cluster.
     memory_mb : float
-        Columns of stars in memory; the rest is in a scratch file.
+        With 'threads': memory in MB for columns of stars; further columns are kept in a scratch
+        file.
     scheduler : str, optional
-        Address of a Dask scheduler; without one a cluster of this machine's processes is started.
+        With 'dask': address of a scheduler. By default a cluster of processes is started on this
+        machine.
     workers : int, optional
-        Processes of that cluster; as many as there are cores by default.
+        Number of processes of that cluster; by default the number of cores.
     scratch : str, optional
-        Folder that all workers of a cluster see under this path: what is in memory goes to them by
-        files in it, which the workers read.  By default it is sent, and the scheduler holds it.
+        Folder that all workers of a cluster see under the same path. Data in memory are passed to
+        the workers by files in this folder. By default they are sent through the scheduler, which
+        keeps them in memory.
+
+    Raises
+    ------
+    InputError
+        If the memory is negative or not finite, or the engine is unknown.
 
     Examples
     --------
@@ -76,11 +84,11 @@ class Compute:
 
 
 class Pieces(ABC):
-    """The data in pieces, in memory, on disk or on a cluster."""
+    """Data divided into pieces, in memory, on disk or on a cluster."""
 
     @abstractmethod
     def sum(self, task: Task, *args: Any) -> Any:
-        """Sum over the pieces of ``task(piece, *args)``, in their order."""
+        """Sum of ``task(piece, *args)`` over the pieces, added in their order."""
 
     @abstractmethod
     def close(self) -> None:
@@ -88,19 +96,19 @@ class Pieces(ABC):
 
 
 class MappedPieces(Pieces):
-    """Pieces from which others are made, where they are."""
+    """Pieces that can be mapped to other pieces at the same location."""
 
     @abstractmethod
     def each(self, task: Task, *args: Any) -> Iterable[Any]:
-        """Results ``task(piece, *args)``, in the order of the pieces."""
+        """Results ``task(piece, *args)`` in the order of the pieces."""
 
     @abstractmethod
     def map(self, task: Task, *args: Any) -> Self:
-        """Pieces ``task(piece, *args)``, which live no longer than the first ones."""
+        """New pieces ``task(piece, *args)``; they are valid until the original ones are closed."""
 
 
 class Shards(Pieces):
-    """Stars of a model, whose pieces are `Stars`.
+    """Stars prepared for a model, divided into shards; each shard is a `Stars` object.
 
     Parameters
     ----------
@@ -109,7 +117,7 @@ class Shards(Pieces):
     Attributes
     ----------
     survey : Survey
-        Of all stars.
+        Statistics of all stars.
     """
 
     survey: Survey
@@ -123,7 +131,7 @@ class Shards(Pieces):
 
     @property
     def groups(self) -> Groups:
-        """Groups of the whole, without members."""
+        """Groups of all stars, without their members."""
         return self.survey.groups
 
 
@@ -135,15 +143,15 @@ class LocalShards(Shards):
         self._store = Store(1e6 * memory_mb)
         surveys = []
         for reader in matches.readers():
-            stars, found = shard_of(model, reader, len(matches))
+            stars, shard_survey = shard_of(model, reader, len(matches))
             self._store.add(stars)
-            surveys.append(found)
+            surveys.append(shard_survey)
         self.survey = total(surveys)
         if not matches.in_memory:
             release_memory()
 
     def sum(self, task: Task, *args: Any) -> Any:
-        """Sum over the shards of ``task(stars, *args)``, in their order."""
+        """Sum of ``task(stars, *args)`` over the shards, added in their order."""
         return total(task(stars, *args) for stars in self._store)
 
     def close(self) -> None:
@@ -152,18 +160,15 @@ class LocalShards(Shards):
 
 
 def shard_of(model: DistortionModel, reader: BatchReader, n_total: int) -> tuple[Stars, Survey]:
-    """One shard, and its survey."""
+    """Load a shard; return its stars and its survey.  `n_total` is the number of all stars."""
     table = reader.load()
     stars, _ = prepare(model, table)
     return stars, survey(stars, table, max(1, n_total // SAMPLE))
 
 
 def total(parts: Iterable[Any]) -> Any:
-    """Sum of one or more parts in their order, by a tree: of so many that follow one another first.
-
-    None for no parts.
-    """
-    rest, sums = iter(parts), []
-    for first in rest:
-        sums.append(reduce(add, islice(rest, BRANCHES - 1), first))
+    """Sum of parts, added in their order by a tree with `BRANCHES` branches; None for no parts."""
+    remaining, sums = iter(parts), []
+    for first in remaining:
+        sums.append(reduce(add, islice(remaining, BRANCHES - 1), first))
     return total(sums) if len(sums) > 1 else next(iter(sums), None)

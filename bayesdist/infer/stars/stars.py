@@ -1,4 +1,4 @@
-"""Matched stars as columns for the passes: sorted by group, scaled to [-1, 1]."""
+"""Matched stars as columns for the passes, sorted by group, with pixels scaled to [-1, 1]."""
 
 from __future__ import annotations
 
@@ -21,19 +21,22 @@ NOBODY = np.zeros(0, np.int64)
 
 @dataclass(frozen=True, eq=False)
 class Stars:
-    """Matched stars in the order of their groups."""
+    """Matched stars, sorted by group.
+
+    Stars of a group have the same effective polynomial coefficients (chip, exposure and date).
+    """
 
     model: DistortionModel
-    groups: Groups  # those that have stars here, without members, which follow from `starts`
-    starts: Int  # first star (G + 1,) of each group
-    X: Float  # scaled detector position (N,)
+    groups: Groups  # the G groups that have stars, without members, which follow from `starts`
+    starts: Int  # index (G + 1,) of the first star of each group, and the number of stars
+    X: Float  # scaled pixel coordinates (N,), from -1 to 1
     Y: Float
-    u: Float  # reference position (N,)
+    u: Float  # reference positions (N,), in the unit of the model
     v: Float
-    var_u: Float  # squared errors (N,); one array where they are equal
+    var_u: Float  # squared errors (N,); the same array for both axes if they are equal
     var_v: Float
-    # nominal position, about which the star was matched, minus reference position (N,); None where
-    # it is not known
+    # nominal position about which a star was matched, minus its reference position (N,); None if
+    # unknown
     off_u: Float | None = None
     off_v: Float | None = None
 
@@ -47,47 +50,47 @@ class Stars:
 
     @property
     def offsets(self) -> tuple[Float, ...]:
-        """off_u and off_v; empty where there are none."""
+        """off_u and off_v; empty if nominal positions are unknown."""
         return () if self.off_u is None or self.off_v is None else (self.off_u, self.off_v)
 
     def circle(self, constants: Constants) -> tuple[Float, ...]:
-        """Offsets of the circles in which stars were matched; empty where they are not needed."""
+        """`offsets` if the constants have a match circle; otherwise empty."""
         return self.offsets if constants.radius else ()
 
     @property
     def nbytes(self) -> int:
-        """Bytes of all columns."""
+        """Size of all columns in bytes."""
         shared = self.var_u is self.var_v
         return 8 * len(self) * ((5 if shared else 6) + len(self.offsets))
 
     def __sizeof__(self) -> int:
-        """Bytes of all columns, without which Dask would move a shard as if it were nothing."""
+        """Size of all columns in bytes, which Dask uses to estimate the cost of moving a shard."""
         return self.nbytes
 
     @cached_property
     def blocks(self) -> Int:
-        """Pieces (n, 3) that fit into the cache."""
+        """Pieces (n, 3) from `pieces_of` that fit into the cache."""
         return kernel.pieces_of(self.starts, kernel.BLOCK)
 
     @cached_property
     def pieces(self) -> Int:
-        """Pieces (n, 3) with separate sums."""
+        """Pieces (n, 3) from `pieces_of` that are summed separately."""
         return kernel.pieces_of(self.starts, kernel.PIECE)
 
     def powers(self, theta: Float | None) -> Float:
-        """Effective coefficients (..., G, 2, K) of the scaled powers; None stands for zero."""
+        """Effective coefficients (..., G, 2, K) of the powers of X and Y; zero if theta is None."""
         if theta is None:
             return np.zeros((len(self.groups), 2, self.model.n_terms))
-        # all chips share the order, hence the map to powers
+        # all chips have the same order and hence the same map to powers
         basis = self.model.basis(self.model.chips[0].number)
         return basis.to_scaled_powers(self.model.effective(theta, self.groups))
 
     def residuals(self, theta: Float) -> Float:
-        """Data minus model (N, 2), in the order of this object."""
+        """Residuals (N, 2), data minus model, in the order of this object."""
         return kernel.residuals(self.blocks, self.columns, self.powers(theta), self.model.order)
 
     def pixels(self) -> tuple[Float, Float]:
-        """Detector positions x, y (N,), FITS 1-based."""
+        """Pixel coordinates x, y (N,), FITS 1-based."""
         x, y = np.empty(len(self)), np.empty(len(self))
         for g, chip in enumerate(self.groups.chip):
             rows = slice(self.starts[g], self.starts[g + 1])
@@ -98,14 +101,15 @@ class Stars:
 
 
 def prepare(model: DistortionModel, matches: Matches) -> tuple[Stars, Int]:
-    """Stars of a table of matches, sorted for the passes, and the table row (N,) of each.
+    """Prepare matches for the passes; return the sorted stars and the table row (N,) of each.
 
-    The model's exposures are the table's `exposure_names`, its chips contain the table's.
-    InputError when the table has no errors, another unit, or lacks an epoch that the model needs.
+    The exposures of the model must be the `exposure_names` of the matches, and its chips must
+    include those of the matches.  Raises InputError if the matches have no errors, another unit
+    than the model, or lack required epochs.
     """
     sigma_u, sigma_v = errors_of(matches)
     groups = groups_of(model, matches)
-    order: Int | slice = slice(None)  # one group: the usual case, without copies
+    order: Int | slice = slice(None)  # no copies in the common case of a single group
     if len(groups) > 1:
         order = np.argsort(groups.index, kind="stable")
     counts = np.bincount(groups.index, minlength=len(groups))
@@ -135,23 +139,23 @@ def prepare(model: DistortionModel, matches: Matches) -> tuple[Stars, Int]:
 
 
 def errors_of(matches: Matches) -> tuple[Float, Float]:
-    """Errors (N,) on u and v of matches; InputError when the table has none."""
+    """Errors (N,) of the matches in u and v; raises InputError if the table has none."""
     if matches.sigma_u is None or matches.sigma_v is None:
         do = "give sigma columns, a number, or sigma = 'by_magnitude'"
-        if matches.has_mag:  # as matches that were read with sigma = 'by_magnitude'
+        if matches.has_mag:  # the matches may have been read with sigma = 'by_magnitude'
             do = (
                 "estimate them from the residuals by magnitude with bayesdist.fit_by_magnitude or "
                 "bayesdist.calibrate, or give sigma columns or a number"
             )
-        raise InputError("the matches carry no errors", do=do)
+        raise InputError("the matches have no errors", do=do)
     return matches.sigma_u, matches.sigma_v
 
 
 def groups_of(model: DistortionModel, matches: Matches) -> Groups:
-    """Groups of matches with equal effective coefficients.
+    """Group the matches by chip, exposure and date, so that each group has the same coefficients.
 
-    InputError when the table has another unit than the model, a chip or an exposure that is not in
-    the model, or lacks an epoch that it needs.
+    Raises InputError if the matches have another unit than the model or an unknown chip or
+    exposure, or lack required epochs.
     """
     if matches.unit != model.unit:
         raise InputError(f"the matches are in {matches.unit} and the model is in {model.unit}")
@@ -161,7 +165,7 @@ def groups_of(model: DistortionModel, matches: Matches) -> Groups:
 
 
 def in_table_order(values: NDArray[Any], order: Int) -> NDArray[Any]:
-    """Values of each star, reordered to the table along the first axis."""
+    """Reorder values per star (first axis) to table rows; `order` is that of `prepare`."""
     out = np.empty_like(values)
     out[order] = values
     return out

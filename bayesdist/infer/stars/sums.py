@@ -1,4 +1,4 @@
-"""Sums over stars, by group or for all: those of two chunks of the data add up."""
+"""Sums over stars, by group or in total; sums over different chunks of the data can be added."""
 
 from __future__ import annotations
 
@@ -16,26 +16,26 @@ Rows = tuple[Int, ...]
 
 
 class Sums:
-    """Base of dataclasses of sums over stars, as tasks for `Shards.sum` return them.
+    """Base class of dataclasses with sums over stars, the results of tasks for `Shards.sum`.
 
-    Fields are numbers, arrays, further sums, None, or tuples and mappings of these.  A field
-    `groups` makes those named in `BY_GROUP` and `OF_GROUP` have a row for each group; the sum then
-    has the groups of both.
+    Fields are numbers, arrays, other `Sums`, None, or tuples and mappings of these.  If a subclass
+    has a field `groups`, the fields named in `BY_GROUP` and `OF_GROUP` have one row per group, and
+    adding two objects merges their groups.
     """
 
-    BY_GROUP: ClassVar[tuple[str, ...]] = ()  # sums
-    OF_GROUP: ClassVar[tuple[str, ...]] = ()  # what the sums of a group refer to
-    SAME: ClassVar[tuple[str, ...]] = ()  # what all sums refer to
+    BY_GROUP: ClassVar[tuple[str, ...]] = ()  # fields that are summed by group
+    OF_GROUP: ClassVar[tuple[str, ...]] = ()  # properties of a group, which must agree
+    SAME: ClassVar[tuple[str, ...]] = ()  # properties of all sums, which must agree
 
     def __add__(self, other: Self) -> Self:
-        """Sum over the stars of both; ValueError for sums that refer to different things."""
+        """Sum over the stars of both; raises ValueError if `SAME` or `OF_GROUP` fields differ."""
         out: dict[str, Any] = {}
         rows: Rows = ()
-        mine: Any = self  # dataclasses, which may have groups
+        mine: Any = self  # dataclasses that may have groups
         theirs: Any = other
         if getattr(mine, "groups", None) is not None:
             out["groups"], rows = _merged(mine.groups, theirs.groups)
-        for name in (one.name for one in fields(mine) if one.name not in out):
+        for name in (item.name for item in fields(mine) if item.name not in out):
             a, b = getattr(self, name), getattr(other, name)
             if name in self.SAME:
                 if np.any(a != b):
@@ -51,7 +51,7 @@ class Sums:
 
 
 def _merged(a: Groups, b: Groups) -> tuple[Groups, Rows]:
-    """Groups of either, and the rows in them of each."""
+    """Merged groups, and the rows in them of the groups of `a` and of `b`."""
     if a.same(b):
         return a, (np.arange(len(a)), np.arange(len(a)))
     groups, *rows = merge_groups(a, b)
@@ -59,7 +59,7 @@ def _merged(a: Groups, b: Groups) -> tuple[Groups, Rows]:
 
 
 def _scattered(a: NDArray[Any], b: NDArray[Any], rows: Rows, n: int) -> NDArray[Any]:
-    """Sum (n, ...) of arrays whose rows have these places in it."""
+    """Sum (n, ...) of arrays, with the rows of `a` and `b` added at the indices `rows`."""
     out = np.zeros((n, *a.shape[1:]), a.dtype)
     out[rows[0]] += a
     out[rows[1]] += b
@@ -67,7 +67,7 @@ def _scattered(a: NDArray[Any], b: NDArray[Any], rows: Rows, n: int) -> NDArray[
 
 
 def _placed(a: NDArray[Any], b: NDArray[Any], rows: Rows, n: int, name: str) -> NDArray[Any]:
-    """Array (n, ...) with the rows of both, which are equal where both have one."""
+    """Array (n, ...) with the rows of both at the indices `rows`; common rows must be equal."""
     out = np.empty((n, *a.shape[1:]), a.dtype)
     out[rows[0]] = a
     out[rows[1]] = b
@@ -80,7 +80,7 @@ def _added(a: Any, b: Any) -> Any:
     if a is None:
         return b
     if isinstance(a, tuple):
-        return tuple(_added(one, two) for one, two in zip(a, b, strict=True))
+        return tuple(_added(first, second) for first, second in zip(a, b, strict=True))
     if isinstance(a, Mapping):
-        return {key: _added(one, b[key]) for key, one in a.items()}
+        return {key: _added(first, b[key]) for key, first in a.items()}
     return a + b

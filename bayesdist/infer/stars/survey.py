@@ -1,4 +1,4 @@
-"""Statistics of all stars that are needed before any fit, as sums over chunks of the data."""
+"""Statistics of the stars that are needed before a fit, as sums over chunks of the data."""
 
 from __future__ import annotations
 
@@ -14,19 +14,19 @@ from bayesdist.infer.stars.stars import Stars
 from bayesdist.model import Groups, merge_groups
 from bayesdist.utils.arrays import Float, Int
 
-# relative distance by which a star at the edge of its circle may seem to lie outside
+# relative tolerance for stars at the edge of their match circle
 ROUNDING = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
 class ChipSurvey:
-    """Positions of the stars of one chip."""
+    """Number and extent of the stars on one chip."""
 
-    n: int
-    # vertices (m, 2) of the convex hull, FITS 1-based pixels; all points where they span no area
+    n: int  # number of stars
+    # vertices (m, 2) of the convex hull, FITS 1-based pixels; all points if they span no area
     corners: Float
-    sums: Float  # (5,) of x, y, x^2, xy, y^2 in units of the chip's size
-    outside: str  # sentence on the first star that lies on no pixel; empty where there is none
+    sums: Float  # sums (5,) of x, y, x^2, xy, y^2 in units of the chip's size
+    outside: str  # message about the first star outside the chip; empty if there is none
 
     def __add__(self, other: ChipSurvey) -> ChipSurvey:
         return ChipSurvey(
@@ -39,16 +39,16 @@ class ChipSurvey:
 
 @dataclass(frozen=True, eq=False)
 class Survey:
-    """Counts and extents of some of the data; surveys of pieces add."""
+    """Statistics of stars; the surveys of different chunks of the data can be added."""
 
-    n: int
+    n: int  # number of stars
     groups: Groups  # without members
-    exposures: Int  # number (E,) of stars of each exposure of the model
-    chips: tuple[ChipSurvey, ...]  # in the order of the model's
-    variance: tuple[Float, ...]  # evenly spread samples of the squared errors of both axes
-    sources: tuple[str, ...]
-    # largest distance of a star from its nominal position, and its name; less than 0 without
-    # nominal positions
+    exposures: Int  # number (E,) of stars in each exposure of the model
+    chips: tuple[ChipSurvey, ...]  # in the order of the model's chips
+    variance: tuple[Float, ...]  # evenly spaced samples of the squared errors of both axes
+    sources: tuple[str, ...]  # names of the files
+    # largest distance of a star from its nominal position, and the name of the star; the distance
+    # is negative if nominal positions are unknown
     farthest: tuple[float, str] = (-1.0, "")
 
     def __add__(self, other: Survey) -> Survey:
@@ -64,33 +64,33 @@ class Survey:
 
     @property
     def reference_sigma(self) -> float:
-        """Median quoted error of one axis: the scale of the priors."""
+        """Median quoted error per axis, which is the scale of the priors."""
         return float(np.sqrt(np.median(np.concatenate(self.variance))))
 
     def check_circle(self, radius: float | None) -> None:
-        """Raise InputError for a star outside the circle in which stars were matched.
+        """Raise InputError if a star is outside its match circle.
 
-        `radius` is in the unit of u, v; None without such a circle.  The error names the star that
-        is farthest from its nominal position.
+        `radius` is in the unit of u, v; None if there is no match circle.  The message names the
+        star that is farthest from its nominal position.
         """
-        distance, where = self.farthest
+        distance, star_name = self.farthest
         if radius is not None and distance > radius * (1 + ROUNDING):
             raise InputError(
-                f"lies {distance:.6g} from its nominal position, outside the match circle of "
+                f"is {distance:.6g} from its nominal position, outside the match circle of "
                 f"radius {radius:g}",
-                where=where,
+                where=star_name,
                 do="set outliers.match_radius to the radius with which the stars were matched, or "
                 "correct the row",
             )
 
     @property
     def where(self) -> str:
-        """Names of the files, for errors."""
+        """Names of the files, for error messages."""
         return ", ".join(self.sources)
 
 
 def survey(stars: Stars, matches: Matches, every: int) -> Survey:
-    """Survey of one piece; every n-th star gives its errors to the sample."""
+    """Survey of a chunk of the data; the errors of every `every`-th star are sampled."""
     model = stars.model
     numbers = matches.chip_number
     chips = []
@@ -114,7 +114,7 @@ def survey(stars: Stars, matches: Matches, every: int) -> Survey:
     return Survey(
         n=len(stars),
         groups=stars.groups,
-        # without frames a model need not have the exposures; the length is that of the model
+        # truncated to the exposures of the model, which may be fewer if it has no frames
         exposures=np.bincount(matches.exposure, minlength=len(model.exposures))[
             : len(model.exposures)
         ],
@@ -126,7 +126,7 @@ def survey(stars: Stars, matches: Matches, every: int) -> Survey:
 
 
 def _farthest(matches: Matches) -> tuple[float, str]:
-    """Largest distance of a star from its nominal position, and the star's file and row."""
+    """Largest distance of a star from its nominal position, and the file and row of the star."""
     if matches.u_nominal is None or matches.v_nominal is None:
         return -1.0, ""
     distance = np.hypot(matches.u - matches.u_nominal, matches.v - matches.v_nominal)
@@ -135,14 +135,14 @@ def _farthest(matches: Matches) -> tuple[float, str]:
 
 
 def _hull(points: Float) -> Float:
-    """Vertices of the convex hull, or all points where it has no area."""
+    """Vertices of the convex hull, or all points if it has no area."""
     if len(points) < 4:
         return points
     try:
-        if len(points) > 1000:  # points inside the octagon of the extremes are no vertices
+        if len(points) > 1000:  # drop points inside the octagon of the extremes, for speed
             x, y = points.T
-            seen = (x, y, x + y, x - y)
-            extreme = points[sorted(set(chain(*((p.argmin(), p.argmax()) for p in seen))))]
+            projections = (x, y, x + y, x - y)
+            extreme = points[sorted(set(chain(*((p.argmin(), p.argmax()) for p in projections))))]
             inner = ConvexHull(extreme).equations
             beyond = np.zeros(len(points), bool)
             for a, b, c in inner:

@@ -19,7 +19,7 @@ from bayesdist.app.commands.options import (
 )
 
 
-@command()
+@command(example="hst handbook 0461802ej_idc.fits -o book --filter F475W")
 @click.argument("file", metavar="FILE", type=click.Path())
 @filter_name
 @epoch
@@ -43,7 +43,7 @@ def handbook(line: str, file: str, output: str, **options: Any) -> None:
     click.echo(written(file, output, command=line, **options))
 
 
-@command()
+@command(example="hst pam 0461802ej_idc.fits -o pam.fits --filter F475W")
 @click.argument("file", metavar="FILE", type=click.Path())
 @filter_name
 @epoch
@@ -71,6 +71,7 @@ def pam(file: str, output: str, **options: Any) -> None:
 
 @command(
     name="acs",
+    example="simulate acs -o campaign --exposures 12 --stars 20000",
     unused=[
         Unused(
             "secondary_exposures",

@@ -33,7 +33,7 @@ _rotation_of_nothing = Unused(
 )
 
 
-@command()
+@command(example="demo -o demo")
 @click.option(
     "-o",
     "--output",
@@ -57,7 +57,7 @@ def demo(line: str, output: str, format: str | None, force: bool) -> None:
     click.echo(simulated_and_run(output, format=format, force=force, command=line))
 
 
-@command(unused=[_rotation_of_nothing])
+@command(example="wise bands w1-run w2-run -o bands", unused=[_rotation_of_nothing])
 @click.argument("runs", nargs=-1, required=True, metavar="RUN...", type=click.Path())
 @new_folder
 @click.option("--bins", type=int, default=31, metavar="N", help="Number of residual bins per axis.")
@@ -98,7 +98,11 @@ def bands(
     click.echo(text)
 
 
-@command(name="bring-up", unused=[_rotation_of_nothing])
+@command(
+    example="wise bring-up detections.ecsv reference.ecsv -o w2 --band W2",
+    name="bring-up",
+    unused=[_rotation_of_nothing],
+)
 @click.argument("detections", metavar="DETECTIONS", type=click.Path())
 @click.argument("reference", metavar="REFERENCE", type=click.Path())
 @new_folder
@@ -121,7 +125,7 @@ def bring_up(line: str, detections: str, reference: str, output: str, **options:
     click.echo(bring_up_files(detections, reference, output, command=line, **options))
 
 
-@command()
+@command(example="wise rotate codev.hdr --angle 270 -o turned.hdr")
 @click.argument("file", metavar="FILE", type=click.Path())
 @_number("--angle", metavar="DEG", help="Angle from x towards y, degrees.")
 @click.option("--mirror", is_flag=True, help="Reverse x before the rotation.")
@@ -136,7 +140,7 @@ def rotate(file: str, output: str, angle: float, mirror: bool, force: bool) -> N
     click.echo(write_rotated(file, output, degrees=angle, mirror=mirror, force=force))
 
 
-@click.group()
+@click.group(epilog="Example: bayesdist wise rvb transform pairs.tbl -o moved --fit")
 def rvb() -> None:
     """Transform the reference positions of WISE's RvB pairs."""
 
@@ -159,6 +163,7 @@ def _pairs(function: Callable[..., None]) -> Callable[..., None]:
 
 
 @command(
+    example="wise rvb transform pairs.tbl -o moved --fit",
     unused=[Unused("dx dy rotation scale_x scale_y", "with --fit", lambda o: o["fit"])],
 )
 @_pairs
@@ -178,7 +183,7 @@ def transform(files: tuple[str, ...], output: str, **options: Any) -> None:
     click.echo(transform_files(files, output, **options))
 
 
-@command()
+@command(example="wise rvb rereference pairs.tbl --from free.ecsv --to fixed.ecsv -o pairs")
 @_pairs
 @click.option(
     "--from",
@@ -208,6 +213,7 @@ def _one_table(options: Mapping[str, Any]) -> bool:
 
 @command(
     name="wise",
+    example="simulate wise -o w1 --bands W1 --pairs 5000",
     unused=[
         Unused(
             "bands pairs false_fraction partition_pattern",

@@ -86,7 +86,7 @@ probability = 0.95
 [[requirement]]
 name = "worst corner"
 statistic = "max"
-limit = 0.02
+limit = 0.05
 unit = "pix"
 probability = 0.95
 

@@ -2,18 +2,23 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
+from matplotlib.colors import Normalize
+from matplotlib.quiver import Quiver
 
 from bayesdist.report.figures.panels import Panels
 from bayesdist.report.figures.style import (
+    COLORBAR,
     CYCLE,
     PALETTE,
+    SIZES,
     Tones,
     figure_style,
     nice_below,
@@ -25,6 +30,7 @@ from bayesdist.utils.numbers import size_of
 
 if TYPE_CHECKING:
     from bayesdist.assess import UncertaintyMap, VectorMap
+    from bayesdist.assess.solution import ChipFrame
     from bayesdist.diagnose.residuals.binned import BinnedResiduals
 
 MOST_CROSSES = 13  # of errors along each axis: more hide each other
@@ -120,6 +126,16 @@ class Arrows:
         """Vectors of the distortion, along the axes of the detector in its pixels."""
         return cls.of_grid(vectors.x, vectors.y, *vectors.on_detector, every=every)
 
+    def placed(self, frame: ChipFrame, *, ringed: bool) -> Arrows:
+        """The vectors in the focal plane; the ring is left out unless `ringed`."""
+        x, y = frame(self.x, self.y)
+        du, dv = frame.turn @ np.stack([self.du, self.dv])
+        ring = None
+        if ringed and self.ring is not None:
+            (left,), (up,) = frame(*np.array(self.ring)[:, None])
+            ring = float(left), float(up)
+        return replace(self, x=x, y=y, du=du, dv=dv, ring=ring)
+
     @classmethod
     def of_cells(cls, binned: BinnedResiduals, min_count: int = 1) -> Arrows:
         """Mean residuals of the cells with at least so many stars; empty cells stay empty."""
@@ -149,6 +165,17 @@ class Arrows:
         return float(max(*over, 0.0))
 
 
+def cell_magnification(step: float, length: float) -> float:
+    """Factor of two digits, rounded down, that draws a length as one step of a grid.
+
+    1 for a length of rounding errors.
+    """
+    if not length > 1e-10 * step:
+        return 1.0
+    unit = 10.0 ** (math.floor(math.log10(step / length)) - 1)
+    return float(f"{math.floor(step / length / unit * (1 + 1e-9)) * unit:.6g}")
+
+
 def magnification_of(step: float, length: float) -> float:
     """Round factor that draws a length about a step long; 1 for a length of rounding errors."""
     return nice_below(step / length) if length > 1e-10 * step else 1.0
@@ -165,13 +192,17 @@ def vector_map(
     unit: str = "pix",
     pad: float = 9.0,
     fine: bool = False,
+    colored: bool = False,
 ) -> None:
     """Draw vectors of each chip, all to one scale that a key states.
 
     `panels` are framed: their limits are final.  `magnification` is in pixels of the axes for one
     unit of the vectors, `key` the length of the arrow above each panel in `unit`; titles are `pad`
-    points away, 17 and more to be above the key.  `fine` is for small panels.
+    points away, 17 and more to be above the key.  `fine` is for small panels.  If `colored`, the
+    colour of a vector is its length, and a colour bar stands beside the panels.
     """
+    norm = length_norm([one for one in chips if one is not None]) if colored else None
+    drawn: Quiver | None = None
     keys: dict[Axes, float] = {}
     for k, (arrows, one) in enumerate(
         zip(chips, np.broadcast_to(np.asarray(key, float), len(chips)), strict=True)
@@ -179,12 +210,22 @@ def vector_map(
         if arrows is None:
             continue
         ax = panels.axes[k][0]
-        draw_arrows(ax, arrows, panels.offset(k), magnification=magnification, fine=fine)
+        look: dict[str, Any] = {"magnification": magnification, "fine": fine, "norm": norm}
+        drawn = draw_arrows(ax, arrows, panels.offset(k), **look)
         keys.setdefault(ax, float(one))
     for ax, title in zip(panels.all_axes, titles, strict=True):
         ax.set_title(title, pad=pad)
     for ax, length in keys.items():
         draw_key(ax, length, magnification=magnification, unit=unit)
+    if norm is not None and drawn is not None:
+        bar = {"label": f"length [{unit}]", **COLORBAR}
+        panels.figure.colorbar(drawn, ax=panels.all_axes, **bar)
+
+
+def length_norm(chips: Sequence[Arrows]) -> Normalize:
+    """Colour scale of lengths from 0 to the longest vector of some chips."""
+    longest = max((float(one.length.max()) for one in chips if one.x.size), default=0.0)
+    return Normalize(0.0, longest if longest > 0 else 1.0)
 
 
 def draw_arrows(
@@ -194,8 +235,12 @@ def draw_arrows(
     *,
     magnification: float,
     fine: bool = False,
-) -> None:
-    """Arrows from (x, y) to (x + M du, y + M dv), in the axes' own pixels; pale unless clear."""
+    norm: Normalize | None = None,
+) -> Quiver:
+    """Arrows from (x, y) to (x + M du, y + M dv), in the axes' own pixels; pale unless clear.
+
+    With `norm` their colour is their length.
+    """
     tones = Tones.of(ax)
     x, y = arrows.x + offset[0], arrows.y + offset[1]
     parts: list[tuple[Any, str]] = [(slice(None), tones.ink)]
@@ -207,24 +252,28 @@ def draw_arrows(
         zip(("headwidth", "headlength", "headaxislength"), heads, strict=True)
     )
     for some, color in parts:
-        ax.quiver(
+        lengths = () if norm is None else (arrows.length[some],)
+        look = {"color": color} if norm is None else {"norm": norm, "cmap": SIZES}
+        drawn = ax.quiver(
             x[some],
             y[some],
             arrows.du[some],
             arrows.dv[some],
+            *lengths,
             angles="xy",
             scale_units="xy",
             scale=1.0 / magnification,
             units="inches",
             width=0.007 if fine else 0.011,
             minlength=0.3,
-            color=color,
             zorder=3,
+            **look,
             **head,
         )
     if arrows.ring is not None:
         at = np.add(arrows.ring, offset)
         ax.plot(*at, "o", ms=5, mfc="none", mec=PALETTE["vermilion"], mew=1.3, zorder=5)
+    return drawn
 
 
 def draw_key(

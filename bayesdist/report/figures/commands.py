@@ -93,7 +93,7 @@ def difference_vectors(
         panels.figure.colorbar(
             shades,
             ax=panels.all_axes,
-            label="significance of each position separately [σ]",
+            label="significance of each position [σ]",
             **COLORBAR,
         )
     return panels.figure

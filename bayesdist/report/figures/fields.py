@@ -9,17 +9,20 @@ from typing import Any
 import numpy as np
 from matplotlib import colormaps
 from matplotlib.axes import Axes
+from matplotlib.collections import QuadMesh
 from matplotlib.colors import BoundaryNorm, Colormap, Normalize
 from matplotlib.contour import QuadContourSet
 from matplotlib.image import AxesImage
 from matplotlib.ticker import MaxNLocator
 from numpy.typing import ArrayLike
 from scipy.interpolate import RectBivariateSpline
+from scipy.ndimage import distance_transform_edt
 
-from bayesdist.report.figures.panels import Panels
+from bayesdist.report.figures.panels import Panels, ToPlane
 from bayesdist.report.figures.style import COLORBAR, INK, SEQUENTIAL, figure_style, small_font
 from bayesdist.utils.arrays import Float
 
+Drawn = QuadContourSet | AxesImage | QuadMesh
 EMPTY = "#D9DEE3"  # of a cell without a value
 NARROW = 1.5  # factor between errors, below which even levels show them as well
 MANTISSAS = (  # of logarithmic levels, 3 to 40 in a decade
@@ -44,7 +47,7 @@ class Grid:
 
 def contour_levels(values: ArrayLike, n: int = 10) -> Float:
     """Round levels that span some values, at least two; 1, 2, 5, 10 of values far apart."""
-    low, high = float(np.min(values)), float(np.max(values))
+    low, high = float(np.nanmin(values)), float(np.nanmax(values))
     if low > 0 and high > FAR * low:
         decades = 10.0 ** np.arange(np.floor(np.log10(low)), np.ceil(np.log10(high)) + 1)
         steps = np.outer(decades, [1.0, 2.0, 5.0]).ravel()
@@ -62,7 +65,7 @@ def error_levels(values: ArrayLike, least: int = 7) -> Float:
     At least `least` of them lie among the values.  Even levels if values are not positive, or
     differ by less than a factor of 1.5.
     """
-    low, high = float(np.min(values)), float(np.max(values))
+    low, high = float(np.nanmin(values)), float(np.nanmax(values))
     if not (low > 0 and high >= NARROW * low):
         return contour_levels(values)
     decades = 10.0 ** np.arange(np.floor(np.log10(low)), np.ceil(np.log10(high)) + 1)
@@ -93,7 +96,7 @@ def scalar_map(
     with their values, else cells; `norm` is one scale for all maps, or one and a colour bar for
     each.
     """
-    drawn: dict[Axes, QuadContourSet | AxesImage] = {}
+    drawn: dict[Axes, Drawn] = {}
     places = [(k, ax) for k, maps in enumerate(panels.axes) for ax in maps]
     single = norm is None or isinstance(norm, Normalize)
     norms: Sequence[Normalize | None] = (
@@ -103,7 +106,7 @@ def scalar_map(
         if grid is None:
             continue
         look: dict[str, Any] = {"levels": levels, "norm": one, "cmap": cmap, "labelled": labelled}
-        drawn[ax] = draw_grid(ax, grid, panels.offset(k), **look)
+        drawn[ax] = draw_grid(ax, grid, panels.offset(k), frame=panels.frame_of(k), **look)
     for ax, title in zip(panels.all_axes, titles, strict=True):
         ax.set_title(title)
     if not label or not drawn:
@@ -125,21 +128,27 @@ def draw_grid(
     grid: Grid,
     offset: tuple[float, float] = (0.0, 0.0),
     *,
+    frame: ToPlane | None = None,
     levels: Float | None = None,
     norm: Normalize | None = None,
     cmap: str | Colormap = SEQUENTIAL,
     labelled: bool = False,
-) -> QuadContourSet | AxesImage:
+) -> Drawn:
     """Draw the values of one grid as contours between `levels`, else as cells, with its ring.
 
-    `offset` is that of the grid's pixels in the axes; `labelled` contours show their values.
+    `offset` is that of the grid's pixels in the axes, `frame` takes the pixels to the axes in its
+    place; `labelled` contours show their values.
     """
-    if levels is None:
-        drawn: QuadContourSet | AxesImage = _cells(ax, grid, offset, norm, cmap)
+    if levels is not None:
+        drawn: Drawn = _contours(ax, grid, offset, levels, frame=frame, labelled=labelled)
+    elif frame is not None:
+        drawn = _turned_cells(ax, grid, frame, norm, cmap)
     else:
-        drawn = _contours(ax, grid, offset, levels, labelled=labelled)
+        drawn = _cells(ax, grid, offset, norm, cmap)
     if grid.ring is not None:
         at = np.add(grid.ring, offset)
+        if frame is not None:
+            at = frame(*np.array(grid.ring)[:, None])[:, 0]
         # dark on light, so that it is seen on every colour of the map in every style
         for color, width, order in (("white", 2.2, 5), (INK, 1.0, 6)):
             ax.plot(*at, "o", ms=5, mfc="none", mec=color, mew=width, clip_on=False, zorder=order)
@@ -147,15 +156,35 @@ def draw_grid(
 
 
 def _contours(
-    ax: Axes, grid: Grid, offset: tuple[float, float], levels: Float, *, labelled: bool
+    ax: Axes,
+    grid: Grid,
+    offset: tuple[float, float],
+    levels: Float,
+    *,
+    frame: ToPlane | None,
+    labelled: bool,
 ) -> QuadContourSet:
-    """Draw filled contours with lines between them, by a spline, as all maps are polynomials."""
+    """Draw filled contours with lines between them, by a spline, as all maps are polynomials.
+
+    Around positions without a value, off the field of a detector, nothing is drawn.
+    """
     x, y, values = grid.x, grid.y, grid.values
+    empty = ~np.isfinite(values)
+    if empty.any():  # a spline needs all values: the nearest ones, which are not drawn
+        nearest = distance_transform_edt(empty, return_distances=False, return_indices=True)
+        values = values[tuple(nearest)]
     spline = RectBivariateSpline(y, x, values, kx=min(3, len(y) - 1), ky=min(3, len(x) - 1))
     fine_x, fine_y = (np.linspace(a[0], a[-1], 4 * len(a)) for a in (x, y))
     # the spline may overshoot a little, and values above the last level would stay white
     fine = np.clip(spline(fine_y, fine_x), values.min(), values.max())
+    if empty.any():
+        rows, columns = (
+            np.abs(fine_a[:, None] - a).argmin(axis=1) for fine_a, a in ((fine_y, y), (fine_x, x))
+        )
+        fine = np.ma.masked_array(fine, empty[np.ix_(rows, columns)])
     at = fine_x + offset[0], fine_y + offset[1]
+    if frame is not None:
+        at = _in_plane(frame, fine_x, fine_y)
     even = np.ptp(np.diff(levels)) <= 1e-6 * levels[-1]
     norm = None if even else BoundaryNorm(levels, colormaps[SEQUENTIAL].N)
     filled = ax.contourf(*at, fine, levels, cmap=SEQUENTIAL, norm=norm)
@@ -168,6 +197,25 @@ def _contours(
                 lines, fontsize=small_font(), fmt=lambda v: f"{v:.{digits}f}".replace("-", "−")
             )
     return filled
+
+
+def _in_plane(frame: ToPlane, x: Float, y: Float) -> tuple[Float, Float]:
+    """Positions (ny, nx) in a focal plane of a grid of pixels."""
+    X, Y = np.meshgrid(x, y)
+    at = frame(X.ravel(), Y.ravel())
+    return at[0].reshape(X.shape), at[1].reshape(X.shape)
+
+
+def _turned_cells(
+    ax: Axes, grid: Grid, frame: ToPlane, norm: Normalize | None, cmap: str | Colormap
+) -> QuadMesh:
+    """Draw cells of one colour each in a focal plane, where chips may be turned."""
+    edges = []
+    for a in (grid.x, grid.y):
+        half = 0.5 * (a[-1] - a[0]) / max(len(a) - 1, 1)
+        edges.append(np.linspace(a[0] - half, a[-1] + half, len(a) + 1))
+    values = np.ma.masked_invalid(grid.values)
+    return ax.pcolormesh(*_in_plane(frame, *edges), values, norm=norm, cmap=cmap, rasterized=True)
 
 
 def _cells(

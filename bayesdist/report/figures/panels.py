@@ -2,24 +2,31 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.patches import Rectangle
+from matplotlib.patches import Polygon, Rectangle
+from matplotlib.patheffects import withStroke
 
+from bayesdist.assess.solution import ChipFrame
 from bayesdist.report.figures.mosaic import Mosaic
 from bayesdist.report.figures.style import (
     HALF_WIDTH,
+    INK,
+    LARGE_WIDTH,
     OUTLINE,
     WIDTH,
     Tones,
     figure_style,
     new_figure,
 )
+from bayesdist.utils.arrays import Float
 
 Size = tuple[float, float]
+ToPlane = Callable[[Float, Float], Float]  # pixels x, y of a chip to positions (2, N)
 
 TALLEST_PANEL = 8.0  # inches
 WIDE = 0.7  # rows over columns below which a chip is wide: its maps are one above the other
@@ -39,6 +46,10 @@ class Panels:
     def offset(self, chip: int) -> tuple[float, float]:
         """Offset of a chip's pixels, counted from 0, in its axes."""
         return 0.0, 0.0
+
+    def frame_of(self, chip: int) -> ToPlane | None:
+        """Function from pixels of a chip to positions in its axes; None if they are the same."""
+        return None
 
     def title(self, chip: int, text: str, joined: str = ": ") -> str:
         """Title of a panel, with the name of the chip where there are several."""
@@ -171,6 +182,76 @@ class OneArray(Panels):
                 at_edge = ax.get_yaxis_transform()
                 text = ax.text(1.012, py + ny / 2, f"chip {number}", transform=at_edge)
                 text.set(rotation=270, ha="left", va="center", fontsize=7.5)
+
+
+class FocalPlane(Panels):
+    """One panel for all chips, each where and as it lies in the focal plane; of several maps more.
+
+    `outlines` are the corners (4, 2) of each chip in the axes' pixels, `margin` is the room beyond
+    them in pixels, `colorbar` leaves room for a colour bar.  `frames` take pixels of each chip to
+    the axes; without them what is drawn is there already.
+    """
+
+    @figure_style()
+    def __init__(
+        self,
+        outlines: Sequence[Float],
+        names: Sequence[str],
+        *,
+        maps: int = 1,
+        frames: Sequence[ChipFrame] = (),
+        margin: float = 0.0,
+        colorbar: bool = False,
+    ) -> None:
+        self.frames = tuple(frames)
+        corners = np.concatenate(outlines)
+        low, high = corners.min(axis=0) - margin, corners.max(axis=0) + margin
+        width = LARGE_WIDTH if maps == 1 else WIDTH
+        room = 0.75 * maps + (0.75 if colorbar else 0.0)
+        aspect = float((high[1] - low[1]) / (high[0] - low[0]))
+        height = (width - room) / maps * min(aspect, 1.6) + 0.9
+        figure = new_figure(width, height, layout="compressed")
+        row = list(figure.subplots(1, maps, sharey=True, squeeze=False)[0])
+        for ax in row:
+            ax.set(aspect="equal", xlim=(low[0], high[0]), ylim=(low[1], high[1]))
+            ax.set(xlabel="x [pix]", ylabel="y [pix]")
+            ax.label_outer()
+            for outline, name in zip(outlines, names, strict=True):
+                ax.add_patch(Polygon(outline, fill=False, lw=0.7, ec=OUTLINE, zorder=4))
+                if len(outlines) > 1:
+                    ax.text(*outline.mean(axis=0), name, **_CHIP_NAME)
+        super().__init__(figure, [row] * len(outlines), [""] * len(outlines))
+
+    def frame_of(self, chip: int) -> ToPlane | None:
+        """Function from pixels of a chip to positions in the plane."""
+        return self.frames[chip] if self.frames else None
+
+
+_CHIP_NAME: Any = {
+    "ha": "center",
+    "va": "center",
+    "fontsize": 7.5,
+    "color": INK,
+    "zorder": 4,
+    "alpha": 0.45,
+    "path_effects": [withStroke(linewidth=1.5, foreground="white", alpha=0.5)],
+    "clip_on": True,
+}
+
+
+OVERLAP = 0.2  # of the shorter side: sizes that are wrong by less still show where chips lie
+
+
+def overlap(outlines: Sequence[Float]) -> bool:
+    """True if chips lie on each other, by more than `OVERLAP`."""
+    for k, a in enumerate(outlines):
+        for b in outlines[k + 1 :]:
+            shared = np.minimum(a.max(axis=0), b.max(axis=0)) - np.maximum(
+                a.min(axis=0), b.min(axis=0)
+            )
+            if shared.min() > OVERLAP * min(np.ptp(a, axis=0).min(), np.ptp(b, axis=0).min()):
+                return True
+    return False
 
 
 def chip_axes(ax: Axes, size: Size, *, margin: float = 0.0) -> None:

@@ -14,9 +14,10 @@ from typing import Any, Literal
 
 import matplotlib
 import numpy as np
+from matplotlib import colormaps
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.colors import to_hex, to_rgba
+from matplotlib.colors import ListedColormap, to_hex, to_rgba
 from matplotlib.figure import Figure
 from matplotlib.rcsetup import cycler
 from matplotlib.ticker import LogFormatterSciNotation, ScalarFormatter
@@ -42,6 +43,7 @@ LEVEL_COLORS = {
     "note": "#666666",
 }
 SEQUENTIAL = "cividis"
+SIZES = ListedColormap(colormaps["cividis_r"](np.linspace(0.2, 1.0, 256)), "sizes")  # of vectors
 DIVERGING = "RdBu_r"  # of values on both sides of zero; told apart in every common colour blindness
 INK = "#1F2A37"
 PALE = "#A9B4C0"  # vectors that may be noise alone, and stars in the background
@@ -51,6 +53,7 @@ BARS = "#C5CED8"  # of a histogram behind a curve
 PAPER = "#FFFFFF"
 COLORBAR: dict[str, Any] = {"fraction": 0.05, "pad": 0.02}  # next to maps
 WIDTH = 7.2  # inches: the text width of an A4 or Letter page
+LARGE_WIDTH = 4.6  # of a map that stands beside a figure of full width on a wide screen
 HALF_WIDTH = WIDTH / 2  # of figures that stand side by side
 
 _RC: Any = {

@@ -12,11 +12,12 @@ from numpy.typing import ArrayLike
 from bayesdist.errors import require_known
 from bayesdist.report.figures.arrows import (
     Arrows,
+    cell_magnification,
     crosses_magnification,
     draw_arrows,
     draw_crosses,
     draw_key,
-    magnification_of,
+    length_norm,
 )
 from bayesdist.report.figures.fields import Grid, draw_grid, error_levels
 from bayesdist.report.figures.panels import chip_axes
@@ -98,13 +99,13 @@ def plot_map(
         draw_crosses(ax, m, magnification=M)
         key = _key_length(m.radius_max, m.unit, scale_mas)
         draw_key(ax, key, magnification=M, unit=m.unit, scale_mas=scale_mas)
-        largest = float(m.per_axis.max())
+        largest = float(np.nanmax(m.per_axis))
         scale = scale_of(m.unit, largest, scale_mas)
         default = f"{m.kind}, largest {scale.text(largest)} per axis"
         set_title(ax, title, default, name, pad=KEY_PAD)
         return ax
     chip_axes(ax, size)
-    scale = scale_of(m.unit, float(m.per_axis.max()), scale_mas)
+    scale = scale_of(m.unit, float(np.nanmax(m.per_axis)), scale_mas)
     grid = Grid(m.x, m.y, m.per_axis * scale.factor, m.position_of_max)
     shown = error_levels(grid.values) if levels is None else np.asarray(levels) * scale.factor
     drawn = draw_grid(ax, grid, levels=shown)
@@ -113,7 +114,7 @@ def plot_map(
         add_colorbar(ax, drawn, label)
     elif colorbar is not False:
         ax.figure.colorbar(drawn, ax=list(colorbar), label=label, **COLORBAR)
-    low, high = number(grid.values.min()), number(grid.values.max())
+    low, high = number(np.nanmin(grid.values)), number(np.nanmax(grid.values))
     set_title(ax, title, f"{m.kind}: {low} to {high}", name)
     return ax
 
@@ -125,13 +126,15 @@ def plot_distortion(
     scale_mas: float | None = None,
     magnification: float | None = None,
     key: float | None = None,
+    colorbar: bool = True,
     name: str = "",
     title: str | None = None,
 ) -> Axes:
     """Plot the distortion of a chip as vectors, with a ring around the origin of the longest.
 
     Vectors are along x and y of the detector and in its pixels. They run from a position to where
-    the distortion moves it, enlarged as the key above the axes states.
+    the distortion moves it, enlarged as the key above the axes states; their colour is their
+    length.
 
     Parameters
     ----------
@@ -142,9 +145,11 @@ def plot_distortion(
     scale_mas : float, optional
         Size of a pixel in mas; if given, lengths are stated in mas.
     magnification : float, optional
-        By which vectors are enlarged; a round number by default.
+        By which vectors are enlarged; by default the longest is as long as a step of the grid.
     key : float, optional
         Length of the vector above the axes, in pixels; a round number by default.
+    colorbar : bool
+        True for a colour bar of the lengths beside the axes.
     name : str
         Name of the chip, which begins the default title.
     title : str, optional
@@ -169,7 +174,9 @@ def plot_distortion(
     arrows = Arrows.of_map(vector_map)
     M = distortion_magnification([vector_map]) if magnification is None else magnification
     chip_axes(ax, size, margin=arrows.reach(M, size) + BORDER * max(size))
-    draw_arrows(ax, arrows, magnification=M)
+    drawn = draw_arrows(ax, arrows, magnification=M, norm=length_norm([arrows]))
+    if colorbar:
+        add_colorbar(ax, drawn, "length [pix]")
     largest = _largest(vector_map)
     length = _key_length(largest / 1.5, "pix", scale_mas) if key is None else key
     draw_key(ax, length, magnification=M, scale_mas=scale_mas)
@@ -179,11 +186,9 @@ def plot_distortion(
 
 
 def distortion_magnification(vectors: Sequence[VectorMap]) -> float:
-    """Round factor that draws the longest vector of some maps as 1.5 grid steps, or less.
-
-    At that length vectors do not hide their neighbours, which have nearly the same direction.
-    """
-    return min(magnification_of(1.5 * Arrows.of_map(v).step, _largest(v)) for v in vectors)
+    """Factor of two digits that draws the longest vector of some maps as one step of the grid."""
+    largest = max(map(_largest, vectors))
+    return cell_magnification(min(Arrows.of_map(v).step for v in vectors), largest)
 
 
 def _largest(vectors: VectorMap) -> float:

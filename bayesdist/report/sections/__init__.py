@@ -26,6 +26,7 @@ from bayesdist.report.sections.run import (  # noqa: F401
     margins,
     periods,
     posterior,
+    previous,
     provenance,
     residuals,
     status,

@@ -266,7 +266,7 @@ function saved(text, name, type) {
   setTimeout(() => URL.revokeObjectURL(link.href), 1000);
 }
 
-/** Below a table: its content as CSV and as LaTeX. */
+/** In the caption of a table: its content as CSV and as LaTeX. */
 function downloads(table) {
   const caption = table.caption ? textsOf({ rows: [{ cells: [table.caption] }] })[0][0] : "table";
   const name = caption.toLowerCase().replace(/[^a-z0-9]+/g, "_").replace(/^_+|_+$/g, "").slice(0, 60) || "table";
@@ -275,10 +275,10 @@ function downloads(table) {
     one.addEventListener("click", act);
     return one;
   };
-  const box = make("p", { class: "get" },
+  const box = make("span", { class: "get" },
     button("CSV", () => saved(csvOf(textsOf(table)), `${name}.csv`, "text/csv")),
     button("LaTeX", () => saved(latexOf(textsOf(table), caption), `${name}.tex`, "text/x-tex")));
-  (table.closest(".tablebox") || table).after(box);
+  table.caption.append(box);
 }
 
 document.addEventListener("DOMContentLoaded", () => {

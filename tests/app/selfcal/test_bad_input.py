@@ -83,7 +83,9 @@ def test_stars_that_are_seen_once(truth, tmp_path):
 
 def test_stars_with_too_few_detections(truth, tmp_path):
     table = list_table(truth)
-    _refused_by_the_match(tmp_path, table, "no star is seen 9 times", selfcal={"min_detections": 9})
+    _refused_by_the_match(
+        tmp_path, table, "no star is detected 9 times", selfcal={"min_detections": 9}
+    )
 
 
 def test_an_exposure_turned_by_half_a_turn(tmp_path):

@@ -113,5 +113,5 @@ def test_information_of_another_model_is_refused():
     rng = np.random.default_rng(9)
     first = stars([2010.0], 300, rng)
     fit = fit_linear(first, model_of(first))
-    with pytest.raises(InputError, match="information is of shape"):
+    with pytest.raises(InputError, match="information has shape"):
         with_information(fit, np.eye(3))

@@ -191,7 +191,7 @@ def test_tables_that_do_not_fit_the_model_are_refused():
     with pytest.raises(InputError, match="in pix and the model is in mas"):
         prepare(DistortionModel(2, (CHIP,), unit="mas"), matches)
     bare = type(matches)(matches.x, matches.y, matches.u, matches.v)
-    with pytest.raises(InputError, match="carry no errors"):
+    with pytest.raises(InputError, match="have no errors"):
         prepare(model, bare)
 
 

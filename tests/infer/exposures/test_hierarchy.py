@@ -584,5 +584,5 @@ def test_models_without_deviations_are_refused():
         {"frames": "shift_rotation"},
         {"gauge": "first", "held": (0.0, 0.0, 0.0)},
     ):
-        with pytest.raises(InputError, match="nothing that scatters; choose"):
+        with pytest.raises(InputError, match="no deviations to estimate; choose"):
             fit_hierarchical(matches, replace(campaign_model(3), **changes))

@@ -349,7 +349,7 @@ def test_wrong_input_is_named(rng):
     with pytest.raises(InputError, match="of filters 'r', 'b'"):
         fit_with_tables(both, model, **OPTIONS)
     fit = fit_with_tables(matches, model, method="binned", **OPTIONS)
-    with pytest.raises(InputError, match="no covariance of their nodes"):
+    with pytest.raises(InputError, match="covariance of the nodes of binned tables is unknown"):
         fit.shift_variance(x, y, chip=1)
     field = fit_with_tables(matches, model, max_iterations=1, **OPTIONS)
     with pytest.raises(InputError, match="no table for chip 2"):

@@ -36,7 +36,7 @@ def test_a_prediction_is_alpha_plus_beta_times_time(posterior):
 
 def test_epochs_outside_are_refused(posterior):
     for t in (1999.0, 2030.0, np.inf, np.nan):
-        with pytest.raises(InputError, match="outside every segment"):
+        with pytest.raises(InputError, match="outside the range of the exposures"):
             posterior.predict([2010.0, t])
     with pytest.raises(InputError, match="no group 'F814W'"):
         posterior.predict([2010.0], group="F814W")

@@ -30,8 +30,8 @@ def changed(array, place, value):
         ({"epoch": changed(EPOCH, 1, np.inf)}, InputError, r"row 2 \(exposure j2\): epoch"),
         ({"sigma": changed(np.full((4, 2), 0.1), (3, 0), -1)}, InputError, "row 4: formal error"),
         ({"epoch": EPOCH[:3]}, InputError, "values has shape"),
-        ({"names": ("j1", "j2", "j2", "j4")}, InputError, "exposure 'j2' stands twice"),
-        ({"coefficients": ("A_2", "A_2")}, InputError, "coefficient 'A_2' stands twice"),
+        ({"names": ("j1", "j2", "j2", "j4")}, InputError, "exposure 'j2' is repeated"),
+        ({"coefficients": ("A_2", "A_2")}, InputError, "coefficient 'A_2' is repeated"),
         ({"group": ("F606W",)}, InputError, "1 group for 4 exposures"),
         ({"epoch": EPOCH[:2], "values": VALUES[:2], "names": ()}, DegenerateError, "2 exposures"),
         (

@@ -423,7 +423,7 @@ def test_build_model_takes_chips_exposures_and_unit_from_the_table():
     with pytest.raises(InputError, match="epoch for every star"):
         build_model(matches, order=4, size=(1000, 800), time=time)
     _, two, _ = simulated(19, 90, chips=TWO_CHIPS)
-    with pytest.raises(InputError, match="chips 1, 2 and one chip"):
+    with pytest.raises(InputError, match="chips 1, 2 but only one chip"):
         build_model(two, order=4, size=(1000, 800))
 
 

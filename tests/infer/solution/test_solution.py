@@ -74,7 +74,7 @@ def test_only_fits_and_posteriors_have_a_likelihood(fitted):
     expected = fit.uses(matches) * residuals(fit, matches)[:, 0] / matches.sigma_u**2
     np.testing.assert_allclose(scores[:, 0], expected, rtol=1e-12, atol=1e-9)
     for one in forms(fit)[1:3]:
-        with pytest.raises(InputError, match="does not say how it was fitted"):
+        with pytest.raises(InputError, match="has no likelihood"):
             likelihood_of(one)
 
 

@@ -309,7 +309,7 @@ def test_task_that_kills_every_worker_ends_with_an_error(there, cluster):
     # with 0, a shard that is read again where such a task runs would be given up as well
     cluster.scheduler.allowed_failures = 2
     try:
-        with pytest.raises(errors.InputError, match="workers die again and again"):
+        with pytest.raises(errors.InputError, match="workers die repeatedly"):
             there.sum(die)
     finally:
         cluster.scheduler.allowed_failures = before

@@ -141,7 +141,7 @@ def test_a_scratch_file_that_was_cut_is_not_read_as_data(shards):
     box = Store(0)
     box.add(shards[0])
     box._file.truncate(shards[0].nbytes - 8)
-    with pytest.raises(InputError, match="scratch file has become shorter"):
+    with pytest.raises(InputError, match="scratch file has been truncated"):
         list(box)
     box.close()
 

@@ -224,7 +224,7 @@ def _read(
     if "flux" in taken:
         what += f" (not all {taken['flux']} are positive)"
     found = scatter_about_polynomials(table.sample(SAMPLE))
-    if found is None:
+    if not found:
         return table, line, f"{SIGMA}                    # {what}", False
     how = "the scatter about a polynomial"
     return table, line, f"{found:<24g}# {what}; {how}", False

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -22,10 +23,9 @@ def inspect(path: str | Path) -> str:
         try:
             return _posterior_text(load_posterior(path))
         except FormatError:
-            try:
-                return _fit_text(load_fit(path))
-            except FormatError:
-                pass
+            if path.is_file():
+                with suppress(FormatError):
+                    return _fit_text(load_fit(path))
             raise
     from bayesdist.products.registry import describe  # each reading loads what it needs alone
 

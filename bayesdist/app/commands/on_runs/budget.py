@@ -2,51 +2,167 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import json
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
+from bayesdist.app.commands.on_files.position_table import origin_line, read_positions
 from bayesdist.app.results import errors_of, open_results
 from bayesdist.app.screen import number, table_text
 from bayesdist.app.store.rundir import RunDirectory
 from bayesdist.assess.budget.budget import TOTAL, ErrorBudget, place_budget
+from bayesdist.assess.drawn import DrawnErrors
 from bayesdist.assess.maps.uncertainty import circular_error, per_axis
 from bayesdist.assess.terms.forms import PRODUCT
 from bayesdist.calibration.chip_map import chosen_chip
+from bayesdist.calibration.sky_table import chip_numbers, pixel_columns
+from bayesdist.errors import InputError
+
+SCHEMA = 1  # of --json
+COLUMNS = ("x", "y")
+CIRCLES = (("CE68", 0.68), ("CE95", 0.95))
 
 
 def budget_at(
     run: str | Path,
-    at: tuple[float, float],
+    at: tuple[float, float] | None,
     *,
+    at_table: str | Path | None = None,
+    columns: tuple[str, str] | None = None,
     to: Sequence[tuple[float, float]] = (),
     chip: int | None = None,
     epoch: float | None = None,
     magnitude: float | None = None,
+    as_json: bool = False,
 ) -> str:
     """The error budget of a pixel `at` (FITS 1-based) of a run that has been sampled, as text.
 
-    With other pixels `to` of the same image it is that of their differences to it.  `chip` is
-    needed where there are several; `epoch` (decimal years) is by default that of the assessment;
-    with a `magnitude` of the stars the errors of their centroids are a term.
+    With other pixels `to` of the same image it is that of their differences to it.  `at_table` is a
+    table of positions in place of `at`; `columns` are those of its pixels, x and y by default.
+    `chip` is needed where there are several and no column has it; `epoch` (decimal years) is by
+    default that of the assessment; with a `magnitude` of the stars the errors of their centroids
+    are a term.  With `as_json` the text is JSON with all terms of all positions.
     """
+    if (at is None) == (at_table is None):
+        raise InputError(
+            "positions are given twice" if at else "no position is given",
+            where="budget",
+            do="give either --at X Y or --at-table FILE",
+        )
     with open_results(RunDirectory.open(run)) as results:
         results.run.require("budget", ("fit", "sample"))
         numbers = [one.number for one in results.posterior.model.chips]
-        number_of = chosen_chip(numbers, chip, where=str(run), argument="--chip")
         errors = errors_of(results)
-        x, y = zip(at, *to, strict=True)
-        found = place_budget(
-            errors,
-            x,
-            y,
-            chip=number_of,
-            epoch=results.epoch if epoch is None else epoch,
-            magnitude=magnitude,
-            relative=bool(to),
+        date = results.epoch if epoch is None else epoch
+        mas = results.config.detector.scale_mas if errors.unit == "pix" else None
+        if at_table is not None:
+            name = str(at_table)
+            table = read_positions(Path(at_table))
+            x, y, origin, reason = pixel_columns(table, columns or COLUMNS, None, name)
+            chips = chip_numbers(table, chip, numbers, str(run), name)
+            found = _budgets(errors, x, y, chips, date, magnitude)
+            rows = list(_entries(found, np.argsort(chips, kind="stable")))
+            if as_json:
+                return _json(errors.unit, date, magnitude, rows, pixel_origin=origin)
+            return "\n".join([_list(rows, errors.unit, mas), origin_line(origin, reason)])
+        number_of = chosen_chip(numbers, chip, where=str(run), argument="--chip")
+        first = at or (0.0, 0.0)  # one of the two is given
+        positions = np.array([first, *to], float)
+        budget = place_budget(
+            errors, *positions.T, chip=number_of, epoch=date, magnitude=magnitude, relative=bool(to)
         )
-        mas = results.config.detector.scale_mas if found.unit == "pix" else None
-        return _text(found, at, mas)
+        if as_json:
+            rows = list(_entries([budget], range(len(budget.x))))
+            rows = [{"from": list(first)} | row for row in rows] if to else rows
+            return _json(errors.unit, date, magnitude, rows)
+        return _text(budget, first, mas)
+
+
+def _budgets(
+    errors: DrawnErrors,
+    x: np.ndarray,
+    y: np.ndarray,
+    chips: np.ndarray,
+    epoch: float | None,
+    magnitude: float | None,
+) -> list[ErrorBudget]:
+    """One budget for the positions on each chip."""
+    return [
+        place_budget(
+            errors, x[chips == k], y[chips == k], chip=int(k), epoch=epoch, magnitude=magnitude
+        )
+        for k in np.unique(chips)
+    ]
+
+
+def _entries(budgets: Sequence[ErrorBudget], rows: Sequence[int] | Any) -> Iterator[dict[str, Any]]:
+    """Entries of all positions, in the order of the table, whose `rows` the budgets are of."""
+    entries = [
+        {
+            "x": float(budget.x[k]),
+            "y": float(budget.y[k]),
+            "chip": budget.domain.chips[0],
+            "terms": [
+                {
+                    "name": t.name,
+                    "kind": t.kind,
+                    "u": float(t.u[k]),
+                    "v": float(t.v[k]),
+                    "per_axis": float(per_axis(t.u[k], t.v[k])),
+                    "relative_error": t.relative_error,
+                    "source": t.source,
+                }
+                for t in budget.every
+            ],
+        }
+        for budget in budgets
+        for k in range(len(budget.x))
+    ]
+    for k in np.argsort(rows):
+        total = entries[k]["terms"][-1]
+        for name, probability in CIRCLES:
+            total[name] = float(circular_error(total["u"], total["v"], 0.0, probability))
+        yield entries[k]
+
+
+def _json(
+    unit: str,
+    epoch: float | None,
+    magnitude: float | None,
+    entries: Sequence[dict[str, Any]],
+    *,
+    pixel_origin: float = 1.0,
+) -> str:
+    """JSON of the entries, whose x and y are FITS 1-based; `pixel_origin`: that of the table."""
+    content = {"schema": SCHEMA, "unit": unit, "epoch": epoch, "magnitude": magnitude}
+    content["pixel_origin_of_table"] = pixel_origin
+    return json.dumps(content | {"positions": entries}, indent=1, allow_nan=False)
+
+
+def _list(entries: Sequence[dict[str, Any]], unit: str, scale_mas: float | None) -> str:
+    """One line for each position: its total error and the largest of its terms."""
+    rows = []
+    for entry in entries:
+        *terms, total = (t for t in entry["terms"] if t["kind"] != PRODUCT)
+        largest = max(terms, key=lambda t: t["per_axis"])
+        row = {key: number(entry[key], 7) for key in ("x", "y", "chip")}
+        row |= {f"{axis} ({unit})": number(total[axis]) for axis in "uv"}
+        row["per axis"] = number(total["per_axis"])
+        if scale_mas is not None:
+            row["mas"] = number(total["per_axis"] * scale_mas)
+        row |= {name: number(total[name], 3) for name, _ in CIRCLES}
+        rows.append(row | {"largest term": largest["name"]})
+    return "\n".join(
+        [
+            table_text(rows),
+            "",
+            "1 sigma of all terms together; per axis: rms of u and v; CE68, CE95: radii that hold "
+            "68 and 95 % of such errors; --json has every term",
+        ]
+    )
 
 
 def _text(found: ErrorBudget, at: tuple[float, float], scale_mas: float | None) -> str:
@@ -72,7 +188,7 @@ def _text(found: ErrorBudget, at: tuple[float, float], scale_mas: float | None) 
             }
             if scale_mas is not None:
                 row["mas"] = number(size * scale_mas)
-            for name, probability in (("CE68", 0.68), ("CE95", 0.95)):
+            for name, probability in CIRCLES:
                 row[name] = number(float(circular_error(u, v, 0.0, probability)), 3)
             rows.append(row | {"source": t.source})
         lines += [place, table_text(rows), ""]

@@ -13,6 +13,7 @@ from astropy.table import Table, vstack
 from bayesdist.app.calibrations import (
     asks_of,
     calibration_at,
+    common_chips,
     on_the_sky,
     positions_on_the_sky,
     refuse_unused_date,
@@ -21,6 +22,7 @@ from bayesdist.app.calibrations import (
 from bayesdist.app.store.keys import attributes
 from bayesdist.app.store.output import record_folder, write_table
 from bayesdist.assess.comparison.compare import (
+    NOISE_SEED,
     Comparison,
     compare,
     comparison_table,
@@ -154,7 +156,6 @@ def joined(found: Sequence[Comparison], table_of: Any) -> Table:
 
 
 SKY_GRID = 65  # points of each axis where positions on the sky are compared
-SEED = 20150206  # of the noise fields: the same comparison gives the same numbers
 
 
 def compare_files(
@@ -183,7 +184,7 @@ def compare_files(
     refuse_unused_date(epoch, *both)
     maps = [one.by_chip(epoch) for one in both]
     numbers = _common(both, chip)
-    rng = np.random.default_rng(SEED)
+    rng = np.random.default_rng(NOISE_SEED)
     nx, ny = grid
     found = [compare(maps[0][n], maps[1][m], rng=rng, grid=(nx, ny), keep=keep) for n, m in numbers]
     gaps = _gaps(both, epoch, [n for n, m in numbers if n == m])
@@ -247,23 +248,9 @@ def _read(
 
 def _common(both: tuple[Calibration, Calibration], chip: int | None) -> list[tuple[int, int]]:
     """Pairs of chips that are compared: by their numbers, or the single ones of both."""
-    a, b = both
     if chip is not None:
-        return [(_number(a, chip), _number(b, chip))]
-    if a.numbered == b.numbered:
-        common = sorted(set(a.numbers) & set(b.numbers))
-        if common:
-            return [(number, number) for number in common]
-    if len(a.numbers) == len(b.numbers) == 1:
-        return [(a.numbers[0], b.numbers[0])]
-    listed = " and ".join(
-        ", ".join(map(str, one.numbers)) if one.numbered else "none" for one in both
-    )
-    raise InputError(
-        f"their chips are {listed}",
-        where=f"{a.name}, {b.name}",
-        do="choose the chip by --chip, which a file without chip numbers takes for its own",
-    )
+        return [(_number(both[0], chip), _number(both[1], chip))]
+    return common_chips(*both)
 
 
 def _number(one: Calibration, number: int) -> int:

@@ -44,7 +44,8 @@ def monitor(
     """Verdict of new matches on the posterior of a run, as text; files in a new folder `output`.
 
     The matches that the run was made from are not needed any more.  `new` are matches, which are
-    read as the run's were, or a configuration whose [data] says how; of a campaign another run of
+    read as the run's were, or a configuration, a run or a folder with a config.toml whose [data]
+    says how; files that the release was made from are left out.  Of a campaign another run of
     which stage 'match' is done, or pairs as a run keeps them; of a self-calibration a configuration
     with [data], whose linear part is free in each exposure.
     """
@@ -89,12 +90,12 @@ def monitor(
 def _fitted(
     run: RunDirectory, config: Config, new: Path
 ) -> tuple[Posterior, Matches, NewFit, tuple[str, ...]]:
-    """Release, new matches and their fit, and the exposures that the release has seen."""
+    """Release, new matches and their fit, and exposures or files that the release has seen."""
     if config.campaign is not None:
         release = results_of(run)
         return release.solution, *fit_new_exposures(release, new)
     posterior = results_of(run).solution
-    matches = _new_matches(run, config, new)
+    matches, seen = _new_matches(run, config, new)
     found = fit_new(
         posterior,
         matches,
@@ -103,32 +104,29 @@ def _fitted(
         # new matches lie on a sky that a self-calibration has not seen
         frames=None if config.selfcal is None else "affine",
     )
-    return posterior, matches, found, ()
+    return posterior, matches, found, seen
 
 
-def _new_matches(run: RunDirectory, config: Config, new: Path) -> Matches:
-    """New matches with errors, read as those of the run or as their own configuration says."""
+def _new_matches(run: RunDirectory, config: Config, new: Path) -> tuple[Matches, tuple[str, ...]]:
+    """New matches with errors, read as those of the run or as their own configuration says.
+
+    The second value names files that are left out, because the release was made from them.
+    """
     if not new.exists():
         raise InputError("there is no such file", where=str(new), do="check the name")
-    if new.suffix == ".toml":
-        loaded, base = load_config(new)[0], new.parent
-        size = loaded.detector.size
-        path: Path | list[Path]
-        if loaded.data is None:
+    configured = _configuration_of(run, new)
+    path: Path | list[Path]
+    if configured is not None:
+        stated, base = configured
+        size, chips = stated.detector.size, stated.chip
+        if stated.data is None:
             raise InputError(
                 "names no table of matches", where=str(new), do="give one in data.matches"
             )
-        data = loaded.data
+        data = stated.data
         path = data.paths(base)
     else:
-        size, path = config.detector.size, new
-        if (new / "run.json").exists():
-            itself = new.resolve() == run.path.resolve()
-            raise InputError(
-                "is the released run itself" if itself else "is a run, and not matches",
-                where=str(new),
-                do="give a file of new matches, or a configuration whose [data] names it",
-            )
+        path, size, chips = new, config.detector.size, config.chip
         if config.data is None:
             raise InputError(
                 "is a table, and a self-calibration has not said how to read one",
@@ -137,30 +135,62 @@ def _new_matches(run: RunDirectory, config: Config, new: Path) -> Matches:
             )
         # the date of the run's exposures is not that of new ones
         data = config.data.model_copy(update={"epoch": None})
-    _refuse_the_same(run, path)
-    matches = read_configured(path, data, size=size, chips=config.chip)
-    if data.sigma != "by_magnitude":
-        return matches
-    errors = load_errors(run.path).by_magnitude
-    if errors is None:
-        raise InputError(
-            "errors by magnitude are asked for, and the run has measured none",
-            where=str(new),
-            do="give data.sigma another value",
-        )
-    return matches.with_errors(errors)
-
-
-def _refuse_the_same(run: RunDirectory, path: Path | list[Path]) -> None:
-    """Refuse matches that the release was made from, under whatever name: they cannot test it."""
-    seen = set(run.facts["inputs"].values())
-    for file in input_files(path):
-        if sha256_of(file) in seen:
+    seen = _files_of_release(run, path)
+    if seen and not Path(new).is_dir():
+        path = [file for file in input_files(path) if file not in seen]
+    matches = read_configured(path, data, size=size, chips=config.chip or chips)
+    from_release = [k for k, name in enumerate(matches.sources) if Path(name) in seen]
+    if from_release:  # parts of one table, which are read together
+        matches = matches.load()
+        matches = matches.select(~np.isin(matches.source, from_release))
+    if data.sigma == "by_magnitude":
+        errors = load_errors(run.path).by_magnitude
+        if errors is None:
             raise InputError(
-                "these are matches that the release was made from, and say nothing new of it",
-                where=str(file),
-                do="give matches that were not in its fit",
+                "errors by magnitude are asked for, and the run has measured none",
+                where=str(new),
+                do="give data.sigma another value",
             )
+        matches = matches.with_errors(errors)
+    return matches, tuple(str(file) for file in seen)
+
+
+def _configuration_of(run: RunDirectory, new: Path) -> tuple[Config, Path] | None:
+    """Configuration that says how new matches are read, and the folder of its names.
+
+    `new` is a configuration, a run, or a folder with a config.toml; None for anything else.
+    """
+    if new.suffix == ".toml":
+        return load_config(new)[0], new.parent
+    if (new / "run.json").exists():
+        if new.resolve() == run.path.resolve():
+            raise InputError(
+                "is the released run itself",
+                where=str(new),
+                do="give a file of new matches, or a configuration whose [data] names it",
+            )
+        other = RunDirectory(new)
+        return other.config, other.base
+    if (new / "config.toml").exists():
+        return load_config(new / "config.toml")[0], new
+    return None
+
+
+def _files_of_release(run: RunDirectory, path: Path | list[Path]) -> list[Path]:
+    """Files among the new ones that the release was made from, under whatever name.
+
+    They cannot test it, and are refused if there are no others.
+    """
+    known = set(run.facts["inputs"].values())
+    files = input_files(path)
+    seen = [file for file in files if sha256_of(file) in known]
+    if len(seen) == len(files):
+        raise InputError(
+            "these are matches that the release was made from, and say nothing new of it",
+            where=str(seen[0]),
+            do="give matches that were not in its fit",
+        )
+    return seen
 
 
 def _facts(new: NewFit, posterior: Posterior) -> dict[str, Any]:
@@ -192,7 +222,12 @@ def _lines(found: Monitored, facts: dict[str, Any], scores: Sequence[PeriodScore
     if facts["deviating"]:
         lines.append("exposures deviate as those of the release scatter")
     if facts["left_out"]:
-        lines.append(f"left out: {len(facts['left_out'])} exposure(s) that the release has seen")
+        names = facts["left_out"]
+        more = "" if len(names) < 4 else ", ..."
+        lines.append(
+            f"left out: {len(names)} exposure(s) or file(s) that the release was made from "
+            f"({', '.join(names[:3])}{more})"
+        )
     lines += [f"rows left out: {n} ({reason})" for reason, n in facts["rejected"].items()]
     for key, what in (("j", "error beyond the quoted ones"), ("f", "fraction of false matches")):
         if key in facts["mixture"] and key in facts["mixture_released"]:

@@ -29,6 +29,7 @@ def validate(run: str | Path, requirements: str | Path) -> tuple[str, int]:
     directory = RunDirectory.open(run)
     with open_results(directory) as results:
         directory.require("requirements", ("fit", "sample"))
+        asked = results.config.within_field(asked)
         with _named_after(requirements, asked):
             margins = margins_of(results, asked)
             periods = validity_periods_of(results, asked)

@@ -75,7 +75,7 @@ def outline_of_campaign(inputs: Inputs) -> Outline:
         for chip in chips:
             nx, ny = np.maximum(np.floor_divide(chip.size, block.step), 2).astype(int)
             values = np.zeros((2, ny, nx))
-            first = tuple((step + 1) / 2 for step in block.step)
+            first = ((block.step[0] + 1) / 2, (block.step[1] + 1) / 2)
             tables += (LookupTable(chip.number, values, name, first, block.step, values),)
     model = DistortionModel(config.model.order, chips, inputs.catalog.unit, config.time())
     return Outline(model, inputs.pixel_arcsec / inputs.unit_arcsec, inputs.filter, tables)

@@ -11,8 +11,8 @@ from bayesdist.app.config import Config
 from bayesdist.data import Matches
 from bayesdist.errors import InputError
 from bayesdist.model import DistortionModel, TimeDependence
-from bayesdist.model.basis import polynomial_terms
-from bayesdist.utils.arrays import Float
+from bayesdist.model.basis import MAX_ORDER, polynomial_terms
+from bayesdist.utils.arrays import Float, Int
 
 OFF = 1e3  # factor on the scale by which u and v cannot be those of the detector
 ODD = 3.0  # factor that is worth a warning
@@ -24,16 +24,28 @@ MADE_FROM_PIXELS = 1e-3  # pixels: scatter below which positions were computed f
 FAR_BELOW = 0.1  # fraction of the quoted errors that such a scatter does not reach
 STARS_PER_TERM = 3  # stars for each term and axis, below which residuals hardly show the errors
 ORDER = 4
-ROUNDS = 20
+ROUNDS, ORDER_ROUNDS = 20, 6  # of rejection
 NORMAL = 1.4826022185056018  # 1 / (median of |z|, z standard normal)
 CLIP = 4.0  # robust standard deviations
 EACH = 4  # stars for each coefficient, at least
+NOISE_FREE = 1e-8  # pixels: scatter that is rounding, and no measurement
+ON_A_LINE = 1e-6  # extent of positions across a line, relative to that along it
+LOW_ORDER = 1.7  # ratio of the scatters about two orders from which the lower one is too low
+BEST_ORDER = 1.2  # ratio of the scatters about two orders that follow the positions equally well
+MOST_STARS = 1500  # by which orders are compared
 YEARS = (1950.0, 2100.0)
 
 
 def doubts_on_stars(stars: Matches, model: DistortionModel, config: Config) -> list[str]:
     """Sentences on what is odd about matched stars, by all of them or a sample, in memory."""
-    return list(_doubts(stars, model, config.detector.scale_mas))
+    found = list(_doubts(stars, model, config.detector.scale_mas))
+    return [*found, *_doubts_on_order(stars, model.order)]
+
+
+def refuse_stars(stars: Matches, model: DistortionModel, config: Config) -> None:
+    """Raise InputError for matched stars that cannot be meant; as `doubts_on_stars`."""
+    for _ in _doubts(stars, model, config.detector.scale_mas):
+        pass
 
 
 def _doubts(stars: Matches, model: DistortionModel, scale_mas: float | None) -> Iterator[str]:
@@ -51,14 +63,14 @@ def _doubts(stars: Matches, model: DistortionModel, scale_mas: float | None) -> 
 
 def doubts_on_numbers(stars: Matches, model: DistortionModel) -> Iterator[str]:
     """Sentences on chips with fewer than three stars for each polynomial term of an axis."""
-    n_terms = len(polynomial_terms(model.order))
-    needed = STARS_PER_TERM * n_terms
+    terms = n_terms(model.order)
+    needed = STARS_PER_TERM * terms
     counts = dict(zip(stars.chip_numbers, np.bincount(stars.chip), strict=False))
     for chip in model.chips:
         n_stars = int(counts.get(chip.number, 0))
         if n_stars < needed:
             yield (
-                f"chip {chip.name} has {n_stars} stars for {n_terms} terms on each axis (order "
+                f"chip {chip.name} has {n_stars} stars for {terms} terms on each axis (order "
                 f"{model.order}), and {needed} or more are advisable: the posterior may be far "
                 "from normal and sampling slow; lower model.order, or add stars"
             )
@@ -128,6 +140,15 @@ def _doubts_on_scatter(stars: Matches, scale: float) -> Iterator[str]:
     if scatter is None:
         return
     in_pixels = scatter / scale
+    if in_pixels < NOISE_FREE and not _on_a_line(stars):  # which the fit refuses
+        raise InputError(
+            f"the reference positions follow a polynomial of the pixels to {in_pixels:.1g} px: "
+            "they were computed from the pixels by a WCS, or are those of a design, and without "
+            "the noise of measured positions there are no errors to find",
+            where=", ".join(stars.sources),
+            do="match detections with a catalogue of their own; a design becomes a calibration "
+            "without errors by bayesdist.fit_linear in Python, and a header by 'bayesdist convert'",
+        )
     quoted = np.inf
     if stars.has_sigma:
         sigma = np.minimum(stars.column("sigma_u"), stars.column("sigma_v"))
@@ -138,6 +159,38 @@ def _doubts_on_scatter(stars: Matches, scale: float) -> Iterator[str]:
             "which no detector reaches: they were probably computed from the pixels by a WCS, and "
             "a fit only gives back that WCS; match the detections with a catalogue of their own"
         )
+
+
+def _on_a_line(stars: Matches) -> bool:
+    """Boolean: the reference positions lie on a line, or in one point."""
+    offsets = np.stack([stars.u - stars.u.mean(), stars.v - stars.v.mean()])
+    long, short = np.linalg.svd(offsets, compute_uv=False)
+    return bool(short <= ON_A_LINE * long)
+
+
+def _doubts_on_order(stars: Matches, order: int) -> Iterator[str]:
+    """A sentence on an order that is too low, by the exposure and chip with the most stars.
+
+    The positions that a polynomial does not follow are rejected, or taken for false matches.
+    """
+    groups = stars.exposure * len(stars.chip_numbers) + stars.chip
+    rows = np.flatnonzero(groups == np.argmax(np.bincount(groups)))
+    rows = rows[:: -(-len(rows) // MOST_STARS)]
+    higher = [n for n in range(order + 1, MAX_ORDER + 1) if EACH * n_terms(n) <= len(rows)]
+    if not higher:
+        return
+    low, high = (_scatter_about(stars, rows, n) for n in (order, higher[-1]))
+    if not low > LOW_ORDER * high > 0:
+        return
+    tried = ((n, _scatter_about(stars, rows, n)) for n in higher)
+    best, least = next(one for one in tried if one[1] <= BEST_ORDER * high)
+    scale = _scale(stars) or 1.0
+    yield (
+        f"the positions scatter by {low / scale:.2g} px about a polynomial of order {order}, and "
+        f"by {least / scale:.2g} px about one of order {best}: the order is too low, and matches "
+        "that it does not follow are rejected or taken for false ones; raise model.order "
+        "(bayesdist select-order CONFIG.toml compares orders)"
+    )
 
 
 def _doubts_on_dates(epochs: Float, where: str) -> Iterator[str]:
@@ -175,29 +228,45 @@ def refuse_empty_segments(epochs: Float, time: TimeDependence | None) -> None:
 def scatter_about_polynomials(table: Matches) -> float | None:
     """Robust scatter along an axis about polynomials on each chip of each exposure, two digits.
 
-    It is in the unit of u, v; None of too few stars, or without scatter.
+    It is in the unit of u, v; None of too few stars.
     """
-    i, j = np.array(polynomial_terms(ORDER)).T
     groups = table.exposure * len(table.chip_numbers) + table.chip
-    residuals: list[Float] = []
-    for group in np.unique(groups):
-        rows = groups == group
-        if rows.sum() < EACH * len(i):
-            continue
-        X, Y = (2 * (z - z.min()) / max(np.ptp(z), 1.0) - 1 for z in (table.x[rows], table.y[rows]))
-        basis = legendre.legvander(X, ORDER)[:, i] * legendre.legvander(Y, ORDER)[:, j]
-        data = np.stack([table.u[rows], table.v[rows]], axis=-1)
-        used = np.ones(len(X), bool)
-        for _ in range(ROUNDS):
-            left = data - basis @ np.linalg.lstsq(basis[used], data[used])[0]
-            size = NORMAL * np.median(np.abs(left[used]))
-            now = (np.abs(left) <= CLIP * size).all(axis=1)
-            if (now == used).all() or now.sum() < 2 * len(i):
-                break
-            used = now
-        # what the fit has taken up is given back
-        residuals.append(left[used].ravel() * np.sqrt(used.sum() / (used.sum() - len(i))))
+    residuals = [
+        _clipped_residuals(table, np.flatnonzero(groups == group), ORDER, ROUNDS)
+        for group in np.flatnonzero(np.bincount(groups) >= EACH * n_terms(ORDER))
+    ]
     if not residuals:
         return None
-    sigma = NORMAL * float(np.median(np.abs(np.concatenate(residuals))))
-    return float(f"{sigma:.2g}") if sigma > 0 else None
+    return float(f"{_robust(np.concatenate(residuals)):.2g}")
+
+
+def n_terms(order: int) -> int:
+    """Number of terms of a polynomial on one axis."""
+    return len(polynomial_terms(order))
+
+
+def _scatter_about(table: Matches, rows: Int, order: int) -> float:
+    """Robust scatter along an axis about one polynomial."""
+    return _robust(_clipped_residuals(table, rows, order, ORDER_ROUNDS))
+
+
+def _robust(residuals: Float) -> float:
+    return NORMAL * float(np.median(np.abs(residuals)))
+
+
+def _clipped_residuals(table: Matches, rows: Int, order: int, rounds: int) -> Float:
+    """Residuals (2 M,) of rows within `CLIP` of a polynomial that is fitted to them."""
+    i, j = np.array(polynomial_terms(order)).T
+    X, Y = (2 * (z - z.min()) / max(np.ptp(z), 1.0) - 1 for z in (table.x[rows], table.y[rows]))
+    basis = legendre.legvander(X, order)[:, i] * legendre.legvander(Y, order)[:, j]
+    data = np.stack([table.u[rows], table.v[rows]], axis=-1)
+    used = np.ones(len(X), bool)
+    for _ in range(rounds):
+        left = data - basis @ np.linalg.lstsq(basis[used], data[used])[0]
+        size = NORMAL * np.median(np.abs(left[used]))
+        now = (np.abs(left) <= CLIP * size).all(axis=1)
+        if (now == used).all() or now.sum() < 2 * len(i):
+            break
+        used = now
+    # what the fit has taken up is given back
+    return np.asarray(left[used].ravel() * np.sqrt(used.sum() / (used.sum() - len(i))))

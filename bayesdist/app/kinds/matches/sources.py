@@ -41,7 +41,7 @@ def reading_options(data: Data, chips: Sequence[ChipBlock]) -> dict[str, Any]:
     """Options of `load_matches` that a section [data] gives; chips may be named in tables."""
     names = (
         *("format", "columns", "unit", "sigma", "pixel_origin", "tangent_point"),
-        *("epoch", "catalogue_epoch", "not_finite", "same_position"),
+        *("epoch", "catalogue_epoch", "not_finite", "same_position", "plate_scale"),
     )
     numbers = {chip.name: chip.number for chip in chips}
     return {name: getattr(data, name) for name in names} | {"chips": numbers or None}

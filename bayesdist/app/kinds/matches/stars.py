@@ -19,8 +19,8 @@ from bayesdist.app.kinds.matched import Matched, set_aside
 from bayesdist.app.kinds.matches.added_errors import compared_errors, in_circle
 from bayesdist.app.kinds.matches.plausibility import (
     doubts_on_numbers,
-    doubts_on_stars,
     refuse_empty_segments,
+    refuse_stars,
 )
 from bayesdist.app.kinds.matches.sources import check_chips, read_configured
 from bayesdist.app.store.rundir import RunDirectory
@@ -111,7 +111,7 @@ def fit_stars(
         with closing(StarReader(config.resources())) as reader:
             return fit_stars(matched, config, base, reader=reader)
     model = model_of(matched.stars, config)
-    doubts_on_stars(reader.sample(matched.stars), model, config)  # refuses what cannot be meant
+    refuse_stars(reader.sample(matched.stars), model, config)
     if matched.stars.in_memory and matched.stars.epoch is not None:
         # a sample may have none of a short segment
         refuse_empty_segments(matched.stars.epoch, model.time)

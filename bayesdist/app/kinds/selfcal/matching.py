@@ -291,7 +291,9 @@ def selfcal_lines(inputs: Inputs) -> Iterator[str]:
     for sigma, k in gauge.weakest:
         yield f"nearly free  {number(sigma)} pix at the edge, led by {model.names[int(k)]}"
     doubtful = [text for chip in chips for text in chip.warnings]
-    for text in (*gauge.sentences, *summary["warnings"], *doubtful):
+    for text in gauge.settled:
+        yield f"note         {text}"
+    for text in (*gauge.unsettled, *summary["warnings"], *doubtful):
         yield f"WARNING      {text[0].upper() + text[1:]}"
 
 

@@ -9,7 +9,7 @@ from pydantic import PositiveFloat
 from bayesdist.calibration.calibration import Calibration
 from bayesdist.calibration.chip_map import ChipMap
 from bayesdist.calibration.inverse import detector_grid
-from bayesdist.calibration.orientation import placed_at
+from bayesdist.calibration.orientation import placed_at, refuse_wide_planes
 from bayesdist.calibration.plane import arcsec_per
 from bayesdist.model import LookupTable
 from bayesdist.products.formats.common.cards import (
@@ -54,6 +54,7 @@ def build(calibration: Calibration, settings: Settings, options: BuildOptions) -
     """The file, with its largest error in pixels: of rounding, and between its nodes."""
     scale = options.scale_arcsec
     calibration = placed_at(calibration, settings.crval, scale, where="products.cpdis")
+    refuse_wide_planes(calibration, options.epoch, scale, where="products.cpdis")
     plane, unit = calibration.plane, calibration.unit
     arcsec = arcsec_per(unit, scale)
     maps = calibration.with_tables(calibration.at(options.epoch, origin="stated"))

@@ -11,6 +11,7 @@ import numpy as np
 from bayesdist.calibration.calibration import Calibration, as_calibration
 from bayesdist.calibration.chip_map import Monomials
 from bayesdist.calibration.inverse import fit_inverse
+from bayesdist.calibration.orientation import MAX_DEPARTURE, departure_from_tangent_plane
 from bayesdist.calibration.plane import ARCSEC, arcsec_per
 from bayesdist.calibration.sky import reprojected
 from bayesdist.errors import InputError
@@ -46,7 +47,7 @@ def sip_from_solution(
     epoch: float | None = None,
     inverse_order: int | None = None,
     linear: str = "cd",
-    axes: str = "sky",
+    axes: str | None = None,
     crval: tuple[float, float] | None = None,
     tangent_point: tuple[float, float] | None = None,
     scale_arcsec: float | None = None,
@@ -73,7 +74,9 @@ def sip_from_solution(
         stands for the reference pixel.  'sip': the CD matrix is a pure scale, and A and B hold
         constant and linear terms too, relative to u = x and v = y in pixels, as the WISE pipeline
         has it (WSDC D-T033, Appendix B); CRVAL stands for `origin`.
-    axes : {'sky', 'linear'}
+    axes : {'sky', 'linear'}, optional
+        By default 'sky', and 'linear' for angular u, v that lie on no sky in a field so wide that a
+        tangent plane is one choice of several.
         'linear', of u, v without a position on the sky: CTYPE is no projection, CD is in the unit
         of u, v per pixel and CRVAL the (u, v) of CRPIX, so that a program gives u, v and no sky.
     crval : tuple of float, optional
@@ -123,6 +126,10 @@ def sip_from_solution(
         tangent_point = calibration.plane.point
     model = calibration.model
     _check_options(model, linear, epoch, scale_arcsec, tangent_point, origin)
+    if axes is None:
+        placed = model.unit == "pix" or tangent_point is not None or crval is not None
+        wide = not placed and departure_from_tangent_plane(calibration, epoch, None) > MAX_DEPARTURE
+        axes = "linear" if wide else "sky"
     in_frame = _is_in_frame(axes, tangent_point, crval)
     number = calibration.numbers[0] if chip is None else chip
     one = calibration.chip(number, epoch, origin="stated")

@@ -9,8 +9,7 @@ import numpy as np
 from pydantic import Field
 
 from bayesdist.calibration.calibration import Calibration
-from bayesdist.calibration.inverse import detector_grid
-from bayesdist.calibration.plane import ARCSEC
+from bayesdist.calibration.orientation import MAX_DEPARTURE, departure_from_tangent_plane
 from bayesdist.products.formats.common.cards import header_of
 from bayesdist.products.formats.common.content import Content
 from bayesdist.products.formats.common.document import (
@@ -34,9 +33,6 @@ from bayesdist.products.formats.sip.lint import lint_sip
 from bayesdist.products.formats.sip.positions import sip_read_back
 from bayesdist.products.formats.sip.read import holds_sip, sip_of
 from bayesdist.products.formats.sip.write import sip_text
-
-# Pixels by which other projections may differ from TAN in a header whose u, v are on no sky.
-MAX_DEPARTURE = 0.1
 
 
 class Settings(FormatSettings):
@@ -108,50 +104,15 @@ def _build(
 
 
 def _notes(sip: SipHeader, calibration: Calibration) -> tuple[str, ...]:
-    """Note on CRVAL where the sky position is neither known nor given in the settings."""
-    if not _sky_is_assumed(sip, calibration) or sip.crval != (0.0, 0.0):
-        return ()
-    remedy = f"set products.sip.crval{_or_linear(calibration)}"
-    return (f"CRVAL is a placeholder, and {_axes(sip)}: {remedy}",)
+    """Notes on what the settings of the product cause.
 
-
-def _projection_matters(
-    calibration: Calibration, settings: Settings, options: BuildOptions
-) -> tuple[str, ...]:
-    """Warning that angular u, v may be in another projection than TAN; empty if it hardly matters.
-
-    In a small field all projections about one point agree.  A distance r in radians differs
-    between a tangent plane and one that keeps angles (ARC) by r - atan r.
+    CRVAL is a placeholder where the sky position is neither known nor given, and terms below order
+    2 are in A and B where they are asked to be.
     """
-    stated = settings.axes is not None or settings.crval is not None
-    if calibration.unit == "pix" or stated or calibration.plane.point is not None:
-        return ()
-    if calibration.model.time is not None and options.epoch is None:
-        return ()  # refused with its reason where the header is made
-    worst = 0.0
-    for one in calibration.at(options.epoch, origin="stated").values():
-        poly = one.monomials()
-        x, y = detector_grid(one.basis.size, 3)
-        offsets = np.stack([x, y]) - np.array(one.basis.reference_pixel)[:, None]
-        arcsec = ARCSEC[calibration.unit] * (poly.linear @ offsets)
-        radians = np.radians(np.hypot(*arcsec) / 3600.0)
-        pixel = np.sqrt(abs(np.linalg.det(poly.linear))) * ARCSEC[calibration.unit]
-        departure = np.degrees(radians - np.arctan(radians)).max() * 3600.0 / pixel
-        worst = max(worst, float(departure))
-    if worst <= MAX_DEPARTURE:
-        return ()
-    return (
-        "the axes are linear: where u, v lie on the sky is not stated, and whether they are a "
-        f"tangent plane is worth {worst:.2g} px in so wide a field. If they are one, set "
-        "products.sip.crval or axes = 'sky'",
-    )
-
-
-def _warnings(sip: SipHeader, calibration: Calibration) -> tuple[str, ...]:
-    """Warnings on what programs will make of a header that the solution does not say."""
     out = []
-    if _sky_is_assumed(sip, calibration) and sip.crval != (0.0, 0.0):
-        out.append(f"{_axes(sip)}: check that they are{_or_linear(calibration)}")
+    if _sky_is_assumed(sip, calibration) and sip.crval == (0.0, 0.0):
+        remedy = f"set products.sip.crval{_or_linear(calibration)}"
+        out.append(f"CRVAL is a placeholder, and {_axes(sip)}: {remedy}")
     low = {k: c for terms in (sip.a, sip.b) for k, c in terms.items() if sum(k) < 2 and c}
     if low:
         out.append(
@@ -162,6 +123,35 @@ def _warnings(sip: SipHeader, calibration: Calibration) -> tuple[str, ...]:
             "drop"
         )
     return tuple(out)
+
+
+def _projection_matters(
+    calibration: Calibration, settings: Settings, options: BuildOptions
+) -> tuple[str, ...]:
+    """Warning that angular u, v may be in another projection than TAN; empty if it hardly matters.
+
+    See `departure_from_tangent_plane`.
+    """
+    stated = settings.axes is not None or settings.crval is not None
+    if calibration.unit == "pix" or stated or calibration.plane.point is not None:
+        return ()
+    if calibration.model.time is not None and options.epoch is None:
+        return ()  # refused with its reason where the header is made
+    worst = departure_from_tangent_plane(calibration, options.epoch, None)
+    if worst <= MAX_DEPARTURE:
+        return ()
+    return (
+        "the axes are linear: where u, v lie on the sky is not stated, and whether they are a "
+        f"tangent plane is worth {worst:.2g} px in so wide a field. If they are one, set "
+        "products.sip.crval or axes = 'sky'",
+    )
+
+
+def _warnings(sip: SipHeader, calibration: Calibration) -> tuple[str, ...]:
+    """Warning on sky axes that the header has and the solution does not state."""
+    if not _sky_is_assumed(sip, calibration) or sip.crval == (0.0, 0.0):
+        return ()
+    return (f"{_axes(sip)}: check that they are{_or_linear(calibration)}",)
 
 
 def _sky_is_assumed(sip: SipHeader, calibration: Calibration) -> bool:

@@ -10,7 +10,7 @@ import numpy as np
 from bayesdist.calibration.calibration import Calibration
 from bayesdist.calibration.chip_map import ChipMap
 from bayesdist.calibration.inverse import detector_grid
-from bayesdist.calibration.orientation import placed_at
+from bayesdist.calibration.orientation import placed_at, refuse_wide_planes
 from bayesdist.calibration.plane import arcsec_per
 from bayesdist.errors import InputError
 from bayesdist.products.formats.common.cards import (
@@ -77,6 +77,7 @@ def build(calibration: Calibration, settings: Settings, options: BuildOptions) -
             where=where,
             do="give the order of a polynomial that replaces them",
         )
+    refuse_wide_planes(calibration, options.epoch, options.scale_arcsec, where=where)
     arcsec = arcsec_per(model.unit, options.scale_arcsec)
     maps = calibration.at(options.epoch, origin="stated")
     heads = tuple(_head(one, number, arcsec, calibration) for number, one in maps.items())

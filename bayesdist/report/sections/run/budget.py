@@ -53,7 +53,7 @@ def budget_table(r: ReportInput) -> tuple[TextTable, ...]:
     alone = replace(budget, terms=tuple(t for t in budget.terms if t.name in parts), products=())
     folded = _table(r, budget, alone, names=parts)
     return (
-        _table(r, budget, jointly),
+        *_by_chip(r, _table(r, budget, jointly)),
         replace(
             folded,
             caption="Parts of the model: their errors are correlated and enter the total jointly",
@@ -61,6 +61,17 @@ def budget_table(r: ReportInput) -> tuple[TextTable, ...]:
             folded=True,
             detail=True,
         ),
+    )
+
+
+def _by_chip(r: ReportInput, table: TextTable) -> tuple[TextTable, ...]:
+    """The table, with the rows of single chips folded if they are many."""
+    if len(r.chips) <= _MOST_PANELS:
+        return (table,)
+    single = replace(table, rows=table.rows[table.leading :], folded=True, detail=True, note="")
+    return (
+        replace(table, rows=table.rows[: table.leading]),
+        replace(single, caption="Error budget of single chips", leading=0),
     )
 
 

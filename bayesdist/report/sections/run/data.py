@@ -11,9 +11,9 @@ from matplotlib.figure import Figure
 from bayesdist.report.contents import REPORT, Plot
 from bayesdist.report.context import ReportInput, needed
 from bayesdist.report.figures.fields import Grid, scalar_map
-from bayesdist.report.figures.panels import ChipPanels
 from bayesdist.report.figures.style import WIDTH, new_figure
 from bayesdist.report.plots.residuals import draw_density
+from bayesdist.report.sections.run.maps import map_panels, map_titles
 from bayesdist.report.texttable import (
     MAX_ROWS,
     TextTable,
@@ -133,21 +133,17 @@ def residuals_by_magnitude(r: ReportInput) -> Plot:
     )
 
 
-@REPORT.figure("fit", printed=lambda r: r.campaign is None)
+@REPORT.figure("data", printed=lambda r: r.campaign is None)
 def coverage(r: ReportInput) -> Plot:
     """Map of the number of stars in each cell of the detector."""
     grids = [Grid(c.binned.x, c.binned.y, np.asarray(c.binned.count, float)) for c in r.chips]
-    panels = ChipPanels(r.mosaic, colorbar=True)
-    panels.frame()
+    panels = map_panels(r)
     counts = np.concatenate([g.values.ravel() for g in grids])
     rows = r.words.rows
     scalar_map(
         panels,
         grids,
-        [
-            panels.title(k, f"{g.values.min():.0f} to {g.values.max():.0f} a cell")
-            for k, g in enumerate(grids)
-        ],
+        map_titles(panels, grids, [lambda low, high: f"{low:.0f} to {high:.0f} a cell"]),
         norm=Normalize(0.0, max(float(counts.max()), 1.0)),
         label=f"{rows} per cell [count]",
     )

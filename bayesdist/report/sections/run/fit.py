@@ -61,6 +61,7 @@ def fit_tables(r: ReportInput) -> tuple[TextTable, ...]:
             tuple(rows),
             note=" ".join(notes),
             detail=True,
+            folded=True,
         ),
     )
 
@@ -77,22 +78,23 @@ def _geometry_table(r: ReportInput) -> TextTable:
         parity, distortion = f"{chip.parity:+d}".replace("-", "−"), number(chip.distortion, 3)
         rows.append((names[chip.chip], x, y, angle, apart, parity, distortion))
     unit = chips[0].scales[2]
-    return TextTable(
-        "Geometry",
-        (
-            "Chip",
-            f"Scale along x [{unit}]",
-            f"Scale along y [{unit}]",
-            "Position angle of +y [°]",
-            "Angle from x to y [°]",
-            "Parity",
-            "Largest distortion [px]",
-        ),
-        tuple(rows),
-        note="Least squares, at the reference pixel, without drift and frames. The position angle "
-        "is from +v towards +u (on the sky: north through east); a parity of −1 is a mirror image. "
-        "The distortion is the deviation from the best linear map of the chip.",
+    heads = (
+        "Chip",
+        f"Scale along x [{unit}]",
+        f"Scale along y [{unit}]",
+        "Position angle of +y [°]",
+        "Angle from x to y [°]",
+        "Parity",
+        "Largest distortion [px]",
     )
+    note = (
+        "Least squares, at the reference pixel, without drift and frames. The position angle is"
+        " from +v towards +u (on the sky: north through east); a parity of −1 is a mirror image."
+        " The distortion is the deviation from the best linear map of the chip."
+    )
+    if len(rows) == 1:
+        return listing("Geometry", dict(zip(heads[1:], rows[0][1:], strict=True)), note)
+    return TextTable("Geometry", heads, tuple(rows), note=note)
 
 
 def _skew_table(r: ReportInput) -> TextTable:
@@ -179,9 +181,13 @@ def score_test_table(r: ReportInput) -> TextTable:
         }
         for t in r.score_tests
     ]
+    n_found = sum(t.significant for t in r.score_tests)
+    verb = "found" if n_found else "found nothing"
+    count_of = f"{n_found} of {len(rows)}" if n_found else f"all {len(rows)}"
     return tabulated(
-        "Score tests of the residuals",
+        f"Score tests of the residuals: {count_of} {verb}",
         rows,
+        folded=not n_found,
         words=(0, 5),
         stacked=(5,),
         note=f"Found: p below {SCORE_TESTS.value:g} after Holm's correction for the number of"

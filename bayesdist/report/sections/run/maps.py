@@ -2,25 +2,30 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import TYPE_CHECKING
+import math
+from collections.abc import Callable, Sequence
+from functools import partial
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from matplotlib.figure import Figure
 
+from bayesdist.assess.solution import chip_frames
 from bayesdist.report.contents import REPORT, Plot
 from bayesdist.report.context import ReportInput
 from bayesdist.report.figures.arrows import (
     Arrows,
+    cell_magnification,
     cross_map,
     crosses_magnification,
+    spacing,
     sparse_step,
     vector_map,
 )
 from bayesdist.report.figures.fields import Grid, contour_levels, error_levels, scalar_map
-from bayesdist.report.figures.panels import ChipPanels
+from bayesdist.report.figures.panels import ChipPanels, FocalPlane, Panels, overlap
 from bayesdist.report.figures.style import nice_below
-from bayesdist.report.plots.maps import BORDER, distortion_magnification
+from bayesdist.report.plots.maps import BORDER, KEY_PAD
 from bayesdist.report.sections.gauge import gauge_mark, gauge_of_maps
 from bayesdist.report.texttable import TextTable, tabulated
 from bayesdist.utils.numbers import display_scale, number, size_of, with_mas
@@ -28,21 +33,24 @@ from bayesdist.utils.numbers import display_scale, number, size_of, with_mas
 if TYPE_CHECKING:
     from bayesdist.assess import VectorMap
 
+MOST_PANELS = 4  # of chips: more are drawn in one focal plane
+MOST_ALONG = 34  # vectors along the longer side of a focal plane: more would hide each other
+
 
 @REPORT.table("maps")
 def map_table(r: ReportInput) -> TextTable:
     """Table of the extremes of the uncertainty maps."""
     rows = []
-    typical = max(float(m.per_axis.max()) for c in r.chips for m in c.maps)
+    typical = max(float(np.nanmax(m.per_axis)) for c in r.chips for m in c.maps)
     for c in r.chips:
         for m in c.maps:
             sizes = {
                 "Largest σ u": m.sigma_u_max,
                 "Largest σ v": m.sigma_v_max,
-                "Largest per axis": float(m.per_axis.max()),
-                "Median per axis": float(np.median(m.per_axis)),
-                "Largest CE68": float(m.circular_error(0.68).max()),
-                "Largest CE95": float(m.circular_error(0.95).max()),
+                "Largest per axis": float(np.nanmax(m.per_axis)),
+                "Median per axis": float(np.nanmedian(m.per_axis)),
+                "Largest CE68": float(np.nanmax(m.circular_error(0.68))),
+                "Largest CE95": float(np.nanmax(m.circular_error(0.95))),
             }
             row = {k: with_mas(v, m.unit, r.scale_mas, like=typical) for k, v in sizes.items()}
             row["At pixel"] = "({:.0f}, {:.0f})".format(*m.position_of_max)
@@ -65,18 +73,18 @@ def map_table(r: ReportInput) -> TextTable:
 def uncertainty_radius(r: ReportInput) -> Plot:
     """Uncertainty per axis, rms of sigma_u and sigma_v, all maps in one colour scale."""
     maps = [m for c in r.chips for m in c.maps]
-    scale = display_scale(r.unit, max(float(m.per_axis.max()) for m in maps))
+    scale = display_scale(r.unit, max(float(np.nanmax(m.per_axis)) for m in maps))
     grids = [Grid(m.x, m.y, m.per_axis * scale.factor, m.position_of_max) for m in maps]
-    panels = ChipPanels(r.mosaic, len(r.chips[0].maps), colorbar=True)
-    panels.frame()
-    kinds = [(k, m.kind) for k, c in enumerate(r.chips) for m in c.maps]
+    kinds = [m.kind for m in r.chips[0].maps]
+    panels = map_panels(r, len(kinds))
+
+    def title(kind: str, low: float, high: float) -> str:
+        return f"{kind}: {number(low)} to {number(high)}"
+
     scalar_map(
         panels,
         grids,
-        [
-            panels.title(k, f"{kind}: {number(g.values.min())} to {number(g.values.max())}", ", ")
-            for (k, kind), g in zip(kinds, grids, strict=True)
-        ],
+        map_titles(panels, grids, [partial(title, kind) for kind in kinds], ", "),
         levels=error_levels(np.concatenate([g.values.ravel() for g in grids])),
         label=f"per axis (1 σ) [{scale.unit}]",
     )
@@ -95,7 +103,7 @@ def uncertainty_radius(r: ReportInput) -> Plot:
     pairs = [(c.formal_map, c.posterior_map) for c in r.chips]
     ratios = [p.radius / f.radius for f, p in pairs if p is not None]
     if ratios:
-        low, high = (number(float(end(ratios))) for end in (np.min, np.max))
+        low, high = (number(float(end(ratios))) for end in (np.nanmin, np.nanmax))
         text += (
             f" The posterior's is {low} to {high} times the formal one;"
             " above 1, the formal errors of least squares with rejection are too small."
@@ -112,7 +120,9 @@ def distortion(r: ReportInput) -> Plot:
     v, where = _longest(r, "displacement")
     notes = {c.chip.name: c.displacement.part_note for c in r.chips}
     note = v.part_note
-    if len(set(notes.values())) > 1:
+    if len(set(notes.values())) > 2:
+        note = "relative to the best similarity of each chip about its reference pixel"
+    elif len(set(notes.values())) > 1:
         note = "; ".join(f"{name} {text}" for name, text in notes.items())
     own = " Each chip is compared with its own array: gap and rotation between chips are not shown."
     return Plot(
@@ -126,77 +136,6 @@ def distortion(r: ReportInput) -> Plot:
 
 
 @REPORT.figure("maps")
-def distortion_non_linear(r: ReportInput) -> Plot:
-    """Vectors of the non-linear part, as Figure 4.1 of the ACS handbook."""
-    v, where = _longest(r, "non_linear")
-    return Plot(
-        _flow(r, [c.non_linear for c in r.chips]),
-        "Distortion, non-linear part",
-        f"Only {v.part_note}: what remains beyond shift, scale, rotation and skew, at most"
-        f" {r.length(v.length_max)} at {where}, ringed.",
-        f"Vector diagram of the non-linear part, largest vector {r.length(v.length_max)}.",
-    )
-
-
-def _flow(r: ReportInput, vectors: Sequence[VectorMap]) -> Figure:
-    """Vectors along x and y of each chip, in its pixels, whatever the unit of u and v."""
-    chips, sizes = [Arrows.of_map(v) for v in vectors], [c.chip.size for c in r.chips]
-    lengths = [float(np.hypot(*v.on_detector).max()) for v in vectors]
-    M = distortion_magnification(vectors)
-    reach = max(one.reach(M, size) for one, size in zip(chips, sizes, strict=True))
-    panels = ChipPanels(r.mosaic)
-    panels.frame(reach + BORDER * r.mosaic.longest_side)
-    titles = [
-        panels.title(k, f"largest {size_of(length, digits=4)}") for k, length in enumerate(lengths)
-    ]
-    vector_map(panels, chips, titles, magnification=M, key=nice_below(max(lengths) / 1.5))
-    return panels.figure
-
-
-def _longest(r: ReportInput, which: str) -> tuple[VectorMap, str]:
-    """Vectors of the chip where the longest one is, and its position in words."""
-    worst = max(r.chips, key=lambda c: getattr(c, which).length_max)
-    vectors: VectorMap = getattr(worst, which)
-    return vectors, f"pixel {r.position(vectors.position_of_max, worst.chip.number)}"
-
-
-@REPORT.figure("maps")
-def formal_uncertainty(r: ReportInput) -> Plot:
-    """Four vectors from each position, to (±sigma_u, ±sigma_v).
-
-    As section 6 of the WISE distortion report, which draws them 2000 times larger than the
-    detector.
-    """
-    maps = [m for c in r.chips for m in c.maps]
-    largest = max(m.radius_max for m in maps)
-    widest = max(max(m.sigma_u_max, m.sigma_v_max) for m in maps)
-    every = max(sparse_step(maps), 2 if r.several else 1)  # panels of several chips are small
-    M = crosses_magnification(maps, every)
-    panels = ChipPanels(r.mosaic, len(r.chips[0].maps))
-    panels.frame(M * widest + BORDER * r.mosaic.longest_side)
-    titles = [
-        panels.title(
-            k, f"{m.kind}, largest {size_of(float(m.per_axis.max()), m.unit)} per axis", ", "
-        )
-        for k, c in enumerate(r.chips)
-        for m in c.maps
-    ]
-    cross_map(panels, maps, titles, magnification=M, key=nice_below(largest), every=every)
-    by_kind = [
-        max(maps, key=lambda m: m.radius_max)
-        for maps in zip(*(c.maps for c in r.chips), strict=True)
-    ]
-    found = " and ".join(f"{r.length(float(m.per_axis.max()))} ({m.kind})" for m in by_kind)
-    return Plot(
-        panels.figure,
-        "Uncertainty diagram",
-        "From each position four vectors to all combinations of ±1 σ in u and v, enlarged as"
-        f" stated above the panels; the largest error per axis is {found}.",
-        f"Crosses of ±1 sigma over the detector; largest per axis {found}.",
-    )
-
-
-@REPORT.figure("maps")
 def pixel_area(r: ReportInput) -> Plot:
     """Contours of the pixel area relative to that at the reference pixel, in percent.
 
@@ -204,15 +143,19 @@ def pixel_area(r: ReportInput) -> Plot:
     """
     areas = [c.area for c in r.chips]
     grids = [Grid(a.x, a.y, 100.0 * (a.area - 1.0)) for a in areas]
-    panels = ChipPanels(r.mosaic, colorbar=True)
-    panels.frame()
+    panels = map_panels(r)
     scalar_map(
         panels,
         grids,
-        [
-            panels.title(k, f"relative area {number(a.area.min(), 6)} to {number(a.area.max(), 6)}")
-            for k, a in enumerate(areas)
-        ],
+        map_titles(
+            panels,
+            grids,
+            [
+                lambda low, high: (
+                    f"relative area {number(1 + low / 100, 6)} to {number(1 + high / 100, 6)}"
+                )
+            ],
+        ),
         levels=contour_levels(np.concatenate([g.values.ravel() for g in grids])),
         label="pixel area − area at reference pixel [%]",
         labelled=True,
@@ -252,15 +195,11 @@ def pixel_scale(r: ReportInput) -> Plot:
     unit = "reference pix" if in_pixels else scale.unit
     by = 1.0 if in_pixels else scale.factor
     grids = [Grid(a.x, a.y, by * v) for a, v in zip(areas, values, strict=True)]
-    panels = ChipPanels(r.mosaic, colorbar=True)
-    panels.frame()
+    panels = map_panels(r)
     scalar_map(
         panels,
         grids,
-        [
-            panels.title(k, f"{g.values.min():.6g} to {g.values.max():.6g}")
-            for k, g in enumerate(grids)
-        ],
+        map_titles(panels, grids, [lambda low, high: f"{low:.6g} to {high:.6g}"]),
         levels=contour_levels(np.concatenate([g.values.ravel() for g in grids])),
         label=f"pixel scale [{unit}/pix]",
         labelled=True,
@@ -274,4 +213,157 @@ def pixel_scale(r: ReportInput) -> Plot:
         " the geometric mean of the scales along both axes. With u and v in pixels it rests on the"
         " size of a pixel that the configuration gives.",
         f"Contour map of the pixel scale, from {low:.6g} to {high:.6g} {unit}.",
+    )
+
+
+@REPORT.figure("maps")
+def distortion_non_linear(r: ReportInput) -> Plot:
+    """Vectors of the non-linear part, as Figure 4.1 of the ACS handbook."""
+    v, where = _longest(r, "non_linear")
+    return Plot(
+        _flow(r, [c.non_linear for c in r.chips]),
+        "Distortion, non-linear part",
+        f"Only {v.part_note}: what remains beyond shift, scale, rotation and skew, at most"
+        f" {r.length(v.length_max)} at {where}, ringed.",
+        f"Vector diagram of the non-linear part, largest vector {r.length(v.length_max)}.",
+    )
+
+
+def map_panels(r: ReportInput, maps: int = 1, *, colorbar: bool = True) -> Panels:
+    """Panels of maps: one for each chip, or one focal plane if there are many."""
+    frames = chip_frames(r.solution, epoch=r.chips[0].best_map.epoch)
+    outlines = [one.outline(c.chip.size) for one, c in zip(frames, r.chips, strict=True)]
+    if len(r.chips) <= MOST_PANELS or overlap(outlines):
+        panels = ChipPanels(r.mosaic, maps, colorbar=colorbar)
+        panels.frame()
+        return panels
+    names = [c.chip.name or f"chip {c.chip.number}" for c in r.chips]
+    border = BORDER * float(np.ptp(np.concatenate(outlines), axis=0).max())
+    look: dict[str, Any] = {"frames": frames, "margin": border, "colorbar": colorbar}
+    return FocalPlane(outlines, names, maps=maps, **look)
+
+
+def map_titles(
+    panels: Panels,
+    grids: Sequence[Grid],
+    texts: Sequence[Callable[[float, float], str]],
+    joined: str = ": ",
+) -> list[str]:
+    """Titles of panels of `map_panels`, which state the extremes of what is in each.
+
+    `grids` are the maps of the first chip, then those of the next; `texts` make words of the lowest
+    and the highest value of each map.
+    """
+    n = len(texts)
+    if isinstance(panels, FocalPlane):
+        values = [np.concatenate([g.values.ravel() for g in grids[k::n]]) for k in range(n)]
+        return [
+            text(float(np.nanmin(v)), float(np.nanmax(v)))
+            for text, v in zip(texts, values, strict=True)
+        ]
+    return [
+        panels.title(
+            k // n, texts[k % n](float(np.nanmin(g.values)), float(np.nanmax(g.values))), joined
+        )
+        for k, g in enumerate(grids)
+    ]
+
+
+def _flow(r: ReportInput, vectors: Sequence[VectorMap]) -> Figure:
+    """Vectors of all chips in the focal plane, in pixels, whatever the unit of u and v.
+
+    Each chip has a panel of its own where the solution does not tell the chips apart.
+    """
+    lengths = [float(np.hypot(*v.on_detector).max()) for v in vectors]
+    frames = chip_frames(r.solution, epoch=r.chips[0].best_map.epoch)
+    outlines = [one.outline(c.chip.size) for one, c in zip(frames, r.chips, strict=True)]
+    apart = not overlap(outlines)
+    every = _every(vectors, np.ptp(np.concatenate(outlines), axis=0).max()) if apart else 1
+    chips = [Arrows.of_map(v, every) for v in vectors]
+    M = cell_magnification(min(one.step for one in chips), max(lengths))
+    key = nice_below(max(lengths) / 1.5)
+    border = BORDER * r.mosaic.longest_side
+    look: dict[str, Any] = {"magnification": M, "key": key, "colored": True}
+    if not apart:
+        reach = max(one.reach(M, c.chip.size) for one, c in zip(chips, r.chips, strict=True))
+        separate = ChipPanels(r.mosaic, colorbar=True)
+        separate.frame(reach + border)
+        titles = [
+            separate.title(k, f"largest {size_of(length, digits=4)}")
+            for k, length in enumerate(lengths)
+        ]
+        vector_map(separate, chips, titles, **look)
+        return separate.figure
+    worst = int(np.argmax(lengths))
+    placed = chips
+    if r.several:
+        placed = [
+            one.placed(frame, ringed=k == worst)
+            for k, (one, frame) in enumerate(zip(chips, frames, strict=True))
+        ]
+    ends = [np.stack([a.x + M * a.du, a.y + M * a.dv], axis=1) for a in placed]
+    corners = np.concatenate(outlines)
+    beyond = [
+        corners.min(axis=0) - np.concatenate(ends).min(axis=0),
+        np.concatenate(ends).max(axis=0) - corners.max(axis=0),
+    ]
+    names = [c.chip.name or f"chip {c.chip.number}" for c in r.chips]
+    plane = FocalPlane(
+        outlines, names, margin=max(float(np.max(beyond)), 0.0) + border, colorbar=True
+    )
+    whose = f"{names[worst]}, " if r.several else ""
+    vector_map(
+        plane, placed, [f"{whose}largest {size_of(lengths[worst], digits=4)}"], pad=KEY_PAD, **look
+    )
+    return plane.figure
+
+
+def _every(vectors: Sequence[VectorMap], extent: float) -> int:
+    """Smallest further step of the grids that leaves few enough vectors along a focal plane."""
+    step = min(spacing(v.x, v.y) for v in vectors)
+    steps = math.gcd(*(len(a) - 1 for v in vectors for a in (v.x, v.y)))
+    known = [k for k in range(1, steps + 1) if steps % k == 0]
+    return next((k for k in known if extent / (k * step) <= MOST_ALONG), known[-1])
+
+
+def _longest(r: ReportInput, which: str) -> tuple[VectorMap, str]:
+    """Vectors of the chip where the longest one is, and its position in words."""
+    worst = max(r.chips, key=lambda c: getattr(c, which).length_max)
+    vectors: VectorMap = getattr(worst, which)
+    return vectors, f"pixel {r.position(vectors.position_of_max, worst.chip.number)}"
+
+
+@REPORT.figure("maps", when=lambda r: len(r.chips) <= MOST_PANELS)
+def formal_uncertainty(r: ReportInput) -> Plot:
+    """Four vectors from each position, to (±sigma_u, ±sigma_v).
+
+    As section 6 of the WISE distortion report, which draws them 2000 times larger than the
+    detector.
+    """
+    maps = [m for c in r.chips for m in c.maps]
+    largest = max(m.radius_max for m in maps)
+    widest = max(max(m.sigma_u_max, m.sigma_v_max) for m in maps)
+    every = max(sparse_step(maps), 2 if r.several else 1)  # panels of several chips are small
+    M = crosses_magnification(maps, every)
+    panels = ChipPanels(r.mosaic, len(r.chips[0].maps))
+    panels.frame(M * widest + BORDER * r.mosaic.longest_side)
+    titles = [
+        panels.title(
+            k, f"{m.kind}, largest {size_of(float(np.nanmax(m.per_axis)), m.unit)} per axis", ", "
+        )
+        for k, c in enumerate(r.chips)
+        for m in c.maps
+    ]
+    cross_map(panels, maps, titles, magnification=M, key=nice_below(largest), every=every)
+    by_kind = [
+        max(maps, key=lambda m: m.radius_max)
+        for maps in zip(*(c.maps for c in r.chips), strict=True)
+    ]
+    found = " and ".join(f"{r.length(float(np.nanmax(m.per_axis)))} ({m.kind})" for m in by_kind)
+    return Plot(
+        panels.figure,
+        "Uncertainty diagram",
+        "From each position four vectors to all combinations of ±1 σ in u and v, enlarged as"
+        f" stated above the panels; the largest error per axis is {found}.",
+        f"Crosses of ±1 sigma over the detector; largest per axis {found}.",
     )

@@ -120,10 +120,11 @@ def added_errors_table(r: ReportInput) -> TextTable:
     )
     if found.added is not None:
         note += " What is beyond the least was added to the quoted errors, and j is the least."
-    return tabulated("Errors beyond the quoted ones", rows, words=(0, 1), note=note)
+    folded = found.added is None  # the errors stand as they were quoted
+    return tabulated("Errors beyond the quoted ones", rows, words=(0, 1), note=note, folded=folded)
 
 
-@REPORT.figure("outliers", needs=("posterior.hyper",))
+@REPORT.figure("outliers", needs=("posterior.hyper",), folded=True)
 def outliers_corner(r: ReportInput) -> Plot:
     """Corner plot of the outlier fraction, jitter and outlier scale, of those that were sampled."""
     posterior = needed(r.posterior)
@@ -142,7 +143,7 @@ def outliers_corner(r: ReportInput) -> Plot:
     )
 
 
-@REPORT.figure("coefficients", needs=("posterior",))
+@REPORT.figure("coefficients", needs=("posterior",), folded=True)
 def correlations(r: ReportInput) -> Plot:
     """Matrix of the correlations between coefficients, as a map of colours."""
     posterior = needed(r.posterior)
@@ -170,7 +171,7 @@ def correlations(r: ReportInput) -> Plot:
     )
 
 
-@REPORT.figure("coefficients", needs=("posterior",))
+@REPORT.figure("coefficients", needs=("posterior",), folded=True)
 def ranks(r: ReportInput) -> Plot:
     """Ranks of the draws of each ensemble among all, of the slowest parameters and f, j, s_out."""
     posterior = needed(r.posterior)

@@ -6,6 +6,7 @@ import hashlib
 import json
 import re
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -50,7 +51,7 @@ def document_tables(r: ReportInput) -> tuple[TextTable, ...]:
     heads = ("Role", "Name", "Date", "Signature")
     return (
         listing("Document", document),
-        TextTable("Sign-off", heads, rows, words=tuple(range(len(heads)))),
+        TextTable("Sign-off", heads, rows, words=tuple(range(len(heads))), folded=True),
     )
 
 
@@ -91,14 +92,13 @@ def provenance_tables(r: ReportInput) -> tuple[TextTable, ...]:
             unit = " [s]" if key == "timings" else ""
             shown = _stage if key == "stages" else _plain
             names = short_paths(value) if key == "inputs" else map(str, value)
-            out.append(
-                listing(
-                    f"{key.capitalize()}{unit}",
-                    dict(zip(names, map(shown, value.values()), strict=True)),
-                    detail=key in _DETAILS,
-                    leading=_PRINTED.get(key, 0),
-                )
+            table = listing(
+                f"{key.capitalize()}{unit}",
+                dict(zip(names, map(shown, value.values()), strict=True)),
+                detail=key in _DETAILS,
+                leading=_PRINTED.get(key, 0),
             )
+            out.append(replace(table, folded=key in _DETAILS))
     return tuple(out)
 
 
@@ -129,4 +129,6 @@ def config_table(r: ReportInput) -> TextTable | None:
             pairs.update({f"{section} {k}": _plain(v) for k, v in enumerate(value, start=1)})
         else:
             pairs[str(section)] = _plain(value)
-    return listing("Resolved configuration", pairs, detail=True) if pairs else None
+    if not pairs:
+        return None
+    return replace(listing("Resolved configuration", pairs, detail=True), folded=True)

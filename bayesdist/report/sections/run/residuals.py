@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -12,7 +13,7 @@ from bayesdist.report.contents import REPORT, Plot
 from bayesdist.report.context import ReportInput
 from bayesdist.report.figures.arrows import CHANCE, Arrows, significant_cells, vector_map
 from bayesdist.report.figures.mosaic import Mosaic
-from bayesdist.report.figures.panels import ChipPanels, Panels
+from bayesdist.report.figures.panels import ChipPanels, FocalPlane, Panels
 from bayesdist.report.figures.style import WIDTH, legend_above, new_figure
 from bayesdist.report.plots.residuals import (
     VECTOR_PAD,
@@ -24,6 +25,7 @@ from bayesdist.report.plots.residuals import (
     significant,
     vector_scale,
 )
+from bayesdist.report.sections.run.maps import map_panels
 from bayesdist.utils.arrays import Float
 from bayesdist.utils.numbers import display_scale
 
@@ -94,7 +96,13 @@ def _histograms(
 @REPORT.figure("fit", printed=lambda r: r.campaign is None)
 def residual_vectors(r: ReportInput) -> Plot:
     """Mean residual vector of each cell of the detector; pale ones are what noise would give."""
-    panels = residual_panels([c.binned for c in r.chips], r.mosaic, unit=r.unit)
+    binned = [c.binned for c in r.chips]
+    plane = map_panels(r, colorbar=False)
+    panels = (
+        _in_plane(binned, plane, unit=r.unit)
+        if isinstance(plane, FocalPlane)
+        else residual_panels(binned, r.mosaic, unit=r.unit)
+    )
     filled = sum(int((np.asarray(c.binned.count) > 0).sum()) for c in r.chips)
     significant = sum(int(significant_cells(c.binned).sum()) for c in r.chips)
     chance = CHANCE * filled
@@ -124,6 +132,21 @@ def residual_vectors(r: ReportInput) -> Plot:
         f" {cannot}.{which}",
         f"Map of binned residual vectors; {significant} of {filled} cells are significant.",
     )
+
+
+def _in_plane(binned: Sequence[BinnedResiduals], plane: FocalPlane, *, unit: str) -> Panels:
+    """Panel with the mean residual of each cell of all chips in a focal plane."""
+    chips = []
+    for one, frame in zip(map(Arrows.of_cells, binned), plane.frames, strict=True):
+        x, y = frame(one.x, one.y)
+        chips.append(replace(one, x=x, y=y))  # u and v are the same on all chips
+    magnification, key = vector_scale(chips)
+    clear, every = sum(one.n_clear for one in chips), sum(one.x.size for one in chips)
+    title = f"{clear} of {every} significant, {CHANCE * every:.0f} by chance"
+    vector_map(
+        plane, chips, [title], magnification=magnification, key=key, unit=unit, pad=VECTOR_PAD
+    )
+    return plane
 
 
 def residual_panels(

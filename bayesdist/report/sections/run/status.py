@@ -175,8 +175,10 @@ def verdict(r: ReportInput) -> Verdict:
     """
     groups = status_checks(r)
     lines = requirement_lines(r)
-    numbers = (*(() if lines else ("No requirement was stated.",)), _accuracy_sentence(r))
+    numbers: tuple[str, ...] = (_accuracy_sentence(r),)
     if r.provisional:
+        if not lines:
+            numbers = ("No requirement was stated.", *numbers)
         reasons = needed(r.posterior).convergence.reasons
         why = f"Why: {'; '.join(reasons) or 'no reason was recorded'}."
         remarks = warnings_of(c for c in r.checks if c.name != "Converged")  # it says the same

@@ -1,0 +1,71 @@
+"""Difference from the release that a calibration replaces."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from bayesdist.report.contents import REPORT, Plot
+from bayesdist.report.context import ReportInput
+from bayesdist.report.figures.commands import difference_vectors
+from bayesdist.report.texttable import TextTable, tabulated
+from bayesdist.utils.numbers import MISSING, number, percent, with_mas
+
+ERRORS = {
+    "both": "The errors of both are taken as independent.",
+    "A": "The release states no errors and is taken for exact.",
+    "B": "This run states no errors and is taken for exact.",
+    "none": "Neither states errors.",
+}
+
+
+@REPORT.table("previous", needs=("previous",))
+def previous_table(r: ReportInput) -> TextTable:
+    """Table of the difference of each chip, of its significance, and of what was taken out."""
+    rows = []
+    for found in r.previous:
+        mas = found.frame.pixel_mas or r.scale_mas
+        field, similarity = found.field, found.similarity
+        verdict = {True: "differs", False: "within the errors", None: "not tested"}[found.differs]
+        chip = next((c.chip for c in r.chips if c.chip.number == found.a.chip), r.chips[0].chip)
+        shift = None if similarity.shift is None else float(np.hypot(*similarity.shift))
+        scale = percent(similarity.scale - 1.0, 2) if similarity.same_unit else MISSING
+        rows.append(
+            {
+                "Chip": chip.name or str(chip.number),
+                "rms": with_mas(found.rms, "pix", mas),
+                "Largest": with_mas(found.largest, "pix", mas),
+                "At pixel": "({:.0f}, {:.0f})".format(*found.position_of_largest),
+                "Chi-square (dof)": MISSING
+                if field is None
+                else f"{number(field.chi2)} ({field.dof})",
+                "p": MISSING if field is None else number(field.p_value, 2),
+                "Shift [pix]": number(shift),
+                "Scale − 1": scale,
+                "Rotation [°]": number(float(np.degrees(similarity.rotation)), 3),
+                "Result": verdict,
+            }
+        )
+    first = r.previous[0]
+    return tabulated(
+        f"This run minus {first.b.name}",
+        rows,
+        words=(0, 9),
+        stacked=(9,),
+        note="Differences are in pixels without distortion. Shift, rotation and scale are stated by"
+        f" themselves and taken out of the rest. {ERRORS[first.errors_of]}",
+    )
+
+
+@REPORT.figure("previous", needs=("previous",), printed=True)
+def previous_difference(r: ReportInput) -> Plot:
+    """Vectors of the run minus the release that it replaces, without shift, rotation and scale."""
+    worst = max(r.previous, key=lambda found: found.largest)
+    size = with_mas(worst.largest, "pix", worst.frame.pixel_mas or r.scale_mas)
+    shades = " Shades are the significance of each position separately." if worst.field else ""
+    return Plot(
+        difference_vectors(r.previous, names=("this run", "previous")),
+        "Difference from the previous release",
+        f"Vectors of this run minus {worst.b.name}, at most {size}, after shift, rotation and scale"
+        f" between both.{shades}",
+        f"Vector diagram of the difference from the previous release, at most {size}.",
+    )
