@@ -27,7 +27,8 @@ from bayesdist.model.similarity import turned, turned_model
 from bayesdist.utils.arrays import Complex, Float
 from bayesdist.utils.quantities import Random, generator_of
 
-# Pixels by which other projections may differ from TAN in a header whose u, v are on no sky.
+# Largest accepted difference in pixels between TAN and other projections, in a header of a
+# calibration whose u, v have no position on the sky.
 MAX_DEPARTURE = 0.1
 
 
@@ -324,17 +325,17 @@ def placed_at(
 def departure_from_tangent_plane(
     calibration: Calibration, epoch: float | None, scale_arcsec: float | None
 ) -> float:
-    """Pixels by which another projection of the sky may differ from TAN over the detector.
+    """Largest difference in pixels between TAN and another projection over the detector.
 
-    In a small field all projections about one point agree.  A distance r in radians differs between
-    a tangent plane and one that keeps angles (ARC) by r - atan r.  `scale_arcsec` is the size of a
-    pixel, for u and v in pixels.
+    In a small field all projections about the same point agree.  At a distance r, in radians, the
+    difference between a tangent plane and an equidistant projection (ARC) is r - atan r.
+    `scale_arcsec` is the size of a pixel, for u and v in pixels.
     """
     unit, worst = arcsec_per(calibration.unit, scale_arcsec), 0.0
-    for one in calibration.at(epoch, origin="stated").values():
-        poly = one.monomials()
-        x, y = detector_grid(one.basis.size, 3)
-        offsets = np.stack([x, y]) - np.array(one.basis.reference_pixel)[:, None]
+    for chip_map in calibration.at(epoch, origin="stated").values():
+        poly = chip_map.monomials()
+        x, y = detector_grid(chip_map.basis.size, 3)
+        offsets = np.stack([x, y]) - np.array(chip_map.basis.reference_pixel)[:, None]
         radians = np.radians(unit * np.hypot(*(poly.linear @ offsets)) / 3600.0)
         pixel = np.sqrt(abs(np.linalg.det(poly.linear))) * unit
         departure = np.degrees(radians - np.arctan(radians)).max() * 3600.0 / pixel
@@ -345,22 +346,23 @@ def departure_from_tangent_plane(
 def refuse_wide_planes(
     calibration: Calibration, epoch: float | None, scale_arcsec: float | None, *, where: str
 ) -> None:
-    """Raise InputError if TAN is one choice of several for u, v that lie on no sky.
+    """Raise InputError if u, v have no position on the sky and the choice of TAN matters.
 
-    `epoch`, `scale_arcsec`: as of `departure_from_tangent_plane`. `where`: the configuration.
+    `epoch` and `scale_arcsec` are those of `departure_from_tangent_plane`; `where` is the section
+    of the configuration, for the message.
     """
     if calibration.plane.point is not None or calibration.plane.kind == "aperture":
         return
     if calibration.unit == "pix" and scale_arcsec is None:
-        return  # of no size
+        return  # the size of the field on the sky is unknown
     worst = departure_from_tangent_plane(calibration, epoch, scale_arcsec)
     if worst > MAX_DEPARTURE:
         raise InputError(
-            "the header is that of a tangent plane, and where u, v lie on the sky is not stated: "
-            f"whether they are a tangent plane is worth {worst:.2g} px in so wide a field",
+            "the header is that of a tangent plane, and the position of u, v on the sky is not "
+            f"given: in so wide a field other projections differ by {worst:.2g} px",
             where=where,
-            do=f"if they are one, set {where}.crval (--option 'crval=[RA, Dec]' of convert); if "
-            "not, write a SIP header with linear axes, or the parameters",
+            do=f"if u, v are on a tangent plane, set {where}.crval (--option 'crval=[RA, Dec]' of "
+            "convert); otherwise write a SIP header with linear axes, or the parameters",
         )
 
 
