@@ -154,9 +154,24 @@ def _laid_out(figure: Figure) -> Bbox:
     if engine is not None:
         with _measured_once(figure):
             engine.execute(figure)
-    box = figure.get_tightbbox(renderer)
+    box = _with_labels(figure.get_tightbbox(renderer), figure, renderer)
     figure.set_layout_engine(None)  # an engine, even 'none', would have each file drawn twice
     return Bbox(box.padded(MARGIN / DPI).get_points())
+
+
+def _with_labels(box: Bbox, figure: Figure, renderer: Any) -> Bbox:
+    """Box (inches) that also holds labels which are longer than their axes.
+
+    Matplotlib before 3.11.2 leaves out what of them is beyond the ends of the axis.
+    """
+    inches = figure.dpi_scale_trans.inverted()
+    ends = {"x": [box.x0, box.x1], "y": [box.y0, box.y1]}
+    for ax in figure.axes:
+        for name, axis in (("x", ax.xaxis), ("y", ax.yaxis)):
+            if ax.get_visible() and ax.axison and axis.get_visible() and axis.label.get_visible():
+                label = axis.label.get_window_extent(renderer).transformed(inches)
+                ends[name] += [label.x0, label.x1] if name == "x" else [label.y0, label.y1]
+    return Bbox([[min(ends["x"]), min(ends["y"])], [max(ends["x"]), max(ends["y"])]])
 
 
 @contextmanager

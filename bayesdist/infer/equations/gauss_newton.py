@@ -117,7 +117,8 @@ def _affine(weight: Float, right: Float) -> Float:
     out = np.full((2, 3), np.nan)
     for axis, pair in ((0, 0), (1, 2)):
         W = weight[pair][:3, :3]
-        if np.linalg.matrix_rank(W, rtol=1e-10) == 3:
+        singular_values = np.linalg.svd(W, compute_uv=False)  # descending
+        if singular_values[-1] > 1e-10 * singular_values[0]:
             out[axis] = np.linalg.solve(W, right[axis][:3])
     return out
 
