@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import replace
+from collections.abc import Iterator, Sequence
 from math import isclose
 
 from bayesdist.data.matches import Matches
@@ -17,12 +16,7 @@ from bayesdist.diagnose.residuals.sample import ExposureScatter
 from bayesdist.diagnose.score.result import ScoreTest
 from bayesdist.infer import LinearFit
 from bayesdist.infer.exposures.frame_choice import frames_that_help
-from bayesdist.infer.posterior.checks import (
-    CHI_SQUARE,
-    RESIDUALS_TOO_LARGE,
-    fit_checks,
-    pixel_doubt,
-)
+from bayesdist.infer.posterior.checks import fit_checks, pixel_doubt
 from bayesdist.utils.checks import EITHER, LARGER, Check
 from bayesdist.utils.limits import (
     CHI2_TOO_LARGE,
@@ -48,7 +42,6 @@ def input_checks(
     reference_sigma: float,
     match_radius: float | None,
     in_circle: bool,
-    false_matches: bool,
     majority: str,
     error_scale: str,
     matched_before: bool,
@@ -68,8 +61,6 @@ def input_checks(
         Radius within which the stars were matched, in the unit of u and v.
     in_circle : bool
         True if the likelihood accounts for the circles that the stars were matched in.
-    false_matches : bool
-        True if a posterior explains residuals that are too large by false matches.
     majority : str
         Sentence on most pairs being false; empty if they are not.
     error_scale : str
@@ -80,9 +71,7 @@ def input_checks(
     rows, chooser : str
         As `things` and `chooser` of `bayesdist.infer.posterior.checks.fit_checks`.
     """
-    yield from fit_checks(
-        fit, in_circle=in_circle, false_matches=false_matches, things=rows, chooser=chooser
-    )
+    yield from fit_checks(fit, things=rows, chooser=chooser)
     if doubt := pixel_doubt(fit):
         yield Check(FIT, "Size of a pixel", level="warn", sentence=doubt)
     suspicious = bool(majority or error_scale)
@@ -111,26 +100,6 @@ def input_checks(
     yield from matching_checks(match_radius, reference_sigma, in_circle=in_circle)
     if matched_before:
         yield from repeated_star_checks(table)
-
-
-def with_causes(checks: Iterable[Check], findings: Sequence[str]) -> tuple[Check, ...]:
-    """Checks of the input, without the advice to change errors if there are other `findings`.
-
-    Residuals that are larger than the quoted errors say nothing about these errors if the model
-    does not describe the positions.
-    """
-    if not findings:
-        return tuple(checks)
-    others = (
-        f"the model does not describe all positions ({', '.join(findings)}): follow that advice "
-        "before the errors are changed"
-    )
-    return tuple(
-        replace(check, sentence=check.sentence.replace(RESIDUALS_TOO_LARGE, others))
-        if check.name == CHI_SQUARE
-        else check
-        for check in checks
-    )
 
 
 def repeated_star_checks(table: Matches) -> Iterator[Check]:

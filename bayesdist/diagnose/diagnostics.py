@@ -18,7 +18,6 @@ from bayesdist.diagnose.checks import (
     outlying_checks,
     score_checks,
     structure_checks,
-    with_causes,
 )
 from bayesdist.diagnose.correlated import Discrepancy, DiscrepancyPriors, estimate_discrepancy
 from bayesdist.diagnose.holdout.validation import HoldoutValidation
@@ -57,6 +56,7 @@ from bayesdist.infer import Compute, GaussianPriors, LinearFit, Posterior, Shard
 from bayesdist.infer.catalogue.star_errors import StarCovariance, StarErrors, star_covariance
 from bayesdist.infer.equations.scaled import one_thread
 from bayesdist.infer.exposures.chip_offsets import Settling
+from bayesdist.infer.posterior.checks import ChiSquare
 from bayesdist.infer.stars.likelihood import Likelihood
 from bayesdist.infer.stars.loading import opened
 from bayesdist.utils.arguments import takes
@@ -94,8 +94,10 @@ class Diagnostics:
         Area of each chip that the stars cover.
     sample : StarSample
         All stars, or a sample of very many, with their residuals and probabilities.
+    chi_square : ChiSquare
+        Chi-square of the fit with the quoted errors.
     input_checks : tuple of Check
-        Checks of the fit, the frames, the quoted errors and the matching.
+        Other checks of the fit, the frames, the quoted errors and the matching.
     dates : ndarray, shape (T,)
         Distinct dates of the stars in decimal years, ascending; empty without dates.
     majority : str
@@ -135,6 +137,7 @@ class Diagnostics:
     misfits: tuple[Misfit, ...]
     coverage: tuple[Coverage, ...]
     sample: StarSample
+    chi_square: ChiSquare
     input_checks: tuple[Check, ...]
     dates: Float
     majority: str = ""
@@ -187,7 +190,7 @@ class Diagnostics:
             findings.append("exposures that deviate far more than the others")
         if self.majority:
             findings.append("more false than true pairs")
-        return with_causes(self.input_checks, findings)
+        return self.chi_square.check(findings), *self.input_checks
 
     @property
     def checks(self) -> tuple[Check, ...]:
@@ -413,7 +416,6 @@ def diagnose_fit(
         reference_sigma=sigma,
         match_radius=match_radius,
         in_circle=in_circle,
-        false_matches=explained_by_false_matches(posterior, sigma),
         majority=majority,
         error_scale=error_scale,
         matched_before=matched_before,
@@ -437,6 +439,9 @@ def diagnose_fit(
             )
         ),
         sample=sample,
+        chi_square=ChiSquare(
+            fit.chi2, fit.dof, in_circle, explained_by_false_matches(posterior, sigma)
+        ),
         input_checks=tuple(checks),
         dates=dates_of(stars if stars.in_memory else table),
         majority=majority,

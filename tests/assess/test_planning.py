@@ -1,10 +1,12 @@
 """Exposures that a requirement needs: by closed forms, and by fits of so many."""
 
 import numpy as np
+import pytest
 from scipy import stats
 
 from bayesdist.assess import Requirement, UserTerm, check_requirements
 from bayesdist.assess.model import error_model
+from bayesdist.assess.planning.dithers import further_dithers
 from bayesdist.assess.planning.exposures import MOST, Schedule, exposures_needed
 from bayesdist.assess.planning.futures import (
     TRUTHS,
@@ -19,7 +21,11 @@ from bayesdist.infer.compare.planning import (
     exposure_information,
     with_information,
 )
+from bayesdist.infer.selfcal.mode import of_first
+from tests.diagnose.correlated.test_selfcal import solution_of
 from tests.infer.compare.test_planning import SIGMA, model_of, stars
+from tests.infer.selfcal.fields import field
+from tests.reduced import case_in_full
 
 
 def judge(requirement, **options):
@@ -181,3 +187,33 @@ def test_scatters_follow_from_deviations_as_bayes_theorem_has_it():
         assert abs(precision.std() / precision.mean() / np.sqrt(2 / 40) - 1) < 0.1
     # the mean of 40 / chi-square of 40 is 40 / 38, its scatter 0.25
     assert abs(np.mean(means) - 40 / 38) < 4 * 0.25 / np.sqrt(150)
+
+
+@pytest.mark.parametrize("seed", [1, case_in_full(3, instead="another seed is run")])
+def test_further_dithers_say_what_exposures_that_are_simulated_do(seed):
+    """Of the same field, 38 exposures in place of 6: more than 38 / 6 times the information."""
+    few, many = (
+        solution_of(field(seed + k, n, sigma=0.02, n_stars=2000)) for k, n in ((0, 6), (100, 38))
+    )
+    n = few.problem.model.n_distortion
+    free = [mode.free[mode.free < n] for mode in (few, many)]
+    at = np.ix_(*[np.intersect1d(*free)] * 2)
+
+    def rms(information):
+        return np.sqrt(np.trace(np.linalg.inv(information[at])))
+
+    # exposures see as many stars in either
+    density = len(few.problem) / 6 / (len(many.problem) / 38)
+    simulated = rms(density * many.distortion_information)
+    several = further_dithers(few, seed)
+    now = of_first(few.expansion.curvature, few.free, few.problem.model.n_params)
+    predicted = [rms(of_first(now + one.information(32), few.free, n)) for one in several]
+    assert abs(np.median(predicted) / simulated - 1) < 0.12
+    assert np.ptp(predicted) > 0.01 * simulated
+    assert rms(few.distortion_information * 38 / 6) > 1.15 * simulated
+    # between the numbers for which it is computed, and beyond them
+    low, middle, high = (several[0].information(k)[at] for k in (16, 24, 32))
+    np.testing.assert_allclose(middle, (low + high) / 2, atol=1e-9 * np.abs(high).max())
+    assert (
+        np.linalg.eigvalsh(several[0].information(200)[at] - several[0].information(64)[at]) > 0
+    ).all()

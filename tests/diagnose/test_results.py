@@ -105,7 +105,7 @@ def test_too_few_stars_are_not_asked():
 def test_remedies_name_what_to_do():
     found = Scene(600, 11, n_exposures=3).with_pattern(1, polynomial(12, 0.05, 1))
     assert found["order 12"].significant and found["order 12"].remedy == "raise model.order to 12"
-    assert found["order 13"].remedy == "fit a look-up table"
+    assert found["order 13"].remedy == "fit a look-up table in a campaign"
     assert "terms of order 12" in found["order 12"].finding
     assert "hierarchy of deviations" in found["exposures"].remedy
     assert found["order 12"].unit == "pix"

@@ -27,7 +27,7 @@ from bayesdist.diagnose.residuals.sample import star_sample
 from bayesdist.diagnose.residuals.star_sums import flagged_by_exposure, star_sums
 from bayesdist.infer.convergence import Convergence, Limits
 from bayesdist.infer.posterior import Posterior, SamplerInfo
-from bayesdist.infer.posterior.checks import fit_checks, sampling_checks
+from bayesdist.infer.posterior.checks import ChiSquare, fit_checks, sampling_checks
 from bayesdist.infer.solution.linear import LinearFit, fit_linear, residuals
 from bayesdist.infer.stars.loading import load
 from bayesdist.infer.stars.mixture import OutlierMixture
@@ -279,7 +279,11 @@ def report_input(
             ),
             Product("maps.fits", "uncertainty maps"),
         ),
-        checks=(*sampling_checks(posterior), *fit_checks(fit)),
+        checks=(
+            *sampling_checks(posterior),
+            ChiSquare(fit.chi2, fit.dof).check(),
+            *fit_checks(fit),
+        ),
         magnitude_errors=estimate(mag, *residual.T),
         flagged=None if posterior is None else flagged_by_exposure(shards, posterior),
         provenance={

@@ -18,8 +18,13 @@ from bayesdist.data.detections import Detections
 from bayesdist.errors import InputError
 from bayesdist.infer.compare.frame_fields import mean_squares
 from bayesdist.infer.equations.priors import Prior
-from bayesdist.infer.selfcal.expected import ExpectedSolution, expected_solution
+from bayesdist.infer.selfcal.expected import (
+    ExpectedSolution,
+    expected_curvature,
+    expected_solution,
+)
 from bayesdist.infer.selfcal.gauge import SAME_ROLL
+from bayesdist.infer.selfcal.mode import SelfCalibrationMode, of_first
 from bayesdist.infer.selfcal.prior import (
     frame_prior,
     pointing_prior,
@@ -39,6 +44,10 @@ MOST_LOOKED_FOR = 5e8  # stars of that sky times exposures of all patterns
 SHORT = 0.25  # of the detector's side: the scales above it are not sampled
 SKEWS = ("skew_plus", "skew_cross")
 MOST = 4  # parameters that are named
+MOST_FURTHER = 64  # exposures whose information is computed: a power of 2
+MOST_DETECTIONS = 15_000  # of all of these
+WAYS = 5  # in which they may be dithered
+SMOOTHING = 0.5  # of the scatter of offsets, by which further ones differ from those at hand
 
 
 @dataclass(frozen=True, eq=False)
@@ -332,3 +341,111 @@ def nearly_free(found: PlannedPattern) -> str:
         f"nearly free: combinations led by {', '.join(list(led)[:MOST])}{more}, up to "
         f"{weakest[:, 0].max():.2g} pix at the edge"
     )
+
+
+@dataclass(frozen=True, eq=False)
+class FurtherDithers:
+    """Information of further exposures about the parameters of a self-calibration.
+
+    It is more than the number of exposures times that of one of those at hand: stars that were seen
+    before lie where they lie, others are seen for a second time, and pointings that lie farther
+    apart tell what small offsets leave nearly free.  By stars that are better known the frames of
+    the exposures at hand are, too.  So it is computed, for further exposures with
+    offsets and rolls as those at hand have, over a field of stars that is as dense.
+    """
+
+    mode: SelfCalibrationMode
+    offsets: Float  # (E + MOST_FURTHER, 2) of all exposures, in the unit of u and v
+    rolls: Float  # (E + MOST_FURTHER,) in radians
+    seed: int
+
+    def information(self, n: int) -> Float:
+        """Information (D, D) of n further exposures; beyond `MOST_FURTHER` it is linear in n."""
+        number, values = self._known
+        above = min(max(int(np.searchsorted(number, n)), 1), len(number) - 1)
+        low, high = number[above - 1], number[above]
+        return values[above - 1] + (n - low) / (high - low) * (values[above] - values[above - 1])
+
+    @cached_property
+    def _known(self) -> tuple[Int, list[Float]]:
+        """Numbers of further exposures, 0 and powers of 2, and their information."""
+        mode, E = self.mode, len(self.mode.problem.model.exposures)
+        number = np.concatenate([[0], 2 ** np.arange(MOST_FURTHER.bit_length())])
+        model, theta, sky = self._field
+        seen = stars_on_detector(model, theta, sky)
+        expected = [self._expected(seen, E + int(n)) for n in number]
+        # of as many detections as there are, with their errors
+        D = mode.problem.model.n_params
+        scale = np.trace(of_first(mode.expansion.curvature, mode.free, D)) / np.trace(expected[0])
+        return number, [scale * (one - expected[0]) for one in expected]
+
+    @cached_property
+    def _field(self) -> tuple[DistortionModel, Float, Float]:
+        """Model and parameters of all exposures, and positions (S, 2) of stars."""
+        mode, problem = self.mode, self.mode.problem
+        n = len(self.offsets)
+        model = replace(problem.model, exposures=tuple(f"e{k:04d}" for k in range(n)))
+        theta = np.zeros(model.n_params)
+        theta[: model.n_global] = mode.theta[: model.n_global]
+        for e in range(1, n):
+            values = dict(zip(("shift_u", "shift_v"), self.offsets[e], strict=True))
+            values["rotation"] = self.rolls[e]
+            names = model.free_frame_names(e)
+            theta[model.frame_slice(e)] = [values.get(name, 0.0) for name in names]
+        low, high = sky_seen(model, theta)
+        per_exposure = min(len(problem) / len(problem.model.exposures), MOST_DETECTIONS / n)
+        area = sum(float(np.prod(chip.size)) for chip in model.chips) * problem.pixel**2
+        rng = np.random.default_rng([self.seed, 7])
+        count = int(per_exposure * np.prod(high - low) / area)
+        return model, theta, low + rng.uniform(size=(count, 2)) * (high - low)
+
+    def _expected(self, seen: tuple[Float, Float, Int, Int, Int], n: int) -> Float:
+        """Information (D, D) of the first n exposures by the stars that they have seen."""
+        whole, theta, _ = self._field
+        model = replace(whole, exposures=whole.exposures[:n])
+        x, y, exposure, chip, star = seen
+        rows = exposure < n
+        detections = Detections(
+            x[rows],
+            y[rows],
+            exposure[rows],
+            model.exposures,
+            chip[rows],
+            sigma=np.full(np.count_nonzero(rows), self.mode.error),
+            star=star[rows],
+        )
+        curvature = expected_curvature(model, theta[: model.n_params], detections)
+        # the gauge holds what it holds at present
+        D = self.mode.problem.model.n_params
+        return of_first(curvature, np.append(self.mode.free, np.arange(D, model.n_params)), D)
+
+
+def further_dithers(mode: SelfCalibrationMode, seed: int) -> list[FurtherDithers]:
+    """Several ways in which further exposures of a self-calibration may be dithered.
+
+    Offsets are those at hand at random, smoothed without a change of their variance, and rolls are
+    those at hand in turn.  The list is empty for fewer than three exposures, for stars that move or
+    are known beforehand, and for distortions that depend on time.
+    """
+    problem = mode.problem
+    model, E = problem.model, len(problem.model.exposures)
+    if E < 3 or model.time is not None or problem.n_star > 2 or problem.priors.informed.any():
+        return []
+    frames = np.zeros((E, 3))
+    for e in range(1, E):
+        of_exposure = mode.theta[model.frame_slice(e)]
+        known = dict(zip(model.free_frame_names(e), of_exposure, strict=True))
+        frames[e] = [known.get(name, 0.0) for name in ("shift_u", "shift_v", "rotation")]
+    offsets, rolls = frames[:, :2], frames[:, 2]
+    middle, scatter = offsets.mean(axis=0), np.cov(offsets.T)
+    # rolls alone, or dithers along a line, have no scatter in some direction
+    root = np.linalg.cholesky(scatter + 1e-9 * (np.trace(scatter) + 1e-300) * np.eye(2))
+    rng, out = np.random.default_rng([seed, 6]), []
+    for k in range(WAYS):
+        more = np.sqrt(E / (E - 1)) * (offsets[rng.integers(E, size=MOST_FURTHER)] - middle)
+        more += SMOOTHING * rng.standard_normal((MOST_FURTHER, 2)) @ root.T
+        more = middle + more / np.sqrt(1 + SMOOTHING**2)
+        turned = np.resize(rng.permutation(rolls), MOST_FURTHER)
+        every = np.concatenate([offsets, more]), np.concatenate([rolls, turned])
+        out.append(FurtherDithers(mode, *every, seed + k))
+    return out

@@ -4,7 +4,8 @@ What more data would show is not known, but today's posterior says how probable 
 drawn from it; for each of them the error model is predicted that a run with the exposures at hand
 and further ones would have, and the requirement is judged by it:
 
-- coefficients: their information is that of all exposures.
+- coefficients: their information is that of all exposures.  In a self-calibration each star takes
+  up one of its detections: further exposures of the same stars say more than those at hand.
 - structure and curvature of the drift, posterior draws z about a mean m: with rho times today's
   data, the draws are m + rho / (1 + rho) (t - m) + sqrt(rho) / (1 + rho) (e - m) + (z - m) /
   sqrt(1 + rho), where the truth t and the noise e are themselves draws.  This is the posterior of a
@@ -12,8 +13,10 @@ and further ones would have, and the requirement is judged by it:
   seen, the prior of the size is nearly flat in its logarithm, and all sizes shrink alike.  Several
   exposures of one date do not show how a drift bends, and leave its curvature as it is.
 - scatter of exposures: its draws are weighted by the likelihood of deviations that are drawn with
-  the scatter of the truth.  Their effect on the mean of the exposures falls as its root; the
-  deviation of a single exposure does not.
+  the scatter of the truth.  Their effect on the mean of the exposures falls as the root of the
+  number of exposures (in a self-calibration, as the variance of the solution times that root).
+  The deviation of a single exposure stays as large as it is: it only becomes better known, so that
+  a limit that is too small for it is never met, and of few exposures nobody knows whether it is.
 - everything else, as what is stated of a catalogue, stays as it is.
 """
 
@@ -41,6 +44,7 @@ from bayesdist.assess.units import convert
 from bayesdist.diagnose.correlated.deviations import LINEAR, SCATTERS, LinearDeviations
 from bayesdist.diagnose.correlated.exposure_fields import QUADRATIC
 from bayesdist.errors import required
+from bayesdist.infer.compare.frame_fields import mean_squares
 from bayesdist.infer.equations.scaled import one_thread
 from bayesdist.infer.solution.solution import Solution
 from bayesdist.utils.arrays import Bool, Float, Int
@@ -64,11 +68,15 @@ class Data:
         u and v.
     n_stars : float
         Stars in an average exposure.
+    gain : float
+        Information of a further exposure about the distortion, relative to the average one at hand:
+        of the same stars in a self-calibration it is larger, as these take up detections once.
     """
 
     n_exposures: int
     weight: float
     n_stars: float
+    gain: float = 1.0
 
 
 def with_more_data(z: Float, rho: float, truth: int, noise: int) -> Float:
@@ -168,24 +176,39 @@ class Futures:
 
         `truths` (t,) are numbers below `TRUTHS`.
         """
-        more = self.solution(n * schedule.information)
-        solution = replace(self.errors.solution, solution=more)
-        solution = replace(solution, without=None, catalogue=())
-        drawn = solution.draw(DRAWS, np.random.default_rng([self.seed, 1]))
-        coefficients = [self._evaluated(drawn, place.positions) for place in self._places]
+        rho = n / self.data.n_exposures
+        several = [self._of_solution(information) for information in schedule.of(n)]
+        # deviations of exposures move the solution by its variance times their sum
+        means = [1 / np.sqrt(1 + rho)] * len(several)
+        if schedule.together:
+            now = self._of_solution(0 * schedule.of(n)[0]).variance
+            means = [np.sqrt(1 + rho) * one.variance / now for one in several]
+        of_bends = 0.0 if schedule.single_date else rho
         reached = [
-            self._probability(coefficients, n, int(k), single_date=schedule.single_date)
-            for k in truths
+            self._probability(several[k % len(several)], means[k % len(several)], n, of_bends, k)
+            for k in truths.tolist()
         ]
         return np.array(reached) >= self.requirement.probability
 
+    def _of_solution(self, information: Float) -> _SolutionErrors:
+        """Errors of the parameters with additional information about them."""
+        more = self.solution(information)
+        solution = replace(self.errors.solution, solution=more, without=None, catalogue=())
+        drawn = solution.draw(DRAWS, np.random.default_rng([self.seed, 1]))
+        square = mean_squares(more.model) * np.diag(more.cov)[: more.model.n_polynomial]
+        errors = [self._evaluated(drawn, place.positions) for place in self._places]
+        return _SolutionErrors(errors, float(square.sum()))
+
     def _probability(
-        self, coefficients: Sequence[Float], n: int, truth: int, *, single_date: bool
+        self, solution: _SolutionErrors, mean: float, n: int, of_bends: float, truth: int
     ) -> float:
-        """Probability of meeting the limit that a run would state for a truth."""
+        """Probability of meeting the limit that a run would state for a truth.
+
+        `mean` is the size of what the mean of the exposures' deviations does, relative to today,
+        and `of_bends` the amount of further data on the curvature of a drift.
+        """
         rho = n / self.data.n_exposures
-        of_bends = 0.0 if single_date else rho
-        rhos = [of_bends if bends else rho for bends in self._bends]
+        rhos = [of_bends if bends else self.data.gain * rho for bends in self._bends]
         rng = np.random.default_rng([self.seed, 2, truth])
         true, noise = rng.integers(DRAWS, size=2)
         # the scatter of the stars is known as well as they are many
@@ -193,15 +216,15 @@ class Futures:
         width = np.exp(rng.standard_normal() * np.sqrt(np.sum(0.5 / stars)))
         chosen = [one.chosen(n, self.data, true, rng) for one in self._scattering]
         values = []
-        for place, of_solution in zip(self._places, coefficients, strict=True):
+        for place, of_solution in zip(self._places, solution.errors, strict=True):
             error = width * of_solution
             for z, more in zip(place.resolved, rhos, strict=True):
                 error += with_more_data(z, more, true, noise)
             for one, (in_mean, own), rows in zip(
                 self._scattering, place.scattering, chosen, strict=True
             ):
-                more = of_bends if one.bends else rho
-                error += in_mean[rows] / np.sqrt(1 + more) + own[rows]
+                size = 1 / np.sqrt(1 + of_bends) if one.bends else mean
+                error += size * in_mean[rows] + own[rows]
             values.append([place.values(error + r) / place.limit for r in place.unchanged])
         worst = np.max(values, axis=0)  # (ways, DRAWS), over the epochs
         return float(np.mean(worst <= 1.0, axis=1).min())
@@ -273,6 +296,14 @@ class Futures:
         shape = DRAWS, positions.size, 2
         normal = np.random.default_rng([self.seed, 4]).standard_normal(shape)
         return drawn.errors(positions)(slice(0, DRAWS), normal)
+
+
+@dataclass(frozen=True, eq=False)
+class _SolutionErrors:
+    """Errors of the parameters of a solution."""
+
+    errors: Sequence[Float]  # (DRAWS, N, 2) at each place
+    variance: float  # mean square over the detector, of the polynomials
 
 
 @dataclass(frozen=True, eq=False)

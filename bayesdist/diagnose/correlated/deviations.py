@@ -47,7 +47,7 @@ LINEAR = {
 }
 SCATTERS = {"shift": "shift", "rotation": "rotation", "scale": "shape", "shear": "shape"}
 CURVATURE = "curvature"
-MAX_EXPOSURES = 40
+MAX_EXPOSURES = 40  # whose deviations are estimated; of more, so many stand for all
 # steps in each amplitude, by the number of scatters: first to find where the density is, then only
 # there
 COARSE, REFINED = (12, 8, 6, 5), (30, 18, 11, 6)
@@ -133,8 +133,10 @@ class DeviationColumns:
     # chip (by code), axis and basis function that is curved in time
     terms: tuple[tuple[int, int, int], ...]
     scatter: NDArray[np.str_]  # name (n,) of the scatter that each coefficient has
-    of_group: Int  # exposure (G,) of each group of stars, from 0
-    n_exposures: int
+    # exposure (G,) of each group of stars, from 0; -1 for those whose deviations are not estimated
+    of_group: Int
+    n_exposures: int  # whose deviations are estimated
+    n_all: int  # exposures with those among them that others stand for
     middle: float  # zero of time; NaN without terms
     size: float  # half the longer side of a chip, in the unit of u, v
     # code, epoch (n_exposures,): of each exposure, and its date in decimal years
@@ -160,6 +162,8 @@ class DeviationColumns:
         Exposures deviate about `centre` (2,); `phi` (C, K) is the model's basis at the stars.
         """
         own = _deviations(self.positions(chip, epoch, phi) - centre, self.kinds, self.size)
+        if self.of_group[g] < 0:
+            own = own[:, :, :0]
         columns = int(self.of_group[g]) * own.shape[2] + np.arange(own.shape[2])
         here = [k for k, term in enumerate(self.terms) if term[0] == chip]
         out = np.zeros((len(phi), 2, len(here)))
@@ -183,14 +187,26 @@ def deviation_columns(
 
     `counts` (G,) is the number of stars of each group.  Single exposures deviate only if
     `exposures`; not where a hierarchy of them has been fitted.  None where nothing can deviate:
-    without a drift for a single exposure, and for more than `most`, whose scatter averages out.
+    without a drift for a single exposure.
+
+    The deviations of at most `most` exposures are estimated.  Where there are more, these stand for
+    all, and are at most half of them: the polynomials follow the mean of all exposures, those
+    chosen among them, and the others are not told from it.
     """
     keys = np.column_stack([groups.exposure, groups.epoch])
     distinct, of_group = np.unique(keys, axis=0, return_inverse=True)
-    n_exposures = len(distinct)
+    n_all = n_exposures = len(distinct)
     kinds = tuple(k for k, fitted in KINDS.items() if model.frames not in fitted)
-    if n_exposures < 2 or n_exposures > most or not exposures:
+    if n_all < 2 or not exposures:
         kinds = ()
+    chosen = np.arange(n_all)
+    if kinds and n_all > most:
+        n_exposures = min(most, n_all // 2)
+        # at random in intervals of one length, so that all dates are among them
+        uniform = np.random.default_rng(n_all).uniform(size=n_exposures)
+        chosen = ((np.arange(n_exposures) + uniform) * n_all / n_exposures).astype(int)
+    number = np.full(n_all, -1)
+    number[chosen] = np.arange(n_exposures)
     per_exposure = [SCATTERS[k] for k in kinds for _ in LINEAR.get(k, "uv")]
     terms = _bending(model)
     scatter = np.array([*per_exposure * n_exposures, *[CURVATURE] * len(terms)])
@@ -202,12 +218,13 @@ def deviation_columns(
         kinds=kinds,
         terms=terms,
         scatter=scatter,
-        of_group=of_group.ravel(),
+        of_group=number[of_group.ravel()],
         n_exposures=n_exposures,
+        n_all=n_all,
         middle=float(np.average(groups.epoch, weights=counts)) if terms else np.nan,
         size=model.pixel_size(theta) * max(max(c.size) for c in model.chips) / 2,
-        code=distinct[:, 0].astype(np.int64),
-        epoch=distinct[:, 1],
+        code=distinct[chosen, 0].astype(np.int64),
+        epoch=distinct[chosen, 1],
     )
 
 
@@ -321,7 +338,7 @@ def deviation_draws(
     grids = _where_it_counts(grids, weights(grids).max(axis=0))
     weight = weights(grids)
     counts = rng.multinomial(n, (weight / weight.sum()).ravel())
-    drawn, sizes, times = [], [], []
+    drawn, followed, sizes, times = [], [], [], []
     combinations = product(range(len(roots)), product(*grids))
     for (k, amplitude), m in zip(combinations, counts, strict=True):
         if m:
@@ -329,27 +346,57 @@ def deviation_draws(
             z = z[:, None] + rng.standard_normal((total, m))
             z = scipy.linalg.solve_triangular(factor, z, trans=1, lower=True)
             drawn.append((roots[k].matrix @ (spread[:, None] * z)).T)
+            followed.append(
+                drawn[-1] + _of_all_exposures(columns, roots[k], spread, loose, drawn[-1], rng)
+            )
             sizes.append(np.tile(amplitude, (m, 1)))
             times.append(np.full(m, roots[k].time))
     order = rng.permutation(n)
     coefficients, amplitudes = np.concatenate(drawn)[order], np.concatenate(sizes)[order]
+    of_fit = np.concatenate(followed)[order]
     per = columns.n_of_exposures // max(columns.n_exposures, 1)
     wrong = loose[: columns.n_of_exposures].reshape(columns.n_exposures, -1).any(axis=1)
     return LinearDeviations(
         model=columns.model,
         # the fit absorbs a deviation; the truth lies on the other side
-        theta=-coefficients @ taken.T,
+        theta=-of_fit @ taken.T,
         terms=columns.terms,
         curvature=(curvature := coefficients[:, columns.n_of_exposures :] * columns.size),
         epoch=columns.middle,
         scatter={name: amplitudes[:, k] for k, name in enumerate(names)},
-        n_exposures=columns.n_exposures,
+        n_exposures=columns.n_all,
         kinds=columns.kinds,
         size=columns.size,
         outlying=tuple(int(code) for code in columns.code[wrong]) if per else (),
         correlation_time=float(np.median(np.concatenate(times))),
         bend=_bend(columns, curvature),
     )
+
+
+def _of_all_exposures(
+    columns: DeviationColumns,
+    root: _Root,
+    spread: Float,
+    loose: Float,
+    drawn: Float,
+    rng: np.random.Generator,
+) -> Float:
+    """What turns draws (m, n) of coefficients into those that the parameters follow.
+
+    It is 0 where the deviations of all exposures were estimated.  Where some exposures stand for
+    all, these say nothing of the mean of all, and the parameters follow deviations that are drawn
+    anew, as many times larger as the mean of all exposures varies more than the sum of a part of
+    it.  Exposures that went wrong are not typical, and stay as they were drawn.
+    """
+    out, n = np.zeros_like(drawn), columns.n_of_exposures
+    if columns.n_all == columns.n_exposures or not n:
+        return out
+    times = columns.n_all / columns.n_exposures
+    if root.time == 0:  # independent deviations add in squares
+        times = np.sqrt(times)
+    anew = root.matrix[:n, :n] @ (spread[:n, None] * rng.standard_normal((n, len(drawn))))
+    out[:, :n] = np.where(loose[:n] > 0, 0.0, times * anew.T - drawn[:, :n])
+    return out
 
 
 def _bend(columns: DeviationColumns, curvature: Float) -> float:

@@ -10,7 +10,7 @@ from operator import add
 import numpy as np
 
 from bayesdist.data.matches import Matches
-from bayesdist.diagnose.correlated.deviations import MAX_EXPOSURES, linear_deviations
+from bayesdist.diagnose.correlated.deviations import linear_deviations
 from bayesdist.diagnose.correlated.exposure_fields import detection_scores, exposure_fields
 from bayesdist.diagnose.correlated.exposure_time import correlated_hierarchy
 from bayesdist.diagnose.correlated.functions import StructureFunctions
@@ -104,7 +104,8 @@ def estimate_discrepancy(
     """
     model, likelihood = solution.model, likelihood_of(solution)
     priors = priors or DiscrepancyPriors()
-    apart = exposures and stars is not None and model.frames == "none" and _several(stars)
+    several = stars is not None and len(stars.exposure_names) > 1
+    apart = exposures and several and model.frames == "none"
     if stars is not None and apart:
         sums = _by_exposure(stars, likelihood, model)
     else:
@@ -183,11 +184,6 @@ def _dates_of_exposures(information: Information) -> Float:
     out = np.full(len(information.model.exposures), np.nan)
     out[groups.exposure] = groups.epoch
     return out
-
-
-def _several(stars: Matches) -> bool:
-    """True for matches of several exposures, few enough that each may deviate."""
-    return 1 < len(stars.exposure_names) <= MAX_EXPOSURES
 
 
 def _by_exposure(

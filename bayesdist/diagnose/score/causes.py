@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 from bayesdist.utils.distributions import f_sf
 
-POINTING_CHANCE = 0.01  # with which random terms of single exposures are taken for a curved sky
+LEADING_CHANCE = 0.01  # with which a few of many functions are taken for the cause of all
 OF_FIELD = ("orders", "edges", "jumps", "rings", "repeating pattern")
 OF_NOISE = ("noise by position", "noise by axis")
 OF_EXPOSURES = ("noise by exposure", *OF_NOISE)
@@ -32,7 +32,7 @@ CAUSES: dict[str, Cause] = {
     "matching": Cause("the match radius", ("shape", *OF_FIELD, *OF_NOISE)),
     "shape": Cause("the shape of the residuals", (*OF_FIELD, *OF_NOISE, "noise by magnitude")),
     "cut-off positions": Cause("positions that were cut off", OF_FIELD),
-    # a cause only if it explains more than deviations of single exposures do: see `is_pointing`
+    # a cause only if it explains more than deviations of single exposures do: see `explains_more`
     "pointing": Cause(
         "the curved sky",
         ("second order of exposures", "fields of exposures", "exposures", *OF_EXPOSURES),
@@ -42,6 +42,10 @@ CAUSES: dict[str, Cause] = {
     ),
     "fields of exposures": Cause(
         "fields that differ between exposures", ("pointing", *OF_EXPOSURES)
+    ),
+    # a cause only if it explains more than missing orders do
+    "edges": Cause(
+        "what rises towards the edges", ("orders", "jumps", "repeating pattern", *OF_NOISE)
     ),
     "exposures in time": Cause(
         "deviations of exposures that are correlated in time", ("curvature in time",)
@@ -72,16 +76,17 @@ def cause_of(names: Collection[str], found: Collection[str]) -> str:
     return ""
 
 
-def is_pointing(pointing: tuple[float, float], single: tuple[float, float]) -> bool:
-    """True if a dependence on the pointing explains more than deviations of single exposures.
+def explains_more(one: tuple[float, float], other: tuple[float, float]) -> bool:
+    """True if a few functions explain more, for their number, than the many others of a test.
 
     Terms that differ from exposure to exposure at random go with the pointing to some extent. A
-    curved sky puts all of the deviations into the few functions of the pointing.
+    curved sky puts all of the deviations into the few functions of the pointing.  Missing orders
+    rise towards the edges, and what is confined to the edges is spread over many orders.
 
     Parameters
     ----------
-    pointing, single : tuple of float
+    one, other : tuple of float
         Statistic and degrees of freedom of both tests.
     """
-    ratio = (pointing[0] / pointing[1]) / (single[0] / single[1])
-    return bool(f_sf(ratio, pointing[1], single[1]) < POINTING_CHANCE)
+    ratio = (one[0] / one[1]) / (other[0] / other[1])
+    return bool(f_sf(ratio, one[1], other[1]) < LEADING_CHANCE)

@@ -18,15 +18,21 @@ import numpy as np
 from numpy.polynomial import legendre
 
 from bayesdist.diagnose.clusters import sums_over
-from bayesdist.diagnose.score.result import Family, Outcome, outcome, smallest_pattern
+from bayesdist.diagnose.score.result import (
+    LOOK_UP_TABLE,
+    Family,
+    Outcome,
+    outcome,
+    smallest_pattern,
+)
 from bayesdist.diagnose.score.sample import ScoredSample
 from bayesdist.diagnose.significance import chi_square_of, hotelling_p
 from bayesdist.utils.arrays import Float, Int
 
 JUMPS = Family(
     "jumps",
-    "fit the parts on both sides separately, correct the offset between them, or fit a look-up "
-    "table; a higher order does not help",
+    "fit the parts on both sides separately, correct the offset between them, or "
+    f"{LOOK_UP_TABLE}; a higher order does not help",
     "",
     "the residuals do not jump at any column or row",
     explained_by="orders",

@@ -36,6 +36,7 @@ MIN_DETECTIONS = 4  # of a star: of fewer nothing is left
 MIN_STARS = 100
 SHORTEST = 0.1  # years in which motions are looked for
 MAX_TAKEN = 0.95  # of one detection, by position and slope
+FARTHEST = 5.0  # errors of a true match along an axis
 MOVING = 1e-6  # of the determinant of the slope's information, that the position leaves
 
 
@@ -58,7 +59,8 @@ def motion_test(sample: ScoredSample) -> Outcome | None:
     """
     if sample.epoch is None or np.ptp(sample.epoch) < SHORTEST:
         return None
-    uu, uv, vv = sample.curvature
+    score, curvature = _of_true_matches(sample)
+    uu, uv, vv = curvature
     stated = None
     if sample.motion_sigma is not None:
         stated = np.zeros((int(sample.star.max()) + 1, 2))
@@ -66,12 +68,27 @@ def motion_test(sample: ScoredSample) -> Outcome | None:
     residuals = StarResiduals(
         sample.star,
         sample.epoch,
-        sample.whole_score.T,
+        score.T,
         np.moveaxis(np.array([[uu, uv], [uv, vv]]), 2, 0),
         np.zeros(()),
         stated,
     )
     return motion_outcome(residuals, sample.model.unit, MOTIONS)
+
+
+def _of_true_matches(sample: ScoredSample) -> tuple[Float, Float]:
+    """Scores (2, N) and curvatures (3, N), 0 where a detection is far off.
+
+    A mixture takes stars that move for false matches of small scatter, whose scores say nothing of
+    where they are.  Errors that are independent from detection to detection are no motion, however
+    large they are, so that all detections within `FARTHEST` errors count as true.
+    """
+    if sample.mixture is None:
+        return sample.whole_score, sample.curvature
+    near = (sample.residual**2 < FARTHEST**2 * sample.variance).all(axis=0) & sample.used
+    score = near * sample.residual / sample.variance / np.sqrt(1.0 - sample.leverage)
+    u, v = near / sample.variance
+    return score, np.stack([u, np.zeros_like(u), v])
 
 
 def motion_outcome(data: StarResiduals, unit: str, family: Family) -> Outcome | None:

@@ -7,14 +7,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.special import i0e, i1e
 
-from bayesdist.diagnose.score.result import Family, Outcome, outcome
+from bayesdist.diagnose.score.result import LOOK_UP_TABLE, Family, Outcome, outcome
 from bayesdist.diagnose.score.sample import ScoredSample
 from bayesdist.model.grid import cell_index
 from bayesdist.utils.arrays import Bool, Float, Int
 
 REPEATING = Family(
     "repeating pattern",
-    "fit a look-up table with nodes closer than half the period",
+    f"correct the positions for it, or {LOOK_UP_TABLE} with nodes closer than half the period",
     "",
     "no pattern repeats over the detector",
 )

@@ -8,12 +8,12 @@ been found follow from them.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
 
-from bayesdist.diagnose.score.result import Family
+from bayesdist.diagnose.score.result import LOOK_UP_TABLE, Family
 from bayesdist.diagnose.score.sample import ScoredSample
 from bayesdist.model.basis import MAX_ORDER, polynomial_terms
 from bayesdist.model.timedep import TimeDependence
@@ -66,13 +66,13 @@ class Question:
 
 MAGNITUDE = Family(
     "magnitude",
-    "add a magnitude term, cut the faint stars, or correct the charge-transfer efficiency",
+    "cut the faint stars, or correct the charge-transfer efficiency",
     "the residuals go with the magnitude of the stars",
     "the residuals do not go with the magnitude of the stars",
 )
 COLOUR = Family(
     "colour",
-    "add a colour term, or select a narrower range of colours",
+    "select a narrower range of colours, or calibrate ranges of colours one by one",
     "the residuals go with the colour of the stars",
     "the residuals do not go with the colour of the stars",
 )
@@ -84,7 +84,7 @@ POINTING = Family(
 )
 EDGES = Family(
     "edges",
-    "leave out the margins of the detector, or fit a look-up table",
+    f"leave out the margins of the detector, or {LOOK_UP_TABLE}",
     "the residuals rise towards the edges of the detector",
     "the residuals do not rise towards the edges of the detector",
 )
@@ -127,7 +127,7 @@ def order_family(total: int, order: int) -> Family:
     """Words of the test for terms of one total order, of a model that ends at another."""
     return Family(
         f"order {total}",
-        f"raise model.order to {total}" if total <= MAX_ORDER else "fit a look-up table",
+        f"raise model.order to {total}" if total <= MAX_ORDER else LOOK_UP_TABLE,
         f"the residuals hold terms of order {total}, and the model ends at order {order}",
         f"no terms of order {total} are left in the residuals",
         group="orders",
@@ -143,11 +143,7 @@ def questions(sample: ScoredSample) -> Iterator[Question]:
         terms = polynomial_terms(total)[len(polynomial_terms(total - 1)) :]
         yield Question(order_family(total, order), (Products(terms),))
     if sample.mag is not None:
-        family = MAGNITUDE
-        if not sample.has_catalogue:  # whose model has no magnitude terms
-            remedy = "cut the faint stars, or correct the charge-transfer efficiency"
-            family = replace(MAGNITUDE, remedy=remedy)
-        yield Question(family, (Products(LINEAR, _standing_out(sample.mag)),))
+        yield Question(MAGNITUDE, (Products(LINEAR, _standing_out(sample.mag)),))
     if sample.offset is not None and sample.position is not None:
         # to first order, what a curved sky makes of the tangent planes of exposures
         p, q = sample.position

@@ -10,7 +10,7 @@ from typing import Literal
 import numpy as np
 from scipy import special
 
-from bayesdist.diagnose.score.causes import CAUSES, cause_of, is_pointing
+from bayesdist.diagnose.score.causes import CAUSES, cause_of, explains_more
 from bayesdist.diagnose.significance import holm
 from bayesdist.utils.checks import LARGER
 from bayesdist.utils.distributions import chi2_isf, f_isf
@@ -21,6 +21,7 @@ HeldBy = Literal[
     "", "noise", "structure", "exposures", "curvature", "second order", "exposure fields", "time"
 ]
 
+LOOK_UP_TABLE = "fit a look-up table in a campaign"  # remedy: other runs have none
 POWER = 0.9  # with which the smallest effect that is stated would have been found
 
 
@@ -199,9 +200,15 @@ def _causes(significant: Mapping[str, Family], outcomes: Sequence[Outcome]) -> d
     by_name = {one.name: (one.statistic, one.dof) for one in outcomes}
     singles = ("second order of exposures", "exposures")
     single = [by_name[name] for name in singles if name in significant]
-    if "pointing" not in significant or all(is_pointing(by_name["pointing"], s) for s in single):
-        return dict(significant)
-    return {name: family for name, family in significant.items() if name != "pointing"}
+    orders = [by_name[one.name] for one in outcomes if one.family.group == "orders"]
+    total = sum(statistic for statistic, _ in orders), sum(dof for _, dof in orders)
+    rivals = {"pointing": single, "edges": [total] if orders else []}
+    weaker = {
+        name
+        for name, others in rivals.items()
+        if name in significant and not all(explains_more(by_name[name], one) for one in others)
+    }
+    return {name: family for name, family in significant.items() if name not in weaker}
 
 
 def _remedy(family: Family, causes: Mapping[str, Family]) -> str:

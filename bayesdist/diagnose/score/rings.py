@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from scipy.fft import fft2
 
 from bayesdist.diagnose.score.pattern import log_tail_of_walk
-from bayesdist.diagnose.score.result import Family, Outcome, outcome
+from bayesdist.diagnose.score.result import LOOK_UP_TABLE, Family, Outcome, outcome
 from bayesdist.diagnose.score.sample import ScoredSample
 from bayesdist.diagnose.significance import chi_square_of
 from bayesdist.model.grid import cell_index
@@ -23,7 +23,7 @@ from bayesdist.utils.arrays import Bool, Complex, Float, Int
 
 RINGS = Family(
     "rings",
-    "correct the positions for rings of the silicon, or fit a look-up table with nodes closer than "
+    f"correct the positions for rings of the silicon, or {LOOK_UP_TABLE} with nodes closer than "
     "half the distance of the rings; a higher order does not help",
     "",
     "the residuals do not form rings",

@@ -96,13 +96,14 @@ def with_information(solution: Solution, information: Float) -> Solution:
     """Add information (d, d) about polynomials and drift to a solution.
 
     The covariance of the existing exposures' frames changes according to its correlation with
-    these.  Raises InputError if the shape of the information does not match the model.
+    these, unless the information is about all parameters, (D, D).  Raises InputError if the shape
+    of the information does not match the model.
     """
-    n = solution.model.n_distortion
-    if information.shape != (n, n):
+    n, known = len(information), (solution.model.n_distortion, solution.model.n_params)
+    if information.shape != (n, n) or n not in known:
         raise InputError(
-            f"the information has shape {information.shape} for {n} parameters",
-            do="give that of the polynomials and their drift",
+            f"the information has shape {information.shape} for {known[0]} parameters",
+            do="give that of the polynomials and their drift, or of all parameters",
         )
     cov = np.asarray(solution.cov, float)
     # (C^-1 + H)^-1 without inverting C, which may be nearly singular

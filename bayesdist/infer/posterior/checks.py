@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import dataclass
+
 import numpy as np
 
 from bayesdist.infer.convergence import Convergence
@@ -24,8 +27,6 @@ from bayesdist.utils.limits import (
 from bayesdist.utils.numbers import count, number, percent
 
 FIT, SAMPLING = "Fit", "Sampling"
-CHI_SQUARE = "Chi-square per degree of freedom, quoted errors"
-RESIDUALS_TOO_LARGE = "they are too small, which the jitter takes up, or the model does not fit"
 
 
 def scatter_too_small(total: float, dof: float) -> bool:
@@ -34,24 +35,85 @@ def scatter_too_small(total: float, dof: float) -> bool:
     return total < CHI2_TOO_SMALL.value * dof and by_chance < CHI2_TOO_SMALL_CHANCE.value
 
 
-def fit_checks(
-    fit: LinearFit,
-    *,
-    in_circle: bool = False,
-    false_matches: bool = False,
-    things: str = "stars",
-    chooser: str = "least-squares fit",
-) -> tuple[Check, ...]:
-    """Checks of a fit: chi-square, fraction of rows left out, and condition number.
+@dataclass(frozen=True)
+class ChiSquare:
+    """Chi-square of a fit with the quoted errors, and what may account for it.
 
     Parameters
     ----------
-    fit : LinearFit
+    total : float
+    dof : float
+        Degrees of freedom.
     in_circle : bool
         True if the likelihood accounts for the match circle that truncates the residuals.
     false_matches : bool
         True if the posterior attributes residuals that are too large to false matches and finds
         the quoted errors correct.
+    """
+
+    total: float
+    dof: float
+    in_circle: bool = False
+    false_matches: bool = False
+
+    def check(self, findings: Sequence[str] = ()) -> Check:
+        """Check that chi-square is about one per degree of freedom.
+
+        `findings` are names of what else was found in the residuals.  Residuals that are larger
+        than the quoted errors say nothing about these errors if the model does not describe the
+        positions.
+        """
+        ratio = self.total / self.dof if self.dof > 0 else float("nan")
+        small = scatter_too_small(self.total, self.dof)
+        return Check(
+            FIT,
+            "Chi-square per degree of freedom, quoted errors",
+            number(ratio),
+            f"{CHI2_TOO_SMALL.value:g} to {CHI2_TOO_LARGE.value:g}",
+            level_of(not small and CHI2_TOO_LARGE.met_by(ratio), "warn"),
+            self._sentence(small, findings),
+            EITHER if small and not self.in_circle else "",
+        )
+
+    def _sentence(self, small: bool, findings: Sequence[str]) -> str:
+        """Sentence on a chi-square that is not about one; empty where it is."""
+        ratio = self.total / max(self.dof, 1)
+        if small and self.in_circle:
+            return (
+                f"chi-square per degree of freedom of least squares is {ratio:.2g}: the match "
+                "circle cuts the residuals, and draws this fit to the nominal solution; the "
+                "posterior accounts for the circle"
+            )
+        if small:
+            return (
+                f"chi-square per degree of freedom is {ratio:.2g}: the match radius has cut the "
+                "residuals, or the quoted errors are too large, and with them all uncertainties"
+            )
+        if ratio <= CHI2_TOO_LARGE.value:
+            return ""
+        if self.false_matches:
+            return (
+                f"chi-square per degree of freedom of least squares is {ratio:.3g}: the rejection "
+                "limits have kept false matches; the posterior accounts for them, with the quoted "
+                "errors of the others as they are"
+            )
+        why = "they are too small, which the jitter takes up, or the model does not fit"
+        if findings:
+            why = (
+                f"the model does not describe all positions ({', '.join(findings)}): follow that "
+                "advice before the errors are changed"
+            )
+        return f"chi-square per degree of freedom is {ratio:.3g} with the quoted errors: {why}"
+
+
+def fit_checks(
+    fit: LinearFit, *, things: str = "stars", chooser: str = "least-squares fit"
+) -> tuple[Check, ...]:
+    """Checks of a fit: fraction of rows left out, and condition number.
+
+    Parameters
+    ----------
+    fit : LinearFit
     things : str
         Plural noun for the rows that are fitted, as printed.
     chooser : str
@@ -61,20 +123,8 @@ def fit_checks(
     -------
     tuple of Check
     """
-    ratio = fit.chi2 / fit.dof if fit.dof > 0 else float("nan")
     left_out = fit.n_rejected / fit.n_rows
-    small = scatter_too_small(fit.chi2, fit.dof)
-    sentence = _of_chi2(fit, small, in_circle=in_circle, false_matches=false_matches)
     return (
-        Check(
-            FIT,
-            CHI_SQUARE,
-            number(ratio),
-            f"{CHI2_TOO_SMALL.value:g} to {CHI2_TOO_LARGE.value:g}",
-            level_of(not small and CHI2_TOO_LARGE.met_by(ratio), "warn"),
-            sentence,
-            EITHER if small and not in_circle else "",
-        ),
         Check(
             FIT,
             f"{things.capitalize()} left out by the {chooser}",
@@ -90,34 +140,6 @@ def fit_checks(
             level_of(CONDITION.met_by(fit.condition), "warn"),
         ),
     )
-
-
-def _of_chi2(fit: LinearFit, small: bool, *, in_circle: bool, false_matches: bool) -> str:
-    """Explain a chi-square per degree of freedom that is not near one; empty if it is."""
-    ratio = fit.chi2 / max(fit.dof, 1)
-    if small and in_circle:
-        return (
-            f"chi-square per degree of freedom of least squares is {ratio:.2g}: the match circle "
-            "cuts the residuals, and draws this fit to the nominal solution; the posterior "
-            "accounts for the circle"
-        )
-    if small:
-        return (
-            f"chi-square per degree of freedom is {ratio:.2g}: the match radius has cut the "
-            "residuals, or the quoted errors are too large, and with them all uncertainties"
-        )
-    if ratio > CHI2_TOO_LARGE.value and false_matches:
-        return (
-            f"chi-square per degree of freedom of least squares is {ratio:.3g}: the rejection "
-            "limits have kept false matches; the posterior accounts for them, with the quoted "
-            "errors of the others as they are"
-        )
-    if ratio > CHI2_TOO_LARGE.value:
-        return (
-            f"chi-square per degree of freedom is {ratio:.3g} with the quoted errors: "
-            f"{RESIDUALS_TOO_LARGE}"
-        )
-    return ""
 
 
 def pixel_doubt(solution: Solution) -> str:

@@ -76,11 +76,7 @@ def expected_solution(
     star codes and errors; `prior` is information from other sources; `min_detections` is the
     minimum number of detections of a star.  Raises InputError if no star has enough detections.
     """
-    # there are no false detections, so the match radius does not matter
-    problem = prepare(model, detections, truth, match_radius=1.0, min_detections=min_detections)
-    stars = problem.mean_places(truth)
-    problem = problem.at(truth, stars)
-    curvature = expand(problem, truth, NONE_FALSE, stars)[0].curvature
+    problem, curvature = _expanded(model, truth, detections, min_detections)
     gauge = find_gauge(problem, truth, curvature, prior)
     free = np.setdiff1d(np.arange(model.n_params), gauge.held)
     precision = (curvature + prior.precision)[np.ix_(free, free)]
@@ -90,3 +86,22 @@ def expected_solution(
         scale, scale
     )
     return ExpectedSolution(model, np.array(truth, float), cov, gauge, problem)
+
+
+def expected_curvature(model: DistortionModel, truth: Float, detections: Detections) -> Float:
+    """Curvature (D, D) of the log-likelihood by all parameters, its stars marginalised.
+
+    Arguments are as of `expected_solution`.
+    """
+    return _expanded(model, truth, detections, 2)[1]
+
+
+def _expanded(
+    model: DistortionModel, truth: Float, detections: Detections, min_detections: int
+) -> tuple[Problem, Float]:
+    """Problem of detections without noise, and the curvature (D, D) of its log-likelihood."""
+    # there are no false detections, so the match radius does not matter
+    problem = prepare(model, detections, truth, match_radius=1.0, min_detections=min_detections)
+    stars = problem.mean_places(truth)
+    problem = problem.at(truth, stars)
+    return problem, expand(problem, truth, NONE_FALSE, stars)[0].curvature

@@ -99,19 +99,21 @@ class SelfCalibrationMode:
 
         Stars and frames are eliminated.  Rows and columns of fixed parameters are zero.
         """
-        n, H = self.problem.model.n_distortion, self.expansion.curvature
-        distortion, frames = self.free[self.free < n], self.free[self.free >= n]
-        information = H[np.ix_(distortion, distortion)]
-        if frames.size:
-            local, cross = H[np.ix_(frames, frames)], H[np.ix_(distortion, frames)]
-            scale = 1.0 / np.sqrt(np.diag(local))
-            half = cross * scale
-            information = information - half @ np.linalg.solve(
-                local * np.outer(scale, scale), half.T
-            )
-        out = np.zeros((n, n))
-        out[np.ix_(distortion, distortion)] = (information + information.T) / 2
-        return out
+        return of_first(self.expansion.curvature, self.free, self.problem.model.n_distortion)
+
+    @property
+    def gain(self) -> float:
+        """Information about the distortion of a further exposure, relative to the average one.
+
+        Each star takes up one of its detections, or as many as it has parameters along an axis,
+        and less where other data say where it lies.  So m detections of a star have the information
+        of m - 1, and further ones of the same star that of as many as they are.
+        """
+        p, error = self.problem, self.error
+        data = np.bincount(p.star, (p.W[:, 0] + p.W[:, 2]) / 2, minlength=p.n_stars) / error**2
+        known = np.trace(p.priors.precision[:, :2, :2], axis1=1, axis2=2) / 2
+        absorbed = np.minimum(p.n_star / 2 * data / (data + known), np.maximum(p.counts - 1, 1))
+        return float(len(p) / (len(p) - absorbed.sum()))
 
     @property
     def error(self) -> float:
@@ -154,6 +156,23 @@ class SelfCalibrationMode:
             dof=max(2 * n_used - lost, 1),
             condition=float(np.linalg.cond(precision / np.outer(scale, scale))),
         )
+
+
+def of_first(curvature: Float, free: Int, n: int) -> Float:
+    """Information (n, n) about the first n parameters, later ones eliminated; zero for fixed ones.
+
+    `curvature` (D, D) is that of all parameters, and `free` (F,) are those that are fitted.
+    """
+    own, later = free[free < n], free[free >= n]
+    left = curvature[np.ix_(own, own)]
+    if later.size:
+        local, cross = curvature[np.ix_(later, later)], curvature[np.ix_(own, later)]
+        scale = 1.0 / np.sqrt(np.diag(local))
+        half = cross * scale
+        left = left - half @ np.linalg.solve(local * np.outer(scale, scale), half.T)
+    out = np.zeros((n, n))
+    out[np.ix_(own, own)] = (left + left.T) / 2
+    return out
 
 
 def solve(

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from bayesdist.diagnose.correlated import estimate_discrepancy
+from bayesdist.diagnose.correlated.deviations import MAX_EXPOSURES
 from bayesdist.infer import Rejection, build_model, fit_linear
 from tests.diagnose.correlated.skies import SIZE, matched
 from tests.reduced import case_in_full, only_in_full
@@ -15,13 +16,15 @@ from tests.reduced import case_in_full, only_in_full
 EXPOSURES, SCATTER = 8, 3e-5
 
 
-def breathing(frames: str, scatter: float = SCATTER, seed: int = 2):
-    """A discrepancy of exposures whose scales scatter."""
+def breathing(
+    frames: str, scatter: float = SCATTER, seed: int = 2, exposures: int = EXPOSURES, n: int = 300
+):
+    """A discrepancy of exposures of n stars each whose scales scatter."""
     rng = np.random.default_rng(seed)
-    _, table, _ = matched(2400, rng)
-    code = np.arange(2400) % EXPOSURES
-    factor = 1 + (scatter * rng.standard_normal(EXPOSURES))[code]
-    names = tuple(f"e{k}" for k in range(EXPOSURES))
+    _, table, _ = matched(n * exposures, rng)
+    code = np.arange(n * exposures) % exposures
+    factor = 1 + (scatter * rng.standard_normal(exposures))[code]
+    names = tuple(f"e{k}" for k in range(exposures))
     middle_u, middle_v = table.u.mean(), table.v.mean()
     table = replace(
         table,
@@ -43,6 +46,27 @@ def test_the_scatter_of_the_scales_is_found(frames):
     assert found is not None and found.n_exposures == EXPOSURES
     # of scale and two shears, of which the scale alone scatters
     assert SCATTER / 3 < np.median(found.scatter["shape"]) < 1.5 * SCATTER
+
+
+@pytest.mark.parametrize(
+    "frames", [case_in_full("none", instead="frames are fitted"), "shift_rotation"]
+)
+def test_of_many_exposures_some_stand_for_all(frames):
+    """A future exposure scatters as they do, and the fit by one over the root of their number."""
+    n = MAX_EXPOSURES + 10
+    found = breathing(frames, exposures=n, n=100)
+    linear = found.linear
+    assert linear is not None and linear.n_exposures == n
+    scatter = np.median(linear.scatter["shape"])
+    assert SCATTER / np.sqrt(3) * 0.8 < scatter < SCATTER
+    # where the stars of an exposure, which lie at random, move the fit alike
+    phi = found.model.basis(1).evaluate(SIZE * np.array([0.75, 0.5]), SIZE * np.array([0.5, 0.5]))
+    deviation = linear.of_single_exposures(found.mean, 1, np.random.default_rng(1))
+    single = (deviation @ (phi[0] - phi[1])).std(axis=0)
+    at = np.zeros(1, int), np.zeros(1)
+    moved = [found.model.polynomials(found.mean + t, *at)[0] for t in linear.theta]
+    mean = (np.array(moved) @ (phi[0] - phi[1])).std(axis=0)
+    np.testing.assert_allclose(mean, single / np.sqrt(n), rtol=0.15)
 
 
 @pytest.mark.slow

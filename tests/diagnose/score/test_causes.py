@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import bayesdist as bd
-from bayesdist.diagnose.score.causes import CAUSES, cause_of, is_pointing
+from bayesdist.diagnose.score.causes import CAUSES, cause_of, explains_more
 from bayesdist.diagnose.score.exposures import SECOND_ORDER
 from bayesdist.diagnose.score.noise import BY_POSITION
 from bayesdist.diagnose.score.questions import POINTING, order_family
@@ -60,7 +60,7 @@ def test_random_terms_of_exposures_are_no_curved_sky(n_exposures):
     rng = np.random.default_rng(n_exposures)
     n = 6 * n_exposures
     squares = 1e3 * rng.standard_normal((2000, n)) ** 2
-    taken = [is_pointing((one[:12].sum(), 12), (one.sum(), n)) for one in squares]
+    taken = [explains_more((one[:12].sum(), 12), (one.sum(), n)) for one in squares]
     # the functions of the pointing are some of all, so that chance is below that of two samples
     assert np.mean(taken) < 0.015
     both = {"second": (SECOND_ORDER, 1e5, n), "pointing": (POINTING, 1e5 * 12 / n, 12)}

@@ -9,7 +9,11 @@ import pytest
 
 import bayesdist as bd
 from bayesdist.assess.statistics import field_statistic
+from bayesdist.diagnose import score_tests
+from bayesdist.model import DistortionModel
 from bayesdist.model.grid import grid_pixels, mesh
+from tests.adversarial.fields import random_polynomial
+from tests.infer.patterned import mode_of
 from tests.reduced import case_in_full, only_in_full
 
 from .shaped import (
@@ -273,3 +277,171 @@ def test_advice_that_is_followed_helps(followed):
     after = followed()
     assert [test.name for test in after.diagnostics.score_tests if test.significant] == []
     after.assert_right(len(after.diagnostics.sample.table))
+
+
+DATES = 2010.0 + np.arange(7)
+LINEAR = (("u", 1, 0), ("u", 0, 1), ("v", 1, 0), ("v", 0, 1))
+
+
+def findings(matches, model) -> tuple[dict[str, str], np.ndarray]:
+    """Remedies of what the tests find at the mode, by name, and the parameters there."""
+    posterior, _ = mode_of(matches, model)
+    tests = score_tests(matches, posterior)
+    return {test.name: test.remedy for test in tests if test.significant}, posterior.mean
+
+
+def model_with(**more) -> DistortionModel:
+    return DistortionModel(3, (CHIP,), **more)
+
+
+def assert_close(model, theta, truth, n: int, inside=(0.0, 1.0), epoch=None) -> None:
+    """The solution is as near the truth as n stars let it be, within a part of the detector."""
+    low, high = inside
+    x, y = mesh(*(SIDE * np.linspace(low + 0.02, high - 0.02, 9) for _ in range(2)))
+    when = None if epoch is None else np.full(x.size, epoch)
+    error = np.asarray(model.predict(theta, x, y, epoch=when)) - truth(x, y)
+    assert float(field_statistic("p95", error)) < 5 * ideal(n)
+
+
+def dated(seed: int, moved) -> tuple:
+    """Matches of seven dates, and the truth (x, y, years) with what `moved` adds."""
+    rng, x, y, _ = stars(seed)
+    epoch = DATES[np.arange(N) % len(DATES)]
+
+    def truth(x, y, epoch):
+        return true_map(x, y) + moved(x, y, epoch - 2013.0)
+
+    uv = truth(x, y, epoch) + SIGMA * gaussian(rng, N)
+    return matches_of(x, y, uv, epoch=epoch), truth
+
+
+def stretching(x, y, size):
+    """Displacements along x that are proportional to it."""
+    return np.stack([size * scaled(x), np.zeros_like(x)], axis=1)
+
+
+def test_a_drift_that_is_fitted():
+    matches, truth = dated(8, lambda x, y, t: stretching(x, y, 0.01 * t))
+    advice, _ = findings(matches, model_with())
+    assert advice["drift"] == "add time-dependent terms to model.tdd"
+    model = model_with(time=bd.TimeDependence(LINEAR, (2013.0,)))
+    advice, theta = findings(matches, model)
+    assert not advice
+    assert_close(model, theta, lambda x, y: truth(x, y, 2016.0), N, epoch=2016.0)
+
+
+def test_a_break_of_the_drift():
+    matches, truth = dated(9, lambda x, y, t: stretching(x, y, 0.02 * np.maximum(t - 0.5, 0)))
+    model = model_with(time=bd.TimeDependence(LINEAR, (2013.0,)))
+    advice, _ = findings(matches, model)
+    assert "give model.tdd a break" in advice["curvature in time"]
+    model = model_with(time=bd.TimeDependence(LINEAR, (2013.0,), (2013.5,)))
+    advice, theta = findings(matches, model)
+    assert not advice
+    assert_close(model, theta, lambda x, y: truth(x, y, 2016.0), N, epoch=2016.0)
+
+
+def test_parts_on_both_sides_of_a_jump():
+    rng, x, y, _ = stars(10)
+
+    def truth(x, y):
+        return true_map(x, y) + (y > 1300)[:, None] * [0.05, 0.0]
+
+    matches = matches_of(x, y, truth(x, y) + SIGMA * gaussian(rng, N))
+    [test] = [one for one in examined(matches).values() if one.name == "jumps"]
+    assert test.significant and "fit the parts on both sides separately" in test.remedy
+    row = float(re.search(r"near row (\d+)", test.finding)[1])
+    assert abs(row - 1300) < SIDE / 31
+    # the row is named to within the distance of the rows that are looked at
+    for part in (y < 1300, y > 1300):
+        advice, _ = findings(matches.select(part), model_with())
+        assert not advice
+
+
+def test_an_offset_of_a_jump_that_is_corrected():
+    rng, x, y, uv = stars(10)
+    noise = SIGMA * gaussian(rng, N)
+    jump = (y > 1300)[:, None] * [0.05, 0.0]
+    assert (
+        "correct the offset"
+        in findings(matches_of(x, y, uv + jump + noise), model_with())[0]["jumps"]
+    )
+    advice, theta = findings(matches_of(x, y, uv + noise), model_with())
+    assert not advice
+    assert_close(model_with(), theta, true_map, N)
+
+
+def test_margins_that_are_left_out():
+    rng, x, y, uv = stars(11)
+
+    def outwards(at):
+        return 0.05 * (np.exp((scaled(at) - 1) / 0.06) - np.exp((-scaled(at) - 1) / 0.06))
+
+    uv = uv + np.stack([outwards(x), outwards(y)], axis=1) + SIGMA * gaussian(rng, N)
+    matches = matches_of(x, y, uv)
+    advice, _ = findings(matches, model_with())
+    assert "leave out the margins" in advice["edges"]
+    assert "raise model.order" not in " ".join(advice.values())
+    inner = np.maximum(np.abs(scaled(x)), np.abs(scaled(y))) < 0.8
+    advice, theta = findings(matches.select(inner), model_with())
+    assert not advice
+    assert_close(model_with(), theta, true_map, int(inner.sum()), inside=(0.1, 0.9))
+
+
+def test_orders_that_rise_towards_the_edges_are_no_edges():
+    """Terms of orders 4, 5 and 6, of which the tests know two."""
+    rng, x, y, uv = stars(15)
+    uv = uv + random_polynomial(rng, dict.fromkeys((4, 5, 6), 0.01))(x, y)
+    advice, _ = findings(matches_of(x, y, uv + SIGMA * gaussian(rng, N)), model_with())
+    assert advice["order 4"] == advice["order 5"] == "raise model.order to 5"
+
+
+def test_a_narrower_range_of_colours():
+    rng, x, y, uv = stars(12, 2 * N)
+    colour = rng.uniform(0, 2, 2 * N)
+    uv = uv + (colour - 1)[:, None] * [0.01, 0.0] + SIGMA * gaussian(rng, 2 * N)
+    matches = matches_of(x, y, uv, colour=colour)
+    assert "select a narrower range of colours" in findings(matches, model_with())[0]["colour"]
+    narrow = np.abs(colour - 1) < 0.2
+    advice, theta = findings(matches.select(narrow), model_with())
+    assert not advice
+    assert_close(model_with(), theta, true_map, int(narrow.sum()))
+
+
+def moving_stars():
+    """Six dates of 500 stars, half of which move; catalogue positions, motions and movers."""
+    rng, x, y, _ = stars(13, 3000)
+    star, moves = np.arange(3000) % 500, np.arange(500) % 2 == 0
+    epoch = DATES[np.arange(3000) // 500]
+    motion = 0.012 * gaussian(rng, 500) * moves[:, None]
+    moved = (epoch - 2012.5)[:, None] * motion[star]
+    uv = true_map(x, y) + SIGMA * gaussian(rng, 3000)
+    return x, y, uv, moved, star, epoch, moves
+
+
+@pytest.mark.parametrize("remedy", ["give the catalogue proper motions", "leave out the stars"])
+def test_stars_that_move(remedy):
+    x, y, uv, moved, star, epoch, moves = moving_stars()
+    model = model_with()
+    # where the catalogue has them is not where they were seen
+    matches = matches_of(x, y, uv - moved, star=star, epoch=epoch)
+    assert remedy in findings(matches, model)[0]["motions"]
+    if "leave out" in remedy:
+        matches = matches.select(~moves[star])
+    else:
+        matches = matches_of(x, y, uv, star=star, epoch=epoch)
+    advice, theta = findings(matches, model)
+    assert not advice
+    assert_close(model, theta, true_map, len(matches))
+
+
+def test_waves_that_are_corrected():
+    """A pattern that repeats is in the positions of stars until these are corrected for it."""
+    rng, x, y, uv = stars(14)
+    noise = SIGMA * gaussian(rng, N)
+    wave = 0.02 * np.sin(2 * np.pi * x / 110)[:, None] * [1.0, 0.0]
+    advice, _ = findings(matches_of(x, y, uv + wave + noise), model_with())
+    assert "correct the positions" in advice["repeating pattern"]
+    advice, theta = findings(matches_of(x, y, uv + noise), model_with())
+    assert not advice
+    assert_close(model_with(), theta, true_map, N)

@@ -445,7 +445,7 @@ def test_distributed_is_not_installed(problem, monkeypatch):
 
 
 def test_no_workers_are_asked_for(problem):
-    with pytest.raises(errors.InputError, match="0 workers"):
+    with pytest.raises(errors.InputError, match="the number of workers is 0"):
         load(*problem, Compute(engine="dask", workers=0))
 
 

@@ -14,6 +14,7 @@ from bayesdist.app.store.rundir import RunDirectory
 from bayesdist.app.tables.margins import judged_requirements
 from bayesdist.assess.evaluation import with_measured_centroids
 from bayesdist.assess.model import with_diagnosed_errors, with_shared_stars
+from bayesdist.assess.planning.dithers import further_dithers
 from bayesdist.assess.planning.exposures import Need, Schedule, exposures_needed
 from bayesdist.assess.planning.futures import Data, Futures
 from bayesdist.assess.requirements.requirement import Requirement
@@ -109,16 +110,10 @@ def needs_of(
             do=f"name one of {known}" if known else "judge some with 'bayesdist requirements'",
         )
     now = {row["name"]: row["probability_met"] for row in results.run.summary["margins"]}
-    solved, future, out = results.fitted.solved, _futures(results, content), []
+    future, out = futures_of(results, content), []
     for requirement in chosen:
-        if solved is None:
-            schedules = _schedules(results, requirement, content, epochs)
-        else:
-            # an exposure by itself says nothing: as many as these say as much
-            information = solved.mode.distortion_information / _n_exposures(results)
-            schedules = [Schedule("dithered like these", information)]
         needs = exposures_needed(
-            schedules,
+            schedules_of(results, requirement, content, epochs),
             future(requirement).probability,
             requirement.probability,
             now=now[requirement.name],
@@ -144,11 +139,20 @@ def content_of(results: Results) -> ExposureContent:
     )
 
 
-def _schedules(
-    results: Results, requirement: Requirement, content: ExposureContent, epochs: Sequence[float]
+def schedules_of(
+    results: Results,
+    requirement: Requirement,
+    content: ExposureContent,
+    epochs: Sequence[float] = (),
 ) -> list[Schedule]:
     """Single exposures at dates that matter to a requirement, or at any."""
-    solution, epoch = results.solution, results.epoch
+    solution, epoch, solved = results.solution, results.epoch, results.fitted.solved
+    if solved is not None:
+        # an exposure by itself says nothing: of stars that were seen before it does
+        information = solved.mode.gain * solved.mode.distortion_information / _n_exposures(results)
+        further = further_dithers(solved.mode, results.config.sampler.seed)
+        together = [one.information for one in further]
+        return [Schedule("dithered like these", information, together=together)]
 
     def worth(date: float | None) -> Float:
         return exposure_information(solution, content, date)
@@ -168,7 +172,7 @@ def _schedules(
     return found
 
 
-def _futures(results: Results, content: ExposureContent) -> Callable[[Requirement], Futures]:
+def futures_of(results: Results, content: ExposureContent) -> Callable[[Requirement], Futures]:
     """Runs with more exposures, for any requirement."""
     settings, errors = results.settings, results.errors
     errors = with_measured_centroids(errors, results.diagnostics, settings)
@@ -185,6 +189,8 @@ def _futures(results: Results, content: ExposureContent) -> Callable[[Requiremen
             return more
         return with_shared_stars(more, hierarchy, diagnostics.catalogue)
 
+    solved = results.fitted.solved
+    gain = 1.0 if solved is None else solved.mode.gain
     weight = np.mean([np.sum([m[axis, 0, 0] for m in content.moments.values()]) for axis in (0, 1)])
     seed = int(assessment_rng(results.config).integers(2**63))
 
@@ -192,7 +198,7 @@ def _futures(results: Results, content: ExposureContent) -> Callable[[Requiremen
         return Futures(
             errors,
             requirement,
-            Data(_n_exposures(results), float(weight), content.n_stars),
+            Data(_n_exposures(results), float(weight), content.n_stars, gain),
             solution,
             settings.grid,
             settings.epoch,
