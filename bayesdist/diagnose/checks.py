@@ -108,7 +108,7 @@ def input_checks(
 
 
 def repeated_star_checks(table: Matches) -> Iterator[Check]:
-    """Checks for stars with several detections in one exposure, and for close groups of stars."""
+    """Checks for stars with several detections in one exposure, and for tight groups of stars."""
     repeated = repeated_detections(table.u, table.v, table.exposure, table.star)
     if repeated is not None:
         name = "Stars with several detections in one exposure"

@@ -77,10 +77,13 @@ log = logging.getLogger("bayesdist")
 
 @dataclass(frozen=True, eq=False)
 class Diagnostics:
-    """Misfit, score tests, correlated errors and further results by the residuals of a solution.
+    """Results of all diagnostics from the residuals of a solution.
 
-    `diagnose` makes it.  `error_budget` and `check_requirements` take it, so that a verdict counts
-    what the residuals show; printed, it says how many tests there were and what was found.
+    They include the misfit, score tests and correlated errors.  Create them with `diagnose`, and
+    pass
+    them to `error_budget` and `check_requirements` so that verdicts take the residuals into
+    account.
+    The printed form gives the number of tests, the significant findings and the warnings.
 
     Parameters
     ----------
@@ -89,11 +92,11 @@ class Diagnostics:
     partitions : mapping
         Numbers of bins (nx, ny) of each partition, by chip number and name of the partition.
     misfits : tuple of Misfit
-        Structure that the solution leaves, for each chip or, if chips share stars, for all.
+        Structure in the residuals, per chip; a single item for all chips if these share stars.
     coverage : tuple of Coverage
         Area of each chip that the stars cover.
     sample : StarSample
-        All stars, or a sample of very many, with their residuals and probabilities.
+        All stars, or a sample if there are very many, with residuals and probabilities.
     chi_square : ChiSquare
         Chi-square of the fit with the quoted errors.
     input_checks : tuple of Check
@@ -101,21 +104,22 @@ class Diagnostics:
     dates : ndarray, shape (T,)
         Distinct dates of the stars in decimal years, ascending; empty without dates.
     majority : str
-        Sentence on a majority of false pairs; empty if there is none.
+        Sentence saying that most pairs are false; empty if they are not.
     epoch_shift : EpochShift or None
         Error of the epochs; None without proper motions.
     centroid : MagnitudeErrors or None
         Scatter of the residuals by magnitude; None without magnitudes.
     flagged : ndarray of int, shape (E,), or None
-        Number of stars of each exposure that are more likely false than not; None for one exposure.
+        Number of stars of each exposure that are more likely false than true; None for one
+        exposure.
     score_tests : tuple of ScoreTest
-        Results of the tests of the residuals.
+        Results of the score tests.
     correlated : Discrepancy or None
         Correlated errors beyond the model; None if they have not been estimated.
     catalogue : StarCovariance or None
         Covariance of the parameters due to errors of the catalogue; None if these are unknown.
     periods : TimeVariation or None
-        Comparison of the models of several periods; None if it was not asked for.
+        Comparison of the models of several periods; None if it was not requested.
     holdout : HoldoutValidation or None
         Results for stars that were set aside before the fit; None without such stars.
     overlap : OverlapTest or None
@@ -229,33 +233,36 @@ def diagnose(
     discrepancy: DiscrepancyPriors | None = None,
     compute: Compute | None = None,
 ) -> Diagnostics:
-    """Examine the residuals of a posterior: what the model leaves out, and how noisy the stars are.
+    """Examine the residuals of a posterior for effects that the model lacks, and for wrong errors.
 
     Correlated errors beyond the model (structure over the detector, differences between exposures)
-    are estimated with priors on their size, targeted tests look for what the model may lack, and
-    the scatter of the stars is compared with their quoted errors.  `bayesdist run` makes the same
+    are
+    estimated with priors on their size, targeted tests search for effects that the model may lack,
+    and
+    the scatter of the stars is compared with their quoted errors.  `bayesdist run` computes the
+    same
     diagnostics: the same stars, settings and seed give the same numbers.
 
     Parameters
     ----------
     posterior : Posterior
-        As `sample` returned it.
+        Posterior from `sample`.
     matches : Matches
-        The N stars that the posterior was made from, with the same errors.
+        The N stars that were given to `sample`, with the same errors.
     fit : LinearFit, optional
-        The fit that the sampler started from; by default a fit with the default rejection limits
-        is made.  Give it if it was made with other limits.
+        Fit that the sampler started from.  The default is a fit with the default rejection limits;
+        pass the fit if it was made with other limits.
     rng : int or numpy.random.Generator
         Seed of the run.  A generator is restarted from its initial state.
     priors : GaussianPriors, optional
         Priors of the parameters, as given to `sample`; flat by default.
     match_radius : float or Quantity, optional
-        Radius within which the stars were matched, in the unit of u and v; that of the posterior's
-        mixture by default.
+        Radius within which the stars were matched, in the unit of u and v; by default that of the
+        posterior's mixture.
     discrepancy : DiscrepancyPriors, optional
-        Prior medians of the sizes of what the model may leave out.
+        Prior medians of the sizes of effects that the model may lack.
     compute : Compute, optional
-        Where the work is done; one process with threads by default.
+        Settings for parallel computation; one process with threads by default.
 
     Returns
     -------
@@ -264,8 +271,9 @@ def diagnose(
     Raises
     ------
     InputError
-        For a fit that was not sampled, matches that are not those of the posterior, a posterior of
-        a campaign or of a self-calibration, a radius that is not positive, and a wrong seed.
+        If `posterior` is not a posterior, or that of a campaign or a self-calibration; if the
+        matches
+        or the fit do not belong to it; if the radius is not positive; or if the seed is invalid.
 
     Examples
     --------

@@ -243,8 +243,8 @@ def _residuals(
     # for a subset of the stars the common model absorbs the same fraction of its coefficients
     n_all = float(together.count.sum())
     absorbed = {
-        name: max(1, round(n_terms * float(first.count.sum()) / n_all))
-        for name, first in rows.items()
+        name: max(1, round(n_terms * float(bins.count.sum()) / n_all))
+        for name, bins in rows.items()
     }
     table = period_table(rows, rng=rng, arcsec_per_pixel=unit_arcsec or 1.0, absorbed=absorbed)
     return table if unit_arcsec else replace(table, unit=unit)

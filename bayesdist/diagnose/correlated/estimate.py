@@ -88,7 +88,7 @@ def estimate_discrepancy(
         neighbouring stars.  If None, that structure is not constrained.
     stars : Matches, optional
         All matches, in memory.  If given, errors that are common to the matches of a star, or of a
-        close group of stars, are estimated, and exposures without separate frames are
+        tight group of stars, are estimated, and exposures without separate frames are
         distinguished.
     structure : bool
         False to omit structure beyond the model, if look-up tables were fitted to it.

@@ -100,7 +100,7 @@ def shared_variances(
     """Evidence of neighbouring stars on both axes of each chip, by the code of the chip.
 
     Nothing is subtracted from the scores.  The matches are those of the solution with this
-    likelihood, or a part of them.  Pairs of matches of one star, or of stars in a close group, are
+    likelihood, or a part of them.  Pairs of matches of one star, or of stars in a tight group, are
     excluded because they share an error of the reference position.  The evidence is None for an
     axis with too few pairs.
     """
@@ -118,7 +118,7 @@ class NeighbourScores:
     Y: Float
     score: Float  # (n, 2) gradient of the log-likelihood
     curvature: Float  # (n, 2, 2) minus its second derivatives
-    # (n,) code of the star, or close group of stars, that shares an error of the reference, from 0
+    # (n,) code of the star, or tight group of stars, that shares an error of the reference, from 0
     star: Int
     pairs: Int  # (p, 2) indices of neighbours that are different stars
     separation: Float  # (p,) in pixels

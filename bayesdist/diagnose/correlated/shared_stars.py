@@ -67,7 +67,7 @@ def shared_stars(
 
     Stars with a single match are left out because k is 0.  `code` (N,) is the star of each match,
     or
-    the close group of stars; `median` is that of the half-Cauchy prior of w, in the unit of u and
+    the tight group of stars; `median` is that of the half-Cauchy prior of w, in the unit of u and
     v.
     """
     stars, order = prepare(model, table)

@@ -26,7 +26,7 @@ from bayesdist.infer.solution.solution import Solution
 from bayesdist.utils.arrays import Float, Int
 from bayesdist.utils.limits import EPOCH_SHIFT
 
-SAMPLE = 20_000  # detections that are looked at
+SAMPLE = 20_000  # largest number of detections that are used
 MIN_STARS = 30  # stars with motions
 FARTHEST = 60.0  # largest shift in the scan, years
 STEPS = 481  # number of steps in the scan, a quarter of a year each

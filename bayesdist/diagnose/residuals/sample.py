@@ -147,9 +147,9 @@ def dates_of(table: Matches) -> Float:
 def likelihood_shown(fit: LinearFit, posterior: Posterior | None) -> Likelihood:
     """Likelihood at the solution whose residuals are shown: the posterior's if there is one.
 
-    If positions of stars were fitted, they belong to the parameters of the fit, and so do the
-    residuals: at the mean of the draws they would include its distance from the fit, which the
-    stars would otherwise follow.
+    If the positions of stars were fitted, the parameters of the fit are used, because the positions
+    belong to them.  Residuals at the mean of the draws would include the distance of that mean from
+    the fit, which fitted positions would follow.
     """
     if posterior is None:
         return fit.likelihood

@@ -37,7 +37,7 @@ MIN_STARS = 100
 SHORTEST = 0.1  # years; shortest time span in which motions are tested
 MAX_TAKEN = 0.95  # largest leverage of one detection by position and slope
 FARTHEST = 5.0  # largest residual of a true match, in errors per axis
-# smallest fraction of the determinant of the slope's information that remains beside the position
+# smallest fraction of the determinant of the slope's information that remains after the position
 MOVING = 1e-6
 
 

@@ -55,7 +55,7 @@ class ScoredSample:
     mag: Float | None  # (N,)
     colour: Float | None
     epoch: Float | None
-    # (N,) number of the star, or of the close group of stars, from 0; its detections share the
+    # (N,) number of the star, or of the tight group of stars, from 0; its detections share the
     # error of the reference position
     star: Int
     # chip, exposure (N,): indices into the model's chips and into the exposures of the data

@@ -49,10 +49,10 @@ LARGEST_LEVERAGE = 0.5
 MAX_FRACTION_BEYOND = 0.25
 STARS_PER_PART = 150  # of similar quoted errors, from which the scatter of a part is measured
 MAX_PARTS = 12
-MIN_EXPECTED = 0.5  # smallest expected number of matches whose absence is significant
+MIN_EXPECTED = 0.5  # with fewer expected matches, their absence is not significant
 MOST_TESTS = 100  # upper limit to the number of score tests of a run
-BEYOND = (0, 3)  # numbers of stars that may lie beyond a radius: the edge need not be sharp
-INSIDE = 0.9  # of the stated radius: matches that extend farther than this end at the stated radius
+BEYOND = (0, 3)  # numbers of stars that may be beyond a radius: the edge need not be sharp
+INSIDE = 0.9  # of the stated radius: beyond this, matches count as ending there
 CLEAR = 4.5  # errors beyond which a match is clearly false, if errors are not larger than quoted
 MIN_FALSE = 8
 SHARE = 0.9  # fraction of the clearly false matches that defines their outer end
@@ -168,7 +168,7 @@ class _FalseMatches:
 
     @property
     def end2(self) -> float:
-        """Squared distance within which a fraction `SHARE` of them lies."""
+        """Squared distance within which a fraction `SHARE` of them is found."""
         return float(self.square[int(np.ceil(SHARE * len(self.square))) - 1])
 
     @property

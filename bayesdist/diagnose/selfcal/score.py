@@ -259,7 +259,7 @@ def _sample(
     residual = np.linalg.solve(J, r)[:, :, 0] * pixel
     variance = (p.var + solution.mixture.jitter**2) * pixel**2
     leverage = taken_by_stars(solution)[rows]
-    at_rows = {name: None if one is None else one[rows] for name, one in known.items()}
+    at_rows = {name: None if column is None else column[rows] for name, column in known.items()}
     frames = [model.frame(theta, e) for e in range(len(model.exposures))]
     position, offset = _pointings(p, theta, frames)
     return ScoredSample(

@@ -23,7 +23,7 @@ from bayesdist.infer.nodes import (
 from bayesdist.model import Chip, LookupTable
 from bayesdist.utils.arrays import Float
 
-FAR = 6.0  # standard deviations
+FAR = 6.0  # residual beyond which a match is excluded, in standard deviations
 
 log = logging.getLogger("bayesdist")
 
