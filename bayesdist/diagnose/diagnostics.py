@@ -80,10 +80,8 @@ class Diagnostics:
     """Results of all diagnostics from the residuals of a solution.
 
     They include the misfit, score tests and correlated errors.  Create them with `diagnose`, and
-    pass
-    them to `error_budget` and `check_requirements` so that verdicts take the residuals into
-    account.
-    The printed form gives the number of tests, the significant findings and the warnings.
+    pass them to `error_budget` and `check_requirements` so that verdicts take the residuals into
+    account.  The printed form gives the number of tests, the significant findings and the warnings.
 
     Parameters
     ----------
@@ -236,12 +234,9 @@ def diagnose(
     """Examine the residuals of a posterior for effects that the model lacks, and for wrong errors.
 
     Correlated errors beyond the model (structure over the detector, differences between exposures)
-    are
-    estimated with priors on their size, targeted tests search for effects that the model may lack,
-    and
-    the scatter of the stars is compared with their quoted errors.  `bayesdist run` computes the
-    same
-    diagnostics: the same stars, settings and seed give the same numbers.
+    are estimated with priors on their size, targeted tests search for effects that the model may
+    lack, and the scatter of the stars is compared with their quoted errors.  `bayesdist run`
+    computes the same diagnostics: the same stars, settings and seed give the same numbers.
 
     Parameters
     ----------
@@ -272,8 +267,8 @@ def diagnose(
     ------
     InputError
         If `posterior` is not a posterior, or that of a campaign or a self-calibration; if the
-        matches
-        or the fit do not belong to it; if the radius is not positive; or if the seed is invalid.
+        matches or the fit do not belong to it; if the radius is not positive; or if the seed is
+        invalid.
 
     Examples
     --------

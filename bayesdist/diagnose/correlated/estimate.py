@@ -84,8 +84,7 @@ def estimate_discrepancy(
         Priors of the solution's parameters; flat by default.
     sample : Matches, optional
         The matches or a part of them, in memory, to estimate structure finer than the functions
-        from
-        neighbouring stars.  If None, that structure is not constrained.
+        from neighbouring stars.  If None, that structure is not constrained.
     stars : Matches, optional
         All matches, in memory.  If given, errors that are common to the matches of a star, or of a
         tight group of stars, are estimated, and exposures without separate frames are

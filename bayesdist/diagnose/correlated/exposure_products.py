@@ -272,9 +272,8 @@ class Modes:
 
     left: float  # mean square of the remaining field
     patches: float  # (sum L)^2 / sum L^2: degrees of freedom of the mean square
-    dof: (
-        float  # (sum L^2)^3 / (sum L^3)^2: of the chi-square with the skewness of a sum of products
-    )
+    # (sum L^2)^3 / (sum L^3)^2: of the chi-square with the skewness of a sum of products
+    dof: float
 
 
 @lru_cache(maxsize=64)

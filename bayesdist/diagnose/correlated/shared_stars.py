@@ -57,18 +57,15 @@ def shared_stars(
     None if stars have one match each.
 
     The likelihood includes the variance 1 / h_i of each match, from quoted errors and jitter, of
-    which
-    the shared error is a part.  The summed score g of a star, with matches that share a variance
-    w^2,
-    then has the variance h (1 + w^2 k), where h is the sum of the h_i and k = h - sum h_i^2 / h, so
-    that
+    which the shared error is a part.  The summed score g of a star, with matches that share a
+    variance w^2, then has the variance h (1 + w^2 k), where h is the sum of the h_i and k = h - sum
+    h_i^2 / h, so that
 
         log p(w) = sum over stars and axes of [g^2 / h w^2 k / (1 + w^2 k) - log(1 + w^2 k)] / 2
 
     Stars with a single match are left out because k is 0.  `code` (N,) is the star of each match,
-    or
-    the tight group of stars; `median` is that of the half-Cauchy prior of w, in the unit of u and
-    v.
+    or the tight group of stars; `median` is that of the half-Cauchy prior of w, in the unit of u
+    and v.
     """
     stars, order = prepare(model, table)
     code = np.unique(code[order], return_inverse=True)[1]

@@ -250,11 +250,9 @@ def deviation_tests(predictive: Predictive, frames: Mapping[str, Frame]) -> list
     """Compare deviations of exposures that were held out entirely with the scatter of the others.
 
     Scale, shears and chip positions of such an exposure are fitted to its stars before the stars
-    are
-    tested, so that errors of these do not show in the residuals.  If b and v are the estimate of
-    one
-    deviation and its variance from the stars alone, with all other deviations following their
-    scatter,
+    are tested, so that errors of these do not show in the residuals.  If b and v are the estimate
+    of one deviation and its variance from the stars alone, with all other deviations following
+    their scatter,
 
         b ~ N(0, tau^2 + v + w)
 

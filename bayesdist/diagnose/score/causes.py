@@ -86,10 +86,8 @@ def explains_more(one: tuple[float, float], other: tuple[float, float]) -> bool:
     """True if a few functions explain more, for their number, than the many of another test.
 
     Terms that differ randomly between exposures correlate with the pointing to some extent, whereas
-    a
-    curved sky concentrates all deviations in the few functions of the pointing.  Missing orders
-    rise
-    towards the edges, whereas effects confined to the edges are spread over many orders.
+    a curved sky concentrates all deviations in the few functions of the pointing.  Missing orders
+    rise towards the edges, whereas effects confined to the edges are spread over many orders.
 
     Parameters
     ----------

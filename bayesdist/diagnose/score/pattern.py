@@ -30,11 +30,11 @@ def pattern_test(sample: ScoredSample) -> Outcome | None:
     """Test for a wave of any period and direction on a chip.
 
     For each frequency k and the scores g of one axis, the length of sum g exp(i k x) is, without a
-    wave, that of a random walk of steps |g| in random directions, for any errors of single
-    stars.  Detections of one star share the error of its reference position and form one step |sum
-    g exp(i k x)|.  The p-value of the longest walk is corrected for the number of frequencies:  at
-    relevant lengths, neighbours among the oversampled frequencies hardly ever exceed it together.
-    Returns None if there are fewer than `MIN_STARS` stars.
+    wave, that of a random walk of steps |g| in random directions, for any errors of single stars.
+    Detections of one star share the error of its reference position and form one step |sum g exp(i
+    k x)|.  The p-value of the longest walk is corrected for the number of frequencies:  at relevant
+    lengths, neighbours among the oversampled frequencies hardly ever exceed it together.  Returns
+    None if there are fewer than `MIN_STARS` stars.
     """
     if len(np.unique(sample.star)) < MIN_STARS:
         return None

@@ -63,8 +63,8 @@ class Question:
     products: tuple[Products, ...]
     # fraction of its information that a direction must keep when the parameters are projected out
     least: float = INDEPENDENT
-    # group of families that a second test includes in the fit; it replaces the first if it is
-    # insignificant
+    # group of families that a second test fits as well; if that test is insignificant, its result
+    # is used
     adjusted_for: str = ""
 
 

@@ -57,15 +57,13 @@ class ScoreTest:
         Number of tested directions.
     dof_residual : float or None
         Number of stars, beyond the tested directions, from which the noise is estimated; None if
-        the
-        statistic has a chi-square distribution.
+        the statistic has a chi-square distribution.
     p_value : float
         Probability of a larger statistic by chance, for this test alone.
     size : float
         Size of the effect, in `unit` and not negative: rms over the detector, both axes together,
-        with
-        the contribution of noise subtracted.  For tests of the noise, the rms difference of its
-        standard deviation per axis.
+        with the contribution of noise subtracted.  For tests of the noise, the rms difference of
+        its standard deviation per axis.
     smallest : float
         Size that would have been detected with probability `POWER`, given the number of tests.
     unit : str
@@ -76,8 +74,7 @@ class ScoreTest:
         Interpretation of the result, as a sentence.
     significant : bool
         True if the result is significant after correction for the number of tests (Holm 1979, at
-        the
-        level `limits.SCORE_TESTS`).
+        the level `limits.SCORE_TESTS`).
     held_by : str
         Component of the correlated errors that includes the effect: 'noise', 'structure',
         'exposures', 'curvature', 'second order' or 'exposure fields' (of single exposures), 'time'

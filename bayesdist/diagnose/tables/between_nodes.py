@@ -81,8 +81,7 @@ def between_nodes(
     taken : callable
         Variance (n, 2) of table and polynomial at pixels x, y (n,), square pixels: the part of the
         residuals that the fit absorbed.  It is negative for a table that was not fitted to them,
-        because
-        the products then include the error of the table.
+        because the products then include the error of the table.
 
     Returns
     -------
