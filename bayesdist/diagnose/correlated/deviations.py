@@ -196,7 +196,8 @@ def deviation_columns(
 
     The deviations of at most `most` exposures are estimated.  If there are more exposures, the
     selected ones represent all and are at most half of them: the polynomials follow the mean of all
-    exposures, so that the deviations of the selected exposures must not be determined by that mean.
+    exposures, including the selected ones, and the deviations of the others cannot be separated
+    from that mean.
     """
     keys = np.column_stack([groups.exposure, groups.epoch])
     distinct, of_group = np.unique(keys, axis=0, return_inverse=True)
@@ -260,8 +261,8 @@ def linear_deviations(
 
     def displacement(cells: GroupCells, g: int) -> Float:
         out = np.zeros((len(cells.X), 2, total))
-        source_index, values = columns.at(g, cells.chip, cells.epoch, cells.phi, centre)
-        out[:, :, source_index] = values
+        indices, values = columns.at(g, cells.chip, cells.epoch, cells.phi, centre)
+        out[:, :, indices] = values
         return np.asarray(np.einsum("ab,cbq->caq", cells.frame, out))
 
     S, score = np.zeros((total, total)), np.zeros(total)

@@ -97,7 +97,7 @@ def star_bins(
     """Sums over bins in which the detections of one star count as one, at their mean.
 
     Detections of a star share the error of its reference position, so that the means of bins
-    scatter according to the number of stars.  `code` (N,) is the star of each match, or the close
+    scatter according to the number of stars.  `code` (N,) is the star of each match, or the tight
     group of stars; for the other arguments see `star_sums`.
     """
     stars, order = prepare(model, table)
