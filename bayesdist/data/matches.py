@@ -604,7 +604,7 @@ class Matches(MatchColumns):
             If no star is selected, or if an index is repeated.
         """
         which = np.asarray(which)
-        if not which.size:  # an empty list has no integer type of its own
+        if not which.size:  # an empty list has no integer type
             which = which.astype(np.int64)
         if self._readers is not None:
             return self._selected_on_disk(self._readers, which, reason)

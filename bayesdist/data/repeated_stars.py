@@ -88,7 +88,7 @@ def repeated_words(number: Int) -> str:
 
 @dataclass(frozen=True, eq=False)
 class RepeatedDetections:
-    """Stars with several detections in one exposure, at most one of which can be correct."""
+    """Stars with several detections in one exposure; at most one of them can be correct."""
 
     stars: int  # reference stars with several detections in an exposure
     rows: int  # rows of these stars in these exposures

@@ -45,7 +45,7 @@ class SampledCalibration:
 
     @property
     def sentence(self) -> str:
-        """How well the polynomial follows the header."""
+        """Sentence on the distance between the polynomial and the header."""
         mas = 1e3 * self.pixel_arcsec
         source = f"{self.projection}, {self.system.upper()}"
         return (

@@ -204,7 +204,7 @@ def built_for(
 def places_of(built: Sequence[Built], target: Path) -> list[Path]:
     """Output paths: inside `target` if it is a folder, else `target` and its companion files.
 
-    InputError if `target` is a file name but there are several files besides the parameter files.
+    InputError if `target` is a file name but there are several files that hold no parameters.
     """
     if target.is_dir():
         return [target / part.file_name for part in built]

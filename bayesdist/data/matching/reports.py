@@ -147,7 +147,7 @@ def all_cut(stars: Detections, rejected: Mapping[str, int]) -> InputError:
 
 
 def too_many(failed: int, matched: int, n: int) -> bool:
-    """True if so many exposures failed that the campaign must be misconfigured."""
+    """True if the number of failures shows that the campaign is misconfigured."""
     return failed > _MAX_FRACTION_LEFT_OUT * n or (not matched and failed >= _MAX_FAILURES_AT_FIRST)
 
 

@@ -1,6 +1,6 @@
 """Search radius for pairs, derived from the distances of the pairs.
 
-Where a distortion is less well known, usually in the corners, pairs need a larger search radius
+In regions with a less well known distortion, usually the corners, pairs need a larger search radius
 than in the middle. A radius that is large everywhere includes false matches (the WISE distortion
 report, Section 3, item 1: criteria that depend on the radial distance from the centre).
 """

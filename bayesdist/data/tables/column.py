@@ -40,7 +40,7 @@ def encoded(values: NDArray[Any], *, ordered: bool = False) -> tuple[Int, tuple[
 
 @dataclass(frozen=True, eq=False)
 class EncodedColumn:
-    """Column with few distinct values, each of which is parsed only once."""
+    """Column with few distinct values; each value is parsed only once."""
 
     codes: Int  # (N,), indices into `labels`
     labels: NDArray[Any]  # (L,), distinct values in the order of their first appearance

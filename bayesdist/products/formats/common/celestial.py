@@ -57,7 +57,7 @@ class TangentForm:
     wcs: WCS  # without look-up tables
     cd: Float  # (2, 2), degrees per pixel, along the axes of the header
     native_turn: Float  # (2, 2), from these axes to east and north in the header's celestial system
-    system_turn: Float  # (2, 2), from east and north in that system to east and north in ICRS
+    system_turn: Float  # (2, 2), from east and north in that system to those of RA and Dec
     native_point: tuple[float, float]  # longitude and latitude of the tangent point, degrees
     point: tuple[float, float]  # RA and Dec of the tangent point, degrees
 
@@ -292,7 +292,7 @@ def _from_galactic(lon: float, lat: float) -> tuple[Float, tuple[float, float]]:
     from astropy.coordinates import CartesianRepresentation, Galactic, SkyCoord
 
     axes = SkyCoord(Galactic(CartesianRepresentation(np.eye(3))))
-    # columns are the ICRS images of the galactic axes
+    # columns are the galactic axes in ICRS
     matrix = np.asarray(axes.icrs.cartesian.xyz.value, float)
     east, north, outwards = plane_axes((lon, lat))
     x, y, z = matrix @ outwards

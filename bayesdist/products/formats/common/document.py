@@ -48,7 +48,7 @@ def of_part(part: str, findings: Iterable[Finding]) -> list[Finding]:
 
 
 def repeated_values(coefficients: Mapping[str, float]) -> list[tuple[str, ...]]:
-    """Groups of names whose values are equal in size and not zero.
+    """Groups of names with non-zero values of equal magnitude.
 
     Two fitted numbers never agree to the last digit: one of them has been copied over the other, as
     in tables that went through text extraction.

@@ -22,7 +22,7 @@ class ReadBack:
     forward: Positions  # (x (N,), y (N,), chip number, date) -> positions (N, 2)
     # same arguments -> error (N, 2) of the pixel after forward and inverse; None without an inverse
     missed: Positions | None = None
-    # True if the file defines axes and a unit of its own, so that shift, rotation and scale do not
+    # True if the file has separate axes and unit, so that shift, rotation and scale do not
     # count as errors; otherwise positions are along u, v in their unit
     own_axes: bool = False
 
@@ -30,7 +30,7 @@ class ReadBack:
 def by_calibrations(
     file: str, sets: Sequence[Calibration], time: TimeDependence | None
 ) -> ReadBack:
-    """Positions by the calibrations of a file that defines axes of its own.
+    """Positions by the calibrations of a file that defines separate axes.
 
     `sets` holds one calibration, or one per segment of the drift. `time` is the time dependence of
     the solution that the file was made from.

@@ -23,7 +23,7 @@ LIMITS = {
 
 
 def rows_text(indices: Iterable[int]) -> str:
-    """Row numbers counted from 1, of which the first three are named."""
+    """Row numbers counted from 1: the first three, and the number of further ones."""
     numbers = [int(k) + 1 for k in indices]
     shown = ", ".join(map(str, numbers[:3]))
     further = f" and {len(numbers) - 3} more" if len(numbers) > 3 else ""

@@ -44,7 +44,7 @@ class Settings(FormatSettings):
         size: tuple[float, float] | None,
         reference_pixel: tuple[float, float] | None,
     ) -> None:
-        """Raise ValueError unless the chip is the full array of a band, centred on its origin."""
+        """Raise ValueError unless the chip is a full array with its middle as reference pixel."""
         band = _band(detector)
         if band is None:
             raise ValueError(
