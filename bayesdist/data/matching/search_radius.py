@@ -25,8 +25,14 @@ _MIN_RADIUS = 1e-3  # of the largest radius; pairs without scatter still have ro
 class SearchRadius:
     """Largest distance of a pair, as a function of the distance from the centre of the detections.
 
-    The radius is linear between the median distances `rho` (R,) of rings, in ascending order, and
-    constant beyond them.
+    The radius is interpolated linearly between rings and is constant beyond them.
+
+    Parameters
+    ----------
+    rho : ndarray, shape (R,)
+        Median distance of the pairs in each ring from the centre, ascending.
+    radius : ndarray, shape (R,)
+        Largest distance of a pair in each ring.
     """
 
     rho: Float

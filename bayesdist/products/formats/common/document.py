@@ -28,12 +28,21 @@ PARAMETERS = "parameters"  # kind of a companion file that holds the parameters 
 
 @dataclass(frozen=True)
 class Finding:
-    """One finding of a format check."""
+    """One finding of a format check.
 
-    # 'error': programs will fail or misplace stars; 'warning': they may; 'note': good to know
+    Parameters
+    ----------
+    level : {'error', 'warning', 'note'}
+        'error': programs will fail or misplace stars; 'warning': they may; 'note': good to know.
+    where : str
+        Keyword, column or row.
+    message : str
+        One clause.
+    """
+
     level: str
-    where: str  # keyword, column or row
-    message: str  # one clause
+    where: str
+    message: str
 
     def __str__(self) -> str:
         return f"{self.level}: {self.where}: {self.message}"
@@ -103,13 +112,22 @@ def required_size(
 
 @dataclass(frozen=True)
 class Choice:
-    """Selection of one calibration in a file, and values that the file may lack."""
+    """Selection of one calibration in a file, and values that the file may lack.
 
-    # filter of an IDCTAB (names in two wheels may be joined by a comma), or a WISE band such as
-    # "W2"
+    Parameters
+    ----------
+    filter : str, optional
+        Filter of an IDCTAB (names in two wheels may be joined by a comma), or a WISE band such as
+        "W2".
+    size : tuple of float, optional
+        Columns and rows, for a header that does not state them.
+    as_used : bool
+        True to read the file as other programs do, without its stored parameters.
+    """
+
     filter: str | None = None
-    size: tuple[float, float] | None = None  # columns and rows, for a header that lacks them
-    as_used: bool = False  # as other programs read it: without the stored parameters
+    size: tuple[float, float] | None = None
+    as_used: bool = False
 
 
 class FormatSettings(BaseModel):

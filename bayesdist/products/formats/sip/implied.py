@@ -76,15 +76,30 @@ class _Student:
 
 @dataclass(frozen=True)
 class Implied:
-    """Value of one coefficient that is implied by all other numbers of a header."""
+    """Value of one coefficient that is implied by all other numbers of a header.
+
+    Parameters
+    ----------
+    keyword : str
+        Keyword of the coefficient.
+    printed : float
+        Value in the header.
+    value, sigma : float
+        Mean and standard deviation of the implied value.
+    interval : tuple of float
+        Central interval that contains 95 % of the probability.
+    probability : float
+        Probability that this coefficient is wrong, if exactly one is and each may be.
+    sources : tuple of str
+        Sources of the implied value: the other pair of polynomials, and A_DMAX or B_DMAX.
+    """
 
     keyword: str
-    printed: float  # value in the header
-    value: float  # mean and standard deviation of the implied value
+    printed: float
+    value: float
     sigma: float
-    interval: tuple[float, float]  # central interval that contains 95 % of the probability
-    probability: float  # that this coefficient is wrong, if exactly one is and each may be
-    # sources of the value: the other pair of polynomials, and A_DMAX or B_DMAX
+    interval: tuple[float, float]
+    probability: float
     sources: tuple[str, ...]
 
     @property

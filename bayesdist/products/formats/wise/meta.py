@@ -28,14 +28,27 @@ ARRAYS = {1: (1016, 2.75), 2: (1016, 2.75), 3: (1016, 2.75), 4: (508, 5.5)}
 
 @dataclass(frozen=True, eq=False)
 class WiseBand:
-    """Distortion entries of one band in a WISE meta-data file."""
+    """Distortion entries of one band in a WISE meta-data file.
+
+    Parameters
+    ----------
+    band : int
+        Number of the band, 1 to 4.
+    sip : SipHeader
+        Distortion. The reference pixel is the middle of the array. Because the file has no sky
+        position, CRVAL is zero and CD has the nominal scale.
+    skew : float
+        SKEW of the CD matrix, radians.
+    printed : mapping of str to str
+        Numbers as printed in the file, by keyword.
+    comments : mapping of str to str
+        Comments of the entries, by keyword.
+    """
 
     band: int
-    # the reference pixel is the middle of the array; because the file has no sky position, CRVAL is
-    # zero and CD has the nominal scale
     sip: SipHeader
-    skew: float  # of the CD matrix, radians
-    printed: Mapping[str, str]  # numbers as printed in the file, by keyword
+    skew: float
+    printed: Mapping[str, str]
     comments: Mapping[str, str]
 
 
