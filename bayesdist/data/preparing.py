@@ -19,9 +19,8 @@ _STARS_IN_BIN = 200  # stars per magnitude bin
 _MAX_BINS = 40
 # scatters above the median of ln(sigma): 0.6 % of a log-normal distribution is farther
 _MAX_SCATTERS_ABOVE = 2.5
-_MIN_SCATTER = (
-    0.05  # smallest scatter of ln(sigma): keeps slightly larger errors if all are nearly equal
-)
+# smallest scatter of ln(sigma): keeps slightly larger errors if all are nearly equal
+_MIN_SCATTER = 0.05
 
 
 @dataclass(frozen=True, eq=False)

@@ -27,9 +27,8 @@ ROUNDING = 1e-9  # fraction of the field; positions closer than this are equal
 # distributed at random, 7 % have a neighbour within it.
 LINK = 0.15
 LARGEST_GROUP = 30  # stars; larger groups indicate a crowded field, not a fiducial
-ISOLATION = (
-    4.0  # smallest distance of a group from the next star, in units of the extent of the group
-)
+# smallest distance of a group from the next star, in units of the extent of the group
+ISOLATION = 4.0
 MOST = 0.5  # fraction of the stars that must be in groups
 MIN_STARS = 20  # with fewer stars, groups cannot be distinguished from chance
 

@@ -36,9 +36,8 @@ from bayesdist.utils.quantities import Epoch, Number, value_in, year_of
 log = logging.getLogger("bayesdist")
 
 CALLER = 3  # stack frames from here to the caller of `Calibration.write`
-LONGEST_NAME = (
-    40  # characters; names in headers are derived from the file name, and a card holds 68
-)
+# characters; names in headers are derived from the file name, and a card holds 68
+LONGEST_NAME = 40
 
 
 def write_calibration(

@@ -48,9 +48,8 @@ _MARGIN = 0.1  # margin around the field, as a fraction of its size
 _MAX_ROUNDS = 12  # largest number of rounds in which the cubics and the radius are updated
 _MIN_UNPAIRED = 100  # smallest number of unpaired detections that represent their distribution
 _MAX_FALSE_FRACTION = 0.1  # largest fraction of chance pairs; with more, the match is rejected
-_GROWTH_FACTOR = (
-    1.01  # increase of the number of pairs per round above which the cubics are still improving
-)
+# increase of the number of pairs per round above which the cubics are still improving
+_GROWTH_FACTOR = 1.01
 _MAG_PERCENTILES = (1.0, 99.0)  # percentiles that define the range of magnitudes of a list
 
 

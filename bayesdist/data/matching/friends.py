@@ -35,9 +35,8 @@ class Friends:
 
     star: Int  # (N,) star codes from 0; `NO_STAR` for dropped detections
     n_stars: int
-    n_doubled: (
-        int  # groups with several detections in one exposure; the one nearest to the mean is kept
-    )
+    # groups with several detections in one exposure; the one nearest to the mean is kept
+    n_doubled: int
     n_dropped: int  # detections dropped for that reason
     n_chains: int  # groups that were dropped because they span several stars
 

@@ -15,17 +15,15 @@ from bayesdist.data.matching.similarity import MIRRORED
 from bayesdist.errors import InputError
 from bayesdist.utils.arrays import Float
 
-_MAX_FRACTION_LEFT_OUT = (
-    0.2  # largest fraction of exposures that may fail; with more, the campaign is misconfigured
-)
+# largest fraction of exposures that may fail; with more, the campaign is misconfigured
+_MAX_FRACTION_LEFT_OUT = 0.2
 _MAX_FAILURES_AT_FIRST = 2  # largest number of exposures that may fail before any has matched
 _MIN_EXPOSURES = 5  # smallest number of exposures among which outliers are identified
 _ODD_SIGMAS = 5.0  # robust standard deviations of all exposures
 _MIN_COMPLETENESS_STEP = 0.15  # smallest deviation of the completeness that is reported
 _MIN_FALSE_STEP = 0.05  # smallest deviation of the false fraction that is reported
-_MIN_SCALE_STEP = (
-    2e-5  # smallest deviation of the scale that is reported; the breathing of telescopes is below
-)
+# smallest deviation of the scale that is reported; the breathing of telescopes is below
+_MIN_SCALE_STEP = 2e-5
 _MAX_NAMED = 5  # largest number of exposures named in a sentence
 
 

@@ -23,9 +23,8 @@ from bayesdist.errors import InputError
 from bayesdist.utils.arrays import Complex, Float
 
 _MIN_STARS_TRIED = 60  # smallest number of stars in a trial
-_STARS_OF_FIRST_LEVEL = (
-    400  # reference stars in the first level; each further level has three times as many
-)
+# reference stars in the first level; each further level has three times as many
+_STARS_OF_FIRST_LEVEL = 400
 _LEVEL_FACTOR = 3
 # tolerances of the logarithms of side ratios, which allow for residual distortion
 _TOLERANCES = (0.004, 0.012)
@@ -42,9 +41,8 @@ _RATIOS = (20.0, 50.0, 1000.0, 3600.0, 72_000.0, 3.6e6)
 _RATIO_TOLERANCE = 1.1  # relative tolerance of such a ratio, because pixel sizes differ
 _WIDE_SCALE = 1.4  # relative tolerance for a scale that is poorly known
 _SCALE_TOLERANCE = 0.03  # relative tolerance of the scale that the matching allows
-_STARS_FOR_EACH_AGREEING = (
-    5.0  # largest number of stars with a neighbour per star with agreeing triangles
-)
+# largest number of stars with a neighbour per star with agreeing triangles
+_STARS_FOR_EACH_AGREEING = 5.0
 _CLEAR_SIGMAS = 16.0  # standard deviations; half of this may occur by chance in many trials
 MIRRORED = "its mirror image"
 

@@ -13,9 +13,8 @@ from scipy.spatial import cKDTree
 from bayesdist.data.matching.linear_map import robust_fit
 from bayesdist.utils.arrays import Bool, Complex, Float, Int
 
-_MIN_SIDE_RATIO = (
-    0.15  # shortest to longest side; in flatter triangles, small errors change the shape
-)
+# shortest to longest side; in flatter triangles, small errors change the shape
+_MIN_SIDE_RATIO = 0.15
 _MAX_SIDE_RATIO = 0.985  # ratio of two sides; more similar sides may change their order
 _MAX_ANCHORS = 500  # largest number of stars of the list around which triangles are made
 _NEIGHBOURS = (5, 6)  # neighbours of each star, in the list and in the reference

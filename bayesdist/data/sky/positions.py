@@ -23,9 +23,8 @@ MOTIONS = ("pm_ra", "pm_dec", "sigma_pm_ra", "sigma_pm_dec")
 SPARED = ("parallax", "sigma_parallax", "corr_ra", "corr_dec")
 SKY_QUANTITIES = ("sigma_ra", "sigma_dec", *MOTIONS, *SPARED, "catalogue_epoch")
 
-_NO_MATTER = (
-    100  # parsecs; without a radial velocity, the path on the sky does not depend on the distance
-)
+# parsecs; without a radial velocity, the path on the sky does not depend on the distance
+_NO_MATTER = 100
 _STANDS = 1e-3  # years; over a shorter time motions are negligible
 
 

@@ -20,9 +20,8 @@ NOT_FINITE = ("refuse", "reject")
 # limits for a value and for an error, so that the ratio of their squares can be represented
 LARGEST, SMALLEST = 1e30, 1e-100
 Place = Callable[[int], str]  # name of a row in error messages, given its index in the arrays
-COMPLETED: Any = (
-    None  # default of columns that a class fills in itself, so that they are never None afterwards
-)
+# default of columns that a class fills in itself, so that they are never None afterwards
+COMPLETED: Any = None
 
 
 def row_number(index: int) -> str:

@@ -46,9 +46,8 @@ _CHECK = 397  # points per axis at which the tables are compared with the map
 class Settings(FormatSettings):
     """Configuration of a file with CPDIS look-up tables."""
 
-    step: PositiveFloat | None = (
-        None  # pixels between nodes; by default, fine enough for an error of 1e-4 pixels
-    )
+    # pixels between nodes; by default, fine enough for an error of 1e-4 pixels
+    step: PositiveFloat | None = None
     crval: tuple[float, float] | None = None
 
 

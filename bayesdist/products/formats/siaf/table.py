@@ -41,9 +41,8 @@ HIGHEST = 9  # highest order: each power has one digit in siaf_index
 SIDE = "siaf_covariance"  # first key of a covariance file
 AGREEMENT = 1e-6  # pixels; tolerance between a table and its covariance file
 _STATED = re.compile(r"#\s*(XSciSize|YSciSize|XSciRef|YSciRef)\s*=\s*(\S+)")
-COVARIANCE = (
-    "The covariance of Sci2Idl is in"  # comment text before the name of the covariance file
-)
+# comment text before the name of the covariance file
+COVARIANCE = "The covariance of Sci2Idl is in"
 # Size (columns, rows) and reference pixel (XSciRef, YSciRef) of full-frame apertures in the SIAF,
 # by patterns of their full names. Subarrays and apertures of several detectors differ, and the
 # reference pixel of the MIRI imager is not in the middle.

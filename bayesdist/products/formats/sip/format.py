@@ -40,9 +40,8 @@ class Settings(FormatSettings):
 
     inverse_order: Annotated[int, Field(ge=2, le=9)] | None = None
     linear: Literal["cd", "sip"] = "cd"
-    axes: Literal["sky", "linear"] | None = (
-        None  # None: sky, except for wide fields without a sky position
-    )
+    # None: sky, except for wide fields without a sky position
+    axes: Literal["sky", "linear"] | None = None
     crval: tuple[float, float] | None = None
     parameters: bool = True  # True to write a companion file with the covariance
 

@@ -78,9 +78,8 @@ def pv_values_of(axis: int, terms: tuple[Powers, ...], values: Float) -> dict[in
 
 
 SIDE_FILE = "BDPARAM"  # keyword with the name of the file that has the covariance
-_BEYOND_TAN = (
-    5  # from this m on, wcslib and astropy.wcs interpret the PV of a TAN as those of a TPV
-)
+# from this m on, wcslib and astropy.wcs interpret the PV of a TAN as those of a TPV
+_BEYOND_TAN = 5
 _CHIP = ("BDCHIP", "CCDNUM", "CCDCHIP", "EXTVER")
 
 
