@@ -1,4 +1,4 @@
-"""summary.json, what scripts read of a run, as a model, of which the package has a JSON Schema."""
+"""Data model of summary.json, the results of a run for scripts; the package has its JSON Schema."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ class Part(BaseModel):
 
     @classmethod
     def row(cls, *objects: Any, **others: Any) -> dict[str, Any]:
-        """Row with these fields: of `others`, or else of the first object that has one."""
+        """Row with these fields, each from `others`, or else from the first object that has it."""
         return {name: cls._value(name, objects, others) for name in cls.model_fields}
 
     @staticmethod
@@ -396,7 +396,7 @@ class Summary(Sections):
 
 
 def head_of(facts: Mapping[str, Any]) -> dict[str, Any]:
-    """What summary.json says of the run as a whole."""
+    """Entries of summary.json about the run as a whole."""
     config = facts["config"]
     kind = next(one for one in ("data", "campaign", "selfcal") if one in config)
     chips = " and ".join(chip["name"] for chip in config["chip"])
