@@ -60,9 +60,10 @@ Held = TypeVar("Held", bound=HoldsRun)
 
 @contextmanager
 def in_python_terms(*, keys: bool = True) -> Iterator[None]:
-    """Context in which errors name arguments in place of options and, optionally, configuration keys.
+    """Context in which errors name arguments in place of options and of configuration keys.
 
-    `keys` is False for a run that was made from a configuration file, because its keys are correct.
+    `keys` is False if keys are to be kept: those of a run made from a configuration file are
+    correct.
     """
     try:
         yield

@@ -203,7 +203,10 @@ class Results:
 
     @property
     def epoch(self) -> float | None:
-        """Epoch of the assessment in decimal years; stars are read only if it is their latest date."""
+        """Epoch of the assessment in decimal years.
+
+        Stars are read only if it is their latest date.
+        """
         if self.config.assess.epoch is not None or self.fit.model.time is None:
             return self.config.assess.epoch  # without reading the stars
         return assessment_epoch(self.data, self.config)

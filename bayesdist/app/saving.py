@@ -195,7 +195,7 @@ def save_figures(results: Results) -> None:
 
 
 def fit_sections(fitted: Fitted, stars: Matches, *, skew: bool = False) -> dict[str, Any]:
-    """Sections 'data' and 'fit' of summary.json, and others that are known only while the fit is made.
+    """Sections 'data' and 'fit' of summary.json, and others known only while the fit is made.
 
     `stars` are those returned by `Fitted.placed`. `skew` is True if the skew of the axes is
     requested.

@@ -228,7 +228,7 @@ class ArtefactStore:
 
     @contextmanager
     def amended(self, name: str, *made_from: object) -> Iterator[dict[str, Any]]:
-        """Record files that a command adds to a stage; yields the entries of the record for changes.
+        """Record files that a command adds to a stage; yields the entries of the record to change.
 
         `made_from` are the new ingredients of the artefact; empty if it is not up to date.
         """
