@@ -185,7 +185,7 @@ def sky_closure(
     u, v = uv.T * arcsec
     predicted = SkyCoord(*sky_of_plane(u, v, point), unit="deg")
     east, north = (float(a.to_value(apu.arcsec).mean()) for a in true.spherical_offsets_to(at))
-    offsets = {
+    sky = {
         "n": int(mine.sum()),  # without probable false matches
         "rms_arcsec": float(np.sqrt(np.mean(true.separation(at).arcsec ** 2))),
         # header minus star
@@ -193,18 +193,18 @@ def sky_closure(
         "mean_north_arcsec": north,
         "solution_arcsec": float(predicted.separation(at).arcsec.max()),  # maximum
     }
-    far = offsets["solution_arcsec"]
+    far = sky["solution_arcsec"]
     off = far / (model.pixel_size(solution.mean) * arcsec)
     faithful = SKY_CLOSURE.met_by(off)
     log.log(
         logging.INFO if faithful else logging.WARNING,
-        f"export: {path.name}: on the sky by astropy.wcs {offsets['rms_arcsec']:.4g} arcsec rms from "
-        f"RA, Dec of {offsets['n']} stars, on average {east:+.2g} east and {north:+.2g} north; "
+        f"export: {path.name}: on the sky by astropy.wcs {sky['rms_arcsec']:.4g} arcsec rms from "
+        f"RA, Dec of {sky['n']} stars, on average {east:+.2g} east and {north:+.2g} north; "
         f"{far:.2g} arcsec at most from the solution",
     )
     if faithful:
-        return offsets, []
-    return offsets, [
+        return sky, []
+    return sky, [
         f"error: sky: astropy.wcs puts pixels up to {far:.3g} arcsec ({off:.2g} px) from where the "
         "solution has them"
     ]
