@@ -101,7 +101,7 @@ def calibrate(
     reference_pixel : tuple of float, optional
         Zero point of the polynomials, FITS 1-based pixels; the centre of the chip by default.
     scale_mas : float or Quantity, optional
-        Size of a pixel in mas, to convert requirements and to print mas beside pixels.
+        Size of a pixel in mas, to convert requirements and to print mas in addition to pixels.
     frames : {'none', 'shift', 'shift_rotation', 'shift_rotation_scale', 'affine'}
         Transformation that is fitted to each exposure.
     time : TimeDependence, optional

@@ -54,7 +54,7 @@ def read_calibration(
     -------
     Calibration
         With the errors that the file states.  A calibration of a run has all errors of the
-        parameters that the run found, and lies on the sky if the positions of its stars did.
+        parameters that the run found, and is on the sky if the positions of its stars are.
 
     Raises
     ------

@@ -106,7 +106,7 @@ class _Root(LazyGroup):
         return None
 
     def invoke(self, ctx: click.Context) -> int:
-        # converted here, because click has its own exit codes for interrupts and closed pipes
+        # converted here, because click uses other exit codes for interrupts and closed pipes
         return _exit_code(lambda: super(_Root, self).invoke(ctx), ctx.obj or "bayesdist")
 
 

@@ -50,9 +50,23 @@ __all__ = [
 
 
 def read(config: Config, base: Path) -> Any:
-    """Read the inputs of a run: matched stars, or star lists with their catalogue and log.
+    """Read the inputs of a run, and refuse those that cannot be used.
 
-    `base` is the folder that file names are relative to.
+    Parameters
+    ----------
+    config : Config
+    base : Path
+        Folder that file names are relative to.
+
+    Returns
+    -------
+    Matches or Inputs
+        Matched stars, or star lists with their catalogue and log, depending on the kind of run.
+
+    Raises
+    ------
+    InputError
+        If the inputs cannot be read or are inconsistent.
     """
     kind = kind_of(config)
     inputs = kind.read(config, base)
@@ -61,14 +75,37 @@ def read(config: Config, base: Path) -> Any:
 
 
 def match(inputs: Any, config: Config) -> Matched:
-    """Fitted and held-out stars; `inputs` are those returned by `read`."""
+    """Match stars, and divide them into fitted and held-out stars.
+
+    Parameters
+    ----------
+    inputs : Matches or Inputs
+        Inputs returned by `read`.
+    config : Config
+
+    Returns
+    -------
+    Matched
+    """
     return kind_of(config).match(inputs, config)
 
 
 def fit(matched: Matched, config: Config, base: Path, reader: StarReader | None = None) -> FitData:
-    """Fit by least squares; the result includes the stars.
+    """Fit by least squares.
 
-    `reader` may already hold the stars.
+    Parameters
+    ----------
+    matched : Matched
+    config : Config
+    base : Path
+        Folder that file names are relative to.
+    reader : StarReader, optional
+        Reader that may already hold the stars.
+
+    Returns
+    -------
+    FitData
+        The solution with its stars.
     """
     reader = reader or StarReader(config.resources())
     return FitData(matched, kind_of(config).fit(matched, config, base, reader), reader)

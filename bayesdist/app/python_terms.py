@@ -101,7 +101,7 @@ def _reworded(text: str, keys: bool) -> str:
 
 
 def _argument(match: re.Match[str]) -> str:
-    """Argument that corresponds to a key: one of its own, or an entry of `settings`."""
+    """Argument that corresponds to a key: a separate one, or an entry of `settings`."""
     section, name, suffix = match[1], match[2], match[3]
     argument = ARGUMENTS.get(f"{section}.{name}")
     if argument is not None:

@@ -73,7 +73,7 @@ def _nothing(_: logging.LogRecord) -> bool:
 
 
 class _QuietHandler(logging.FileHandler):
-    """Log file that ignores its own errors, such as a full disk, so as not to hide the main one."""
+    """Log file that ignores errors of writing it, such as a full disk, which would hide others."""
 
     def handleError(self, record: logging.LogRecord) -> None:  # noqa: N802  logging's own name
         """Ignore the error."""

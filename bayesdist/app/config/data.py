@@ -80,7 +80,7 @@ class Data(Section):
         return unit
 
     def faults(self) -> Iterator[str]:
-        """Faults of nominal positions without a table, and of lengths without a plate scale."""
+        """Faults of lengths without a plate scale, and of nominal positions outside of tables."""
         if self.unit in LENGTHS and self.plate_scale is None:
             yield (
                 f"data.unit is {self.unit!r}, and positions are in pixels or angles; "

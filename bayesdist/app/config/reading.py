@@ -98,7 +98,24 @@ def load_config(path: str | Path) -> tuple[Config, str]:
 
 
 def parse_config(text: str, where: str) -> Config:
-    """Configuration from the text of a file; `where` is its name in errors."""
+    """Validate a configuration.
+
+    Parameters
+    ----------
+    text : str
+        Configuration in TOML.
+    where : str
+        Name of the configuration in errors.
+
+    Returns
+    -------
+    MatchesConfig, CampaignConfig or SelfcalConfig
+
+    Raises
+    ------
+    ConfigError
+        If the configuration is invalid.
+    """
     raw = _settings(text, where, begin="write one by 'bayesdist init'")
     config = _validated(CONFIG, KINDS, raw, where)
     with _as_config_errors(where):
@@ -112,7 +129,24 @@ def parse_config(text: str, where: str) -> Config:
 
 
 def config_of_record(settings: Mapping[str, Any], where: str) -> Config:
-    """Configuration from the record of a run; `where` is the name of the record in errors."""
+    """Configuration from the record of a run.
+
+    Parameters
+    ----------
+    settings : mapping
+        Configuration as stored in run.json.
+    where : str
+        Name of the record in errors.
+
+    Returns
+    -------
+    MatchesConfig, CampaignConfig or SelfcalConfig
+
+    Raises
+    ------
+    ConfigError
+        If the settings are invalid, for example if they are from another version.
+    """
     try:
         return CONFIG.validate_python(settings)
     except ValidationError as error:
@@ -120,7 +154,22 @@ def config_of_record(settings: Mapping[str, Any], where: str) -> Config:
 
 
 def load_requirements(path: str | Path) -> tuple[Requirement, ...]:
-    """Read the ``[[requirement]]`` blocks of a file, which may be a complete configuration."""
+    """Read the ``[[requirement]]`` blocks of a file.
+
+    Parameters
+    ----------
+    path : path
+        TOML file, which may be a complete configuration.
+
+    Returns
+    -------
+    tuple of Requirement
+
+    Raises
+    ------
+    ConfigError
+        If the file cannot be read, has no such blocks, or a block is invalid.
+    """
     text, begin = load_text(path), "give it [[requirement]] blocks"
     settings = _settings(text, str(path), begin=begin)
     if "requirement" in settings and settings.keys() & {"data", "detector", "model"}:
@@ -132,7 +181,10 @@ def load_requirements(path: str | Path) -> tuple[Requirement, ...]:
 
 
 def load_text(path: str | Path) -> str:
-    """Unchanged text of a file, including its line endings."""
+    """Text of a configuration file, unchanged including its line endings.
+
+    Raises ConfigError if the file cannot be read.
+    """
     with _as_config_errors():
         return read_text(path, most=MOST_TEXT)
 

@@ -51,7 +51,7 @@ TABLES, POSTERIOR = "tables.h5", "posterior.nc"
 
 
 class RunConfig(Section):
-    """Sections of every configuration of a run; each kind adds sections of its own types."""
+    """Sections of every configuration of a run; each kind adds further sections."""
 
     if TYPE_CHECKING:
         model: MatchedModel | CampaignModel | SelfcalModel

@@ -15,14 +15,26 @@ from bayesdist.utils.arrays import Float
 
 @dataclass(frozen=True, eq=False)
 class ErrorLaw:
-    """Rule that derives the errors of fitted and held-out stars from the quoted errors."""
+    """Rule that derives the errors of fitted and held-out stars from the quoted errors.
 
-    factor: float = 1.0  # applied to all quoted errors; 1 if these are adequate
-    # centroid errors as a function of magnitude, which replace the quoted errors
+    Parameters
+    ----------
+    factor : float
+        Factor on all quoted errors; 1 if these are adequate.
+    by_magnitude : MagnitudeErrors or None
+        Centroid errors as a function of magnitude, which replace the quoted errors or are added to
+        them.
+    added : AddedErrors or None
+        Additional errors of groups of stars, added in quadrature.
+    with_catalogue : bool
+        True if `by_magnitude` is added in quadrature to the quoted errors, because these are the
+        errors
+        of the catalogue.
+    """
+
+    factor: float = 1.0
     by_magnitude: MagnitudeErrors | None = None
-    added: AddedErrors | None = None  # additional errors of groups of stars, added in quadrature
-    # True if `by_magnitude` is added in quadrature to the quoted errors because these are the
-    # errors of the catalogue
+    added: AddedErrors | None = None
     with_catalogue: bool = False
 
     def applied(self, matches: Matches) -> Matches:
@@ -41,11 +53,21 @@ QUOTED = ErrorLaw()
 
 @dataclass(frozen=True, eq=False)
 class ExposureScatter:
-    """Scatter of the linear terms of the exposures about those of the model."""
+    """Scatter of the linear terms of the exposures about those of the model.
 
-    kinds: tuple[str, ...]  # names of the linear terms that scatter
-    tau: Float  # (n, k), posterior draws of the standard deviation of each kind
-    offsets: Settling  # relation between the constant terms of chips and the shifts of single chips
+    Parameters
+    ----------
+    kinds : tuple of str
+        Names of the k linear terms that scatter.
+    tau : ndarray, shape (n, k)
+        Posterior draws of the standard deviation of each term.
+    offsets : Settling
+        Relation between the constant terms of chips and the shifts of single chips.
+    """
+
+    kinds: tuple[str, ...]
+    tau: Float
+    offsets: Settling
 
     def averaged(self, posterior: Posterior, rng: np.random.Generator) -> Posterior:
         """Posterior in which each chip has its mean position over the exposures."""

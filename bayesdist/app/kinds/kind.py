@@ -25,7 +25,7 @@ from bayesdist.infer import Posterior
 class Kind:
     """Functions that implement one kind of run: matched stars, a campaign, or a self-calibration.
 
-    Configurations, inputs and matches have types of their own for each kind.
+    Configurations, inputs and matches have different types for each kind.
 
     Parameters
     ----------

@@ -46,7 +46,7 @@ class Matched:
 
     section: ClassVar[str] = ""  # section of summary.json that holds `facts`
     has_catalogue: ClassVar[bool] = True  # star positions come from a reference catalogue
-    along_detector: ClassVar[bool] = False  # u and v lie along the detector axes, not along the sky
+    along_detector: ClassVar[bool] = False  # u and v are along the detector axes, not along the sky
 
     stars: Matches  # fitted stars
     held: Matches | None = None  # held-out stars

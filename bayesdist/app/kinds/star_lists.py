@@ -72,8 +72,8 @@ class StarLists:
 def lists_of(block: StarListsBlock, base: Path, *, errors: bool = False) -> StarLists:
     """Read all star lists that a configuration names.
 
-    Each entry of the configuration is read separately: if two entries contain a list of the same
-    name, the exposure was given twice and is not renamed.
+    Each entry of the configuration is read separately, so that lists of the same name in two
+    entries are recognised as one exposure given twice, not as two exposures.
 
     Parameters
     ----------

@@ -156,7 +156,7 @@ class _Laid:
     ----------
     product : ProductInput
     place : callable
-        Positions of the file, in a unit of its own if `scaled`.
+        Positions of the file, in an arbitrary unit if `scaled`.
     scaled : bool
         True if the scale of the file is a convention; it is fitted at the date of the assessment.
     """

@@ -15,7 +15,15 @@ from pydantic_core import to_jsonable_python
 
 @dataclass(frozen=True)
 class Adjustable:
-    """Settings that may change when a stage is resumed: in its key, not in its checkpoints."""
+    """Settings that may change when a stage is resumed.
+
+    They are part of the key of the stage, but not of that of its checkpoints.
+
+    Parameters
+    ----------
+    value : object
+        Settings that `as_json` can convert.
+    """
 
     value: Any
 

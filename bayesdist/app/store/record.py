@@ -26,7 +26,14 @@ PACKAGES = ("arviz-stats", "astropy", "emcee", "h5py", "numba", "numpy", "scipy"
 
 
 def write_json(path: Path, value: Any) -> None:
-    """Write a JSON file, replaced atomically."""
+    """Write a JSON file, replaced atomically.
+
+    Parameters
+    ----------
+    path : Path
+    value : object
+        Value that `as_json` can convert.
+    """
     write_text(path, json_text(as_json(value)))
 
 
@@ -45,7 +52,7 @@ _version = cache(metadata.version)
 
 
 def versions() -> dict[str, str]:
-    """Versions of Python, the platform, and the packages that affect results."""
+    """Versions of Python, the platform, and the packages that affect results, by name."""
     out = {"python": sys.version.split()[0], "platform": platform.platform()}
     out["bayesdist"] = __version__  # also if run from a source tree
     out |= {name: _version(name) for name in PACKAGES}
@@ -85,13 +92,24 @@ def _as_sections(raw: dict[str, Any]) -> dict[str, Any]:
 
 
 class Artefact(_Part):
-    """Ingredients of a stage, and the files that it wrote."""
+    """Ingredients of a stage, and the files that it wrote.
 
-    key: str  # hash of `parts`
-    # revision of the stage, settings, and digests of the artefacts before it
+    Parameters
+    ----------
+    key : str
+        Hash of `parts`.
+    parts : dict
+        Revision of the stage, settings, and digests of the preceding artefacts.
+    files : dict of str to FileMark
+        Marks of the files by their path in the folder.
+    sections : dict
+        Sections of summary.json.
+    """
+
+    key: str
     parts: dict[str, Any]
-    files: dict[str, FileMark]  # by their path in the folder
-    sections: Annotated[dict[str, Any], AfterValidator(_as_sections)]  # of summary.json
+    files: dict[str, FileMark]
+    sections: Annotated[dict[str, Any], AfterValidator(_as_sections)]
 
     @property
     def digest(self) -> str:
@@ -134,15 +152,26 @@ _HEAD, _WHOLE = TypeAdapter(_Head), TypeAdapter(_Whole)
 
 @dataclass
 class Record:
-    """Content of run.json."""
+    """Content of run.json.
 
-    facts: dict[str, Any]  # ingredients of the run: configuration, inputs, versions
-    artefacts: dict[str, Artefact] = field(default_factory=dict)  # of completed stages
-    # of completed stages: when each ended, and how long it took
+    Parameters
+    ----------
+    facts : dict
+        Ingredients of the run: configuration, inputs, versions.
+    artefacts : dict of str to Artefact
+        Artefacts of completed stages.
+    stages : dict of str to dict
+        For each completed stage when it ended, and how long it took.
+    under_way : dict or None
+        Name of the stage in progress or interrupted, and the files that it may have written.
+    checkpoints : dict of str to str
+        For each stage with checkpoints the hash of their ingredients.
+    """
+
+    facts: dict[str, Any]
+    artefacts: dict[str, Artefact] = field(default_factory=dict)
     stages: dict[str, dict[str, Any]] = field(default_factory=dict)
-    # of the stage in progress or interrupted: its name, and the files that it may have written
     under_way: dict[str, Any] | None = None
-    # of stages with checkpoints: hash of the ingredients of the checkpoints
     checkpoints: dict[str, str] = field(default_factory=dict)
 
     @classmethod

@@ -97,7 +97,7 @@ def refuse_another_solution(
 
 
 def refuse_edited(folder: Path, known: Config) -> None:
-    """Refuse a run whose config.toml was edited in place after the run began."""
+    """Refuse a run if its config.toml was edited in place after the run began."""
     path = folder / "config.toml"
     if not path.exists():
         return

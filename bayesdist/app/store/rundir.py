@@ -119,7 +119,7 @@ class RunDirectory(ArtefactStore):
             run._adopted = config, text, {"inputs": inputs, **places_of(base, run.path)}
             return run
         if run.is_initialized:
-            run.record  # noqa: B018 - refuse to replace a run whose record cannot be read
+            run.record  # noqa: B018 - refuse to replace a run with an unreadable record
         else:
             refuse_foreign_files(run.path, text, (base / name for name in inputs))
         run._plan(with_seed(config, seed), text, base, inputs, command)
@@ -267,8 +267,8 @@ class RunDirectory(ArtefactStore):
     def base(self) -> Path:
         """Folder that inputs are relative to.
 
-        If inputs exist at the recorded path relative to the run, that folder is used, because the
-        run may have been moved together with them.  Otherwise it is the recorded folder.
+        If all inputs exist at the recorded path relative to the run, that folder is used, because
+        the run may have been moved together with them.  Otherwise it is the recorded folder.
         """
         return base_of(self.facts, self.path)
 

@@ -34,7 +34,7 @@ class FilterComparison:
     reference: str  # reference filter
     # offset by (filter, term), with terms such as 'WFC2.A_2', if all filters have a common drift
     offsets: Mapping[tuple[str, str], Measured]
-    # difference of the rate, per year, by (filter, term), if each filter has rates of its own
+    # difference of the rate, per year, by (filter, term), if each filter has separate rates
     rates: Mapping[tuple[str, str], Measured]
     # p-value of the differences of rates: the smallest of all chips, multiplied by their number
     p_value: float

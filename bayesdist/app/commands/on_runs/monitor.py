@@ -125,7 +125,7 @@ def _fitted(
 
 
 def _new_matches(run: RunDirectory, config: Config, new: Path) -> tuple[Matches, tuple[str, ...]]:
-    """New matches with errors, read like those of the run or according to their own configuration.
+    """New matches with errors, read like those of the run or as a configuration of theirs states.
 
     The second value names files that are left out because the release was made from them.
     """

@@ -140,7 +140,7 @@ def read_campaign_catalog(
     """Read the catalogue, and describe its tangent plane if it has right ascension and declination.
 
     The plane touches the sky at the mean pointing of the exposures of all filters if the log has
-    all pointings and their mean lies within the field of the stars; otherwise at the centre of the
+    all pointings and their mean is within the field of the stars; otherwise at the centre of the
     stars.
 
     Returns

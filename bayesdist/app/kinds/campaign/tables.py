@@ -143,8 +143,9 @@ def _with_errors(
     """Pairs with errors by magnitude that exclude the table pattern, and a rough fit of the tables.
 
     Without tables the residuals scatter twice as much as the centroids.  With errors from that
-    scatter the tables would be smoothed too much, and their own errors would be twice too large.
-    The smoothness of the rough tables hardly matters, because it hardly affects the scatter.
+    scatter the tables would be smoothed too much, and the errors of the tables would be twice too
+    large.  The smoothness of the rough tables hardly matters, because it hardly affects the
+    scatter.
     """
     pairs, inputs, model = matched.stars, matched.inputs, matched.affine_model
     block = inputs.config.tables

@@ -104,8 +104,8 @@ def fit_stars(
 ) -> Fitted:
     """Fit matched stars by least squares, with errors adjusted to the residuals.
 
-    After the fit `reader` holds the stars for later passes.  If the fit is degenerate, the error
-    names the frames of the exposures that would remove the degeneracy.
+    After the fit `reader` holds the stars for later passes.  If the fit is degenerate or does not
+    settle, the error names the frames of the exposures that would help, if any.
     """
     if reader is None:
         with closing(StarReader(config.resources())) as reader:

@@ -23,7 +23,7 @@ def fixed_by(
 ) -> dict[str, str]:
     """Source of the constraint on each property of the solution, by name of the property."""
     problem, theta = solution.problem, solution.theta
-    alone, information_of_references = solution.curvatures
+    alone, with_priors = solution.curvatures
     priors = {name: piece(theta) for name, piece in pieces.pieces.items()}
     sigmas: dict[str, dict[str, float]] = {}
     none = Prior.none(theta)
@@ -31,7 +31,7 @@ def fixed_by(
         constrained = find_gauge(problem, theta, alone, information)
         sigmas[name] = {d.name: d.sigma_fixed for d in constrained.directions}
     if problem.priors.informed.any():
-        constrained = find_gauge(problem, theta, alone, none, known=information_of_references)
+        constrained = find_gauge(problem, theta, alone, none, known=with_priors)
         sigmas[REFERENCES] = {d.name: d.sigma_fixed for d in constrained.directions}
     return {d.name: _fixed_by(d, sigmas) for d in gauge.directions}
 
