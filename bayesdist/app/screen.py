@@ -39,9 +39,8 @@ def open_streams() -> None:
         try:
             os.fstat(number_of)
         except OSError:
-            os.set_inheritable(
-                os.open(os.devnull, os.O_RDWR), True
-            )  # it gets the lowest free descriptor
+            # the new file gets the lowest free descriptor
+            os.set_inheritable(os.open(os.devnull, os.O_RDWR), True)
         if getattr(sys, name) is None:
             stream = os.fdopen(number_of, mode, encoding="utf-8", closefd=False)
             setattr(sys, name, stream)

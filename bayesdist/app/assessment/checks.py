@@ -52,9 +52,8 @@ def _kind_checks(data: FitData, series: Mapping[str, Any] | None) -> tuple[Check
             "Constraints": solved.contradictions,
             "Detections": matched.warnings,
         }
-        settled = set(
-            solved.gauge.settled
-        )  # settled by the choice of a gauge, not a fault of the data
+        # settled by the choice of a gauge, so that they are not a fault of the data
+        settled = set(solved.gauge.settled)
         return tuple(
             Check("Gauge", name, level="note" if text in settled else "warn", sentence=text)
             for name, texts in named.items()

@@ -13,10 +13,7 @@ from bayesdist.errors import InputError
 from bayesdist.files.regular import read_text
 
 _PACKAGE = Path(bayesdist.version.__file__).parent
-_FOLDERS = (
-    _PACKAGE / "docs",
-    _PACKAGE.parent / "docs",
-)  # in an installation, and in the source tree
+_FOLDERS = (_PACKAGE / "docs", _PACKAGE.parent / "docs")  # installed, and in the source tree
 
 
 @command()

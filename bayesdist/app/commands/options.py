@@ -172,9 +172,8 @@ def command(
     ----------
     calls : str
         Function that carries out the command, as "module:function".  It is imported when the
-        command
-        runs, receives the options, and returns the text to print.  If it is empty the decorated
-        function does everything and returns the exit code.
+        command runs, receives the options, and returns the text to print.  If it is empty the
+        decorated function does everything and returns the exit code.
     example : str
         Command line without 'bayesdist' that is shown at the end of the help.
     recorded : bool

@@ -28,8 +28,7 @@ class ErrorLaw:
         Additional errors of groups of stars, added in quadrature.
     with_catalogue : bool
         True if `by_magnitude` is added in quadrature to the quoted errors, because these are the
-        errors
-        of the catalogue.
+        errors of the catalogue.
     """
 
     factor: float = 1.0

@@ -49,8 +49,7 @@ class Kind:
         stars are found by their fit.
     lines : callable
         ``lines(inputs)`` returns the lines that the command `check` prints about the inputs, or
-        None
-        if those about the fit are more informative.
+        None if those about the fit are more informative.
     outline : callable, optional
         ``outline(inputs)`` returns the shape of the solution, from which products are written on
         trial before stars are matched.  None if the fit is used for that.

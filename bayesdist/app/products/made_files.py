@@ -215,8 +215,7 @@ def write_files(
         Folder to write to.
     solutions : mapping of str to Solution
         Solutions by filter.  The first one must be that of the configuration: V2 and V3 are
-        oriented as
-        the reference states for it.
+        oriented as the reference states for it.
     tables : sequence of LookupTable
     history : sequence of str
         Lines for HISTORY in all files.

@@ -118,8 +118,7 @@ def made_from_of(
     config : Config
     facts : mapping
         Entries of the record: inputs with their hashes, and requirements that replace the
-        configured
-        ones.
+        configured ones.
     """
     begins_with = () if config.data is not None or stage == "match" else ("match",)
     if not before.keys() >= {*begins_with, *NEEDS[stage]}:
@@ -146,14 +145,11 @@ def _of_diagnoses(later: Mapping[str, Any], own: list[Any], config: Config) -> d
     """Settings that affect the diagnostics."""
     settings = {key: later[key] for key in ("discrepancy", "periods") if key in later}
     if later.get("periods"):
-        settings["requirement"] = (
-            own  # the tightest limit is the tolerance when periods are compared
-        )
+        settings["requirement"] = own  # the tightest limit is the tolerance of periods
     if config.holdout is not None:  # held-out stars are predicted with all position errors
         settings |= {key: later[key] for key in ("assess", "budget")}
-        settings["useafter"] = (
-            config.products.useafter_years()
-        )  # may be the epoch of the assessment
+        # may be the epoch of the assessment
+        settings["useafter"] = config.products.useafter_years()
     return settings
 
 

@@ -100,8 +100,7 @@ class RunDirectory(ArtefactStore):
         ------
         InputError
             If the folder holds other files or a run that is neither resumed nor replaced, or the
-            run cannot
-            be resumed with this configuration or these inputs.
+            run cannot be resumed with this configuration or these inputs.
         """
         run = cls(path)
         if run.path.exists() and not run.path.is_dir():

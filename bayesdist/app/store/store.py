@@ -83,8 +83,7 @@ class ArtefactStore:
         Stages in order.
     head : callable
         ``head(facts)`` returns the entries of summary.json about the run as a whole, from the
-        entries of
-        run.json.
+        entries of run.json.
     """
 
     def __init__(
@@ -96,9 +95,8 @@ class ArtefactStore:
         self.path, self.stages, self.head = path, stages, head
         self._planned: Record | None = None
         self._read: tuple[tuple[int, ...], Record] | None = None  # with the times of run.json
-        self._known: dict[
-            str, tuple[tuple[int, ...], FileMark]
-        ] = {}  # by file name, with the times of the file
+        # by file name, with the times of the file
+        self._known: dict[str, tuple[tuple[int, ...], FileMark]] = {}
         # of the stage that is being made by this process
         self._making = ""
         self._sections: dict[str, Any] = {}
@@ -233,7 +231,7 @@ class ArtefactStore:
         `made_from` are the new ingredients of the artefact; empty if it is not up to date.
         """
         record, self._sections = self.record, {}
-        artefact_before = record.artefacts.get(name)
+        previous = record.artefacts.get(name)
         written: set[str] = set()
 
         def note(paths: Sequence[Path]) -> None:
@@ -241,13 +239,13 @@ class ArtefactStore:
 
         with watched_writes(note):
             yield record.facts
-        parts = self._parts(name, made_from) if artefact_before and made_from else {}
-        artefact_before = artefact_before or Artefact(key="", parts={}, files={}, sections={})
+        parts = self._parts(name, made_from) if previous and made_from else {}
+        previous = previous or Artefact(key="", parts={}, files={}, sections={})
         files = {file: FileMark.of(self.path / file) for file in written if self._is_there(file)}
         files = {
-            file: mark for file, mark in artefact_before.files.items() if self._is_there(file)
+            file: mark for file, mark in previous.files.items() if self._is_there(file)
         } | files
-        sections = {**artefact_before.sections, **self._sections}
+        sections = {**previous.sections, **self._sections}
         key = digest_of(parts) if parts else ""
         record.artefacts[name] = Artefact(key=key, parts=parts, files=files, sections=sections)
         self._sections = {}
@@ -296,16 +294,16 @@ class ArtefactStore:
         """Drop the sections of a stage from later artefacts that were made from another version."""
         stale: set[str] = set()
         for later in list(self.stages)[list(self.stages).index(name) + 1 :]:
-            artefact_later = record.artefacts.get(later)
-            made_from = {} if artefact_later is None else artefact_later.parts.get("from", {})
-            if artefact_later is not None and (
+            affected = record.artefacts.get(later)
+            made_from = {} if affected is None else affected.parts.get("from", {})
+            if affected is not None and (
                 made_from.get(name, artefact.digest) != artefact.digest or stale & made_from.keys()
             ):
                 stale.add(later)
                 remaining = {
-                    k: v for k, v in artefact_later.sections.items() if k not in artefact.sections
+                    k: v for k, v in affected.sections.items() if k not in artefact.sections
                 }
-                record.artefacts[later] = artefact_later.model_copy(update={"sections": remaining})
+                record.artefacts[later] = affected.model_copy(update={"sections": remaining})
 
     def _in_order(self, found: dict[str, Any]) -> dict[str, Any]:
         """Entries of stages, in the order of the stages."""

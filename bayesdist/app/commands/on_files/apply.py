@@ -76,12 +76,10 @@ def apply_to_table(
         Order of the fitted polynomial.
     columns : sequence of str, optional
         Columns with the positions; by default those with usual names for pixels, or x_out and y_out
-        for
-        the inverse.
+        for the inverse.
     pixel_origin : float, optional
         Coordinate of the centre of the first pixel in the table; by default that of the program
-        that
-        wrote the columns.
+        that wrote the columns.
     chip : int, optional
         Chip number, in place of a column 'chip'.
     filter, scale, size

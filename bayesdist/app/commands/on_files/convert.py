@@ -75,8 +75,7 @@ def convert(
         KEY=VALUE of the section of the format in a configuration, with values as in TOML.
     order : int, optional
         Order of the output polynomial; that of the calibration by default.  Look-up tables are
-        included
-        in the polynomial if the format cannot hold them.
+        included in the polynomial if the format cannot hold them.
     chip : int, optional
         Number of the only chip to convert.
     filter, epoch, size

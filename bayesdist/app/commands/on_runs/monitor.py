@@ -51,11 +51,10 @@ def monitor(
         Released run.
     new : path
         New matches, which are read like those of the run; or a configuration, a run or a folder
-        with a
-        config.toml that has a section [data].  Files that the release was made from are left out.
-        For a
-        campaign: another run with completed stage 'match', or pairs as stored in a run.  For a
-        self-calibration: a configuration with [data]; the linear part of each exposure is free.
+        with a config.toml that has a section [data].  Files that the release was made from are left
+        out.  For a campaign: another run with completed stage 'match', or pairs as stored in a run.
+        For a self-calibration: a configuration with [data]; the linear part of each exposure is
+        free.
     output : path, optional
         Folder to create.
     command : str
@@ -343,8 +342,7 @@ def fit_new_exposures(release: Results, new: Path) -> tuple[Matches, NewFit, tup
     release : Results
     new : Path
         Run directory of a campaign with completed stage 'match', or a file or folder of pairs as
-        stored
-        in a run.  Star lists must be matched first.
+        stored in a run.  Star lists must be matched first.
 
     Returns
     -------

@@ -45,8 +45,7 @@ def release_runs(
     runs : sequence of path
         Finished runs of campaigns, one per filter.  The first is that of the reference filter: its
         section [products.release] defines the files, its drift is stored, and its tables are those
-        of
-        the detector.
+        of the detector.
     output : path
         Folder to create.
     allow_unconverged : bool

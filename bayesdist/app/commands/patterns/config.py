@@ -35,9 +35,8 @@ from bayesdist.utils.arrays import Float
 
 Pair = tuple[PositiveFloat, PositiveFloat]
 MOST_EXPOSURES = 10_000  # largest number of exposures of a pattern
-Count = Annotated[
-    int, Field(ge=1, le=MOST_EXPOSURES)
-]  # number of exposures, or of grid points per axis
+# number of exposures, or of grid points per axis
+Count = Annotated[int, Field(ge=1, le=MOST_EXPOSURES)]
 Pointing = tuple[float, float] | tuple[float, float, float]
 
 

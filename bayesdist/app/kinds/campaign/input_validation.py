@@ -48,9 +48,8 @@ def refuse_unsound(inputs: Inputs) -> None:
             where=inputs.catalog.source,
             do="give the columns sigma_u and sigma_v",
         )
-    if not any(
-        good.any() for good in lists.passed
-    ):  # a single exposure without any is left out in matching
+    # a single exposure without usable detections is left out in matching
+    if not any(good.any() for good in lists.passed):
         raise InputError(
             f"the cuts leave none of {len(lists)} detections in {len(lists.lists)} exposures "
             f"({lists.cut_words})",

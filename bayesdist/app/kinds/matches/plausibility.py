@@ -24,10 +24,8 @@ MADE_FROM_PIXELS = 1e-3  # pixels: smaller scatter means that positions were com
 FAR_BELOW = 0.1  # such a scatter is also below this fraction of the quoted errors
 STARS_PER_TERM = 3  # fewest stars per term and axis for which residuals show the errors
 ORDER = 4
-ROUNDS, ORDER_ROUNDS = (
-    20,
-    6,
-)  # of rejection, in estimates of the scatter and in comparisons of orders
+# rounds of rejection in estimates of the scatter, and in comparisons of orders
+ROUNDS, ORDER_ROUNDS = 20, 6
 NORMAL = 1.4826022185056018  # 1 / (median of |z|, z standard normal)
 CLIP = 4.0  # robust standard deviations
 EACH = 4  # fewest stars per coefficient

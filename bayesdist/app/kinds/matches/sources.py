@@ -114,8 +114,7 @@ class MatchSource:
     ----------
     read : callable
         ``read(paths, data, size)`` returns the matches in memory; `data` is the section [data] of
-        the
-        mission, `size` the number of columns and rows of the detector.
+        the mission, `size` the number of columns and rows of the detector.
     input_of : callable
         ``input_of(run)`` returns the `RunInput` of a run directory.
     template : callable
