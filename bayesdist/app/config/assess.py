@@ -27,7 +27,7 @@ from bayesdist.assess.terms.parameters import one_size_kinds
 from bayesdist.assess.terms.solution import COEFFICIENTS, EXPOSURE_FRAME, TIME_DEPENDENCE
 
 Probability = Annotated[float, Field(gt=0, lt=1)]
-GridPoints = Annotated[int, Field(ge=2, le=10_000)]  # about the number of pixels of a detector
+GridPoints = Annotated[int, Field(ge=2, le=10_000)]  # no more than a detector has pixels
 
 # names of rows that every budget has, including totals
 MEASURED_TERMS = (

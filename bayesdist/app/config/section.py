@@ -96,7 +96,7 @@ def same_names(block: str, names: Sequence[object], key: str = "name") -> Iterat
 
 
 def reference_first(chips: Sequence[Block]) -> list[Block]:
-    """Blocks with the reference chip, which defines the frame, in the first place."""
+    """Blocks with that of the reference chip, which defines the frame, as the first."""
     return sorted(chips, key=lambda c: not c.reference)
 
 

@@ -47,8 +47,7 @@ class SelfCalibrated:
     # sentences about constraints that contradict the detections
     contradictions: tuple[str, ...] = ()
     references: ReferenceCatalog | None = None  # reference stars that are also in a catalogue
-    # point (u, v) where the tangent plane of the stars touches the sky; None if the sky is taken as
-    # flat
+    # point (u, v) where the tangent plane of the stars touches the sky; None if the sky is flat
     contact: tuple[float, float] | None = None
 
     def save(self, folder: Path) -> None:

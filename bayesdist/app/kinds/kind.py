@@ -100,6 +100,7 @@ def _campaign() -> Kind:
 
 @cache
 def _selfcal() -> Kind:
+    """Functions of a self-calibration."""
     from bayesdist.app.kinds.selfcal.fit import fit_selfcal, load_selfcal, sample_detections
     from bayesdist.app.kinds.selfcal.inputs import outline_of_selfcal, read_selfcal, refuse_selfcal
     from bayesdist.app.kinds.selfcal.matched import load_matched_selfcal

@@ -53,7 +53,7 @@ class Matched:
     whole: tuple[str, ...] = ()  # exposures that are held out entirely
     facts: Mapping[str, Any] = field(default_factory=dict)
     table: Table | None = None  # one row per exposure of star lists
-    catalogue: ReferenceCatalog | None = None  # if more than the matches is known
+    catalogue: ReferenceCatalog | None = None  # None if only the matches are known
 
     @property
     def warnings(self) -> tuple[str, ...]:

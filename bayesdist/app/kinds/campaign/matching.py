@@ -145,7 +145,7 @@ def _doubtful_parity(mirrored: bool, parities: tuple[bool, ...], detector: str) 
 
 
 def _gauge_first(star_lists: StarLists, chip: int) -> tuple[Detections, ...]:
-    """Star lists, with one that has enough stars on the reference chip in the first place.
+    """Star lists, reordered if necessary so that the first has enough stars on the reference chip.
 
     These stars of the first exposure define the gauge of the joint fit.  The order is kept if the
     first list has at least half the median number of stars there.
