@@ -254,8 +254,8 @@ def diagnosed_error_model(
     if diagnostics.catalogue is not None:
         catalogue_errors = catalogue_terms(posterior, diagnostics.catalogue, catalogue)
         solution_errors = replace(solution_errors, without=posterior, catalogue=catalogue_errors)
-    found = error_model(posterior, terms, aligned=aligned, pixel_scale=pixel_scale)
-    return replace(found, solution=solution_errors, terms=(*measured, *found.terms))
+    stated_errors = error_model(posterior, terms, aligned=aligned, pixel_scale=pixel_scale)
+    return replace(stated_errors, solution=solution_errors, terms=(*measured, *stated_errors.terms))
 
 
 def with_shared_stars(posterior: Posterior, fit: LinearFit, stars: StarCovariance) -> Posterior:
