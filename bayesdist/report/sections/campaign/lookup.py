@@ -65,9 +65,9 @@ def lookup_table(r: ReportInput) -> TextTable:
 
 @REPORT.figure("campaign-tables", needs=("campaign.residuals", "campaign.tables"))
 def table_residuals(r: ReportInput) -> Plot:
-    """Draw residuals of single stars on each chip, without and with the tables.
+    """Residuals of single stars on each chip, without the tables and with them.
 
-    See Figures 6 and 7 of ACS ISR 2015-06.
+    Figures 6 and 7 of ACS ISR 2015-06.
     """
     results = needed(r.campaign)
     order = sorted(range(len(results.residuals)), key=lambda k: r.mosaic.places[k])
@@ -145,9 +145,9 @@ def _base(c: CampaignResults) -> str:
     },
 )
 def residual_map(r: ReportInput, which: str) -> Plot:
-    """Draw the mean residual of each cell, without or with the tables, at a common scale.
+    """Mean residual of each cell, without the tables or with them, at one scale for both.
 
-    See Figure 10 of ACS ISR 2015-06.
+    Figure 10 of ACS ISR 2015-06.
     """
     c = needed(r.campaign)
     binned = binned_of(c.residuals, which)
@@ -232,7 +232,7 @@ def _by_chip(c: CampaignResults, filter: str) -> list[LookupTable | None]:
     each=lambda r: _figures_by_filter(r, "table_nodes", known=False),
 )
 def table_nodes(r: ReportInput, filter: str) -> Plot:
-    """Draw the pixel shifts in the tables of a filter as an arrow at each node."""
+    """Shifts of the pixels by the tables of a filter, an arrow at each node."""
     c = needed(r.campaign)
     chips = _by_chip(c, filter)
     tables = [t for t in c.tables if t.filter == filter]
@@ -281,7 +281,7 @@ def table_nodes(r: ReportInput, filter: str) -> Plot:
     each=lambda r: _figures_by_filter(r, "table_errors", known=True),
 )
 def table_errors(r: ReportInput, filter: str) -> Plot:
-    """Draw the standard errors of the nodes along x and y in a common colour scale."""
+    """Standard errors of the nodes along x and y, in one scale of colours."""
     c = needed(r.campaign)
     chips = _by_chip(c, filter)
     tables = [t for t in c.tables if t.filter == filter]

@@ -53,9 +53,9 @@ def matching_table(r: ReportInput) -> TextTable:
 
 @REPORT.figure("campaign-matching", needs=("campaign.catalog",))
 def catalogue_errors(r: ReportInput) -> Plot:
-    """Draw errors of positions, and of proper motions with their selection limit.
+    """Errors of positions, and of proper motions with the limit of their selection.
 
-    See Figure 3 of ACS ISR 2015-06.
+    Figure 3 of ACS ISR 2015-06.
     """
     c = needed(r.campaign)
     catalog, centroids, section = needed(c.catalog), c.centroids, c.section("matching")
@@ -140,10 +140,7 @@ def _motions(ax: Axes, catalog: CatalogStars, error: Float) -> None:
 
 @REPORT.figure("campaign-matching", needs=("campaign.detections",))
 def fit_quality(r: ReportInput) -> Plot:
-    """Draw the quality of the PSF fit against magnitude, with the cuts.
-
-    See Figure 5 of ACS ISR 2015-06.
-    """
+    """Quality of the PSF fit against magnitude, with the cuts: Figure 5 of ACS ISR 2015-06."""
     d = needed(needed(r.campaign).detections)
     faintest, brightest = np.quantile(d.mag, (0.9995, 0.001))
     low, high = np.quantile(d.q[d.q > 0], (0.0005, 0.9995))
@@ -187,7 +184,7 @@ def fit_quality(r: ReportInput) -> Plot:
 
 @REPORT.figure("campaign-matching", needs=("campaign",))
 def matching(r: ReportInput) -> Plot:
-    """Draw the completeness and the fraction of false pairs of each exposure against its date."""
+    """Completeness and fraction of false pairs of each exposure, against its date."""
     c = needed(r.campaign)
     epoch = np.asarray(c.matching["epoch"], float)
     rows = (
@@ -223,10 +220,7 @@ def matching(r: ReportInput) -> Plot:
 
 @REPORT.figure("campaign-matching", needs=("campaign.footprints",))
 def footprints(r: ReportInput) -> Plot:
-    """Draw the outlines of the chips in every exposure over the catalogue.
-
-    See Figure 4 of ACS ISR 2015-06.
-    """
+    """Outlines of the chips of every exposure over the catalogue: Figure 4 of ACS ISR 2015-06."""
     c = needed(r.campaign)
     field = needed(c.footprints)
     fig = new_figure(0.85 * WIDTH, 0.78 * WIDTH, layout="compressed")

@@ -51,9 +51,9 @@ def released_files(r: ReportInput) -> TextTable | None:
 
 @REPORT.figure("campaign-release", needs=("campaign.overlap",))
 def overlap(r: ReportInput) -> Plot:
-    """Draw residuals between two exposures after shift, rotation and scale, for both sets of files.
+    """Residuals between two exposures after shift, rotation and scale: old files and new.
 
-    See Figures 27 and 28 of ACS ISR 2015-06.
+    Figures 27 and 28 of ACS ISR 2015-06.
     """
     t = needed(needed(r.campaign).overlap)
     states = {"old": (t.binned_old, t.old), "new": (t.binned_new, t.new)}

@@ -129,7 +129,7 @@ def _stars(found: SelfcalResults, r: ReportInput) -> TextTable:
 
 @REPORT.figure("selfcal", needs=("selfcal",))
 def selfcal(r: ReportInput) -> Plot:
-    """Draw the field with its exposures, and the errors of the stars."""
+    """The field with its exposures, and the errors of the stars."""
     results = needed(r.selfcal)
     stars = results.stars[:: max(1, -(-len(results.stars) // MAX_STARS_DRAWN))]
     fig = new_figure(WIDTH, 0.5 * WIDTH)

@@ -161,9 +161,9 @@ def _figures(r: ReportInput) -> Mapping[str, tuple[str, int]]:
 
 @REPORT.figure("campaign-time", needs=("campaign.series",), each=_figures)
 def series(r: ReportInput, which: tuple[str, int]) -> Plot:
-    """Draw a term of some chips: as measured, corrected by VAFACTOR with its lines, without drift.
+    """A term of some chips: as measured, after VAFACTOR with its lines, and without drift.
 
-    It is drawn against time, and against PA_V3 if known; see Figures 14 to 24 of ACS ISR 2015-06.
+    Against time, and against PA_V3 where it is known: Figures 14 to 24 of ACS ISR 2015-06.
     """
     campaign, (term, n) = needed(r.campaign), which
     series, unit = needed(campaign.series), campaign.unit

@@ -154,9 +154,9 @@ def _of_products(rows: Sequence[Mapping[str, Any]]) -> str:
 
 @REPORT.figure("budget", needs=("budget",))
 def budget_terms(r: ReportInput) -> Plot:
-    """Draw the rms per axis of each term over the detector as bars, with markers for u and v.
+    """Bars of each term's rms per axis over the detector, with its two axes marked.
 
-    Each of up to three chips has a panel next to that of the detector.
+    Each of up to three chips has a panel next to that of the whole detector.
     """
     budget = needed(r.budget)
     rows = budget.rows()
@@ -189,7 +189,7 @@ def budget_terms(r: ReportInput) -> Plot:
     "budget", needs=("budget",), when=lambda r: int(np.count_nonzero(r.budget.share)) > 1
 )
 def budget_dominating(r: ReportInput) -> Plot:
-    """Draw a map of the largest term at each position, if it differs between positions."""
+    """Map of the term that contributes most at each position, if it is not the same everywhere."""
     budget = needed(r.budget)
     share = budget.share
     present = np.flatnonzero(share)

@@ -114,7 +114,7 @@ def _exposure_table(r: ReportInput) -> TextTable:
 
 @REPORT.figure("data", when=lambda r: bool(_magnitudes(r).any()))
 def residuals_by_magnitude(r: ReportInput) -> Plot:
-    """Draw the density of residuals against magnitude, with the errors assigned by magnitude."""
+    """Density of the residuals against magnitude, with the errors assigned to each magnitude."""
     words, has_magnitude = r.words, _magnitudes(r)
     text = f"Residuals grow towards faint stars; colour counts {words.rows}."
     if r.magnitude_errors is not None:
@@ -141,7 +141,7 @@ def residuals_by_magnitude(r: ReportInput) -> Plot:
 
 @REPORT.figure("data", printed=lambda r: r.campaign is None)
 def coverage(r: ReportInput) -> Plot:
-    """Draw a map of the number of stars in each cell of the detector."""
+    """Map of the number of stars in each cell of the detector."""
     grids = [Grid(c.binned.x, c.binned.y, np.asarray(c.binned.count, float)) for c in r.chips]
     panels = map_panels(r)
     counts = np.concatenate([g.values.ravel() for g in grids])

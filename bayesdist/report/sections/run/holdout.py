@@ -84,7 +84,7 @@ def _question(test: HeldTest, unit: str) -> str:
 
 @REPORT.figure("holdout", needs=("held_out",), printed=lambda r: r.campaign is None)
 def holdout(r: ReportInput) -> Plot:
-    """Draw predictive probabilities, and residuals by region in units of their prediction."""
+    """Predictive probabilities, and residuals by region in units of their prediction."""
     stars, mosaic = needed(r.held_out), r.mosaic
     rows, columns = (max(place[k] for place in mosaic.places) + 1 for k in (0, 1))
     aspect = max(ny / nx for nx, ny in mosaic.sizes)

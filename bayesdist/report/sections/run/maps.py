@@ -71,7 +71,7 @@ def map_table(r: ReportInput) -> TextTable:
 
 @REPORT.figure("maps", printed=True)
 def uncertainty_radius(r: ReportInput) -> Plot:
-    """Draw the uncertainty per axis, rms of sigma_u and sigma_v, in a common colour scale."""
+    """Uncertainty per axis, rms of sigma_u and sigma_v, all maps in one colour scale."""
     maps = [m for c in r.chips for m in c.maps]
     scale = display_scale(r.unit, max(float(np.nanmax(m.per_axis)) for m in maps))
     grids = [Grid(m.x, m.y, m.per_axis * scale.factor, m.position_of_max) for m in maps]
@@ -113,9 +113,9 @@ def uncertainty_radius(r: ReportInput) -> Plot:
 
 @REPORT.figure("maps", printed=True)
 def distortion(r: ReportInput) -> Plot:
-    """Draw vectors from each pixel position to the position after distortion.
+    """Vectors from each array position to where the distortion puts it.
 
-    The constant term is omitted, as in section 4 of the WISE distortion report.
+    As section 4 of the WISE distortion report, with the zeroth order suppressed.
     """
     v, position = _longest(r, "displacement")
     notes = {c.chip.name: c.displacement.part_note for c in r.chips}
@@ -139,9 +139,9 @@ def distortion(r: ReportInput) -> Plot:
 
 @REPORT.figure("maps")
 def pixel_area(r: ReportInput) -> Plot:
-    """Draw contours of the pixel area relative to that of the reference pixel, in percent.
+    """Contours of the pixel area relative to that at the reference pixel, in percent.
 
-    Figure 4.5 of the ACS handbook shows the same ratio without subtracting one.
+    As Figure 4.5 of the ACS handbook, which gives the same ratio without subtracting one.
     """
     areas = [c.area for c in r.chips]
     grids = [Grid(a.x, a.y, 100.0 * (a.area - 1.0)) for a in areas]
@@ -188,7 +188,7 @@ def pixel_area(r: ReportInput) -> Plot:
 
 @REPORT.figure("maps", printed=True)
 def pixel_scale(r: ReportInput) -> Plot:
-    """Draw a map of the pixel scale, the square root of the area of each pixel."""
+    """Map of the pixel scale, the square root of the area of each pixel."""
     areas = [c.area for c in r.chips]
     in_pixels = r.unit == "pix" and r.scale_mas is None
     factor = r.scale_mas or 1.0 if r.unit == "pix" else 1.0
@@ -220,7 +220,7 @@ def pixel_scale(r: ReportInput) -> Plot:
 
 @REPORT.figure("maps")
 def distortion_non_linear(r: ReportInput) -> Plot:
-    """Draw vectors of the non-linear part, as in Figure 4.1 of the ACS handbook."""
+    """Vectors of the non-linear part, as Figure 4.1 of the ACS handbook."""
     v, position = _longest(r, "non_linear")
     return Plot(
         _flow(r, [c.non_linear for c in r.chips]),
@@ -337,9 +337,10 @@ def _longest(r: ReportInput, which: str) -> tuple[VectorMap, str]:
 
 @REPORT.figure("maps", when=lambda r: len(r.chips) <= MOST_PANELS)
 def formal_uncertainty(r: ReportInput) -> Plot:
-    """Draw four vectors from each position, to (±sigma_u, ±sigma_v).
+    """Four vectors from each position, to (±sigma_u, ±sigma_v).
 
-    Section 6 of the WISE distortion report draws them magnified by 2000 relative to the detector.
+    As section 6 of the WISE distortion report, which draws them 2000 times larger than the
+    detector.
     """
     maps = [m for c in r.chips for m in c.maps]
     largest = max(m.radius_max for m in maps)

@@ -91,7 +91,7 @@ def rests_on_table(r: ReportInput) -> TextTable | None:
 
 @REPORT.figure("margins", needs=("margins",), printed=True)
 def margins(r: ReportInput) -> Plot:
-    """Draw the statistic of each requirement in units of its limit, with its central 95 %."""
+    """Each requirement's statistic in units of its own limit: its draws and their central 95 %."""
     margins = r.margins
     fig = new_figure(WIDTH, 0.9 + 0.62 * len(margins))
     plot_margins(margins, fig.subplots())
@@ -109,7 +109,7 @@ def margins(r: ReportInput) -> Plot:
 
 @REPORT.figure("margins", needs=("validity",), printed=True)
 def validity_period(r: ReportInput) -> Plot:
-    """Draw the probability of meeting each requirement against time, and when it is too low."""
+    """Probability of meeting each requirement against time, and when it becomes too low."""
     periods = r.validity
     fig = new_figure(WIDTH, 0.7 + 1.5 * len(periods))
     panels = fig.subplots(len(periods), 1, sharex=True, squeeze=False)[:, 0]

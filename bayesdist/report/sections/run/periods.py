@@ -163,9 +163,9 @@ def _patterns(found: TimeVariation, r: ReportInput) -> TextTable:
 
 @REPORT.figure("periods", needs=("periods",), printed=lambda r: r.campaign is None)
 def period_differences(r: ReportInput) -> Plot:
-    """Draw a map of the latest model minus the earliest one.
+    """Map of the latest model minus the earliest one.
 
-    Vectors are pale if noise would make them as long in more than 5 % of cases.
+    Vectors that noise would make as long at their position in more than 5 % of cases are pale.
     """
     result = needed(r.periods)
     comparison, unit = result.comparison, result.comparison.model.unit

@@ -126,7 +126,7 @@ def added_errors_table(r: ReportInput) -> TextTable:
 
 @REPORT.figure("outliers", needs=("posterior.hyper",), folded=True)
 def outliers_corner(r: ReportInput) -> Plot:
-    """Draw a corner plot of outlier fraction, jitter and outlier scale, as far as sampled."""
+    """Corner plot of the outlier fraction, jitter and outlier scale, of those that were sampled."""
     posterior = needed(r.posterior)
     columns = [mixture_column(posterior, name) for name in MIXTURE if name in posterior.hyper]
     side = WIDTH if len(columns) > 3 else 1.6 * len(columns) + 0.9
@@ -145,7 +145,7 @@ def outliers_corner(r: ReportInput) -> Plot:
 
 @REPORT.figure("coefficients", needs=("posterior",), folded=True)
 def correlations(r: ReportInput) -> Plot:
-    """Draw the correlations between coefficients as a matrix of colours."""
+    """Matrix of the correlations between coefficients, as a map of colours."""
     posterior = needed(r.posterior)
     names, matrix = correlation_matrix(posterior)
     fig = new_figure(0.72 * WIDTH, 0.62 * WIDTH, layout="compressed")
@@ -173,7 +173,7 @@ def correlations(r: ReportInput) -> Plot:
 
 @REPORT.figure("coefficients", needs=("posterior",), folded=True)
 def ranks(r: ReportInput) -> Plot:
-    """Draw ranks of the draws of each ensemble, for the slowest parameters and f, j, s_out."""
+    """Ranks of the draws of each ensemble among all, of the slowest parameters and f, j, s_out."""
     posterior = needed(r.posterior)
     names = list(slowest_parameters(posterior, without=r.held))
     names += [name for name in MIXTURE if name in posterior.hyper]

@@ -62,7 +62,7 @@ def previous_table(r: ReportInput) -> TextTable:
 
 @REPORT.figure("previous", needs=("previous",), printed=True)
 def previous_difference(r: ReportInput) -> Plot:
-    """Draw vectors of the run minus the previous release, without shift, rotation and scale."""
+    """Vectors of the run minus the release that it replaces, without shift, rotation and scale."""
     worst = max(r.previous, key=lambda found: found.largest)
     size = with_mas(worst.largest, "pix", worst.frame.pixel_mas or r.scale_mas)
     shades = " Shades are the significance of each position separately." if worst.field else ""

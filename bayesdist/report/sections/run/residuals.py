@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 
 @REPORT.figure("fit")
 def residual_histogram(r: ReportInput) -> Plot:
-    """Draw histograms of both axes: the core, and all residuals with a logarithmic scale."""
+    """Histograms of the two axes: the core, and everything on a logarithmic scale of counts."""
     words = r.words
     if r.posterior is None:
         text = (
@@ -95,7 +95,7 @@ def _histograms(
 
 @REPORT.figure("fit", printed=lambda r: r.campaign is None)
 def residual_vectors(r: ReportInput) -> Plot:
-    """Draw the mean residual of each cell as a vector, pale if it is consistent with noise."""
+    """Mean residual vector of each cell of the detector; pale ones are what noise would give."""
     binned = [c.binned for c in r.chips]
     plane = map_panels(r, colorbar=False)
     panels = (

@@ -55,13 +55,13 @@ def _sample_words(r: ReportInput) -> str:
 
 @REPORT.figure("residuals", when=lambda r: r.stars.by_exposure is not None, printed=True)
 def chi_square_by_exposure(r: ReportInput) -> Plot:
-    """Draw the chi-square per degree of freedom of each exposure, with its range by chance."""
-    spread = needed(r.stars.by_exposure)
-    n, mean = len(spread.names), spread.of_all
-    width = 2 * mean * spread.chance
+    """Chi-square per degree of freedom of each exposure, with the range that chance gives."""
+    sums = needed(r.stars.by_exposure)
+    n, mean = len(sums.names), sums.of_all
+    width = 2 * mean * sums.chance
     fig = new_figure(WIDTH, 1.5)
-    plot_exposures(spread, fig.subplots())
-    away = np.abs(spread.ratio - mean) / width
+    plot_exposures(sums, fig.subplots())
+    away = np.abs(sums.ratio - mean) / width
     worst, beyond = int(np.argmax(away)), int((away > 1).sum())
     return Plot(
         fig,
@@ -70,7 +70,7 @@ def chi_square_by_exposure(r: ReportInput) -> Plot:
         f" included. The line is that of all exposures, {number(mean)}: below 1 where many"
         f" parameters were fitted to few {r.words.rows}. The band about it holds 95 % by chance;"
         f" {count(beyond)} of {count(n)} exposures lie outside it, and the farthest is"
-        f" {spread.names[worst]}, with {number(float(spread.ratio[worst]))}. Exposures above the band"
+        f" {sums.names[worst]}, with {number(float(sums.ratio[worst]))}. Exposures above the band"
         " have larger errors than the others (guiding, focus, breathing); the status says whether"
         f" that is more than a trifle.{_sample_words(r)}",
         f"Chi-square per degree of freedom of {n} exposures; {beyond} lie outside the band of"
@@ -80,7 +80,7 @@ def chi_square_by_exposure(r: ReportInput) -> Plot:
 
 @REPORT.figure("residuals", printed=True)
 def residuals_by_position(r: ReportInput) -> Plot:
-    """Draw residuals du and dv against x and y, with means in bins and their errors."""
+    """Residuals du and dv against x and y, with means in bins and their errors."""
     figure, worst = _against_pixels(r, MAX_BINS, points=True)
     return Plot(
         figure,
@@ -95,7 +95,7 @@ def residuals_by_position(r: ReportInput) -> Plot:
 
 @REPORT.figure("residuals", printed=True)
 def residuals_by_column_and_row(r: ReportInput) -> Plot:
-    """Draw mean residuals of narrow strips of columns and of rows, with their errors."""
+    """Mean residuals of narrow strips of columns and of rows, with their errors."""
     figure, worst = _against_pixels(r, _FINE_BINS, points=False)
     return Plot(
         figure,
@@ -111,7 +111,7 @@ def residuals_by_column_and_row(r: ReportInput) -> Plot:
 
 @REPORT.figure("residuals", when=lambda r: bool(properties_of(r.stars)), printed=True)
 def residuals_by_property(r: ReportInput) -> Plot:
-    """Draw mean residuals against magnitude, colour and epoch, with their errors."""
+    """Mean residuals against magnitude, colour and epoch, with their errors."""
     residuals, rows = TrueResiduals.of(r.stars, r.solution), properties_of(r.stars)
     fig = new_figure(WIDTH, 0.4 + 1.25 * len(rows))
     axes = fig.subplots(len(rows), 2, sharex="row", sharey="row", squeeze=False)
