@@ -95,9 +95,10 @@ class DrawnErrors:
         return self._cache[domain]
 
     def treatments(self, grid: tuple[int, int] | None) -> tuple[DrawnErrors, ...]:
-        """Draws in which terms vary over the field, as far as they may: smoothly, and at random.
+        """Draws in which every term that may vary over the field does so.
 
-        Empty if no term may vary.
+        Returns two variants: as smooth fields, and independently at every position. Empty if no
+        term may vary.
 
         `grid`: number of points along x and y over which a smooth field has its stated size.
         """

@@ -122,6 +122,11 @@ def chip_places(solution: Solution, *, epoch: float | None = None) -> tuple[tupl
     tuple of (row, column)
         In the order of the model's chips. Row 0 is at the top (largest y), column 0 at the left.
         No two chips have the same row and column: if they would, all are in one column.
+
+    Raises
+    ------
+    InputError
+        If the model depends on time and the epoch is missing.
     """
     chips = solution.model.chips
     x, y = np.transpose([frame.centre for frame in chip_frames(solution, epoch=epoch)])

@@ -28,22 +28,36 @@ JOINTLY = "errors of the parameters, combined by draws"
 
 @dataclass(frozen=True, eq=False)
 class BudgetTerm:
-    """One contribution to the position error."""
+    """One contribution to the position error.
+
+    Parameters
+    ----------
+    name : str
+        Name of the row.
+    kind : str
+        'random'; 'systematic' (shared by all stars, like errors of the model's parameters); 'local'
+        (shared by stars near a position); or 'product' (known deviation of a file, in no total).
+    u, v : ndarray, shape (P,)
+        Standard deviations in the unit of the budget; for products the displacements.
+    source : str
+        Begins with 'measured in this run', 'given by the user' or 'published'.
+    relative_error : float or None
+        Relative uncertainty of the standard deviations; for draws their Monte-Carlo error. None if
+        it is unknown.
+    by_chip : mapping of int to (float or None)
+        Relative uncertainty by chip number, if it differs; `relative_error` is for the first chip.
+    of_parameters : bool
+        True for errors of the model's parameters, which are correlated.
+    """
 
     name: str
-    # 'random', 'systematic' (shared by all stars, like errors of the model's parameters), 'local'
-    # (shared by stars near a position) or 'product' (known deviation of a file, in no total)
     kind: str
-    # (P,), standard deviations in the unit of the budget; for products the displacements
     u: Float
-    v: Float  # (P,)
-    source: str  # begins with 'measured in this run', 'given by the user' or 'published'
-    # relative uncertainty of the standard deviations; for draws their Monte-Carlo error. None if
-    # it is unknown
+    v: Float
+    source: str
     relative_error: float | None = None
-    # relative uncertainty by chip number, if it differs; `relative_error` is for the first chip
     by_chip: Mapping[int, float | None] = field(default_factory=dict)
-    of_parameters: bool = False  # True for errors of the model's parameters, which are correlated
+    of_parameters: bool = False
 
     @property
     def radial(self) -> Float:

@@ -315,6 +315,11 @@ def plot_validity(
     Returns
     -------
     matplotlib.axes.Axes
+
+    Raises
+    ------
+    InputError
+        If `ax` is not a single Axes.
     """
     ax = axes_of(ax)
     ink, asked = Tones.of(ax).ink, period.requirement.probability

@@ -159,6 +159,11 @@ def plot_distortion(
     -------
     matplotlib.axes.Axes
 
+    Raises
+    ------
+    InputError
+        If `ax` is not a single Axes.
+
     Examples
     --------
     >>> chip = bd.Chip(1, "camera", (2048, 2048), (1024.5, 1024.5))

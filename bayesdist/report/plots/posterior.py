@@ -239,6 +239,11 @@ def plot_correlations(posterior: Posterior, ax: Axes | None = None) -> Axes:
     Returns
     -------
     matplotlib.axes.Axes
+
+    Raises
+    ------
+    InputError
+        If `ax` is not a single Axes.
     """
     ax = axes_of(ax)
     names, matrix = correlation_matrix(posterior)

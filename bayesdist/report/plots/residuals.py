@@ -76,6 +76,11 @@ def plot_residual_vectors(
     Returns
     -------
     matplotlib.axes.Axes
+
+    Raises
+    ------
+    InputError
+        If `ax` is not a single Axes.
     """
     ax = axes_of(ax)
     arrows = Arrows.of_cells(binned)

@@ -302,6 +302,11 @@ def plot_exposures(scatter: ExposureScatter, ax: Axes | None = None) -> Axes:
     Returns
     -------
     matplotlib.axes.Axes
+
+    Raises
+    ------
+    InputError
+        If `ax` is not a single Axes.
     """
     ax = axes_of(ax)
     tones, n, mean = Tones.of(ax), len(scatter.names), scatter.of_all
