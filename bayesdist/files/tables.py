@@ -15,6 +15,7 @@ from pathlib import Path
 import numpy as np
 from astropy.io import fits
 from astropy.table import Table, vstack
+from astropy.table.meta import get_header_from_yaml
 from astropy.utils.xml.iterparser import get_xml_iterator
 
 from bayesdist.errors import FormatError, InputError
@@ -25,6 +26,7 @@ from bayesdist.files.parquet import parquet_table
 from bayesdist.files.regular import head_of
 from bayesdist.files.text_tables import (
     MAYBE_FOREIGN_BYTES,
+    columns_of_numbers,
     is_text_table,
     mark_of,
     parse_text_table,
@@ -83,8 +85,15 @@ def read_ecsv(path: Path, limits: Limits = LIMITS) -> Table:
         lines = _whole_lines(lines, " ", path)
         table = Table.read(lines, format="ascii.ecsv")
         mark = "," if any(map(_COMMAS.match, takewhile(_is_comment, lines))) else " "
-        refuse_foreign_numbers(table, lines, mark, where=str(path))
+        refuse_foreign_numbers(_columns_of_ecsv(lines), lines, mark, where=str(path))
         return table
+
+
+def _columns_of_ecsv(lines: list[str]) -> dict[str, bool]:
+    """True for each column of numbers of an ECSV file; a SkyCoord takes up two of them."""
+    header = [line[2:] for line in takewhile(_is_comment, lines)]
+    described = get_header_from_yaml(header[1:])["datatype"]  # the first line is the version
+    return {str(one["name"]): one["datatype"] not in ("string", "bool") for one in described}
 
 
 def _budget(path: Path, limits: Limits) -> Budget:
@@ -111,7 +120,7 @@ def _read_separated(path: Path, limits: Limits, *, mark: str) -> Table:
     # the time astropy needs for a comment grows with the square of its length
     lines = with_decimal_points([line for line in lines if line[:1] != "#"], mark, where=str(path))
     table = Table.read(lines, format="ascii.csv", delimiter=mark, comment="#", guess=False)
-    refuse_foreign_numbers(table, lines, mark, where=str(path))
+    refuse_foreign_numbers(columns_of_numbers(table), lines, mark, where=str(path))
     return table
 
 

@@ -6,7 +6,7 @@ import csv
 import io
 import logging
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from itertools import takewhile
 
 from astropy.table import Table
@@ -207,7 +207,7 @@ def parse_text_table(lines: Sequence[str], budget: Budget) -> Table:
         elif mark == ";":
             options["delimiter"] = mark
     table = Table.read(lines, format=kind, guess=False, **options)
-    refuse_foreign_numbers(table, lines, mark, where=file_name)
+    refuse_foreign_numbers(columns_of_numbers(table), lines, mark, where=file_name)
     return table
 
 
@@ -266,24 +266,30 @@ def refuse_cut_end(lines: Sequence[str], mark: str | None, *, where: str) -> Non
     log.warning("%s: its last line has no end, so that the file may be truncated", where)
 
 
+def columns_of_numbers(table: Table) -> dict[str, bool]:
+    """True for each column of a table that holds numbers."""
+    return {name: table[name].dtype.kind in "iuf" for name in table.colnames}
+
+
 def refuse_foreign_numbers(
-    table: Table, lines: Sequence[str], mark: str | None, *, where: str
+    columns: Mapping[str, bool], lines: Sequence[str], mark: str | None, *, where: str
 ) -> None:
     """Refuse cells that Python or C would read as numbers, but that no table format allows.
 
     These are digits with underscores ("1_00"), hexadecimal numbers ("0x64"), and digits of other
-    scripts. `lines`: lines of the table, with cells separated by `mark`, or by blanks or the bars
-    of an IPAC table. In text columns such cells are allowed.
+    scripts. `columns`: True for each column of numbers, in the order of the file. `lines`: lines of
+    the table, with cells separated by `mark`, or by blanks or the bars of an IPAC table. In text
+    columns such cells are allowed.
     """
-    kinds = [table[name].dtype.kind for name in table.colnames]
+    names = list(columns)
     for number, line in enumerate(lines, start=1):
         if not MAYBE_FOREIGN.search(line) or line[:1] in ("#", "\\", "|"):
             continue
         cells = [cell.strip() for cell in _cells(line, mark)]
-        complete = len(cells) == len(kinds)
+        complete = len(cells) == len(names)
         for k, cell in enumerate(cells):
-            if _FOREIGN.fullmatch(cell) and (not complete or kinds[k] in "iuf"):
-                name = f", column {table.colnames[k]!r}" if complete else ""
+            if _FOREIGN.fullmatch(cell) and (not complete or columns[names[k]]):
+                name = f", column {names[k]!r}" if complete else ""
                 raise FormatError(
                     f"{cell[:40]!r} is no number",
                     where=f"{where}, line {number}{name}",
