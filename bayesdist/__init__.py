@@ -1,12 +1,12 @@
-"""bayesdist: how well is the geometric distortion of a detector known?
+"""bayesdist: the geometric distortion of a detector and its uncertainty.
 
-Everything public is here and is loaded when it is first used::
+All public names are available from this module and are imported on first use::
 
     import bayesdist as bd
     matches = bd.read_matches("stars.ecsv")
 
-Messages go to the logger "bayesdist", which has no handler of its own: a program that wants them
-configures `logging`.  Importing the package changes nothing else in the process.
+Messages go to the logger "bayesdist", which has only a `logging.NullHandler`: programs that want to
+show them configure `logging`.  Importing the package has no other effect on the process.
 """
 
 import logging

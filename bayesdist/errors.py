@@ -1,8 +1,9 @@
-"""One family of errors: what is wrong, where, and what to do next.
+"""Exceptions and warnings of the package.
 
-Everything that a user can put right is raised as a `BayesdistError`; the command line prints its
-one sentence and exits with its code.  Any other exception is a defect of the program, and the
-command line says so (`bayesdist.app.commands.failures`).
+Every error that a user can correct is raised as a `BayesdistError`: one sentence that gives the
+cause, the location and the next action.  The command line prints this sentence and exits with the
+`exit_code` of the exception.  Any other exception is a defect of the program, which the command
+line reports as such (`bayesdist.app.commands.failures`).
 """
 
 from __future__ import annotations
@@ -29,12 +30,12 @@ T = TypeVar("T")
 
 
 class BayesdistError(Exception):
-    """Base of all errors meant for the user.
+    """Base class of all errors that a user can correct.
 
     Parameters
     ----------
     cause : str
-        What is wrong, as a clause without a full stop.
+        Cause of the error, as a clause without a full stop.
     where : str, optional
         File, row, column or keyword, as in ``"stars.ecsv, row 12, column 'su'"``.
     do : str, optional
@@ -62,15 +63,15 @@ class BayesdistError(Exception):
 
     @property
     def sentence(self) -> str:
-        """The whole message as one sentence."""
+        """Location, cause and next action as one sentence."""
         head = f"{self.where}: {self.cause}" if self.where else self.cause
         return f"{head}; {self.do}." if self.do else f"{head}."
 
 
 class BayesdistWarning(UserWarning):
-    """Warning about what other programs will make of a file, or what the file does not hold.
+    """Warning that a written file is incomplete or may be misread by other programs.
 
-    It is issued by functions that write files, once for each sentence.
+    Functions that write files issue it, once for each message.
     """
 
 
@@ -80,7 +81,7 @@ class InputError(BayesdistError):
     Parameters
     ----------
     cause, where, do : str
-        As of `BayesdistError`.
+        See `BayesdistError`.
 
     Examples
     --------
@@ -94,23 +95,23 @@ class InputError(BayesdistError):
 
 
 class ConfigError(InputError):
-    """A configuration that cannot be used."""
+    """Invalid configuration."""
 
 
 class FormatError(InputError):
-    """A file that is not what its format demands (truncated, corrupt, other columns)."""
+    """File that violates its format: truncated, corrupt, or with unexpected columns."""
 
 
 class DegenerateError(InputError):
-    """The data do not determine the parameters that are asked for."""
+    """Data that do not determine all parameters of the model."""
 
 
 class MemoryLimitError(InputError):
-    """A computation that needs more memory than there is."""
+    """Computation that needs more memory than is available."""
 
 
 class NotSettledError(InputError):
-    """An iteration over the data that does not come to rest."""
+    """Iteration over the data that does not converge."""
 
 
 class NotConvergedError(BayesdistError):
@@ -120,38 +121,41 @@ class NotConvergedError(BayesdistError):
 
 
 class RenamedError(BayesdistError):
-    """A command under a name that it no longer has."""
+    """Command called by a former name."""
 
     exit_code = 2
 
 
 def required(value: T | None, cause: str) -> T:
-    """The value, if there is one; InputError, with this cause, if there is none."""
+    """Return the value; raise InputError with this cause if it is None."""
     if value is None:
         raise InputError(cause)
     return value
 
 
 def require_known(name: str, known: Sequence[str], what: str, *, where: str = "") -> None:
-    """Pass a known name.
+    """Raise an error unless a name is one of the allowed names.
 
     Parameters
     ----------
     name : str
+        Name to check.
     known : sequence of str
+        Allowed names.
     what : str
-        What the name stands for, as in ``"statistic"``.
+        Noun for the message, such as ``"statistic"``.
     where : str, optional
-        Where it was given.
+        File or key in which the name was given.
 
     Raises
     ------
     InputError
-        For an unknown name; it names the nearest known one, or all of them where none is near.
+        If the name is not allowed.  The message suggests the most similar allowed name, or lists
+        all of them if none is similar.
     """
     if name in known:
         return
-    from difflib import get_close_matches  # which takes longer to load than all else here
+    from difflib import get_close_matches  # slow to import, and needed only for the message
 
     near = get_close_matches(str(name).lower(), known, n=1, cutoff=0.5)
     do = f"use {near[0]!r} if that is meant" if near else f"choose one of {', '.join(known)}"

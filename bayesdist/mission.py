@@ -1,6 +1,6 @@
-"""A mission: what a package adds for one instrument, and how it is found.
+"""Missions: plug-ins that add commands, formats and report sections for one instrument.
 
-A package names it in its pyproject.toml, and it is found there::
+A package registers its `Mission` as an entry point in its pyproject.toml::
 
     [project.entry-points."bayesdist.missions"]
     wise = "bayesdist.missions.wise:MISSION"
@@ -22,24 +22,23 @@ GROUP = "bayesdist.missions"
 
 @dataclass(frozen=True)
 class Mission:
-    """What belongs to one mission, as "module:object" that is loaded when it is used."""
+    """Extensions for one mission, each given as "module:object" and imported on first use."""
 
     title: str  # one line for `bayesdist --help`
-    # of the group that has the mission's name
+    # subcommands of `bayesdist NAME`, where NAME is the name of the entry point
     commands: Mapping[str, str] = field(default_factory=dict)
     simulate: Mapping[str, str] = field(default_factory=dict)  # of `bayesdist simulate`
-    # commands that stand beside those of the core
+    # commands at the top level, like those of the core
     beside_core: Mapping[str, str] = field(default_factory=dict)
-    # formats of files of matches, by name: each a `bayesdist.data.MatchFormat`
+    # file formats of matches, by name: each a `bayesdist.data.MatchFormat`
     match_formats: Mapping[str, str] = field(default_factory=dict)
-    # sections `[data]` of formats that have keys of their own, by the name of the format: each a
-    # subclass of `bayesdist.app.config.Data`
+    # format-specific keys of the section `[data]`, by the name of the format: each a subclass of
+    # `bayesdist.app.config.Data`
     data_sections: Mapping[str, str] = field(default_factory=dict)
-    # how the matches of these formats are read: each a
-    # `bayesdist.app.kinds.matches.sources.MatchSource`
+    # readers of these formats: each a `bayesdist.app.kinds.matches.sources.MatchSource`
     match_sources: Mapping[str, str] = field(default_factory=dict)
-    # kinds of `[[budget]]` rows with one sigma: each makes an error term of name, kind, sigma,
-    # solution and source, as `bayesdist.assess.terms.parameters.ScaleError`
+    # kinds of `[[budget]]` rows with one sigma: each a callable (name, kind, sigma, solution,
+    # source) that returns an error term, such as `bayesdist.assess.terms.parameters.ScaleError`
     error_terms: Mapping[str, str] = field(default_factory=dict)
     # module that registers figures and tables with `bayesdist.report.contents.REPORT`
     report: str = ""
@@ -51,35 +50,35 @@ def _entries() -> dict[str, EntryPoint]:
 
 
 def mission_names() -> list[str]:
-    """Names of all missions that are installed; none of them is loaded."""
+    """Names of all installed missions, found without importing them."""
     return list(_entries())
 
 
 def load_mission(name: str) -> Mission:
-    """Mission of this name.
+    """Import the mission of this name.
 
-    InputError when its package cannot be loaded.
+    Raises InputError if its package cannot be imported.
     """
     entry = _entries()[name]
     try:
-        found = entry.load()
+        mission = entry.load()
     except (ImportError, AttributeError) as error:
         raise InputError(
             f"the mission cannot be loaded ({error})",
             where=f"{name} = {entry.value}",
             do="install its package again, or remove it",
         ) from error
-    if not isinstance(found, Mission):
+    if not isinstance(mission, Mission):
         raise InputError("is no Mission", where=f"{name} = {entry.value}", do="mend its package")
-    return found
+    return mission
 
 
 def missions() -> dict[str, Mission]:
-    """All missions that are installed, by name."""
+    """All installed missions by name, imported."""
     return {name: load_mission(name) for name in mission_names()}
 
 
 def load_object(where: str) -> Any:
-    """Object that "module:object" names."""
+    """Import the object given as "module:object"."""
     module, _, name = where.partition(":")
     return getattr(import_module(module), name)

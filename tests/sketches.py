@@ -79,7 +79,9 @@ def _unmade(registry, results, *, pdf=False, processes=1):
 def main() -> int:
     """Exit code of a command of bayesdist whose runs are quick."""
     from bayesdist.app.cli import main as command
+    from bayesdist.app.screen import open_streams
 
+    open_streams()  # as `command` does, here before numpy 2.0 writes to a closed one
     with quick():
         return command(sys.argv[1:])
 

@@ -80,7 +80,7 @@ def test_the_bring_up_ends_at_the_truth_from_every_start(tmp_path):
         # the largest of eight numbers, four corners of two axes each
         assert float(last[5]) < 4 * sigma < 0.1 * off
         assert last[3] == "100.0%" and float(first[3].rstrip("%")) < 95
-        assert "The calibration settled in" in one
+        assert "The calibration converged in" in one
         ends.append(last[5])
     # not the start decides, but the pairs
     assert len(set(ends)) == 1

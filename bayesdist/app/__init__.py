@@ -1,1 +1,1 @@
-"""The program: configuration, run directories, stages, command line."""
+"""Application layer: configuration, run directories, stages, command line."""

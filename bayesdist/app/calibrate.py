@@ -40,14 +40,14 @@ from bayesdist.utils.quantities import value_in, values_in, year_of
 
 __all__ = ["calibrate"]
 
-WHERE = "calibrate"  # stands for the name of the configuration in messages
-# keys of [data] by which a table is read
+WHERE = "calibrate"  # used in messages in place of the name of the configuration file
+# keys of [data] that apply to reading a table
 READING = (
     *("columns", "unit", "pixel_origin", "tangent_point", "epoch", "catalogue_epoch"),
     *("not_finite", "same_position"),
 )
 
-# arguments that settings may replace while they have their defaults
+# arguments that settings may replace if they have their default values
 DEFAULTS = {
     "assess.exposure": "mean",
     "detector.name": "",
@@ -101,7 +101,7 @@ def calibrate(
     reference_pixel : tuple of float, optional
         Zero point of the polynomials, FITS 1-based pixels; the centre of the chip by default.
     scale_mas : float or Quantity, optional
-        Size of a pixel in mas, to convert requirements and to print mas beside pixels.
+        Size of a pixel in mas, to convert requirements and to print mas in addition to pixels.
     frames : {'none', 'shift', 'shift_rotation', 'shift_rotation_scale', 'affine'}
         Transformation that is fitted to each exposure.
     time : TimeDependence, optional
@@ -199,7 +199,7 @@ def calibrate(
         if isinstance(held_out, int | float) and held_out == 0
         else {"fraction": held_out},
         "budget": _budget(catalogue, terms, None if stars is None else stars.unit),
-        "requirement": [_requirement_block(one) for one in as_requirements(requirements)],
+        "requirement": [_requirement_block(limit) for limit in as_requirements(requirements)],
     }
     text = tomli_w.dumps(_merged(configured, settings))
     config = parse_config(text, WHERE)
@@ -255,7 +255,7 @@ def _calibrated(results: Results, progress: bool) -> Results:
 
 
 def _is_path(matches: Any) -> bool:
-    """True if stars are given by the names of files."""
+    """True if the stars are given as names of files."""
     if isinstance(matches, str | os.PathLike):
         return True
     return (
@@ -266,9 +266,9 @@ def _is_path(matches: Any) -> bool:
 
 
 def _stars(matches: Any, sigma: Any, options: Mapping[str, Any]) -> tuple[Matches, str | float]:
-    """Matches with the errors that are asked for, and the source of these errors.
+    """Matches with the requested errors, and the source of these errors.
 
-    `options` are keys of the section [data], by which a table is read.
+    `options` are keys of the section [data] that apply to reading a table.
     """
     if not isinstance(matches, Matches):
         unknown = [key for key in options if key not in READING]
@@ -314,7 +314,7 @@ def _in(value: Any, unit: str, what: str) -> float | None:
 
 
 def _pixels(pair: Any, what: str) -> Any:
-    """Pair of numbers without a unit; pixels are the only one."""
+    """Pair of numbers without a unit; the pixel is the only unit allowed."""
     if pair is not None and (isinstance(pair, str) or np.shape(pair) != (2,)):
         raise InputError(
             f"{what} is {pair!r}",
@@ -336,7 +336,7 @@ def _drift(time: TimeDependence) -> Settings:
 
 
 def _chips(chips: Sequence[Chip]) -> Sequence[Chip]:
-    """Chips, each checked to be one."""
+    """Chips, after a check of their types."""
     if not isinstance(chips, Sequence) or not all(isinstance(chip, Chip) for chip in chips):
         raise InputError(
             f"chips is {chips!r}", where=WHERE, do="give a list of bayesdist.Chip, or size"
@@ -345,7 +345,7 @@ def _chips(chips: Sequence[Chip]) -> Sequence[Chip]:
 
 
 def _outliers(outliers: OutlierMixture | str, unit: str | None) -> Settings:
-    """Section [outliers] of a mixture; `unit` is that of u and v, None if it is not known yet."""
+    """Section [outliers] of a mixture; `unit` is that of u and v, None if not known yet."""
     if not isinstance(outliers, str | OutlierMixture):
         raise InputError(
             f"outliers is {outliers!r}",
@@ -364,7 +364,7 @@ def _outliers(outliers: OutlierMixture | str, unit: str | None) -> Settings:
 def _budget(
     catalogue: Catalogue | None, terms: Sequence[UserTerm], unit: str | None
 ) -> list[Settings]:
-    """[[budget]] rows of the errors that the user states; `unit` is that of u, v if it is known."""
+    """[[budget]] rows of the errors that the user states; `unit` is that of u, v if known."""
     require_catalogue(catalogue)
     rows = [] if catalogue is None else [catalogue.budget_row()]
     if isinstance(terms, UserTerm):
@@ -399,17 +399,17 @@ def _merged(configured: Settings, settings: Mapping[str, Any]) -> Settings:
     """Merge the user's settings into the configuration, and drop sections without content."""
     out = _plain(configured)
     for key, section in _plain(settings).items():
-        given = out.get(key) or {}
+        existing = out.get(key) or {}
         if not isinstance(section, Mapping):
-            if given:
+            if existing:
                 raise _given_twice(key)
             out[key] = section
             continue
         for name, value in section.items():
-            known = given.get(name, value)
-            if known != value and known != DEFAULTS.get(f"{key}.{name}"):
+            old_value = existing.get(name, value)
+            if old_value != value and old_value != DEFAULTS.get(f"{key}.{name}"):
                 raise _given_twice(f"{key}.{name}")
-        out[key] = {**given, **section}
+        out[key] = {**existing, **section}
     return {key: value for key, value in out.items() if value not in ({}, [])}
 
 
@@ -420,7 +420,7 @@ def _given_twice(key: str) -> ConfigError:
 
 
 def _plain(tree: Any, key: str = "") -> Any:
-    """Tree of values that TOML can hold, without None; `key` is where it stands."""
+    """Convert a tree of values to TOML values and drop None; `key` is its dotted key."""
     if isinstance(tree, Mapping):
         for name in tree:
             if not isinstance(name, str):

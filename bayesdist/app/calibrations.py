@@ -54,7 +54,7 @@ def read_calibration(
     -------
     Calibration
         With the errors that the file states.  A calibration of a run has all errors of the
-        parameters that the run found, and lies on the sky if the positions of its stars did.
+        parameters that the run found, and is on the sky if the positions of its stars are.
 
     Raises
     ------
@@ -82,9 +82,9 @@ def calibration_at(
     filter: str | None = None,
     size: tuple[float, float] | None = None,
 ) -> Calibration:
-    """Calibration of a file or a run; arguments as of `read_calibration`.
+    """Calibration of a file or a run; arguments as for `read_calibration`.
 
-    The plane of u and v of a run is free, also if the positions of its stars were on the sky.
+    The plane of u and v of a run is free even if the positions of its stars were on the sky.
     """
     path = Path(path)
     if not path.exists():
@@ -96,8 +96,8 @@ def calibration_at(
     document = registry.open_document(path)
     if document.format.calibration is not None:
         _refuse_unused(document.format.asks, document.format.title, path, filter, size)
-    found = document.calibration(Choice(filter, size))
-    sizes = [tuple(map(float, chip.size)) for chip in found.model.chips]
+    calibration = document.calibration(Choice(filter, size))
+    sizes = [tuple(map(float, chip.size)) for chip in calibration.model.chips]
     if size is not None and tuple(map(float, size)) not in sizes:
         stated = " and ".join(dict.fromkeys(f"{nx:g} x {ny:g}" for nx, ny in sizes))
         raise InputError(
@@ -105,11 +105,11 @@ def calibration_at(
             where=str(path),
             do="leave the size (--size on the command line) out",
         )
-    return found
+    return calibration
 
 
 def common_chips(a: Calibration, b: Calibration) -> list[tuple[int, int]]:
-    """Pairs of chips of two calibrations: by their numbers, or the single ones of both."""
+    """Pairs of chip numbers that two calibrations have in common, or their only chips."""
     if a.numbered == b.numbered:
         common = sorted(set(a.numbers) & set(b.numbers))
         if common:
@@ -117,7 +117,8 @@ def common_chips(a: Calibration, b: Calibration) -> list[tuple[int, int]]:
     if len(a.numbers) == len(b.numbers) == 1:
         return [(a.numbers[0], b.numbers[0])]
     listed = " and ".join(
-        ", ".join(map(str, one.numbers)) if one.numbered else "none" for one in (a, b)
+        ", ".join(map(str, calibration.numbers)) if calibration.numbered else "none"
+        for calibration in (a, b)
     )
     raise InputError(
         f"their chips are {listed}",
@@ -129,10 +130,11 @@ def common_chips(a: Calibration, b: Calibration) -> list[tuple[int, int]]:
 def difference_from_previous(
     calibration: Calibration, previous: Path, epoch: float | None
 ) -> tuple[Comparison, ...]:
-    """Each chip of a calibration minus that of the release at `previous`.
+    """Difference between each chip of a calibration and that of the release at `previous`.
 
-    Shift, rotation and scale are taken out. `epoch`: decimal years, of what depends on time. The
-    filter and the size that a file asks for are those of the calibration.
+    Shift, rotation and scale are fitted and removed. `epoch`, in decimal years, is used for
+    calibrations that depend on time.  The filter and the size of the calibration are used if the
+    file requires them.
     """
     filter = calibration.filter or None if "filter" in asks_of(previous) else None
     try:
@@ -141,8 +143,8 @@ def difference_from_previous(
         size = calibration.model.chips[0].size
         released = calibration_at(previous, filter=filter, size=size)
     maps = [
-        one.by_chip(epoch if one.model.time is not None else None)
-        for one in (calibration, replace(released, name=str(previous)))
+        version.by_chip(epoch if version.model.time is not None else None)
+        for version in (calibration, replace(released, name=str(previous)))
     ]
     rng = np.random.default_rng(NOISE_SEED)
     return tuple(
@@ -151,7 +153,10 @@ def difference_from_previous(
 
 
 def asks_of(path: Path) -> tuple[str, ...]:
-    """Arguments of `calibration_at` that the file uses: "filter", "size"; a run uses none."""
+    """Names of the arguments of `calibration_at` that a file uses: "filter", "size".
+
+    Runs use none.
+    """
     if path.is_dir() or path.suffix == ".nc" or not path.exists():
         return ()
     return registry.open_document(path).format.asks
@@ -178,19 +183,21 @@ def _refuse_unused(
 def refuse_unused_date(epoch: float | None, *calibrations: Calibration) -> None:
     """Refuse a date if none of the calibrations depends on time.
 
-    A file that drifts and has no date of reference refuses a date by itself.
+    Files that drift but have no reference date refuse a date themselves.
     """
-    if epoch is None or any(one.model.time is not None or one.no_date for one in calibrations):
+    if epoch is None or any(
+        calibration.model.time is not None or calibration.no_date for calibration in calibrations
+    ):
         return
     raise InputError(
         "does not depend on time",
-        where=" and ".join(dict.fromkeys(one.name for one in calibrations)),
+        where=" and ".join(dict.fromkeys(calibration.name for calibration in calibrations)),
         do="leave the date (--epoch on the command line) out",
     )
 
 
 def _calibration_of_run(solution: Solution, path: Path) -> Calibration:
-    """Calibration of a solution, with what its run knows: a folder, or a file in it."""
+    """Calibration of a solution with facts of its run; `path` is a folder or a file in it."""
     run, summary = run_of(path), _summary_of(path)
     if run is None:
         return calibration_of(solution, str(path))
@@ -210,10 +217,10 @@ def _calibration_of_run(solution: Solution, path: Path) -> Calibration:
 
 
 def solution_at(path: Path) -> Solution | None:
-    """The fit or posterior at a place; None where it is no such file.
+    """Fit or posterior at a path; None if the file is neither.
 
-    A run directory, or posterior.nc in it, stands for the posterior with the errors that the run
-    was assessed with, or for the fit where there is no posterior yet.
+    For a run directory or its posterior.nc the result is the posterior with the errors that the run
+    was assessed with, or the fit if there is no posterior yet.
     """
     if path.is_dir():
         if not (path / "run.json").exists() and not (path / "posterior.nc").exists():
@@ -236,14 +243,14 @@ def solution_at(path: Path) -> Solution | None:
 
 
 def _fit_at(path: Path) -> LinearFit:
-    """The fit of a file, which is as it was written where it is that of a run."""
+    """Fit of a file; if it belongs to a run it must be unchanged."""
     if (path.parent / "run.json").exists():
         RunDirectory(path.parent).refuse_damaged("fit")
     return load_fit(path)
 
 
 def _as_assessed(folder: Path) -> Solution:
-    """The posterior of a folder, with the errors as assessed where it is that of a run."""
+    """Posterior of a folder; if it is a run, with the errors as assessed."""
     if not (folder / "run.json").exists():
         return load_posterior(folder)
     run = RunDirectory(folder)
@@ -253,7 +260,7 @@ def _as_assessed(folder: Path) -> Solution:
 
 
 def on_the_sky(path: Path, found: Calibration) -> Calibration:
-    """Calibration of a run about the point where its stars touch the sky, where they do."""
+    """Calibration of a run in the tangent plane of its stars, if they have one."""
     summary = _summary_of(path)
     point = None if summary is None or summary.data is None else summary.data.tangent_point
     if point is None or found.plane.kind != "free":
@@ -262,20 +269,20 @@ def on_the_sky(path: Path, found: Calibration) -> Calibration:
 
 
 def positions_on_the_sky(found: Calibration, at: Float) -> tuple[Float, Float]:
-    """RA and Dec (N,) in degrees of positions (N, 2) in u and v of a calibration on the sky."""
+    """RA and Dec (N,) in degrees of positions (N, 2) in u and v; the plane is on the sky."""
     point = required(found.plane.point, "does not lie on the sky")
     xi, eta = (at * ARCSEC[found.unit]).T
     return sky_of_plane(xi, eta, point)
 
 
 def run_of(path: Path) -> RunDirectory | None:
-    """The run that a folder is, or that a file is of; None where it is of none."""
+    """Run that a folder or file belongs to; None if there is none."""
     home = path if path.is_dir() else path.parent
     return RunDirectory(home) if (home / "run.json").exists() else None
 
 
 def _summary_of(path: Path) -> Summary | None:
-    """Summary of the run that a file or folder is of; None where there is none."""
+    """Summary of the run that a file or folder belongs to; None if there is none."""
     run = run_of(path)
     if run is None or not (run / "summary.json").exists():
         return None

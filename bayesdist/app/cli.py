@@ -1,4 +1,4 @@
-"""The command line: all commands, and how errors become one sentence and an exit code."""
+"""Command line: all commands, and the conversion of errors to a sentence and an exit code."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ from bayesdist.files.faults import InterruptHandler, raising_interrupts
 from bayesdist.mission import load_mission, mission_names, missions
 from bayesdist.version import __version__
 
-_LONGEST = 1000  # letters of a sentence
-# objects between collections of garbage: imports make half a million that stay, and looking at
-# them again and again takes a tenth of a small run
+_LONGEST = 1000  # largest number of characters of a sentence
+# thresholds of the garbage collector: imports create half a million permanent objects, and scanning
+# them repeatedly takes a tenth of the time of a small run
 SELDOM = 50_000, 20, 100
-# a command has threads of its own on all cores: those of linear algebra would only wait beside them
+# commands use threads on all cores, which threads of the linear algebra would only slow down
 ALGEBRA = "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "BLIS_NUM_THREADS"
 COMMANDS = "bayesdist.app.commands"
 CORE = {
@@ -73,23 +73,23 @@ EXAMPLES = {
 
 
 def _renamed(name: str, new: str) -> RenamedError:
-    """Error of a command that has another name now."""
+    """Error for a command that has been renamed."""
     return RenamedError(f"the command {name!r} is {new!r} now", do=f"say 'bayesdist {new}'")
 
 
 class _Root(LazyGroup):
-    """Commands of the core first, then what missions add."""
+    """Commands of the core, followed by those of missions."""
 
     def list_commands(self, ctx: click.Context) -> list[str]:
-        beside = [name for mission in missions().values() for name in mission.beside_core]
-        return [*beside, *super().list_commands(ctx), "simulate", *mission_names()]
+        next_to_core = [name for mission in missions().values() for name in mission.beside_core]
+        return [*next_to_core, *super().list_commands(ctx), "simulate", *mission_names()]
 
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
-        found = super().get_command(ctx, cmd_name)
-        if found is not None:
+        command = super().get_command(ctx, cmd_name)
+        if command is not None:
             if cmd_name in EXAMPLES:
-                found.epilog = f"Example: bayesdist {EXAMPLES[cmd_name]}"
-            return found
+                command.epilog = f"Example: bayesdist {EXAMPLES[cmd_name]}"
+            return command
         if cmd_name in RENAMED:
             raise _renamed(cmd_name, RENAMED[cmd_name])
         if cmd_name in mission_names():
@@ -107,7 +107,7 @@ class _Root(LazyGroup):
         return None
 
     def invoke(self, ctx: click.Context) -> int:
-        # here, as click ends with codes of its own on an interrupt and a closed pipe
+        # converted here, because click uses other exit codes for interrupts and closed pipes
         return _exit_code(lambda: super(_Root, self).invoke(ctx), ctx.obj or "bayesdist")
 
 
@@ -131,7 +131,7 @@ def program() -> int:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run a command."""
+    """Run a command and return its exit code."""
     open_streams()
     gc.set_threshold(*SELDOM)
     for name in ALGEBRA:
@@ -145,28 +145,28 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _exit_code(call: Callable[[], int | None], command: str) -> int:
-    """Exit code of a call whose errors are said in one sentence."""
+    """Exit code of a call; errors are printed as one sentence."""
     try:
         with raising_interrupts():
             return call() or 0
-    except click.exceptions.Exit as end:  # after help was shown
+    except click.exceptions.Exit as end:  # after printing help
         return end.exit_code
     except click.ClickException as error:
         error.show(file=sys.stderr)
         return error.exit_code
     except BayesdistError as error:
-        sentence = " ".join(str(error).split())  # libraries below break their reasons into lines
-        if len(sentence) > _LONGEST:  # it quotes something
+        sentence = " ".join(str(error).split())  # messages of libraries may have several lines
+        if len(sentence) > _LONGEST:  # it contains a long quotation
             sentence = f"{sentence[: _LONGEST // 2]} ... {sentence[-_LONGEST // 2 :]}"
         print(f"bayesdist: {sentence}", file=sys.stderr)
         return error.exit_code
     except (KeyboardInterrupt, click.Abort):
         print("bayesdist: interrupted; resume with --resume", file=sys.stderr)
         return 130
-    except BrokenPipeError:  # the reader of a pipe had enough
+    except BrokenPipeError:  # the reader of the pipe has closed it
         sys.stderr.close()
         return 0
-    except Exception as error:  # of which nobody below could say more
+    except Exception as error:  # not converted to a message at a lower level
         from bayesdist.app.commands.failures import failure
 
         code, sentence = failure(error, command)

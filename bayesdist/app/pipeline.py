@@ -1,18 +1,15 @@
-"""From stars to files in Python: the functions that `bayesdist run` calls, without a folder.
+"""Functions of a calibration in Python: the steps of `bayesdist run`, without a run directory.
 
-A configuration says what is asked for, and paths in it are relative to `base`::
+The steps follow a configuration, and paths in it are relative to `base`::
 
-    config, _ = load_config("job/config.toml")
-    base = Path("job")
-    data = fit(match(read(config, base), config), config, base)
-    posterior = sample(data, config)
-    found = diagnose(posterior, data, config, base)
-    errors = error_model(posterior, found, data, config)
-    evaluation = evaluate(errors, posterior, found, data, config, base)
-    export(evaluation, posterior, found, data, config, base, Path("products"))
+config, _ = load_config("job/config.toml") base = Path("job") data = fit(match(read(config, base),
+config), config, base) posterior = sample(data, config) found = diagnose(posterior, data, config,
+base) errors = error_model(posterior, found, data, config) evaluation = evaluate(errors, posterior,
+found, data, config, base) export(evaluation, posterior, found, data, config, base,
+Path("products"))
 
-What `bayesdist run` makes of the same configuration is the same to the last bit: it makes these
-calls in `bayesdist.app.stages.make_stages`, and writes what they give.  A `report` shows the
+The results are identical to those of `bayesdist run` with the same configuration, which calls these
+functions in `bayesdist.app.stages.make_stages` and writes their results.  A `report` shows the
 `Results` of a run's folder (`bayesdist.app.results`).
 """
 
@@ -53,9 +50,23 @@ __all__ = [
 
 
 def read(config: Config, base: Path) -> Any:
-    """All that a run begins with: matched stars, or star lists with what goes with them.
+    """Read the inputs of a run, and refuse those that cannot be used.
 
-    `base`: folder that its files are relative to.
+    Parameters
+    ----------
+    config : Config
+    base : Path
+        Folder that file names are relative to.
+
+    Returns
+    -------
+    Matches or Inputs
+        Matched stars, or star lists with their catalogue and log, depending on the kind of run.
+
+    Raises
+    ------
+    InputError
+        If the inputs cannot be read or are inconsistent.
     """
     kind = kind_of(config)
     inputs = kind.read(config, base)
@@ -64,14 +75,37 @@ def read(config: Config, base: Path) -> Any:
 
 
 def match(inputs: Any, config: Config) -> Matched:
-    """Stars that are fitted and stars that are held out; `inputs` are from `read`."""
+    """Match stars, and divide them into fitted and held-out stars.
+
+    Parameters
+    ----------
+    inputs : Matches or Inputs
+        Inputs returned by `read`.
+    config : Config
+
+    Returns
+    -------
+    Matched
+    """
     return kind_of(config).match(inputs, config)
 
 
 def fit(matched: Matched, config: Config, base: Path, reader: StarReader | None = None) -> FitData:
-    """The least-squares solution with its stars.
+    """Fit by least squares.
 
-    `reader`: that has read the stars before.
+    Parameters
+    ----------
+    matched : Matched
+    config : Config
+    base : Path
+        Folder that file names are relative to.
+    reader : StarReader, optional
+        Reader that may already hold the stars.
+
+    Returns
+    -------
+    FitData
+        The solution with its stars.
     """
     reader = reader or StarReader(config.resources())
     return FitData(matched, kind_of(config).fit(matched, config, base, reader), reader)
@@ -84,9 +118,20 @@ def sample(
     folder: Path | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> Posterior:
-    """The posterior of a fit.
+    """Sample the posterior of a fit.
 
-    `folder`: for checkpoints. `progress`: called with (steps made, most steps).
+    Parameters
+    ----------
+    data : FitData
+    config : Config
+    folder : Path, optional
+        Folder for checkpoints.
+    progress : callable, optional
+        Called with the number of steps made and the largest number of steps.
+
+    Returns
+    -------
+    Posterior
     """
     return kind_of(config).sample(data, config, folder=folder, progress=progress)
 
@@ -102,10 +147,25 @@ def evaluate(
     source: str = "",
     series: Mapping[str, Any] | None = None,
 ) -> assessed.Evaluation:
-    """Maps, budget, margins and validity periods.
+    """Evaluate maps, budget, margins and validity periods.
 
-    `source`: where the solution is from, by default the detector. `series`: how linear terms went
-    with time, as summary.json has it.
+    Parameters
+    ----------
+    errors : ErrorModel
+    posterior : Posterior
+    found : Diagnostics
+    data : FitData
+    config : Config
+    base : Path
+        Folder that file names are relative to.
+    source : str
+        Origin of the solution that files state; the detector by default.
+    series : mapping, optional
+        Section 'time_dependence' of summary.json.
+
+    Returns
+    -------
+    Evaluation
     """
     solution = solution_of(posterior, found, data.fitted)
     product = product_input(solution, data, config, source)

@@ -1,4 +1,4 @@
-"""Messages in the terms of Python: arguments in place of configuration keys and options."""
+"""Error messages for Python: arguments in place of configuration keys and options."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from typing import Concatenate, ParamSpec, Protocol, TypeVar
 from bayesdist.app.config import MatchesConfig
 from bayesdist.errors import BayesdistError
 
-# arguments of `bayesdist.calibrate` by the keys of the configuration that they stand for
+# arguments of `bayesdist.calibrate` by the configuration keys that they set
 ARGUMENTS = {
     "assess.epoch": "epoch",
     "assess.exposure": "exposure",
@@ -52,7 +52,7 @@ class HoldsRun(Protocol):
 
     @property
     def folder(self) -> object | None:
-        """Folder of the run, whose configuration is a file; None if the run is in memory."""
+        """Folder of the run, which has a configuration file; None if the run is in memory."""
 
 
 Held = TypeVar("Held", bound=HoldsRun)
@@ -60,9 +60,10 @@ Held = TypeVar("Held", bound=HoldsRun)
 
 @contextmanager
 def in_python_terms(*, keys: bool = True) -> Iterator[None]:
-    """Context in which errors name arguments in place of options, and of `keys` if these are True.
+    """Context in which errors name arguments in place of options and of configuration keys.
 
-    The keys of a run that was made from a configuration file are right as they are.
+    `keys` is False if keys are to be kept: those of a run made from a configuration file are
+    correct.
     """
     try:
         yield
@@ -76,7 +77,7 @@ def in_python_terms(*, keys: bool = True) -> Iterator[None]:
 def python_terms(
     method: Callable[Concatenate[Held, P], R],
 ) -> Callable[Concatenate[Held, P], R]:
-    """Method of a run whose errors are worded for Python."""
+    """Decorate a method of a run so that its errors are worded for Python."""
 
     @wraps(method)
     def worded(self: Held, /, *args: P.args, **kwargs: P.kwargs) -> R:
@@ -100,11 +101,11 @@ def _reworded(text: str, keys: bool) -> str:
 
 
 def _argument(match: re.Match[str]) -> str:
-    """Argument for a key: one of its own, or the entry of `settings`."""
-    section, name, rest = match[1], match[2], match[3]
+    """Argument that corresponds to a key: a separate one, or an entry of `settings`."""
+    section, name, suffix = match[1], match[2], match[3]
     argument = ARGUMENTS.get(f"{section}.{name}")
     if argument is not None:
-        return argument + rest
+        return argument + suffix
     if section == "outliers":
         return f"outliers=OutlierMixture({name}=...)"
-    return f'settings["{section}"]["{name}"]{rest}'
+    return f'settings["{section}"]["{name}"]{suffix}'

@@ -1,4 +1,4 @@
-"""All that can be known to be wrong before anything is written."""
+"""Checks that can be made before anything is written."""
 
 from __future__ import annotations
 
@@ -22,13 +22,13 @@ REHEARSAL_DRAWS = 100
 
 
 def rehearse(results: Results) -> Results:
-    """Results with what a run begins with and, of matched stars, their fit; nothing is written.
+    """Results with the inputs and, for matched stars, their fit; nothing is written.
 
-    What is wrong with the data or the configuration shows here, before hours of sampling.
+    Errors in the data or the configuration are found here, before hours of sampling.
     """
     kind, config, base = results.kind, results.config, results.base
     kind.refuse(results.inputs)
-    if kind.outline is not None:  # to match stars takes long
+    if kind.outline is not None:  # matching takes long
         outline = kind.outline(results.inputs)
         rehearse_outline(outline, config, base, str(results.run.path))
         return results
@@ -42,7 +42,7 @@ def rehearse(results: Results) -> Results:
 
 
 def rehearse_solution(results: Results) -> None:
-    """Refuse terms, requirements and files that could not be made of a fit; nothing is written."""
+    """Refuse terms, requirements and products that cannot be made from a fit."""
     data, config = results.data, results.config
     _rehearse_evaluation(data, config, REHEARSAL_DRAWS)
     product = product_input(data.fit, data, config, str(results.run.path))
@@ -53,7 +53,7 @@ def rehearse_solution(results: Results) -> None:
 
 
 def _check_residuals(data: FitData, config: Config) -> None:
-    """Refuse a budget with errors that are included in the residuals and larger than these."""
+    """Refuse a budget with errors included in the residuals that exceed the residuals."""
     fit = data.fit
     held = config.held_in_residuals(fit.model.unit)
     if held:
@@ -64,14 +64,14 @@ def _check_residuals(data: FitData, config: Config) -> None:
 
 
 def _rehearse_evaluation(data: FitData, config: Config, n_draws: int) -> None:
-    """Refuse terms and requirements that the run could not be judged by."""
+    """Refuse terms and requirements that the run cannot be judged by."""
     settings = rehearsal_settings(data, config)
     errors = errors_of_fit(data.fit, data, config)
     drawn = errors.drawn(n_draws, assessment_rng(config))
     budget_of(drawn, settings.domain(errors))
-    # without a posterior centroids have no errors yet
+    # without a posterior there are no centroid errors yet
     has_mag = data.placed.has_mag
-    # one of each form: others differ in what nothing is refused for
+    # one requirement of each form, because names, limits and probabilities are never refused
     forms = {
         replace(r, name="any", limit=1.0, probability=0.5): _of_any_star(r, has_mag=has_mag)
         for r in reversed(config.requirements())
@@ -88,7 +88,7 @@ def _rehearse_evaluation(data: FitData, config: Config, n_draws: int) -> None:
 
 
 def _of_any_star(requirement: Requirement, *, has_mag: bool) -> Requirement:
-    """A requirement without its magnitude, if the matches have such."""
+    """Requirement without its magnitude; refused if it has one and the matches have none."""
     if requirement.magnitude is not None and not has_mag:
         raise InputError(
             f"names magnitude {requirement.magnitude:g}, and the matches have no magnitudes",

@@ -1,4 +1,4 @@
-"""The report of a run: what it shows, figures, and report.html."""
+"""Report of a run: content, figures, and report.html."""
 
 from __future__ import annotations
 
@@ -33,8 +33,8 @@ log = logging.getLogger("bayesdist")
 
 
 def report(results: Results, *, pdf: bool = False) -> list[str]:
-    """Names of the figures of a report, which is written into the folder of the run."""
-    # figures take seconds to import
+    """Write the report to the folder of the run, and return the names of its figures."""
+    # imported here because plotting takes seconds to import
     from bayesdist.report.drawing import save_drawings
     from bayesdist.report.run_report import draw_report, write_report
     from bayesdist.report.sections.run.status import verdict
@@ -43,8 +43,8 @@ def report(results: Results, *, pdf: bool = False) -> list[str]:
     drawings = draw_report(inputs, pdf=pdf, processes=2 if _is_command_line() else 1)
     names = [path.name for path in save_drawings(drawings, run / "figures")]
     write_report(run / "report.html", inputs, drawings)
-    found = verdict(inputs)
-    run.summarise(verdict={"level": found.level, "headline": found.headline})
+    overall = verdict(inputs)
+    run.summarise(verdict={"level": overall.level, "headline": overall.headline})
     log.info("report: %s", run / "report.html")
     return names
 
@@ -71,22 +71,24 @@ def write_html_report(results: Results, path: Path) -> None:
 
 
 def _is_command_line() -> bool:
-    """Boolean: other processes may import the main module; a user's own may not be guarded."""
+    """True if other processes may import the main module; that of a user may be unguarded."""
     path = Path(getattr(sys.modules["__main__"], "__file__", None) or "")
     name = path.parent.stem if path.name == "__main__.py" else path.stem
     return name == "bayesdist" and (os.cpu_count() or 1) > 1
 
 
 def report_input(results: Results) -> ReportInput:
-    """All that the report shows, from the artefacts of a run."""
+    """Content of the report, from the artefacts of a run."""
     run, config, fitted = results.run, results.config, results.fitted
     fit, posterior, solution = results.fit, results.posterior, results.solution
-    found, evaluation, epoch = results.diagnostics, results.evaluation, results.epoch
+    diagnostics, evaluation, epoch = results.diagnostics, results.evaluation, results.epoch
     campaign, selfcal = None, None
     if fitted.scatter is not None:
         from bayesdist.app.kinds.campaign.report import campaign_results
 
-        campaign = campaign_results(run, results.inputs, results.data, posterior, found.overlap)
+        campaign = campaign_results(
+            run, results.inputs, results.data, posterior, diagnostics.overlap
+        )
     if fitted.solved is not None:
         selfcal = selfcal_results(run, fitted, posterior, epoch)
     facts, folder = run.facts, run.path.resolve().name
@@ -96,11 +98,11 @@ def report_input(results: Results) -> ReportInput:
     return ReportInput(
         name=title_of(config) or folder,
         config=as_json(config.model_dump(exclude_none=True)),
-        stars=found.sample,
-        exposures=found.sums.exposures,
+        stars=diagnostics.sample,
+        exposures=diagnostics.sums.exposures,
         fit=fit,
         posterior=posterior,
-        chips=_chip_results(solution, found, evaluation, epoch),
+        chips=_chip_results(solution, diagnostics, evaluation, epoch),
         coefficients=coefficient_table(fit, solution),
         previous=_difference_from_previous(results),
         budget=evaluation.budget,
@@ -109,12 +111,12 @@ def report_input(results: Results) -> ReportInput:
         validity=evaluation.validity,
         products=products,
         checks=evaluation.checks,
-        score_tests=found.score_tests,
-        periods=found.periods,
-        held_out=found.holdout,
+        score_tests=diagnostics.score_tests,
+        periods=diagnostics.periods,
+        held_out=diagnostics.holdout,
         magnitude_errors=fitted.errors.by_magnitude,
         added_errors=fitted.grouped,
-        flagged=found.flagged,
+        flagged=diagnostics.flagged,
         campaign=campaign,
         selfcal=selfcal,
         provenance={"folder": folder}
@@ -124,7 +126,7 @@ def report_input(results: Results) -> ReportInput:
 
 
 def _difference_from_previous(results: Results) -> tuple[Comparison, ...]:
-    """The run minus the release that it replaces, chip by chip; empty if none is named."""
+    """Difference from the release that the run replaces, by chip; empty if none is named."""
     previous = results.config.products.previous
     if previous is None:
         return ()
@@ -134,16 +136,16 @@ def _difference_from_previous(results: Results) -> tuple[Comparison, ...]:
     )
 
 
-MOST_NAMED = 3  # chips by which a run is called
+MOST_NAMED = 3  # largest number of chips named in a title
 
 
 def title_of(config: Config) -> str:
     """Mission, instrument, detector or chips, and filter, as far as they are given."""
-    given, names = config.detector, [chip.name for chip in config.chip if chip.name]
-    few = len(names) <= MOST_NAMED
-    detector = given.name or (" and ".join(names) if few else f"{names[0]} to {names[-1]}")
-    band = given.filter or (config.campaign and config.campaign.filter)
-    named = " ".join(part for part in (given.mission, given.instrument, detector) if part)
+    block, names = config.detector, [chip.name for chip in config.chip if chip.name]
+    is_short = len(names) <= MOST_NAMED
+    detector = block.name or (" and ".join(names) if is_short else f"{names[0]} to {names[-1]}")
+    band = block.filter or (config.campaign and config.campaign.filter)
+    named = " ".join(part for part in (block.mission, block.instrument, detector) if part)
     return ", ".join(part for part in (named, band) if part)
 
 
@@ -177,21 +179,21 @@ def _chip_results(
 
 
 def _product_checks(product: dict[str, Any]) -> tuple[Check, ...]:
-    """Checks of a file as written."""
+    """Checks of a product after it was written."""
     named = {
         "closure_pix": "worst closure of the inverse (pix)",
         "a_dmax": "A_DMAX (pix)",
         "b_dmax": "B_DMAX (pix)",
     }
-    found = {name: product.get(key) for key, name in named.items()}
+    values = {name: product.get(key) for key, name in named.items()}
     if sky := product.get("sky"):
-        found[f"rms distance from RA, Dec of {sky['n']} stars (arcsec)"] = sky["rms_arcsec"]
-        found["largest distance from the solution (arcsec)"] = sky["solution_arcsec"]
-    out = [Check("Products", name, size) for name, size in found.items() if size is not None]
+        values[f"rms distance from RA, Dec of {sky['n']} stars (arcsec)"] = sky["rms_arcsec"]
+        values["largest distance from the solution (arcsec)"] = sky["solution_arcsec"]
+    out = [Check("Products", name, size) for name, size in values.items() if size is not None]
     levels = {"error": "fail", "warning": "warn", "note": "note"}
     for finding in product["findings"]:
         level, _, text = finding.partition(": ")
-        # the sentence is what was found: the headline names the criterion
+        # the finding is the sentence, and the headline names the criterion
         name = "reading by other programs"
         out.append(Check("Products", name, text, "", levels.get(level, "note")))
     return tuple(out)
@@ -208,8 +210,10 @@ def selfcal_results(
         for chip in model.chips:
             x, y = outline_pixels(chip.size)
             when = None if model.time is None else np.full(len(x), epoch)
-            one = np.full(len(x), e)
-            outlines.append(model.predict(theta, x, y, exposure=one, chip=chip.number, epoch=when))
+            codes = np.full(len(x), e)
+            outlines.append(
+                model.predict(theta, x, y, exposure=codes, chip=chip.number, epoch=when)
+            )
     names = model.names
     return SelfcalResults(
         words=solved.gauge_words,

@@ -1,4 +1,4 @@
-"""The artefacts of a run: made by its stages, or loaded from its folder when they are asked for."""
+"""Artefacts of a run: made by its stages, or loaded from its folder when needed."""
 
 from __future__ import annotations
 
@@ -44,30 +44,30 @@ from bayesdist.utils.checks import Check, in_order
 
 T = TypeVar("T")
 
-# each rests on those before it
+# in order: each depends on those before it
 ARTEFACTS = "inputs matched fitted data posterior stored evaluation products figures".split()
 
 
 @dataclass(frozen=True, eq=False)
 class Results:
-    """The artefacts of a run, and what follows from them."""
+    """Artefacts of a run, and quantities derived from them."""
 
     run: RunDirectory
-    reader: StarReader  # reads the stars once for all stages
-    # artefacts of this process, in place of those in the folder
+    reader: StarReader  # cache: the stars are read once for all stages
+    # artefacts made by this process, which replace those in the folder
     made: Mapping[str, Any] = field(default_factory=dict)
-    # pairs in RvB files, which may have to be selected before they are read
+    # matches in the format of a mission, which may have to be selected before they are read
     source: RunInput | None = None
 
     def having(self, **artefacts: Any) -> Results:
-        """Results with artefacts in place of earlier ones, without any that rested on those."""
+        """Results with some artefacts replaced; artefacts that depend on them are dropped."""
         first = min(ARTEFACTS.index(name) for name in artefacts)
-        known = {**self.made, **vars(self)}
-        kept = {name: known[name] for name in ARTEFACTS[:first] if name in known}
-        return replace(self, made={**kept, **artefacts})
+        available = {**self.made, **vars(self)}
+        unaffected = {name: available[name] for name in ARTEFACTS[:first] if name in available}
+        return replace(self, made={**unaffected, **artefacts})
 
     def adopting_inputs(self) -> Results:
-        """Results whose inputs lie in the run's folder, where they were prepared beside it."""
+        """Results with inputs moved into the run's folder, if they were prepared elsewhere."""
         if self.source is None or not self.source.move_into_run():
             return self
         moved = self.having(inputs=self.source.load())
@@ -75,7 +75,7 @@ class Results:
         return moved.having(matched=moved.matched).having(fitted=self.fitted)
 
     def close(self) -> None:
-        """Let go of the stars, and of what was written of them beside the run's folder."""
+        """Release the stars, and remove their temporary files."""
         self.reader.close()
         if self.source is not None:
             self.source.close()
@@ -83,31 +83,31 @@ class Results:
     # -- artefacts --------------------------------------------------------------------------------
 
     def _artefact(self, name: str, stage: str, load: Callable[[], T]) -> T:
-        """What this process has made, or what a stage has left in the folder, if undamaged."""
+        """Artefact made by this process, otherwise loaded from the folder if undamaged."""
         if self.made.get(name) is not None:
-            found: T = self.made[name]
-            return found
+            artefact: T = self.made[name]
+            return artefact
         self.run.refuse_damaged(stage)
         return load()
 
     @cached_property
     def config(self) -> Config:
-        """The resolved configuration."""
+        """Resolved configuration."""
         return self.run.config
 
     @cached_property
     def base(self) -> Path:
-        """Folder that the configuration's files are relative to."""
+        """Folder that file names in the configuration are relative to."""
         return self.run.base
 
     @cached_property
     def kind(self) -> Kind:
-        """Kind of the run, with all that it does in its own way."""
+        """Kind of the run."""
         return kind_of(self.config)
 
     @cached_property
     def inputs(self) -> Any:
-        """All that the run begins with."""
+        """Inputs of the run."""
         if "inputs" in self.made:
             return self.made["inputs"]
         if self.source is not None:
@@ -116,7 +116,7 @@ class Results:
 
     @cached_property
     def matched(self) -> Matched:
-        """Stars that are fitted and stars that are held out, as they were read or matched."""
+        """Fitted and held-out stars."""
 
         def load() -> Matched:
             if self.kind.load_matched is None:
@@ -127,7 +127,7 @@ class Results:
 
     @cached_property
     def fitted(self) -> Fitted:
-        """The least-squares solution, with what its stars were given."""
+        """Least-squares solution with everything that it depends on."""
         return self._artefact(
             "fitted", "fit", lambda: self.kind.load_fitted(self.run.path, lambda: self.matched)
         )
@@ -139,104 +139,110 @@ class Results:
 
     @cached_property
     def posterior(self) -> Posterior:
-        """The posterior as it was sampled."""
+        """Posterior as sampled."""
         return self._artefact(
             "posterior", "sample", lambda: load_posterior(self.run / "posterior.nc")
         )
 
     @property
     def is_sampled(self) -> bool:
-        """Boolean: there is a posterior."""
+        """True if there is a posterior."""
         return "posterior" in self.made or (self.run / "posterior.nc").exists()
 
     @cached_property
     def stored(self) -> Diagnostics | None:
-        """Diagnostics as the run has them; None before."""
+        """Diagnostics stored in the run; None if there are none."""
         return self._artefact(
             "stored", "diagnose", lambda: load_diagnostics(self.run, self.fit, self.posterior)
         )
 
     @cached_property
     def diagnostics(self) -> Diagnostics:
-        """Diagnostics as the run has them, or made now; fewer of a fit alone."""
+        """Diagnostics stored in the run, otherwise computed now.
+
+        Without a posterior they are those of the fit alone.
+        """
         if not self.is_sampled:
             return diagnose_residuals(None, self.data, self.config)
         return self.stored or diagnose_run(self.posterior, self.data, self.config, self.base)
 
     @cached_property
     def evaluation(self) -> Evaluation:
-        """Maps, budget, margins and validity periods, as the assessment has found them."""
+        """Maps, budget, margins and validity periods."""
         return self._artefact(
             "evaluation", "evaluate", lambda: load_evaluation(self.run, self.fit, self.posterior)
         )
 
     @property
     def stored_evaluation(self) -> Evaluation | None:
-        """The evaluation, if there is one of this posterior."""
-        there = "evaluation" in self.made or self.run.done("evaluate")
-        return self.evaluation if there else None
+        """Evaluation of this posterior; None if there is none."""
+        exists = "evaluation" in self.made or self.run.done("evaluate")
+        return self.evaluation if exists else None
 
     # -- what follows from them -------------------------------------------------------------------
 
     @property
     def fit(self) -> LinearFit:
-        """The least-squares fit itself."""
+        """Least-squares fit."""
         return self.fitted.linear
 
     @cached_property
     def solution(self) -> Posterior:
-        """Posterior that is exported and shown: with all errors that were found."""
+        """Posterior with all errors that the diagnostics found; it is exported and shown."""
         return solution_of(self.posterior, self.stored, self.fitted)
 
     @cached_property
     def errors(self) -> ErrorModel:
-        """All errors of a position."""
+        """Error model of positions, with all errors."""
         return errors_of_run(self.posterior, self.diagnostics, self.data, self.config)
 
     @cached_property
     def settings(self) -> EvaluationSettings:
-        """Where and how errors are evaluated."""
+        """Settings of the evaluation."""
         return evaluation_settings(self.data, self.config)
 
     @property
     def epoch(self) -> float | None:
-        """Epoch of the assessment, decimal years; stars are read only where it is theirs."""
+        """Epoch of the assessment in decimal years.
+
+        Stars are read only if it is their latest date.
+        """
         if self.config.assess.epoch is not None or self.fit.model.time is None:
             return self.config.assess.epoch  # without reading the stars
         return assessment_epoch(self.data, self.config)
 
     @property
     def product(self) -> ProductInput:
-        """Ingredients of the files of the solution."""
+        """Ingredients of the products."""
         return product_of(self.posterior, self.stored, self.data, self.config, self.source_name)
 
     @property
     def source_name(self) -> str:
-        """Name of the run in the files of its solution; empty if it has no folder."""
+        """Name of the run in its products; empty if it has no folder."""
         return "" if self.run.in_memory else str(self.run.path)
 
     @property
     def series(self) -> Mapping[str, Any]:
-        """Linear terms against time: a section of summary.json, empty where it has none."""
-        found: Mapping[str, Any] = self.run.summary.get("time_dependence", {})
-        return found
+        """Section 'time_dependence' of summary.json; empty if there is none."""
+        section: Mapping[str, Any] = self.run.summary.get("time_dependence", {})
+        return section
 
     @property
     def checks(self) -> tuple[Check, ...]:
-        """All checks but those of an evaluation."""
+        """All checks except those of an evaluation."""
         posterior = self.posterior if self.is_sampled else None
-        own = run_checks(self.data, posterior, self.diagnostics, self.config, self.series)
-        return in_order((*own, *self.diagnostics.checks))
+        run_only = run_checks(self.data, posterior, self.diagnostics, self.config, self.series)
+        return in_order((*run_only, *self.diagnostics.checks))
 
 
 def results_of(run: RunDirectory) -> Results:
-    """The results of a run, which whoever asks for them closes."""
+    """Results of a run; the caller must close them."""
     return Results(run, StarReader(run.config.resources()), source=input_of_run(run))
 
 
 @contextmanager
 def open_results(run: RunDirectory) -> Iterator[Results]:
-    """The results of a run, whose stars are let go of in the end."""
+    """Open the results of a run, and close them at the end of the context."""
     results = results_of(run)
     try:
         yield results
@@ -245,22 +251,22 @@ def open_results(run: RunDirectory) -> Iterator[Results]:
 
 
 def errors_of(results: Results) -> DrawnErrors:
-    """Draws of all errors of a position, as budget and margins have them, and of files."""
+    """Draws of all position errors, as for budget and margins, including those of products."""
     files = file_errors(results.product, results.config, results.base)
-    given = results.errors, results.diagnostics, results.settings
-    return drawn_errors(*given, assessment_rng(results.config), files=files)
+    arguments = results.errors, results.diagnostics, results.settings
+    return drawn_errors(*arguments, assessment_rng(results.config), files=files)
 
 
 def margins_of(results: Results, requirements: Sequence[Requirement]) -> tuple[Margin, ...]:
-    """Margins of a run against requirements."""
+    """Margins of a run for the given requirements."""
     requirements = results.config.within_field(requirements)
-    given = results.errors, results.diagnostics, requirements, results.settings
-    return judged(*given, assessment_rng(results.config), checks=results.checks)
+    arguments = results.errors, results.diagnostics, requirements, results.settings
+    return judged(*arguments, assessment_rng(results.config), checks=results.checks)
 
 
 def validity_periods_of(
     results: Results, requirements: Sequence[Requirement]
 ) -> tuple[ValidityPeriod, ...]:
-    """Until when requirements are met by a run, where something depends on time."""
-    given = results.errors, results.diagnostics, requirements, results.settings
-    return validity_of(*given, assessment_rng(results.config))
+    """Validity periods of requirements, if anything depends on time."""
+    arguments = results.errors, results.diagnostics, requirements, results.settings
+    return validity_of(*arguments, assessment_rng(results.config))

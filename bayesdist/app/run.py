@@ -285,10 +285,10 @@ class Run:
         number = self._chip(chip)
         date = None if epoch is None else year_of(epoch)
         if date is None:
-            return next(one for one in self.evaluation.maps if one.chip == number)
+            return next(item for item in self.evaluation.maps if item.chip == number)
         results = self.results
         settings = replace(results.settings, epoch=date)
-        chip_of_map = next(one for one in self.model.chips if one.number == number)
+        chip_of_map = next(item for item in self.model.chips if item.number == number)
         return position_map(results.errors, results.solution, settings, chip_of_map)
 
     def _chip(self, number: int | None) -> int:
@@ -430,7 +430,7 @@ class Run:
         evaluation, fit, config = self.evaluation, self.fit, self.results.config
         convergence = self.posterior.convergence
         scale_mas = config.detector.scale_mas
-        largest = max(float(np.nanmax(one.per_axis)) for one in evaluation.maps)
+        largest = max(float(np.nanmax(chip_map.per_axis)) for chip_map in evaluation.maps)
         exposures = len(self.results.data.placed.exposures)
         state = f"yes, R-hat {convergence.rhat_max:.3f}, ESS {convergence.ess_bulk_min:.0f}"
         facts = [
@@ -488,10 +488,10 @@ class Run:
         value = f"{row['Value']} {margin.unit}"
         if margin.unit == "pix" and scale_mas is not None:
             value += f" ({number(margin.value * scale_mas, 3)} mas)"
-        known = " by the known errors alone" if margin.verdict == "undecided" else ""
+        qualifier = " by the known errors alone" if margin.verdict == "undecided" else ""
         return (
             f"{margin.verdict.upper()}: {asked.name}: {statistic} {value}, "
-            f"limit {asked.limit:g} {asked.unit}, {margin.probability_words}{known}"
+            f"limit {asked.limit:g} {asked.unit}, {margin.probability_words}{qualifier}"
         )
 
     @python_terms
@@ -757,7 +757,7 @@ def run(
 
 
 def _pairs(positions: Positions, name: str) -> list[tuple[float, float]]:
-    """Positions (x, y) as a list; one position alone becomes a list of one."""
+    """Positions (x, y) as a list of pairs; a single position becomes a list with one pair."""
     try:
         pairs = np.atleast_2d(np.asarray(_without_unit(positions, name), float))
     except (TypeError, ValueError):

@@ -1,4 +1,4 @@
-"""Files, sections of summary.json and lines of the log that the stages of a run write."""
+"""Files, sections of summary.json and log messages that the stages of a run write."""
 
 from __future__ import annotations
 
@@ -46,14 +46,14 @@ log = logging.getLogger("bayesdist")
 
 
 def save_matches(results: Results) -> None:
-    """Write the matches of star lists."""
+    """Write the matches found in star lists."""
     matched = results.matched
     matched.save(results.run.path)
     results.run.summarise(**{matched.section: matched.facts})
 
 
 def save_fit(results: Results) -> None:
-    """Write the least-squares solution, and what is odd about it, before hours of sampling."""
+    """Write the least-squares solution and log anything suspicious before sampling starts."""
     config, data = results.config, results.data
     fitted = data.fitted
     fitted.save(results.run.path)
@@ -75,12 +75,12 @@ def save_fit(results: Results) -> None:
         log.warning("fit: WARNING: %s", text)
     if fitted.scatter is not None:
         scatter = fitted.facts["scatter"]
-        sizes = ", ".join(f"{name} {found['value']:.2g}" for name, found in scatter.items())
+        sizes = ", ".join(f"{name} {term['value']:.2g}" for name, term in scatter.items())
         log.info("fit: scatter of the exposures %s", sizes)
 
 
 def _log_geometry(fit: LinearFit) -> None:
-    """Lines of the log on scales, orientation, parity and distortion of each chip."""
+    """Log scales, orientation, parity and distortion of each chip."""
     for chip in geometries(fit):
         log.info("fit: chip %d: %s", chip.chip, chip.sentence)
         for text in chip.warnings:
@@ -88,7 +88,7 @@ def _log_geometry(fit: LinearFit) -> None:
 
 
 def _log_matches(data: FitData, config: Config) -> None:
-    """Lines of the log on stars that were matched before."""
+    """Log notes and warnings about stars that were matched before the run."""
     matches, fit = data.placed, data.fit
     for note in matches.notes:
         log.info("fit: %s", note)
@@ -112,7 +112,7 @@ def _log_matches(data: FitData, config: Config) -> None:
 
 
 def save_sampled(results: Results) -> None:
-    """Write the posterior, and what it says of each star."""
+    """Write the posterior, and its residuals and outlier probabilities of each star."""
     run, data, posterior = results.run, results.data, results.posterior
     facts, gauge = run.facts, results.fitted.gauge_words
     provenance = {k: facts[k] for k in ("inputs", "seed", "versions", "created")}
@@ -132,19 +132,19 @@ def save_sampled(results: Results) -> None:
 
 
 def save_diagnosed(results: Results) -> None:
-    """Write what residuals say, held-out stars, periods and exposures among them."""
-    run, found = results.run, results.diagnostics
+    """Write the diagnostics, including those of held-out stars, periods and exposures."""
+    run, diagnostics = results.run, results.diagnostics
     if results.fitted.alone is not None:
         from bayesdist.app.assessment.series import write_series_tables
 
         write_series_tables(run, results.fitted, results.config)
-    write_diagnostics(run, results.fit, results.posterior, found)
-    if found.holdout is not None:
-        write_table(holdout_table(found.holdout), run / "holdout.ecsv")
-        run.summarise(holdout=holdout_summary(found.holdout))
-        log.info("diagnose: %s", found.holdout.verdict)
-        log.info("diagnose: %s", found.holdout.coverage_words)
-    periods = found.periods
+    write_diagnostics(run, results.fit, results.posterior, diagnostics)
+    if diagnostics.holdout is not None:
+        write_table(holdout_table(diagnostics.holdout), run / "holdout.ecsv")
+        run.summarise(holdout=holdout_summary(diagnostics.holdout))
+        log.info("diagnose: %s", diagnostics.holdout.verdict)
+        log.info("diagnose: %s", diagnostics.holdout.coverage_words)
+    periods = diagnostics.periods
     if periods is not None:
         write_table(periods_table(periods), run / "periods.ecsv")
         run.summarise(periods=periods_summary(periods))
@@ -155,47 +155,50 @@ def save_diagnosed(results: Results) -> None:
         from bayesdist.app.kinds.selfcal.stars import write_stars
 
         notes = provenance_notes(results.posterior, solved.gauge_words)
-        stars = write_stars(run.path, solved, found.correlated, notes, results.config.resources())
+        stars = write_stars(
+            run.path, solved, diagnostics.correlated, notes, results.config.resources()
+        )
         run.summarise(selfcal=run.summary.get("selfcal", {}) | {"stars": stars})
 
 
 def save_evaluation(results: Results) -> None:
     """Write maps, budget, margins and validity periods."""
-    run, config, found = results.run, results.config, results.evaluation
-    for text in warnings_of(found.checks):
+    run, config, evaluation = results.run, results.config, results.evaluation
+    for text in warnings_of(evaluation.checks):
         log.warning("evaluate: WARNING: %s", text)
     if idle := idle_dates(config, config.requirements()):
         log.warning("evaluate: WARNING: %s", idle)
     gauge, solution = results.fitted.gauge_words, results.solution
-    write_evaluation(run, results.fit, results.posterior, solution, gauge, found)
+    write_evaluation(run, results.fit, results.posterior, solution, gauge, evaluation)
     if results.fitted.scatter is not None:
         from bayesdist.app.kinds.campaign.linear_terms import line_sections
 
         run.summarise(**line_sections(solution, config.chips()[0].number))
-    for one in found.validity:
-        log.info("evaluate: %s", one.sentence)
-    largest = max(float(np.nanmax(one.per_axis)) for one in found.maps)
+    for period in evaluation.validity:
+        log.info("evaluate: %s", period.sentence)
+    largest = max(float(np.nanmax(period.per_axis)) for period in evaluation.maps)
     log.info(
         "evaluate: largest uncertainty per axis %.4g %s (1 sigma)", largest, results.fit.model.unit
     )
 
 
 def save_products(results: Results) -> None:
-    """List the files that were exported."""
+    """List the exported files in summary.json and the log."""
     products = results.made["products"]
     results.run.summarise(products=products)
     log.info("export: %s", ", ".join(p["path"] for p in products) or "no products asked for")
 
 
 def save_figures(results: Results) -> None:
-    """List the figures that were drawn."""
+    """List the figures in summary.json."""
     results.run.summarise(figures=results.made["figures"])
 
 
 def fit_sections(fitted: Fitted, stars: Matches, *, skew: bool = False) -> dict[str, Any]:
-    """Sections of summary.json: 'data', 'fit', and those that only the making of the fit knows.
+    """Sections 'data' and 'fit' of summary.json, and others known only while the fit is made.
 
-    `stars`: as `Fitted.placed` gives them. `skew`: the skew of the axes is asked for.
+    `stars` are those returned by `Fitted.placed`. `skew` is True if the skew of the axes is
+    requested.
     """
     fit, errors = fitted.linear, fitted.errors
     optional: dict[str, Any] = {}
@@ -227,7 +230,7 @@ def fit_sections(fitted: Fitted, stars: Matches, *, skew: bool = False) -> dict[
 
 
 def log_fit(fit: LinearFit, rows: str) -> None:
-    """A line of the log; `rows` is what a row of the data is, in words."""
+    """Log a line about the fit; `rows` is the word for rows of the data."""
     log.info(
         "fit: %d %s, %d rejected, rms %.4g and %.4g %s, chi2/dof %.3f",
         fit.n_rows,
@@ -241,20 +244,20 @@ def log_fit(fit: LinearFit, rows: str) -> None:
 
 
 def _skew(fit: LinearFit) -> Mapping[str, Any]:
-    """Skew of the first chip and, where there are several, of each."""
-    found = {chip.number: skew_of(fit, chip=chip.number) for chip in fit.model.chips}
+    """Skew of the first chip and, if there are several, of each chip."""
+    skews = {chip.number: skew_of(fit, chip=chip.number) for chip in fit.model.chips}
     rows = [
-        {"value_rad": one.value, "sigma_rad": one.sigma, "significance": one.significance}
-        for one in found.values()
+        {"value_rad": skew.value, "sigma_rad": skew.sigma, "significance": skew.significance}
+        for skew in skews.values()
     ]
-    each = [{"chip": number} | row for number, row in zip(found, rows, strict=True)]
+    each = [{"chip": number} | row for number, row in zip(skews, rows, strict=True)]
     return rows[0] | ({"chips": each} if len(rows) > 1 else {})
 
 
 def sample_sections(posterior: Posterior, *, in_circle: bool) -> dict[str, Any]:
     """Sections 'outliers' and 'sampler' of summary.json.
 
-    `in_circle`: stars were matched in circles about nominal positions.
+    `in_circle` is True if stars were matched in circles about nominal positions.
     """
     return {
         "outliers": _outliers(posterior, in_circle),
@@ -283,7 +286,7 @@ def _outliers(posterior: Posterior, in_circle: bool) -> dict[str, object]:
 
 
 def _certificate(posterior: Posterior) -> dict[str, object]:
-    """Evidence for draws that were not made from the posterior itself."""
+    """Evidence for draws that are not from the posterior itself."""
     c = posterior.certificate
     if c is None:
         return {}
@@ -294,18 +297,18 @@ FOLDER = "stars"
 
 
 def write_star_files(matches: Matches, fit: LinearFit, posterior: Posterior, folder: Path) -> None:
-    """Write residuals and memberships of each star by batches, in place of parts that are there."""
+    """Write residuals and memberships of each star in batches, replacing existing parts."""
     made_folder(folder)
     remove_leftovers(folder)
     for path in part_files(folder):
         path.unlink()
-    for k, reader in enumerate(matches.readers()):  # a batch is let go before the next one is read
+    for k, reader in enumerate(matches.readers()):  # one batch in memory at a time
         _write_part(reader.load(), fit, posterior, folder / f"part-{k:05d}.parquet")
 
 
 def _write_part(table: Matches, fit: LinearFit, posterior: Posterior, path: Path) -> None:
     stars, order = prepare(posterior.model, table)
-    said = memberships_of(posterior, stars).in_table_order(order)
+    memberships = memberships_of(posterior, stars).in_table_order(order)
     u, v = in_table_order(stars.residuals(posterior.mean), order).T
     columns = {
         "source": (table.source, table.sources),
@@ -316,9 +319,9 @@ def _write_part(table: Matches, fit: LinearFit, posterior: Posterior, path: Path
         "residual_u": u,
         "residual_v": v,
         "used": in_table_order(fit.clip.keeps_of(stars), order),
-        "outlier_probability": said.outlier_probability,
-        "log_likelihood": said.log_likelihood,
-        "log_likelihood_variance": said.log_likelihood_variance,
+        "outlier_probability": memberships.outlier_probability,
+        "log_likelihood": memberships.log_likelihood,
+        "log_likelihood_variance": memberships.log_likelihood_variance,
     }
     unit = posterior.unit
     write_columns(path, columns, {"x": "pix", "y": "pix", "residual_u": unit, "residual_v": unit})

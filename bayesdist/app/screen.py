@@ -1,4 +1,4 @@
-"""Logs, progress and tables in the terminal."""
+"""Logs, progress bars and tables in the terminal."""
 
 from __future__ import annotations
 
@@ -24,32 +24,33 @@ _UNITS_UNKNOWN_TO_ASTROPY = (
     r"The unit '.*' has been deprecated",
     r".*could not be saved in native FITS format",
 )
-# they write tracebacks of lost connections above the sentence that says so; Dask sets their levels
+# loggers that print tracebacks of lost connections before our message; Dask sets their levels
 DASK_LOGS = ("distributed.client", "distributed.core", "distributed.comm.tcp", "distributed.utils")
 FORMAT = "%(asctime)s %(levelname)-7s %(message)s"
 
 
 def open_streams() -> None:
-    """Give a process that was started without standard streams empty ones.
+    """Open null streams for a process that was started without standard streams.
 
-    The files that it opens would get their numbers, and what a library writes to stderr would end
-    in one of them.
+    Otherwise files that it opens would get the descriptors of these streams, and output of
+    libraries to stderr would be written to one of the files.
     """
     for number_of, (name, mode) in enumerate((("stdin", "r"), ("stdout", "w"), ("stderr", "w"))):
         try:
             os.fstat(number_of)
         except OSError:
-            os.set_inheritable(os.open(os.devnull, os.O_RDWR), True)  # it gets the lowest number
+            # the new file gets the lowest free descriptor
+            os.set_inheritable(os.open(os.devnull, os.O_RDWR), True)
         if getattr(sys, name) is None:
             stream = os.fdopen(number_of, mode, encoding="utf-8", closefd=False)
             setattr(sys, name, stream)
 
 
 def start_logging(*, quiet: bool) -> None:
-    """Send the package's log to stderr, warnings alone where it is quiet.
+    """Send the log of the package to stderr; only warnings if `quiet`.
 
-    What astropy says of units of columns that nobody uses stays out of the terminal: units that
-    matter are checked column by column.
+    Warnings of astropy about units of unused columns are suppressed, because relevant units are
+    checked column by column.
     """
     for message in _UNITS_UNKNOWN_TO_ASTROPY:
         warnings.filterwarnings("ignore", message=message)
@@ -66,18 +67,18 @@ def start_logging(*, quiet: bool) -> None:
 
 
 def _nothing(_: logging.LogRecord) -> bool:
-    """Pass no record; a function of its own, so that it is added to a logger only once."""
+    """Reject every log record; a named function, so that it is added to a logger only once."""
     return False
 
 
 class _QuietHandler(logging.FileHandler):
-    """A log whose own errors do not bury that which stops the run, as of a full disk."""
+    """Log file that ignores errors of writing it, such as a full disk, which would hide others."""
 
     def handleError(self, record: logging.LogRecord) -> None:  # noqa: N802  logging's own name
-        """Pass over it."""
+        """Ignore the error."""
 
     def _open(self) -> TextIOWrapper:
-        """Open the log for appending; a symbolic link is not followed."""
+        """Open the log for appending, without following a symbolic link."""
         descriptor = descriptor_for_writing(self.baseFilename, os.O_APPEND)
         return TextIOWrapper(FileIO(descriptor, self.mode), encoding=self.encoding)
 
@@ -105,7 +106,7 @@ def log_file(path: Path) -> Iterator[None]:
 
 @contextmanager
 def progress_bar(label: str) -> Iterator[Callable[[int, int], None]]:
-    """A progress bar on stderr, silent where stderr is no terminal."""
+    """Progress bar on stderr, shown only if stderr is a terminal."""
     from tqdm import tqdm
 
     is_terminal = sys.stderr is not None and sys.stderr.isatty()
@@ -121,14 +122,14 @@ def progress_bar(label: str) -> Iterator[Callable[[int, int], None]]:
 
 
 def number(value: Any, digits: int = 4) -> str:
-    """A number as a person reads it."""
+    """Text of a number for display."""
     if isinstance(value, Real) and not isinstance(value, Integral):
         return f"{value:.{digits}g}" if math.isfinite(value) else "-"
     return "-" if value is None else str(value)
 
 
 def table_text(rows: list[dict[str, Any]], digits: int = 4) -> str:
-    """Rows as aligned text: text to the left, numbers to the right, headings centred."""
+    """Rows as aligned text: text on the left, numbers on the right, headings centred."""
     if not rows:
         return "(none)"
     columns = []

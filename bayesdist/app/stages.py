@@ -1,4 +1,4 @@
-"""The whole job: a configuration in, a finished run directory out."""
+"""Complete calibration, from a configuration to a finished run directory."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ def run(
     report: bool = True,
     command: str = "",
 ) -> Path:
-    """Match, fit, sample, diagnose, evaluate, export and report, as a configuration says.
+    """Match, fit, sample, diagnose, evaluate, export and report, as configured.
 
     Parameters
     ----------
@@ -65,17 +65,17 @@ def run(
     output : path
         Run directory.
     resume : bool
-        Resume the run that is there: stages that stand are skipped, checkpoints are used.
+        Resume the existing run: stages that are up to date are skipped, and checkpoints are used.
     force : bool
-        Replace the run that is there.
+        Replace the existing run.
     strict : bool
-        Raise when the sampler has not converged (after everything has been written).
+        Raise if the sampler has not converged (after everything has been written).
     seed : int, optional
-        In place of the configured one.
+        Seed that replaces the configured one.
     report : bool
         False to leave out the stage 'report'.
     command : str
-        For the record.
+        Command line, for the record.
 
     Returns
     -------
@@ -85,6 +85,7 @@ def run(
     Raises
     ------
     BayesdistError
+        If the run cannot be made.
     """
     settings, text = load_config(config)
     directory = RunDirectory.plan(
@@ -114,7 +115,7 @@ def make_stages(
     ready: Mapping[str, Any] | None = None,
     source: str = "",
 ) -> Results:
-    """Run stages that are not up to date, and save what they make.
+    """Run stages that are not up to date, and save their results.
 
     Results of other stages are loaded from the folder when they are needed.
 
@@ -122,14 +123,19 @@ def make_stages(
     ----------
     results : Results
     stages : collection of str
+        Names of the stages.
     force : bool
-        Make them also where they stand.
+        Run the stages even if they are up to date.
     pdf : bool
-        Draw figures as PDF, too.
+        Write figures as PDF, too.
     ready : mapping of str to object, optional
-        Artefacts that were computed before and are only to be saved, by name.
+        Artefacts by name that were computed before and only have to be saved.
     source : str
-        Name of the run in files of its solution; by default that of its folder.
+        Name of the run in its products; by default that of its folder.
+
+    Returns
+    -------
+    Results
     """
     r, run, config, base = results, results.run, results.config, results.base
     source, ready = source or str(run.path), ready or {}
@@ -137,14 +143,14 @@ def make_stages(
     def stage(
         name: str, artefact: str, make: Callable[[], Any], save: Callable[[Results], None]
     ) -> None:
-        """Make and save an artefact, where its stage is among them."""
+        """Make and save an artefact if its stage is to be run."""
         nonlocal r
 
         def made() -> Results:
             value = ready[artefact] if artefact in ready else make()
             results_of_stage = r.having(**{artefact: value})
             save(results_of_stage)
-            # matches are read back: their rows may name the files that they lie in from now on
+            # matches are read back, so that their rows refer to the files of the run
             return results_of_stage if name != "match" else r.having(inputs=r.inputs)
 
         if name in stages:
@@ -152,7 +158,7 @@ def make_stages(
             release_memory()
 
     def fitted() -> Fitted:
-        """The fit, unless the rehearsal has made it."""
+        """Fit of the rehearsal if there is one, otherwise a new one."""
         return r.made.get("fitted") or fit(r.matched, config, base, r.reader).fitted
 
     def exported() -> list[dict[str, Any]]:
@@ -172,7 +178,7 @@ def make_stages(
 
 
 def evaluated(results: Results) -> Evaluation:
-    """Maps, budget, margins and validity periods of a run that has been sampled and diagnosed."""
+    """Maps, budget, margins and validity periods of a run that was sampled and diagnosed."""
     posterior, diagnostics, data = results.posterior, results.diagnostics, results.data
     return evaluate(
         error_model(posterior, diagnostics, data, results.config),
@@ -187,7 +193,7 @@ def evaluated(results: Results) -> Evaluation:
 
 
 def _sampled(r: Results) -> Posterior:
-    """The posterior, with a progress bar."""
+    """Sample the posterior with a progress bar."""
     with progress_bar("sample") as progress:
         return sample(r.data, r.config, folder=r.run.path, progress=progress)
 
@@ -202,14 +208,20 @@ def continue_stage(
     path : path
         Run directory.
     stage : str
+        Name of the stage.
     strict : bool
-        Of 'sample': as of `run`.
+        For 'sample': raise if the sampler has not converged.
     pdf : bool
-        Of 'report': whether figures are drawn as PDF, too.
+        For 'report': write figures as PDF, too.
+
+    Returns
+    -------
+    RunDirectory
 
     Raises
     ------
     BayesdistError
+        If the stage cannot be run.
     """
     directory = RunDirectory.open(path)
     begins_with = kind_of(directory.config).begins_with
@@ -243,7 +255,7 @@ def initialized(directory: RunDirectory) -> Iterator[Results]:
 
 
 def _require_converged(results: Results, strict: bool) -> None:
-    """Raise where a sampler has not converged, if that is asked for."""
+    """Raise NotConvergedError if `strict` and the sampler has not converged."""
     posterior = results.posterior
     if strict and convergence_check(posterior.convergence).level == "fail":
         exact = posterior.sampler.exact

@@ -1,4 +1,4 @@
-"""The error budget and the verdicts of a solution, for those who use single functions.
+"""Error budget and verdicts of a solution, as functions for users.
 
 The results equal those of a run with the same stars, terms and seed; see
 `bayesdist.assess.evaluation`.
@@ -71,36 +71,37 @@ def error_budget(
 ) -> ErrorBudget:
     """Error budget of a solution over a grid on the detector, at an epoch.
 
-    The parts of the model are combined by joint draws, for they are correlated; other terms are
-    independent and added in quadrature.  Without `diagnostics` the measured terms are missing, and
+    The rows of the model are combined by joint draws because they are correlated. Other terms are
+    independent and added in quadrature. Without `diagnostics` the measured terms are missing, and
     the notes of the budget say so.
 
     Parameters
     ----------
     solution : Posterior or LinearFit
-        With `diagnostics` the posterior that they were made of.
+        With `diagnostics`, the posterior from which they were computed.
     diagnostics : Diagnostics, optional
         Result of `diagnose`, which adds structure beyond the model, differences between exposures
         and the observed noise of the stars.
     catalogue : Catalogue, optional
         Error of the reference catalogue.
     terms : sequence of ErrorTerm
-        Further errors, such as `UserTerm`; each gives one row or more.
+        Further errors, such as `UserTerm`; each contributes one or more rows.
     exposure : str
-        'mean' for a position in the mean of the exposures; 'single' for one in a single exposure,
-        which deviates as the diagnostics have found.
+        'mean' for a position in the mean of the exposures; 'single' for a position in a single
+        exposure, which deviates as measured by the diagnostics.
     aligned : bool
-        True if the observer fits shift and rotation of the exposure, so that they are no errors.
+        True if the observer fits shift and rotation of the exposure, so that they are not errors.
     grid : tuple of int
-        Points on x and y of each chip.
+        Number of points along x and y of each chip.
     epoch : float, Time or str, optional
-        Decimal years or a date.  By default the latest date of the stars, if the model depends on
-        time and `diagnostics` know the dates.
+        Decimal years or a date. By default the latest date of the stars, if the model depends on
+        time and `diagnostics` contain the dates.
     chip : int, optional
         Chip number; all chips by default.
     n_draws : int
+        Number of draws, at least 2.
     rng : int or numpy.random.Generator
-        Seed of a run; a generator is advanced.
+        Seed as in a run, or a generator, which is advanced.
     pixel_scale : float or Quantity, optional
         Size of one pixel in mas; that of the solution by default.
 
@@ -112,8 +113,9 @@ def error_budget(
     Raises
     ------
     InputError
-        For an unknown chip, a missing epoch, a bad grid, fewer than two draws, a term whose unit
-        needs a pixel scale that is not known, and diagnostics of another solution.
+        If the chip is unknown, the epoch is missing, the grid is invalid, `n_draws` is less than
+        two, the unit of a term needs a pixel scale that is unknown, or the diagnostics belong to
+        another solution.
 
     Examples
     --------
@@ -162,55 +164,57 @@ def check_requirements(
 ) -> tuple[Margin, ...]:
     """Judge requirements on draws of the position error.
 
-    Each draw is an error field over the grid: a draw of the solution minus its mean (all parts of
-    the model jointly, so with the correlation between positions), plus a draw of every term: for a
-    systematic term of the user one Gaussian offset of each axis for the whole field, for random and
-    local ones an independent Gaussian error at every grid point.  The statistic of each field gives
-    a distribution, and the fraction of draws at or under the limit is compared with the probability
-    asked for.
+    Each draw is an error field over the grid. It is the sum of a draw of the solution minus its
+    mean and a draw of every term. The solution is drawn jointly, so that the correlation between
+    positions is included. A systematic term of the user contributes one Gaussian offset per axis
+    for the whole field; random and local terms contribute an independent Gaussian error at every
+    grid point. The statistic of each field gives a distribution. The fraction of draws that do not
+    exceed the limit is compared with the required probability.
 
     Without `diagnostics` every verdict is 'undecided': structure in the residuals would make the
-    errors larger than stated, and quoted errors that are too large make them smaller.  Without an
-    error of the reference catalogue nothing is 'met'.  With both, the verdict is that of
+    errors larger than stated, and overestimated quoted errors would make them smaller. Without an
+    error of the reference catalogue no verdict is 'met'. With both, the verdict is that of
     `bayesdist run` for the same stars, terms and seed.
 
-    The field is that of all chips: the same grid on each of them, so that each has the same weight.
+    The field covers all chips with the same grid on each, so that each chip has the same weight.
     A draw of the solution and an offset are common to all chips.
 
-    For a relative error the statistic is that of the differences between two positions, over all
-    pairs of points.  Over a range of epochs the draws of everything are the same throughout, and
-    that of the statistic is the largest over nine epochs and the breaks between them.
+    For a relative error, the statistic is that of the differences between two positions, over all
+    pairs of points. Over a range of epochs, the same draws are used throughout, and the statistic
+    of each draw is its maximum over nine epochs and the breaks between them.
 
     Parameters
     ----------
     solution : Posterior or LinearFit
-        With `diagnostics` the posterior that they were made of.
+        With `diagnostics`, the posterior from which they were computed.
     requirements : Requirement or sequence of Requirement
     diagnostics : Diagnostics, optional
-        What the residuals show, as of `diagnose`.
+        Result of `diagnose`.
     catalogue : Catalogue, optional
-        Error of the reference catalogue; a term that names a catalogue states it as well.
+        Error of the reference catalogue; it can also be stated by a term that names a catalogue.
     terms : sequence of ErrorTerm
         Further errors, such as `UserTerm`.
     exposure : str
         'mean' for a position in the mean of the exposures; 'single' for one in a single exposure.
     aligned : bool
-        True if shift and rotation of the exposure are the observer's to fit, as of `ErrorModel`:
-        over all chips, even if one is judged.  Terms that are no polynomials stay as they are.
+        True if the observer fits shift and rotation of the exposure; see `ErrorModel`. They are
+        fitted over all chips, even if only one chip is judged. Terms that are not polynomials are
+        unchanged.
     grid : tuple of int
-        Points on x and y of each chip.
+        Number of points along x and y of each chip.
     epoch : float, Time or str, optional
-        Decimal years or a date, for requirements that name none.  By default the latest date of the
-        stars, if the model depends on time and `diagnostics` know the dates.
+        Decimal years or a date, for requirements that name none. By default the latest date of the
+        stars, if the model depends on time and `diagnostics` contain the dates.
     chip : int, optional
         Chip number, for requirements that name none; all chips by default.
     n_draws : int
+        Number of draws, at least 2.
     rng : int or numpy.random.Generator
-        Seed of a run; a generator is advanced.
+        Seed as in a run, or a generator, which is advanced.
     pixel_scale : float or Quantity, optional
         Size of one pixel in mas; that of the solution by default.
     checks : sequence of Check
-        Further reasons why the errors may not be as stated.
+        Further reasons why the errors may differ from those stated.
 
     Returns
     -------
@@ -220,10 +224,10 @@ def check_requirements(
     Raises
     ------
     InputError
-        For a requirement without an epoch if the model depends on time, units that need a pixel
-        scale that is not known, an unknown chip, a bad grid, a region without points of the grid, a
-        magnitude without errors by magnitude, fewer than two draws, and diagnostics of another
-        solution.
+        If a requirement has no epoch although the model depends on time, a unit needs a pixel scale
+        that is unknown, the chip is unknown, the grid is invalid, a region contains no grid points,
+        a magnitude is given but no errors by magnitude are known, `n_draws` is less than two, or
+        the diagnostics belong to another solution.
 
     Examples
     --------
@@ -253,7 +257,7 @@ def check_requirements(
     for r in requirements:
         convert(r.limit, r.unit, solution.model.unit, scale, where=r.where)
     errors = _error_model(solution, diagnostics, stated, settings, aligned=aligned, chip=chip)
-    if not requirements:  # terms in units that need a scale are refused all the same
+    if not requirements:  # units of terms have been checked nevertheless
         return ()
     generator = assessment_rng(rng)
     drawn = errors.drawn(n_draws, generator)
@@ -289,7 +293,7 @@ def check_requirements(
 
 
 def _stated_terms(catalogue: Catalogue | None, terms: Sequence[ErrorTerm]) -> tuple[ErrorTerm, ...]:
-    """The user's terms in the order of a run: those that are the same everywhere come last."""
+    """The user's terms in the order of a run: the catalogue first, then the other terms."""
     require_catalogue(catalogue)
     if catalogue is None:
         return tuple(terms)
@@ -306,10 +310,10 @@ def _settings(
     n_draws: int,
     pixel_scale: Number | None,
 ) -> EvaluationSettings:
-    """Settings of an evaluation, as a run makes them of its configuration."""
+    """Settings of an evaluation, equal to those that a run makes from its configuration."""
     require_known(exposure, EXPOSURES, "exposure", where="exposure")
     if diagnostics is not None:
-        _posterior_of(solution, diagnostics)  # refuses diagnostics of another solution
+        _posterior_of(solution, diagnostics)  # raises if they belong to another solution
     scale_mas = None if pixel_scale is None else value_in(pixel_scale, "mas", "pixel_scale")
     year = None if epoch is None else year_of(epoch)
     dates = np.zeros(0) if diagnostics is None else diagnostics.dates
@@ -341,14 +345,14 @@ def _error_model(
     aligned: bool,
     chip: int | None,
 ) -> ErrorModel:
-    """All errors: of the solution, of what the diagnostics found, and of the user's terms."""
+    """Errors of the solution, errors measured by the diagnostics, and the user's terms."""
     scale = pixel_scale_of(solution, chip, settings.scale_mas)
     if diagnostics is None:
         return error_model(solution, stated, aligned=aligned, pixel_scale=scale)
     errors = diagnosed_error_model(
         _posterior_of(solution, diagnostics),
         diagnostics,
-        # in the order of a run, whose sums are the same to the last bit
+        # the order of a run, so that sums are identical to the last bit
         sorted(stated, key=lambda term: isinstance(term, UserTerm)),
         hierarchy=None,
         catalogue="catalogue",
@@ -362,46 +366,46 @@ def _error_model(
 
 
 def _posterior_of(solution: Solution, diagnostics: Diagnostics) -> Posterior:
-    """The solution, checked to be the posterior that was diagnosed.
+    """Return the solution if it is the posterior that was diagnosed.
 
-    Raises InputError if it is another one.
+    Raises InputError if the diagnostics belong to another solution.
     """
-    where = "diagnostics"
+    location = "diagnostics"
     if not isinstance(diagnostics, Diagnostics):
         raise InputError(
             f"they are a {type(diagnostics).__name__}",
-            where=where,
+            where=location,
             do="give what bd.diagnose(posterior, matches) returned",
         )
     if not isinstance(solution, Posterior):
         raise InputError(
             f"they are those of a posterior, and the solution is a {type(solution).__name__}",
-            where=where,
+            where=location,
             do="give the posterior, or leave them out",
         )
     if solution.own_places or solution.model.gauge == "held":
         kind = "self-calibration" if solution.own_places else "campaign"
         raise InputError(
             f"the posterior is that of a {kind}, which has more errors than these",
-            where=where,
+            where=location,
             do="use the budget and the verdicts of its run",
         )
     correlated = diagnostics.correlated
-    same = correlated is not None and correlated.model == solution.model
+    same_model = correlated is not None and correlated.model == solution.model
     sample = diagnostics.sample
     digests = solution.matches_digest, "" if sample.partial else sample.table.digest()
     other_stars = all(digests) and digests[0] != digests[1]
-    if not same or sample.n_total != solution.n_stars or other_stars:
+    if not same_model or sample.n_total != solution.n_stars or other_stars:
         raise InputError(
             "they are those of another solution",
-            where=where,
+            where=location,
             do="give bd.diagnose(posterior, matches) of this posterior",
         )
     return solution
 
 
 def _states(settings: EvaluationSettings, names: Callable[[str], bool]) -> bool:
-    """True if one of the terms that state an error has such a name."""
+    """True if one of the terms that state an error has a name that `names` accepts."""
     return any(map(names, settings.given))
 
 
@@ -410,5 +414,5 @@ def _catalogue_checks(settings: EvaluationSettings) -> tuple[Check, ...]:
 
 
 def _sampling_checks(solution: Solution) -> tuple[Check, ...]:
-    """Check of the convergence of draws; none for a fit."""
+    """Check of the convergence of the draws; empty for a linear fit."""
     return () if solution.convergence is None else (convergence_check(solution.convergence),)

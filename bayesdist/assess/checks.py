@@ -1,4 +1,4 @@
-"""Checks of what an evaluation takes for granted: residuals, catalogue and dates."""
+"""Checks of the assumptions of an evaluation: residuals, catalogue and dates."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ UNEXAMINED = Check(
     "bd.diagnose",
     "warn",
     "the residuals were not examined; give diagnostics=bd.diagnose(posterior, matches)",
-    # structure would make errors larger; quoted errors that are too large make them smaller
+    # structure would make errors larger; overestimated quoted errors would make them smaller
     EITHER,
 )
 
@@ -37,19 +37,23 @@ def assumption_checks(
 ) -> tuple[Check, ...]:
     """Checks of the sampling, the fit, the matching, the catalogue and the dates.
 
-    A verdict takes all of these for granted, in addition to `Diagnostics.checks`.
+    A verdict relies on all of these, in addition to `Diagnostics.checks`.
 
     Parameters
     ----------
     posterior : Posterior or None
         None for a fit that was not sampled.
     diagnostics : Diagnostics
-        Of the posterior, or of the fit.
+        Diagnostics of the posterior or of the fit.
     time : TimeDependence or None
-        Of the model.
+        Time dependence of the model.
     catalogue_stated, motions_stated : bool or None
         True if errors of the reference catalogue's positions, and of its proper motions, are
         stated; None without a catalogue.
+
+    Returns
+    -------
+    tuple of Check
     """
     return (
         *sampling_checks(posterior),
@@ -60,7 +64,7 @@ def assumption_checks(
 
 
 def catalogue_checks(catalogue_stated: bool | None) -> Iterator[Check]:
-    """Check that the errors of the reference catalogue are stated; None without a catalogue."""
+    """Check that errors of the reference catalogue are stated; no check without a catalogue."""
     if catalogue_stated is None:
         return
     name, limit = "Error of the reference catalogue", "a row of [[budget]] or of the table"
@@ -78,10 +82,10 @@ def catalogue_checks(catalogue_stated: bool | None) -> Iterator[Check]:
 def time_checks(
     time: TimeDependence | None, dates: Float, motions_stated: bool | None
 ) -> Iterator[Check]:
-    """Checks that the data determine a drift, and that the motions' errors are stated.
+    """Checks that the data constrain a drift and that errors of the proper motions are stated.
 
-    `time`: nothing is checked without. `dates`: of the matches, decimal years. `motions_stated`:
-    None without a catalogue.
+    `time`: time dependence of the model; nothing is checked if it is None. `dates`: dates of the
+    matches, decimal years. `motions_stated`: None without a catalogue.
     """
     if time is None:
         return
@@ -111,9 +115,10 @@ def time_checks(
 
 
 def visits_of(dates: Float, *, whole: Float | None = None) -> Float:
-    """First dates of the visits, in rising order: exposures next to each other are one visit.
+    """Start dates of the visits, ascending; consecutive exposures form one visit.
 
-    It spans a day at most, or a fiftieth of the time of all dates. `whole`: all, if not `dates`.
+    A visit spans at most one day or 2 % of the baseline. `whole`: dates that define the baseline;
+    `dates` by default.
     """
     if not dates.size:
         return dates

@@ -1,4 +1,4 @@
-"""The coefficient table: formal sigma beside posterior, in Legendre and in monomial form."""
+"""Table of the coefficients with formal and posterior errors, in Legendre and monomial form."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ if TYPE_CHECKING:
 
 
 def coefficient_table(fit: LinearFit, posterior: Posterior | None = None) -> Table:
-    """Every parameter of the model, with its uncertainties.
+    """Table of all parameters of the model with their uncertainties.
 
-    Returns one row for each parameter and, behind them, one for each polynomial coefficient in
-    monomial form: coefficient of (x - xref)^i (y - yref)^j.  Columns: name, chip, axis, i, j, form
-    ('legendre', 'monomial', 'tdd' or 'frame'), lsq_value and lsq_sigma of least squares; with a
-    posterior also mean, sd, lo68, hi68, lo95, hi95, rhat, ess_bulk (of the sampled, that is the
-    Legendre form); unit.
+    Returns one row for each parameter, followed by one for each polynomial coefficient in monomial
+    form, the coefficient of (x - xref)^i (y - yref)^j. Columns: name, chip, axis, i, j, form
+    ('legendre', 'monomial', 'tdd' or 'frame'), lsq_value and lsq_sigma of the least-squares
+    solution; with a posterior also mean, sd, lo68, hi68, lo95, hi95, and, for sampled parameters,
+    rhat and ess_bulk; unit.
     """
     model = fit.model
     sampled = None if posterior is None else posterior.flat
@@ -58,14 +58,14 @@ def coefficient_table(fit: LinearFit, posterior: Posterior | None = None) -> Tab
         unknown = np.full(len(rows) - model.n_params, np.nan)
         c = posterior.convergence
         for column, measured in (("rhat", c.rhat), ("ess_bulk", c.ess_bulk)):
-            every = np.concatenate([measured[: model.n_params], unknown])
-            table[column] = MaskedColumn(every, mask=~np.isfinite(every))
+            padded = np.concatenate([measured[: model.n_params], unknown])
+            table[column] = MaskedColumn(padded, mask=~np.isfinite(padded))
     table["unit"] = [row[-1] for row in rows]
     return table
 
 
 def _columns(value: Float, sigma: Float, draws: Float | None) -> dict[str, Float]:
-    """Columns of some rows, by name: with draws (n, rows) also what is known of these."""
+    """Columns of a block of rows; statistics of the draws (n, rows) are added if given."""
     columns = {"lsq_value": value, "lsq_sigma": sigma}
     if draws is not None:
         tails = {"lo68": 0.16, "hi68": 0.84, "lo95": 0.025, "hi95": 0.975}

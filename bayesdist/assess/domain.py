@@ -1,4 +1,4 @@
-"""Positions at which errors are evaluated: on some chips, or on parts of them."""
+"""Positions at which errors are evaluated, on chips or on regions of them."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from bayesdist.model import DistortionModel
 from bayesdist.model.grid import grid_pixels, mesh
 from bayesdist.utils.arrays import Bool, Float, Int
 
-MIN_POSITIONS = 4  # of a region
+MIN_POSITIONS = 4  # least number of grid points in a region
 Region: TypeAlias = "str | tuple[tuple[float, float], ...]"
 WHOLE = "whole"
 QUADRANTS = ("lower left", "lower right", "upper left", "upper right")
@@ -33,33 +33,35 @@ class WorstPosition:
     chip: int  # number
     x: float  # FITS 1-based pixels
     y: float
-    rms: float  # root mean square of the error there over the draws
+    rms: float  # rms of the error at this position over the draws
 
 
 @dataclass(frozen=True, eq=False)
 class EvaluationDomain:
-    """Positions on one chip or more, at one epoch, of one kind of star.
+    """Positions on one or several chips, with an epoch and optionally the magnitude of a star.
 
-    Two domains of the same positions, epoch and star are equal.
+    Domains with the same positions, epoch and magnitude compare equal.
 
     Parameters
     ----------
     model : DistortionModel
     chip : ndarray of int, shape (N,)
-        Numbers of the chips; positions of one chip stand together.
+        Chip number of each position; positions on the same chip must be contiguous.
     x, y : ndarray, shape (N,)
         FITS 1-based pixels.
     epoch : float or None
         Decimal years.
     magnitude : float or None
-        Of the star: its centroid's error counts in.
+        Magnitude of the star, for which the error of its centroid is included; None for no centroid
+        error.
     relative : str
-        'pairs' where errors are those of differences of any two positions, 'first' where they are
-        those of the differences to the first one; empty for errors of positions.
+        'pairs' for errors of the differences between any two positions, 'first' for differences
+        from the first position, or empty for errors of positions.
     separation : float or None
-        Pixels that the two of a pair are apart at most, on one chip.
+        Maximum separation of the two positions of a pair, in pixels on the same chip.
     grid : tuple of int or None
-        Points on x and y of each chip where the positions are those of a grid, or of a part of it.
+        Number of points along x and y of each chip, if the positions are those of a grid or of a
+        part of it.
     """
 
     model: DistortionModel
@@ -85,27 +87,31 @@ class EvaluationDomain:
         relative: bool = False,
         separation: float | None = None,
     ) -> EvaluationDomain:
-        """Points of the same grid on some chips, or on a region of each.
+        """Grid points on some chips, or on a region of each chip.
 
         Parameters
         ----------
         model : DistortionModel
         grid : tuple of int
-            Points on x and y of a chip.
+            Number of points along x and y of a chip.
         chips : sequence of int, optional
-            Numbers; all by default.
+            Chip numbers; all chips by default.
         region : str or tuple of (x, y), optional
-            As `check_region` gives it.
+            Region of each chip, as returned by `check_region`.
         epoch, magnitude, separation
-            As of the class.
+            See `EvaluationDomain`.
         relative : bool
-            Whether errors are those of differences.
+            True for errors of differences between positions.
+
+        Returns
+        -------
+        EvaluationDomain
 
         Raises
         ------
         InputError
-            For an unknown chip, a missing epoch, a bad grid, and a region that holds fewer than
-            four points of the grid.
+            If a chip is unknown, the epoch is missing, the grid is invalid, or the region contains
+            fewer than four grid points.
         """
         numbers = [c.number for c in model.chips] if chips is None else list(chips)
         points: list[tuple[Float, Float]] = []
@@ -145,24 +151,29 @@ class EvaluationDomain:
         magnitude: float | None = None,
         relative: bool = False,
     ) -> EvaluationDomain:
-        """Some pixels of one chip.
+        """Given pixels of one chip.
 
         Parameters
         ----------
         model : DistortionModel
         chip : int
+            Chip number.
         x, y : array_like, shape (N,)
-            FITS 1-based pixels; two or more for relative errors.
+            FITS 1-based pixels; at least two for relative errors.
         epoch, magnitude
-            As of the class.
+            See `EvaluationDomain`.
         relative : bool
-            Whether errors are those of the differences to the first pixel.
+            True for errors of the differences from the first pixel.
+
+        Returns
+        -------
+        EvaluationDomain
 
         Raises
         ------
         InputError
-            For an unknown chip, a missing epoch, a position off the chip, and relative errors of
-            one position.
+            If the chip is unknown, the epoch is missing, a position is off the chip, or a relative
+            error of a single position is requested.
         """
         size = place_of(model, epoch=epoch, chip=chip).chip.size
         x, y = (np.atleast_1d(np.asarray(a, float)) for a in (x, y))
@@ -187,17 +198,17 @@ class EvaluationDomain:
         )
 
     def at(self, epoch: float | None) -> EvaluationDomain:
-        """Domain of these positions at another epoch."""
+        """Domain with the same positions at another epoch."""
         return replace(self, epoch=None if epoch is None else float(epoch))
 
     def on(self, chip: int) -> EvaluationDomain:
-        """Domain of the positions that are on one chip."""
+        """Domain with only the positions on one chip."""
         rows = self.chip == chip
         return replace(self, chip=self.chip[rows], x=self.x[rows], y=self.y[rows])
 
     @property
     def positions(self) -> EvaluationDomain:
-        """The positions by themselves, not relative to each other."""
+        """Domain with the same positions for absolute instead of relative errors."""
         return replace(self, relative="", separation=None) if self.relative else self
 
     @property
@@ -211,7 +222,7 @@ class EvaluationDomain:
         return tuple(dict.fromkeys(self.chip.tolist()))
 
     def by_chip(self) -> Iterator[tuple[int, slice]]:
-        """Number and rows of each chip."""
+        """Chip numbers, each with the slice of its positions."""
         start = 0
         for number in self.chips:
             stop = start + int((self.chip == number).sum())
@@ -220,19 +231,19 @@ class EvaluationDomain:
 
     @cached_property
     def basis(self) -> dict[int, Float]:
-        """Basis functions (N, K) of the model at the positions on each chip, by its number."""
+        """Basis functions (N, K) of the model at the positions, by chip number."""
         return {
             chip: self.model.basis(chip).evaluate(self.x[rows], self.y[rows])
             for chip, rows in self.by_chip()
         }
 
     def pairs(self) -> Int | None:
-        """Pairs of positions, shape (2, P), whose differences count; None where none do.
+        """Indices of the pairs of positions, shape (2, P); None if the domain is not relative.
 
         Raises
         ------
         InputError
-            Where no two positions are that near.
+            If no two positions are within `separation`.
         """
         if not self.relative:
             return None
@@ -273,13 +284,13 @@ class EvaluationDomain:
 def check_region(
     region: Region | Sequence[Sequence[float]] | Mapping[str, Any], where: str
 ) -> Region:
-    """A region as it is kept: in a form that can be compared.
+    """Normalise a region to a form that can be compared.
 
-    `region`: 'whole'; 'inner 80 %', the rectangle of so much of both sides around the middle of the
-    chip; a quadrant: 'lower left', 'lower right', 'upper left', 'upper right'; or the corners of a
-    polygon in FITS 1-based pixels; or a mapping with centre [x, y] and radius of a circle, which
-    is kept as 'circle of radius 900 about (1024.5, 1024.5)'. `where`: for the message. InputError
-    for anything else.
+    `region`: 'whole'; 'inner 80 %', the central rectangle with this fraction of both sides of the
+    chip; a quadrant: 'lower left', 'lower right', 'upper left', 'upper right'; the corners of a
+    polygon in FITS 1-based pixels; or a mapping with the centre [x, y] and radius of a circle,
+    which is returned as 'circle of radius 900 about (1024.5, 1024.5)'. `where`: location for the
+    error message. Raises InputError for anything else.
     """
     if isinstance(region, Mapping):
         return _circle(region, where)
@@ -309,7 +320,7 @@ def check_region(
 
 
 def _circle(given: Mapping[str, Any], where: str) -> str:
-    """Words for a circle, from which `in_region` reads it."""
+    """Text that describes a circle and is parsed by `in_region`."""
     try:
         (x, y), radius = (float(v) for v in given["centre"]), float(given["radius"])
     except (KeyError, TypeError, ValueError):
@@ -324,10 +335,10 @@ def _circle(given: Mapping[str, Any], where: str) -> str:
 
 
 def in_region(region: Region, size: tuple[float, float], x: Float, y: Float) -> Bool:
-    """Boolean mask of the pixels in a region; its edge belongs to rectangles.
+    """Boolean mask of the pixels in a region; rectangles include their edges.
 
-    `region`: as `check_region` gives it. `size`: columns and rows of the chip. `x`, `y`: (N,), FITS
-    1-based pixels. Returns (N,).
+    `region`: as returned by `check_region`. `size`: numbers of columns and rows of the chip. `x`,
+    `y`: FITS 1-based pixels, shape (N,). Returns an array of shape (N,).
     """
     if not isinstance(region, str):
         return _in_polygon(np.array(region), x, y)
@@ -346,7 +357,7 @@ def in_region(region: Region, size: tuple[float, float], x: Float, y: Float) -> 
 
 
 def _in_polygon(corners: Float, x: Float, y: Float) -> Bool:
-    """Pixels from which a ray to the right crosses an odd number of sides."""
+    """Boolean mask of pixels in a polygon: a ray to the right crosses an odd number of sides."""
     inside = np.zeros(np.shape(x), bool)
     for (x1, y1), (x2, y2) in zip(corners, np.roll(corners, -1, axis=0), strict=True):
         if y1 == y2:
@@ -357,7 +368,7 @@ def _in_polygon(corners: Float, x: Float, y: Float) -> Bool:
 
 
 def region_words(region: Region) -> str:
-    """' over the inner 80 %' and the like; empty for the whole chip."""
+    """Text such as ' over the inner 80 %'; empty for the whole chip."""
     if region == WHOLE:
         return ""
     if isinstance(region, str):

@@ -1,8 +1,8 @@
-"""All errors of a position, drawn once, and statistics of them over parts of the detector.
+"""Draws of all errors of a position, and their statistics over parts of the detector.
 
-What is drawn serves every requirement, epoch and part of the detector, and every question of the
-kind "what if this term were half as large": so differences between answers are not differences of
-draws.
+Requirements, epochs, parts of the detector and questions such as "what if this term were half as
+large" are all answered with the same draws. Differences between answers are therefore free of
+Monte-Carlo noise.
 """
 
 from __future__ import annotations
@@ -32,37 +32,37 @@ from bayesdist.infer.equations.scaled import one_thread
 from bayesdist.infer.solution.solution import Solution
 from bayesdist.utils.arrays import Float
 
-ROWS = 16  # draws whose noise comes from one generator: so that blocks do not change it
-BLOCK = 60_000  # positions times draws whose errors a thread holds at once: in its cache
-EPOCHS = 8  # whose polynomials are in memory at once
-MOST_PAIRS = 5000  # pairs of positions that stand for all: percentiles over them to about 1 %
+ROWS = 16  # draws per random generator of the noise, so that it does not depend on the blocks
+BLOCK = 60_000  # positions times draws per thread at a time, which fit into the processor's cache
+EPOCHS = 8  # number of epochs with their polynomials in memory at the same time
+MOST_PAIRS = 5000  # sampled pairs of positions, which give percentiles over all pairs to about 1 %
 
 
 def generators(terms: Sequence[ErrorTerm], seed: int) -> list[np.random.Generator]:
-    """A generator for each term, by the name of its first row and how often that came before.
+    """Random generator of each term, seeded with the name of its first row and its occurrence.
 
-    The draws of a term do not depend on what other terms there are.
+    The draws of a term therefore do not depend on the other terms.
     """
-    seen: Counter[str] = Counter()
+    occurrences: Counter[str] = Counter()
     out = []
     for term in terms:
         name = term.rows[0].name
-        out.append(np.random.default_rng([seed, zlib.crc32(name.encode()), seen[name]]))
-        seen[name] += 1
+        out.append(np.random.default_rng([seed, zlib.crc32(name.encode()), occurrences[name]]))
+        occurrences[name] += 1
     return out
 
 
 @dataclass(frozen=True, eq=False)
 class DrawnErrors:
-    """Draws of everything that moves a position."""
+    """Draws of all errors of a position."""
 
     solution: Solution
     terms: tuple[ErrorTerm, ...]
     draws: tuple[ErrorDraws, ...]  # one for each term
     image: Image
     n_draws: int
-    seed: int  # of the errors that are independent from position to position, and of the terms
-    # makes so many further draws of the same errors, another set for each number from 1 on
+    seed: int  # for the terms, and for errors that are independent between positions
+    # further(n, number): n more draws of the same errors, another set for each number from 1 on
     further: Callable[[int, int], DrawnErrors] | None = None
     _cache: dict[EvaluationDomain, tuple[ErrorField, ...]] = field(default_factory=dict, repr=False)
 
@@ -73,48 +73,50 @@ class DrawnErrors:
 
     @property
     def n_effective(self) -> float:
-        """Independent draws that are worth at least as much as these; at least 1.
+        """Effective number of independent draws (a lower bound); at least 1.
 
-        Taking n draws from a finite set worth m independent ones, as a chain is, adds the set's own
-        Monte-Carlo variance to that of the drawing.  The shares of several sets in the variance of
-        a probability add up to 1 at most: 1 / n_eff = 1 / n + 1 / m at most, for the smallest m.
+        Taking n draws from a finite set that is equivalent to m independent draws, such as a chain,
+        adds the Monte-Carlo variance of the set to that of the drawing. The fractions that several
+        sets contribute to the variance of a probability sum to at most 1. Hence 1 / n_eff is at
+        most 1 / n + 1 / m for the smallest m.
         """
-        least = min((pool.size for pool in self.pools), default=np.inf)
-        return max(1.0 / (1.0 / self.n_draws + 1.0 / least), 1.0)
+        smallest = min((pool.size for pool in self.pools), default=np.inf)
+        return max(1.0 / (1.0 / self.n_draws + 1.0 / smallest), 1.0)
 
     @property
     def pools(self) -> tuple[Pool, ...]:
         """Finite sets that draws of the terms are taken from."""
-        return tuple(pool for one in self.draws for pool in one.pools)
+        return tuple(pool for draws in self.draws for pool in draws.pools)
 
     def at(self, domain: EvaluationDomain) -> tuple[ErrorField, ...]:
-        """The errors of each term at the positions of a domain."""
+        """Errors of each term at the positions of a domain."""
         if domain not in self._cache:
-            self._cache[domain] = tuple(one.on(domain, self.image) for one in self.draws)
+            self._cache[domain] = tuple(draws.on(domain, self.image) for draws in self.draws)
         return self._cache[domain]
 
     def treatments(self, grid: tuple[int, int] | None) -> tuple[DrawnErrors, ...]:
-        """Draws with what may vary over the field varying: smoothly, and everywhere.
+        """Draws in which every term that may vary over the field does so.
 
-        Nothing where no term may vary.
+        Returns two variants: as smooth fields, and independently at every position. Empty if no
+        term may vary.
 
-        `grid`: points of each chip over which a smooth field has its size.
+        `grid`: number of points along x and y over which a smooth field has its stated size.
         """
         model = self.solution.model
-        others = [
+        variants = [
             getattr(term, "treatments", lambda *_: ())(model, grid) or (term, term)
             for term in self.terms
         ]
-        if all(pair == (term, term) for pair, term in zip(others, self.terms, strict=True)):
+        if all(pair == (term, term) for pair, term in zip(variants, self.terms, strict=True)):
             return ()
         out = []
-        for way in zip(*others, strict=True):
-            random = generators(way, self.seed)
+        for choice in zip(*variants, strict=True):
+            random = generators(choice, self.seed)
             draws = tuple(
                 old if new is term else new.draw(self.n_draws, rng)
-                for old, term, new, rng in zip(self.draws, self.terms, way, random, strict=True)
+                for old, term, new, rng in zip(self.draws, self.terms, choice, random, strict=True)
             )
-            out.append(replace(self, terms=way, draws=draws, further=None, _cache={}))
+            out.append(replace(self, terms=choice, draws=draws, further=None, _cache={}))
         return tuple(out)
 
     def statistics(
@@ -125,15 +127,15 @@ class DrawnErrors:
         scale: Mapping[str, float] | None = None,
         n_draws: int | None = None,
     ) -> dict[str, Float]:
-        """Statistics of each draw's error over the positions, or over pairs of them.
+        """Statistics of the error field of each draw, over positions or over pairs of them.
 
-        `names`: of `STATISTICS`. `scale`: factors by which rows are multiplied. `n_draws`: the
-        first so many of the draws; all by default. Returns (n_draws,). InputError for no pair of
-        positions that near, a magnitude where no errors by magnitude are known, and a missing
-        epoch.
+        `names`: names in `STATISTICS`. `scale`: factors by which rows are multiplied. `n_draws`:
+        number of draws to use, from the first; all by default. Returns an array (n_draws,) for each
+        name. Raises InputError if no pair of positions is close enough, if the domain has a
+        magnitude but no errors by magnitude are known, or if the epoch is missing.
         """
-        (found,) = self._together(domain, (domain.epoch,), names, scale, n_draws)
-        return found
+        (statistics,) = self._together(domain, (domain.epoch,), names, scale, n_draws)
+        return statistics
 
     def over_epochs(
         self,
@@ -144,18 +146,18 @@ class DrawnErrors:
         scale: Mapping[str, float] | None = None,
         n_draws: int | None = None,
     ) -> tuple[dict[str, Float], ...]:
-        """Statistics at several epochs, sooner than one by one.
+        """Statistics at several epochs, faster than with one call per epoch.
 
-        `epochs`: decimal years. `names`, `scale`, `n_draws`: as `statistics`. Returns (n_draws,),
-        one for each epoch.
+        `epochs`: decimal years. `names`, `scale`, `n_draws`: see `statistics`. Returns for each
+        epoch an array (n_draws,) for each name.
         """
-        found: list[dict[str, Float]] = []
+        statistics: list[dict[str, Float]] = []
         for k in range(0, len(epochs), EPOCHS):
-            some = replace(self, _cache={})  # errors at so many epochs are not kept
-            found += some._together(domain, epochs[k : k + EPOCHS], names, scale, n_draws)
-        return tuple(found)
+            uncached = replace(self, _cache={})  # errors at many epochs would need much memory
+            statistics += uncached._together(domain, epochs[k : k + EPOCHS], names, scale, n_draws)
+        return tuple(statistics)
 
-    @one_thread  # of each thread that it starts
+    @one_thread  # of linear algebra in each thread that it starts
     def _together(
         self,
         domain: EvaluationDomain,
@@ -164,15 +166,15 @@ class DrawnErrors:
         scale: Mapping[str, float] | None,
         n_draws: int | None,
     ) -> tuple[dict[str, Float], ...]:
-        """Statistics at a few epochs, for all of which the noise is drawn once."""
+        """Statistics at a few epochs, which use the same noise."""
         pairs = domain.pairs()
         if pairs is not None and pairs.shape[1] > MOST_PAIRS:
             rng = np.random.default_rng(self.seed)
             pairs = pairs[:, rng.choice(pairs.shape[1], MOST_PAIRS, replace=False)]
         errors = [self.errors(domain.positions.at(epoch), scale) for epoch in epochs]
-        noisy = any(one.noises for one in errors)
+        noisy = any(summed.noises for summed in errors)
         by_axis = [tuple(name.rpartition("_")[::2]) for name in names]
-        # largest differences are those of all positions, not of pairs that stand for them
+        # the largest difference is found from all positions, without the sampled pairs
         over_all = domain.relative == "pairs" and domain.separation is None
         n = n_draws or self.n_draws
         width = max(domain.size, 0 if pairs is None else pairs.shape[1])
@@ -183,8 +185,8 @@ class DrawnErrors:
             normal = _normal(self.seed, rows, domain.size) if noisy else np.zeros(1)
             for error_of in errors:
                 error = error_of(rows, normal)
-                seen = error if pairs is None else error[:, pairs[0]] - error[:, pairs[1]]
-                size = {axis: sizes(axis, seen) for axis, _ in by_axis}
+                evaluated = error if pairs is None else error[:, pairs[0]] - error[:, pairs[1]]
+                size = {axis: sizes(axis, evaluated) for axis, _ in by_axis}
                 out.append(
                     [
                         extent(name, error)
@@ -196,7 +198,7 @@ class DrawnErrors:
             return out
 
         starts = range(0, n, step)
-        if len(starts) == 1:  # sooner than a thread starts
+        if len(starts) == 1:  # faster than starting a thread
             blocks = [found(0)]
         else:
             with ThreadPoolExecutor(os.cpu_count()) as pool:
@@ -207,34 +209,34 @@ class DrawnErrors:
         )
 
     def worst(self, domain: EvaluationDomain, axis: str = "") -> WorstPosition:
-        """The position at which the error is largest; of two, the one farther off.
+        """Position with the largest error; for a difference, the one of the two that is worse.
 
-        `axis`: one of '', 'u', 'v', of which axis; of both by default.
+        `axis`: 'u' or 'v'; empty for both axes.
         """
         variance = np.zeros((domain.size, 2))
-        for one in self.at(domain.positions):
-            # what all positions share is no error of a difference
-            if not (one.uniform and domain.relative):
-                variance += one.total()
+        for errors in self.at(domain.positions):
+            # an offset common to all positions cancels in a difference
+            if not (errors.uniform and domain.relative):
+                variance += errors.total()
         total = variance.sum(axis=1) if not axis else variance[:, "uv".index(axis)]
         k = int(np.argmax(total))
         at = int(domain.chip[k]), float(domain.x[k]), float(domain.y[k])
         return WorstPosition(*at, float(np.sqrt(total[k])))
 
     def sizes(self, domain: EvaluationDomain) -> dict[str, float]:
-        """Radial root mean square of each row over the positions."""
+        """Radial rms of each row over the positions, in the unit of the errors."""
         squares: dict[str, Float] = {}
-        for one in self.at(domain.positions):
-            if not any(row.kind == PRODUCT for row in one.rows):
-                squares |= one.squares()
+        for errors in self.at(domain.positions):
+            if not any(row.kind == PRODUCT for row in errors.rows):
+                squares |= errors.squares()
         return {name: float(np.sqrt(np.mean(s.sum(axis=1)))) for name, s in squares.items()}
 
     def errors(
         self, domain: EvaluationDomain, scale: Mapping[str, float] | None = None
     ) -> SummedErrors:
-        """Errors of all terms, by draws.
+        """Sum of the errors of all terms, as a function of the draws.
 
-        `domain`: of positions, not of differences. `scale`: factors by which rows are multiplied.
+        `domain`: positions, not differences. `scale`: factors by which rows are multiplied.
         """
         fields, scale = self.at(domain), scale or {}
         noises = [
@@ -246,7 +248,7 @@ class DrawnErrors:
             domain,
             tuple(f for f in fields if isinstance(f, DrawnField)),
             scale,
-            # nothing is drawn where all of them are zero
+            # no noise needs to be drawn if all of them are zero
             tuple(noises) if any(np.any(sigma) for sigma, _ in noises) else (),
         )
 
@@ -258,21 +260,21 @@ class SummedErrors:
     domain: EvaluationDomain
     drawn: tuple[DrawnField, ...]
     scale: Mapping[str, float]  # factors by which rows are multiplied
-    # standard deviations (N, 2) of independent errors, and sizes as of `Independent`
+    # standard deviations (N, 2) of independent errors, and their factors; see `Independent`
     noises: tuple[tuple[Float, Mapping[int, Float]], ...]
 
     def __call__(self, rows: slice, normal: Float) -> Float:
-        """Errors (d, N, 2) of some draws, given as many normal numbers for the noise."""
-        # in memory axis by axis, as the terms evaluate their errors
+        """Errors (d, N, 2) of the draws `rows`, from standard normal numbers of the same shape."""
+        # each axis is contiguous in memory, as the terms evaluate their errors
         out = np.zeros((rows.stop - rows.start, 2, self.domain.size)).swapaxes(1, 2)
         if self.noises:
             out += normal * np.sqrt(self._variance(rows))
-        for one in self.drawn:
-            out += one.errors(rows, self.scale)
+        for field_errors in self.drawn:
+            out += field_errors.errors(rows, self.scale)
         return out
 
     def _variance(self, rows: slice) -> Float:
-        """Variance (N, 2) of all independent errors, or (d, N, 2) where it differs by draw."""
+        """Variance (N, 2) of all independent errors, or (d, N, 2) if it differs between draws."""
         variance = np.zeros((self.domain.size, 2))
         for sigma, _ in self.noises:
             variance = variance + sigma**2
@@ -280,14 +282,16 @@ class SummedErrors:
             return variance
         drawn = np.tile(variance, (rows.stop - rows.start, 1, 1))
         for sigma, size in self.noises:
-            for chip, here in self.domain.by_chip():
+            for chip, rows_of_chip in self.domain.by_chip():
                 if chip in size:
-                    drawn[:, here] += (size[chip][rows, None] - 1.0) * sigma[here] ** 2
+                    drawn[:, rows_of_chip] += (size[chip][rows, None] - 1.0) * sigma[
+                        rows_of_chip
+                    ] ** 2
         return np.maximum(drawn, 0.0)
 
 
 def _normal(seed: int, rows: slice, n_positions: int) -> Float:
-    """Standard normal numbers (rows, N, 2), those of a draw the same in any block."""
+    """Standard normal numbers (rows, N, 2); a draw has the same ones in any block."""
     shape = ROWS, n_positions, 2
     starts = range(rows.start, rows.stop, ROWS)
     out = np.empty((len(starts), *shape))

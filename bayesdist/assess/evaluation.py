@@ -1,4 +1,4 @@
-"""The evaluation of a calibration: maps, budget, margins and one verdict, as one value."""
+"""Evaluation of a calibration: maps, error budget, margins and one verdict."""
 
 from __future__ import annotations
 
@@ -33,9 +33,9 @@ from bayesdist.utils.arrays import Float
 from bayesdist.utils.checks import Check, in_order, worst
 from bayesdist.utils.streams import restarted
 
-VALIDITY_DRAWS = 1000  # for each of its epochs
-VALIDITY_EPOCHS = 40  # of a curve
-YEARS_AHEAD = 10.0  # to which the budget at every position is extrapolated
+VALIDITY_DRAWS = 1000  # number of draws for each epoch of a validity period
+VALIDITY_EPOCHS = 40  # number of epochs of a validity curve
+YEARS_AHEAD = 10.0  # years after the last epoch to which the budget surface extrapolates
 
 ERRORS = "Errors"
 
@@ -47,25 +47,27 @@ class EvaluationSettings:
     Parameters
     ----------
     grid : tuple of int
-        Points on x and y of a chip.
+        Number of points along x and y of a chip.
     epoch : float or None
         Decimal years.
     draws : int
+        Number of draws.
     years_ahead : float
-        Over which validity periods are looked for; 0 for none.
+        Years after the last epoch in which the end of a validity period is searched; 0 for none.
     scale_mas : float or None
-        Size of a pixel, where it is given.
+        Size of a pixel in mas, if the user states it.
     single : bool
-        Whether errors of a single exposure are asked for.
+        True for errors of a position in a single exposure, False for the mean of the exposures.
     contained : sequence of (name, sigma_u, sigma_v)
-        Errors that the residuals hold beside those of the centroids, in the unit of the solution.
+        Errors that the residuals contain in addition to those of the centroids, in the unit of the
+        solution.
     given : tuple of str
-        Names of the errors that the user gives.
+        Names of the errors that the user states.
     dates : ndarray
-        Of the matches, decimal years.
+        Dates of the matches, decimal years.
     field : Region
-        Part of the detector that sees the sky, as `check_region` gives it, over which errors are
-        evaluated.
+        Part of the detector that sees the sky, as returned by `check_region`. Errors are evaluated
+        only there.
     """
 
     grid: tuple[int, int] = DEFAULT_GRID
@@ -80,35 +82,39 @@ class EvaluationSettings:
     field: Region = WHOLE
 
     def domain(self, errors: ErrorModel) -> EvaluationDomain:
-        """The grid of all chips, within the field."""
+        """Grid points of all chips within the field."""
         model = errors.solution.solution.model
         return EvaluationDomain.of_chips(model, self.grid, epoch=self.epoch, region=self.field)
 
     def pixel_scale(self, errors: ErrorModel) -> float | None:
-        """Size of a pixel in mas, as given or of the solution."""
+        """Size of a pixel in mas: the stated one, or that of the solution."""
         return pixel_scale_of(errors.solution.solution, scale_mas=self.scale_mas)
 
 
 @dataclass(frozen=True, eq=False)
 class Evaluation:
-    """Errors of a calibration, and how they stand against requirements.
+    """Errors of a calibration and the verdicts on its requirements.
 
     Parameters
     ----------
     settings : EvaluationSettings
     formal, maps : tuple of UncertaintyMap
-        Of least squares, and with all errors that all positions near one share, on each chip.
+        Uncertainty of each chip: formal errors of the least-squares solution, and all errors that
+        neighbouring positions share.
     relative : tuple of UncertaintyMap
-        Of relative positions, where the gauge is a question.
+        Uncertainty of relative positions on each chip; empty unless gauge directions were given.
     areas : tuple of AreaMap
+        Pixel area map of each chip.
     budget : ErrorBudget
-        Over the grid of all chips.
+        Error budget over the grid of all chips.
     surface : BudgetSurface or None
-        At every position and epoch; None where errors contradict each other.
+        Error budget at every position and epoch; None if stated errors contradict the residuals, or
+        if the field is only a part of the detector.
     margins : tuple of Margin
     validity : tuple of ValidityPeriod
-        Until when requirements are met; empty where nothing depends on time.
+        Periods in which requirements are met; empty if nothing depends on time.
     checks : tuple of Check
+        All checks, sorted by group.
     """
 
     settings: EvaluationSettings
@@ -124,14 +130,16 @@ class Evaluation:
 
     @property
     def verdict(self) -> tuple[str, tuple[str, ...]]:
-        """The worst level of all checks and margins, and the reasons for it."""
-        found = (*self.checks, *(_of_margin(one) for one in self.margins))
-        level = worst(found)
-        return level, tuple(one.text or one.name for one in found if one.level == level != "pass")
+        """Worst level of all checks and margins, and the reasons for it."""
+        verdict_checks = (*self.checks, *(_of_margin(margin) for margin in self.margins))
+        level = worst(verdict_checks)
+        return level, tuple(
+            check.text or check.name for check in verdict_checks if check.level == level != "pass"
+        )
 
 
 def _of_margin(margin: Margin) -> Check:
-    """A margin as a check."""
+    """Margin in the form of a check."""
     name = margin.requirement.name
     sentence = f"{name}: {margin.verdict}: {margin.reason}"
     return Check("Requirements", name, level=VERDICT_LEVELS[margin.verdict], sentence=sentence)
@@ -160,16 +168,17 @@ def evaluate(
     requirements : sequence of Requirement
     settings : EvaluationSettings
     rng : numpy.random.Generator
-        Each result is made from its numbers from their beginning.
+        Every result restarts the generator, so that results do not depend on each other.
     fit : LinearFit
     solution : Posterior
-        With all errors of the parameters in its draws.
+        Posterior with all errors of the parameters in its draws.
     checks : sequence of Check
-        What is known beside: of the matching, the sampling, the fit and the catalogue.
+        Checks of the matching, the sampling, the fit and the catalogue.
     files : sequence of Known
-        What files differ by from the solution.
+        Differences between the files of the calibration and the solution.
     null : ndarray, shape (D, d), optional
-        Directions that the gauge decides: relative positions are mapped, too.
+        Directions of the parameters that the gauge determines. If given, the uncertainties of
+        relative positions are mapped, too.
 
     Returns
     -------
@@ -178,26 +187,28 @@ def evaluate(
     Raises
     ------
     InputError
-        For a requirement that cannot be judged.
+        If a requirement cannot be judged.
     """
     chips, grid, epoch = solution.model.chips, settings.grid, settings.epoch
 
     def uncertainty(of: Solution, chip: Chip) -> UncertaintyMap:
-        found = uncertainty_map(of, grid=grid, epoch=epoch, chip=chip.number)
-        return _within_field(found, chip, settings)
+        uncertainty_of_chip = uncertainty_map(of, grid=grid, epoch=epoch, chip=chip.number)
+        return _within_field(uncertainty_of_chip, chip, settings)
 
-    own = request_checks(errors, diagnostics, settings)
-    every = in_order((*checks, *diagnostics.checks, *own))
-    whole = drawn_errors(errors, diagnostics, settings, rng, files=files)
+    requested = request_checks(errors, diagnostics, settings)
+    all_checks = in_order((*checks, *diagnostics.checks, *requested))
+    all_errors = drawn_errors(errors, diagnostics, settings, rng, files=files)
     surface = None
-    # a page knows averages over whole chips alone
+    # the interactive page shows averages over whole chips only
     if _contradiction(diagnostics, settings) is None and settings.field == WHOLE:
         years = _years(solution, diagnostics, epoch)
-        surface = budget_surface(whole, grid, epoch=epoch, years=years)
+        surface = budget_surface(all_errors, grid, epoch=epoch, years=years)
     maps = [position_map(errors, solution, settings, chip) for chip in chips]
-    budget = budget_of(whole, settings.domain(errors))
-    margins = judged(errors, diagnostics, requirements, settings, rng, checks=every, drawn=whole)
-    del whole  # validity periods have draws of their own
+    budget = budget_of(all_errors, settings.domain(errors))
+    margins = judged(
+        errors, diagnostics, requirements, settings, rng, checks=all_checks, drawn=all_errors
+    )
+    del all_errors  # validity periods use fewer draws
     return Evaluation(
         settings=settings,
         formal=tuple(uncertainty(fit, chip) for chip in chips),
@@ -210,7 +221,7 @@ def evaluate(
         surface=surface,
         margins=margins,
         validity=validity_of(errors, diagnostics, requirements, settings, rng),
-        checks=every,
+        checks=all_checks,
     )
 
 
@@ -224,7 +235,7 @@ def position_map(
     ----------
     errors : ErrorModel
     solution : Posterior
-        With all errors of the parameters in its draws.
+        Posterior with all errors of the parameters in its draws.
     settings : EvaluationSettings
     chip : Chip
 
@@ -233,8 +244,8 @@ def position_map(
     UncertaintyMap
     """
     shared = uncertainty_map(solution, grid=settings.grid, epoch=settings.epoch, chip=chip.number)
-    found = with_local(shared, errors.structure_sigma(_domain(solution, chip, settings)))
-    return _within_field(found, chip, settings)
+    with_structure = with_local(shared, errors.structure_sigma(_domain(solution, chip, settings)))
+    return _within_field(with_structure, chip, settings)
 
 
 @one_thread
@@ -247,9 +258,10 @@ def drawn_errors(
     files: Sequence[Known] = (),
     n: int | None = None,
 ) -> DrawnErrors:
-    """Draws of all errors: those of the centroids, and of files, among them.
+    """Draws of all errors, including those of the centroids and of files.
 
-    `errors`, `diagnostics`, `settings`, `rng`, `files`: as `evaluate`. `n`: number of draws.
+    `errors`, `diagnostics`, `settings`, `rng`, `files`: see `evaluate`. `n`: number of draws; that
+    of the settings by default.
     """
     model = with_measured_centroids(errors, diagnostics, settings).with_terms(*files)
     return model.drawn(n or settings.draws, restarted(rng))
@@ -258,9 +270,9 @@ def drawn_errors(
 def with_measured_centroids(
     errors: ErrorModel, diagnostics: Diagnostics, settings: EvaluationSettings
 ) -> ErrorModel:
-    """Error model with the errors of centroids by magnitude, as the residuals scatter."""
-    known = _contradiction(diagnostics, settings) is None
-    centroids = centroids_of(diagnostics, settings.contained) if known else None
+    """Error model with the errors of centroids by magnitude, from the scatter of the residuals."""
+    consistent = _contradiction(diagnostics, settings) is None
+    centroids = centroids_of(diagnostics, settings.contained) if consistent else None
     return errors.with_terms(Centroids(centroids))
 
 
@@ -276,12 +288,12 @@ def judged(
     drawn: DrawnErrors | None = None,
     chip: int | None = None,
 ) -> tuple[Margin, ...]:
-    """Margins of requirements, and what they rest on.
+    """Judge requirements, and list the assumptions that each margin rests on.
 
-    `errors`, `diagnostics`, `requirements`, `settings`, `rng`: as `evaluate`. `checks`: all of
-    them: their doubts keep verdicts from being given. `drawn`: as of `drawn_errors`. `chip`: number
-    of the chip for requirements that name none; all chips by default. InputError for a requirement
-    that cannot be judged.
+    `errors`, `diagnostics`, `requirements`, `settings`, `rng`: see `evaluate`. `checks`: all
+    checks; failed ones can make a verdict undecided. `drawn`: result of `drawn_errors`. `chip`:
+    chip number for requirements that name none; all chips by default. Raises InputError for a
+    requirement that cannot be judged.
     """
     if not requirements:
         return ()
@@ -323,10 +335,10 @@ def validity_of(
     settings: EvaluationSettings,
     rng: np.random.Generator,
 ) -> tuple[ValidityPeriod, ...]:
-    """Until when requirements at one date are met, on fewer draws than their margins.
+    """Validity periods of the requirements at a single epoch, with fewer draws than their margins.
 
-    `errors`, `diagnostics`, `requirements`, `settings`, `rng`: as `evaluate`. The result is empty
-    where nothing depends on time.
+    `errors`, `diagnostics`, `requirements`, `settings`, `rng`: see `evaluate`. The result is empty
+    if nothing depends on time.
     """
     epoch = diagnostics.sample.table.epoch
     if errors.solution.solution.model.time is None or not requirements or not settings.years_ahead:
@@ -350,7 +362,7 @@ def validity_of(
 def request_checks(
     errors: ErrorModel, diagnostics: Diagnostics, settings: EvaluationSettings
 ) -> Iterator[Check]:
-    """Checks of requests that cannot be met: errors of single exposures, contradicting terms."""
+    """Checks for requests that cannot be met: errors of single exposures, contradicting terms."""
     linear = None if diagnostics.correlated is None else diagnostics.correlated.linear
     measured = errors.of_new_exposure or (linear is not None and bool(linear.kinds))
     if settings.single and not measured:
@@ -363,12 +375,14 @@ def request_checks(
         )
     error = _contradiction(diagnostics, settings)
     if error is not None:
-        what = f"{error.where}: {error.cause}, so that no budget of single positions can be made"
-        yield Check(ERRORS, "Terms within the scatter", level="warn", sentence=what)
+        sentence = (
+            f"{error.where}: {error.cause}, so that no budget of single positions can be made"
+        )
+        yield Check(ERRORS, "Terms within the scatter", level="warn", sentence=sentence)
 
 
 def _contradiction(diagnostics: Diagnostics, settings: EvaluationSettings) -> InputError | None:
-    """Error of a term that is larger than the residuals said to hold it; None where none is."""
+    """Error about a term that exceeds the residuals that are stated to contain it, else None."""
     try:
         centroids_of(diagnostics, settings.contained)
     except InputError as error:
@@ -377,22 +391,22 @@ def _contradiction(diagnostics: Diagnostics, settings: EvaluationSettings) -> In
 
 
 def _where_stars_are(margin: Margin, diagnostics: Diagnostics, grid: tuple[int, int]) -> Margin:
-    """A margin that is not met where it is judged on pixels that no stars cover."""
-    for one in diagnostics.coverage:
-        if margin.verdict == "met" and margin.requirement.reaches_beyond(one, grid):
-            return replace(margin, verdict="undecided", reason=one.sentence)
+    """Change a verdict from met to undecided if it is judged on pixels without stars."""
+    for coverage in diagnostics.coverage:
+        if margin.verdict == "met" and margin.requirement.reaches_beyond(coverage, grid):
+            return replace(margin, verdict="undecided", reason=coverage.sentence)
     return margin
 
 
 def _years(
     solution: Posterior, diagnostics: Diagnostics, epoch: float | None
 ) -> tuple[float, float] | None:
-    """First and last epoch of the budget at every date."""
+    """First and last epoch of the budget surface; None if there is no drift or no epochs."""
     epochs = diagnostics.sample.table.epoch
     if solution.model.time is None or epochs is None:
         return None
-    seen = [*epochs, epoch]
-    return float(min(seen)), float(max(seen)) + YEARS_AHEAD
+    years = [*epochs, epoch]
+    return float(min(years)), float(max(years)) + YEARS_AHEAD
 
 
 def _domain(solution: Posterior, chip: Chip, settings: EvaluationSettings) -> EvaluationDomain:
@@ -408,24 +422,24 @@ def _relative(
     chip: Chip,
     settings: EvaluationSettings,
 ) -> UncertaintyMap:
-    """Uncertainty of relative positions on a chip, with what the model leaves out."""
+    """Uncertainty of relative positions on a chip, including structure that the model omits."""
     from bayesdist.infer.selfcal.sky_moves import gauge_free, gauge_free_matrix
 
     local, correlated = None, diagnostics.correlated
     if correlated is not None and correlated.structure:
         S = gauge_free_matrix(solution.model, np.asarray(solution.mean, float), null)
-        # of the detector alone: frames are no part of it
+        # only the distortion of the detector, without frames of exposures
         local = StructureErrors(correlated.moved(S)).sigma(_domain(solution, chip, settings))
-    found = uncertainty_map(
+    gauge_free_map = uncertainty_map(
         gauge_free(solution, null), grid=settings.grid, epoch=settings.epoch, chip=chip.number
     )
-    return _within_field(replace(with_local(found, local), kind=RELATIVE), chip, settings)
+    return _within_field(replace(with_local(gauge_free_map, local), kind=RELATIVE), chip, settings)
 
 
 def _within_field(
     found: UncertaintyMap, chip: Chip, settings: EvaluationSettings
 ) -> UncertaintyMap:
-    """Map with NaN at the positions of a chip that see no sky."""
+    """Map with NaN at positions of a chip that see no sky."""
     if settings.field == WHOLE:
         return found
     inside = in_region(settings.field, chip.size, *mesh(found.x, found.y))

@@ -1,6 +1,6 @@
-"""Everything that moves a position: a solution, and terms that are independent of each other.
+"""Model of all position errors: those of the solution, and independent error terms.
 
-Errors that its likelihood does not know of spread the draws of a solution.
+Errors that the likelihood does not include are added by widening the draws of the solution.
 """
 
 from __future__ import annotations
@@ -43,11 +43,11 @@ class ErrorModel:
     solution : SolutionErrors
         Errors of the parameters, from draws of a solution.
     terms : tuple of ErrorTerm
-        Independent of the solution and of each other, in its unit.
+        Errors that are independent of the solution and of each other, in the unit of the solution.
     aligned : bool
-        Whether the star lies in a new exposure whose shift and rotation the observer fits: no frame
-        of the solution is in the error then, and what a shift and a rotation of all chips together
-        take up is no error.  Terms that are no polynomials stay as they are.
+        True if the star is observed in a new exposure and the observer fits its shift and rotation.
+        The errors then exclude the frames of the solution, and a shift and rotation common to all
+        chips. Terms that are not polynomials are unchanged.
     """
 
     solution: SolutionErrors
@@ -56,25 +56,30 @@ class ErrorModel:
 
     @property
     def of_new_exposure(self) -> bool:
-        """True if the star lies in a new exposure, which deviates as those at hand scatter."""
+        """True if the star is in a new exposure, which deviates as much as the fitted ones do."""
         return self.aligned and any(isinstance(term, ExposureVariation) for term in self.terms)
 
     @one_thread
     def drawn(self, n: int, rng: Random) -> DrawnErrors:
         """Draws of all errors.
 
-        A star is taken to lie in an exposure chosen at random, for each draw, among those whose
-        frame was fitted, and its error is given along the axes of the polynomials.
+        For each draw, the star is in an exposure chosen at random among those with a fitted frame.
+        Its error is given along the axes of the polynomials.
 
         Parameters
         ----------
         n : int
+            Number of draws, at least 2.
         rng : int or numpy.random.Generator
+
+        Returns
+        -------
+        DrawnErrors
 
         Raises
         ------
         InputError
-            For fewer than two draws, or more than fit into memory.
+            If `n` is less than two, or if the draws do not fit into memory.
         """
         if n < 2:
             raise InputError(f"the number of draws is {n}", do="ask for at least 2")
@@ -87,8 +92,8 @@ class ErrorModel:
         return self._drawn(n, generator_of(rng))
 
     def _drawn(self, n: int, rng: np.random.Generator) -> DrawnErrors:
-        """Draws of all errors, which know how to make further ones."""
-        one = self.solution.draw(n, rng)
+        """Draws of all errors, with a function that makes further ones."""
+        solution_draws = self.solution.draw(n, rng)
         solution, fitted = self.solution.solution, self.solution.fitted_exposures
         image = Image()
         if self.aligned:
@@ -97,40 +102,44 @@ class ErrorModel:
             image = Image(rng.integers(fitted[0], len(solution.model.exposures), size=n))
         seed = int(rng.integers(2**63))
         draws = [
-            term.draw(n, own)
-            for term, own in zip(self.terms, generators(self.terms, seed), strict=True)
+            term.draw(n, term_rng)
+            for term, term_rng in zip(self.terms, generators(self.terms, seed), strict=True)
         ]
         terms = (self.solution, *self.terms)
         further = partial(self._further, seed)
-        return DrawnErrors(solution, terms, (one, *draws), image, n, seed, further)
+        return DrawnErrors(solution, terms, (solution_draws, *draws), image, n, seed, further)
 
     def _further(self, seed: int, n: int, number: int) -> DrawnErrors:
-        """Further draws beside those of a seed, another set for each number from 1 on."""
+        """Further draws of the errors with this seed; each `number` from 1 on gives another set."""
         return self._drawn(n, np.random.default_rng([seed, number]))
 
     def with_terms(self, *terms: ErrorTerm) -> ErrorModel:
-        """Error model with more terms; errors of centroids replace those that were there."""
-        known = self.terms
+        """Error model with more terms; new errors of centroids replace the previous ones."""
+        previous = self.terms
         if any(isinstance(term, Centroids) for term in terms):
-            known = tuple(term for term in known if not isinstance(term, Centroids))
-        return replace(self, terms=(*known, *terms))
+            previous = tuple(term for term in previous if not isinstance(term, Centroids))
+        return replace(self, terms=(*previous, *terms))
 
     def structure_sigma(self, domain: EvaluationDomain) -> Float | None:
-        """Standard deviations (N, 2) of what the model leaves out; None where nothing is left."""
+        """Standard deviations (N, 2) of structure that the model omits; None if there is none."""
         for term in self.terms:
             if isinstance(term, StructureErrors) and term.left:
                 return term.sigma(domain)
         return None
 
     def local_tables(self, grid: tuple[int, int], epoch: float | None) -> tuple[LookupTable, ...]:
-        """Errors that belong to positions on the detector, as a table of each chip.
+        """Tables of the position-dependent errors, one for each chip that has any.
 
         Parameters
         ----------
         grid : tuple of int
-            Points on x and y of each chip.
+            Number of points along x and y on each chip.
         epoch : float or None
             Decimal years.
+
+        Returns
+        -------
+        tuple of LookupTable
         """
         model, out = self.solution.solution.model, []
         for chip in model.chips:
@@ -144,14 +153,19 @@ class ErrorModel:
         return tuple(out)
 
     def at(self, domain: EvaluationDomain, *, n: int = 4000, rng: Random) -> ErrorBudget:
-        """The error budget of positions, or of their differences.
+        """Error budget of positions, or of differences between positions.
 
         Parameters
         ----------
         domain : EvaluationDomain
+            Positions, epoch and magnitude.
         n : int
-            Draws.
+            Number of draws.
         rng : int or numpy.random.Generator
+
+        Returns
+        -------
+        ErrorBudget
         """
         return budget_of(self.drawn(n, rng), domain)
 
@@ -163,37 +177,41 @@ def error_model(
     aligned: bool = False,
     pixel_scale: float | None = None,
 ) -> ErrorModel:
-    """The error model of a solution by itself, of which residuals say nothing.
+    """Error model of a solution without anything measured from the residuals.
 
     Parameters
     ----------
     solution : LinearFit or Posterior
     terms : sequence of ErrorTerm
-        Other errors.  A `SolutionErrors` among them says what of the solution's errors is shown by
-        itself.
+        Further errors. If one is a `SolutionErrors`, it determines which rows of the budget the
+        errors of the solution are split into.
     aligned : bool
-        As of `ErrorModel`.
+        True if the observer fits shift and rotation of the exposure; see `ErrorModel`.
     pixel_scale : float, optional
-        Size of one pixel in mas; `pixel_scale_of` the solution by default.
+        Size of one pixel in mas; by default `pixel_scale_of` the solution.
+
+    Returns
+    -------
+    ErrorModel
 
     Raises
     ------
     InputError
-        For a term whose unit needs a pixel scale that is not known.
+        If the unit of a term needs the pixel scale and that is unknown.
     """
     if pixel_scale is None:
         pixel_scale = pixel_scale_of(solution)
-    errors, others = SolutionErrors(solution), list[ErrorTerm]()
+    errors, other_terms = SolutionErrors(solution), list[ErrorTerm]()
     for term in terms:
         if isinstance(term, SolutionErrors):
             errors = replace(term, solution=solution)
         elif isinstance(term, UserTerm):
-            others.append(term.in_unit(solution.model.unit, pixel_scale))
+            other_terms.append(term.in_unit(solution.model.unit, pixel_scale))
         else:
-            others.append(term)
-    if not any(isinstance(term, Centroids) for term in others):
-        others.append(Centroids(None))  # a domain that names a magnitude asks for it
-    return ErrorModel(errors, tuple(others), aligned)
+            other_terms.append(term)
+    if not any(isinstance(term, Centroids) for term in other_terms):
+        other_terms.append(Centroids(None))  # a domain with a magnitude needs this term
+    return ErrorModel(errors, tuple(other_terms), aligned)
 
 
 @one_thread
@@ -210,16 +228,16 @@ def diagnosed_error_model(
     aligned: bool,
     pixel_scale: float | None,
 ) -> ErrorModel:
-    """The error model of a posterior, with what residuals say of it.
+    """Error model of a posterior, including what was measured from the residuals.
 
-    `posterior`: as it was sampled. `diagnostics`: its correlated errors, and what errors of the
-    catalogue do, count in. `terms`: other errors. `hierarchy`: the fit of a hierarchy of exposures,
-    whose covariance has no noise of draws. `catalogue`: name of the file that states the
-    catalogue's errors. `single`: whether the star lies in a single exposure, whose deviation
-    counts; else in the mean. `frames`: whether errors of the exposures' frames follow the
-    correlated errors. `structure_left`: whether what the model leaves out at a position counts; not
-    where errors of look-up tables stand for it. `aligned`, `pixel_scale`, InputError: as of
-    `error_model`.
+    `posterior`: as sampled. `diagnostics`: their correlated errors and effects of catalogue errors
+    are included. `terms`: further errors. `hierarchy`: fit of the hierarchy of exposures, which
+    gives a covariance without Monte-Carlo noise. `catalogue`: name of the file with the
+    catalogue errors. `single`: True if the star is in a single exposure and the deviation of that
+    exposure is an error, False for the mean of all exposures. `frames`: True if errors of the
+    exposure frames are correlated with the measured errors. `structure_left`: True to include
+    structure that the model omits; False if errors of look-up tables represent it.
+    `aligned`, `pixel_scale`: see `error_model`, which also raises InputError.
     """
     measured: list[ErrorTerm] = []
     correlated = diagnostics.correlated
@@ -228,26 +246,28 @@ def diagnosed_error_model(
     if correlated is not None and correlated.linear is not None:
         measured.append(Deviations(correlated, single, frames))
     if correlated is not None and correlated.fields is not None:
-        # of a campaign positions are assessed in a new exposure
+        # in a campaign, positions are assessed in a new exposure
         measured.append(FieldsOfExposures(correlated, single or aligned, frames))
-    own = SolutionErrors(with_diagnosed_errors(posterior, diagnostics, hierarchy, noise_alone=True))
+    solution_errors = SolutionErrors(
+        with_diagnosed_errors(posterior, diagnostics, hierarchy, noise_alone=True)
+    )
     if diagnostics.catalogue is not None:
-        of_catalogue = catalogue_terms(posterior, diagnostics.catalogue, catalogue)
-        own = replace(own, without=posterior, catalogue=of_catalogue)
-    found = error_model(posterior, terms, aligned=aligned, pixel_scale=pixel_scale)
-    return replace(found, solution=own, terms=(*measured, *found.terms))
+        catalogue_errors = catalogue_terms(posterior, diagnostics.catalogue, catalogue)
+        solution_errors = replace(solution_errors, without=posterior, catalogue=catalogue_errors)
+    stated_errors = error_model(posterior, terms, aligned=aligned, pixel_scale=pixel_scale)
+    return replace(stated_errors, solution=solution_errors, terms=(*measured, *stated_errors.terms))
 
 
 def with_shared_stars(posterior: Posterior, fit: LinearFit, stars: StarCovariance) -> Posterior:
-    """A posterior whose draws are spread by what the errors of the catalogue add.
+    """Widen the draws of a posterior by the covariance that the catalogue errors contribute.
 
-    The linear map that turns the covariance of the fit into the larger one is applied to the
-    deviations of the draws, so that they keep their shape: no noise could be added, as errors that
-    the fit takes for independent may cancel.  Where the posterior is as much wider than the fit as
-    its jitter says, so is the covariance that the map begins with.
+    The deviations of the draws are multiplied by the matrix that transforms the covariance of the
+    fit into the larger one. This preserves the shape of the posterior. Adding noise would be wrong,
+    because errors that the fit takes as independent may cancel. If jitter made the posterior wider
+    than the fit, the covariance before widening is scaled accordingly.
 
-    `fit`: that `stars` was computed for. The result comes with other draws of theta and the same
-    mean; all else is as it was.
+    `fit`: the fit that `stars` was computed for. Returns a posterior with other draws of theta and
+    the same mean; everything else is unchanged.
     """
     before = _covariance(posterior, fit)
     return posterior.mapped(recolouring(before, before + stars.extra))
@@ -261,45 +281,46 @@ def with_diagnosed_errors(
     *,
     noise_alone: bool = False,
 ) -> Posterior:
-    """Posterior whose draws are spread by all that diagnostics know of errors of its parameters.
+    """Widen the draws of a posterior by all errors of its parameters that diagnostics found.
 
-    So it is exported and shown; `posterior` is as it was sampled.  `hierarchy` is the fit of a
-    hierarchy of exposures, whose covariance has no noise of draws.  `noise_alone` counts, of the
-    correlated errors, those of the stars as they scatter: what else there is stands in terms of its
-    own.
+    The result is what is exported and shown; `posterior` is as sampled. `hierarchy` is the fit of a
+    hierarchy of exposures, which gives a covariance without Monte-Carlo noise. With `noise_alone`,
+    the only correlated errors included are those from the observed scatter of the stars, because
+    separate error terms represent the others.
     """
     if diagnostics is None:
         return posterior
-    solution, stars, found = posterior, diagnostics.catalogue, diagnostics.correlated
+    solution, stars, correlated = posterior, diagnostics.catalogue, diagnostics.correlated
     if stars is not None:
         needed = required(hierarchy, "errors of the catalogue need a joint fit")
         solution = with_shared_stars(posterior, needed, stars)
-    if found is None:
+    if correlated is None:
         return solution
-    cov = found.noise if noise_alone else found.covariance
+    cov = correlated.noise if noise_alone else correlated.covariance
     if hierarchy is None:
-        return solution.mapped(recolouring(found.formal, cov))
+        return solution.mapped(recolouring(correlated.formal, cov))
     before = _covariance(posterior, hierarchy)
     if stars is not None:
         before = before + stars.extra
-    # frames follow as they are correlated with polynomials and drift
-    D = found.model.n_distortion
+        # the frames change according to their correlation with polynomials and drift
+    D = correlated.model.n_distortion
     follow = np.asarray(np.linalg.solve(before[:D, :D], before[:D]).T, float)
-    more = _least(before, follow, (cov - found.formal)[:D, :D])
-    return solution.mapped(recolouring(before, before + more))
+    addition = _least(before, follow, (cov - correlated.formal)[:D, :D])
+    return solution.mapped(recolouring(before, before + addition))
 
 
 def _covariance(posterior: Posterior, fit: LinearFit) -> Float:
-    """Covariance (D, D) of a posterior without the noise of its draws."""
+    """Covariance (D, D) of a posterior without the Monte-Carlo noise of its draws."""
     formal = np.asarray(fit.cov, float)
     wider = float(np.trace(np.linalg.solve(formal, posterior.cov))) / len(formal)
     return wider * formal
 
 
 def _least(before: Float, follow: Float, change: Float) -> Float:
-    """Addition to a covariance (D, D), limited so that no direction loses more than half of it.
+    """Increment of a covariance (D, D), limited so that no variance falls below half.
 
-    It is that of some parameters, `change` (d, d), which the others `follow` (D, d).
+    `before`: covariance (D, D). `follow`: regression coefficients (D, d) of all parameters on the
+    d parameters with the covariance increment `change` (d, d).
     """
     root = scaled_cholesky(before)
     basis, white = np.linalg.qr(solve_triangular(root, follow, lower=True))

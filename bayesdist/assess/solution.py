@@ -1,8 +1,7 @@
-"""A solution at one place, where it is one polynomial.
+"""A solution on one chip at one epoch in one exposure, where it is a single polynomial.
 
-At one chip, epoch and exposure the whole model is a single polynomial of the pixel position, so
-maps, budgets and margins carry 2 K coefficients and their covariance instead of one Jacobian row
-for each grid point and parameter: their cost on the grid does not grow with the exposures.
+Maps, budgets and margins therefore need only the 2 K coefficients and their covariance, instead of
+one Jacobian row per grid point and parameter. Their cost is independent of the number of exposures.
 """
 
 from __future__ import annotations
@@ -20,15 +19,15 @@ from bayesdist.utils.arrays import Float
 
 @dataclass(frozen=True, eq=False)
 class Place:
-    """One chip at one epoch in one exposure, where the model is one polynomial."""
+    """One chip at one epoch in one exposure, where the model is a single polynomial."""
 
     model: DistortionModel
-    group: Groups  # the single group of this place
-    epoch: float | None  # decimal years, as asked for
+    group: Groups  # a single group
+    epoch: float | None  # decimal years, as requested
 
     @property
     def chip(self) -> Chip:
-        """The chip."""
+        """The chip of the group."""
         return self.model.chips[int(self.group.chip[0])]
 
     @property
@@ -41,7 +40,7 @@ class Place:
         return self.model.effective(theta, self.group)[..., 0, :, :]
 
     def covariance(self, solution: Solution) -> Float:
-        """Covariance (2, K, 2, K) of `polynomial`, linearised at the solution's mean."""
+        """Covariance (2, K, 2, K) of `polynomial`, linearised at the mean of the solution."""
         [(columns, d)] = self.model.effective_jacobian(solution.mean, self.group)
         K = self.model.n_terms
         d = d.reshape(2 * K, -1)
@@ -56,11 +55,11 @@ def place_of(
     exposure: int | str | None = None,
     chip: int | None = None,
 ) -> Place:
-    """The place of a chip, an epoch and an exposure.
+    """Select a chip, an epoch and an exposure of a model.
 
-    `epoch`: decimal years; needed by a model with time dependence. `exposure`: code or name; the
-    gauge exposure by default. `chip`: chip number; the first chip by default. InputError for an
-    unknown chip or exposure, or a missing or infinite epoch.
+    `epoch`: decimal years; required if the model depends on time. `exposure`: code or name; the
+    gauge exposure by default. `chip`: chip number; the first chip by default. Raises InputError if
+    the chip or exposure is unknown, or the epoch is missing or not finite.
     """
     if epoch is not None and not np.isfinite(epoch):
         raise InputError(f"the epoch is {epoch}", do="give it in decimal years")
@@ -74,16 +73,16 @@ def place_of(
 class ChipFrame:
     """Position of a chip in the focal plane, along the pixel axes of the first chip."""
 
-    centre: Float  # (2,), of the chip, in pixels of the first chip
-    middle: Float  # (2,), the same point in the chip's own pixels
-    turn: Float  # (2, 2), takes offsets in the chip's own pixels to those of the first chip
+    centre: Float  # (2,), centre of the chip in pixels of the first chip
+    middle: Float  # (2,), the same point in pixels of this chip
+    turn: Float  # (2, 2), matrix that converts pixel offsets to those of the first chip
 
     def __call__(self, x: Float, y: Float) -> Float:
-        """Positions (2, N) in the focal plane of pixels of the chip."""
+        """Convert pixels of the chip to positions (2, N) in the focal plane."""
         return self.centre[:, None] + self.turn @ (np.stack([x, y]) - self.middle[:, None])
 
     def outline(self, size: tuple[float, float]) -> Float:
-        """Corners (4, 2) of a chip of that size."""
+        """Corners (4, 2) of a chip of the given size in the focal plane."""
         right, top = size[0] + 0.5, size[1] + 0.5
         return self(np.array([0.5, right, right, 0.5]), np.array([0.5, 0.5, top, top])).T
 
@@ -91,8 +90,8 @@ class ChipFrame:
 def chip_frames(solution: Solution, *, epoch: float | None = None) -> tuple[ChipFrame, ...]:
     """Positions of all chips in the focal plane, in the order of the model's chips.
 
-    `epoch`: decimal years; needed by a model with time dependence. The solution is linear about the
-    centre of each chip, so that outlines show gaps and rotations but no distortion.
+    `epoch`: decimal years; required if the model depends on time. The solution is linearised about
+    the centre of each chip, so that outlines show gaps and rotations but no distortion.
     """
     centres, gradients, middles = [], [], []
     for chip in solution.model.chips:
@@ -103,8 +102,8 @@ def chip_frames(solution: Solution, *, epoch: float | None = None) -> tuple[Chip
         px, py = place.basis.gradient(*middle[:, None])
         gradients.append(np.column_stack([polynomial @ px[0], polynomial @ py[0]]))
         middles.append(middle)
-    turns = [np.linalg.lstsq(gradients[0], one, rcond=None)[0] for one in gradients]
-    offsets = np.transpose([one - centres[0] for one in centres])
+    turns = [np.linalg.lstsq(gradients[0], gradient, rcond=None)[0] for gradient in gradients]
+    offsets = np.transpose([centre - centres[0] for centre in centres])
     at = middles[0] + np.linalg.lstsq(gradients[0], offsets, rcond=None)[0].T
     return tuple(map(ChipFrame, at, middles, turns))
 
@@ -112,12 +111,25 @@ def chip_frames(solution: Solution, *, epoch: float | None = None) -> tuple[Chip
 def chip_places(solution: Solution, *, epoch: float | None = None) -> tuple[tuple[int, int], ...]:
     """Row and column of each chip in a drawing of the detector, along the axes of the first chip.
 
-    `epoch`: decimal years; needed by a model with time dependence. The result is in the order of
-    the model's chips; row 0 is the one on top (largest y), column 0 the one at the left.  No two
-    chips have the same place: where they overlap, all stand in one column.
+    Parameters
+    ----------
+    solution : Solution
+    epoch : float, optional
+        Decimal years; required if the model depends on time.
+
+    Returns
+    -------
+    tuple of (row, column)
+        In the order of the model's chips. Row 0 is at the top (largest y), column 0 at the left.
+        No two chips have the same row and column: if they would, all are in one column.
+
+    Raises
+    ------
+    InputError
+        If the model depends on time and the epoch is missing.
     """
     chips = solution.model.chips
-    x, y = np.transpose([one.centre for one in chip_frames(solution, epoch=epoch)])
+    x, y = np.transpose([frame.centre for frame in chip_frames(solution, epoch=epoch)])
     half = np.array([c.size for c in chips]).min(axis=0) / 2
     places = tuple(zip(_ranks(-y, half[1]), _ranks(x, half[0]), strict=True))
     if len(set(places)) < len(places):
@@ -127,7 +139,7 @@ def chip_places(solution: Solution, *, epoch: float | None = None) -> tuple[tupl
 
 
 def _ranks(values: Float, least: float) -> list[int]:
-    """Group of each value, counted from the lowest; groups lie `least` apart."""
+    """Group number of each value, ascending; a gap larger than `least` starts a new group."""
     order = np.argsort(values, kind="stable")
     new = np.diff(values[order]) > least
     ranks = np.empty(len(values), np.int64)

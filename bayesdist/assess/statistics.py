@@ -1,4 +1,4 @@
-"""Statistics that turn an error field into one number."""
+"""Statistics that reduce an error field to one number."""
 
 from __future__ import annotations
 
@@ -10,21 +10,22 @@ from bayesdist.errors import require_known
 from bayesdist.utils.arrays import Float
 
 _PERCENTILES = {"p50": 50.0, "p68": 68.0, "p90": 90.0, "p95": 95.0, "p99": 99.0}
-_DIRECTIONS = 64  # over half a turn
+_DIRECTIONS = 64  # number of directions over 180 degrees
 _BASE = ("max", "rms", "mean", *_PERCENTILES)
 
 STATISTICS = (*_BASE, *(f"u_{s}" for s in _BASE), *(f"v_{s}" for s in _BASE))
 
 
 def field_statistic(name: str, error: Float) -> Float:
-    """A statistic over the points of error fields.
+    """Statistic of error fields over their positions.
 
     Parameters
     ----------
     name : str
-        One of `STATISTICS`: of the radial error, or with the prefix ``u_`` or ``v_`` of the
-        absolute error of one axis.
+        One of `STATISTICS`. It applies to the radial error, or with the prefix ``u_`` or ``v_`` to
+        the absolute error of one axis.
     error : ndarray, shape (..., N, 2)
+        Errors of u and v at N positions.
 
     Returns
     -------
@@ -33,7 +34,7 @@ def field_statistic(name: str, error: Float) -> Float:
     Raises
     ------
     InputError
-        For an unknown statistic.
+        If the statistic is unknown.
     """
     require_known(name, STATISTICS, "statistic")
     axis, _, base = name.rpartition("_")
@@ -41,14 +42,14 @@ def field_statistic(name: str, error: Float) -> Float:
 
 
 def sizes(axis: str, error: Float) -> Float:
-    """Absolute errors (..., N) of an axis, or radial ones where none is named."""
+    """Absolute errors (..., N) of an axis, or radial errors if `axis` is empty."""
     if axis:
         return np.abs(error[..., "uv".index(axis)])
-    return np.sqrt(error[..., 0] ** 2 + error[..., 1] ** 2)  # a fifth of the time of `hypot`
+    return np.sqrt(error[..., 0] ** 2 + error[..., 1] ** 2)  # five times as fast as `hypot`
 
 
 def of_sizes(base: str, size: Float) -> Float:
-    """A statistic of `_BASE` over the last axis."""
+    """Statistic named in `_BASE`, over the last axis."""
     if base == "max":
         return size.max(axis=-1)
     if base == "mean":
@@ -59,11 +60,11 @@ def of_sizes(base: str, size: Float) -> Float:
 
 
 def extent(name: str, error: Float) -> Float:
-    """Largest difference between the errors at any two points.
+    """Largest difference between the errors at any two positions.
 
-    `name`: one of 'max', 'u_max', 'v_max'. `error`: (..., N, 2). Returns (...), of both axes the
-    largest extent along any of 64 directions, which falls short of the largest distance by 0.03 %
-    at most.
+    `name`: 'max', 'u_max' or 'v_max'. `error`: shape (..., N, 2). Returns an array of shape (...).
+    For 'max' it is the largest extent along any of 64 directions, which underestimates the largest
+    distance by at most 0.03 %.
     """
     axis = name.removesuffix("max").rstrip("_")
     if axis:

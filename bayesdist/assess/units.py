@@ -1,4 +1,4 @@
-"""Units of positions and errors: pixels and angles, and the pixel scale that joins them."""
+"""Units of positions and errors: pixels, angles, and the pixel scale that relates them."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ _MAS = {"mas": 1.0, "arcsec": 1e3, "deg": 3.6e6}
 def convert(
     value: float, from_unit: str, to_unit: str, pixel_scale: float | None = None, *, where: str = ""
 ) -> float:
-    """A length in another unit.
+    """Convert a length to another unit.
 
     Parameters
     ----------
@@ -22,10 +22,10 @@ def convert(
     from_unit, to_unit : str
         'pix', 'arcsec', 'mas' or 'deg'.
     pixel_scale : float, optional
-        Size of one pixel in **mas**, as `pixel_scale_of` gives it; needed only between pixels and
-        angles.
+        Size of one pixel in **mas**, as returned by `pixel_scale_of`; needed only between pixels
+        and angles.
     where : str, optional
-        Where the value was given, for the message.
+        Location of the value in the user's input, for the error message.
 
     Returns
     -------
@@ -34,7 +34,8 @@ def convert(
     Raises
     ------
     InputError
-        For an unknown unit, a scale that is not positive, or pixels and angles without a scale.
+        If a unit is unknown, the scale is not positive, or pixels and angles are converted without
+        a scale.
     """
     for unit in (from_unit, to_unit):
         require_known(unit, UNITS, "unit", where=where)
@@ -54,10 +55,10 @@ def convert(
 
 
 def stated_unit(stated: str | None, unit: str, where: str) -> str:
-    """Unit of a number of the user: the stated one, or pixels if u and v are in pixels.
+    """Unit of a number given by the user: the stated unit, or pixels if u and v are in pixels.
 
-    `unit`: of u and v; `where`: what the number is, for the message. InputError where none is
-    stated and u and v are angles: the number may be in either.
+    `unit`: unit of u and v; `where`: description of the number, for the error message. Raises
+    InputError if no unit is stated and u and v are angles, since the number may be in either unit.
     """
     if not stated and unit != "pix":
         raise InputError(
@@ -69,7 +70,7 @@ def stated_unit(stated: str | None, unit: str, where: str) -> str:
 
 
 def require_scale(scale_mas: float) -> None:
-    """Pass a pixel scale that is positive and finite."""
+    """Raise InputError unless a pixel scale is positive and finite."""
     if not (math.isfinite(scale_mas) and scale_mas > 0):
         raise InputError(
             f"the pixel scale is {scale_mas} mas",
@@ -83,10 +84,24 @@ def pixel_scale_of(
 ) -> float | None:
     """Size of one pixel, in mas.
 
-    `chip`: chip number; the first chip by default. `scale_mas`: the scale where the user gives it;
-    it is returned as it is. The result is in mas per pixel.  Without `scale_mas`: where u and v are
-    angles, the square root of the pixel area at the reference pixel, without drift and frames;
-    where they are pixels, None. InputError for an unknown chip or a scale that is not positive.
+    Parameters
+    ----------
+    solution : Solution
+    chip : int, optional
+        Chip number; the first chip by default.
+    scale_mas : float, optional
+        Scale stated by the user, which is returned unchanged.
+
+    Returns
+    -------
+    float or None
+        Without `scale_mas`, the square root of the pixel area at the reference pixel, ignoring
+        drift and exposure frames; None if u and v are in pixels.
+
+    Raises
+    ------
+    InputError
+        If the chip is unknown, or the scale is not positive.
     """
     if scale_mas is not None:
         require_scale(scale_mas)

@@ -1,4 +1,4 @@
-"""The distortion as vectors over the detector."""
+"""Distortion vectors over the detector."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ from bayesdist.model.grid import DEFAULT_GRID, grid_pixels, mesh, position_of_la
 from bayesdist.utils.arrays import Float
 
 PARTS = ("no_constant", "non_linear")
-VECTORS_ALONG = 17  # the longer side of a chip in a diagram: more would hide each other
+VECTORS_ALONG = 17  # number of vectors along the longer side of a chip; more would overlap
 
-# u, v in pixels count as positions on the array itself when the best similarity is as near to the
-# identity as this (scale 0.9 to 1.1, rotation below 6 degrees).
+# u, v in pixels are compared with the pixel position itself if the best-fitting similarity is
+# as close to the identity as this (scale from 0.9 to 1.1, rotation below 6 degrees).
 NEAR_IDENTITY = 0.1
 
 
@@ -34,13 +34,14 @@ class VectorMap:
     du, dv : ndarray, shape (ny, nx)
         Displacement along u and v, in `unit`.
     unit : str
+        Unit of u and v.
     part : str
         One of `PARTS`.
     part_note : str
-        What the displacement is relative to, for people.
+        Text that tells readers what the displacement is relative to.
     similarity : ndarray, shape (2, 2)
-        Linear map from pixel offsets to offsets in (u, v): the identity where u, v lie along the
-        pixel axes, else the best scale, rotation and parity.
+        Linear map from pixel offsets to offsets in (u, v): the identity if u, v are along the pixel
+        axes, otherwise the best-fitting scale, rotation and parity.
     """
 
     x: Float
@@ -69,10 +70,9 @@ class VectorMap:
 
     @property
     def on_detector(self) -> tuple[Float, Float]:
-        """The vectors along the detector's x and y, (ny, nx) each, in pixels.
+        """Vectors along the detector's x and y, in pixels, each of shape (ny, nx).
 
-        These are what a diagram over the detector shows; they equal (du, dv) where `similarity` is
-        the identity.
+        Diagrams over the detector show these. They equal (du, dv) if `similarity` is the identity.
         """
         d = np.linalg.solve(self.similarity, np.stack([self.du.ravel(), self.dv.ravel()]))
         return d[0].reshape(self.du.shape), d[1].reshape(self.dv.shape)
@@ -86,22 +86,22 @@ def distortion_vectors(
     epoch: float | None = None,
     chip: int | None = None,
 ) -> VectorMap:
-    """The distortion of a solution's mean, without constant or without its linear part.
+    """Distortion of a solution's mean as vectors, without its constant or its linear part.
 
     Parameters
     ----------
     solution : LinearFit or Posterior
     grid : tuple of int
-        Points on x and y.
+        Number of points along x and y.
     part : str
-        'no_constant': from the array position to the corrected position, the zeroth order (the
-        value at the reference pixel) suppressed, as the diagrams in section 4 of WSDC D-T033.
-        Where u, v are angles, or pixels of rotated or flipped axes, the array position is first
-        taken through the similarity (scale, rotation, parity) that fits best over the detector.
-        'non_linear': the terms of order 2 and more about the reference pixel, as Figure 4.1 of
-        section 4.1 of the ACS handbook.
+        'no_constant': displacement from the pixel position to the corrected position, relative to
+        that of the reference pixel, as in the diagrams of section 4 of WSDC D-T033. If u, v are
+        angles, or pixels along rotated or mirrored axes, the pixel position is first transformed by
+        the similarity (scale, rotation, parity) that fits best over the detector.
+        'non_linear': only terms of order 2 and higher about the reference pixel, as in Figure 4.1
+        of section 4.1 of the ACS handbook.
     epoch : float, optional
-        Decimal years; needed by a model with time dependence.
+        Decimal years; required if the model depends on time.
     chip : int, optional
         Chip number; the first chip by default.
 
@@ -112,12 +112,13 @@ def distortion_vectors(
     Raises
     ------
     InputError
-        For an unknown part or chip, a missing epoch, a bad grid, or a solution without linear part.
+        If the part or chip is unknown, the epoch is missing, the grid is invalid, or the solution
+        has no linear part.
     """
     require_known(part, PARTS, "part of the distortion", where="part")
     place = place_of(solution.model, epoch=epoch, chip=chip)
     basis, reference = place.basis, np.array(place.chip.reference_pixel)
-    # Legendre coefficients (2, K) of positions and of pixels about those of the reference pixel
+    # Legendre coefficients (2, K) of positions and of pixels, relative to the reference pixel
     polynomial = place.polynomial(solution.mean).copy()
     polynomial[:, 0] -= polynomial @ basis.evaluate(*reference[:, None])[0]
     pixels = basis.from_monomials(np.eye(basis.n_terms)[1:3])
@@ -128,8 +129,8 @@ def distortion_vectors(
         note = "the terms of order 2 and more about the reference pixel"
     x, y = grid_pixels(place.chip.size, grid)
     X, Y = mesh(x, y)
-    left = polynomial - linear @ pixels
-    d = [left @ basis.evaluate(X[rows], Y[rows]).T for rows in point_blocks(X.size)]
+    displacement = polynomial - linear @ pixels
+    d = [displacement @ basis.evaluate(X[rows], Y[rows]).T for rows in point_blocks(X.size)]
     du, dv = np.concatenate(d, axis=1).reshape(2, y.size, x.size)
     return VectorMap(x, y, du, dv, solution.model.unit, part, note, similarity)
 
@@ -137,25 +138,27 @@ def distortion_vectors(
 def diagram_vectors(
     solution: Solution, chip: Chip, *, part: str = "no_constant", epoch: float | None = None
 ) -> VectorMap:
-    """The distortion of a chip on a grid for a diagram, which is equally fine on both axes.
+    """Distortion of a chip on a grid for a diagram, with the same spacing along both axes.
 
-    Parameters as of `distortion_vectors`.
+    For the parameters see `distortion_vectors`.
     """
     nx, ny = (max(3, round(VECTORS_ALONG * side / max(chip.size))) for side in chip.size)
     return distortion_vectors(solution, part=part, grid=(nx, ny), epoch=epoch, chip=chip.number)
 
 
 def _similarity(place: Place, polynomial: Float, pixels: Float) -> tuple[Float, str]:
-    """Linear map from pixels that distortion is shown against, and a note.
+    """Linear map from pixels to which the distortion is relative, and a note that describes it.
 
-    It is the identity, or scale, rotation and parity that bring pixels nearest to positions: least
-    squares over the whole area of the detector, about the reference pixel.  `polynomial` and
-    `pixels` are Legendre coefficients (2, K) of both.
+    It is the identity, or the scale, rotation and parity that best map pixels to positions in a
+    least-squares fit over the whole area of the detector about the reference pixel. `polynomial`
+    and `pixels` are the Legendre coefficients (2, K) of positions and pixels, respectively.
     """
-    w, z = (one[0] + 1j * one[1] for one in (polynomial, pixels))
+    w, z = (coefficients[0] + 1j * coefficients[1] for coefficients in (polynomial, pixels))
     weight = place.basis.mean_squares
     norm = weight @ np.abs(z) ** 2
-    straight, flipped = (complex(np.sum(weight * w * one) / norm) for one in (z.conj(), z))
+    straight, flipped = (
+        complex(np.sum(weight * w * pixel_plane) / norm) for pixel_plane in (z.conj(), z)
+    )
     mirrored = abs(straight) < abs(flipped)
     turn = flipped if mirrored else straight
     if turn == 0:

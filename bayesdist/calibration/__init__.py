@@ -1,5 +1,5 @@
-"""Calibrations: content of a file for a pipeline, as a map from pixels to a plane and back.
+"""Calibrations: maps between the pixels of a detector and a plane, with their errors.
 
-Nothing here reads or writes a file: formats make calibrations from files and files from
-calibrations, see `bayesdist.products`.
+This subpackage does not access files.  The formats in `bayesdist.products` convert between files
+and calibrations.
 """

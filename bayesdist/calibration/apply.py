@@ -1,13 +1,14 @@
-"""Pixels to the output frame and back, each way with the calibration's error.
+"""Transformation between detector pixels and an undistorted output frame, with errors.
 
-The four steps of section 4.1.5 of the ACS handbook:
+The forward transformation has the four steps of section 4.1.5 of the ACS handbook:
 
-1. the offset of a pixel from the zero point of its chip, subarrays first brought to the whole chip;
-2. undistorted positions in arcseconds by the polynomials;
-3. these divided by the output scale, SCALE unless another is wanted;
-4. the chip's own offset added, so that all chips lie in one image.
+1. Pixels of subarrays are converted to pixels of the full chip, and the offset from the reference
+   pixel is taken.
+2. The polynomials give undistorted positions in arcseconds.
+3. The positions are divided by the output scale (by default SCALE of the calibration).
+4. The offset of the chip is added, so that all chips are in one image.
 
-The inverse is Newton's method on the forward polynomials, exact to rounding.
+The inverse solves the forward transformation by Newton's method to rounding error.
 """
 
 from __future__ import annotations
@@ -24,17 +25,23 @@ from bayesdist.calibration.subarray import FULL, Subarray
 from bayesdist.errors import InputError
 from bayesdist.utils.arrays import Bool, Float, Int
 
-# Points along each edge of a chip, whose image bulges.
+# points along each edge of a chip, since the edges are curved in the output frame
 _EDGE = 257
 
 
 @dataclass(frozen=True)
 class OutputFrame:
-    """Image without distortion; a scale or factor that is not positive is refused."""
+    """Undistorted output image.
 
-    scale: float  # size of its pixels, in the calibration's unit (arcsec for an IDCTAB)
-    origin: tuple[float, float] = (0.0, 0.0)  # pixel of the reference chip's zero point
-    vafactor: float = 1.0  # velocity aberration, by which positions are stretched
+    Raises
+    ------
+    InputError
+        If the scale or the velocity aberration factor is not positive, or the origin not finite.
+    """
+
+    scale: float  # size of an output pixel, in the calibration's unit (arcsec for an IDCTAB)
+    origin: tuple[float, float] = (0.0, 0.0)  # output pixel of the calibration's zero point
+    vafactor: float = 1.0  # velocity aberration factor by which positions are multiplied
 
     def __post_init__(self) -> None:
         for name, value in (("scale", self.scale), ("VAFACTOR", self.vafactor)):
@@ -49,32 +56,32 @@ class OutputFrame:
 
     @property
     def pixels_per_unit(self) -> float:
-        """Output pixels in one unit of the calibration."""
+        """Output pixels per unit of the calibration."""
         return self.vafactor / self.scale
 
 
 @dataclass(frozen=True, eq=False)
 class Positions:
-    """Positions (N,) and their covariance by the calibration."""
+    """Positions of N points, and their covariance due to the errors of the calibration."""
 
-    x: Float  # NaN where there is none
-    y: Float
-    cov: Float | None  # (N, 2, 2); None where the calibration has no errors
-    chip: Int  # 0 where a position lies on no chip
+    x: Float  # (N,); NaN if there is no solution
+    y: Float  # (N,)
+    cov: Float | None  # (N, 2, 2); None if the calibration has no errors
+    chip: Int  # (N,) chip number; 0 for positions outside of all chips
 
     @property
     def sigma_x(self) -> Float:
-        """Standard deviations of x; NaN where they are not known."""
+        """Standard deviations (N,) of x; NaN if unknown."""
         return self._sigma(0)
 
     @property
     def sigma_y(self) -> Float:
-        """Standard deviations of y; NaN where they are not known."""
+        """Standard deviations (N,) of y; NaN if unknown."""
         return self._sigma(1)
 
     @property
     def correlation(self) -> Float:
-        """Correlation of x and y; 0 where one of them is exact."""
+        """Correlation (N,) of x and y; 0 if one of them is exact, NaN if unknown."""
         if self.cov is None:
             return np.full(self.x.shape, np.nan)
         product = self.sigma_x * self.sigma_y
@@ -90,16 +97,16 @@ class Positions:
 
 @dataclass(frozen=True, eq=False)
 class Application:
-    """Chips and the frame that they are brought to; `images` are subarrays, by chip."""
+    """Transformation between the pixels of several chips and an output frame."""
 
-    chips: Mapping[int, ChipMap]  # in one plane; the first one's zero point is the frame's origin
+    chips: Mapping[int, ChipMap]  # by chip number, all in one plane
     frame: OutputFrame
-    images: Mapping[int, Subarray] = field(default_factory=dict)
+    images: Mapping[int, Subarray] = field(default_factory=dict)  # subarrays, by chip number
 
     def forward(self, x: ArrayLike, y: ArrayLike, *, chip: int) -> Positions:
-        """Positions in output pixels of FITS 1-based pixels (N,) of a chip, or of its image.
+        """Transform pixels (N,) of a chip, or of its subarray, to output pixels.
 
-        InputError for an unknown chip.
+        Pixels are FITS 1-based.  Raises InputError if the chip is unknown.
         """
         c, k = self.chip(chip), self.frame.pixels_per_unit
         x, y = self._image(chip).to_chip(np.atleast_1d(x), np.atleast_1d(y))
@@ -109,58 +116,60 @@ class Application:
         return Positions(at[0], at[1], cov, np.full(x.size, chip))
 
     def inverse(self, X: ArrayLike, Y: ArrayLike, *, chip: int) -> Positions:
-        """Pixels of one chip, or of its image, at output pixels (N,), by Newton's method.
+        """Transform output pixels (N,) to pixels of a chip, or of its subarray.
 
-        The polynomials are also followed beyond the chip's edges; NaN where no pixel was found.
-        InputError for an unknown chip, or one whose linear part is singular.
+        The polynomials are extrapolated beyond the edges of the chip.  The result is NaN if
+        Newton's method does not converge.  Raises InputError if the chip is unknown or its linear
+        part is singular.
         """
         c, image = self.chip(chip), self._image(chip)
-        found, slope = c.pixels(self.plane(X, Y))
-        cov = c.covariance_at(*found)
+        pixels, slope = c.pixels(self.plane(X, Y))
+        cov = c.covariance_at(*pixels)
         if cov is not None:
             back = np.array(image.ltm)[:, None] * np.linalg.inv(slope)
             cov = back @ cov @ np.swapaxes(back, 1, 2)
-        number = np.where(np.isfinite(found[0]), chip, 0)
-        return Positions(*image.from_chip(*found), cov, number)
+        number = np.where(np.isfinite(pixels[0]), chip, 0)
+        return Positions(*image.from_chip(*pixels), cov, number)
 
     def locate(self, X: ArrayLike, Y: ArrayLike) -> Positions:
-        """Pixels at output pixels (N,) of the chip on which each lies, the first where several do.
+        """Transform output pixels (N,) to pixels of the chip that contains them.
 
-        NaN and chip 0 for those in gaps and outside.
+        If chips overlap, the first one is used.  Positions in gaps or outside of all chips have NaN
+        and chip 0.
         """
         X, Y = np.atleast_1d(np.asarray(X, float)), np.atleast_1d(np.asarray(Y, float))
-        known = all(c.cov is not None for c in self.chips.values())
+        has_errors = all(c.cov is not None for c in self.chips.values())
         out = Positions(
             np.full(X.size, np.nan),
             np.full(X.size, np.nan),
-            np.full((X.size, 2, 2), np.nan) if known else None,
+            np.full((X.size, 2, 2), np.nan) if has_errors else None,
             np.zeros(X.size, np.int64),
         )
         for number, c in self.chips.items():
-            rest = np.flatnonzero(out.chip == 0)
-            here = self.inverse(X[rest], Y[rest], chip=number)
-            on = on_chip(c, *self._image(number).to_chip(here.x, here.y))
-            found = rest[on]
-            out.x[found], out.y[found], out.chip[found] = here.x[on], here.y[on], number
-            if out.cov is not None and here.cov is not None:
-                out.cov[found] = here.cov[on]
+            pending = np.flatnonzero(out.chip == 0)
+            candidates = self.inverse(X[pending], Y[pending], chip=number)
+            on = on_chip(c, *self._image(number).to_chip(candidates.x, candidates.y))
+            rows = pending[on]
+            out.x[rows], out.y[rows], out.chip[rows] = candidates.x[on], candidates.y[on], number
+            if out.cov is not None and candidates.cov is not None:
+                out.cov[rows] = candidates.cov[on]
         return out
 
     def closure(self, chip: int) -> float:
-        """Largest distance between a pixel and the `inverse` of its position, pixels."""
+        """Largest distance in pixels between a pixel and the inverse of its forward position."""
         x, y = detector_grid(self.chip(chip).basis.size)
-        whole = replace(self, images={})
-        at = whole.forward(x, y, chip=chip)
-        back = whole.inverse(at.x, at.y, chip=chip)
+        without_subarrays = replace(self, images={})
+        at = without_subarrays.forward(x, y, chip=chip)
+        back = without_subarrays.inverse(at.x, at.y, chip=chip)
         return float(np.hypot(back.x - x, back.y - y).max())
 
     def plane(self, X: ArrayLike, Y: ArrayLike) -> Float:
-        """Positions (2, N) in the unit of the calibration."""
+        """Positions (2, N), in the unit of the calibration, of output pixels."""
         at = np.stack([np.atleast_1d(np.asarray(v, float)) for v in (X, Y)])
         return (at - np.array(self.frame.origin)[:, None]) / self.frame.pixels_per_unit
 
     def chip(self, number: int) -> ChipMap:
-        """Map of a chip; InputError for an unknown one."""
+        """Map of a chip; raises InputError if the chip is unknown."""
         return chip_of(self.chips, number, "application")
 
     def _image(self, chip: int) -> Subarray:
@@ -170,16 +179,19 @@ class Application:
 def frame_that_holds(
     chips: Mapping[int, ChipMap], scale: float, vafactor: float = 1.0
 ) -> tuple[OutputFrame, tuple[int, int]]:
-    """Smallest image that holds all chips, its origin a whole pixel, and its columns and rows."""
+    """Smallest output frame that contains all chips, and its numbers of columns and rows.
+
+    The origin of the frame is a whole pixel.
+    """
     plain = Application(chips, OutputFrame(scale, vafactor=vafactor))
     at = []
     for number, c in chips.items():
         x, y = (np.linspace(0.5, n + 0.5, _EDGE) for n in c.basis.size)
         ends = [np.full(_EDGE, v) for v in (x[0], x[-1], y[0], y[-1])]
-        here = plain.forward(
+        outline = plain.forward(
             np.concatenate([x, x, *ends[:2]]), np.concatenate([*ends[2:], y, y]), chip=number
         )
-        at.append(np.stack([here.x, here.y]))
+        at.append(np.stack([outline.x, outline.y]))
     low, high = np.concatenate(at, axis=1).min(axis=1), np.concatenate(at, axis=1).max(axis=1)
     origin = np.ceil(0.5 - low)
     size = np.ceil(high + origin - 0.5)
@@ -188,6 +200,6 @@ def frame_that_holds(
 
 
 def on_chip(chip: ChipMap, x: Float, y: Float) -> Bool:
-    """Boolean mask of pixels on a chip, edges included; False for NaN."""
+    """Boolean mask that is True for pixels on a chip, including its edges; False for NaN."""
     nx, ny = chip.basis.size
     return (x >= 0.5) & (x <= nx + 0.5) & (y >= 0.5) & (y <= ny + 0.5)

@@ -1,9 +1,10 @@
-"""Area of pixels in (u, v), and pixel area maps.
+"""Areas of pixels in (u, v), and pixel area maps.
 
-A map holds the area of each pixel on the sky over that of a corrected pixel, SCALE squared.  Flat
-fields make the sky look even, which divides each pixel by its area; the map undoes this, so that
-photometry agrees with that of drizzled images.  ACS's maps are defined in this way, without
-velocity aberration.  WFC3's are relative to the area at one pixel instead.
+A pixel area map is the area of each pixel on the sky relative to that of a corrected pixel, SCALE
+squared.  Flat-fielding makes the sky background uniform and thereby divides each pixel by its
+area.  Multiplication by the map reverses this, so that photometry agrees with that of drizzled
+images.  The maps of ACS follow this definition, without velocity aberration.  Those of WFC3 are
+relative to the area of one pixel instead.
 """
 
 from __future__ import annotations
@@ -26,7 +27,10 @@ _MAGNITUDES = 2.5 / np.log(10.0)
 def determinant(
     basis: PolynomialBasis, polynomial: Float, x: Float, y: Float
 ) -> tuple[Float, Float]:
-    """Determinants (N,) of d(u, v) / d(x, y), and derivatives (N, 2 K) by the coefficients."""
+    """Jacobian determinants (N,) of (u, v), and their derivatives (N, 2 K).
+
+    The derivatives are with respect to the coefficients `polynomial` (2, K), u before v.
+    """
     px, py = basis.gradient(x, y)
     (ux, vx), (uy, vy) = polynomial @ px.T, polynomial @ py.T
     by_u = vy[:, None] * px - vx[:, None] * py
@@ -35,12 +39,25 @@ def determinant(
 
 
 def pixel_areas(chip: ChipMap, x: ArrayLike, y: ArrayLike) -> tuple[Float, Float | None]:
-    """Areas (ny, nx) of the pixels of a grid, ``|det d(u, v) / d(x, y)|``, and standard deviations.
+    """Areas ``|det d(u, v) / d(x, y)|`` of the pixels of a grid, and their standard deviations.
 
-    In the unit of the map squared; None in place of the deviations where the map has no errors.
-    The determinant is a polynomial of order 2 (n - 1) and its variance one of 4 (n - 1), so that
-    both follow exactly from as few nodes as such polynomials need.  With look-up tables the areas
-    are those of the quadrilaterals that the corners make, and the deviations of the polynomial's.
+    For a polynomial of order n the determinant is a polynomial of order 2 (n - 1) and its variance
+    one of order 4 (n - 1).  Both are therefore obtained exactly from their values at a few
+    Gauss-Legendre nodes.  With look-up tables the areas are those of the quadrilaterals between the
+    transformed corners of the pixels; the standard deviations are still those of the polynomial.
+
+    Parameters
+    ----------
+    chip : ChipMap
+    x, y : array_like, shape (nx,) and (ny,)
+        Columns and rows of the grid, FITS 1-based pixels.
+
+    Returns
+    -------
+    area : ndarray, shape (ny, nx)
+        In the unit of the map squared.
+    sigma : ndarray, shape (ny, nx), or None
+        None if the map has no errors.
     """
     basis = chip.basis
     nodes, weights = legendre.leggauss(4 * (basis.order - 1) + 1)
@@ -60,7 +77,7 @@ def pixel_areas(chip: ChipMap, x: ArrayLike, y: ArrayLike) -> tuple[Float, Float
 
 
 def _quadrilaterals(chip: ChipMap, x: Float, y: Float) -> Float:
-    """Areas (ny, nx) of the images of pixels, by their corners: half the product of diagonals."""
+    """Areas (ny, nx) of transformed pixels: half the cross product of their diagonals."""
     X, Y = np.meshgrid(x, y)
     corners = [
         chip.at((X + dx).ravel(), (Y + dy).ravel())
@@ -71,48 +88,63 @@ def _quadrilaterals(chip: ChipMap, x: Float, y: Float) -> Float:
 
 
 def _through_nodes(values: Float, nodes: Float, weights: Float, X: Float, Y: Float) -> Float:
-    """Polynomial (Y.size, X.size) through values on a square of Gauss-Legendre nodes."""
+    """Interpolate values on a square of Gauss-Legendre nodes to a grid (Y.size, X.size)."""
     n = nodes.size
     to_coefficients = legendre.legvander(nodes, n - 1).T * weights * (np.arange(n) + 0.5)[:, None]
-    c = to_coefficients @ values.reshape(n, n) @ to_coefficients.T  # rows go with y
+    c = to_coefficients @ values.reshape(n, n) @ to_coefficients.T  # first axis: y
     return legendre.legvander(Y, n - 1) @ c @ legendre.legvander(X, n - 1).T
 
 
 @dataclass(frozen=True, eq=False)
 class PixelAreaMap:
-    """Relative pixel areas of one image."""
+    """Pixel area map of one image."""
 
     chip: int
-    area: Float  # (ny, nx), over that of a corrected pixel
-    sigma: Float | None  # (ny, nx); None where the calibration has no errors
-    scale: float  # size of the corrected pixel
-    unit: str  # of the scale and the calibration
+    area: Float  # (ny, nx), relative to that of a corrected pixel
+    sigma: Float | None  # (ny, nx); None if the calibration has no errors
+    scale: float  # size of a corrected pixel, in `unit`
+    unit: str  # unit of the calibration
     image: Subarray
     epoch: float | None  # decimal years
 
     @property
     def magnitude(self) -> Float:
-        """Change (ny, nx) of a point source's magnitude by the map."""
+        """Magnitude correction (ny, nx) that the map causes for point sources."""
         return -2.5 * np.log10(self.area)
 
     @property
     def sigma_magnitude(self) -> Float | None:
-        """Standard deviation of `magnitude`."""
+        """Standard deviation (ny, nx) of `magnitude`; None if the calibration has no errors."""
         return None if self.sigma is None else _MAGNITUDES * self.sigma / self.area
 
 
 def pixel_area_map(chip: ChipMap, scale: float, *, image: Subarray = FULL) -> PixelAreaMap:
-    """Pixel area map of a chip, or of a subarray with a size, for a corrected pixel of `scale`.
+    """Pixel area map of a chip or of a subarray.
 
-    InputError for a scale that is not positive, or a subarray without size or beyond the chip.
+    Parameters
+    ----------
+    chip : ChipMap
+    scale : float
+        Size of a corrected pixel, in the unit of the map.
+    image : Subarray
+        Subarray of known size; the full chip by default.
+
+    Returns
+    -------
+    PixelAreaMap
+
+    Raises
+    ------
+    InputError
+        If the scale is not positive, or the size of the subarray is unknown or exceeds the chip.
     """
     number = chip.chip or 1
-    where = f"pixel area map of chip {number}"
+    location = f"pixel area map of chip {number}"
     if not (np.isfinite(scale) and scale > 0):
-        raise InputError(f"the scale is {scale}", where=where, do="give a positive number")
-    x, y = _pixels(chip, image, where)
+        raise InputError(f"the scale is {scale}", where=location, do="give a positive number")
+    x, y = _pixels(chip, image, location)
     area, sigma = pixel_areas(chip, x, y)
-    # a binned pixel covers several of the chip's, and so does a corrected one of its image
+    # binning multiplies the areas of image pixels and of corrected pixels by the same factor
     norm = 1.0 / scale**2
     return PixelAreaMap(
         chip=number,
@@ -126,18 +158,18 @@ def pixel_area_map(chip: ChipMap, scale: float, *, image: Subarray = FULL) -> Pi
 
 
 def _pixels(chip: ChipMap, image: Subarray, where: str) -> tuple[Float, Float]:
-    """Columns and rows, in pixels of the chip, that an image shows."""
+    """Columns and rows of an image, in pixels of the chip."""
     nx, ny = (int(n) for n in chip.basis.size)
     if image.size is None and image != FULL:
-        raise InputError("the size of the subarray is not known", where=where, do="give it")
+        raise InputError("the size of the subarray is unknown", where=where, do="give its size")
     columns, rows = image.size or (nx, ny)
     x, _ = image.to_chip(np.arange(1, columns + 1), 1.0)
     _, y = image.to_chip(1.0, np.arange(1, rows + 1))
     if min(x[0], y[0]) < 0.5 or x[-1] > nx + 0.5 or y[-1] > ny + 0.5:
         raise InputError(
-            f"the subarray goes from ({x[0]:g}, {y[0]:g}) to ({x[-1]:g}, {y[-1]:g}), and the chip "
-            f"has {nx} x {ny} pixels",
+            f"the subarray extends from ({x[0]:g}, {y[0]:g}) to ({x[-1]:g}, {y[-1]:g}), but the "
+            f"chip has {nx} x {ny} pixels",
             where=where,
-            do="check LTV1 and LTV2, and that the image is a calibrated one without overscan",
+            do="check LTV1 and LTV2, and that the image is calibrated and has no overscan",
         )
     return x, y

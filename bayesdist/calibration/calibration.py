@@ -1,8 +1,8 @@
-"""Calibration of a detector: all its chips in one plane, at any date.
+"""Calibration of a detector: maps of all chips to one plane, at any date.
 
-A calibration is a solution without the frames of exposures, whether it was fitted or read from a
-file, with the further data that pipelines need: the plane it maps to, look-up tables, explicit
-inverses, its reference date.  A calibration belongs to one filter.
+A calibration is a fitted solution, or one read from a file, without the frames of exposures.  It
+also contains the data that pipelines need: the plane, look-up tables, explicit inverses and the
+reference date.  It applies to one filter.
 """
 
 from __future__ import annotations
@@ -46,62 +46,62 @@ if TYPE_CHECKING:
 __all__ = ["Calibration"]
 
 ORIGINS = ("stated", "reference", "chip")
-FOLLOWING_ORDER = 9  # of the polynomial that stands for look-up tables where two are compared
+FOLLOWING_ORDER = 9  # order of the polynomial that replaces look-up tables in comparisons
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Calibration:
     """Map from the pixels of all chips of a detector to one plane, with its errors.
 
-    `bayesdist.read_calibration` reads it from a run or from a calibration file of any format, and
-    `from_solution` makes it from a fit or a posterior.  A chip maps a pixel (x, y), FITS 1-based,
-    to (u, v): the pixel is first corrected by the look-up tables `before`, then the polynomial of
-    the solution is evaluated, then the look-up tables `after` are added.
+    Use `bayesdist.read_calibration` to read a calibration from a run or from a file of any format,
+    and `from_solution` to make one from a fit or a posterior.  Each chip maps pixels (x, y), FITS
+    1-based, to (u, v) in three steps: the look-up tables `before` correct the pixel, the polynomial
+    of the solution is evaluated at the corrected pixel, and the look-up tables `after` are added.
 
     Parameters
     ----------
     name : str
         Name of the file or run, for messages.
     solution : Solution
-        Polynomials of all chips and their covariance, without frames of exposures.  Its first chip
+        Polynomials of all chips and their covariance, without frames of exposures.  The first chip
         is the reference chip.
     plane : Plane, optional
-        Plane of (u, v): on the sky, in an aperture, of corrected pixels, or free.
+        Plane of (u, v): on the sky, in an aperture, of corrected pixels, or undefined ('free').
     instrument, detector, filter : str, optional
         Names; empty if unknown.
     errors : {'covariance', 'sigma', 'none'}
-        What is known of the errors of the coefficients: their covariance, standard deviations of
-        monomials alone, or nothing.
+        Available errors of the coefficients: their covariance, only standard deviations of the
+        monomial coefficients, or none.
     numbered : bool
         False for a file without chip numbers.
     before : tuple of LookupTable, optional
-        Look-up tables in pixels, which are applied before the polynomial.
+        Look-up tables in pixels that are applied before the polynomial.
     after : tuple of LookupTable, optional
-        Look-up tables in the unit of u and v, which are added after the polynomial.
+        Look-up tables in the unit of u and v that are added to the polynomial.
     inverses : mapping of int to ExplicitInverse, optional
-        Inverse polynomials of a file, by chip number, at the reference date.
+        Inverse polynomials from a file at the reference date, by chip number.
     scale : float, optional
         Size of a corrected pixel in the unit of u and v, if stated.
     scale_from : str, optional
         Source of `scale`.
     pixel_mas : float, optional
-        Size of a pixel on the sky in mas, if known for u and v in pixels.
+        Pixel scale on the sky in mas per pixel, if known for u and v in pixels.
     reference_date : float, optional
-        Date in decimal years at which a calibration that depends on time is evaluated by default.
+        Default date, in decimal years, for a calibration that depends on time.
     undated : str, optional
-        Note on positions without a date.
+        Note that is added to results if no date is given.
     no_date : str, optional
         Reason why the calibration cannot be evaluated at another date; empty if it can.
     with_plane : ndarray, shape (D, 4), optional
         Covariance of the D parameters with the four parameters of the orientation of the plane.
     notes : tuple of str, optional
-        Notes for the reader.
+        Notes for users of the calibration.
     further : tuple of FurtherError, optional
-        Errors of positions that the covariance of the solution does not hold.
+        Position errors that the covariance of the solution does not include.
 
     Examples
     --------
-    A camera with 0.2 arcsec to the pixel, fitted to 500 stars and written as a TPV header:
+    A camera with 0.2 arcsec per pixel, fitted to 500 stars and written as a TPV header:
 
     >>> rng = np.random.default_rng(1)
     >>> chip = bd.Chip(1, "camera", (1000, 1000), (500.5, 500.5))
@@ -157,10 +157,10 @@ class Calibration:
         name : str, optional
             Name for messages and files.
         point : SkyCoord or tuple, optional
-            Right ascension and declination (numbers in degrees) of (u, v) = (0, 0), if u increases
-            to the east and v to the north; by default the tangent point of the solution.
+            Right ascension and declination (numbers in degrees) of (u, v) = (0, 0), where u
+            increases to the east and v to the north; by default the tangent point of the solution.
         detector, filter : str, optional
-            Names that files state.
+            Names to be written to files.
 
         Returns
         -------
@@ -177,14 +177,14 @@ class Calibration:
 
     def __repr__(self) -> str:
         chips = f"chip{'s' if len(self.numbers) > 1 else ''} {', '.join(map(str, self.numbers))}"
-        where = {
+        location = {
             "sky": " on the sky",
             "aperture": " of an aperture",
             "detector": " of the corrected detector",
         }.get(self.plane.kind, "")
         if self.plane.point is not None:
-            where += " at ({:.6g}, {:.6g})".format(*self.plane.point)
-        parts = [chips, f"order {self.model.order}", f"u and v in {self.unit}{where}"]
+            location += " at ({:.6g}, {:.6g})".format(*self.plane.point)
+        parts = [chips, f"order {self.model.order}", f"u and v in {self.unit}{location}"]
         if self.before or self.after:
             parts.append("look-up tables")
         if self.model.time is not None:
@@ -195,7 +195,7 @@ class Calibration:
 
     @property
     def model(self) -> DistortionModel:
-        """Structure of the solution."""
+        """Distortion model of the solution."""
         return self.solution.model
 
     @property
@@ -210,7 +210,7 @@ class Calibration:
 
     @property
     def remarks(self) -> tuple[str, ...]:
-        """Notes for the reader, that on the plane included."""
+        """Notes for users of the calibration, including the note on the plane."""
         return tuple(note for note in (*self.notes, self.plane.note) if note)
 
     # -- forward ----------------------------------------------------------------------------------
@@ -218,9 +218,23 @@ class Calibration:
     def at(self, epoch: float | None = None, *, origin: str = "reference") -> dict[int, ChipMap]:
         """Polynomials of all chips at a date, the reference chip first.
 
-        (u, v) = 0 is at the zero point of the reference chip ('reference'), where the solution has
-        it ('stated'), or at the zero point of each chip by itself ('chip').  InputError for a date
-        that it cannot be brought to, or that it needs and is not given.
+        Parameters
+        ----------
+        epoch : float, optional
+            Decimal years; `reference_date` by default.
+        origin : {'reference', 'stated', 'chip'}
+            Pixel that maps to (u, v) = 0: the reference pixel of the reference chip, the zero point
+            of the solution, or the reference pixel of each chip.
+
+        Returns
+        -------
+        dict of int to ChipMap
+            Maps by chip number, without look-up tables.
+
+        Raises
+        ------
+        InputError
+            If the calibration cannot be evaluated at the date, or a required date is missing.
         """
         draws, notes = sampling_of(self.solution)
         notes = (*notes, *self.notes)
@@ -247,33 +261,37 @@ class Calibration:
         return out
 
     def in_frame(self, epoch: float | None = None) -> dict[int, ChipMap]:
-        """Maps for an output frame: from the reference chip's zero point in a free plane."""
+        """Maps with look-up tables for an output frame.
+
+        In a free plane (u, v) = 0 is at the reference pixel of the reference chip.
+        """
         origin = "reference" if self.plane.kind == "free" else "stated"
         return self.with_tables(self.at(epoch, origin=origin))
 
     def by_chip(self, epoch: float | None = None) -> dict[int, ChipMap]:
-        """Polynomials for chips one by one: in an aperture each about its own zero point.
+        """Polynomials for the comparison of single chips, without look-up tables.
 
-        Look-up tables are followed by a polynomial, and a note says how well.
+        In an aperture (u, v) = 0 is at the reference pixel of each chip.  Look-up tables are
+        approximated by a polynomial; a note states the residuals.
         """
         maps = self.at(epoch, origin="chip" if self.plane.kind == "aperture" else "stated")
         if not self.before and not self.after:
             return maps
         out = {}
-        for number, one in self.with_tables(maps).items():
-            made, worst, rms = one.polynomial(FOLLOWING_ORDER)
+        for number, chip_map in self.with_tables(maps).items():
+            polynomial, worst, rms = chip_map.polynomial(FOLLOWING_ORDER)
             note = (
-                f"its look-up tables are followed by a polynomial of order {FOLLOWING_ORDER}, "
-                f"{worst:.2g} pix off at worst, {rms:.2g} rms"
+                f"its look-up tables are approximated by a polynomial of order {FOLLOWING_ORDER}, "
+                f"with residuals of at most {worst:.2g} pix, {rms:.2g} pix rms"
             )
-            out[number] = replace(made, notes=(*one.notes, note))
+            out[number] = replace(polynomial, notes=(*chip_map.notes, note))
         return out
 
     def with_tables(self, maps: Mapping[int, ChipMap]) -> dict[int, ChipMap]:
-        """These maps of chips, with the look-up tables of the calibration."""
+        """Add the look-up tables of the calibration to the maps of chips."""
         return {
             number: replace(
-                one,
+                chip_map,
                 before=tuple(
                     t
                     for t in sorted(self.before, key=lambda table: table.filter != "")
@@ -281,20 +299,20 @@ class Calibration:
                 ),
                 after=tuple(t for t in self.after if t.chip == number),
             )
-            for number, one in maps.items()
+            for number, chip_map in maps.items()
         }
 
     def chip(
         self, number: int | None = None, epoch: float | None = None, *, origin: str = "reference"
     ) -> ChipMap:
-        """Polynomial of one chip, the reference chip by default; errors as for `at`."""
+        """Polynomial of one chip, by default the reference chip; see `at`."""
         maps = self.at(epoch, origin=origin)
         return chip_of(maps, self.numbers[0] if number is None else number, self.name)
 
     def joint_covariance(
         self, numbers: Sequence[int], epoch: float | None = None, *, origin: str = "reference"
     ) -> Float | None:
-        """Covariance (2 K n, 2 K n) of the coefficients of several chips; None without errors."""
+        """Covariance (2 K n, 2 K n) of the coefficients of n chips; None without errors."""
         if self.errors == "none":
             return None
         parts = [self.coefficients(number, epoch, origin)[1] for number in numbers]
@@ -305,7 +323,7 @@ class Calibration:
     def forward(
         self, x: ArrayLike, y: ArrayLike, *, chip: int, epoch: float | None = None
     ) -> Float:
-        """Positions (N, 2) of pixels (N,), look-up tables included, as the solution states them."""
+        """Positions (u, v), shape (N, 2), of pixels (N,), FITS 1-based, with look-up tables."""
         px, py = np.asarray(x, float), np.asarray(y, float)
         if self.before:
             px, py = corrected(self.before, px, py, chip=chip, filter=self.filter)
@@ -319,24 +337,27 @@ class Calibration:
     def coefficients(
         self, number: int, epoch: float | None = None, origin: str = "stated"
     ) -> tuple[Float, Float]:
-        """Legendre coefficients (2, K) of a chip, and their derivatives (2 K, D) by the solution.
+        """Legendre coefficients (2, K) of a chip, and their derivatives (2 K, D).
 
-        `epoch` and `origin` as for `at`.
+        The derivatives are with respect to the parameters of the solution.  See `at` for `epoch`
+        and `origin`.
         """
         if origin not in ORIGINS:
             raise ValueError(f"the origin is {origin!r}")
         coefficients, jacobian = self._stated(number, epoch)
         if origin != "stated":
-            whose = number if origin == "chip" else self.numbers[0]
+            origin_chip = number if origin == "chip" else self.numbers[0]
             value, slope = (
-                (coefficients, jacobian) if whose == number else self._stated(whose, epoch)
+                (coefficients, jacobian)
+                if origin_chip == number
+                else self._stated(origin_chip, epoch)
             )
-            basis = self.model.basis(whose)
+            basis = self.model.basis(origin_chip)
             zero = basis.evaluate(*np.array(basis.reference_pixel)[:, None])[0]
-            shift, by = value @ zero, np.einsum("akd,k->ad", slope, zero)
+            shift, zero_jacobian = value @ zero, np.einsum("akd,k->ad", slope, zero)
             coefficients, jacobian = coefficients.copy(), jacobian.copy()
             coefficients[:, 0] -= shift  # the first basis function is 1
-            jacobian[:, 0] -= by
+            jacobian[:, 0] -= zero_jacobian
         return coefficients, jacobian.reshape(-1, self.model.n_params)
 
     def _stated(self, number: int, epoch: float | None) -> tuple[Float, Float]:
@@ -350,44 +371,48 @@ class Calibration:
         return model.effective(self.solution.mean, group)[0], jacobian
 
     def _date(self, epoch: float | None) -> float | None:
-        """Date at which the model is evaluated."""
+        """Date at which the model is evaluated; None if it does not depend on time."""
         if epoch is not None and not np.isfinite(epoch):
             raise InputError(f"the epoch is {epoch}", do="give it in decimal years")
         if epoch is not None and self.no_date:
             raise InputError(
                 self.no_date,
                 where=self.name,
-                do="leave out the epoch, or give a file with a date of reference (TDD_DATE)",
+                do="omit the epoch, or give a file with a reference date (TDD_DATE)",
             )
         if self.model.time is None:
             return None
         if epoch is None and self.reference_date is None:
             raise InputError(
-                "depends on time and no date is given",
+                "depends on time, but no date is given",
                 where=self.name,
                 do="give the epoch (--epoch on the command line)",
             )
         return self.reference_date if epoch is None else epoch
 
     def at_date(self, epoch: float | None = None) -> Calibration:
-        """This calibration without dependence on time, its covariance that at the date."""
+        """Calibration at one date, without time dependence."""
         if self.model.time is None:
             return self
-        made = calibration_of_maps(
+        at_epoch = calibration_of_maps(
             self.at(epoch, origin="stated"),
             self.name,
             cov=self.joint_covariance(self.numbers, epoch, origin="stated"),
             errors=self.errors,
         )
-        return replace(self, solution=made.solution, reference_date=None, undated="", inverses={})
+        return replace(
+            self, solution=at_epoch.solution, reference_date=None, undated="", inverses={}
+        )
 
     def only(self, number: int, epoch: float | None = None) -> Calibration:
-        """This calibration at a date, of one of its chips alone."""
-        one = self.chip(number, epoch, origin="stated")
-        made = calibration_of_maps({number: one}, self.name, cov=one.cov, errors=self.errors)
+        """Calibration of a single chip at one date."""
+        chip_map = self.chip(number, epoch, origin="stated")
+        single = calibration_of_maps(
+            {number: chip_map}, self.name, cov=chip_map.cov, errors=self.errors
+        )
         return replace(
             self,
-            solution=made.solution,
+            solution=single.solution,
             reference_date=None,
             undated="",
             before=tuple(t for t in self.before if t.chip == number),
@@ -415,37 +440,39 @@ class Calibration:
         format : str
             Name of the format, such as 'sip' or 'tpv'; `bayesdist.formats.list_formats` lists them.
         file : path
-            File to write, or an existing folder, in which files have the usual names of the
-            format.  A format with a file for each chip needs a folder.
+            File to write, or an existing folder, in which the files have the default names of the
+            format.  A format with one file per chip needs a folder.
         epoch : float, str, Time or Quantity, optional
             Date at which a calibration that depends on time is written; a number is in decimal
             years.
         scale_mas : float or Quantity, optional
-            Size of a pixel on the sky in mas.  Needed if u and v are in pixels and the file states
-            angles; by default `pixel_mas`.
+            Pixel scale on the sky in mas per pixel; by default `pixel_mas`.  It is needed if u and
+            v are in pixels and the file contains angles.
         order : int, optional
-            Order of the polynomial in the file, by default that of the calibration.  Look-up
-            tables that the format cannot hold are fitted by a polynomial of this order.
+            Order of the polynomial in the file (default: that of the calibration).  Look-up tables
+            that the format cannot store are approximated by a polynomial of this order.
         overwrite : bool
-            Whether existing files are replaced.
+            True to replace existing files.
         **settings
             Settings of the format: the keys of its table ``[products.NAME]`` in a configuration.
 
         Returns
         -------
         list of Path
-            Files that were written, those that stand beside the file itself first.
+            Files that were written: auxiliary files first, the file itself last.
 
         Raises
         ------
         InputError
-            For an unknown format or setting, an existing file, a folder that does not exist, and
-            whatever the format cannot hold, such as look-up tables or the dependence on time.
+            If the format or a setting is unknown, the file exists already, the folder does not
+            exist, or the format cannot store the calibration, for example its look-up tables or
+            time dependence.
 
         Warns
         -----
         bayesdist.errors.BayesdistWarning
-            On what other programs will make of the file, and on what was changed for the format.
+            If other programs may misread the file, or the calibration was changed to fit the
+            format.
         """
         written: list[Path] = load_object(hooks.WRITE)(
             self,
@@ -471,45 +498,45 @@ class Calibration:
         point: Direction | None = None,
         covariance: bool = False,
     ) -> QTable:
-        """Positions on the sky of a table of pixels, with all errors that the calibration carries.
+        """Convert a table of pixel positions to sky positions, with all errors of the calibration.
 
         Parameters
         ----------
         table : table
-            Pixels of stars, in whatever `Matches.from_table` takes, with a column chip if the
-            detector has several chips.
+            Pixels of stars, in any type that `Matches.from_table` accepts.  A column chip is needed
+            if the detector has several chips.
         columns : tuple of str, optional
-            Names of the columns with x and y; by default they are found by the names that
-            `Matches.from_table` knows.
+            Names of the columns with x and y; by default the names that `Matches.from_table`
+            recognises.
         centroids : tuple of str, optional
             Names of the columns with the standard deviations of x and y, in pixels.
         pixel_origin : float, optional
-            Coordinate of the centre of the first pixel: 1 as in FITS, 0 as in photutils.  By
-            default 0 for columns of programs that count from 0, as `Matches.from_table` knows them,
-            and otherwise 1.
+            Coordinate of the centre of the first pixel: 1 as in FITS, 0 as in photutils.  The
+            default is 0 if `Matches.from_table` recognises the columns as those of a program that
+            counts from 0, and otherwise 1.
         chip : int, optional
             Chip number of all stars, instead of a column.
         epoch : float, str, Time or Quantity, optional
             Date, for a calibration that depends on time; a number is in decimal years.
         point : SkyCoord or tuple, optional
             Right ascension and declination (numbers in degrees) of (u, v) = (0, 0), with u to the
-            east and v to the north, instead of the calibration's own.
+            east and v to the north; by default that of the calibration.
         covariance : bool
-            Whether the joint covariance of all stars is returned.
+            True to return the joint covariance of all stars.
 
         Returns
         -------
         QTable
-            The table with `ra` and `dec`, their standard deviations `sigma_ra` (to the east, with
-            cos(dec)) and `sigma_dec`, and the correlation `corr_ra_dec`.  ``meta["errors"]`` names
-            the errors that are included, ``meta["pixel_origin"]`` is the origin.  With
-            `covariance`, ``meta["covariance"]`` is the matrix (2 N, 2 N) of all stars in mas^2,
-            east and north in turn.
+            The table with additional columns `ra` and `dec`, their standard deviations `sigma_ra`
+            (multiplied by cos(dec)) and `sigma_dec`, and the correlation `corr_ra_dec`.
+            ``meta["errors"]`` lists the errors that are included, and ``meta["pixel_origin"]`` is
+            the pixel origin.  With `covariance`, ``meta["covariance"]`` is the covariance matrix
+            (2 N, 2 N) of all stars in mas^2, with east and north alternating.
 
         Raises
         ------
         InputError
-            For a calibration that does not lie on the sky, and unknown columns or chips.
+            If the plane of the calibration is not on the sky, or a column or chip is unknown.
 
         Examples
         --------
@@ -541,16 +568,17 @@ class Calibration:
     # -- scale ------------------------------------------------------------------------------------
 
     def pixel(self, epoch: float | None = None) -> tuple[float, str]:
-        """Size of a corrected pixel in the plane's unit, and the source of it.
+        """Size of a corrected pixel in the unit of the plane, and its source.
 
-        InputError when nothing states it and the pixel at the zero point has no area.
+        If the size is not stated, it is that of the reference pixel.  Raises InputError if this
+        pixel has no area.
         """
         if self.scale is not None:
             return self.scale, self.scale_from
         area = abs(float(np.linalg.det(self.chip(epoch=epoch).linear)))
         if not area > 0:
             raise InputError(
-                "the pixel at the zero point has no area", where=self.name, do="give the scale"
+                "the reference pixel has no area", where=self.name, do="give the scale"
             )
         return float(np.sqrt(area)), "the pixel at the zero point"
 
@@ -568,27 +596,27 @@ class Calibration:
     ) -> CalibrationWCS:
         """World coordinate system of a chip, with its errors.
 
-        A calibration whose plane touches the sky needs no further argument.  Any other one is put
-        on the sky with `point`; without it the world coordinates are u and v.
+        If the plane of the calibration is tangent to the sky, no further arguments are needed.
+        Otherwise `point` places the plane on the sky; without it the world coordinates are u and v.
 
         Parameters
         ----------
         chip : int, optional
-            Number of the chip; needed if there are several.
+            Number of the chip; required if there are several.
         epoch : float, str or Time, optional
-            Date; needed if the calibration depends on time and states no reference date.
+            Date; required if the calibration depends on time and has no reference date.
         point : SkyCoord or tuple of float, optional
-            Sky position of (u, v) = (0, 0), right ascension and declination (ICRS) in degrees, in
-            place of the calibration's.
+            Sky position of (u, v) = (0, 0): right ascension and declination (ICRS) in degrees; by
+            default that of the calibration.
         position_angle : float or Quantity, optional
-            Position angle of the v axis at `point`, in degrees from north to east, 0 by default.
-            For a calibration in the plane of an aperture it has to be given, and is that of V3 if
-            the directions of u and v in V2, V3 are known.
+            Position angle of the v axis at `point`, in degrees from north to east; 0 by default.
+            It is required for a calibration in the plane of an aperture, and is that of V3 if the
+            directions of u and v in V2, V3 are known.
         mirrored : bool
             True if u is 90 degrees west of v; by default it is 90 degrees east of it.
         pixel_scale : float or Quantity, optional
-            Size of a pixel in arcsec, `pixel_mas` by default; needed on the sky if u and v are in
-            pixels.
+            Pixel scale in arcsec per pixel; by default `pixel_mas`.  It is required on the sky if u
+            and v are in pixels.
 
         Returns
         -------
@@ -597,8 +625,8 @@ class Calibration:
         Raises
         ------
         InputError
-            If the chip is unknown or not given, the epoch is missing, or the direction or scale of
-            u and v on the sky is needed and not given.
+            If the chip is unknown, or a required chip, epoch, position angle or pixel scale is
+            missing.
         """
         wcs: CalibrationWCS = load_object(hooks.WCS)(
             self,
@@ -617,34 +645,34 @@ class Calibration:
         Parameters
         ----------
         chip, epoch
-            As for `wcs`.
+            See `wcs`.
         **sky
-            Position on the sky: `point`, `position_angle`, `mirrored` and `pixel_scale` of `wcs`.
+            Arguments `point`, `position_angle`, `mirrored` and `pixel_scale` of `wcs`.
 
         Returns
         -------
         astropy.modeling.Model
-            Two inputs, x and y; two outputs, right ascension and declination in degrees, or u and
-            v.  It has an inverse.
+            Model with inputs x and y and outputs right ascension and declination in degrees, or u
+            and v.  It has an inverse.
 
         Raises
         ------
         InputError
-            As for `wcs`.
+            See `wcs`.
         """
         return self.wcs(chip, epoch=epoch, **sky).to_model()
 
 
 @dataclass(frozen=True, eq=False)
 class GaussianSolution(Solution):
-    """Solution with a normal distribution of its parameters, of which nothing else is known."""
+    """Solution that consists only of a mean and a covariance of its parameters."""
 
     model: DistortionModel
     mean: Float
     cov: Float
 
     def draws(self, n: int, rng: Random) -> Float:
-        """Parameter vectors, shape (n, D)."""
+        """Random parameter vectors (n, D) from the normal distribution."""
         generator = generator_of(rng)
         return generator.multivariate_normal(self.mean, self.cov, size=n, method="eigh")
 
@@ -660,8 +688,22 @@ def calibration_of(
 ) -> Calibration:
     """Calibration of a fit or a posterior, without the frames of its exposures.
 
-    `scale` is the size of a corrected pixel and its source, by default 1 for u, v in pixels.  The
-    `plane` is by default that about the tangent point of the solution, and free without one.
+    Parameters
+    ----------
+    solution : Solution
+        Fit or posterior.
+    name : str
+        Name for messages.
+    plane : Plane, optional
+        By default the tangent plane of the solution, or a free plane if it has no tangent point.
+    detector, filter : str, optional
+    scale : tuple of (float, str), optional
+        Size of a corrected pixel in the unit of u and v, and its source; by default 1 for u and v
+        in pixels.
+
+    Returns
+    -------
+    Calibration
     """
     bare = solution if solution.model.frames == "none" else without_frames(solution)
     if plane is None and solution.tangent_point is not None and bare.model.unit in ARCSEC:
@@ -691,10 +733,10 @@ def calibration_of_exposure(
     filter: str = "",
     scale: tuple[float, str] | None = None,
 ) -> Calibration:
-    """Calibration of one exposure of a fit or a posterior, with its frame applied.
+    """Calibration of one exposure of a fit or a posterior, including the frame of the exposure.
 
-    The frame of an exposure (shift, rotation, scale, shear) becomes part of the polynomials, with
-    its covariance and its draws.
+    The frame (shift, rotation, scale, shear) is combined with the polynomials, as are its
+    covariance and its draws.
 
     Parameters
     ----------
@@ -703,11 +745,11 @@ def calibration_of_exposure(
     exposure : str
         Name of the exposure.
     name : str, optional
-        Name for messages, that of the exposure by default.
+        Name for messages (default: that of the exposure).
     epoch : float, str or Time, optional
-        Date of the exposure; needed by a model with time dependence.
+        Date of the exposure; required for a model with time dependence.
     plane, detector, filter, scale
-        As for `calibration_of`.
+        See `calibration_of`.
 
     Returns
     -------
@@ -731,7 +773,7 @@ def calibration_of_exposure(
 
 
 def as_calibration(one: Solution | Calibration) -> Calibration:
-    """Calibration of a solution; a calibration as it is."""
+    """Calibration of a solution; a calibration is returned unchanged."""
     return one if isinstance(one, Calibration) else calibration_of(one)
 
 
@@ -745,28 +787,46 @@ def calibration_of_maps(
     errors: str = "none",
     **what: Any,
 ) -> Calibration:
-    """Calibration from the polynomials of its chips, as files state them.
+    """Calibration from the polynomials of its chips, as given in files.
 
-    `maps` are by chip number, the reference chip first, of one order and unit, at the reference
-    date.  `rates` are by (chip, axis, i, j), of monomials x^i y^j, in the unit per pixel^(i + j)
-    and year, the terms being those of every chip.  `cov` (D, D) is of the parameters in the model's
-    order; other arguments are fields of `Calibration`.
+    Parameters
+    ----------
+    maps : mapping of int to ChipMap
+        Maps at the reference date by chip number, the reference chip first.  All must have the same
+        order and unit.
+    name : str
+        Name for messages.
+    rates : mapping, optional
+        Drift by (chip, axis, i, j) of the coefficients of monomials x^i y^j, in the unit of u and v
+        per pixel^(i + j) and year.  All chips must have the same drifting terms.
+    reference_date : float, optional
+        Decimal years.
+    cov : ndarray, shape (D, D), optional
+        Covariance of the parameters, in the order of the model.
+    errors : {'covariance', 'sigma', 'none'}
+        See `Calibration`.
+    **what
+        Further fields of `Calibration`.
+
+    Returns
+    -------
+    Calibration
     """
     first = next(iter(maps.values()))
     time = None
     if rates and reference_date is not None:
         time = TimeDependence(tuple(dict.fromkeys(key[1:] for key in rates)), (reference_date,))
     chips = tuple(
-        Chip(number, str(number), one.basis.size, one.basis.reference_pixel)
-        for number, one in maps.items()
+        Chip(number, str(number), chip_map.basis.size, chip_map.basis.reference_pixel)
+        for number, chip_map in maps.items()
     )
     model = DistortionModel(first.basis.order, chips, first.unit, time)
     mean = np.zeros(model.n_params)
-    for number, one in maps.items():
+    for number, chip_map in maps.items():
         for axis in (0, 1):
-            mean[model.coefficient_slice(number, axis)] = one.coefficients[axis]
+            mean[model.coefficient_slice(number, axis)] = chip_map.coefficients[axis]
         if time is not None and rates is not None:
-            half = one.basis.half_size
+            half = chip_map.basis.half_size
             mean[model.tdd_slice(number)] = [
                 rates[number, axis, i, j] * half[0] ** i * half[1] ** j for axis, i, j in time.terms
             ]

@@ -1,8 +1,9 @@
-"""One chip at one date: a polynomial from pixels to (u, v), with its covariance.
+"""Map of one chip at one date: a polynomial from pixels to (u, v), with its covariance.
 
-Fits, posteriors and files of every format are reduced to this, so that any two can be compared,
-applied, inverted.  Look-up tables are those of pixels before the polynomial and of positions after
-it, which are evaluated at the corrected pixel; they have no part in the covariance.
+Fits, posteriors and files of all formats are converted to such maps, so that any two of them can be
+compared, applied and inverted.  Look-up tables may correct the pixels before the polynomial, or add
+to the positions after it (evaluated at the corrected pixel).  The covariance does not include the
+errors of look-up tables.
 """
 
 from __future__ import annotations
@@ -19,24 +20,26 @@ from bayesdist.model import Chip, LookupTable, PolynomialBasis
 from bayesdist.model.basis import point_blocks
 from bayesdist.utils.arrays import Float
 
-# Newton's method has converged when a step is this short in pixels, which rounding allows.
+# Newton's method has converged if a step, in pixels, is below STEP, which is above rounding errors
 STEP, MAX_STEPS = 1e-9, 30
-_FIT_NODES = 129  # points of each axis over which a map is followed by a polynomial
-MOST_ORDER = 20  # of the polynomials of any file
-SINGULAR = 1e-12  # of the largest slope squared: below that a linear part has no inverse
+_FIT_NODES = 129  # points per axis in the fit of a polynomial to a map
+MOST_ORDER = 20  # highest polynomial order that is accepted from files
+SINGULAR = (
+    1e-12  # a linear part with a smaller determinant, over its largest entry squared, is singular
+)
 
 
 @dataclass(frozen=True, eq=False)
 class Monomials:
-    """Map as files state it: coefficients of (x - xref)^i (y - yref)^j."""
+    """Map in the form used in files: coefficients of (x - xref)^i (y - yref)^j."""
 
-    basis: PolynomialBasis  # for order, size and reference pixel
-    values: Float  # (2, K), of u and v, in the order of `terms`
+    basis: PolynomialBasis  # has the order, size and reference pixel
+    values: Float  # (2, K), coefficients of u and v in the order of `terms`
     cov: Float | None = None  # (2 K, 2 K), u before v
 
     @property
     def terms(self) -> tuple[tuple[int, int], ...]:
-        """Powers (i, j), length K."""
+        """Powers (i, j) of the K terms."""
         return self.basis.terms
 
     def index(self, i: int, j: int) -> int:
@@ -56,33 +59,33 @@ class Monomials:
 
 @dataclass(frozen=True, eq=False)
 class ChipMap:
-    """Map of one chip at one date by one calibration."""
+    """Map of one chip at one date."""
 
-    name: str  # of the calibration, for messages
+    name: str  # name of the calibration, for messages
     basis: PolynomialBasis
-    unit: str  # of u and v
-    coefficients: Float  # (2, K), Legendre, of u and v
+    unit: str  # unit of u and v
+    coefficients: Float  # (2, K), Legendre coefficients of u and v
     cov: Float | None = None  # (2 K, 2 K), u before v; None without errors
-    correlated: bool = True  # False where monomials have sigmas alone
-    draws: float = np.inf  # effective number behind `cov`; infinite if computed
-    chip: int | None = None  # None where the source numbers no chips
+    correlated: bool = True  # False if only standard deviations of monomials are known
+    draws: float = np.inf  # effective number of draws for `cov`; infinite if it is analytic
+    chip: int | None = None  # None if the source has no chip numbers
     epoch: float | None = None  # decimal years
-    notes: tuple[str, ...] = ()  # notes for the reader
-    before: tuple[LookupTable, ...] = ()  # in pixels, one after the other, before the polynomial
+    notes: tuple[str, ...] = ()  # notes for users
+    before: tuple[LookupTable, ...] = ()  # pixels, applied in sequence before the polynomial
     after: tuple[LookupTable, ...] = ()  # in the unit of u and v, added to the polynomial
 
     def __post_init__(self) -> None:
-        known = [self.coefficients] if self.cov is None else [self.coefficients, self.cov]
-        if not all(np.isfinite(values).all() for values in known):
+        arrays = [self.coefficients] if self.cov is None else [self.coefficients, self.cov]
+        if not all(np.isfinite(values).all() for values in arrays):
             raise InputError(
-                "holds coefficients or errors that are not finite",
+                "has coefficients or errors that are not finite",
                 where=self.name,
                 do="check the file",
             )
 
     @property
     def errors(self) -> str:
-        """Kind of its errors: 'none', 'sigma' or 'covariance'."""
+        """Kind of errors of the coefficients: 'none', 'sigma' or 'covariance'."""
         if self.cov is None:
             return "none"
         return "covariance" if self.correlated else "sigma"
@@ -99,7 +102,7 @@ class ChipMap:
         return out
 
     def design(self, x: Float, y: Float) -> Float:
-        """Basis functions (N, K) at pixels (N,), tables before the polynomial included."""
+        """Basis functions (N, K) at pixels (N,), after the tables `before` the polynomial."""
         return self.basis.evaluate(*self._corrected(x, y))
 
     def slope(self, x: ArrayLike, y: ArrayLike) -> Float:
@@ -111,7 +114,10 @@ class ChipMap:
         return out
 
     def covariance_at(self, x: Float, y: Float) -> Float | None:
-        """Covariances (N, 2, 2) of positions at pixels (N,); NaN stays NaN, None without errors."""
+        """Covariances (N, 2, 2) of the positions of pixels (N,); None without errors.
+
+        The result is NaN for pixels that are NaN.
+        """
         if self.cov is None:
             return None
         K = self.basis.n_terms
@@ -123,42 +129,59 @@ class ChipMap:
 
     @property
     def linear(self) -> Float:
-        """Derivatives (2, 2) at the reference pixel."""
+        """Derivatives d(u, v) / d(x, y) at the reference pixel, shape (2, 2)."""
         x, y = self.basis.reference_pixel
         return self.slope([x], [y])[0]
 
     def pixels(self, w: Float) -> tuple[Float, Float]:
-        """Pixels (2, N) at positions (2, N) by Newton's method, and derivatives (N, 2, 2) there.
+        """Invert the map by Newton's method.
 
-        The derivatives are d(u, v) / d(x, y).  Also beyond the edges of the chip; NaN where the
-        iteration does not converge.  InputError when the linear part at the reference pixel is
-        singular.
+        Parameters
+        ----------
+        w : ndarray, shape (2, N)
+            Positions (u, v), also beyond the edges of the chip.
+
+        Returns
+        -------
+        pixels : ndarray, shape (2, N)
+            FITS 1-based pixels; NaN if the iteration does not converge.
+        slope : ndarray, shape (N, 2, 2)
+            Derivatives d(u, v) / d(x, y) at the pixels.
+
+        Raises
+        ------
+        InputError
+            If the linear part at the reference pixel is singular.
         """
         linear = self.linear
         if abs(np.linalg.det(linear)) <= SINGULAR * np.abs(linear).max() ** 2:
             raise InputError(
-                "maps its zero point to a line, so that it has no inverse",
+                "has a singular linear part at its reference pixel, so that it has no inverse",
                 where=f"{self.name}, chip {self.chip}",
                 do="check the linear coefficients",
             )
-        found, slope = np.empty((2, w.shape[1])), np.empty((w.shape[1], 2, 2))
+        pixels, slope = np.empty((2, w.shape[1])), np.empty((w.shape[1], 2, 2))
         for rows in point_blocks(w.shape[1]):
-            found[:, rows], slope[rows] = self._newton(w[:, rows], linear)
-        return found, slope
+            pixels[:, rows], slope[rows] = self._newton(w[:, rows], linear)
+        return pixels, slope
 
     def unfolded_pixels(self, w: Float) -> Float:
-        """Pixels (2, N) at positions (2, N), as `pixels`; NaN beyond a fold of the map."""
-        found, slope = self.pixels(w)
+        """Pixels (2, N) at positions (2, N); see `pixels`.
+
+        The result is also NaN if the map is folded at the pixel, that is, if the sign of its
+        determinant differs from that at the reference pixel.
+        """
+        pixels, slope = self.pixels(w)
         det = slope[:, 0, 0] * slope[:, 1, 1] - slope[:, 0, 1] * slope[:, 1, 0]
-        found[:, ~(det * np.linalg.det(self.linear) > 0)] = np.nan
-        return found
+        pixels[:, ~(det * np.linalg.det(self.linear) > 0)] = np.nan
+        return pixels
 
     def _newton(self, w: Float, linear: Float) -> tuple[Float, Float]:
         zero = np.array(self.basis.reference_pixel)[:, None]
         pixels = zero + np.linalg.solve(linear, w - self._values_and_slopes(zero)[0])
         moving = np.isfinite(pixels).all(axis=0)
         pixels[:, ~moving] = np.nan
-        far = 3.0 * max(self.basis.size)  # where a polynomial means nothing any more
+        far = 3.0 * max(self.basis.size)  # a polynomial is meaningless so far outside
         for _ in range(MAX_STEPS):
             if not moving.any():
                 break
@@ -178,14 +201,14 @@ class ChipMap:
         return pixels, slope
 
     def _values_and_slopes(self, pixels: Float) -> tuple[Float, Float]:
-        """Values (2, N) and derivatives (N, 2, 2) by the pixel."""
+        """Positions (2, N) and their derivatives (N, 2, 2) with respect to the pixels (2, N)."""
         inner = np.eye(2)
         for table in self.before:
             inner = _slope(table, *pixels) @ inner
             pixels = pixels + _shift(table, *pixels)
         by_x, by_y = self.basis.derivatives
         C = self.coefficients.T
-        # in one pass over the basis functions, which are far more numbers than the results
+        # one product for values and derivatives, so that the basis functions are read only once
         all_six = self.basis.evaluate(*pixels) @ np.hstack([C, by_x @ C, by_y @ C])
         value = all_six[:, :2].T
         slope = np.stack([all_six[:, 2:4], all_six[:, 4:]], axis=-1)
@@ -195,14 +218,14 @@ class ChipMap:
         return value, slope @ inner if self.before else slope
 
     def _corrected(self, x: Float, y: Float) -> tuple[Float, Float]:
-        """Pixels after the tables before the polynomial."""
+        """Apply the tables `before` the polynomial to pixels."""
         for table in self.before:
             dx, dy = _shift(table, x, y)
             x, y = x + dx, y + dy
         return x, y
 
     def monomials(self) -> Monomials:
-        """Map in powers of offsets from the reference pixel."""
+        """Convert to coefficients of powers of the offsets from the reference pixel."""
         values = self.basis.to_monomials(self.coefficients)
         cov = None
         if self.cov is not None:
@@ -211,7 +234,7 @@ class ChipMap:
         return Monomials(self.basis, values, cov)
 
     def padded(self, n_terms: int) -> tuple[Float, Float | None]:
-        """Coefficients (2, n) and covariance (2 n, 2 n), zero for terms that are missing."""
+        """Coefficients (2, n) and covariance (2 n, 2 n), extended with zeros to n terms."""
         K = self.basis.n_terms
         coefficients = np.zeros((2, n_terms))
         coefficients[:, :K] = self.coefficients
@@ -222,7 +245,7 @@ class ChipMap:
         return coefficients, cov.reshape(2 * n_terms, 2 * n_terms)
 
     def transformed(self, linear: ArrayLike, shift: ArrayLike = (0.0, 0.0)) -> ChipMap:
-        """Map to linear (u, v) + shift, both taken as exact."""
+        """Map to the positions linear (u, v) + shift; the transformation is taken as exact."""
         L = np.asarray(linear, float)
         after = tuple(
             replace(t, values=np.einsum("ab,byx->ayx", L, t.values), sigma=None) for t in self.after
@@ -231,59 +254,72 @@ class ChipMap:
         coefficients[:, 0] += np.asarray(shift, float)  # the first basis function is 1
         cov = None
         if self.cov is not None:
-            by = np.kron(L, np.eye(self.basis.n_terms))
-            cov = by @ self.cov @ by.T
+            change = np.kron(L, np.eye(self.basis.n_terms))
+            cov = change @ self.cov @ change.T
         return replace(self, coefficients=coefficients, cov=cov, after=after)
 
     def polynomial(self, order: int) -> tuple[ChipMap, float, float]:
-        """Map without tables, of an order, and how far it is off: largest and rms, pixels.
+        """Approximate the map by a polynomial of some order without look-up tables.
 
-        The polynomial is fitted over the detector; where there are no tables and the order is not
-        below that of the map, the map stays as it is.  The errors are those of the terms that both
-        have.
+        The polynomial is fitted over the detector, and the covariance is that of the common terms.
+        A map without look-up tables is returned unchanged if its order is not above `order`.
+
+        Parameters
+        ----------
+        order : int
+
+        Returns
+        -------
+        polynomial : ChipMap
+        worst, rms : float
+            Largest and rms residual in pixels.
         """
         if not self.before and not self.after and order >= self.basis.order:
             return self, 0.0, 0.0
         basis = PolynomialBasis(order, self.basis.size, self.basis.reference_pixel)
         x, y = _even_grid(basis.size)
-        design, wanted = basis.evaluate(x, y), self.at(x, y)
-        coefficients = np.asarray(np.linalg.lstsq(design, wanted.T, rcond=None)[0].T, float)
-        left = np.hypot(*(design @ coefficients.T - wanted.T).T)
-        left /= np.sqrt(abs(np.linalg.det(self.linear)))
+        design, positions = basis.evaluate(x, y), self.at(x, y)
+        coefficients = np.asarray(np.linalg.lstsq(design, positions.T, rcond=None)[0].T, float)
+        residual = np.hypot(*(design @ coefficients.T - positions.T).T)
+        residual /= np.sqrt(abs(np.linalg.det(self.linear)))
         cov, K = None, self.basis.n_terms
         if self.cov is not None:
-            same = min(K, basis.n_terms)
-            both = np.zeros((2, basis.n_terms, 2, basis.n_terms))
-            both[:, :same, :, :same] = self.cov.reshape(2, K, 2, K)[:, :same, :, :same]
-            cov = both.reshape(2 * basis.n_terms, -1)
-        made = replace(self, basis=basis, coefficients=coefficients, cov=cov, before=(), after=())
-        return made, float(left.max()), float(np.sqrt(np.mean(left**2)))
+            n_common = min(K, basis.n_terms)
+            common = np.zeros((2, basis.n_terms, 2, basis.n_terms))
+            common[:, :n_common, :, :n_common] = self.cov.reshape(2, K, 2, K)[
+                :, :n_common, :, :n_common
+            ]
+            cov = common.reshape(2 * basis.n_terms, -1)
+        approximation = replace(
+            self, basis=basis, coefficients=coefficients, cov=cov, before=(), after=()
+        )
+        return approximation, float(residual.max()), float(np.sqrt(np.mean(residual**2)))
 
 
 def _shift(table: LookupTable, x: Float, y: Float) -> Float:
-    """Values (2, N) of a table; NaN where a pixel is."""
-    known = np.isfinite(x) & np.isfinite(y)
+    """Shifts (2, N) of a table; NaN for pixels that are NaN."""
+    finite = np.isfinite(x) & np.isfinite(y)
     out = np.full((2, x.size), np.nan)
-    out[:, known] = table.evaluate(x[known], y[known]).T
+    out[:, finite] = table.evaluate(x[finite], y[finite]).T
     return out
 
 
 def _slope(table: LookupTable, x: Float, y: Float) -> Float:
-    """Derivatives (N, 2, 2) of the corrected pixel by the pixel; NaN where a pixel is."""
-    known = np.isfinite(x) & np.isfinite(y)
+    """Derivatives (N, 2, 2) of the corrected with respect to the original pixel; NaN for NaN."""
+    finite = np.isfinite(x) & np.isfinite(y)
     out = np.full((x.size, 2, 2), np.nan)
-    out[known] = table.gradient(x[known], y[known])
+    out[finite] = table.gradient(x[finite], y[finite])
     return out
 
 
 def _even_grid(size: tuple[float, float]) -> tuple[Float, Float]:
-    """Points (N,) over a detector, denser than any table that a polynomial could follow."""
+    """Uniform grid of pixels (N,) over a detector, denser than the nodes of look-up tables."""
     x, y = np.meshgrid(*(np.linspace(0.5, n + 0.5, _FIT_NODES) for n in size))
     return x.ravel(), y.ravel()
 
 
 def chip_of(maps: Mapping[int, ChipMap], number: int, where: str) -> ChipMap:
-    """Map of a chip; InputError for an unknown one."""
+    """Map of a chip; raises InputError if the chip is unknown."""
     if number not in maps:
         raise InputError(
             f"there is no chip {number}",
@@ -296,17 +332,34 @@ def chip_of(maps: Mapping[int, ChipMap], number: int, where: str) -> ChipMap:
 def chosen_chip(
     numbers: Sequence[int], chip: int | None, *, where: str, argument: str = "chip"
 ) -> int:
-    """Number of the chip that is asked for; it may be omitted if there is only one.
+    """Validate a chip number, which may be omitted if there is only one chip.
 
-    `argument` is what the user gives it by: an argument in Python, or an option of a command.
-    InputError if there is no such chip, or there are several and none is given.
+    Parameters
+    ----------
+    numbers : sequence of int
+        Available chip numbers.
+    chip : int or None
+        Requested chip number.
+    where : str
+        File or name, for the error message.
+    argument : str
+        Name of the argument or command-line option, for the error message.
+
+    Returns
+    -------
+    int
+
+    Raises
+    ------
+    InputError
+        If the chip does not exist, or there are several chips and none is requested.
     """
     if chip is None and len(numbers) == 1:
         return numbers[0]
     if chip is not None and chip in numbers:
         return int(chip)
     raise InputError(
-        f"has {len(numbers)} chips, and none is named"
+        f"has {len(numbers)} chips, but none is given"
         if chip is None
         else f"there is no chip {chip!r}",
         where=where,
@@ -315,7 +368,7 @@ def chosen_chip(
 
 
 def sampling_of(solution: Solution) -> tuple[float, tuple[str, ...]]:
-    """Effective number of draws behind a solution's covariance, and notes on these."""
+    """Effective number of draws for the covariance of a solution, and notes on convergence."""
     convergence = solution.convergence
     if convergence is None:
         return np.inf, ()
@@ -324,10 +377,10 @@ def sampling_of(solution: Solution) -> tuple[float, tuple[str, ...]]:
 
 
 def refuse_order(order: int, name: str) -> None:
-    """Raise InputError for a polynomial of an order that only a misprint has."""
-    if order > MOST_ORDER:  # time and memory go with its fourth power
+    """Raise InputError if the order of a polynomial is so high that it must be a misprint."""
+    if order > MOST_ORDER:  # time and memory are proportional to its fourth power
         raise InputError(
-            f"the order of its polynomials is {order}, and at most {MOST_ORDER} is read",
+            f"the order of its polynomials is {order}, but at most {MOST_ORDER} is supported",
             where=name,
             do="correct the file",
         )
@@ -344,15 +397,36 @@ def fitted_map(
     monomial_cov: Float | None = None,
     chip: int | None = None,
 ) -> ChipMap:
-    """Map with the values of a function from pixels to (u, v) that is a polynomial.
+    """Map of a chip from a function that is known to be a polynomial.
 
-    `positions` takes FITS 1-based pixels x, y (N,) to u and v (2, N), a polynomial of total order
-    `order`; `monomial_cov` (2 K, 2 K) is of the coefficients of (x - xref)^i (y - yref)^j, u before
-    v; other arguments as in `PolynomialBasis` and `ChipMap`.
+    Parameters
+    ----------
+    positions : callable
+        Function of FITS 1-based pixels x, y (N,) that returns u and v (2, N) and is a polynomial of
+        total order `order`.
+    name : str
+        Name of the calibration.
+    order, size, reference_pixel
+        See `PolynomialBasis`.
+    unit : str
+        Unit of u and v.
+    monomial_cov : ndarray, shape (2 K, 2 K), optional
+        Covariance of the coefficients of (x - xref)^i (y - yref)^j, u before v.
+    chip : int, optional
+        Chip number.
+
+    Returns
+    -------
+    ChipMap
+
+    Raises
+    ------
+    InputError
+        If the order is too high.
     """
     refuse_order(order, name)
     basis = PolynomialBasis(order, size, reference_pixel)
-    # products of two terms have twice the order, for which so many nodes are exact
+    # products of two terms have twice the order; order + 1 nodes integrate them exactly
     x, y, weight = Chip(1, "", size, reference_pixel).quadrature(order + 1)
     norm = basis.mean_squares * weight.sum()
     coefficients = (np.asarray(positions(x, y)) * weight) @ basis.evaluate(x, y) / norm
@@ -367,18 +441,22 @@ def fitted_map(
 def position_moments(
     coefficients: Float, basis: PolynomialBasis, x: Float, y: Float
 ) -> tuple[Float, Float, Float]:
-    """Variances and covariance (N,) of u, v at pixels, from second moments (2, K, 2, K)."""
+    """Variance of u, of v, and covariance, each (N,), from those of the coefficients.
+
+    `coefficients` (2, K, 2, K) is the covariance of the coefficients; x and y (N,) are FITS 1-based
+    pixels.
+    """
     out = np.empty((3, x.size))
     for rows in point_blocks(x.size):
         phi = basis.evaluate(x[rows], y[rows])
         for k, (a, b) in enumerate(((0, 0), (1, 1), (0, 1))):
             out[k, rows] = np.einsum("nk,nk->n", phi @ coefficients[a, :, b, :], phi)
-    # rounding may leave a variance of zero slightly below it
+    # rounding can make a variance of zero slightly negative
     return np.maximum(out[0], 0.0), np.maximum(out[1], 0.0), out[2]
 
 
 def _solved(a: Float, b: Float) -> Float:
-    """Solutions (2, N) of 2 x 2 systems (N, 2, 2) for (2, N); infinite where one is singular."""
+    """Solutions (2, N) of 2 x 2 systems a (N, 2, 2) x = b (2, N); infinite if singular."""
     det = a[:, 0, 0] * a[:, 1, 1] - a[:, 0, 1] * a[:, 1, 0]
     x = a[:, 1, 1] * b[0] - a[:, 0, 1] * b[1]
     y = a[:, 0, 0] * b[1] - a[:, 1, 0] * b[0]

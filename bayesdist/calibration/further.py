@@ -1,4 +1,4 @@
-"""Errors of positions that are in no covariance of parameters, as a file can carry them."""
+"""Position errors outside of the covariance of the parameters, in a form for files."""
 
 from __future__ import annotations
 
@@ -8,50 +8,54 @@ from typing import Any
 
 from bayesdist.errors import FormatError
 
-SHARED = "systematic"  # kind of an error that all stars of an image have in common
+SHARED = "systematic"  # kind of an error that is common to all stars of an image
 
 
 @dataclass(frozen=True)
 class FurtherError:
-    """Row of an error budget beside the covariance: root mean squares over the detector."""
+    """Row of an error budget that the covariance of the parameters does not include."""
 
     name: str
-    # 'systematic' (shared by the stars of an image), 'random' (of each star) or 'local' (shared by
-    # the stars near a position)
+    # 'systematic' (common to all stars of an image), 'random' (independent for each star) or
+    # 'local' (common to stars that are close together)
     kind: str
-    u: float  # standard deviation, in the unit of u, v
-    v: float
+    u: float  # rms over the detector of the error along u, in the unit of u and v
+    v: float  # the same along v
     source: str = ""
-    # of a local error: fractions of its variance with the correlation lengths, in pixels, of fields
-    # that the stars of a chip share; the rest is independent from star to star
+    # for local errors: (fraction of the variance, correlation length in pixels) of each correlated
+    # component; the remaining variance is independent for each star
     correlation: tuple[tuple[float, float], ...] = ()
 
     @property
     def shared(self) -> bool:
-        """True for an error that all stars of an image have in common."""
+        """True if the error is common to all stars of an image."""
         return self.kind == SHARED
 
 
 def scaled(rows: Sequence[FurtherError], factor: float) -> tuple[FurtherError, ...]:
-    """Rows in another unit."""
+    """Convert rows to another unit."""
     return tuple(replace(row, u=factor * row.u, v=factor * row.v) for row in rows)
 
 
 def further_from(records: Sequence[Mapping[str, Any]], where: str) -> tuple[FurtherError, ...]:
-    """Rows of records; FormatError for one that lacks a part."""
+    """Rows from the records of a file; raises FormatError if a record is incomplete."""
     try:
         return tuple(
             FurtherError(
-                str(one["name"]),
-                str(one["kind"]),
-                float(one["u"]),
-                float(one["v"]),
-                str(one.get("source", "")),
-                tuple((float(part), float(length)) for part, length in one.get("correlation", ())),
+                str(record["name"]),
+                str(record["kind"]),
+                float(record["u"]),
+                float(record["v"]),
+                str(record.get("source", "")),
+                tuple(
+                    (float(part), float(length)) for part, length in record.get("correlation", ())
+                ),
             )
-            for one in records
+            for record in records
         )
     except (KeyError, TypeError, ValueError) as error:
         raise FormatError(
-            f"holds a further error that is not whole ({error})", where=where, do="write it again"
+            f"has an incomplete entry for a further error ({error})",
+            where=where,
+            do="write the file again",
         ) from None

@@ -1,7 +1,7 @@
-"""Functions behind methods of `Calibration` that lie in modules which import it.
+"""Functions that implement methods of `Calibration` in modules of higher layers.
 
-A calibration is written by formats, which are built on it.  Methods load these functions by name
-when they are called; this is the only place where a lower layer names an upper one.
+These modules import `Calibration`, so that it cannot import them.  Its methods import the functions
+by name when they are called.  No other module of a lower layer refers to a higher one.
 """
 
 WRITE = "bayesdist.products.writing:write_calibration"

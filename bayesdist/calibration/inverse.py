@@ -1,10 +1,11 @@
-"""Explicit inverses: polynomials from positions back to pixels, and their closure errors.
+"""Explicit inverses: polynomials from positions to pixels, and their closure errors.
 
     (U, V) = L^-1 (position - zero),    x = x0 + U + P(U, V),    y = y0 + V + Q(U, V)
 
-Newton's method on the forward polynomials does not need them; programs that cannot iterate, or
-start their iterations there, do.  AP and BP of SIP are of this form, with L the CD matrix; so are
-INVERSE rows of an IDCTAB, with L = 1 and P(0, 0) = 0.
+This package inverts the forward polynomials by Newton's method instead.  Explicit inverses are
+needed for programs that cannot iterate or that use them as a starting point.  AP and BP of SIP have
+this form, with the CD matrix as L, and so have the INVERSE rows of an IDCTAB, with L = 1 and
+P(0, 0) = 0.
 """
 
 from __future__ import annotations
@@ -24,35 +25,36 @@ from bayesdist.utils.arrays import Float
 Terms = Mapping[tuple[int, int], float]
 Forward = Callable[[Float, Float], tuple[Float, Float]]
 
-# Points of each axis: of the fits, and of the check of their closure.
+# points per axis of the grids for the fits and for the closure errors
 FIT_NODES, CHECK_NODES = 65, 257
 
 
 @dataclass(frozen=True, eq=False)
 class ExplicitInverse:
-    """Pixels of one chip as polynomials of positions."""
+    """Inverse map of one chip: pixels as polynomials of positions."""
 
     reference_pixel: tuple[float, float]  # (x0, y0), FITS 1-based
-    x_terms: Terms  # P by powers (p, q) of (U, V), pixels
-    y_terms: Terms  # Q
-    zero: tuple[float, float] = (0.0, 0.0)  # position of the reference pixel
-    linear: Float | None = None  # L (2, 2); 1 if None
-    jacobian: Float | None = None  # (2 n, 2 K), of the terms (x first) by the map's coefficients
+    x_terms: Terms  # coefficients of P by powers (p, q) of (U, V), pixels
+    y_terms: Terms  # coefficients of Q
+    zero: tuple[float, float] = (0.0, 0.0)  # position (u, v) of the reference pixel
+    linear: Float | None = None  # L (2, 2); the identity if None
+    # (2 n, 2 K), derivatives of the n terms, x first, with respect to the map's coefficients
+    jacobian: Float | None = None
 
     @property
     def order(self) -> int:
-        """Largest total power."""
+        """Total order of the polynomials."""
         return max(i + j for i, j in self.x_terms)
 
     def pixels(self, u: ArrayLike, v: ArrayLike) -> tuple[Float, Float]:
-        """Pixels, FITS 1-based, of positions (N,)."""
+        """FITS 1-based pixels x and y of positions (N,)."""
         at = np.stack([np.asarray(u, float) - self.zero[0], np.asarray(v, float) - self.zero[1]])
         U, V = at if self.linear is None else np.linalg.solve(self.linear, at)
         x, y = (_value(terms, U, V) for terms in (self.x_terms, self.y_terms))
         return self.reference_pixel[0] + U + x, self.reference_pixel[1] + V + y
 
     def misses(self, chip: ChipMap) -> tuple[float, float]:
-        """Largest and rms distance over a chip of pixels from their images there and back."""
+        """Closure error: largest and rms distance of pixels from the inverse of their positions."""
         x, y = detector_grid(chip.basis.size)
         back = self.pixels(*chip.at(x, y))
         far = np.hypot(back[0] - x, back[1] - y)
@@ -67,11 +69,29 @@ def fitted_inverse(
     constant: bool = True,
     linear: Float | None = None,
 ) -> ExplicitInverse:
-    """Inverse of a map, fitted over the whole chip, with its derivatives.
+    """Fit an explicit inverse to a map over the whole chip.
 
-    The order is by default one above that of the map, and at most 12; `nodes` are the points of
-    each axis; P and Q have constant terms with `constant`; L is by default the derivatives at the
-    reference pixel.  InputError for an order outside 1 to 12, or a chip that is folded onto itself.
+    Parameters
+    ----------
+    chip : ChipMap
+    order : int, optional
+        Order of the inverse, 1 to 12; by default one above that of the map.
+    nodes : int
+        Points per axis of the grid for the fit.
+    constant : bool
+        True if P and Q have constant terms.
+    linear : ndarray, shape (2, 2), optional
+        Matrix L; by default the derivatives at the reference pixel.
+
+    Returns
+    -------
+    ExplicitInverse
+        Inverse with the derivatives of its terms.
+
+    Raises
+    ------
+    InputError
+        If the order is not from 1 to 12, or the map is not one-to-one.
     """
     basis = chip.basis
     if order is None:
@@ -92,10 +112,10 @@ def fitted_inverse(
     fit = _Fit.of(U, V, order, constant=constant)
     offsets = np.stack([x - x0 - U, y - y0 - V], axis=1)
     terms = fit.terms(offsets)
-    # at a fixed position a change dX of the forward map moves the pixel by -(dX/dx)^-1 dX
+    # at a fixed position a change dX of the forward map shifts the pixel by -(dX/dx)^-1 dX
     phi = basis.evaluate(x, y)
     if not constant:
-        phi = phi - basis.evaluate([x0], [y0])  # the reference pixel stays where it is
+        phi = phi - basis.evaluate([x0], [y0])  # the reference pixel is not shifted
     back = -np.linalg.inv(slope)
     jacobian = np.einsum("kn,nab,nl->akbl", fit.projection, back, phi, optimize=True)
     return ExplicitInverse(
@@ -110,12 +130,21 @@ def fitted_inverse(
 def fit_inverse(
     forward: Forward, reference_pixel: tuple[float, float], size: tuple[float, float], order: int
 ) -> tuple[dict[tuple[int, int], float], dict[tuple[int, int], float]]:
-    """Terms P and Q, by powers of (U, V), of the inverse of a map from pixels (x, y) to (U, V).
+    """Fit the inverse polynomials P and Q of a map from pixels (x, y) to (U, V).
 
-    Orthogonal polynomials over the bounding box of the detector's image carry the fit.  Its points
-    are denser at the detector's edges (Chebyshev's extrema): that halves the worst error, which a
-    uniform grid leaves in the corners.  InputError when the map folds the detector onto itself, so
-    that there is no inverse.
+    The fit uses orthogonal polynomials over the bounding box of the mapped detector.  The grid
+    consists of Chebyshev extrema, which are denser near the edges of the detector; this halves the
+    largest error, which occurs in the corners for a uniform grid.
+
+    Returns
+    -------
+    x_terms, y_terms : dict
+        Coefficients of P and Q by powers of (U, V).
+
+    Raises
+    ------
+    InputError
+        If the map is not one-to-one over the detector.
     """
     x, y = detector_grid(size, FIT_NODES, chebyshev=True)
     U, V = forward(x, y)
@@ -127,7 +156,7 @@ def fit_inverse(
 def detector_grid(
     size: tuple[float, float], nodes: int = CHECK_NODES, *, chebyshev: bool = False
 ) -> tuple[Float, Float]:
-    """Grid x, y (nodes^2,) over the pixel centres from corner to corner, even or Chebyshev's."""
+    """Grid x, y (nodes^2,) between the centres of the corner pixels, uniform or Chebyshev."""
     t = np.linspace(-1.0, 1.0, nodes)
     if chebyshev:
         t = np.sin(t * np.pi / 2)
@@ -137,7 +166,7 @@ def detector_grid(
 
 
 def check_one_to_one(U: Float, V: Float, nodes: int, areas: Float | None = None) -> None:
-    """Refuse a map that folds the detector: cells of a grid of it must keep their sense."""
+    """Raise InputError if a map is folded, that is, if any cell of the grid changes its parity."""
     if areas is None:
         u, v = U.reshape(nodes, nodes), V.reshape(nodes, nodes)
         du_x, dv_x = u[:-1, 1:] - u[:-1, :-1], v[:-1, 1:] - v[:-1, :-1]
@@ -146,22 +175,22 @@ def check_one_to_one(U: Float, V: Float, nodes: int, areas: Float | None = None)
     if areas.min() <= 0:
         raise InputError(
             "the distortion maps several pixels to one position, so it has no inverse",
-            do="lower the order or fit stars over the whole detector",
+            do="lower the order, or fit stars that cover the whole detector",
         )
 
 
 @dataclass(frozen=True, eq=False)
 class _Fit:
-    """Least squares by orthogonal polynomials over the bounding box of some points."""
+    """Least-squares fit of orthogonal polynomials over the bounding box of N points."""
 
     basis: PolynomialBasis
-    design: Float  # (N, K), or (N, K - 1) of functions that vanish at (0, 0)
-    at_zero: Float | None  # (K - 1,): constants that make them vanish
+    design: Float  # (N, K); (N, K - 1) if the functions vanish at (0, 0)
+    at_zero: Float | None  # (K - 1,), values at (0, 0) that were subtracted so that they vanish
 
     @classmethod
     def of(cls, U: Float, V: Float, order: int, *, constant: bool) -> _Fit:
         extent = np.ptp(U), np.ptp(V)
-        # a basis is made for pixels 0.5 .. n + 0.5: move the box there, its zero point with it
+        # a basis covers pixels 0.5 to n + 0.5, so the box and its zero point are shifted there
         zero = [(n + 1) / 2 - (w.max() + w.min()) / 2 for n, w in zip(extent, (U, V), strict=True)]
         basis = PolynomialBasis(order, extent, (zero[0], zero[1]))
         design = basis.evaluate(U + zero[0], V + zero[1])
@@ -171,16 +200,16 @@ class _Fit:
         return cls(basis, design[:, 1:] - at_zero, at_zero)
 
     def _monomials(self, fitted: Float) -> Float:
-        """Coefficients (K, M) of powers of U, V, from those of the functions of the design."""
+        """Convert coefficients of the design's functions to those (K, M) of powers of U and V."""
         if self.at_zero is None:
             return self.basis.monomial_matrix @ fitted
-        whole = np.concatenate([-(self.at_zero @ fitted)[None], fitted])
-        out = self.basis.monomial_matrix @ whole
+        with_constant = np.concatenate([-(self.at_zero @ fitted)[None], fitted])
+        out = self.basis.monomial_matrix @ with_constant
         out[0] = 0.0
         return out
 
     def terms(self, wanted: Float) -> tuple[dict, dict]:
-        """Polynomials through values (N, 2), as powers and their coefficients."""
+        """Fit polynomials to values (N, 2); coefficients by power for both columns."""
         fitted = np.asarray(np.linalg.lstsq(self.design, wanted, rcond=None)[0], float)
         powers = self.basis.terms
         x, y = (
@@ -194,7 +223,7 @@ class _Fit:
 
     @property
     def projection(self) -> Float:
-        """Matrix (n, N) from values at the points to the coefficients of powers."""
+        """Matrix (n, N) that converts values at the points to coefficients of powers."""
         out = self._monomials(np.asarray(np.linalg.pinv(self.design), float))
         return out if self.at_zero is None else out[1:]
 

@@ -1,9 +1,9 @@
-"""Models of astropy.modeling for a chip: pixels to a plane or to the sky, and back.
+"""Models of astropy.modeling for a chip: from pixels to a plane or the sky, and back.
 
     pixel -> look-up tables -> offset from the reference pixel -> two Polynomial2D -> plane
 
-Pixels are 0-based as everywhere in astropy and gwcs.  In distortion reference files the plane is
-rotated to V2, V3 and shifted to the position of the aperture; on the sky it is a tangent plane.
+Pixels are 0-based, as in astropy and gwcs.  In distortion reference files the plane is rotated to
+V2, V3 and shifted to the position of the aperture; on the sky it is a tangent plane.
 """
 
 from __future__ import annotations
@@ -22,18 +22,31 @@ from bayesdist.errors import InputError
 from bayesdist.model import LookupTable
 from bayesdist.utils.arrays import Float
 
-# Fixed-point steps that invert tables: each leaves the table's largest slope times what was left.
+# fixed-point iteration that inverts tables: error in pixels to be reached, and maximum number of
+# steps; each step multiplies the error by at most the largest slope of the table
 _LEFT, _MOST_STEPS = 1e-10, 12
 _SPLIT = models.Mapping((0, 1, 0, 1))
 
 
 def plane_model(chip: ChipMap, inverse_order: int | None = None) -> Model:
-    """Model from 0-based pixels to the plane (u, v) of a chip, with its inverse.
+    """Model from 0-based pixels to the plane (u, v) of a chip, with an inverse.
 
-    The inverse iterates by default; with `inverse_order` it is a polynomial that is fitted over the
-    chip, and every part of the model is one that ASDF can write.
-    InputError for such a polynomial beside look-up tables behind the polynomial of the chip, and as
-    for `fitted_inverse`.
+    Parameters
+    ----------
+    chip : ChipMap
+    inverse_order : int, optional
+        Order of a polynomial inverse that is fitted over the chip, so that ASDF can write all parts
+        of the model.  By default the inverse uses Newton's method.
+
+    Returns
+    -------
+    astropy.modeling.Model
+
+    Raises
+    ------
+    InputError
+        If a polynomial inverse is requested for a chip with look-up tables `after` the polynomial,
+        or cannot be fitted (see `fitted_inverse`).
     """
     x, y = chip.basis.reference_pixel
     poly = chip.monomials()
@@ -49,9 +62,9 @@ def plane_model(chip: ChipMap, inverse_order: int | None = None) -> Model:
         return model
     if chip.after:
         raise InputError(
-            "has look-up tables behind its polynomial, which no fitted inverse takes back",
+            "has look-up tables after its polynomial, which a fitted inverse cannot include",
             where=chip.name,
-            do="leave inverse_order out",
+            do="omit inverse_order",
         )
     back = fitted_inverse(replace(chip, before=()), inverse_order)
     model.inverse = inverse_transform(back, np.eye(2), (0.0, 0.0), chip.before)
@@ -61,7 +74,8 @@ def plane_model(chip: ChipMap, inverse_order: int | None = None) -> Model:
 def sky_model(plane: Model, placement: SkyPlacement) -> Model:
     """Model from 0-based pixels to right ascension and declination in degrees.
 
-    `plane` is the model from pixels to the plane, to which the projection is added.
+    `plane` is the model from pixels to the plane, and `placement` the position of the plane on the
+    sky.
     """
     ra, dec = placement.point
     return _chain(
@@ -80,7 +94,7 @@ class PlaneToPixel(Model):
     Parameters
     ----------
     chip : ChipMap
-        Map that is inverted, look-up tables included.
+        Map to be inverted, including its look-up tables.
     """
 
     n_inputs = 2
@@ -92,12 +106,12 @@ class PlaneToPixel(Model):
         self.chip = chip
 
     def evaluate(self, u: Float, v: Float) -> tuple[Float, Float]:
-        """Pixels of positions of any shape; NaN if no pixel has a position."""
+        """0-based pixels of positions of any shape; NaN if there is no such pixel."""
         u, v = np.broadcast_arrays(np.asarray(u, float), np.asarray(v, float))
         x, y = self.chip.unfolded_pixels(np.stack([u.ravel(), v.ravel()])) - 1.0
         return x.reshape(u.shape), y.reshape(u.shape)
 
-    # astropy would read the annotations of `evaluate` as units
+    # without these properties astropy would take the annotations of `evaluate` for units
     @property
     def input_units(self) -> None:
         """None: the inputs are numbers."""
@@ -118,10 +132,18 @@ class PlaneToPixel(Model):
 def forward_transform(
     poly: Monomials, matrix: Float, v2v3: tuple[float, float], tables: Sequence[LookupTable] = ()
 ) -> Model:
-    """Transform from 0-based pixels to V2, V3 [arcsec], without inverse.
+    """Model from 0-based pixels to V2, V3 in arcsec, without an inverse.
 
-    `poly` maps FITS pixels to the plane in arcsec; `matrix` turns that to V2, V3; `tables` are
-    applied in their order.
+    Parameters
+    ----------
+    poly : Monomials
+        Polynomials from FITS 1-based pixels to the plane in arcsec.
+    matrix : ndarray, shape (2, 2)
+        Rotation from the plane to V2, V3.
+    v2v3 : tuple of float
+        V2, V3 of the zero point of the plane, arcsec.
+    tables : sequence of LookupTable
+        Look-up tables that are applied in this order before the polynomials.
     """
     x, y = poly.basis.reference_pixel
     parts = [_corrected(table) for table in tables]
@@ -138,7 +160,7 @@ def forward_transform(
 def inverse_transform(
     back: ExplicitInverse, matrix: Float, v2v3: tuple[float, float], tables: Sequence[LookupTable]
 ) -> Model:
-    """Transform from V2, V3 [arcsec] to 0-based pixels."""
+    """Model from V2, V3 in arcsec to 0-based pixels; see `forward_transform`."""
     x, y = back.reference_pixel
     linear = np.eye(2) if back.linear is None else back.linear
     terms = [dict(back.x_terms), dict(back.y_terms)]
@@ -158,10 +180,10 @@ def inverse_transform(
 
 
 def _chain(parts: Sequence[Model]) -> Model:
-    whole, *others = parts
-    for part in others:
-        whole = whole | part
-    return whole
+    combined, *following = parts
+    for part in following:
+        combined = combined | part
+    return combined
 
 
 def _pair(kind: type[Model], a: float, b: float) -> Model:
@@ -169,7 +191,7 @@ def _pair(kind: type[Model], a: float, b: float) -> Model:
 
 
 def _polynomials(x_terms: Terms, y_terms: Terms) -> Model:
-    """Two polynomials side by side."""
+    """Parallel combination of two polynomials."""
     return _polynomial(x_terms) & _polynomial(y_terms)
 
 
@@ -179,10 +201,10 @@ def _polynomial(terms: Terms) -> Model:
 
 
 def _shifts(table: LookupTable) -> tuple[Model, Model]:
-    """Tables of both axes over 0-based pixels.
+    """Models of the shifts along x and y as functions of 0-based pixels.
 
-    `Tabular2D` goes on in a straight line beyond its outermost nodes, and ours are constant there:
-    a further row of equal nodes all around makes it so.
+    `Tabular2D` extrapolates linearly beyond its outermost nodes, whereas look-up tables are
+    constant there.  The outermost nodes are therefore repeated once on all sides.
     """
     x, y = table.nodes()
     points = tuple(
@@ -190,7 +212,7 @@ def _shifts(table: LookupTable) -> tuple[Model, Model]:
         for n, step in zip((x, y), table.step, strict=True)
     )
     values = np.pad(table.values, ((0, 0), (1, 1), (1, 1)), mode="edge")
-    one, two = (
+    along_x, along_y = (
         models.Tabular2D(
             points=points,
             lookup_table=np.ascontiguousarray(plane.T),
@@ -200,18 +222,21 @@ def _shifts(table: LookupTable) -> tuple[Model, Model]:
         )
         for plane in values
     )
-    return one, two
+    return along_x, along_y
 
 
 def _corrected(table: LookupTable) -> Model:
-    """Pixels (x, y) with their shifts."""
+    """Model that applies the shifts of a table to pixels."""
     dx, dy = _shifts(table)
     first, second = (models.Mapping((axis,), n_inputs=2) for axis in (0, 1))
     return _SPLIT | (first + dx) & (second + dy)
 
 
 def _uncorrected(table: LookupTable) -> Model:
-    """Pixels whose corrected ones are given: x = x' - D(x), by so many steps as its slope needs."""
+    """Model that removes the shifts of a table from pixels, by fixed-point iteration.
+
+    It solves x = x' - D(x) for x; the number of steps depends on the slope of the table.
+    """
     dx, dy = _shifts(table)
     slope = max(
         np.abs(np.diff(table.values, axis=2)).max() / table.step[0],

@@ -1,11 +1,12 @@
-"""A calibration oriented by another one, with the error of that, or by a position on the sky.
+"""Orientation of a calibration relative to another one or on the sky, with its error.
 
-Shift, turn, scale and parity between two maps are found by least squares over the area of a chip.
-With w = u + i v as Legendre coefficients, mean over the chip,
+Shift, rotation, scale and parity between two maps A and B are determined by least squares over the
+area of a chip.  With the Legendre coefficients of w = u + i v,
 
-    w_A = shift + turn w_B + d        (or the conjugate of w_B, where one of them is mirrored)
+    w_A = shift + turn w_B + d        (or the conjugate of w_B if one of them is mirrored)
 
-Products of two polynomials have their means from the coefficients alone, without any grid.
+Means of products of two polynomials over the chip follow directly from the coefficients, so that no
+grid is needed.
 """
 
 from __future__ import annotations
@@ -26,7 +27,8 @@ from bayesdist.model.similarity import turned, turned_model
 from bayesdist.utils.arrays import Complex, Float
 from bayesdist.utils.quantities import Random, generator_of
 
-# Pixels by which other projections may differ from TAN in a header whose u, v are on no sky.
+# Largest accepted difference in pixels between TAN and other projections, in a header of a
+# calibration whose u, v have no position on the sky.
 MAX_DEPARTURE = 0.1
 
 
@@ -39,40 +41,60 @@ def lay_on(
     reference_drift: bool = True,
     scale_arcsec: float | None = None,
 ) -> Orientation:
-    """Similarity from a calibration to an existing one in an aperture [arcsec], with its error.
+    """Similarity from a calibration to a reference in an aperture [arcsec], with its error.
 
-    Shift, rotation and, for u, v in pixels, scale make the mean square distance between the two
-    maps of `chip` at `epoch` smallest over its area; the other chips follow.  A fit over the whole
-    chip is used, not the linear terms at the reference pixel: each pixel then counts alike, and a
-    term that one calibration has and the other has not, or a poorly measured fifth order, cannot
-    tilt the whole.  Where the two maps differ by a similarity only, both ways agree.
+    Shift, rotation and, for u and v in pixels, scale minimise the mean square distance between the
+    two maps of one chip over its area; the same similarity applies to all chips.  The fit uses the
+    whole chip rather than the linear terms at the reference pixel.  All pixels have equal weight,
+    so that a term that only one calibration has, or a poorly measured fifth order, cannot rotate
+    the result.  Both methods agree if the two maps differ only by a similarity.
 
-    `reference_drift` applies the reference's time-dependent terms.  A given `scale_arcsec`
-    (arcseconds in one unit of u, v) is held; without it the scale is fitted for u, v in pixels, and
-    is that of the unit for others.
+    The residuals of the fit have 2 K - 4 free coefficients (K terms per axis).  The four parameters
+    of the similarity are given the mean variance of these coefficients: the reference may be as
+    wrong in roll and scale as it is, on average, in any other term.  If the residuals were treated
+    as white noise on the pixels, the stated errors would be far too small.
 
-    The residuals of the fit are a field of 2 K - 4 free coefficients (K terms of one axis).  The
-    four that it cannot see are given the mean variance of those it can: the reference may be as
-    wrong in its roll and scale as it is, on average, in any other single term.  White noise on
-    these pixels would make them known far too well.
+    Parameters
+    ----------
+    calibration : Calibration
+        Calibration to be oriented.
+    reference : Calibration
+        Existing calibration in the aperture.
+    chip : int
+        Number of the chip over which the maps are compared.
+    epoch : float, optional
+        Decimal years; required if the calibration depends on time.
+    reference_drift : bool
+        True to apply the time-dependent terms of the reference.
+    scale_arcsec : float, optional
+        Fixed scale, in arcsec per unit of u and v.  By default the scale is fitted for u and v in
+        pixels, and is the size of the unit otherwise.
 
-    InputError for a chip that is missing or of another size, a missing epoch, a drift of the
-    reference that cannot be evaluated, a scale that is not positive, or u, v mirrored against x, y;
-    DegenerateError when the calibration maps the chip to one point.
+    Returns
+    -------
+    Orientation
+
+    Raises
+    ------
+    InputError
+        If the chip is missing or differs in size, the epoch is missing, the drift of the reference
+        cannot be evaluated, the scale is not positive, or u and v are mirrored against x and y.
+    DegenerateError
+        If the calibration maps the chip to one point.
     """
     model = calibration.model
     if model.time is not None and epoch is None:
         raise InputError(
-            "the solution depends on time and no epoch is given",
+            "the solution depends on time, but no epoch is given",
             where="epoch",
-            do="give the decimal year at which it is laid on the reference",
+            do="give the decimal year at which it is compared with the reference",
         )
     size = model.chips[model.chip_code(chip)].size
-    other = reference.model.chips[reference.model.chip_code(chip)].size
-    if tuple(size) != tuple(other):
+    reference_size = reference.model.chips[reference.model.chip_code(chip)].size
+    if tuple(size) != tuple(reference_size):
         raise InputError(
-            f"chip {chip} has {other[0]:g} x {other[1]:g} pixels and the solution "
-            f"{size[0]:g} x {size[1]:g}",
+            f"chip {chip} has {reference_size[0]:g} x {reference_size[1]:g} pixels, but in the "
+            f"solution {size[0]:g} x {size[1]:g}",
             where=reference.name,
             do="give a reference of the same detector",
         )
@@ -83,7 +105,7 @@ def lay_on(
     z, slopes = _complex(*calibration.coefficients(chip, epoch), basis.n_terms)
     w, _ = _complex(*reference.coefficients(chip, then), basis.n_terms)
     weight = basis.mean_squares
-    weight[0] = 0.0  # the shift takes the mean
+    weight[0] = 0.0  # the mean is absorbed by the shift
     S, flipped, Q = correlations(w, z, basis)
     if Q == 0 or S == 0:
         raise DegenerateError(
@@ -93,9 +115,9 @@ def lay_on(
         )
     if abs(flipped) > abs(S):
         raise InputError(
-            "u, v are mirrored against the detector's x, y",
+            "u and v are mirrored against the detector's x and y",
             where=reference.name,
-            do="let u run with x and v with y, or change the sign of one of them",
+            do="let u increase with x and v with y, or change the sign of one of them",
         )
     dS = (weight * w) @ slopes.conj()
     held = _held_scale(model.unit, scale_arcsec)
@@ -108,9 +130,9 @@ def lay_on(
     shift = complex(w[0] - b * z[0])
     d_shift = -b * d_log * z[0] - b * slopes[0]
 
-    left = np.asarray(w - b * z, complex)
-    left[0] -= shift
-    agreement = _agreement(left, basis)
+    residual = np.asarray(w - b * z, complex)
+    residual[0] -= shift
+    agreement = _agreement(residual, basis)
     n_free = 2 * basis.n_terms - (4 if held is None else 3)
     variance = (1e-3 * agreement.rms) ** 2 / n_free
     angular = variance / (abs(b) ** 2 * Q)
@@ -130,25 +152,26 @@ def lay_on(
 
 
 def oriented(calibration: Calibration, orientation: Orientation) -> Calibration:
-    """Calibration in the plane of an aperture, in arcseconds, with the error of the orientation.
+    """Apply an orientation: calibration in the plane of an aperture, in arcseconds.
 
-    Every term of both axes is rotated together, those that depend on time as well: where (u, i, j)
-    drifts, (v, i, j) does after the turn, so that the model of the result has both.  The
-    calibration is that of the orientation, or of another filter in the same system, which is taken
-    as independent of it.  InputError for another unit than the orientation's.
+    The errors of the orientation are included.  All terms of both axes are rotated, including those
+    that depend on time: if (u, i, j) drifts, (v, i, j) does after the rotation, so that the model
+    of the result has both.  The calibration is either the one for which the orientation was
+    determined, or that of another filter in the same system, which is assumed to be independent.
+    Raises InputError if its unit differs from that of the orientation.
     """
     solution, base, model = calibration.solution, orientation.base, calibration.model
     if model.unit != base.model.unit:
         raise InputError(
-            f"the solution is in {model.unit} and the orientation is for {base.model.unit}",
+            f"the solution is in {model.unit}, but the orientation is for {base.model.unit}",
             where="model.unit",
-            do="orient solutions of one system only",
+            do="orient only solutions in the same system",
         )
     mean, cov = np.asarray(solution.mean, float), np.asarray(solution.cov, float)
     turn = orientation.scale * np.exp(1j * orientation.angle)
     linear = turned(model, np.eye(model.n_params), turn, 0.0).T
     moved = turned(model, mean, turn, complex(*orientation.shift))
-    # derivatives by shift_x, shift_y, log_scale, angle
+    # derivatives with respect to shift_x, shift_y, log_scale, angle
     by = np.stack(
         [
             turned(model, 0 * mean, turn, 1.0),
@@ -161,14 +184,14 @@ def oriented(calibration: Calibration, orientation: Orientation) -> Calibration:
     if solution is base:
         total = linear + by @ orientation.derivative
         with_plane = total @ cov @ orientation.derivative.T + by @ orientation.reference_cov
-        own = total @ cov @ total.T + by @ orientation.reference_cov @ by.T
+        oriented_cov = total @ cov @ total.T + by @ orientation.reference_cov @ by.T
     else:
         with_plane = by @ orientation.cov
-        own = linear @ cov @ linear.T + with_plane @ by.T
+        oriented_cov = linear @ cov @ linear.T + with_plane @ by.T
     new = replace(turned_model(model), unit="arcsec")
     return replace(
         calibration,
-        solution=_Oriented(new, moved, (own + own.T) / 2, solution, orientation),
+        solution=_Oriented(new, moved, (oriented_cov + oriented_cov.T) / 2, solution, orientation),
         plane=Plane("aperture", v2v3=orientation.v2v3, orientation=orientation),
         with_plane=with_plane,
         scale=None,
@@ -177,7 +200,7 @@ def oriented(calibration: Calibration, orientation: Orientation) -> Calibration:
 
 @dataclass(frozen=True, eq=False)
 class _Oriented(DerivedSolution):
-    """Solution in the plane of an aperture: each draw turned by a draw of the orientation."""
+    """Solution in the plane of an aperture; each draw is rotated by a draw of the orientation."""
 
     model: DistortionModel
     mean: Float
@@ -202,7 +225,7 @@ class _Oriented(DerivedSolution):
 
 
 def _complex(coefficients: Float, jacobian: Float, n_terms: int) -> tuple[Complex, Complex]:
-    """Coefficients (n,) of u + i v and their derivatives (n, D), with zeros for terms not there."""
+    """Coefficients (n,) of u + i v and their derivatives (n, D), zero for missing terms."""
     K = coefficients.shape[1]
     z = np.zeros(n_terms, complex)
     z[:K] = coefficients[0] + 1j * coefficients[1]
@@ -212,7 +235,7 @@ def _complex(coefficients: Float, jacobian: Float, n_terms: int) -> tuple[Comple
 
 
 def _agreement(left: Complex, basis: PolynomialBasis) -> Agreement:
-    """Rms and largest distance over the chip of a difference [arcsec] in Legendre coefficients."""
+    """Rms and largest distance on a chip, from Legendre coefficients of a residual [arcsec]."""
     on_grid = basis.evaluate(*mesh(*grid_pixels(basis.size, DEFAULT_GRID))) @ left
     return Agreement(
         rms=1e3 * float(np.sqrt(basis.mean_squares @ np.abs(left) ** 2)),
@@ -221,7 +244,7 @@ def _agreement(left: Complex, basis: PolynomialBasis) -> Agreement:
 
 
 def _held_scale(unit: str, scale_arcsec: float | None) -> float | None:
-    """Arcseconds in one unit of u, v, or None where it is to be fitted."""
+    """Arcseconds per unit of u and v, or None if the scale is to be fitted."""
     if scale_arcsec is None:
         return None if unit == "pix" else ARCSEC[unit]
     if not (np.isfinite(scale_arcsec) and scale_arcsec > 0):
@@ -232,10 +255,10 @@ def _held_scale(unit: str, scale_arcsec: float | None) -> float | None:
 
 
 def _cov_about(arm: complex, variance: float, log_scale: float, angular: float) -> Float:
-    """Covariance of the four parameters from independent errors at a point.
+    """Covariance (4, 4) of shift_x, shift_y, log_scale and angle.
 
-    The shift holds at (u, v) = (0, 0), which lies at -`arm` from the point where position, scale
-    and angle are independent.
+    The shift refers to (u, v) = (0, 0).  This is offset by -`arm` from the point about which the
+    errors of position, scale and angle are independent.
     """
     to_origin = np.eye(4)
     to_origin[:2, 2] = -arm.real, -arm.imag
@@ -250,30 +273,47 @@ def placed_at(
     *,
     where: str,
 ) -> Calibration:
-    """Calibration with (u, v) = (0, 0) at CRVAL (degrees), u to the east and v to the north.
+    """Place a calibration on the sky, with u increasing to the east and v to the north.
 
-    Pixels become arcseconds by their size.  Without a CRVAL the calibration stays as it is.
-    InputError, that names the configuration `where`, for a plane that lies on the sky already, a
-    CRVAL that is no position, and pixels of unknown size.
+    Parameters
+    ----------
+    calibration : Calibration
+    crval : tuple of float or None
+        Right ascension and declination of (u, v) = (0, 0) in degrees.  If it is None, the
+        calibration is returned unchanged.
+    scale_arcsec : float or None
+        Pixel scale in arcsec per pixel, to convert u and v from pixels.
+    where : str
+        Section of the configuration, for error messages.
+
+    Returns
+    -------
+    Calibration
+
+    Raises
+    ------
+    InputError
+        If the plane has a position on the sky already, CRVAL is invalid, or the pixel scale is
+        unknown.
     """
     if crval is None:
         return calibration
     if calibration.plane.point is not None:
         raise InputError(
-            "a crval is given for a plane that lies on the sky already",
+            "a crval is given for a plane that has a position on the sky already",
             where=f"{where}.crval",
-            do="leave it out",
+            do="omit it",
         )
     if not (np.isfinite(crval).all() and -90 <= crval[1] <= 90):
         raise InputError(
-            f"crval is {crval}, no right ascension and declination in degrees",
+            f"crval is {crval}, which is not a right ascension and declination in degrees",
             where=f"{where}.crval",
-            do="correct it, or leave it out",
+            do="correct it, or omit it",
         )
     if calibration.unit == "pix":
         if scale_arcsec is None:
             raise InputError(
-                "a crval is given, and u and v are in pixels of unknown size",
+                "a crval is given, but u and v are in pixels of unknown size",
                 where="detector.scale_mas",
                 do="give the pixel scale (scale_mas in Python, --scale of convert)",
             )
@@ -285,17 +325,17 @@ def placed_at(
 def departure_from_tangent_plane(
     calibration: Calibration, epoch: float | None, scale_arcsec: float | None
 ) -> float:
-    """Pixels by which another projection of the sky may differ from TAN over the detector.
+    """Largest difference in pixels between TAN and another projection over the detector.
 
-    In a small field all projections about one point agree.  A distance r in radians differs between
-    a tangent plane and one that keeps angles (ARC) by r - atan r.  `scale_arcsec` is the size of a
-    pixel, for u and v in pixels.
+    In a small field all projections about the same point agree.  At a distance r, in radians, the
+    difference between a tangent plane and an equidistant projection (ARC) is r - atan r.
+    `scale_arcsec` is the size of a pixel, for u and v in pixels.
     """
     unit, worst = arcsec_per(calibration.unit, scale_arcsec), 0.0
-    for one in calibration.at(epoch, origin="stated").values():
-        poly = one.monomials()
-        x, y = detector_grid(one.basis.size, 3)
-        offsets = np.stack([x, y]) - np.array(one.basis.reference_pixel)[:, None]
+    for chip_map in calibration.at(epoch, origin="stated").values():
+        poly = chip_map.monomials()
+        x, y = detector_grid(chip_map.basis.size, 3)
+        offsets = np.stack([x, y]) - np.array(chip_map.basis.reference_pixel)[:, None]
         radians = np.radians(unit * np.hypot(*(poly.linear @ offsets)) / 3600.0)
         pixel = np.sqrt(abs(np.linalg.det(poly.linear))) * unit
         departure = np.degrees(radians - np.arctan(radians)).max() * 3600.0 / pixel
@@ -306,27 +346,28 @@ def departure_from_tangent_plane(
 def refuse_wide_planes(
     calibration: Calibration, epoch: float | None, scale_arcsec: float | None, *, where: str
 ) -> None:
-    """Raise InputError if TAN is one choice of several for u, v that lie on no sky.
+    """Raise InputError if u, v have no position on the sky and the choice of TAN matters.
 
-    `epoch`, `scale_arcsec`: as of `departure_from_tangent_plane`. `where`: the configuration.
+    `epoch` and `scale_arcsec` are those of `departure_from_tangent_plane`; `where` is the section
+    of the configuration, for the message.
     """
     if calibration.plane.point is not None or calibration.plane.kind == "aperture":
         return
     if calibration.unit == "pix" and scale_arcsec is None:
-        return  # of no size
+        return  # the size of the field on the sky is unknown
     worst = departure_from_tangent_plane(calibration, epoch, scale_arcsec)
     if worst > MAX_DEPARTURE:
         raise InputError(
-            "the header is that of a tangent plane, and where u, v lie on the sky is not stated: "
-            f"whether they are a tangent plane is worth {worst:.2g} px in so wide a field",
+            "the header is that of a tangent plane, and the position of u, v on the sky is not "
+            f"given: in so wide a field other projections differ by {worst:.2g} px",
             where=where,
-            do=f"if they are one, set {where}.crval (--option 'crval=[RA, Dec]' of convert); if "
-            "not, write a SIP header with linear axes, or the parameters",
+            do=f"if u, v are on a tangent plane, set {where}.crval (--option 'crval=[RA, Dec]' of "
+            "convert); otherwise write a SIP header with linear axes, or the parameters",
         )
 
 
 def in_arcsec(calibration: Calibration, pixel: float) -> Calibration:
-    """Calibration in arcseconds; `pixel` is the size of one."""
+    """Convert a calibration from pixels to arcseconds; `pixel` is the size of a pixel in arcsec."""
     solution, model = calibration.solution, calibration.model
     return replace(
         calibration,
@@ -352,12 +393,12 @@ def in_arcsec(calibration: Calibration, pixel: float) -> Calibration:
 def correlations(
     za: Complex, zb: Complex, basis: PolynomialBasis
 ) -> tuple[complex, complex, float]:
-    """Mean products, about mean positions, of A with B, of A with B mirrored, and of B with itself.
+    """Covariances over a chip of A with B, of A with the mirror image of B, and of B with itself.
 
-    `za` and `zb` (K,) are coefficients of u + i v.
+    `za` and `zb` (K,) are the Legendre coefficients of u + i v of the maps A and B.
     """
     weight = basis.mean_squares
-    weight[0] = 0.0  # the shift takes the mean
+    weight[0] = 0.0  # the mean is absorbed by the shift
     straight = complex(np.sum(weight * za * zb.conj()))
     flipped = complex(np.sum(weight * za * zb))
     return straight, flipped, float(weight @ np.abs(zb) ** 2)
@@ -366,9 +407,9 @@ def correlations(
 def turn_between(
     za: Complex, zb: Complex, basis: PolynomialBasis, name: str
 ) -> tuple[complex, bool]:
-    """Scale and rotation that bring B nearest to A, as one complex number; True if mirrored first.
+    """Scale and rotation from B to A as one complex number, and True if B is mirrored first.
 
-    InputError, with B's `name`, when B maps the chip to one point.
+    Raises InputError, with the `name` of B, if B maps the chip to one point.
     """
     straight, flipped, norm = correlations(za, zb, basis)
     if norm == 0.0:
@@ -378,14 +419,16 @@ def turn_between(
 
 
 def as_real(z: Complex) -> Float:
-    """Coefficients (2 K,), u before v, of u + i v."""
+    """Convert coefficients (K,) of u + i v to real coefficients (2 K,), u before v."""
     return np.concatenate([z.real, z.imag])
 
 
 def similarity_fields(z: Complex) -> Float:
-    """Derivatives (2 K, 4) of positions by shift along u and v, scale and rotation."""
-    one = np.zeros_like(z)
-    one[0] = 1.0
+    """Derivatives (2 K, 4) of coefficients with respect to shift_u, shift_v, scale and rotation."""
+    unit_shift = np.zeros_like(z)
+    unit_shift[0] = 1.0
     offsets = z.copy()
-    offsets[0] = 0.0  # about the mean position, so that a rotation is no shift
-    return np.stack([as_real(f) for f in (one, 1j * one, offsets, 1j * offsets)], axis=1)
+    offsets[0] = 0.0  # about the mean position, so that rotations do not shift
+    return np.stack(
+        [as_real(f) for f in (unit_shift, 1j * unit_shift, offsets, 1j * offsets)], axis=1
+    )

@@ -1,4 +1,4 @@
-"""Sky positions as distributions: draws of all errors that a calibration knows."""
+"""Sky positions as distributions: random draws of all errors of a calibration."""
 
 from __future__ import annotations
 
@@ -56,39 +56,40 @@ def sky_distribution(
     x, y : array_like, shape (N,)
         FITS 1-based pixels.
     n_draws : int
+        Number of draws, at least 2.
     rng : int or numpy.random.Generator
-        Seed, or source of the random numbers.
+        Seed or random generator.
     chip : array_like, optional
-        Chip number of each position, or of all; it may be left out for a single chip.
+        Chip number of each position, or of all positions; not needed if there is only one chip.
     epoch : float, str, Time, date or Quantity, optional
-        Needed by a calibration that depends on time.
+        Date, for a calibration that depends on time.
     point : SkyCoord, or pair of float or Quantity, optional
-        Sky position of (u, v) = (0, 0), u to the east and v to the north, in place of the
-        calibration's own.
+        Sky position of (u, v) = (0, 0), with u to the east and v to the north; by default that of
+        the calibration.
     placement : SkyPlacement, optional
-        Place and directions of u and v on the sky, in place of `point`.
+        Position and directions of u and v on the sky, instead of `point`.
     centroids : pair of array_like, optional
         Standard deviations of x and y in pixels.
 
     Returns
     -------
     SkyCoord, shape (N,)
-        ICRS, with `astropy.uncertainty.Distribution` of `n_draws` values as ra and dec.  A draw has
-        the same errors of the calibration for all stars, so that the covariance between positions
-        is that of ``sky_positions(..., joint=True)`` within its Monte-Carlo error.
+        ICRS positions; ra and dec are `astropy.uncertainty.Distribution` of `n_draws` values.  All
+        stars of a draw have the same errors of the calibration, so that the covariance between
+        positions agrees with ``sky_positions(..., joint=True)`` within its Monte-Carlo error.
 
     Raises
     ------
     InputError
-        For fewer than two draws, a calibration without errors, a plane that does not touch the sky
-        and no point, or a unit that is no angle.
+        If fewer than two draws are requested, the calibration has no errors, the plane has no
+        position on the sky and no point is given, or the unit is not an angle.
 
     Notes
     -----
-    ``sky.ra.pdf_std()``, transformations to other frames, offsets and the separation from a plain
-    SkyCoord work on distributions.  Indexing with a single number and the separation of two such
-    objects do not in astropy 8; for these ``SkyCoord(sky.ra.distribution, sky.dec.distribution)``
-    is a plain SkyCoord of shape (N, n_draws).
+    Distributions support ``sky.ra.pdf_std()``, transformations to other frames, offsets, and the
+    separation from a plain SkyCoord.  In astropy 8 they do not support indexing with a single
+    number or the separation of two such objects.  For these, use the plain SkyCoord of shape
+    (N, n_draws) ``SkyCoord(sky.ra.distribution, sky.dec.distribution)``.
     """
     from astropy import units as apu
     from astropy.coordinates import SkyCoord
@@ -97,7 +98,7 @@ def sky_distribution(
     n_draws = whole_number(n_draws, "n_draws", least=2)
     if calibration.errors == "none" and not calibration.further and centroids is None:
         raise InputError(
-            "has no errors to draw from",
+            "has no errors that could be drawn",
             where=calibration.name,
             do="give a calibration with a covariance, or the errors of the centroids",
         )
@@ -121,37 +122,39 @@ def sky_distribution(
     design = designs(calibration, maps, px, py, numbers)
     errors = design @ (root @ generator.standard_normal((len(root), n_draws)))  # (N, 2, n_draws)
     errors += _root(shared_covariance(calibration)) @ generator.standard_normal((2, n_draws))
-    alone = own_covariances(calibration, slope, centroids)
+    star_covariance = own_covariances(calibration, slope, centroids)
     for row in calibration.further:
         if not row.correlation:
             continue
         fraction = sum(part for part, _ in row.correlation)
         for axis, sigma in enumerate((row.u, row.v)):
-            alone[:, axis, axis] -= fraction * sigma**2
+            star_covariance[:, axis, axis] -= fraction * sigma**2
             for number in np.unique(numbers):
-                here = np.flatnonzero(numbers == number)
-                at = np.column_stack([px[here], py[here]])
+                on_chip = np.flatnonzero(numbers == number)
+                at = np.column_stack([px[on_chip], py[on_chip]])
                 field = drawn_fields(at, row.correlation, n_draws, generator)
-                errors[here, axis] += sigma * field
-    own = _root(alone)
-    errors += own @ generator.standard_normal((px.size, 2, n_draws))
+                errors[on_chip, axis] += sigma * field
+    star_root = _root(star_covariance)
+    errors += star_root @ generator.standard_normal((px.size, 2, n_draws))
     steps = placement.steps(ra, dec)  # mas to the east and to the north
     drawn_ra, drawn_dec = _moved(ra, dec, np.radians((steps @ errors) / 3.6e6))
     return SkyCoord(Distribution(drawn_ra * apu.deg), Distribution(drawn_dec * apu.deg))
 
 
 def _moved(ra: Float, dec: Float, offset: Float) -> tuple[Float, Float]:
-    """Directions (N, n), degrees, at small offsets (N, 2, n) to the east and north, radians."""
-    axes = np.stack([plane_axes(one) for one in zip(ra.tolist(), dec.tolist(), strict=True)])
+    """RA and Dec (N, n) in degrees after small offsets (N, 2, n) to east and north in radians."""
+    axes = np.stack(
+        [plane_axes(direction) for direction in zip(ra.tolist(), dec.tolist(), strict=True)]
+    )
     vectors = axes[:, 2, :, None] + np.einsum("nad,nax->nxd", offset, axes[:, :2])
     x, y, z = np.moveaxis(vectors, 1, 0)
     moved = np.degrees(np.arctan2(y, x))
-    # on one side of the meridian for each star, so that mean and scatter make sense
+    # no jumps by 360 degrees between the draws of a star, so that mean and scatter are meaningful
     moved = ra[:, None] + (moved - ra[:, None] + 180.0) % 360.0 - 180.0
     return moved, np.degrees(np.arctan2(z, np.hypot(x, y)))
 
 
 def _root(cov: Float) -> Float:
-    """Matrices R with R R^T equal to covariances (..., n, n), which may be singular."""
+    """Matrix square roots R, with R R^T = cov, of covariances (..., n, n) that may be singular."""
     values, vectors = np.linalg.eigh(cov)
     return np.asarray(vectors * np.sqrt(np.maximum(values, 0.0))[..., None, :])

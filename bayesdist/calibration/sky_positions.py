@@ -1,13 +1,15 @@
-"""Positions on the sky of pixels, with the covariance that a calibration gives them.
+"""Sky positions of pixels, with their covariance according to a calibration.
 
-With phi the Legendre products at a pixel, S the covariance of the coefficients and A the derivative
-of a step on the sky (east, north) by one on the plane, two stars n and m have the covariance
+Let phi be the Legendre products at a pixel, S the covariance of the coefficients, and A the
+derivative of the offset on the sky (east, north) with respect to the plane (u, v).  The covariance
+of the positions of two stars n and m is
 
     A_n phi_n S phi_m A_m + A_n T A_m + [n = m] A_n (L + J C J) A_n
 
-where T are errors that all stars of an image share, L those of each star by itself, C that of its
-centroid in pixels and J the slope of the map.  Of local errors that are correlated over some pixels
-a part is in the covariance of stars of one chip, by their separation.
+where T is the covariance of errors that are common to all stars of an image, L that of errors that
+are independent for each star, C that of the centroid in pixels, and J the derivative of the map.
+Local errors that are correlated over some pixels also contribute to the covariance of stars on the
+same chip, depending on their separation.
 """
 
 from __future__ import annotations
@@ -30,16 +32,16 @@ from bayesdist.utils.quantities import Direction, Epoch, direction_in, values_in
 
 @dataclass(frozen=True, eq=False)
 class SkyPositions:
-    """Positions on the sky (N,) and their covariance."""
+    """Sky positions of N pixels and their covariance."""
 
-    ra: Float  # degrees; NaN for a pixel that is no number
-    dec: Float
-    cov: Float | None  # (N, 2, 2), to the east and to the north, mas^2; None where nothing is known
-    joint: Float | None = None  # (2 N, 2 N), the same of all stars, east and north in turn
+    ra: Float  # (N,), degrees; NaN if the pixel is NaN
+    dec: Float  # (N,), degrees
+    cov: Float | None  # (N, 2, 2), east and north, mas^2; None if no errors are known
+    joint: Float | None = None  # (2 N, 2 N), mas^2, of all stars, east and north alternating
 
     @property
     def sigma(self) -> Float | None:
-        """Standard deviations (2, N) to the east and to the north, mas."""
+        """Standard deviations (2, N) to the east and to the north in mas; None if unknown."""
         if self.cov is None:
             return None
         return np.sqrt(np.einsum("naa->an", self.cov))
@@ -57,13 +59,35 @@ def sky_positions(
     centroids: tuple[ArrayLike, ArrayLike] | None = None,
     joint: bool = False,
 ) -> SkyPositions:
-    """Positions on the sky of FITS 1-based pixels (N,), with all errors that the calibration knows.
+    """Sky positions of pixels, with all errors of the calibration.
 
-    `chip` is the chip number of each, or of all.  `point` is the sky position of (u, v) = (0, 0) in
-    degrees, u to the east and v to the north, in place of the calibration's own; `placement` gives
-    other directions of u and v; `centroids` are standard deviations of x and y in pixels; with
-    `joint` the covariance of all stars is there.
-    InputError for a plane that does not touch the sky and no point, or a unit that is no angle.
+    Parameters
+    ----------
+    calibration : Calibration
+    x, y : array_like, shape (N,)
+        FITS 1-based pixels.
+    chip : array_like
+        Chip number of each position, or of all positions.
+    epoch : float, str, Time or Quantity, optional
+        Date, for a calibration that depends on time.
+    point : SkyCoord, or pair of float or Quantity, optional
+        Sky position of (u, v) = (0, 0), with u to the east and v to the north; by default that of
+        the calibration.
+    placement : SkyPlacement, optional
+        Position and directions of u and v on the sky, instead of `point`.
+    centroids : pair of array_like, optional
+        Standard deviations of x and y in pixels.
+    joint : bool
+        True to compute the joint covariance of all stars.
+
+    Returns
+    -------
+    SkyPositions
+
+    Raises
+    ------
+    InputError
+        If the plane has no position on the sky and no point is given, or the unit is not an angle.
     """
     x, y = (np.atleast_1d(values_in(a, "pix", name)) for name, a in (("x", x), ("y", y)))
     epoch = None if epoch is None else year_of(epoch)
@@ -76,16 +100,16 @@ def sky_positions(
         plane[:, rows] = chip_map.at(x[rows], y[rows])
     ra, dec = placement.sky(plane)
     steps = placement.steps(ra, dec)
-    single, whole = plane_covariances(
+    single, joint_cov = plane_covariances(
         calibration, maps, x, y, chip, epoch=epoch, centroids=centroids, joint=joint
     )
     if single is None:
         return SkyPositions(ra, dec, None)
     cov = np.einsum("nab,nbc,ndc->nad", steps, single, steps)
-    if whole is None:
+    if joint_cov is None:
         return SkyPositions(ra, dec, cov)
-    whole = np.einsum("nab,nbmc,mdc->namd", steps, whole, steps, optimize=True)
-    return SkyPositions(ra, dec, cov, whole.reshape(2 * x.size, 2 * x.size))
+    joint_cov = np.einsum("nab,nbmc,mdc->namd", steps, joint_cov, steps, optimize=True)
+    return SkyPositions(ra, dec, cov, joint_cov.reshape(2 * x.size, 2 * x.size))
 
 
 def plane_covariances(
@@ -99,11 +123,22 @@ def plane_covariances(
     centroids: tuple[ArrayLike, ArrayLike] | None = None,
     joint: bool = False,
 ) -> tuple[Float | None, Float | None]:
-    """Covariances of u, v at FITS 1-based pixels (N,), with all errors that the calibration knows.
+    """Covariances of (u, v) at FITS 1-based pixels (N,), with all errors of the calibration.
 
-    `maps` are those of all chips at the epoch, look-up tables included; other arguments as for
-    `sky_positions`.  The first result (N, 2, 2) is for each position and the second (N, 2, N, 2)
-    for all, None unless it is asked for with `joint`; both are None if no errors are known.
+    Parameters
+    ----------
+    calibration : Calibration
+    maps : mapping of int to ChipMap
+        Maps of all chips at the epoch, with look-up tables.
+    x, y, chip, epoch, centroids, joint
+        See `sky_positions`.
+
+    Returns
+    -------
+    single : ndarray, shape (N, 2, 2), or None
+        Covariance of each position; None if no errors are known.
+    joint : ndarray, shape (N, 2, N, 2), or None
+        Covariance of all positions; None unless `joint` is True.
     """
     if calibration.errors == "none" and not calibration.further and centroids is None:
         return None, None
@@ -111,9 +146,9 @@ def plane_covariances(
     for number, chip_map in maps.items():
         rows = chip == number
         slope[rows] = chip_map.slope(x[rows], y[rows])
-    own = own_covariances(calibration, slope, centroids)
+    star_cov = own_covariances(calibration, slope, centroids)
     shared = shared_covariance(calibration)
-    single = own + shared
+    single = star_cov + shared
     for number, chip_map in maps.items():
         rows = chip == number
         from_coefficients = chip_map.covariance_at(x[rows], y[rows])
@@ -122,18 +157,18 @@ def plane_covariances(
     if not joint:
         return single, None
     design = designs(calibration, maps, x, y, chip)
-    whole = np.einsum(
+    joint_cov = np.einsum(
         "nak,kl,mbl->namb", design, coefficient_covariance(calibration, epoch), design
     )
-    whole += shared[None, :, None, :]
+    joint_cov += shared[None, :, None, :]
     for row in calibration.further:
         if row.correlation:
             nearby = local_correlation(row, x, y, chip)
-            whole[:, 0, :, 0] += row.u**2 * nearby
-            whole[:, 1, :, 1] += row.v**2 * nearby
+            joint_cov[:, 0, :, 0] += row.u**2 * nearby
+            joint_cov[:, 1, :, 1] += row.v**2 * nearby
     rows = np.arange(x.size)
-    whole[rows, :, rows, :] += own
-    return single, whole
+    joint_cov[rows, :, rows, :] += star_cov
+    return single, joint_cov
 
 
 def placement_of(
@@ -146,27 +181,43 @@ def placement_of(
 ) -> SkyPlacement:
     """Placement of the plane of a calibration on the sky.
 
-    `point` (degrees) is the sky position of (u, v) = (0, 0), in place of that of the plane.
-    `position_angle` (degrees, from north to east) is that of the v axis, 0 by default, or of V3 for
-    a plane in an aperture with known axes; u is 90 degrees east of v, or west if `mirrored`.
-    `pixel_scale` is the size of a pixel in arcsec, for u and v in pixels.
-    InputError for a plane in an aperture without position angle, a plane without point, and u and v
-    in pixels of unknown size.
+    Parameters
+    ----------
+    calibration : Calibration
+    point : SkyCoord, or pair of float or Quantity, optional
+        Sky position of (u, v) = (0, 0); by default that of the plane.
+    position_angle : float, optional
+        Position angle, in degrees from north to east, of the v axis, or of V3 for a plane in an
+        aperture with known axes; 0 by default.
+    mirrored : bool
+        True if u is 90 degrees west of v; by default it is 90 degrees east of it.
+    pixel_scale : float, optional
+        Pixel scale in arcsec per pixel, for u and v in pixels.
+
+    Returns
+    -------
+    SkyPlacement
+
+    Raises
+    ------
+    InputError
+        If the position angle is missing for a plane in an aperture, the plane has no position on
+        the sky and no point is given, or u and v are in pixels of unknown size.
     """
     plane = calibration.plane
     if plane.kind == "aperture" and position_angle is None:
         raise InputError(
-            "lies in V2, V3 or the Ideal system of an aperture, and not on the sky",
+            "is in V2, V3 or the Ideal system of an aperture, not on the sky",
             where=calibration.name,
-            do="put it into the image's header by a pipeline, or give a file in TPV or SIP",
+            do="let a pipeline add it to the image's header, or give a TPV or SIP file",
         )
     place = plane.point if point is None else direction_in(point, "point")
     if place is None:
         raise InputError(
-            "does not say where its plane touches the sky",
+            "does not state the tangent point of its plane",
             where=calibration.name,
-            do="give the point (--point RA DEC on the command line), the sky position of u, v = 0, "
-            "if u is east and v is north",
+            do="if u is east and v is north, give the sky position of u, v = 0 (point in Python, "
+            "--point RA DEC on the command line)",
         )
     if calibration.unit in ARCSEC:
         unit = ARCSEC[calibration.unit]
@@ -174,7 +225,7 @@ def placement_of(
         unit = pixel_scale
     else:
         raise InputError(
-            f"is in {calibration.unit}, which is no angle on the sky",
+            f"is in {calibration.unit}, which is not an angle",
             where=calibration.name,
             do="give a calibration in arcsec, mas or deg",
         )
@@ -185,7 +236,7 @@ def placement_of(
         if mirrored:
             matrix = matrix @ np.diag([-1.0, 1.0])
         if plane.kind == "aperture" and plane.to_v2v3 is not None and plane.v2v3 is not None:
-            # V2 and V3 are spherical: a step in V2 is an arc shorter by cos V3
+            # V2 and V3 are spherical coordinates: the arc of a step in V2 is shorter by cos V3
             cosine = np.cos(np.radians(plane.v2v3[1] / 3600.0))
             matrix = matrix @ np.diag([cosine, 1.0]) @ plane.to_v2v3
     elif mirrored:
@@ -194,13 +245,13 @@ def placement_of(
 
 
 def shared_covariance(calibration: Calibration) -> Float:
-    """Covariance (2, 2) on the plane of errors that all stars of an image share."""
+    """Covariance (2, 2) of (u, v) of errors that are common to all stars of an image."""
     rows = [row for row in calibration.further if row.shared]
     return np.diag([float(sum(r.u**2 for r in rows)), float(sum(r.v**2 for r in rows))])
 
 
 def local_correlation(row: FurtherError, x: Float, y: Float, chip: Int) -> Float:
-    """Correlations (N, N) of a local error between different stars; 0 between chips."""
+    """Correlations (N, N) of a local error between stars; 0 between chips and on the diagonal."""
     at = np.column_stack([x, y])
     separation = np.linalg.norm(at[:, None] - at, axis=2)
     out = np.where(chip[:, None] == chip, correlation_at(separation, row.correlation), 0.0)
@@ -211,11 +262,11 @@ def local_correlation(row: FurtherError, x: Float, y: Float, chip: Int) -> Float
 def own_covariances(
     calibration: Calibration, slope: Float, centroids: tuple[ArrayLike, ArrayLike] | None
 ) -> Float:
-    """Covariances (N, 2, 2) on the plane of local errors, and those of each star by itself."""
-    alone = [row for row in calibration.further if not row.shared]
+    """Covariances (N, 2, 2) of (u, v) of each star: local, random and centroid errors."""
+    not_shared = [row for row in calibration.further if not row.shared]
     out = np.zeros(slope.shape)
-    out[:, 0, 0] = sum(row.u**2 for row in alone)
-    out[:, 1, 1] = sum(row.v**2 for row in alone)
+    out[:, 0, 0] = sum(row.u**2 for row in not_shared)
+    out[:, 1, 1] = sum(row.v**2 for row in not_shared)
     if centroids is not None:
         sigma = np.stack(
             [np.broadcast_to(values_in(s, "pix", "centroids"), len(slope)) for s in centroids]
@@ -225,22 +276,22 @@ def own_covariances(
 
 
 def coefficient_covariance(calibration: Calibration, epoch: float | None) -> Float:
-    """Covariance of the coefficients of all chips; zero where there is none."""
-    found = calibration.joint_covariance(calibration.numbers, epoch, origin="stated")
+    """Covariance of the coefficients of all chips; zero if no errors are known."""
+    cov = calibration.joint_covariance(calibration.numbers, epoch, origin="stated")
     n = 2 * calibration.model.n_terms * len(calibration.numbers)
-    return np.zeros((n, n)) if found is None else found
+    return np.zeros((n, n)) if cov is None else cov
 
 
 def designs(
     calibration: Calibration, maps: Mapping[int, ChipMap], x: Float, y: Float, chip: Int
 ) -> Float:
-    """Derivatives (N, 2, n) of positions by the coefficients of all chips."""
+    """Derivatives (N, 2, n) of (u, v) with respect to the coefficients of all chips."""
     K = calibration.model.n_terms
     out = np.zeros((x.size, 2, 2 * K * len(maps)))
-    for k, (number, one) in enumerate(maps.items()):
-        mine = np.flatnonzero(chip == number)
-        phi = one.design(x[mine], y[mine])
+    for k, (number, chip_map) in enumerate(maps.items()):
+        rows = np.flatnonzero(chip == number)
+        phi = chip_map.design(x[rows], y[rows])
         for axis in (0, 1):
             start = (2 * k + axis) * K
-            out[mine, axis, start : start + K] = phi
+            out[rows, axis, start : start + K] = phi
     return out

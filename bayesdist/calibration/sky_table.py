@@ -1,4 +1,4 @@
-"""Tables of pixels, and the positions on the sky that a calibration gives them."""
+"""Conversion of tables of pixels to sky positions with a calibration."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from bayesdist.utils.quantities import Direction, Epoch, direction_in, year_of
 log = logging.getLogger("bayesdist")
 
 COLUMNS = ("ra", "dec", "sigma_ra", "sigma_dec", "corr_ra_dec")
-COVARIANCE = "covariance"  # key of the joint covariance in the meta-data of a table
+COVARIANCE = "covariance"  # metadata key of the joint covariance in a table
 
 
 def table_on_sky(
@@ -39,9 +39,9 @@ def table_on_sky(
     covariance: bool = False,
     name: str = "table",
 ) -> QTable:
-    """Positions on the sky of a table of pixels; arguments as for `Calibration.to_sky`.
+    """Convert a table of pixels to sky positions; see `Calibration.to_sky`.
 
-    `name` is that of the table in messages.
+    `name` is the name of the table in messages.
     """
     rows = QTable(as_table(table, name))
     plain = Table(rows)
@@ -88,36 +88,38 @@ def table_on_sky(
 
 
 def errors_in(calibration: Calibration, centroids: Sequence[str] | None) -> list[tuple[str, str]]:
-    """Errors of positions on the sky, and in which way stars have them in common."""
+    """Errors of sky positions: (name, correlation between stars in words) of each."""
     out = []
     if calibration.errors == "covariance":
         out.append(("coefficients, with their covariance", "correlated between stars"))
     elif calibration.errors == "sigma":
         out.append(("coefficients, without their correlations", "correlated between stars"))
     for row in calibration.further:
-        shared = "the same for all stars" if row.shared else "of each star by itself"
+        shared = "the same for all stars" if row.shared else "independent for each star"
         if row.correlation:
             low, high = (f(length for _, length in row.correlation) for f in (min, max))
             over = f"{low:.0f}" if low == high else f"{low:.0f} to {high:.0f}"
             shared = f"correlated between stars over {over} pixels"
         out.append((row.name, shared))
     if centroids is not None:
-        out.append(("centroids", "of each star by itself"))
+        out.append(("centroids", "independent for each star"))
     return out
 
 
 def position_column(table: Table, name: str, where: str) -> Float:
-    """Numbers (N,) of a column; NaN for missing ones."""
+    """Numbers (N,) of a column, NaN if missing; raises InputError if the column is unsuitable."""
     if name not in table.colnames:
         raise InputError(
             f"there is no column {name!r}",
             where=where,
-            do="name those of the positions (columns in Python, --columns on the command line), of "
-            f"{', '.join(table.colnames[:8])}",
+            do="give the columns of the positions (columns in Python, --columns on the command "
+            f"line), among {', '.join(table.colnames[:8])}",
         )
     column = table[name]
     if column.dtype.kind not in "iuf" or column.ndim != 1:
-        raise InputError("holds no numbers", where=f"{where}, column {name!r}", do="check it")
+        raise InputError(
+            "does not contain numbers", where=f"{where}, column {name!r}", do="check the column"
+        )
     values: Float = np.ma.filled(np.ma.asarray(column).astype(float), np.nan)
     lost = ~np.isfinite(values)
     if lost.any():
@@ -129,12 +131,12 @@ def position_column(table: Table, name: str, where: str) -> Float:
 def pixel_columns(
     table: Table, names: Sequence[str] | None, pixel_origin: float | None, where: str
 ) -> tuple[Float, Float, float, str]:
-    """Pixels x and y (N,) as FITS counts them, the origin of the columns, and its reason.
+    """FITS 1-based pixels x and y (N,), the pixel origin of the columns, and its reason.
 
-    Without `names` the columns are found by their usual names, as in tables of matches.  A unit
-    other than the pixel is refused.  The origin is `pixel_origin` if it is given.  Otherwise
-    it is that of the program which writes such columns, as for tables of matches, and 1 if nothing
-    is known.
+    If `names` is None, the columns are found by their usual names, as in tables of matches.  The
+    origin is `pixel_origin` if it is given.  Otherwise it is that of the program that writes such
+    columns, or 1 if the program is unknown.  Raises InputError if a column has a unit other than
+    the pixel.
     """
     if names is None:
         names = usual_pixel_names(table.colnames, where)
@@ -159,18 +161,19 @@ def pixel_columns(
 
 
 def usual_pixel_names(names: Sequence[str], where: str) -> tuple[str, str]:
-    """Columns of the pixels by their usual names; ('x', 'y') if there are none."""
+    """Names of the pixel columns among the usual ones; ("x", "y") if there are none."""
     usual = {key: ALIASES[key] for key in ("x", "y")}
-    found = find_columns(names, None, usual, source=where, pairs=(("x", "y"),))
-    return (found["x"], found["y"]) if len(found) == 2 else ("x", "y")
+    column_of = find_columns(names, None, usual, source=where, pairs=(("x", "y"),))
+    return (column_of["x"], column_of["y"]) if len(column_of) == 2 else ("x", "y")
 
 
 def chip_numbers(
     table: Table, chip: int | None, known: Sequence[int], name: str, where: str
 ) -> Int:
-    """Chip (N,) of each row, by an option or a column.
+    """Chip number (N,) of each row, from an option or a column.
 
-    `known` are the chips of the calibration; `name` and `where` are what to call it and the table.
+    `known` are the chip numbers of the calibration; `name` and `where` are the names of the
+    calibration and of the table for messages.
     """
     listed = ", ".join(map(str, known))
     if chip is not None:
@@ -181,7 +184,7 @@ def chip_numbers(
         return np.full(len(table), known[0])
     if "chip" not in table.colnames:
         raise InputError(
-            f"there is no column 'chip', and {name} has chips {listed}",
+            f"there is no column 'chip', but {name} has chips {listed}",
             where=where,
             do="add the column, or give the chip (--chip on the command line)",
         )
@@ -198,11 +201,11 @@ def chip_numbers(
 
 
 def refuse_columns(table: Table, new: Sequence[str], where: str) -> None:
-    """Refuse names of new columns that a table has already."""
-    taken = [name for name in new if name in table.colnames]
-    if taken:
+    """Raise InputError if a table already has one of the new columns."""
+    existing = [name for name in new if name in table.colnames]
+    if existing:
         raise InputError(
-            f"has a column {taken[0]!r} already, which would be overwritten",
+            f"has a column {existing[0]!r} already, which would be overwritten",
             where=where,
-            do="rename or drop it",
+            do="rename or remove it",
         )

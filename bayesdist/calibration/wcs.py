@@ -1,4 +1,4 @@
-"""World coordinate systems of calibrations, as objects of the shared astropy interface (APE 14)."""
+"""World coordinate systems of calibrations with the common interface of astropy (APE 14)."""
 
 from __future__ import annotations
 
@@ -51,15 +51,14 @@ SIP_ORDER = 9  # highest order of a SIP polynomial
 class CalibrationWCS(BaseLowLevelWCS, HighLevelWCSMixin):
     """World coordinate system of one chip at one date, with its errors.
 
-    `Calibration.wcs` makes it.  It has both interfaces of APE 14: methods that take and return
-    numbers, such as `pixel_to_world_values`, and methods that take and return objects, such as
-    `pixel_to_world`.  Any package that accepts such a WCS accepts it, among them photutils,
-    reproject, regions, ndcube and the axes of astropy for matplotlib.
+    Use `Calibration.wcs` to create it.  It has both interfaces of APE 14: methods for numbers, such
+    as `pixel_to_world_values`, and methods for objects, such as `pixel_to_world`.  It can be used
+    with photutils, reproject, regions, ndcube, WCSAxes, and other packages that accept such a WCS.
 
     Pixels are 0-based: the centre of the first pixel is (0, 0).  World coordinates are right
     ascension and declination (ICRS) in degrees, or u and v if the plane of the calibration has no
-    position on the sky.  Positions have any shape and are broadcast.  Pixels are found by Newton's
-    method on the same map, look-up tables included; they are NaN if there is no solution.
+    position on the sky.  Positions of any shape are broadcast.  The inverse uses Newton's method on
+    the map, including look-up tables, and is NaN if there is no solution.
 
     Parameters
     ----------
@@ -92,7 +91,7 @@ class CalibrationWCS(BaseLowLevelWCS, HighLevelWCSMixin):
 
     @cached_property
     def chip_map(self) -> ChipMap:
-        """Map from FITS 1-based pixels to the plane (u, v), look-up tables included."""
+        """Map from FITS 1-based pixels to the plane (u, v), including look-up tables."""
         [chip_map] = self.calibration.with_tables(self.calibration.at(origin="stated")).values()
         return chip_map
 
@@ -104,7 +103,7 @@ class CalibrationWCS(BaseLowLevelWCS, HighLevelWCSMixin):
     # -- values -----------------------------------------------------------------------------------
 
     def pixel_to_world_values(self, *pixel_arrays: ArrayLike) -> tuple[Float, Float]:
-        """World coordinates of pixels.
+        """Convert pixels to world coordinates.
 
         Parameters
         ----------
@@ -115,7 +114,7 @@ class CalibrationWCS(BaseLowLevelWCS, HighLevelWCSMixin):
         -------
         tuple of ndarray
             Right ascension and declination in degrees, or u and v in the unit of the calibration;
-            numbers if x and y are numbers.
+            scalars if x and y are scalars.
         """
         x, y, shape = _flat(*pixel_arrays)
         plane = self.chip_map.at(x + 1.0, y + 1.0)
@@ -123,7 +122,7 @@ class CalibrationWCS(BaseLowLevelWCS, HighLevelWCSMixin):
         return first.reshape(shape)[()], second.reshape(shape)[()]
 
     def world_to_pixel_values(self, *world_arrays: ArrayLike) -> tuple[Float, Float]:
-        """Pixels of world coordinates.
+        """Convert world coordinates to pixels.
 
         Parameters
         ----------
@@ -134,7 +133,7 @@ class CalibrationWCS(BaseLowLevelWCS, HighLevelWCSMixin):
         Returns
         -------
         tuple of ndarray
-            0-based x and y; NaN if no pixel of the chip or around it has this position.
+            0-based x and y; NaN if no pixel on the chip or near it has this position.
         """
         first, second, shape = _flat(*world_arrays)
         plane = np.stack([first, second])
@@ -180,7 +179,7 @@ class CalibrationWCS(BaseLowLevelWCS, HighLevelWCSMixin):
 
     @property
     def axis_correlation_matrix(self) -> Bool:
-        """Matrix that is True where a world axis depends on a pixel axis: everywhere."""
+        """Matrix that is True if a world axis depends on a pixel axis; here always."""
         return np.ones((2, 2), bool)
 
     @property
@@ -221,7 +220,7 @@ class CalibrationWCS(BaseLowLevelWCS, HighLevelWCSMixin):
 
     @property
     def bounding_box(self) -> tuple[tuple[float, float], tuple[float, float]]:
-        """Edges of the chip in x and in y, as `pixel_bounds`; pixels outside are mapped too."""
+        """Edges of the chip in x and in y, like `pixel_bounds`; pixels outside are mapped too."""
         return self.pixel_bounds
 
     # -- errors -----------------------------------------------------------------------------------
@@ -231,35 +230,35 @@ class CalibrationWCS(BaseLowLevelWCS, HighLevelWCSMixin):
     ) -> units.Quantity:
         """Covariance of the positions of pixels.
 
-        It contains the errors of the coefficients and the `further` errors of the calibration, the
-        same as `bayesdist apply --sky`.  Errors of centroids are not contained.
+        It includes the errors of the coefficients and the `further` errors of the calibration, as
+        `bayesdist apply --sky` does, but not the errors of centroids.
 
         Parameters
         ----------
         x, y : array_like
             0-based pixels of any shape.
         joint : bool
-            Give the covariance between all positions too.
+            True to include the covariance between all positions.
         further : bool
-            False to leave out the further errors of the calibration: the covariance is then that of
-            the draws of `draw`.
+            False to exclude the further errors of the calibration, so that the covariance is that
+            of the draws from `draw`.
 
         Returns
         -------
         astropy.units.Quantity
             In mas^2 along east and north, or along u and v in the square of their unit.  The shape
             is that of the positions followed by (2, 2); with `joint` it is (2 N, 2 N) for N
-            positions, with the two axes of each position next to each other.
+            positions, with the two axes of each position adjacent.
 
         Raises
         ------
         InputError
-            If the calibration states no errors.
+            If the calibration has no errors.
         """
         px, py, shape = _flat(x, y)
         calibration = self.calibration if further else replace(self.calibration, further=())
         if self.placement is None:
-            single, whole = plane_covariances(
+            single, joint_cov = plane_covariances(
                 calibration,
                 {self.chip: self.chip_map},
                 px + 1.0,
@@ -272,21 +271,21 @@ class CalibrationWCS(BaseLowLevelWCS, HighLevelWCSMixin):
             at = sky_positions(
                 calibration, px + 1.0, py + 1.0, self.chip, placement=self.placement, joint=joint
             )
-            single, whole, unit = at.cov, at.joint, units.mas**2
+            single, joint_cov, unit = at.cov, at.joint, units.mas**2
         if single is None:
             raise InputError(
-                "states no errors of its coefficients",
+                "has no errors of the coefficients",
                 where=self.calibration.name,
-                do="use a run, or a file that holds the covariance",
+                do="use a run, or a file that contains the covariance",
             )
-        if whole is not None:
-            return units.Quantity(whole.reshape(2 * px.size, 2 * px.size), unit)
+        if joint_cov is not None:
+            return units.Quantity(joint_cov.reshape(2 * px.size, 2 * px.size), unit)
         return units.Quantity(single.reshape(*shape, 2, 2), unit)
 
     def draw(self, n: int, rng: Random = 1) -> list[CalibrationWCS]:
         """Random draws from the posterior of the WCS.
 
-        Each is a possible WCS of the same chip, without errors.  The coefficients vary as in the
+        Each draw is a WCS of the same chip without errors.  The coefficients are drawn from the
         posterior; the further errors of the calibration are not drawn.
 
         Parameters
@@ -303,14 +302,14 @@ class CalibrationWCS(BaseLowLevelWCS, HighLevelWCSMixin):
         Raises
         ------
         InputError
-            If the calibration states no errors of its coefficients, or `n` is negative.
+            If the calibration has no errors of the coefficients, or `n` is negative.
         """
         n = whole_number(n, "the number of draws", least=0, where="draw")
         if self.calibration.errors == "none":
             raise InputError(
-                "states no errors of its coefficients, so there is nothing to draw",
+                "has no errors of the coefficients that could be drawn",
                 where=self.calibration.name,
-                do="use a run, or a file that holds the covariance",
+                do="use a run, or a file that contains the covariance",
             )
         solution = self.calibration.solution
         exact = np.zeros((solution.model.n_params,) * 2)
@@ -325,7 +324,7 @@ class CalibrationWCS(BaseLowLevelWCS, HighLevelWCSMixin):
                 further=(),
             )
             drawn = replace(self, calibration=calibration)
-            # the cached map: thousands of draws need not work it out again
+            # set the cached map, which would be slow to compute for thousands of draws
             drawn.__dict__["chip_map"] = replace(
                 self.chip_map, name=name, coefficients=theta.reshape(2, -1), cov=None
             )
@@ -340,8 +339,8 @@ class CalibrationWCS(BaseLowLevelWCS, HighLevelWCSMixin):
         Returns
         -------
         astropy.modeling.Model
-            Two inputs, x and y; two outputs, right ascension and declination in degrees, or u and
-            v.  `inverse` iterates on the map, as `world_to_pixel_values` does.
+            Model with inputs x and y and outputs right ascension and declination in degrees, or u
+            and v.  Its inverse uses Newton's method, like `world_to_pixel_values`.
         """
         return self._model(None)
 
@@ -355,23 +354,23 @@ class CalibrationWCS(BaseLowLevelWCS, HighLevelWCSMixin):
         Parameters
         ----------
         inverse_order : int, optional
-            Order of a polynomial that is fitted over the chip for the inverse, which ASDF files can
-            hold.  By default the inverse iterates on the map, and the WCS cannot be written to a
+            Order of a polynomial inverse that is fitted over the chip and can be stored in ASDF
+            files.  By default the inverse uses Newton's method, and the WCS cannot be written to a
             file.
 
         Returns
         -------
         gwcs.WCS
-            From a frame ``detector`` in pixels to a frame ``world``: ICRS, or u and v.  It has no
-            bounding box.  With one, as in ``w.bounding_box = wcs.bounding_box``, gwcs refuses
-            positions outside the range of the four corners, some pixels at curved edges and all
-            around a celestial pole among them.
+            WCS from the frame ``detector`` in pixels to the frame ``world``, ICRS or u and v.  It
+            has no bounding box.  If you set one, as in ``w.bounding_box = wcs.bounding_box``, gwcs
+            rejects positions outside the range of the four corners.  These include some pixels at
+            curved edges, and all pixels if the chip contains a celestial pole.
 
         Raises
         ------
         InputError
-            If gwcs is not installed, or look-up tables behind the polynomial leave no inverse that
-            a file can hold.
+            If gwcs is not installed, or a polynomial inverse is requested for a chip with look-up
+            tables after the polynomial.
         """
         try:
             import gwcs
@@ -401,13 +400,13 @@ class CalibrationWCS(BaseLowLevelWCS, HighLevelWCSMixin):
     def to_fits_sip(self, *, max_residual: float = 0.0) -> WCS:
         """WCS of astropy.wcs with SIP polynomials.
 
-        It is exact for a polynomial up to order 9 without look-up tables.  Otherwise a polynomial
-        of order 9 is fitted over the chip if that is allowed by `max_residual`.
+        It is exact for polynomials up to order 9 without look-up tables.  Otherwise a polynomial of
+        order 9 is fitted over the chip, and accepted if its residuals are at most `max_residual`.
 
         Parameters
         ----------
         max_residual : float
-            Largest distance in pixels that the fitted polynomial may have from the map.
+            Largest accepted distance, in pixels, between the fitted polynomial and the map.
 
         Returns
         -------
@@ -417,15 +416,15 @@ class CalibrationWCS(BaseLowLevelWCS, HighLevelWCSMixin):
         Raises
         ------
         InputError
-            If the plane has no position on the sky, or the fitted polynomial is farther from the
-            map than `max_residual`; the message states its largest and rms distance.
+            If the plane has no position on the sky, or the fitted polynomial deviates from the map
+            by more than `max_residual`; the message states the largest and rms distance.
         """
         placement = self.placement
         if placement is None:
             raise InputError(
-                "has no position on the sky, and a SIP header has to state one",
+                "has no position on the sky, which a SIP header requires",
                 where=self.calibration.name,
-                do="give wcs the point, the sky position of u, v = 0",
+                do="give the argument point of wcs, the sky position of u, v = 0",
             )
         allowed = value_in(max_residual, "pix", "max_residual", where="to_fits_sip")
         if not allowed >= 0:
@@ -450,7 +449,7 @@ class CalibrationWCS(BaseLowLevelWCS, HighLevelWCSMixin):
         return load_object(hooks.SIP)(self._on_tangent_plane(chip_map), placement.point)
 
     def _on_tangent_plane(self, chip_map: ChipMap) -> Calibration:
-        """Calibration of the chip in arcsec to the east and north of the tangent point."""
+        """Calibration of the chip with u to the east and v to the north, in arcsec."""
         placement = self.placement
         assert placement is not None
         K = chip_map.basis.n_terms
@@ -482,7 +481,7 @@ class CalibrationWCS(BaseLowLevelWCS, HighLevelWCSMixin):
         return "\n".join(lines) + ">"
 
     def _centre_lines(self, x: float, y: float) -> list[str]:
-        """Lines on the position of the centre, the pixel scale and the parity."""
+        """Lines that state the position of the centre, the pixel scale and the parity."""
         world = self.pixel_to_world_values(x, y)
         slope = self.chip_map.slope(x + 1.0, y + 1.0)[0]
         if self.placement is None:
@@ -504,7 +503,7 @@ class CalibrationWCS(BaseLowLevelWCS, HighLevelWCSMixin):
         ]
 
     def _sigma_words(self, x: float, y: float) -> str:
-        """Standard deviations along an axis at the centre and in the worst corner."""
+        """Standard deviations per axis at the centre and in the worst corner, in words."""
         corners = ([x, 0.0, 2 * x, 0.0, 2 * x], [y, 0.0, 0.0, 2 * y, 2 * y])
         try:
             cov = self.covariance(*corners)
@@ -526,10 +525,10 @@ def wcs_of_chip(
     mirrored: bool,
     pixel_scale: Number | None,
 ) -> CalibrationWCS:
-    """WCS of a chip; arguments as for `Calibration.wcs`."""
+    """WCS of a chip; see `Calibration.wcs`."""
     number = chosen_chip(calibration.numbers, chip, where=calibration.name)
     date = None if epoch is None else year_of(epoch)
-    calibration.at(date)  # refuses a date that the calibration cannot be brought to
+    calibration.at(date)  # raises an error for an invalid date
     placement = None
     if calibration.plane.point is not None or point is not None:
         angle = scale = None
@@ -555,9 +554,9 @@ def wcs_of_chip(
         )
     elif position_angle is not None or mirrored or pixel_scale is not None:
         raise InputError(
-            "has no position on the sky, to which the directions and the scale of u and v refer",
+            "has no position on the sky, so that directions and scale of u and v are undefined",
             where=calibration.name,
-            do="give the point, the sky position of u, v = 0, too",
+            do="also give the point, the sky position of u, v = 0",
         )
     return CalibrationWCS(_at_date(calibration, number, date), placement)
 
@@ -565,12 +564,12 @@ def wcs_of_chip(
 def _check_placement(
     calibration: Calibration, position_angle: float | None, pixel_scale: float | None
 ) -> None:
-    """Refuse a plane without the direction or the scale that it needs on the sky."""
+    """Raise InputError if the direction or the scale of a plane on the sky is missing."""
     if calibration.plane.kind == "aperture" and position_angle is None:
         raise InputError(
-            "lies in the plane of an aperture, whose orientation on the sky is not known",
+            "is in the plane of an aperture, and its orientation on the sky is unknown",
             where=calibration.name,
-            do="give position_angle, that of V3 (or of v, if V3 is not known) at the point",
+            do="give position_angle, that of V3 (or of v, if V3 is unknown) at the point",
         )
     if calibration.unit == "pix" and not (
         pixel_scale is not None and np.isfinite(pixel_scale) and pixel_scale > 0
@@ -578,14 +577,14 @@ def _check_placement(
         raise InputError(
             "has u and v in pixels of unknown size"
             if pixel_scale is None
-            else f"has u and v in pixels, and pixel_scale is {pixel_scale:g}",
+            else f"has u and v in pixels, but pixel_scale is {pixel_scale:g}",
             where=calibration.name,
             do="give pixel_scale in arcsec, a positive number",
         )
 
 
 def _at_date(calibration: Calibration, number: int, epoch: float | None) -> Calibration:
-    """Calibration of one chip at a date, with the draws of its solution."""
+    """Calibration of one chip at a date; the draws of its solution are kept."""
     date = calibration.reference_date if epoch is None else epoch
     return replace(
         calibration,
@@ -601,17 +600,18 @@ def _at_date(calibration: Calibration, number: int, epoch: float | None) -> Cali
 
 
 def _rounded_up(value: float) -> float:
-    """Value rounded up to two digits."""
+    """Value rounded up to two significant digits."""
     step = 10.0 ** (np.floor(np.log10(value)) - 1)
     return float(np.ceil(value / step) * step)
 
 
 def _flat(*arrays: ArrayLike) -> tuple[Float, Float, tuple[int, ...]]:
-    """Two arrays (N,), broadcast, and the shape that they had."""
+    """Broadcast and flatten two arrays; returns both (N,) and their common shape."""
     try:
         first, second = np.broadcast_arrays(*(np.asarray(array, float) for array in arrays))
     except (TypeError, ValueError) as error:
         raise InputError(
-            f"x and y are no positions ({error})", do="give numbers, or arrays of one shape"
+            f"x and y are not positions ({error})",
+            do="give numbers, or arrays of the same shape",
         ) from error
     return first.ravel(), second.ravel(), first.shape

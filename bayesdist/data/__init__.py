@@ -1,9 +1,8 @@
-"""Input: matched positions, reference catalogues, and the matching of star lists with catalogues.
+"""Input data: matched positions, reference catalogues, and matching of star lists.
 
-`read_matches` reads any known kind of file.  Each kind has a module of its own, and all of them end
-in `Matches`, where units, errors and row numbers have been checked.  Tables that are larger than
-the memory are Parquet: `open_matches` leaves them on disk, to be read in batches;
-`write_partitioned` makes such files.
+`read_matches` reads files of all supported kinds. All of them end in `Matches`, after units, errors
+and row numbers have been checked. Tables larger than memory are stored as Parquet: `open_matches`
+leaves them on disk, to be read in batches, and `write_partitioned` writes such files.
 """
 
 import lazy_loader

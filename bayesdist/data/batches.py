@@ -1,4 +1,4 @@
-"""Batches of rows: units of reading, of transfer to a worker and of computing."""
+"""Batches of rows, which are read, sent to a worker and processed as one unit."""
 
 from __future__ import annotations
 
@@ -6,21 +6,21 @@ import numpy as np
 
 from bayesdist.errors import InputError
 
-BATCH = 2**20  # rows of a batch at most: as many as a row group of Parquet has by default
+BATCH = 2**20  # largest number of rows in a batch, the default size of a Parquet row group
 
 
 def batch_edges(n: int) -> list[int]:
-    """Edges 0, ..., n of batches of about equal size."""
+    """Edges 0, ..., n of batches of nearly equal size."""
     return even_edges(n, BATCH)
 
 
 def even_edges(n: int, most: int) -> list[int]:
-    """Edges 0, ..., n of ranges of about equal size, of at most `most` rows."""
+    """Edges 0, ..., n of ranges of nearly equal size with at most `most` rows each."""
     return np.linspace(0, n, -(-n // most) + 1).astype(int).tolist()
 
 
 def every_kth(n_rows: int, n: int) -> int:
-    """Smallest k for which every k-th of `n_rows` rows makes no more than n."""
+    """Smallest k for which every k-th of `n_rows` rows gives a sample of at most n rows."""
     if n < 1:
         raise InputError(f"a sample of {n} rows is asked for", do="ask for at least one")
     return max(1, -(-n_rows // n))

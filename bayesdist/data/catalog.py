@@ -38,40 +38,43 @@ _COLUMNS = ("u", "v", "mag", *(name for pair in _PAIRS for name in pair), *_PARA
 
 @dataclass(frozen=True, eq=False)
 class ReferenceCatalog:
-    """Reference stars, arrays of length N.
+    """Reference stars: positions, errors, proper motions and parallaxes; arrays of length N.
 
     Parameters
     ----------
     u, v : ndarray
         Positions at `epoch`, in `unit`.
     sigma_u, sigma_v : ndarray, optional
-        Their standard errors; 0 or more.
+        Standard errors of the positions; 0 or more.
     mag : ndarray, optional
+        Magnitudes.
     pm_u, pm_v : ndarray, optional
         Proper motions in `unit` per year.
     sigma_pm_u, sigma_pm_v : ndarray, optional
-        Their standard errors; 0 or more.
+        Standard errors of the proper motions; 0 or more.
     epoch : float or ndarray, optional
-        Decimal year of the positions, one for all or one for each star.
+        Decimal year of the positions, common to all stars or one per star.
     unit : str
         'pix', 'arcsec', 'mas' or 'deg'.
     tangent_point : tuple of float, optional
-        RA and Dec in degrees of the plane that u, v lie on: u grows to the east, v to the north.
+        RA and Dec of the tangent point in degrees, if u, v are on a tangent plane; u increases to
+        the east and v to the north.
     source : str
-        File.
+        Name of the file.
     star : ndarray of int, optional
-        Code of each star, 0 or more, by which it is known in tables of matches; by default the row,
-        from 0.  It stays with the star in every selection.
+        Code of each star, 0 or more, which identifies it in tables of matches. The default is the
+        row, counted from 0. It is kept in every selection.
     parallax, sigma_parallax : ndarray, optional
-        In `unit`, of a catalogue with a tangent point; 0 where it is not known.
+        Parallaxes and their standard errors in `unit`, for a catalogue with a tangent point; 0 if
+        unknown.
     notes : tuple of str
-        Treatment of the file's stars, as clauses.
+        Clauses on how the stars of the file were treated.
 
     Raises
     ------
     InputError
-        For no stars, unequal lengths, values that are not finite, negative errors or codes, or half
-        a pair.
+        If there are no stars, if lengths are unequal, if values are not finite, if errors or codes
+        are negative, or if only one of a pair of columns is given.
 
     Examples
     --------
@@ -103,9 +106,9 @@ class ReferenceCatalog:
         n = np.size(self.u)
         if n == 0:
             raise InputError("holds no stars", where=self.source, do="give a catalogue with stars")
-        given = columns_of(self, _COLUMNS)
-        for pair, what in zip(_PAIRS, ("errors", "motions", "errors of motions"), strict=True):
-            refuse_half(pair, given, where=self.source, what=what)
+        columns = columns_of(self, _COLUMNS)
+        for pair, quantity in zip(_PAIRS, ("errors", "motions", "errors of motions"), strict=True):
+            refuse_half(pair, columns, where=self.source, what=quantity)
         sigmas = [name for name in _COLUMNS if name.startswith("sigma")]
         check_columns(self, _COLUMNS, where=self.source, not_negative=sigmas)
         star = np.ascontiguousarray(np.arange(n) if self.star is None else self.star, np.int64)
@@ -131,12 +134,17 @@ class ReferenceCatalog:
         return len(self.u)
 
     def select(self, which: NDArray[Any]) -> ReferenceCatalog:
-        """Stars by mask or indices.
+        """Select stars by mask or indices.
 
         Parameters
         ----------
         which : ndarray
-            Boolean mask (S,), or indices.
+            Boolean mask (N,), or indices.
+
+        Returns
+        -------
+        ReferenceCatalog
+            The selected stars, with their codes.
         """
         arrays = {name: values[which] for name, values in columns_of(self, _COLUMNS).items()}
         if isinstance(self.epoch, np.ndarray):
@@ -144,14 +152,20 @@ class ReferenceCatalog:
         return replace(self, **arrays, star=self.star[which])
 
     def rescaled(self, factor: float, unit: str) -> ReferenceCatalog:
-        """Catalogue in another unit, of which the present one is `factor`.
+        """Convert the catalogue to another unit.
 
         Parameters
         ----------
         factor : float
-            Of all lengths: positions, motions and their errors.
+            Size of the present unit in the new unit. All positions, motions and their errors are
+            multiplied by it.
         unit : str
             Name of the new unit.
+
+        Returns
+        -------
+        ReferenceCatalog
+            Catalogue in the new unit.
         """
         lengths = columns_of(self, [name for name in _COLUMNS if name != "mag"])
         return replace(self, **{k: factor * values for k, values in lengths.items()}, unit=unit)
@@ -161,23 +175,24 @@ class ReferenceCatalog:
 
             u(t) = u + pm (t - t0),   sigma(t)^2 = sigma^2 + sigma_pm^2 (t - t0)^2
 
-        Errors of positions and proper motions count as uncorrelated, which holds at the mean epoch
-        of the catalogue's observations.  Without proper motions the stars stand still; without
-        errors of them, or of positions, the errors stay as they are.
+        Errors of positions and proper motions are treated as uncorrelated, which holds at the mean
+        epoch of the catalogue's observations. Without proper motions, positions do not change.
+        Without errors of the motions, or of the positions, the errors do not change.
 
         Parameters
         ----------
         epoch : float, str, Time, date or Quantity
-            Numbers are decimal years.
+            New epoch; numbers are decimal years.
 
         Returns
         -------
         ReferenceCatalog
+            Catalogue with positions and errors at the new epoch.
 
         Raises
         ------
         InputError
-            When there are proper motions but no epoch to count from.
+            If there are proper motions but no epoch of the positions.
         """
         year = year_of(epoch)
         if self.pm_u is None or self.pm_v is None:
@@ -202,27 +217,28 @@ class ReferenceCatalog:
         )
 
     def as_seen(self, epoch: Epoch) -> ReferenceCatalog:
-        """Catalogue as seen from the Earth: that of `at`, displaced by the parallaxes.
+        """Catalogue as seen from the Earth: as from `at`, displaced by the parallaxes.
 
         Parameters
         ----------
         epoch : float, str, Time, date or Quantity
-            Numbers are decimal years.
+            Epoch of the observation; numbers are decimal years.
 
         Returns
         -------
         ReferenceCatalog
-            Without parallaxes; they are in its positions, and their errors in its errors.
+            Catalogue without parallax columns: parallaxes are included in the positions, and their
+            errors in the errors.
 
         Raises
         ------
         InputError
-            As `at`.
+            As for `at`.
         """
         then = self.at(epoch)
         if self.parallax is None or self.tangent_point is None:
             return then
-        # factors of the middle of the field serve all of it
+        # parallax factors at the middle of the field are used for the whole field
         east, north = parallax_factors(year_of(epoch), *self.tangent_point)[0]
         sigmas = {}
         u, v = then.sigma_u, then.sigma_v
@@ -241,7 +257,7 @@ class ReferenceCatalog:
         )
 
     def mirrored(self) -> ReferenceCatalog:
-        """Catalogue with the sign of u changed, which takes it off the tangent plane's own axes."""
+        """Catalogue with the sign of u reversed, and therefore without a tangent point."""
         return replace(
             self,
             u=-self.u,
@@ -270,11 +286,11 @@ _ALIASES: dict[str, tuple[str, ...]] = {
     "star": ALIASES["star"],
 }
 _NAME_PAIRS = (("u", "v"), ("ra", "dec"), *_PAIRS)
-# as tables of matches call these quantities
+# keys under which tables of matches know these quantities
 _ALSO = {"sigma_ra": "sigma_u", "sigma_dec": "sigma_v", "pm_ra": "pm_u", "pm_dec": "pm_v"}
 _ALSO |= {"sigma_pm_ra": "sigma_pm_u", "sigma_pm_dec": "sigma_pm_v", "catalogue_epoch": "epoch"}
 _MOTIONS = frozenset(("pm_u", "pm_v", "sigma_pm_u", "sigma_pm_v"))
-_SPARED = frozenset(_PARALLAX)  # a star may lack these: they are 0 then
+_SPARED = frozenset(_PARALLAX)  # missing values of these quantities count as 0
 
 
 def read_catalog(
@@ -290,18 +306,19 @@ def read_catalog(
     Parameters
     ----------
     path : path-like
-        .ecsv, .csv, .fits or .parquet.
+        .ecsv, .csv, .fits or .parquet file.
     columns, unit, epoch, tangent_point
-        As `catalog_from_table`.
+        As for `catalog_from_table`.
 
     Returns
     -------
     ReferenceCatalog
+        Reference stars of the file.
 
     Raises
     ------
     InputError
-        As `catalog_from_table`, and for files that cannot be read.
+        As for `catalog_from_table`, and if the file cannot be read.
 
     Examples
     --------
@@ -330,37 +347,38 @@ def catalog_from_table(
     epoch: Epoch | None = None,
     tangent_point: Direction | None = None,
 ) -> ReferenceCatalog:
-    """Reference catalogue from a table's columns.
+    """Reference catalogue from the columns of a table.
 
     Parameters
     ----------
     table : table
-        Any object that `Matches.from_table` takes.
+        Any object that `Matches.from_table` accepts.
     columns : mapping of str to str, optional
-        Column of each quantity: u v ra dec sigma_u sigma_v pm_u pm_v sigma_pm_u sigma_pm_v
-        parallax sigma_parallax epoch mag star; an empty name leaves one out.  With ra and dec,
-        positions are projected to the tangent plane in arcsec; pm_u (pm_ra) is then the motion to
-        the east with its factor cos(dec), all errors and motions turn with the plane, and stars
-        without a value, a motion above all, are left out.
+        Column of each quantity: u v ra dec sigma_u sigma_v pm_u pm_v sigma_pm_u sigma_pm_v parallax
+        sigma_parallax epoch mag star; an empty name omits the quantity. With ra and dec, positions
+        are projected to the tangent plane in arcsec. pm_u (pm_ra) is then the motion to the east,
+        which includes the factor cos(dec); errors and motions are rotated to the axes of the plane;
+        and stars with a missing value, in most cases a missing motion, are left out.
     source : str, optional
-        File, for errors.
+        Name of the file, for error messages.
     unit : str, optional
-        Unit of u and v where the table has none.  Errors and motions without a unit are in that
-        of u and v, per year; with ra and dec they must have one, in the file or by their names
-        (those of the Gaia archive and of VizieR).
+        Unit of u and v if the table states none. Errors and motions without a unit are in that of u
+        and v, per year. With ra and dec they must have a unit, in the file or implied by the names
+        of the Gaia archive or VizieR.
     epoch : float, str, Time, date or Quantity, optional
-        Epoch of the positions, where the table has no such column.
+        Epoch of the positions, if the table has no such column.
     tangent_point : SkyCoord, or pair of float or Quantity, optional
-        By default the mean direction of the stars.
+        Tangent point. The default is the mean direction of the stars.
 
     Returns
     -------
     ReferenceCatalog
+        Reference stars of the table.
 
     Raises
     ------
     InputError
-        For missing columns, values that are missing or no numbers, and units missing or
+        If columns are missing, if values are missing or not numbers, or if units are missing or
         contradictory.
     """
     if epoch is not None:
@@ -370,30 +388,36 @@ def catalog_from_table(
         point = direction_in(tangent_point, "tangent_point", where=source)
     table = with_sky_columns(as_table(table, source))
     named = {_ALSO.get(key, key): name for key, name in (columns or {}).items()}
-    found = find_columns(table.colnames, named, _ALIASES, source=source, pairs=_NAME_PAIRS)
-    on_sky = is_on_sky(table.colnames, found, named, source)
+    column_names = find_columns(table.colnames, named, _ALIASES, source=source, pairs=_NAME_PAIRS)
+    on_sky = is_on_sky(table.colnames, column_names, named, source)
     first, second = ("ra", "dec") if on_sky else ("u", "v")
-    if first not in found or second not in found:
+    if first not in column_names or second not in column_names:
         raise InputError(
             f"no columns for u, v or ra, dec among {', '.join(table.colnames) or 'none'}",
             where=source,
             do="rename the columns, or name them in the option 'columns'",
         )
     unread = {"u", "v"} if on_sky else {"ra", "dec", *_PARALLAX}
-    unread |= {one for pair in _PAIRS for one in pair if not set(pair) <= set(found)}
+    unread |= {
+        column_name for pair in _PAIRS for column_name in pair if not set(pair) <= set(column_names)
+    }
     if on_sky and "pm_u" in unread:
         unread |= _MOTIONS
-    found = {key: name for key, name in found.items() if key not in unread}
+    column_names = {key: name for key, name in column_names.items() if key not in unread}
     notes: tuple[str, ...] = ()
     rows = np.arange(len(table))
-    required = found if on_sky else {key: found[key] for key in _MOTIONS & found.keys()}
+    required = (
+        column_names
+        if on_sky
+        else {key: column_names[key] for key in _MOTIONS & column_names.keys()}
+    )
     if required and len(table):
         stay, counts = without_missing(
             table, required, source=source, reject=False, spared=_SPARED, motions=_MOTIONS
         )
         table, rows = table[stay], rows[stay]
         notes = tuple(f"{n} stars are left out: {reason}" for reason, n in counts.items())
-    quantities = Quantities(table, found, source, lambda index: row_number(int(rows[index])))
+    quantities = Quantities(table, column_names, source, lambda index: row_number(int(rows[index])))
     column = quantities.__getitem__
     if on_sky:
         base = plane_unit(unit, source=source)
@@ -402,7 +426,7 @@ def catalog_from_table(
 
     def values(key: str, per_year: str = "") -> Float:
         if on_sky and column(key).unit is None:
-            # catalogues write degrees for positions and mas for the rest: no guess is safe
+            # catalogues use degrees for positions and mas for other columns, so no default is safe
             raise InputError(
                 "has no unit",
                 where=column(key).where,
@@ -416,16 +440,16 @@ def catalog_from_table(
     if not on_sky:
         out |= {key: values(key) for key in ("u", "v")}
     for pair in _PAIRS:
-        if pair[0] in found:
+        if pair[0] in column_names:
             out |= {key: values(key, " / yr" if "pm" in key else "") for key in pair}
-    out |= {key: values(key) for key in _PARALLAX if key in found}
-    if "mag" in found:
+    out |= {key: values(key) for key in _PARALLAX if key in column_names}
+    if "mag" in column_names:
         out["mag"] = column("mag").numbers()
-    if "star" in found:
+    if "star" in column_names:
         out["star"] = _identities(column("star"))
     elif notes:
         out["star"] = rows
-    out["epoch"] = column("epoch").years() if "epoch" in found else epoch
+    out["epoch"] = column("epoch").years() if "epoch" in column_names else epoch
     if on_sky:
         sigma, motion, sigma_motion = (
             np.stack([out.pop(key) for key in pair]) if pair[0] in out else None for pair in _PAIRS
@@ -442,10 +466,10 @@ def catalog_from_table(
 
 
 def _identities(column: SourceColumn) -> Int:
-    """Codes of the stars; a repeated one is refused."""
+    """Codes of the stars; InputError if a code is repeated."""
     star = column.integers()
     unique, first = np.unique(star, return_index=True)
     if len(unique) < len(star):
-        again = int(np.setdiff1d(np.arange(len(star)), first)[0])
-        raise column.fail(again, f"star {star[again]} stands twice")
+        repeated = int(np.setdiff1d(np.arange(len(star)), first)[0])
+        raise column.fail(repeated, f"star {star[repeated]} stands twice")
     return star

@@ -1,4 +1,4 @@
-"""Detections of stars on one exposure or on many."""
+"""Detections of stars in one or more exposures."""
 
 from __future__ import annotations
 
@@ -21,18 +21,18 @@ _COLUMNS = ("x", "y", "sigma", "mag", "q", *_CODES)
 
 @dataclass(frozen=True, eq=False)
 class Detections:
-    """Raw positions of stars on some exposures, arrays of length N unless stated otherwise.
+    """Raw positions of stars in exposures; arrays of length N unless stated otherwise.
 
     Parameters
     ----------
     x, y : ndarray
-        Raw detector position, FITS 1-based pixels of the chip.
+        Raw detector positions, FITS 1-based pixels of the chip.
     exposure : ndarray of int, optional
-        Codes into `exposure_names`; by default 0.
+        Indices into `exposure_names`; 0 by default.
     exposure_names : tuple of str, optional
-        By default the codes.
+        Names of the exposures. The default is their indices.
     chip : ndarray of int, optional
-        Chip *numbers* (not codes); by default 1.
+        Chip *numbers* (not codes); 1 by default.
     epoch : ndarray, shape (E,), optional
         Decimal year of each exposure.
     sigma : ndarray, optional
@@ -40,19 +40,19 @@ class Detections:
     mag : ndarray, optional
         Instrumental magnitudes, -2.5 log10(flux / exposure time).
     star : ndarray of int, optional
-        Code of the star; by default it is not known, -1.
+        Code of the star; by default -1, which means unknown.
     source : str
-        File.
+        Name of the file.
     q : ndarray, optional
         Quality of the PSF fit: 0 is perfect, large is poor.
     row : ndarray of int, optional
-        0-based row in the file.
+        Row in the file, counted from 0.
 
     Raises
     ------
     InputError
-        For no detections, unequal lengths, values that are not finite, or errors that are not
-        positive.
+        If there are no detections, if lengths are unequal, if values are not finite, or if errors
+        are not positive.
     """
 
     x: Float
@@ -94,14 +94,14 @@ class Detections:
 
     @property
     def name(self) -> str:
-        """Name of the exposure, of a list of one; else of the first."""
+        """Name of the first exposure, which is the only one in a list of one exposure."""
         return self.exposure_names[0]
 
     @property
     def where(self) -> str:
-        """File, for messages, and exposure where there is only one."""
-        one = len(self.exposure_names) == 1
-        return f"{self.source}, exposure {self.name}" if one else self.source
+        """File for messages, with the exposure if there is only one."""
+        is_single = len(self.exposure_names) == 1
+        return f"{self.source}, exposure {self.name}" if is_single else self.source
 
     @property
     def points(self) -> Float:
@@ -119,15 +119,17 @@ class Detections:
         return int(self.star.max()) + 1
 
     def select(self, which: NDArray[Any]) -> Detections:
-        """Detections by mask or indices; the exposures stay.
+        """Select detections by mask or indices; exposure names are kept.
 
         Parameters
         ----------
         which : ndarray of bool or int
+            Boolean mask (N,), or indices.
 
         Returns
         -------
         Detections
+            The selected detections.
         """
         columns = columns_of(self, _COLUMNS)
         return replace(self, **{name: values[which] for name, values in columns.items()})
@@ -139,27 +141,27 @@ def detections_of(
     epoch: Float | None = None,
     sigma: float | None = None,
 ) -> Detections:
-    """Detections of lists of one exposure each, with epochs (E,) in years.
+    """Combine lists of one exposure each; `epoch` (E,) is in decimal years.
 
-    `sigma` is one error for all, pixels; without it errors are those of the lists, where all have
-    some.  Refused where only some of the lists have magnitudes.
+    `sigma` is an error in pixels common to all detections. Without it, errors are those of the
+    lists if all lists have errors. InputError if only some of the lists have magnitudes.
     """
-    with_mag = [one.mag is not None for one in lists]
+    with_mag = [stars.mag is not None for stars in lists]
     if any(with_mag) and not all(with_mag):
         bare = lists[with_mag.index(False)]
         raise InputError("has no magnitudes, and others have", where=bare.source)
-    n = [len(one) for one in lists]
-    own = [one.sigma for one in lists if one.sigma is not None]
-    errors = np.concatenate(own) if len(own) == len(lists) else None
+    n = [len(stars) for stars in lists]
+    list_sigmas = [stars.sigma for stars in lists if stars.sigma is not None]
+    errors = np.concatenate(list_sigmas) if len(list_sigmas) == len(lists) else None
     return Detections(
-        np.concatenate([one.x for one in lists]),
-        np.concatenate([one.y for one in lists]),
+        np.concatenate([stars.x for stars in lists]),
+        np.concatenate([stars.y for stars in lists]),
         np.repeat(np.arange(len(lists)), n),
-        tuple(one.name for one in lists),
-        np.concatenate([one.chip for one in lists]),
+        tuple(stars.name for stars in lists),
+        np.concatenate([stars.chip for stars in lists]),
         epoch,
         errors if sigma is None else np.full(sum(n), sigma),
-        np.concatenate([one.mag for one in lists if one.mag is not None])
+        np.concatenate([stars.mag for stars in lists if stars.mag is not None])
         if all(with_mag)
         else None,
         source=lists[0].source if len(lists) == 1 else f"{len(lists)} star lists",

@@ -1,4 +1,4 @@
-"""Logs of exposures: each one's epoch, filter, aberration, roll and target; read and written."""
+"""Exposure logs: epoch, filter, velocity aberration, roll and target of each exposure."""
 
 from __future__ import annotations
 
@@ -22,9 +22,9 @@ from bayesdist.utils.arrays import Float
 from bayesdist.utils.text import ascii_of, refuse_control_characters
 
 _NUMBERS = ("exptime", "vafactor", "pa_v3", "ra", "dec")
-_SLOWEST = 2e-4  # |VAFACTOR - 1| of anything in orbit about the Earth stays below 1.4e-4
+_SLOWEST = 2e-4  # for anything in orbit around the Earth, |VAFACTOR - 1| is below 1.4e-4
 _UNITS = {"epoch": "yr", "exptime": "s", "pa_v3": "deg", "ra": "deg", "dec": "deg"}
-# plausible values: angles in other units and numbers of another meaning are beyond
+# plausible ranges, which exclude angles in other units and unrelated numbers
 _RANGES = {
     "exptime": (0.0, 1e7),
     "pa_v3": (-360.0, 720.0),
@@ -46,29 +46,30 @@ _ALIASES: dict[str, tuple[str, ...]] = {
 
 @dataclass(frozen=True)
 class Exposure:
-    """One exposure.
+    """One exposure of an exposure log.
 
     Parameters
     ----------
     name : str
+        Name of the exposure.
     epoch : float
-        Decimal year of its middle.
+        Decimal year of mid-exposure.
     filter : str
-        Empty where it is not known.
+        Filter; empty if unknown.
     exptime : float, optional
-        Seconds.
+        Exposure time, seconds.
     vafactor : float, optional
-        Scale factor of velocity aberration, as the keyword VAFACTOR.
+        Scale factor of velocity aberration, as in the keyword VAFACTOR.
     pa_v3 : float, optional
         Position angle of the V3 axis, degrees.
     ra, dec : float, optional
-        Target, degrees.
+        Position of the target, degrees.
 
     Raises
     ------
     InputError
-        For an empty name, numbers that are not finite or beyond all that exposures have, or a
-        factor that no orbit brings about.
+        If the name is empty, if a number is not finite or outside its plausible range, or if
+        VAFACTOR is too far from 1 for any orbit around the Earth.
     """
 
     name: str
@@ -113,18 +114,19 @@ class Exposure:
 
 @dataclass(frozen=True, eq=False)
 class ExposureLog:
-    """Exposures by name.
+    """Exposures, accessible by name.
 
     Parameters
     ----------
     exposures : tuple of Exposure
+        Exposures in the order of the log.
     source : str
-        File.
+        Name of the file.
 
     Raises
     ------
     InputError
-        For no exposures, or a repeated one.
+        If there are no exposures, or if a name is repeated.
     """
 
     exposures: tuple[Exposure, ...]
@@ -134,16 +136,16 @@ class ExposureLog:
         object.__setattr__(self, "exposures", tuple(self.exposures))
         if not self.exposures:
             raise InputError("holds no exposures", where=self.source, do="name at least one")
-        names = [one.name for one in self.exposures]
+        names = [exposure.name for exposure in self.exposures]
         if len(self._by_name) < len(names):
-            again = next(name for k, name in enumerate(names) if name in names[:k])
+            repeated = next(name for k, name in enumerate(names) if name in names[:k])
             raise InputError(
-                f"exposure {again} stands twice", where=self.source, do="name each only once"
+                f"exposure {repeated} stands twice", where=self.source, do="name each only once"
             )
 
     @cached_property
     def _by_name(self) -> dict[str, Exposure]:
-        return {one.name: one for one in self.exposures}
+        return {exposure.name: exposure for exposure in self.exposures}
 
     def __len__(self) -> int:
         return len(self.exposures)
@@ -155,7 +157,7 @@ class ExposureLog:
         return name in self._by_name
 
     def __getitem__(self, name: str) -> Exposure:
-        """The exposure of a name; InputError where there is none."""
+        """Exposure with this name; InputError if there is none."""
         try:
             return self._by_name[name]
         except KeyError:
@@ -165,13 +167,13 @@ class ExposureLog:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Names of the exposures, in their order."""
-        return tuple(one.name for one in self.exposures)
+        """Names of the exposures, in the order of the log."""
+        return tuple(exposure.name for exposure in self.exposures)
 
     @property
     def filters(self) -> tuple[str, ...]:
         """Filters, in the order of their first appearance."""
-        return tuple(dict.fromkeys(one.filter for one in self.exposures))
+        return tuple(dict.fromkeys(exposure.filter for exposure in self.exposures))
 
     def select(
         self,
@@ -179,27 +181,31 @@ class ExposureLog:
         filter: str | Collection[str] | None = None,
         names: Collection[str] | None = None,
     ) -> ExposureLog:
-        """Some of the exposures.
+        """Select exposures by filter and name.
 
         Parameters
         ----------
         filter : str or collection of str, optional
+            Filters to keep; all by default.
         names : collection of str, optional
+            Exposures to keep; all by default.
 
         Returns
         -------
         ExposureLog
+            The selected exposures.
 
         Raises
         ------
         InputError
-            When none is left.
+            If no exposure is selected.
         """
         filters = (filter,) if isinstance(filter, str) else filter
         chosen = [
-            one
-            for one in self.exposures
-            if (filters is None or one.filter in filters) and (names is None or one.name in names)
+            exposure
+            for exposure in self.exposures
+            if (filters is None or exposure.filter in filters)
+            and (names is None or exposure.name in names)
         ]
         if not chosen:
             raise InputError(
@@ -210,7 +216,7 @@ class ExposureLog:
         return replace(self, exposures=tuple(chosen))
 
     def require(self, *quantities: str) -> None:
-        """Refuse a log in which an exposure lacks a quantity.
+        """Raise InputError if any exposure lacks a quantity.
 
         Parameters
         ----------
@@ -220,125 +226,132 @@ class ExposureLog:
         Raises
         ------
         InputError
-            Naming the first exposure that lacks one.
+            If an exposure lacks one of them; the message names the first such exposure.
         """
-        for one in self.exposures:
+        for exposure in self.exposures:
             for key in quantities:
-                if getattr(one, key) in (None, ""):
+                if getattr(exposure, key) in (None, ""):
                     do = "add it to the log"
                     if key == "vafactor":
                         do += (
                             ", or compute it from epoch, ra and dec "
                             "(campaign.vafactor_source = 'earth')"
                         )
-                    raise InputError(f"exposure {one.name} has no {key}", where=self.source, do=do)
+                    raise InputError(
+                        f"exposure {exposure.name} has no {key}", where=self.source, do=do
+                    )
 
     def values(self, quantity: str) -> Float:
-        """A number of each exposure, NaN where it is not known.
+        """Values of a quantity for all exposures, NaN if unknown.
 
         Parameters
         ----------
         quantity : {'epoch', 'exptime', 'vafactor', 'pa_v3', 'ra', 'dec'}
+            Name of the quantity.
 
         Returns
         -------
         ndarray, shape (number of exposures,)
+            Values in the order of the log.
         """
-        found = (getattr(one, quantity) for one in self.exposures)
-        return np.array([np.nan if value is None else value for value in found], float)
+        stated = (getattr(exposure, quantity) for exposure in self.exposures)
+        return np.array([np.nan if value is None else value for value in stated], float)
 
     def with_aberration(self) -> ExposureLog:
         """Log with VAFACTOR computed where it is missing.
 
-        Only the motion of the Earth counts; the orbit of HST adds up to 2.5e-5.
+        Only the orbital motion of the Earth is included; the orbit of HST adds up to 2.5e-5.
 
         Returns
         -------
         ExposureLog
+            Log in which every exposure has VAFACTOR.
 
         Raises
         ------
         InputError
-            When an exposure has neither the factor nor a target.
+            If an exposure has neither VAFACTOR nor a target.
         """
         out = []
-        for one in self.exposures:
-            if one.vafactor is None:
-                if one.ra is None or one.dec is None:
+        for exposure in self.exposures:
+            if exposure.vafactor is None:
+                if exposure.ra is None or exposure.dec is None:
                     raise InputError(
-                        f"exposure {one.name} has neither vafactor nor ra and dec to compute it",
+                        f"exposure {exposure.name} has neither vafactor nor ra and dec to "
+                        "compute it",
                         where=self.source,
                         do="add one of them to the log",
                     )
-                factor = velocity_aberration(one.epoch, one.ra, one.dec)
-                one = replace(one, vafactor=factor)
-            out.append(one)
+                factor = velocity_aberration(exposure.epoch, exposure.ra, exposure.dec)
+                exposure = replace(exposure, vafactor=factor)
+            out.append(exposure)
         return replace(self, exposures=tuple(out))
 
 
 def read_exposures(path: str | os.PathLike[str]) -> ExposureLog:
-    """Read a log of exposures.
+    """Read an exposure log.
 
     Parameters
     ----------
     path : path-like
-        .ecsv, .csv, .fits or .parquet, one row for each exposure, with columns exposure epoch
-        filter exptime vafactor pa_v3 ra dec.  The epoch may be a decimal year, an ISO date, or a
-        Modified Julian Date with the unit 'd'.  All but exposure and epoch may be missing, in
-        single rows, too.
+        .ecsv, .csv, .fits or .parquet table with one row per exposure and the columns exposure
+        epoch filter exptime vafactor pa_v3 ra dec. The epoch may be a decimal year, an ISO date, or
+        a Modified Julian Date with the unit 'd'. Columns other than exposure and epoch are optional
+        and may have missing values.
 
     Returns
     -------
     ExposureLog
+        Exposures in the order of the rows.
 
     Raises
     ------
     InputError
-        For missing columns and values that are wrong, naming the row.
+        If columns are missing or values are invalid; the message names the row.
     """
     path = Path(path)
     table = read_table(path)
     needed = ("exposure", "epoch")
-    found = find_columns(table.colnames, None, _ALIASES, source=str(path), needed=needed)
+    column_names = find_columns(table.colnames, None, _ALIASES, source=str(path), needed=needed)
     if not len(table):
         raise InputError("holds no exposures", where=str(path), do="name at least one")
 
     def column(key: str) -> SourceColumn:
-        return SourceColumn(table[found[key]], str(path), found[key])
+        return SourceColumn(table[column_names[key]], str(path), column_names[key])
 
     codes, labels = column("exposure").labels()
     rows: dict[str, list[Any]] = {
         "name": [labels[code] for code in codes],
         "epoch": column("epoch").years().tolist(),
     }
-    if "filter" in found:
+    if "filter" in column_names:
         rows["filter"] = _filled(column("filter"))
     for key in _NUMBERS:
-        if key in found:
+        if key in column_names:
             rows[key] = _known_numbers(column(key), _UNITS.get(key))
     exposures = []
     for k in range(len(table)):
         try:
             exposures.append(Exposure(**{key: values[k] for key, values in rows.items()}))
         except InputError as error:
-            where = f"{path}, row {k + 1}, {error.where}".rstrip(", ")
-            raise InputError(error.cause, where=where, do=error.do) from None
+            location = f"{path}, row {k + 1}, {error.where}".rstrip(", ")
+            raise InputError(error.cause, where=location, do=error.do) from None
     return ExposureLog(tuple(exposures), source=str(path))
 
 
 def _filled(column: SourceColumn) -> list[str]:
-    """Texts of a column, empty where they are missing."""
-    known, named = column.known()
+    """Strings of a column; empty if missing."""
+    rows, named = column.known()
     out = [""] * len(column.values)
-    if len(known):
+    if len(rows):
         codes, labels = named.labels()
-        for row, code in zip(known, codes, strict=True):
+        for row, code in zip(rows, codes, strict=True):
             out[row] = labels[code]
     return out
 
 
 def _known_numbers(column: SourceColumn, unit: str | None) -> list[float | None]:
-    """Numbers of a column, None where they are missing."""
+    """Numbers of a column; None if missing."""
     numbers = column.known_numbers()
     if unit is not None and not np.isnan(numbers).all():
         numbers = numbers * column.factor(unit)
@@ -346,19 +359,20 @@ def _known_numbers(column: SourceColumn, unit: str | None) -> list[float | None]
 
 
 def write_exposures(log: ExposureLog, path: str | os.PathLike[str]) -> None:
-    """Write a log as `read_exposures` reads it.
+    """Write an exposure log that `read_exposures` can read.
 
     Parameters
     ----------
     log : ExposureLog
+        Log to write.
     path : path-like
-        .ecsv, .csv or .fits; replaced atomically.
+        .ecsv, .csv or .fits file, which is replaced atomically.
 
     Raises
     ------
     InputError
-        For another extension, names that are not ASCII in a FITS table, or when the file cannot be
-        written.
+        If the extension is not supported, if a FITS table would have names that are not ASCII, or
+        if the file cannot be written.
     """
     path = Path(path)
     if path.suffix.lower() not in _FORMATS:
@@ -367,24 +381,25 @@ def write_exposures(log: ExposureLog, path: str | os.PathLike[str]) -> None:
             where=str(path),
             do=f"choose one of {', '.join(_FORMATS)}",
         )
-    texts = (text for one in log for text in (one.name, one.filter))
-    other = next((text for text in texts if ascii_of(text) != text), None)
-    if path.suffix.lower() == ".fits" and other is not None:  # lists are found by these names
+    texts = (text for exposure in log for text in (exposure.name, exposure.filter))
+    not_ascii = next((text for text in texts if ascii_of(text) != text), None)
+    # star lists are found by these names
+    if path.suffix.lower() == ".fits" and not_ascii is not None:
         raise InputError(
-            f"the name {other!r} is not ASCII, which FITS tables hold alone",
+            f"the name {not_ascii!r} is not ASCII, which FITS tables hold alone",
             where=str(path),
             do="write .ecsv or .csv",
         )
     table = Table()
-    for one in fields(Exposure):
-        values = [getattr(exposure, one.name) for exposure in log]
-        if one.name in ("name", "filter"):
-            table["exposure" if one.name == "name" else one.name] = Column(values, dtype=str)
+    for field in fields(Exposure):
+        values = [getattr(exposure, field.name) for exposure in log]
+        if field.name in ("name", "filter"):
+            table["exposure" if field.name == "name" else field.name] = Column(values, dtype=str)
             continue
         missing = [value is None for value in values]
         if not all(missing):
             numbers = [np.nan if value is None else value for value in values]
-            column = MaskedColumn(numbers, mask=missing, unit=_UNITS.get(one.name))
-            table[one.name] = column if any(missing) else Column(column)
+            column = MaskedColumn(numbers, mask=missing, unit=_UNITS.get(field.name))
+            table[field.name] = column if any(missing) else Column(column)
     with atomic_path(path) as temporary:
         table.write(temporary, format=_FORMATS[path.suffix.lower()])

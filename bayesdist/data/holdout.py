@@ -1,7 +1,7 @@
-"""Matches that are set aside before anything is fitted, to be predicted afterwards.
+"""Matches that are held out of the fit in order to be predicted afterwards.
 
-The choice depends on a star's own code, or on its position on the detector where it has none, and
-on a seed: neither on the order of the rows nor on the batches in which they are read.
+The selection depends on a seed and on the star code, or on the detector position if there are no
+codes. It does not depend on the order of the rows or on the batches in which they are read.
 """
 
 from __future__ import annotations
@@ -20,42 +20,42 @@ from bayesdist.utils.streams import mixed
 
 Bits = NDArray[np.uint64]
 
-HELD_OUT = "held out"  # reason under which they are counted
+HELD_OUT = "held out"  # reason under which held-out rows are counted
 
 
 @dataclass(frozen=True)
 class HoldoutSpec:
-    """Selection of the matches that are set aside: a fraction of the stars, and whole exposures."""
+    """Selection of the matches to hold out: a fraction of the stars, and entire exposures."""
 
-    fraction: float  # of the stars, in [0, 1)
+    fraction: float  # fraction of the stars, in [0, 1)
     exposures: tuple[str, ...] = ()
     seed: int = 1
 
     def which(self, table: Matches) -> Bool:
-        """Boolean mask (N,) of the matches that are set aside; those of a star go together."""
+        """Boolean mask (N,) of the matches to hold out; all matches of a star are treated alike."""
         if table.star is not None:
             keys = [table.star.view(np.uint64)]
         else:
-            # -0.0 and 0.0 are one position
+            # adding 0.0 makes -0.0 and 0.0 the same position
             keys = [(a + 0.0).view(np.uint64) for a in (table.x, table.y)]
         bits = np.full(len(table), mixed(np.array([self.seed], np.uint64))[0])
         for key in keys:
             bits = mixed(bits ^ key)
         chosen = (bits >> np.uint64(11)) * 2.0**-53 < self.fraction
-        whole = [name in set(self.exposures) for name in table.exposure_names]
-        return np.asarray(chosen | np.array(whole, bool)[table.exposure])
+        is_held_exposure = [name in set(self.exposures) for name in table.exposure_names]
+        return np.asarray(chosen | np.array(is_held_exposure, bool)[table.exposure])
 
 
 @dataclass(frozen=True, eq=False)
 class Split:
-    """Matches in two parts: to be fitted, and set aside."""
+    """Matches split into those to fit and those that are held out."""
 
-    kept: Matches  # fitted; exposures without stars here are not named
-    held: Matches  # set aside, with the names of all exposures
+    kept: Matches  # matches to fit; exposures without such matches are not listed
+    held: Matches  # held-out matches, with the names of all exposures
 
 
 def exposures_drawn(names: Sequence[str], n: int, seed: int) -> tuple[str, ...]:
-    """Names of `n` exposures drawn by a seed, whatever their order; refused where none is left."""
+    """Names of `n` exposures drawn with a seed; InputError unless fewer than all are drawn."""
     if n >= len(names):
         raise InputError(
             f"{n} exposures are to be held out, and there are {len(names)}",
@@ -68,27 +68,29 @@ def exposures_drawn(names: Sequence[str], n: int, seed: int) -> tuple[str, ...]:
 
 
 def split_matches(matches: Matches, aside: HoldoutSpec) -> Split:
-    """Matches in two parts; those on disk are read once.
+    """Split matches into two parts; matches on disk are read once.
 
-    Refused are an unknown exposure, nothing left to fit, and nothing set aside.
+    InputError for an unknown exposure, or if either part would be empty.
     """
-    where = ", ".join(matches.sources)
-    refuse_strangers(aside.exposures, matches.exposure_names, where)
+    location = ", ".join(matches.sources)
+    refuse_strangers(aside.exposures, matches.exposure_names, location)
     masks = []
-    seen = np.zeros(len(matches.exposure_names), bool)
+    has_fitted = np.zeros(len(matches.exposure_names), bool)
     for batch in matches.batches():
         rows = aside.which(batch)
-        seen[batch.exposure[~rows]] = True
+        has_fitted[batch.exposure[~rows]] = True
         masks.append(rows)
-    which = np.concatenate(masks)
-    _refuse_nothing(int(which.sum()), len(which), where)
-    names = tuple(n for n, there in zip(matches.exposure_names, seen, strict=True) if there)
-    kept = matches.select(~which, reason=HELD_OUT).with_exposure_names(names)
-    return Split(kept, matches.select(which))
+    held = np.concatenate(masks)
+    _refuse_nothing(int(held.sum()), len(held), location)
+    names = tuple(
+        n for n, is_fitted in zip(matches.exposure_names, has_fitted, strict=True) if is_fitted
+    )
+    fitted = matches.select(~held, reason=HELD_OUT).with_exposure_names(names)
+    return Split(fitted, matches.select(held))
 
 
 def refuse_strangers(asked: Sequence[str], names: Sequence[str], where: str) -> None:
-    """Refuse names of exposures to be held out that are not among `names`."""
+    """Raise InputError for names of held-out exposures that are not among `names`."""
     for name in asked:
         if name not in names:
             raise InputError(

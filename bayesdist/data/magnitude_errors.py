@@ -1,4 +1,4 @@
-"""Errors by magnitude, from the residuals of a fit; and errors added to those that are quoted."""
+"""Errors by magnitude, estimated from the residuals of a fit, and errors added to quoted ones."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from bayesdist.utils.arrays import Float, Int
 
 _MIN_STARS_IN_BIN = 40
 _MAX_BINS = 25
-_MIN_STARS = 10  # stars in all, below which the scatter is unknown
-_CLIP = 4.0  # sigmas beyond which a star has no part in the scatter
+_MIN_STARS = 10  # smallest number of stars from which the scatter is estimated
+_CLIP = 4.0  # sigmas beyond which a star is excluded from the scatter
 MAD_TO_SIGMA = 1.4826022185056018  # 1 / (median of |z|, z standard normal)
 _SMALL_SAMPLE = 0.31  # relative bias of the median of |z| over n stars is +0.31 / n
 _LOG_VARIANCE = 1.36  # variance of ln(scatter) times n: the median of |z| is 37 % efficient
-_LEAST_LEFT = 0.25  # of errors from which others are taken off
-_TURN = 9.0  # gain in chi-square that a rise towards the bright end must bring to be believed
+_LEAST_LEFT = 0.25  # smallest fraction of an error that remains after others are subtracted
+_TURN = 9.0  # smallest gain in chi-square for which a rise towards the bright end is accepted
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,13 +29,13 @@ class MagnitudeErrors:
     Parameters
     ----------
     mag : ndarray, shape (B,)
-        Median magnitude of each bin, rising.
+        Median magnitude of each bin, ascending.
     sigma_u, sigma_v : ndarray, shape (B,)
-        Smoothed, in the unit of the residuals.
+        Smoothed standard errors, in the unit of the residuals.
     n : ndarray of int, shape (B,)
-        Stars in each bin.
+        Number of stars in each bin.
     scatter_u, scatter_v : ndarray, shape (B,)
-        The bins' own scatter, before smoothing.
+        Scatter in each bin before smoothing.
     """
 
     mag: Float
@@ -46,21 +46,23 @@ class MagnitudeErrors:
     scatter_v: Float
 
     def at(self, mag: ArrayLike) -> tuple[Float, Float]:
-        """Errors at magnitudes.
+        """Standard errors at given magnitudes.
 
         Parameters
         ----------
         mag : array_like, shape (N,)
+            Magnitudes.
 
         Returns
         -------
         sigma_u, sigma_v : ndarray, shape (N,)
-            Monotone cubic interpolation of the logarithm; constant beyond the first and last bin.
+            Standard errors by monotone cubic interpolation of their logarithm, constant beyond the
+            first and last bin.
         """
         inside = np.clip(np.asarray(mag, float), self.mag[0], self.mag[-1])
         if len(self.mag) == 1:
             return np.full(inside.shape, self.sigma_u[0]), np.full(inside.shape, self.sigma_v[0])
-        from scipy.interpolate import PchipInterpolator  # a fifth of a second
+        from scipy.interpolate import PchipInterpolator  # takes a fifth of a second to import
 
         u, v = (
             np.exp(PchipInterpolator(self.mag, np.log(sigma))(inside))
@@ -69,19 +71,19 @@ class MagnitudeErrors:
         return u, v
 
     def less(self, sigma_u: ArrayLike, sigma_v: ArrayLike) -> MagnitudeErrors:
-        """Errors less others that are in them, one for all magnitudes or those of each bin (B,).
+        """Subtract other errors in quadrature, common to all magnitudes or one per bin (B,).
 
-        A quarter stays at least: the other errors are not that well known.
+        At least a quarter of each error remains, because the other errors are not known precisely.
         """
-        left_u, left_v = (
-            np.sqrt(np.maximum(sigma**2 - np.square(known), (_LEAST_LEFT * sigma) ** 2))
-            for sigma, known in ((self.sigma_u, sigma_u), (self.sigma_v, sigma_v))
+        remaining_u, remaining_v = (
+            np.sqrt(np.maximum(sigma**2 - np.square(other_sigma), (_LEAST_LEFT * sigma) ** 2))
+            for sigma, other_sigma in ((self.sigma_u, sigma_u), (self.sigma_v, sigma_v))
         )
-        return replace(self, sigma_u=left_u, sigma_v=left_v)
+        return replace(self, sigma_u=remaining_u, sigma_v=remaining_v)
 
 
 def no_magnitudes(where: str) -> InputError:
-    """Error of stars without magnitudes whose errors are to be estimated by magnitude."""
+    """Error for stars without magnitudes when errors are to be estimated by magnitude."""
     return InputError(
         "holds no magnitudes, and errors by magnitude need them",
         where=where,
@@ -94,31 +96,31 @@ def estimate(
 ) -> MagnitudeErrors:
     """Robust scatter of residuals (N,) in bins of magnitude, smoothed.
 
-    The scatter of a bin is 1.4826 times the median absolute residual (about zero: an offset common
-    to the stars of one magnitude is an error, too), over the stars within 4 sigma on both axes.
-    It is corrected for the size of the bin and for the freedom that the fit has used: `n_params` is
-    the number of parameters, both axes together, of a fit with weights 1 / sigma^2.  Bins hold
-    about equal numbers.  The smoothed curve rises towards faint stars, and towards the brightest
-    (saturated) ones where the data demand it.
+    The scatter of a bin is 1.4826 times the median absolute residual of the stars within 4 sigma on
+    both axes. It is taken about zero, because an offset common to the stars of one magnitude is
+    also an error. It is corrected for the size of the bin and for the degrees of freedom used by
+    the fit: `n_params` is the number of parameters, for both axes together, of a fit with weights 1
+    / sigma^2. Bins hold nearly equal numbers of stars. The smoothed curve increases towards faint
+    stars, and towards the brightest (saturated) stars if the data require it.
 
-    Refused are values that are not finite, fewer than 10 stars, no more residuals than parameters,
-    and a bin without scatter.
+    InputError if values are not finite, if there are fewer than 10 stars, if there are not more
+    residuals than parameters, or if a bin has no scatter.
     """
     mag = np.asarray(mag, float)
     residuals = np.stack([np.asarray(residual_u, float), np.asarray(residual_v, float)])
-    where = "errors by magnitude"
+    source = "errors by magnitude"
     if not (np.isfinite(mag).all() and np.isfinite(residuals).all()):
         raise InputError(
-            "a magnitude or a residual is not finite", where=where, do="drop such stars"
+            "a magnitude or a residual is not finite", where=source, do="drop such stars"
         )
     if mag.size < _MIN_STARS:
         raise InputError(
-            f"{mag.size} stars are too few", where=where, do=f"give {_MIN_STARS}, or give errors"
+            f"{mag.size} stars are too few", where=source, do=f"give {_MIN_STARS}, or give errors"
         )
     if 2 * mag.size <= n_params:
         raise InputError(
             f"{mag.size} stars leave no residuals beside {n_params} parameters",
-            where=where,
+            where=source,
             do="lower the order of the model or give errors",
         )
     bins = _bins(mag)
@@ -128,7 +130,7 @@ def estimate(
         bad = int(np.argmin((scatter > 0).all(axis=0)))
         raise InputError(
             f"residuals near magnitude {np.median(mag[bins[bad]]):.2f} have no scatter",
-            where=where,
+            where=source,
             do="give errors; positions that were computed have none",
         )
     scatter = _with_lost_freedom(scatter, n, n_params)
@@ -144,14 +146,14 @@ def estimate(
 
 
 def _bins(mag: Float) -> list[Int]:
-    """Indices of the stars of each bin; stars of one magnitude stay together."""
+    """Indices of the stars of each bin; stars of equal magnitude are in the same bin."""
     order = np.argsort(mag, kind="stable")
     count = int(np.clip(len(mag) // _MIN_STARS_IN_BIN, 1, _MAX_BINS))
     edges = np.linspace(0, len(mag), count + 1).astype(int)[1:-1]
     edges = np.unique(np.searchsorted(mag[order], mag[order][edges], side="left"))
     parts = [part for part in np.split(order, edges) if len(part)]
     out: list[Int] = []
-    for part in parts:  # ties may have left a bin too small to stand alone
+    for part in parts:  # ties may leave a bin with too few stars
         if out and min(len(part), len(out[-1])) < min(_MIN_STARS_IN_BIN, len(mag) // count):
             out[-1] = np.concatenate([out[-1], part])
         else:
@@ -164,7 +166,7 @@ def _scatter(residuals: Float) -> Float:
     size = np.abs(residuals)
     scale = MAD_TO_SIGMA * np.median(size, axis=1)
     for _ in range(20):
-        # one membership for both axes, as in the outlier model
+        # stars are rejected on both axes together, as in the outlier model
         near = (size <= _CLIP * scale[:, None]).all(axis=0)
         if not near.any():
             break
@@ -176,10 +178,10 @@ def _scatter(residuals: Float) -> Float:
 
 
 def _with_lost_freedom(scatter: Float, n: Int, n_params: int) -> Float:
-    """Scatter of the errors, from that of the residuals.
+    """Scatter of the errors, computed from that of the residuals.
 
-    A weighted fit takes up h_i = (p / 2) w_i / sum(w) of the variance of star i on average over the
-    detector, w = 1 / sigma^2: most from the best stars.
+    A weighted fit absorbs a fraction h_i = (p / 2) w_i / sum(w) of the variance of star i, averaged
+    over the detector, with w = 1 / sigma^2: the best stars lose most.
     """
     sigma = scatter.copy()
     for _ in range(50):
@@ -192,7 +194,7 @@ def _with_lost_freedom(scatter: Float, n: Int, n_params: int) -> Float:
 
 
 def _smoothed(log_sigma: Float, n: Int) -> Float:
-    """Isotonic regression, or falling then rising where chi-square is clearly better."""
+    """Isotonic regression, or a decrease and then an increase if chi-square is clearly better."""
     from scipy.optimize import isotonic_regression
 
     weights = n / _LOG_VARIANCE
@@ -215,20 +217,20 @@ def _smoothed(log_sigma: Float, n: Int) -> Float:
 
 @dataclass(frozen=True, eq=False)
 class AddedErrors:
-    """Errors to be added in quadrature, by group; `other` is for stars of none of these groups.
+    """Errors to be added in quadrature, by group; `other` is for stars in none of the groups.
 
     A group is an axis, or an axis of the stars of one chip, exposure or filter.
     """
 
-    by: str  # 'chip', 'exposure' or 'filter'; empty where all stars are of one group
-    labels: tuple[str, ...]  # length G: chip numbers or names; one empty text for one group
-    sigma: Float  # (G, 2), along u and v in their unit
-    other: Float  # (2,), of stars with another label, as of an exposure that was held out
+    by: str  # 'chip', 'exposure' or 'filter'; empty if all stars are in one group
+    labels: tuple[str, ...]  # length G: chip numbers or names; a single empty string for one group
+    sigma: Float  # (G, 2), along u and v in the unit of u and v
+    other: Float  # (2,), for stars with another label, such as a held-out exposure
 
     def at(self, labels: Sequence[str], codes: Int) -> tuple[Float, Float]:
-        """Errors (N,) on u and v of stars, by the labels of their groups and codes (N,) into them.
+        """Errors (N,) of u and v of stars; `codes` (N,) are indices into `labels` of their groups.
 
-        `Matches.grouped` gives both.
+        `Matches.grouped` returns both.
         """
         row = {label: k for k, label in enumerate(self.labels)}
         of_label = np.array([row.get(label, len(row)) for label in labels], np.int64)

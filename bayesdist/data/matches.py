@@ -1,4 +1,4 @@
-"""Matches: detector pixels with reference positions, one row for each matched star."""
+"""Matches: detector pixels and reference positions, one row per matched star."""
 
 from __future__ import annotations
 
@@ -34,25 +34,24 @@ Errors = MagnitudeErrors | AddedErrors | Number | tuple[ArrayLike, ArrayLike]
 
 
 class BatchReader(Protocol):
-    """Batch of matches that has not been read; can be pickled."""
+    """Batch of matches that has not been read yet; it can be pickled."""
 
     def __len__(self) -> int:
-        """Rows."""
+        """Number of rows."""
 
     def load(self) -> Matches:
-        """Rows in memory, with codes by the names of all batches."""
+        """Read the rows into memory, with codes that refer to the names of all batches."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Matches(MatchColumns):
     """Matched stars, in memory or on disk.
 
-    Stars in memory are one table; larger ones stay in files, and `batches` gives them part by part.
-    All else is alike, but the columns of stars on disk raise InputError.
-
-    All arrays have length N and are float64, codes and rows int64; anything that converts to them
-    is taken.  Quantities are converted to `unit` (x and y to pixels), and rows with a masked value
-    are left out and counted in `rejected`.  Only x, y, u, v are needed.
+    Stars in memory are one table. Larger tables stay in files, and `batches` yields them one by
+    one. Both kinds have the same methods, but accessing a column of stars on disk raises
+    InputError. All arrays have length N; they are converted to float64, and codes and rows to
+    int64. Quantities are converted to `unit` (x and y to pixels), and rows with a masked value are
+    left out and counted in `rejected`. Only x, y, u, v are required.
 
     Parameters
     ----------
@@ -61,8 +60,7 @@ class Matches(MatchColumns):
     u, v : ndarray
         Reference position, in `unit`.
     sigma_u, sigma_v : ndarray, optional
-        Standard errors of the match in `unit`: both or neither.  None where they are to be
-        estimated.
+        Standard errors of the match in `unit`: both or neither. None if they are to be estimated.
     unit : str
         'pix', 'arcsec', 'mas' or 'deg'.
     epoch : ndarray, optional
@@ -72,44 +70,46 @@ class Matches(MatchColumns):
     colour : ndarray, optional
         Colour indices, in magnitudes; any zero point.
     exposure, chip, filter : ndarray of int, optional
-        Codes into `exposure_names`, `chip_numbers` and `filter_names`.
+        Codes: indices into `exposure_names`, `chip_numbers` and `filter_names`.
     exposure_names, filter_names : tuple of str
+        Names of the exposures and filters.
     chip_numbers : tuple of int
+        Numbers of the chips.
     star : ndarray of int, optional
-        Code of the reference star of each match, 0 or more: one star may be matched in many
-        exposures.  None where it is not known.
+        Code of the reference star of each match, 0 or more. A star may be matched in many
+        exposures. None if unknown.
     row : ndarray of int, optional
-        0-based row in the file that the star comes from.
+        Row of the star in its file, counted from 0.
     source : ndarray of int, optional
-        Code of that file into `sources`.
+        Code of that file: index into `sources`.
     sources : tuple of str
         Names of the files.
     n_rows : int, optional
-        Rows read, rejected ones included.
+        Number of rows read, including rejected ones.
     rejected : dict of str to int
-        Rows left out, by reason.
+        Number of rows left out, by reason.
     tangent_point : tuple of float, optional
-        RA and Dec in degrees of the plane that u, v lie on, where they were made from sky
-        positions.
+        RA and Dec of the tangent point in degrees, if u, v were computed from sky positions.
     u_nominal, v_nominal : ndarray, optional
-        Position by an earlier solution, in `unit`: both or neither.  The match was looked
-        for within a circle about it.
+        Position by an earlier solution, in `unit`: both or neither. Matches were searched for
+        within a circle around it.
     pm_u, pm_v, sigma_pm_u, sigma_pm_v : ndarray, optional
-        Proper motion of the reference star in `unit` per year, and its standard errors, where the
-        catalogue gives them: both axes or neither.  u and v include it already where `notes` state
-        that they were moved.
+        Proper motion of the reference star in `unit` per year, and its standard errors, if the
+        catalogue has them: both axes or neither. If `notes` state that the stars were moved, u and
+        v already include the motion.
     chip_names : tuple of str
-        Names of the chips of `chip_numbers`, where the file has names in place of numbers.
+        Names of the chips in `chip_numbers`, if the file has names instead of numbers.
     notes : tuple of str
-        Treatment in reading, as clauses.
+        Clauses on how the rows were treated when they were read.
     match_radius : float, optional
-        Largest distance in `unit` of a match from its nominal position, if `match` looked for it.
+        Largest distance in `unit` of a match from its nominal position, if `match` made the
+        matches.
 
     Raises
     ------
     InputError
-        For no rows, unequal lengths, values that are not finite, errors that are not positive, an
-        unknown unit, or the same star twice.
+        If there are no rows, if lengths are unequal, if values are not finite, if errors are not
+        positive, if the unit is unknown, or if a star is repeated.
 
     Examples
     --------
@@ -128,28 +128,33 @@ class Matches(MatchColumns):
 
     @classmethod
     def of_distinct_rows(cls, **columns: Any) -> Matches:
-        """Matches in memory that are known to differ, made without a search for repeated rows.
+        """Matches in memory that are known to be distinct.
 
-        All is as in the constructor, but repeated rows are not looked for.
+        As the constructor, but repeated rows are not searched for.
 
         Parameters
         ----------
         **columns
-            As the constructor's.
+            Arguments of the constructor.
 
         Returns
         -------
         Matches
+            Matches with these columns.
 
         Raises
         ------
         InputError
-            As the constructor, but for the same star twice.
+            As for the constructor, except for repeated stars.
         """
-        arguments = [one for one in fields(cls) if one.init]
-        defaults = {one.name: one.default for one in arguments if one.default is not MISSING}
+        arguments = [argument for argument in fields(cls) if argument.init]
+        defaults = {
+            argument.name: argument.default
+            for argument in arguments
+            if argument.default is not MISSING
+        }
         values = defaults | {"rejected": {}} | columns
-        if values.keys() != {one.name for one in arguments}:
+        if values.keys() != {argument.name for argument in arguments}:
             raise TypeError(f"{', '.join(columns)} are not the columns of matches")
         matches = object.__new__(cls)
         for name, value in values.items():
@@ -176,32 +181,33 @@ class Matches(MatchColumns):
     ) -> Matches:
         """Matches from any object with columns.
 
-        Columns are recognised by the same names and units as those of files, and the same rules
-        hold for proper motions, missing values and pixels that count from 0: see `read_matches`.
+        Columns are recognised by the same names and units as those of files. The rules for proper
+        motions, missing values and pixels that count from 0 are also the same: see `read_matches`.
 
         Parameters
         ----------
         table : table
             An astropy Table or QTable, also with Time and SkyCoord columns; a pandas DataFrame, in
             which NaN is a missing value; an object with an Arrow stream (a polars DataFrame, a
-            pyarrow Table, a DuckDB result); a mapping of arrays or lists; a structured array.
+            pyarrow Table, a DuckDB result); a mapping of arrays or lists; or a structured array.
         columns, unit, sigma, pixel_origin, tangent_point, epoch, catalogue_epoch, chips, not_finite
             As for `ReadOptions`.
         same_position : {'one_star', 'separate_stars'}, optional
-            As for `ReadOptions`: rows with the same reference position belong to one star by
-            default, if there is no column `star`.
+            As for `ReadOptions`: without a column `star`, rows with the same reference position
+            belong to one star by default.
         plate_scale : float, optional
-            As for `ReadOptions`: arcsec in a millimetre of u and v.
+            As for `ReadOptions`: arcsec per millimetre of u and v.
 
         Returns
         -------
         Matches
+            Matches in memory.
 
         Raises
         ------
         InputError
-            For a missing column, text among numbers, values that are not finite, units that are
-            missing or contradict each other, missing errors, and no rows.
+            If a column is missing, if a column of numbers contains text, if values are not finite,
+            if units are missing or contradictory, if errors are missing, or if there are no rows.
 
         Examples
         --------
@@ -243,25 +249,25 @@ class Matches(MatchColumns):
     ) -> Matches:
         """Matches of pixels with sky coordinates.
 
-        Coordinates of any frame are transformed to ICRS.  If they have proper motions and an
-        `obstime`, they are moved to the epoch of the exposures, as those of a table are.
+        Coordinates in any frame are transformed to ICRS. If they have proper motions and an
+        `obstime`, they are moved to the epoch of the exposures, as for tables.
 
         Parameters
         ----------
         x, y : array_like, shape (N,)
             Raw detector positions in pixels.
         sky : SkyCoord, shape (N,)
-            Reference positions.  Distances are not used.
+            Reference positions. Distances are not used.
         sigma : float, Quantity, array_like or pair of array_like, optional
-            Standard error of the match: one number, one for each star, or errors to the east and to
-            the north.  Plain numbers are in arcsec.  Without it the errors are estimated from the
-            residuals by magnitude, which needs `mag`.
+            Standard error of the match: one number, one per star, or errors to the east and to the
+            north. Plain numbers are in arcsec. By default, errors are estimated from the residuals
+            by magnitude, which requires `mag`.
         mag, exposure, chip : array_like, shape (N,), optional
             Magnitudes, names of the exposures, and numbers or names of the chips.
         epoch : float, str, Time, date, Quantity or array_like, optional
-            Epoch of the exposures: one, or one for each star.
+            Epoch of the exposures, common to all or one per star.
         tangent_point : SkyCoord, or pair of float or Quantity, optional
-            By default the mean direction of the stars.
+            Tangent point. The default is the mean direction of the stars.
         pixel_origin : {0, 1}, optional
             Coordinate of the centre of the first pixel: 1 as in FITS, 0 as in photutils.
         not_finite : {'refuse', 'reject'}, optional
@@ -270,13 +276,13 @@ class Matches(MatchColumns):
         Returns
         -------
         Matches
-            With u, v on the tangent plane in arcsec.
+            Matches with u, v on the tangent plane in arcsec.
 
         Raises
         ------
         InputError
-            For unequal lengths, coordinates that cannot be transformed to ICRS, units that do not
-            fit, and all that `from_table` refuses.
+            If lengths are unequal, if coordinates cannot be transformed to ICRS, if units do not
+            fit, and for the reasons given in `from_table`.
 
         Examples
         --------
@@ -300,7 +306,7 @@ class Matches(MatchColumns):
         )
 
     def as_read(self, sigma: str | Number) -> Matches:
-        """These stars with the errors that the option `sigma` of reading asks for.
+        """These stars with the errors requested by the reading option `sigma`.
 
         Parameters
         ----------
@@ -310,15 +316,16 @@ class Matches(MatchColumns):
         Returns
         -------
         Matches
+            Matches with these errors, or unchanged.
 
         Raises
         ------
         InputError
-            If they have neither errors nor magnitudes where `sigma` needs them.
+            If the stars lack the errors or magnitudes that `sigma` requires.
         """
-        where = ", ".join(self.sources)
+        location = ", ".join(self.sources)
         if isinstance(sigma, str):
-            refuse_missing_errors(sigma, self.has_sigma, self.has_mag, where=where)
+            refuse_missing_errors(sigma, self.has_sigma, self.has_mag, where=location)
             return self
         return self.with_errors(sigma)
 
@@ -331,14 +338,16 @@ class Matches(MatchColumns):
         Parameters
         ----------
         readers : sequence of BatchReader
-            Whose codes are those of `labels`.
+            Readers of the batches, with codes that refer to `labels`.
         labels : Labels
+            Names, counts and notes of the whole table.
         columns : collection of str
             Columns that the batches have.
 
         Returns
         -------
         Matches
+            Matches on disk.
         """
         matches = object.__new__(cls)
         for name, value in labels.arguments().items():
@@ -360,7 +369,7 @@ class Matches(MatchColumns):
         return html_of(len(self), facts)
 
     def _facts(self) -> tuple[tuple[str, str], ...]:
-        """Names and words of what a reader wants to know first."""
+        """Names and text of the facts that are shown first."""
         n, chips = len(self.exposures), len(self.chip_numbers)
         return (
             ("exposures", f"{n} exposure{'s' if n > 1 else ''}"),
@@ -383,8 +392,8 @@ class Matches(MatchColumns):
         Returns
         -------
         QTable
-            With units, and the names of exposures and filters and the numbers or names of chips in
-            place of codes.  ``meta["bayesdist"]`` has the tangent point, the match radius, counts
+            Table with units. Exposures and filters are given by name, and chips by number or name,
+            instead of codes. ``meta["bayesdist"]`` has the tangent point, the match radius, counts
             and notes.
 
         Raises
@@ -401,21 +410,22 @@ class Matches(MatchColumns):
         return table_of(self.load())
 
     def __arrow_c_stream__(self, requested_schema: object | None = None) -> object:
-        """Arrow stream of the columns of `to_table`, by the Arrow PyCapsule interface."""
+        """Arrow stream of the columns of `to_table`, following the Arrow PyCapsule interface."""
         names = [name for name in COLUMNS if self.has(name)]
         return arrow_stream(self, self.batches(), names).__arrow_c_stream__(requested_schema)
 
     @property
     def in_memory(self) -> bool:
-        """True where the columns are in memory."""
+        """True if the columns are in memory."""
         return self._readers is None
 
     def digest(self) -> str:
-        """SHA-256 of the positions, which tells these stars from others; empty for stars on disk.
+        """SHA-256 of the positions, which identifies these stars.
 
         Returns
         -------
         str
+            Hexadecimal digest; empty for stars on disk.
         """
         if not self.in_memory:
             return ""
@@ -425,58 +435,62 @@ class Matches(MatchColumns):
         return digest.hexdigest()
 
     def has(self, column: str) -> bool:
-        """Truth of a column being there.
+        """True if the stars have a column.
 
         Parameters
         ----------
         column : str
+            Name of an optional column.
 
         Returns
         -------
         bool
+            True if the column exists.
         """
         return getattr(self, column) is not None if self.in_memory else column in self._stored
 
     def column(self, name: str) -> NDArray[Any]:
-        """A column that may be missing.
+        """Values of an optional column.
 
         Parameters
         ----------
         name : str
+            Name of the column.
 
         Returns
         -------
         ndarray, shape (N,)
+            Values of the column.
 
         Raises
         ------
         InputError
-            Where the stars do not have it.
+            If the stars do not have the column.
         """
-        found = getattr(self, name)
-        if found is None:
-            where = ", ".join(self.sources)
-            raise InputError(f"there is no column {name!r}", where=where, do="add or map it")
-        return np.asarray(found)
+        values = getattr(self, name)
+        if values is None:
+            location = ", ".join(self.sources)
+            raise InputError(f"there is no column {name!r}", where=location, do="add or map it")
+        return np.asarray(values)
 
     @property
     def has_sigma(self) -> bool:
-        """True where the stars have errors."""
+        """True if the stars have errors."""
         return self.has("sigma_u")
 
     @property
     def has_epoch(self) -> bool:
-        """True where the stars have epochs."""
+        """True if the stars have epochs."""
         return self.has("epoch")
 
     @property
     def has_mag(self) -> bool:
-        """True where the stars have magnitudes."""
+        """True if the stars have magnitudes."""
         return self.has("mag")
 
     @property
     def has_nominal(self) -> bool:
-        """True where the stars have nominal positions."""
+        """True if the stars have nominal positions."""
         return self.has("u_nominal")
 
     @property
@@ -487,12 +501,12 @@ class Matches(MatchColumns):
         return tuple(self.exposure_names[k] for k in np.unique(self.exposure))
 
     def readers(self) -> tuple[BatchReader, ...]:
-        """Consecutive batches, not read where they are on disk.
+        """Readers of consecutive batches; those on disk are not read yet.
 
         Returns
         -------
         tuple of BatchReader
-            Of at most `BATCH` rows each; they can be sent to other processes.
+            Readers of at most `BATCH` rows each, which can be sent to other processes.
         """
         if self._readers is not None:
             return self._readers
@@ -506,33 +520,33 @@ class Matches(MatchColumns):
         )
 
     def batches(self) -> Iterator[Matches]:
-        """Consecutive batches in memory, read one after another.
+        """Iterate over consecutive batches in memory, read one after another.
 
         Yields
         ------
         Matches
-            Of at most `BATCH` rows, with codes by the names of the whole.
+            Batch of at most `BATCH` rows, with codes that refer to the names of the whole table.
 
         Raises
         ------
         InputError
-            When a file is damaged, gone, or not what it was when it was opened.
+            If a file is damaged, missing, or has changed since it was opened.
         """
         for reader in self.readers():
             yield reader.load()
 
     def load(self) -> Matches:
-        """All stars in memory.
+        """Load all stars into memory.
 
         Returns
         -------
         Matches
-            These themselves where they are in memory.
+            Matches in memory; the object itself if they already are.
 
         Raises
         ------
         InputError
-            As `batches`.
+            As for `batches`.
         """
         return self if self.in_memory else self.sample(len(self))
 
@@ -542,17 +556,18 @@ class Matches(MatchColumns):
         Parameters
         ----------
         n : int
-            Largest number of rows of the sample; k is as small as this allows.
+            Largest number of rows in the sample; k is the smallest number for which this holds.
 
         Returns
         -------
         Matches
-            In the order of the rows; these themselves where they are in memory and not more than n.
+            Sample in the order of the rows; the object itself if it is in memory and has at most n
+            rows.
 
         Raises
         ------
         InputError
-            For less than one row, and as `batches`.
+            If n is less than one, and as for `batches`.
         """
         k = every_kth(len(self), n)
         if self.in_memory:
@@ -563,32 +578,33 @@ class Matches(MatchColumns):
             rows = slice(-start % k, None, k)
             start += len(reader)
             if len(range(len(reader))[rows]):
-                # copies: views, and the batch by a name, would hold it while the next one is read
+                # copies, because views would keep the whole batch in memory while the next one is
+                # read
                 parts.append({n: a[rows].copy() for n, a in reader.load()._columns.items()})
         return Matches.of_distinct_rows(**joined_columns(parts), **self.labels.arguments())
 
     def select(self, which: ArrayLike, *, reason: str | None = None) -> Matches:
-        """Stars by mask or indices.
+        """Select stars by mask or indices.
 
         Parameters
         ----------
         which : array_like of bool or int
-            Mask of length N, or indices without repetition; on disk a mask.
+            Mask of length N, or indices without repetition; for stars on disk, a mask.
         reason : str, optional
-            Why the others go; they are counted under it in `rejected`.
+            Reason under which the other stars are counted in `rejected`.
 
         Returns
         -------
         Matches
-            Codes keep their meaning: names without stars stay.
+            The selected stars. Names and codes are unchanged, even if a name has no more stars.
 
         Raises
         ------
         InputError
-            When no star is left, or when an index is repeated.
+            If no star is selected, or if an index is repeated.
         """
         which = np.asarray(which)
-        if not which.size:  # an empty list has no integer type of its own
+        if not which.size:  # an empty list has no integer type
             which = which.astype(np.int64)
         if self._readers is not None:
             return self._selected_on_disk(self._readers, which, reason)
@@ -596,7 +612,7 @@ class Matches(MatchColumns):
         counts = self._counts_without(len(index), reason)
         columns = {name: values[index] for name, values in self._columns.items()}
         selected = self.with_columns(**columns, rejected=counts)
-        # rows of one table differ: only a repeated index repeats one
+        # rows of one table are distinct: only a repeated index can repeat a row
         if which.dtype != bool and len(np.unique(index)) < len(index):
             refuse_repeated(selected._columns, place=selected.place)
         return selected
@@ -630,7 +646,7 @@ class Matches(MatchColumns):
         )
 
     def _counts_without(self, n: int, reason: str | None) -> dict[str, int]:
-        """Rows left out by reason, once n stars are left."""
+        """Counts of rejected rows by reason, after a selection that leaves n stars."""
         dropped = {} if reason is None or n == len(self) else {reason: len(self) - n}
         return merged_counts([self.rejected, dropped])
 
@@ -641,39 +657,42 @@ class Matches(MatchColumns):
         adds: Collection[str] = (),
         drops: Collection[str] = (),
     ) -> Matches:
-        """Stars as a step makes them that acts on each row by itself.
+        """Apply a function that treats each row independently.
 
         Parameters
         ----------
         step : callable
-            It takes matches in memory and gives as many, with the same labels.  For stars on disk
-            it is taken when they are read, and must be one that can be pickled.
+            ``step(matches)`` takes matches in memory and returns as many, with the same labels. For
+            stars on disk it is called when they are read, and it must be picklable.
         adds : collection of str
-            Columns that the stars have afterwards, whether or not they had them before.
+            Columns that the stars have afterwards, even if they had them before.
         drops : collection of str
-            Columns that the step removes.
+            Columns that the function removes.
 
         Returns
         -------
         Matches
+            Result of the function; for stars on disk, the result that reading will give.
         """
         if self._readers is None:
             return step(self)
-        readers = [_Deferred(one, step, len(one)) for one in self._readers]
+        readers = [_Deferred(reader, step, len(reader)) for reader in self._readers]
         stored = (self._stored | set(adds)) - set(drops)
         return Matches.from_readers(readers, self.labels, stored)
 
     def without(self, *columns: str) -> Matches:
-        """These stars without some of the columns that they may have.
+        """These stars without the given optional columns.
 
         Parameters
         ----------
         *columns : str
-            Optional columns, such as 'sigma_u' and 'sigma_v'.
+            Optional columns, such as 'sigma_u' and 'sigma_v'; columns that do not exist are
+            ignored.
 
         Returns
         -------
         Matches
+            Matches without these columns.
         """
         if not any(self.has(name) for name in columns):
             return self
@@ -685,30 +704,35 @@ class Matches(MatchColumns):
         Parameters
         ----------
         **changes
-            As the constructor's arguments.  Repeated rows are not looked for.
+            Arguments of the constructor. Repeated rows are not searched for.
 
         Returns
         -------
         Matches
+            Matches with these changes.
 
         Raises
         ------
         InputError
-            As the constructor, and for stars on disk.
+            As for the constructor, and for stars on disk.
         """
-        given = {one.name: getattr(self, one.name) for one in fields(self) if one.init}
-        return Matches.of_distinct_rows(**(given | changes))
+        current = {
+            argument.name: getattr(self, argument.name)
+            for argument in fields(self)
+            if argument.init
+        }
+        return Matches.of_distinct_rows(**(current | changes))
 
     @cached_property
     def error_codes(self) -> Int | None:
-        """Code (N,) of the stars, or tight groups of stars, whose rows share a reference error.
+        """Code (N,) of the star, or tight group of stars, that shares a reference error.
 
-        None if each row is a star by itself.  The stars must be in memory.
+        None if each row is a separate star. The stars must be in memory.
         """
         return error_codes(self.u, self.v, self.star)
 
     def with_star_codes(self, same_position: str = "one_star") -> Matches:
-        """These stars with codes by their reference positions.
+        """These stars with codes assigned by their reference positions.
 
         Parameters
         ----------
@@ -718,13 +742,13 @@ class Matches(MatchColumns):
         Returns
         -------
         Matches
-            They are returned unchanged if they have codes, if no position occurs twice, or if they
-            are on disk.
+            Matches with star codes; unchanged if they have codes, if no position occurs twice, or
+            if they are on disk.
 
         Raises
         ------
         InputError
-            For an unknown `same_position`.
+            If `same_position` is unknown.
         """
         check_same_position(same_position)
         if not self.in_memory or self.star is not None:
@@ -733,17 +757,19 @@ class Matches(MatchColumns):
         return self if star is None else self.with_columns(star=star, notes=(*self.notes, note))
 
     def with_counts(self, n_rows: int, rejected: Mapping[str, int]) -> Matches:
-        """These stars with other counts of the rows that they were selected from.
+        """These stars with other counts of the rows from which they were selected.
 
         Parameters
         ----------
         n_rows : int
+            Number of rows read.
         rejected : mapping of str to int
-            Rows left out, by reason.
+            Number of rows left out, by reason.
 
         Returns
         -------
         Matches
+            Matches with these counts.
         """
         if self._readers is None:
             return self.with_columns(n_rows=n_rows, rejected=rejected)
@@ -751,41 +777,43 @@ class Matches(MatchColumns):
         return Matches.from_readers(self._readers, labels, self._stored)
 
     def named_below(self, folder: str) -> Matches:
-        """These stars with names of their files that are relative to a folder.
+        """These stars with file names relative to a folder.
 
         Parameters
         ----------
         folder : str
-            Names that do not begin with it are kept.
+            Folder; file names that do not begin with it are unchanged.
 
         Returns
         -------
         Matches
+            Matches with these file names.
         """
-        names = tuple(one.removeprefix(f"{folder}/") for one in self.sources)
+        names = tuple(name.removeprefix(f"{folder}/") for name in self.sources)
         if self._readers is None:
             return self.with_columns(sources=names)
         step = partial(Matches.named_below, folder=folder)
-        readers = [_Deferred(one, step, len(one)) for one in self._readers]
+        readers = [_Deferred(reader, step, len(reader)) for reader in self._readers]
         return Matches.from_readers(readers, replace(self.labels, sources=names), self._stored)
 
     def with_exposure_names(self, names: tuple[str, ...]) -> Matches:
-        """These stars with other exposures, which include all of their own.
+        """These stars with other exposure names, which must include all present ones.
 
         Parameters
         ----------
         names : tuple of str
+            New exposure names.
 
         Returns
         -------
         Matches
-            Whose codes are by these names.
+            Matches with exposure codes that refer to these names.
         """
         if names == self.exposure_names:
             return self
         if self._readers is not None:
             step = partial(Matches.with_exposure_names, names=names)
-            readers = [_Deferred(one, step, len(one)) for one in self._readers]
+            readers = [_Deferred(reader, step, len(reader)) for reader in self._readers]
             labels = replace(self.labels, exposure_names=names)
             return Matches.from_readers(readers, labels, self._stored)
         code = {name: k for k, name in enumerate(names)}
@@ -798,19 +826,21 @@ class Matches(MatchColumns):
         Parameters
         ----------
         errors : MagnitudeErrors, AddedErrors, float, Quantity or pair of array_like
-            By magnitude; by groups of stars; one for all; or of u and of v, each a number or, in
-            memory, of shape (N,).  Plain numbers are in `unit`.
+            Errors by magnitude; errors by groups of stars; one error for all; or errors of u and of
+            v, each a number or, for stars in memory, an array of shape (N,). Plain numbers are in
+            `unit`.
         in_quadrature : bool, optional
-            Add them to the errors that the stars have, if any, in quadrature.
+            True to add them in quadrature to the present errors, if there are any.
 
         Returns
         -------
         Matches
+            Matches with these errors.
 
         Raises
         ------
         InputError
-            Without magnitudes, where these are needed, and for errors that are not positive.
+            If magnitudes are needed but missing, or if errors are not positive.
         """
         if isinstance(errors, MagnitudeErrors) and not self.has_mag:
             raise no_magnitudes(", ".join(self.sources))
@@ -832,7 +862,7 @@ class Matches(MatchColumns):
             return errors.at(*self.grouped(errors.by))
         pair = errors if isinstance(errors, tuple) else (errors, errors)
         shape = (len(self),)
-        u, v = (np.broadcast_to(values_in(one, self.unit, "sigma"), shape) for one in pair)
+        u, v = (np.broadcast_to(values_in(value, self.unit, "sigma"), shape) for value in pair)
         return u, v
 
     def with_scaled_errors(self, factor: float) -> Matches:
@@ -841,10 +871,12 @@ class Matches(MatchColumns):
         Parameters
         ----------
         factor : float
+            Factor for the errors of u and v.
 
         Returns
         -------
         Matches
+            Matches with these errors; unchanged without errors.
         """
         if not self.in_memory:
             return self.mapped(partial(Matches.with_scaled_errors, factor=factor))
@@ -854,25 +886,26 @@ class Matches(MatchColumns):
 
     @staticmethod
     def concatenate(tables: Sequence[Matches]) -> Matches:
-        """Stars of several tables, in their order.
+        """Concatenate the stars of several tables.
 
-        Exposures, chips, filters and files of equal name become one.  Stars keep their codes, which
-        must belong to one catalogue; the codes are left out when one of the tables has none.
+        Exposures, chips, filters and files with the same name are merged. Star codes are kept and
+        must refer to the same catalogue; they are dropped if one of the tables has none.
 
         Parameters
         ----------
         tables : sequence of Matches
-            In memory.
+            Tables in memory.
 
         Returns
         -------
         Matches
+            Stars in the order of the tables.
 
         Raises
         ------
         InputError
-            For no tables, different units or tangent points, or an optional column that only some
-            have.
+            If there are no tables, if units or tangent points differ, or if only some of the tables
+            have an optional column.
         """
         if not tables:
             raise InputError("there are no tables to join", do="give at least one")
@@ -881,7 +914,7 @@ class Matches(MatchColumns):
 
 @dataclass(frozen=True, eq=False)
 class _Deferred:
-    """Batch on which a step is taken when it is read."""
+    """Batch to which a function is applied when it is read."""
 
     reader: BatchReader
     step: Callable[[Matches], Matches]
@@ -891,7 +924,7 @@ class _Deferred:
         return self.n
 
     def load(self) -> Matches:
-        """Rows after the step."""
+        """Rows after the function has been applied."""
         return self.step(self.reader.load())
 
 
@@ -901,18 +934,18 @@ def _without(batch: Matches, columns: Sequence[str]) -> Matches:
 
 
 def _by_bits(batch: Matches, bits: NDArray[np.uint8]) -> Matches:
-    """Rows of a batch whose bit is set."""
+    """Rows of a batch for which the bit is set."""
     return batch.select(np.unpackbits(bits, count=len(batch)).astype(bool))
 
 
 def _checked_numbers(
     errors: Number | tuple[ArrayLike, ArrayLike], unit: str
 ) -> tuple[float, float]:
-    """Errors of u and v in `unit` that are one number each, finite and positive."""
+    """Errors of u and v in `unit`, each a finite and positive number."""
     pair = errors if isinstance(errors, tuple) else (errors, errors)
     numbers = []
-    for name, given in zip(SIGMAS, pair, strict=True):
-        sigma = values_in(given, unit, name)
+    for name, error in zip(SIGMAS, pair, strict=True):
+        sigma = values_in(error, unit, name)
         if sigma.ndim:
             raise InputError(
                 "errors of single stars are given, and the stars are on disk",

@@ -1,4 +1,4 @@
-"""Preparation for the fit: well measured motions, errors of centroids, and no aberration."""
+"""Preparation for the fit: selection by proper-motion error, centroid errors, and aberration."""
 
 from __future__ import annotations
 
@@ -15,46 +15,49 @@ from bayesdist.data.tables.checks import columns_of
 from bayesdist.errors import InputError, required
 from bayesdist.utils.arrays import Float
 
-_STARS_IN_BIN = 200  # stars of a bin in magnitude
+_STARS_IN_BIN = 200  # stars per magnitude bin
 _MAX_BINS = 40
-# above the median, in the logarithm: 0.6 % of a log-normal distribution
+# scatters above the median of ln(sigma): 0.6 % of a log-normal distribution is farther
 _MAX_SCATTERS_ABOVE = 2.5
-_MIN_SCATTER = 0.05  # of ln(sigma): among errors all alike a slightly larger one stays
+# smallest scatter of ln(sigma): keeps slightly larger errors if all are nearly equal
+_MIN_SCATTER = 0.05
 
 
 @dataclass(frozen=True, eq=False)
 class MotionErrorLine:
-    """Largest error of a proper motion that counts as well measured, by magnitude."""
+    """Largest proper-motion error that counts as well measured, as a function of magnitude."""
 
-    # mag, sigma (B,): knots in rising magnitude; linear in the logarithm between, constant beyond
+    # mag, sigma (B,): knots in ascending magnitude; log-linear between them, constant beyond
     mag: Float
     sigma: Float
 
     def __call__(self, mag: ArrayLike) -> Float:
-        """The line at magnitudes, in the catalogue's unit per year."""
+        """Largest error at the given magnitudes, in the catalogue's unit per year."""
         return np.exp(np.interp(np.asarray(mag, float), self.mag, np.log(self.sigma)))
 
 
 def motion_error_line(catalog: ReferenceCatalog) -> MotionErrorLine:
     """Line in magnitude and proper-motion error above which stars are badly measured.
 
-    In bins of about 200 stars by magnitude (40 bins at most) the line is the median of the error
-    times exp(2.5 s), s being the robust scatter (1.4826 median absolute deviation) of its
-    logarithm. The median follows how errors grow towards faint stars; what lies above is far from
-    the stars of its own magnitude.  The error is the larger one of the two axes.
+    In magnitude bins of about 200 stars (at most 40 bins), the line is the median of the error
+    times exp(2.5 s), where s is the robust scatter (1.4826 median absolute deviation) of its
+    logarithm. The median follows the increase of errors towards faint stars; a star above the line
+    has an unusual error for its magnitude. The error is the larger one of the two axes.
 
     Parameters
     ----------
     catalog : ReferenceCatalog
+        Catalogue with magnitudes and proper-motion errors.
 
     Returns
     -------
     MotionErrorLine
+        Largest error by magnitude.
 
     Raises
     ------
     InputError
-        Without magnitudes or errors of the motions.
+        If there are no magnitudes or no errors of the motions.
     """
     sigma = _motion_errors(catalog)
     if catalog.mag is None:
@@ -78,22 +81,22 @@ def motion_error_line(catalog: ReferenceCatalog) -> MotionErrorLine:
 
 
 def select_motions(catalog: ReferenceCatalog) -> ReferenceCatalog:
-    """Stars with well measured proper motions (the red line of ACS ISR 2015-06, Figure 3).
+    """Select stars with well measured proper motions (the red line of ACS ISR 2015-06, Figure 3).
 
     Parameters
     ----------
     catalog : ReferenceCatalog
+        Catalogue with magnitudes and proper-motion errors.
 
     Returns
     -------
     ReferenceCatalog
-        The stars at or below the line of `motion_error_line`, by the worse axis; they keep their
-        codes.
+        Stars at or below the line of `motion_error_line` on both axes, with their codes.
 
     Raises
     ------
     InputError
-        As `motion_error_line`.
+        As for `motion_error_line`.
     """
     line = motion_error_line(catalog)
     mag = required(catalog.mag, "proper motions are selected by magnitude")
@@ -111,24 +114,24 @@ def _motion_errors(catalog: ReferenceCatalog) -> Float:
 
 
 def centroid_errors(table: Matches, total: MagnitudeErrors) -> MagnitudeErrors:
-    """Errors of the centroids: scatter of the residuals less the errors of the catalogue.
+    """Centroid errors: scatter of the residuals minus the errors of the catalogue, in quadrature.
 
     Parameters
     ----------
     table : Matches
-        With magnitudes and the errors of the catalogue.
+        Matches with magnitudes and the errors of the catalogue.
     total : MagnitudeErrors
-        Scatter of its residuals.
+        Scatter of their residuals.
 
     Returns
     -------
     MagnitudeErrors
-        Total less catalogue (median of each bin's stars).
+        Scatter minus the median catalogue error in each bin, in quadrature.
 
     Raises
     ------
     InputError
-        Without magnitudes or errors.
+        If there are no magnitudes or no errors.
     """
     if table.mag is None or table.sigma_u is None or table.sigma_v is None:
         raise InputError(
@@ -136,8 +139,8 @@ def centroid_errors(table: Matches, total: MagnitudeErrors) -> MagnitudeErrors:
             where=", ".join(table.sources),
             do="give lists with magnitudes and a catalogue with errors",
         )
-    which = np.searchsorted((total.mag[1:] + total.mag[:-1]) / 2, table.mag)
-    of_bins = [np.flatnonzero(which == k) for k in range(len(total.mag))]
+    bin_number = np.searchsorted((total.mag[1:] + total.mag[:-1]) / 2, table.mag)
+    of_bins = [np.flatnonzero(bin_number == k) for k in range(len(total.mag))]
     known_u, known_v = (
         np.array([np.median(sigma[rows]) if rows.size else 0.0 for rows in of_bins])
         for sigma in (table.sigma_u, table.sigma_v)
@@ -146,26 +149,29 @@ def centroid_errors(table: Matches, total: MagnitudeErrors) -> MagnitudeErrors:
 
 
 def neutralise_aberration(table: Matches, log: ExposureLog) -> Matches:
-    """Matches with catalogue positions as an aberration-free scale gives them.
+    """Matches with catalogue positions converted to a scale free of velocity aberration.
 
-    A true offset on the sky is VAFACTOR times that by the aberration-free scale of the detector,
-    so that positions and their errors are divided by it.  Any other origin would shift all stars of
-    an exposure alike.
+    A true offset on the sky is VAFACTOR times the offset in the aberration-free scale of the
+    detector. Positions and their errors are therefore divided by VAFACTOR. Another origin would
+    shift all stars of an exposure equally.
 
     Parameters
     ----------
     table : Matches
+        Matches with positions of the catalogue.
     log : ExposureLog
-        With VAFACTOR of each exposure of the table.
+        Log with the VAFACTOR of each exposure of the table.
 
     Returns
     -------
     Matches
+        Matches with rescaled positions and errors.
 
     Raises
     ------
     InputError
-        Naming the first exposure without VAFACTOR, or not in the log.
+        If an exposure is not in the log or has no VAFACTOR; the message names the first such
+        exposure.
     """
     for name in table.exposures:
         if name not in log:

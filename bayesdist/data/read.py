@@ -1,4 +1,4 @@
-"""`read_matches`: files of any known kind to one Matches."""
+"""`read_matches`: read matches from files of all supported kinds."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ from bayesdist.files.unpacked import read_lines
 from bayesdist.utils.quantities import Direction, Epoch, Number
 
 PathLike = str | os.PathLike[str]
-# the other quantities are left out: 'mag', if there is one, is the index star's
+# other quantities are omitted: 'mag', if present, is the magnitude of the index star
 _CORR = dict.fromkeys(ALIASES, "") | CORR_COLUMNS
 
 
@@ -67,31 +67,31 @@ def read_matches(
     Parameters
     ----------
     path : path-like, sequence of path-like, or table
-        A file, a list of files, a pattern, or a folder of Parquet files (parts of one table).  Of
-        several files each is one exposure, named for the file, where it has no column of exposures.
-        Objects with columns are passed on to `Matches.from_table`.
+        A file, a list of files, a pattern, or a folder of Parquet files (parts of one table). If
+        there are several files without a column of exposures, each file is one exposure named after
+        the file. Objects with columns are passed on to `Matches.from_table`.
     format : str, optional
-        'table' (.ecsv, .csv, .fits, .parquet, .vot, .tbl and text of several kinds),
-        'hst1pass' (lists with raw and corrected positions),
-        'matchup' (such lists with the MATCHUP master that they are then matched with),
-        'astrometry.net' (corr.fits), 'bayesdist' (matches.h5 of a saved run), one that a mission
-        adds, or 'auto': by name and content.
+        'table' (.ecsv, .csv, .fits, .parquet, .vot, .tbl and several kinds of text), 'hst1pass'
+        (lists with raw and corrected positions), 'matchup' (such lists and the MATCHUP master with
+        which they are matched), 'astrometry.net' (corr.fits), 'bayesdist' (matches.h5 of a saved
+        run), a format added by a mission, or 'auto': recognized by name and content.
     columns, unit, sigma, pixel_origin, tangent_point, epoch, catalogue_epoch, chips, not_finite
-        As `ReadOptions`.
+        As for `ReadOptions`.
     plate_scale : float, optional
-        As `ReadOptions`: arcsec in a millimetre of u and v.
+        As for `ReadOptions`: arcsec per millimetre of u and v.
     same_position : {'one_star', 'separate_stars'}, optional
-        As `ReadOptions`: rows with the same reference position, in one file or in several, belong
-        to one star by default, if there is no column `star`.
+        As for `ReadOptions`: without a column `star`, rows with the same reference position, in one
+        or several files, belong to one star by default.
 
     Returns
     -------
     Matches
+        Matches in memory.
 
     Raises
     ------
     InputError
-        For all that is wrong with a file or an option, in one sentence.
+        If a file or an option is invalid; the message says what to change.
 
     Examples
     --------
@@ -101,10 +101,10 @@ def read_matches(
     >>> matches.x.tolist()
     [10.5, 900.0]
     """
-    known = (*FORMATS, *mission_formats())
-    if format not in known:
+    formats = (*FORMATS, *mission_formats())
+    if format not in formats:
         raise InputError(
-            f"format is {format!r}", where="data.format", do=f"choose one of {', '.join(known)}"
+            f"format is {format!r}", where="data.format", do=f"choose one of {', '.join(formats)}"
         )
     options = ReadOptions(
         columns,
@@ -141,15 +141,15 @@ def read_matches(
 def _read_plain(
     files: Sequence[Path], kinds: Sequence[str], options: ReadOptions, *, in_parts: bool
 ) -> Matches:
-    """Matches from files that hold them."""
-    own = mission_formats()
+    """Matches from files that hold both pixels and reference positions."""
+    added_formats = mission_formats()
     names: Sequence[str | None] = exposure_names(files)
-    if in_parts or (len(files) == 1 and kinds[0] in ("table", "bayesdist", *own)):
+    if in_parts or (len(files) == 1 and kinds[0] in ("table", "bayesdist", *added_formats)):
         names = [None] * len(files)
     tables = {
-        file: own[kind].read(file) if kind in own else read_table(file)
+        file: added_formats[kind].read(file) if kind in added_formats else read_table(file)
         for file, kind in zip(files, kinds, strict=True)
-        if kind in ("table", "astrometry.net", *own)
+        if kind in ("table", "astrometry.net", *added_formats)
     }
     options = _with_common_chips(tables, _with_common_point(tables, kinds, options))
     readers: dict[str, Callable[[Path, str | None], Matches]] = {
@@ -162,12 +162,12 @@ def _read_plain(
             )
         ),
     }
-    readers |= dict.fromkeys(own, readers["table"])
+    readers |= dict.fromkeys(added_formats, readers["table"])
     matches = Matches.concatenate(
         [readers[kind](file, name) for file, kind, name in zip(files, kinds, names, strict=True)]
     )
     if matches.star is not None or len(tables) < len(files):
-        return matches  # lists and records have no reference positions, or state the stars
+        return matches  # lists and records have no reference positions, or have star codes
     corr = "astrometry.net" in set(kinds)
     return _with_stars(matches, tables, _CORR if corr else options.columns, options.same_position)
 
@@ -178,7 +178,7 @@ def _with_stars(
     columns: Mapping[str, str] | None,
     same_position: str,
 ) -> Matches:
-    """Matches with codes of the stars, if some have the same reference position."""
+    """Matches with star codes, if some rows have the same reference position."""
     sky = [catalogue_positions(table, columns, source=str(file)) for file, table in tables.items()]
     at = matches.u, matches.v
     on_sky = [positions for positions in sky if positions is not None]
@@ -195,13 +195,13 @@ def _with_stars(
 def _with_common_point(
     tables: Mapping[Path, Table], kinds: Iterable[str], options: ReadOptions
 ) -> ReadOptions:
-    """Options with one tangent point for all files: each by itself would choose its own."""
+    """Options with a tangent point common to all files, which by default have different ones."""
     if options.tangent_point is not None or len(tables) < 2:
         return options
     corr = "astrometry.net" in set(kinds)
     columns = _CORR if corr else options.columns
     sky = [sky_positions(table, columns, source=str(file)) for file, table in tables.items()]
-    on_sky = [one for one in sky if one is not None and len(one[0])]
+    on_sky = [position for position in sky if position is not None and len(position[0])]
     if not on_sky:
         return options
     ra, dec = (np.concatenate(axis) for axis in zip(*on_sky, strict=True))
@@ -209,16 +209,16 @@ def _with_common_point(
 
 
 def _with_common_chips(tables: Mapping[Path, Table], options: ReadOptions) -> ReadOptions:
-    """Options with one numbering of the chips of all files, where these give names."""
+    """Options with a chip numbering common to all files, if the files have chip names."""
     if options.chips is not None or len(tables) < 2:
         return options
     names: set[str] = set()
     for file, table in tables.items():
-        found = find_columns(table.colnames, options.columns, ALIASES, source=str(file))
-        if "chip" in found:
-            column = table[found["chip"]]
+        column_names = find_columns(table.colnames, options.columns, ALIASES, source=str(file))
+        if "chip" in column_names:
+            column = table[column_names["chip"]]
             present = column[~absent(column, not_finite=False)]
-            names.update(text_labels(SourceColumn(present, str(file), found["chip"])))
+            names.update(text_labels(SourceColumn(present, str(file), column_names["chip"])))
     return replace(options, chips=numbered(names)) if names else options
 
 
@@ -231,7 +231,7 @@ def _read_list(file: Path, name: str | None, options: ReadOptions) -> Matches:
 
 
 def _read_record(file: Path, options: ReadOptions) -> Matches:
-    """Matches of a file that bayesdist wrote, which states all that the options could."""
+    """Matches of a file that bayesdist wrote; it fixes everything that the options could set."""
     names = "columns unit tangent_point epoch catalogue_epoch chips not_finite same_position"
     fixed = (*names.split(), "plate_scale", *_other_origin(options))
     options.refuse_fixed(str(file), "bayesdist", *fixed)
@@ -239,15 +239,15 @@ def _read_record(file: Path, options: ReadOptions) -> Matches:
 
 
 def _other_origin(options: ReadOptions) -> tuple[str, ...]:
-    """Name of the option of the origin, if another one than 1 is given, which formats fix."""
+    """Name of the option `pixel_origin`, if it differs from 1, which is fixed by the format."""
     return () if options.pixel_origin == 1 else ("pixel_origin",)
 
 
 def _read_corr(file: Path, table: Table, name: str | None, options: ReadOptions) -> Matches:
     """Matches from a `corr.fits`, which fixes columns, origin and unit.
 
-    field_x and field_y are FITS 1-based pixels; index_ra and index_dec come to the tangent plane.
-    Magnitudes are instrumental, -2.5 log10 FLUX, where all fluxes are positive; there are no
+    field_x and field_y are FITS 1-based pixels; index_ra and index_dec are projected to the tangent
+    plane. Magnitudes are instrumental, -2.5 log10 FLUX, if all fluxes are positive. There are no
     errors.
     """
     options.refuse_fixed(str(file), "astrometry.net", "columns", *_other_origin(options))
@@ -270,7 +270,7 @@ def _read_corr(file: Path, table: Table, name: str | None, options: ReadOptions)
 
 
 def _read_with_master(files: Sequence[Path], kinds: Sequence[str], options: ReadOptions) -> Matches:
-    """Matches of hst1pass lists with the MATCHUP master among the files."""
+    """Matches of hst1pass lists with the MATCHUP master that is among the files."""
     masters: list[Path] = []
     lists: list[Path] = []
     for file, kind in zip(files, kinds, strict=True):

@@ -1,8 +1,9 @@
 """Reference stars that occur in several rows, recognised by their positions.
 
-Rows of one star share the error of its reference position.  Tables often lack a column that names
-the star; equal reference positions then tell which rows belong together.  Stars may also come in
-tight groups, such as the pinholes of one fiducial, whose positions share an error of the group.
+Rows of one star share the error of its reference position. Tables often lack a column that
+identifies the star; rows with equal reference positions then belong to one star. Stars may also
+form tight groups, such as the pinholes of a fiducial, with position errors that are common to the
+group.
 """
 
 from __future__ import annotations
@@ -19,16 +20,17 @@ from bayesdist.errors import InputError
 from bayesdist.utils.arrays import Float, Int
 from bayesdist.utils.numbers import count
 
-# what rows with equal reference positions are: option `same_position` of reading
+# interpretation of rows with equal reference positions: reading option `same_position`
 SAME_POSITION = ("one_star", "separate_stars")
-ROUNDING = 1e-9  # fraction of the field below which positions are equal
-# Linking length of tight groups, in units of the root of the area per star.  Of stars that are
+ROUNDING = 1e-9  # fraction of the field; positions closer than this are equal
+# Linking length of tight groups, in units of the square root of the area per star. If stars are
 # distributed at random, 7 % have a neighbour within it.
 LINK = 0.15
-LARGEST_GROUP = 30  # stars: more are a crowded field, and no fiducial
-ISOLATION = 4.0  # least distance of a group from the next star, in units of its own extent
-MOST = 0.5  # fraction of the stars that must lie in groups
-MIN_STARS = 20  # below which groups cannot be told from chance
+LARGEST_GROUP = 30  # stars; larger groups indicate a crowded field, not a fiducial
+# smallest distance of a group from the next star, in units of the extent of the group
+ISOLATION = 4.0
+MOST = 0.5  # fraction of the stars that must be in groups
+MIN_STARS = 20  # with fewer stars, groups cannot be distinguished from chance
 
 
 def check_same_position(value: str) -> None:
@@ -44,7 +46,7 @@ def check_same_position(value: str) -> None:
 def position_codes(first: Float, second: Float) -> Int:
     """Code (N,) of the distinct position of each row; positions within rounding are equal.
 
-    The codes count from 0 in ascending order of the positions, whatever the order of the rows.
+    Codes count from 0 in ascending order of the positions, independent of the order of the rows.
     """
     # -0.0 and 0.0 are equal
     distinct, code = np.unique((first + 0.0) + 1j * (second + 0.0), return_inverse=True)
@@ -58,10 +60,10 @@ def position_codes(first: Float, second: Float) -> Int:
 
 
 def star_codes(first: Float, second: Float, same_position: str) -> tuple[Int | None, str]:
-    """Codes (N,) of stars by their reference positions, and a note on them.
+    """Codes (N,) of stars by their reference positions, and a note about them.
 
-    None and an empty note if no position occurs twice.  With "separate_stars" each row has a code
-    of its own, so that nobody looks for equal positions again.
+    None and an empty note if no position occurs twice. With "separate_stars" each row gets a
+    different code, so that equal positions are not searched for again.
     """
     code = position_codes(first, second)
     number = np.bincount(code)
@@ -75,28 +77,28 @@ def star_codes(first: Float, second: Float, same_position: str) -> tuple[Int | N
 
 
 def repeated_words(number: Int) -> str:
-    """Clause on reference positions that occur in several rows, given the number of each."""
+    """Clause on reference positions that occur in several rows; `number` is the count of each."""
     low, high = int(number.min()), int(number.max())
     times = f"{low}" if low == high else f"{low} to {high}"
-    one = len(number) == 1
-    verb = "position occurs" if one else "positions occur"
-    return f"{count(len(number))} reference {verb} {times} times" + ("" if one else " each")
+    is_single = len(number) == 1
+    verb = "position occurs" if is_single else "positions occur"
+    return f"{count(len(number))} reference {verb} {times} times" + ("" if is_single else " each")
 
 
 @dataclass(frozen=True, eq=False)
 class RepeatedDetections:
-    """Stars with several detections in one exposure, of which one at most can be right."""
+    """Stars with several detections in one exposure; at most one of them can be correct."""
 
     stars: int  # reference stars with several detections in an exposure
-    rows: int  # their rows in these exposures
-    n_stars: int  # all reference stars
-    # True if there is one exposure, and most stars occur several times in it: rows of several
-    # exposures that no column tells apart
+    rows: int  # rows of these stars in these exposures
+    n_stars: int  # total number of reference stars
+    # True if there is only one exposure and most stars occur several times in it: probably several
+    # exposures that no column distinguishes
     unlabelled: bool
 
     @property
     def sentence(self) -> str:
-        """What was found, and what to do about it."""
+        """Sentence that states the problem and how to solve it."""
         if self.unlabelled:
             return (
                 f"{count(self.stars)} of {count(self.n_stars)} stars have several detections, and "
@@ -115,11 +117,11 @@ def repeated_detections(
 ) -> RepeatedDetections | None:
     """Stars that occur several times in one exposure; None if there are none.
 
-    Rows of an exposure count as detections of one star if they have the same reference position,
-    and also the same code in `star` (N,) if there are codes.
+    Rows of an exposure are detections of the same star if they have the same reference position
+    and, if `star` (N,) is given, the same code.
     """
     position = position_codes(u, v)
-    # separate stars at one position, or parts of a group with one code
+    # distinguish separate stars at one position, and members of a group with one code
     code = position if star is None else _joint(star, position)
     cell = _joint(exposure, code)
     number = np.bincount(cell)
@@ -133,16 +135,16 @@ def repeated_detections(
 
 @dataclass(frozen=True, eq=False)
 class TightGroups:
-    """Stars that lie in groups far tighter than the distances between the groups."""
+    """Stars in groups that are far tighter than the distances between the groups."""
 
-    code: Int  # (N,) group of each row; a star in no group is one by itself
+    code: Int  # (N,) group of each row; a star outside of any group is a group of one
     groups: int  # number of groups with several stars
-    size: int  # median number of stars in these
+    size: int  # median number of stars in groups with several stars
     extent: float  # median largest extent of a group, in the unit of u, v
     apart: float  # median distance between neighbouring groups
 
     def sentence(self, unit: str) -> str:
-        """What was found, and what to do about it."""
+        """Sentence that states the problem and how to solve it; `unit` is that of u, v."""
         return (
             f"the stars lie in {count(self.groups)} groups of {self.size} (extent "
             f"{self.extent:.2g} {unit}, {self.apart:.2g} {unit} apart), and stars of a group are "
@@ -152,9 +154,9 @@ class TightGroups:
 
 
 def tight_groups(u: Float, v: Float, star: Int | None = None) -> TightGroups | None:
-    """Tight groups of reference positions; None if most stars lie by themselves.
+    """Tight groups of reference positions; None if most stars are isolated.
 
-    Rows with one code in `star` (N,) are one star at their mean position.
+    Rows with the same code in `star` (N,) are one star at their mean position.
     """
     code = position_codes(u, v) if star is None else np.unique(star, return_inverse=True)[1]
     number = np.bincount(code)
@@ -168,7 +170,7 @@ def tight_groups(u: Float, v: Float, star: Int | None = None) -> TightGroups | N
     near, _ = tree.query(at, k=2)
     if (near[:, 1] <= link).mean() < MOST:
         return None
-    # many pairs: a crowded field, whose groups would be larger than any fiducial
+    # many pairs mean a crowded field, in which groups would be larger than any fiducial
     if tree.count_neighbors(tree, link) > n * LARGEST_GROUP:
         return None
     pairs = tree.query_pairs(link, output_type="ndarray")
@@ -182,13 +184,13 @@ def tight_groups(u: Float, v: Float, star: Int | None = None) -> TightGroups | N
     if n_groups < 2:
         return None
     apart = cKDTree(centre).query(centre, k=2)[0][:, 1]
-    # stars at one position have been told apart by their codes: their errors are independent
+    # stars at one position have different codes by request: their errors are independent
     distinct = extent > ROUNDING * float(np.ptp(at, axis=0).max())
     isolated = distinct & (size <= LARGEST_GROUP) & (apart > ISOLATION * extent)
     if size[isolated].sum() < MOST * n:
         return None
     return TightGroups(
-        group[code],  # groups that are not isolated too, now that most are
+        group[code],  # includes groups that are not isolated, because most groups are
         int(isolated.sum()),
         int(np.median(size[isolated])),
         float(np.median(extent[isolated])),
@@ -197,21 +199,21 @@ def tight_groups(u: Float, v: Float, star: Int | None = None) -> TightGroups | N
 
 
 def error_codes(u: Float, v: Float, star: Int | None) -> Int | None:
-    """Code (N,) of what shares an error of the reference: a star, or a tight group of stars.
+    """Code (N,) of the star, or tight group of stars, that shares a reference error.
 
-    None if each row is a star by itself.
+    None if each row is a separate star.
     """
     groups = tight_groups(u, v, star)
     return star if groups is None else groups.code
 
 
 def _joint(a: Int, b: Int) -> Int:
-    """Code (N,), from 0, of each pair of codes."""
+    """Code (N,) from 0 for each distinct pair of codes."""
     keys = np.unique(a, return_inverse=True)[1] * (int(b.max(initial=0)) + 1) + b
     return np.asarray(np.unique(keys, return_inverse=True)[1])
 
 
 def _linked(pairs: Sequence[Int] | Int, n: int) -> tuple[int, Int]:
-    """Number of connected components of n points, and the component of each."""
+    """Number of connected components of n points, and the component of each point."""
     i, j = np.asarray(pairs).T
     return connected_components(coo_array((np.ones(len(i)), (i, j)), shape=(n, n)), directed=False)

@@ -1,4 +1,4 @@
-"""Star lists read from files, and the cuts that select the detections to be matched."""
+"""Reading of star lists, and the cuts that select the detections to be matched."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ _LIST_ALIASES = {key: BASIC[key] for key in ("exposure", "chip", "epoch")} | {
     "sigma_x": ("sigma_x", "x_err", "x_error", "errx2win_image", "errx2psf_image", "errx2_image"),
     "sigma_y": ("sigma_y", "y_err", "y_error", "erry2win_image", "erry2psf_image", "erry2_image"),
 }
-_VARIANCE = ("errx2", "erry2")  # beginnings of columns of SExtractor
+_VARIANCE = ("errx2", "erry2")  # prefixes of SExtractor columns that hold variances
 
 
 @dataclass(frozen=True)
@@ -44,12 +44,12 @@ class StarCuts:
     Parameters
     ----------
     mag : tuple of float, optional
-        Brightest and faintest instrumental magnitude; for ACS/WFC lists (-14, -10) are the well
-        measured stars (ISR 2015-06, Figure 5).
+        Brightest and faintest instrumental magnitude. For ACS/WFC lists, (-14, -10) selects the
+        well measured stars (ISR 2015-06, Figure 5).
     saturation : float, optional
-        Stars brighter than this are saturated.
+        Magnitude limit; brighter stars are saturated.
     q_max : float, optional
-        Poorest quality of the fit.
+        Largest (poorest) quality parameter of the PSF fit.
     """
 
     mag: tuple[float, float] | None = None
@@ -65,23 +65,24 @@ class StarCuts:
             )
 
     def passed(self, stars: Detections) -> tuple[Bool, dict[str, int]]:
-        """Mask of the detections that pass, and counts of the others by reason.
+        """Apply the cuts to detections.
 
         Parameters
         ----------
         stars : Detections
-            Of one exposure.
+            Detections of one exposure.
 
         Returns
         -------
         good : ndarray of bool, shape (N,)
+            Mask of the detections that pass.
         rejected : dict of str to int
-            Detections that fail, by the first reason.
+            Number of detections that fail, by the first reason.
 
         Raises
         ------
         InputError
-            When the list lacks the magnitudes or qualities that a cut needs.
+            If the list lacks the magnitudes or qualities that a cut needs.
         """
         by_mag = self.mag is not None or self.saturation is not None
         for needed, name in ((by_mag, "mag"), (self.q_max is not None, "q")):
@@ -108,32 +109,32 @@ def read_star_lists(
     *,
     errors: bool = False,
 ) -> tuple[Detections, ...]:
-    """Raw detections of exposures, read from files.
+    """Read raw detections of exposures from files.
 
     Parameters
     ----------
     path : path-like or sequence of path-like
-        Files, patterns or a folder of Parquet files: tables as `read_matches` takes them, or lists
-        of hst1pass.  A table with a column of exposures may hold several of them; any other file is
-        one exposure, named for the file.
+        Files, patterns or a folder of Parquet files: tables as for `read_matches`, or lists of
+        hst1pass. A table with a column of exposures may hold several of them; any other file is one
+        exposure, named after the file.
     columns : mapping of str to str, optional
-        Column of each quantity: x y exposure chip mag flux q epoch sigma_x sigma_y; without a
-        column of chips all are 1.  Lists of hst1pass know theirs.  Pixels that the table's names or
-        header show to count from 0 are converted; fluxes are magnitudes of zero point 0 where there
-        are no others, and all are positive.
+        Column of each quantity: x y exposure chip mag flux q epoch sigma_x sigma_y. Without a
+        column of chips, all are chip 1. Lists of hst1pass have fixed columns. Pixels are converted
+        if the column names or the header show that they count from 0. Fluxes are converted to
+        magnitudes with zero point 0 if there are no magnitudes and all fluxes are positive.
     errors : bool, optional
-        Whether errors of the pixels are read, of which the rms of x and y is taken.
+        True to read errors of the pixels; the rms of the errors of x and y is used.
 
     Returns
     -------
     tuple of Detections
-        One for each exposure, in the order of their first appearance.
+        One entry per exposure, in the order of first appearance.
 
     Raises
     ------
     InputError
-        For files that cannot be read, missing columns, wrong values, a detection that stands twice,
-        or an exposure that stands in two files.
+        If a file cannot be read, if columns are missing or values are invalid, if a detection is
+        repeated, or if an exposure occurs in two files.
     """
     files = input_files(path)
     out: list[Detections] = []
@@ -156,20 +157,20 @@ def read_star_lists(
                 where=str(file),
                 do="give tables with x, y, or lists of hst1pass",
             )
-    names = [one.name for one in out]
-    for k, one in enumerate(out):
-        _refuse_repeated(one)
-        if one.name in names[:k]:
+    names = [stars.name for stars in out]
+    for k, stars in enumerate(out):
+        _refuse_repeated(stars)
+        if stars.name in names[:k]:
             raise InputError(
-                f"exposure {one.name} stands in {out[names.index(one.name)].source}, too",
-                where=one.source,
+                f"exposure {stars.name} stands in {out[names.index(stars.name)].source}, too",
+                where=stars.source,
                 do="give each exposure in one file",
             )
     return tuple(out)
 
 
 def _refuse_repeated(one: Detections) -> None:
-    """Refuse a list that has a detection twice, as where a table was appended to itself."""
+    """Raise InputError if a detection is repeated, for instance in a table appended to itself."""
     keys = [one.x, one.y, one.chip] + ([] if one.mag is None else [one.mag])
     pair = first_duplicate(keys)
     if pair is not None:
@@ -185,7 +186,7 @@ def _of_table(
     table: Table, columns: Mapping[str, str] | None, source: str, name: str, errors: bool
 ) -> list[Detections]:
     """Detections of each exposure of a table."""
-    found = find_columns(
+    column_names = find_columns(
         table.colnames,
         columns,
         _LIST_ALIASES,
@@ -197,47 +198,47 @@ def _of_table(
         raise InputError("holds no detections", where=source, do="give a list with stars")
 
     def column(key: str) -> SourceColumn:
-        return SourceColumn(table[found[key]], source, found[key])
+        return SourceColumn(table[column_names[key]], source, column_names[key])
 
-    keys = [key for key in ("x", "y", "mag", "q") if key in found]
+    keys = [key for key in ("x", "y", "mag", "q") if key in column_names]
     values: dict[str, Float] = {key: column(key).numbers() for key in keys}
-    if "mag" not in values and "flux" in found:
+    if "mag" not in values and "flux" in column_names:
         mag = column("flux").magnitudes_of_fluxes()
         if mag is not None:
             values["mag"] = mag
     if errors:
         values["sigma"] = np.sqrt((_variance(column("sigma_x")) + _variance(column("sigma_y"))) / 2)
-    if "exposure" in found:
+    if "exposure" in column_names:
         codes, names = column("exposure").labels()
     else:
         codes, names = np.zeros(len(table), np.int64), (name,)
-    origin, why = origin_of(found["x"], table.colnames, table.meta)
+    origin, why = origin_of(column_names["x"], table.colnames, table.meta)
     if origin == 0:
         log.info("%s: 1 is added to its pixels: %s", source, why)
-    whole = Detections(
+    detections = Detections(
         values["x"] + (1 - origin),
         values["y"] + (1 - origin),
-        chip=column("chip").integers() if "chip" in found else COMPLETED,
+        chip=column("chip").integers() if "chip" in column_names else COMPLETED,
         mag=values.get("mag"),
         q=values.get("q"),
         sigma=values.get("sigma"),
         source=source,
     )
-    years = column("epoch").years() if "epoch" in found else None
+    years = column("epoch").years() if "epoch" in column_names else None
     order = np.argsort(codes, kind="stable")
     edges = np.searchsorted(codes[order], np.arange(len(names) + 1))
     return [
         replace(
-            whole.select(rows),
-            exposure_names=(one,),
+            detections.select(rows),
+            exposure_names=(exposure_name,),
             epoch=None if years is None else years[rows].mean(keepdims=True),
         )
-        for one, rows in zip(names, np.split(order, edges[1:-1]), strict=True)
+        for exposure_name, rows in zip(names, np.split(order, edges[1:-1]), strict=True)
     ]
 
 
 def _variance(column: SourceColumn) -> Float:
-    """Variance of pixels (N,), which SExtractor writes itself."""
+    """Variance of pixels (N,); SExtractor columns already hold variances."""
     values = column.numbers()
     bad = values <= 0
     if bad.any():

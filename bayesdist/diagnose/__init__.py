@@ -1,4 +1,4 @@
-"""Tests for what a model may lack: targeted, each with its size and its power."""
+"""Targeted tests for effects that a model may lack, with the size and the power of each test."""
 
 from bayesdist.diagnose.score.result import ScoreTest
 from bayesdist.diagnose.score.tests import score_tests

@@ -1,4 +1,4 @@
-"""Checks of a fit, of its matching, and of what residuals and held-out stars say."""
+"""Checks of a fit, of its matching, and of the results from residuals and held-out stars."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ from bayesdist.utils.numbers import count, number, percent, probability, size_of
 
 FIT, HELD_OUT, SCORE_TESTS = "Fit", "Held-out truth", "Score tests"
 MATCHING, ASSUMPTIONS = "Matching", "Assumptions"
-DISPLACING = ("shape", "matching")  # groups of score tests
+DISPLACING = ("shape", "matching")  # groups of score tests that indicate a displaced solution
 
 
 def input_checks(
@@ -53,23 +53,28 @@ def input_checks(
     Parameters
     ----------
     fit : LinearFit
+        The fit to check.
     table : Matches
         Stars of the fit, or an evenly spread sample of them.
     reference_sigma : float
-        Median quoted error of one axis, in the unit of u and v.
+        Median quoted error per axis, in the unit of u and v.
     match_radius : float or None
         Radius within which the stars were matched, in the unit of u and v.
     in_circle : bool
-        True if the likelihood accounts for the circles that the stars were matched in.
+        True if the likelihood includes the match circles of the stars.
     majority : str
-        Sentence on most pairs being false; empty if they are not.
+        Sentence saying that most pairs are false; empty if they are not.
     error_scale : str
-        Sentence on quoted errors that were multiplied; empty if they were not.
+        Sentence saying that quoted errors were multiplied; empty if they were not.
     matched_before : bool
-        True if the stars were matched by the user, so that frames and nominal positions can be
-        wrong or missing.
+        True if the user matched the stars, so that frames and nominal positions may be wrong or
+        missing.
     rows, chooser : str
-        As `things` and `chooser` of `bayesdist.infer.posterior.checks.fit_checks`.
+        See `things` and `chooser` of `bayesdist.infer.posterior.checks.fit_checks`.
+
+    Yields
+    ------
+    Check
     """
     yield from fit_checks(fit, things=rows, chooser=chooser)
     if doubt := pixel_doubt(fit):
@@ -103,7 +108,7 @@ def input_checks(
 
 
 def repeated_star_checks(table: Matches) -> Iterator[Check]:
-    """Checks of stars with several detections in one exposure, and of tight groups of stars."""
+    """Checks for stars with several detections in one exposure, and for tight groups of stars."""
     repeated = repeated_detections(table.u, table.v, table.exposure, table.star)
     if repeated is not None:
         name = "Stars with several detections in one exposure"
@@ -120,7 +125,7 @@ def frames_doubt(fit: LinearFit, table: Matches, *, suspicious: bool) -> str:
     """Clause on frames that would make the residuals far smaller; empty if there are none.
 
     Other frames are tried only if the residuals are larger than their errors, or if the fit is
-    `suspicious` for another reason. `table`: stars of the fit, or a sample of them.
+    `suspicious` for another reason.  `table` contains stars of the fit, or a sample of them.
     """
     if not suspicious and fit.chi2 <= CHI2_TOO_LARGE.value * fit.dof:
         return ""
@@ -131,10 +136,10 @@ def frames_doubt(fit: LinearFit, table: Matches, *, suspicious: bool) -> str:
 def matching_checks(
     match_radius: float | None, sigma: float, *, in_circle: bool
 ) -> Iterator[Check]:
-    """Check of residuals that the match circle may have cut off, unknown to the likelihood.
+    """Check for residuals truncated by a match circle that the likelihood does not include.
 
-    `match_radius`: in the unit of u and v. `sigma`: usual error of a star. `in_circle`: True if the
-    likelihood knows of the circles.
+    `match_radius` is in the unit of u and v, `sigma` is the typical error of a star, and
+    `in_circle` is True if the likelihood includes the circles.
     """
     if in_circle or match_radius is None or MATCH_RADIUS.met_by(match_radius / sigma):
         return
@@ -158,51 +163,51 @@ def structure_checks(
 ) -> Iterator[Check]:
     """Checks of the structure that a fit leaves in the residuals.
 
-    There is one misfit for each chip, or none; `correlated` errors of the solution hold some of the
-    structure. Score `tests` may have found where it comes from.
+    There is one misfit per chip, or none.  The `correlated` errors of the solution include some of
+    the structure.  Significant score `tests` may indicate its origin.
     """
     if not misfits:
         return
-    one = worst_misfit(misfits)
-    chip = "" if one.chip is None else f" of {one.chip.name}"
-    size = size_of(one.structure, one.unit, 2)
-    found = f"{size} rms in {one.partition}{chip}" if one.structure > 0 else "none"
-    if one.power < 1:
-        found += (
-            f" ({percent(one.power, 2)} of all patterns can be separated from positions of stars)"
+    entry = worst_misfit(misfits)
+    chip = "" if entry.chip is None else f" of {entry.chip.name}"
+    size = size_of(entry.structure, entry.unit, 2)
+    value = f"{size} rms in {entry.partition}{chip}" if entry.structure > 0 else "none"
+    if entry.power < 1:
+        value += (
+            f" ({percent(entry.power, 2)} of all patterns can be separated from positions of stars)"
         )
     held = None if correlated is None else correlated.structure_rms
     sentence = doubt = ""
-    if one.significant:
-        what = "nothing" if held is None else f"{held:.2g} {one.unit} rms"
-        sentence = f"{one.finding}, and the budget holds {what} of it"
+    if entry.significant:
+        included = "nothing" if held is None else f"{held:.2g} {entry.unit} rms"
+        sentence = f"{entry.finding}, and the budget holds {included} of it"
         if correlated is None:
-            sentence = one.sentence
+            sentence = entry.sentence
         if displacing(tests):
             sentence += "; it may come from residuals that are lopsided or cut, of which score "
             sentence += "tests have found some"
-        if (held or 0.0) < STRUCTURE_IN_BUDGET.value * one.structure:
+        if (held or 0.0) < STRUCTURE_IN_BUDGET.value * entry.structure:
             doubt = LARGER
     yield Check(
         FIT,
         "Structure in the residuals, beyond noise",
-        f"{found}, {probability(one.p_value)}",
+        f"{value}, {probability(entry.p_value)}",
         f"p at least {number(STRUCTURE.value, 1)}",
-        "warn" if one.significant or one.underpowered else "pass",
+        "warn" if entry.significant or entry.underpowered else "pass",
         sentence,
         doubt,
     )
-    for one in misfits:
-        if one.underpowered:
+    for entry in misfits:
+        if entry.underpowered:
             sentence = (
-                f"{100 * (1 - one.power):.0f} % of the structure that the model might leave is "
+                f"{100 * (1 - entry.power):.0f} % of the structure that the model might leave is "
                 "hidden: positions of stars take it up where dithers are small"
             )
             yield Check(
                 FIT,
                 "Structure that positions of stars hide"
-                + ("" if one.chip is None else f" on {one.chip.name}"),
-                percent(1 - one.power, 2),
+                + ("" if entry.chip is None else f" on {entry.chip.name}"),
+                percent(1 - entry.power, 2),
                 f"at most {percent(1 - STRUCTURE_SEEN.value, 2)}",
                 "warn",
                 sentence,
@@ -212,19 +217,19 @@ def structure_checks(
 def score_checks(
     tests: Sequence[ScoreTest], correlated: Discrepancy | None = None
 ) -> Iterator[Check]:
-    """Checks of what targeted tests have found, one for each remedy, or that they found nothing.
+    """Checks of the score tests: one for each remedy of a finding, or one if there are no findings.
 
-    Verdicts stand where correlated errors hold what the tests have found.  Noise is held by the
-    sandwich covariance, unless the residuals are lopsided or the match radius has cut them: that
-    covariance holds the scatter of a solution, and not its displacement.
+    Verdicts stay valid if the correlated errors include what the tests have found.  Noise is
+    included in the sandwich covariance, unless the residuals are lopsided or truncated by the match
+    radius: that covariance includes the scatter of a solution, but not its displacement.
     """
     limit = f"p at least {number(SCORE_LIMIT.value, 1)}"
-    found: dict[str, list[ScoreTest]] = {}
+    by_remedy: dict[str, list[ScoreTest]] = {}
     for test in tests:
         if test.significant:
-            found.setdefault(test.remedy, []).append(test)
+            by_remedy.setdefault(test.remedy, []).append(test)
     displaced = displacing(tests)
-    for remedy, several in found.items():
+    for remedy, several in by_remedy.items():
         sentence = f"{'; '.join(test.finding for test in several)}: {remedy}"
         doubts = {test.doubt for test in several if not _held(correlated, test, tests, displaced)}
         doubt = EITHER if EITHER in doubts else LARGER if doubts else ""
@@ -234,22 +239,22 @@ def score_checks(
             for test in several
         )
         yield Check(SCORE_TESTS, f"Residuals: {names}", value, limit, "warn", sentence, doubt)
-    if tests and not found:
+    if tests and not by_remedy:
         name = f"Tests of the residuals ({len(tests)})"
         yield Check(SCORE_TESTS, name, "nothing found", limit, "pass")
 
 
 def displacing(tests: Sequence[ScoreTest]) -> bool:
-    """True where tests have found residuals that displace the solution, as noise does not."""
+    """True if tests have found residuals that displace the solution, which noise does not."""
     return any(test.significant and test.group in DISPLACING for test in tests)
 
 
 def _held(
     correlated: Discrepancy | None, test: ScoreTest, tests: Sequence[ScoreTest], displaced: bool
 ) -> bool:
-    """True where correlated errors hold what one of the tests has found.
+    """True if the correlated errors include what one of the tests has found.
 
-    `displaced`: whether the residuals displace the solution.
+    `displaced` is True if the residuals displace the solution.
     """
     if correlated is None:
         return False
@@ -259,13 +264,13 @@ def _held(
     scatter = set() if linear is None else set(linear.scatter)
     bend = 0.0 if linear is None else linear.bend
     in_time = linear is not None and linear.correlation_time > 0
-    wandering = any(one.significant and one.held_by == "time" for one in tests)
+    wandering = any(result.significant and result.held_by == "time" for result in tests)
     held = {
         "": False,
         "noise": not displaced,
         "structure": bool(correlated.structure),
         "exposures": bool(scatter - {CURVATURE}),
-        # a parabola does not hold deviations that wander
+        # a parabola does not include deviations that vary irregularly
         "curvature": in_time or (bend >= enough and not wandering),
         "second order": of_exposures.get("second_order", 0.0) >= enough > 0,
         "exposure fields": of_exposures.get("field", 0.0) >= enough > 0,
@@ -275,30 +280,30 @@ def _held(
 
 
 def coverage_checks(chips: Sequence[Coverage]) -> Iterator[Check]:
-    """Checks of the area of each chip that stars cover: of those that lack too much, or the worst.
+    """Checks of the area of each chip that stars cover: those with too large a gap, or the worst.
 
-    Nothing is checked where an earlier calibration knows the rest.
+    Chips on which an earlier calibration covers the remaining area are not checked.
     """
-    asked = [one for one in chips if not one.known]
+    asked = [coverage for coverage in chips if not coverage.known]
     if not asked:
         return
-    bad = [one for one in asked if one.significant]
-    for one in bad or [max(asked, key=lambda one: one.gap / one.most)]:
+    bad = [coverage for coverage in asked if coverage.significant]
+    for coverage in bad or [max(asked, key=lambda coverage: coverage.gap / coverage.most)]:
         yield Check(
             FIT,
-            "Area beyond the stars" + (f" of {one.chip.name}" if one.several else ""),
-            percent(one.gap, 2),
-            f"at most {percent(one.most, 2)}",
-            "warn" if one.significant else "pass",
-            one.sentence if one.significant else "",
+            "Area beyond the stars" + (f" of {coverage.chip.name}" if coverage.several else ""),
+            percent(coverage.gap, 2),
+            f"at most {percent(coverage.most, 2)}",
+            "warn" if coverage.significant else "pass",
+            coverage.sentence if coverage.significant else "",
         )
 
 
 def exposure_checks(found: ExposureScatter | None) -> Iterator[Check]:
-    """Check that no exposure has larger or smaller errors than all; nothing for one exposure."""
+    """Check for exposures with larger or smaller errors than all; nothing for one exposure."""
     if found is None:
         return
-    low, high, most = found.relative.min(), found.relative.max(), EXPOSURE_CHI2.value
+    low, high, limit = found.relative.min(), found.relative.max(), EXPOSURE_CHI2.value
     sentence = ""
     if found.deviating.any():
         names = [name for name, off in zip(found.names, found.deviating, strict=True) if off]
@@ -311,14 +316,14 @@ def exposure_checks(found: ExposureScatter | None) -> Iterator[Check]:
         FIT,
         "Chi-square of single exposures, relative to that of all",
         f"{number(low)} to {number(high)} in {count(len(found.names))} exposures",
-        f"{number(1 / most, 2)} to {number(most, 2)}",
+        f"{number(1 / limit, 2)} to {number(limit, 2)}",
         "warn" if sentence else "pass",
         sentence,
     )
 
 
 def outlying_checks(correlated: Discrepancy | None) -> Iterator[Check]:
-    """Check that names exposures whose linear terms are far beyond the scatter of the others."""
+    """Check that names exposures with linear terms far beyond the scatter of the others."""
     names = [] if correlated is None else correlated.facts.get("exposures_outlying", [])
     if names:
         yield Check(
@@ -334,7 +339,7 @@ def outlying_checks(correlated: Discrepancy | None) -> Iterator[Check]:
 
 
 def holdout_checks(found: HoldoutValidation | None) -> Iterator[Check]:
-    """Check of held-out stars; nothing where there are none."""
+    """Check of held-out stars; nothing if there are none."""
     if found is None:
         return
     agrees = found.level == "pass"

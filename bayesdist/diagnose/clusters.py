@@ -1,7 +1,7 @@
-"""Sums over detections with correlated errors: those of one star, of one exposure, or in one cell.
+"""Sums over detections with correlated errors: those of one star, one exposure, or one cell.
 
-A statistic that is a sum over detections varies by the squares of its sums over such clusters, not
-by those of single detections.
+The variance of a statistic that is a sum over detections follows from the squares of its sums over
+such clusters, not from those of single detections.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from bayesdist.utils.arrays import Float, Int
 def sums_over(cluster: Int, values: Float, n: int = 0) -> Float:
     """Sums of values over clusters.
 
-    `cluster` (N,) counts from 0, `values` are (N, ...); there are at least `n` clusters.
+    `cluster` (N,) are codes from 0, `values` are (N, ...), and the result has at least `n` rows.
     """
     columns = values.reshape(len(values), math.prod(values.shape[1:])).T
     sums = [np.bincount(cluster, column, n) for column in columns]
@@ -25,7 +25,7 @@ def sums_over(cluster: Int, values: Float, n: int = 0) -> Float:
 
 
 def add_over(total: Float, cluster: Int, values: Float) -> None:
-    """Add values (N, ...) to the totals (c, ...) of their clusters, which may be few of many.
+    """Add values (N, ...) to the totals (c, ...) of their clusters, a few of many.
 
     `total` is changed in place.
     """
@@ -34,9 +34,9 @@ def add_over(total: Float, cluster: Int, values: Float) -> None:
 
 
 def joint_clusters(group: Int, cluster: Int) -> tuple[Int, Int]:
-    """Group (c,) of each part of a cluster that lies in one group, and part (N,) of each value.
+    """Split clusters by group: the group (c,) of each part, and the part (N,) of each value.
 
-    `group` and `cluster` (N,) are not negative.
+    `group` and `cluster` (N,) must not be negative.
     """
     n = int(cluster.max(initial=0)) + 1
     keys, of = np.unique(group * n + cluster, return_inverse=True)
@@ -44,18 +44,18 @@ def joint_clusters(group: Int, cluster: Int) -> tuple[Int, Int]:
 
 
 def squares_over(cluster: Int, values: Float, group: Int | None = None, n: int = 1) -> Float:
-    """Squares (n, ...) of the sums over clusters, added up in each group.
+    """Squares (n, ...) of the sums over clusters, summed in each group.
 
-    `cluster` (N,) is not negative, `values` are (N, ...); one of `n` groups by default.
+    `cluster` (N,) must not be negative, `values` are (N, ...); there is a single group by default.
     """
     owner, of = joint_clusters(np.zeros_like(cluster) if group is None else group, cluster)
     return sums_over(owner, sums_over(of, values) ** 2, n)
 
 
 def products_over(group: Int, cluster: Int, values: Float, n: int) -> Float:
-    """Products of sums of k values over groups and clusters, added up over the clusters.
+    """Products between groups of the sums of k values over clusters, summed over the clusters.
 
-    Matrix (k n, k n) for values (N, k) of n groups.
+    Returns a matrix (k n, k n) for values (N, k) in n groups.
     """
     k = values.shape[1]
     rows = (group[:, None] * k + np.arange(k)).ravel()

@@ -1,4 +1,4 @@
-"""Diagnostics of a solution by its residuals: one value, made by a function of its arguments."""
+"""Diagnostics of a solution from its residuals, and the functions that compute them."""
 
 from __future__ import annotations
 
@@ -70,17 +70,18 @@ if TYPE_CHECKING:
 
 Bins = tuple[int, int]
 
-SHOWN = "shown"  # the partition that diagrams of mean residuals show
+SHOWN = "shown"  # name of the partition that is plotted as a map of mean residuals
 
 log = logging.getLogger("bayesdist")
 
 
 @dataclass(frozen=True, eq=False)
 class Diagnostics:
-    """Misfit, score tests, correlated errors and further results by the residuals of a solution.
+    """Results of all diagnostics from the residuals of a solution.
 
-    `diagnose` makes it.  `error_budget` and `check_requirements` take it, so that a verdict counts
-    what the residuals show; printed, it says how many tests there were and what was found.
+    They include the misfit, score tests and correlated errors.  Create them with `diagnose`, and
+    pass them to `error_budget` and `check_requirements` so that verdicts take the residuals into
+    account.  The printed form gives the number of tests, the significant findings and the warnings.
 
     Parameters
     ----------
@@ -89,11 +90,11 @@ class Diagnostics:
     partitions : mapping
         Numbers of bins (nx, ny) of each partition, by chip number and name of the partition.
     misfits : tuple of Misfit
-        Structure that the solution leaves, for each chip or, if chips share stars, for all.
+        Structure in the residuals, per chip; a single item for all chips if these share stars.
     coverage : tuple of Coverage
         Area of each chip that the stars cover.
     sample : StarSample
-        All stars, or a sample of very many, with their residuals and probabilities.
+        All stars, or a sample if there are very many, with residuals and probabilities.
     chi_square : ChiSquare
         Chi-square of the fit with the quoted errors.
     input_checks : tuple of Check
@@ -101,21 +102,22 @@ class Diagnostics:
     dates : ndarray, shape (T,)
         Distinct dates of the stars in decimal years, ascending; empty without dates.
     majority : str
-        Sentence on a majority of false pairs; empty if there is none.
+        Sentence saying that most pairs are false; empty if they are not.
     epoch_shift : EpochShift or None
         Error of the epochs; None without proper motions.
     centroid : MagnitudeErrors or None
         Scatter of the residuals by magnitude; None without magnitudes.
     flagged : ndarray of int, shape (E,), or None
-        Number of stars of each exposure that are more likely false than not; None for one exposure.
+        Number of stars of each exposure that are more likely false than true; None for one
+        exposure.
     score_tests : tuple of ScoreTest
-        Results of the tests of the residuals.
+        Results of the score tests.
     correlated : Discrepancy or None
         Correlated errors beyond the model; None if they have not been estimated.
     catalogue : StarCovariance or None
         Covariance of the parameters due to errors of the catalogue; None if these are unknown.
     periods : TimeVariation or None
-        Comparison of the models of several periods; None if it was not asked for.
+        Comparison of the models of several periods; None if it was not requested.
     holdout : HoldoutValidation or None
         Results for stars that were set aside before the fit; None without such stars.
     overlap : OverlapTest or None
@@ -170,17 +172,17 @@ class Diagnostics:
 
     @property
     def misfit(self) -> Misfit:
-        """Worst of the misfits, its probability corrected for their number."""
+        """Worst of the misfits, corrected for their number."""
         return worst_misfit(self.misfits)
 
     @property
     def shown(self) -> tuple[BinnedSums, ...]:
-        """Sums of residuals that diagrams of their means show, one for each chip."""
+        """Sums of residuals for maps of their means, one per chip."""
         return tuple(self.sums.binned[c, bins[SHOWN]] for c, bins in self.partitions.items())
 
     @property
     def checks_of_input(self) -> tuple[Check, ...]:
-        """Checks of the fit and its matching, in the light of what the tests have found."""
+        """Checks of the fit and its matching, taking the results of the tests into account."""
         findings = [
             test.name for test in self.score_tests if test.significant and test.held_by != "noise"
         ]
@@ -194,7 +196,7 @@ class Diagnostics:
 
     @property
     def checks(self) -> tuple[Check, ...]:
-        """Checks that a reader of the numbers has to know."""
+        """Checks of the results that a reader of the numbers needs to know."""
         out = [
             *holdout_checks(self.holdout),
             *score_checks(self.score_tests, self.correlated),
@@ -229,33 +231,33 @@ def diagnose(
     discrepancy: DiscrepancyPriors | None = None,
     compute: Compute | None = None,
 ) -> Diagnostics:
-    """Examine the residuals of a posterior: what the model leaves out, and how noisy the stars are.
+    """Examine the residuals of a posterior for effects that the model lacks, and for wrong errors.
 
     Correlated errors beyond the model (structure over the detector, differences between exposures)
-    are estimated with priors on their size, targeted tests look for what the model may lack, and
-    the scatter of the stars is compared with their quoted errors.  `bayesdist run` makes the same
-    diagnostics: the same stars, settings and seed give the same numbers.
+    are estimated with priors on their size, targeted tests search for effects that the model may
+    lack, and the scatter of the stars is compared with their quoted errors.  `bayesdist run`
+    computes the same diagnostics: the same stars, settings and seed give the same numbers.
 
     Parameters
     ----------
     posterior : Posterior
-        As `sample` returned it.
+        Posterior from `sample`.
     matches : Matches
-        The N stars that the posterior was made from, with the same errors.
+        The N stars that were given to `sample`, with the same errors.
     fit : LinearFit, optional
-        The fit that the sampler started from; by default a fit with the default rejection limits
-        is made.  Give it if it was made with other limits.
+        Fit that the sampler started from.  The default is a fit with the default rejection limits;
+        pass the fit if it was made with other limits.
     rng : int or numpy.random.Generator
         Seed of the run.  A generator is restarted from its initial state.
     priors : GaussianPriors, optional
         Priors of the parameters, as given to `sample`; flat by default.
     match_radius : float or Quantity, optional
-        Radius within which the stars were matched, in the unit of u and v; that of the posterior's
-        mixture by default.
+        Radius within which the stars were matched, in the unit of u and v; by default that of the
+        posterior's mixture.
     discrepancy : DiscrepancyPriors, optional
-        Prior medians of the sizes of what the model may leave out.
+        Prior medians of the sizes of effects that the model may lack.
     compute : Compute, optional
-        Where the work is done; one process with threads by default.
+        Settings for parallel computation; one process with threads by default.
 
     Returns
     -------
@@ -264,8 +266,9 @@ def diagnose(
     Raises
     ------
     InputError
-        For a fit that was not sampled, matches that are not those of the posterior, a posterior of
-        a campaign or of a self-calibration, a radius that is not positive, and a wrong seed.
+        If `posterior` is not a posterior, or that of a campaign or a self-calibration; if the
+        matches or the fit do not belong to it; if the radius is not positive; or if the seed is
+        invalid.
 
     Examples
     --------
@@ -321,7 +324,7 @@ def diagnose(
 
 
 def _refuse_other_posterior(posterior: Posterior, matches: Matches, fit: LinearFit | None) -> None:
-    """Refuse what is no posterior of these matches, or of exposures that were fitted jointly."""
+    """Raise InputError unless the posterior is one of these matches, without joint exposures."""
     if not isinstance(posterior, Posterior):
         raise InputError(
             f"a {type(posterior).__name__} has no posterior to examine",
@@ -385,14 +388,33 @@ def diagnose_fit(
     rows: str = "stars",
     chooser: str = "least-squares fit",
 ) -> Diagnostics:
-    """Diagnostics by residuals alone, of a posterior where there is one; nothing is estimated.
+    """Diagnostics from residuals alone; nothing is estimated or tested against alternatives.
 
-    `stars`: those that were fitted, with errors. `shards`: the same, as passes go over them.
-    `table`: evenly spread ones of them, or all. `eliminated`: the solution with its stars, where
-    places of stars were fitted too. `centroid`: errors of the centroids where the fit has found
-    them; else they are the scatter of the residuals. `known`: whether an earlier calibration says
-    where no stars are. `match_radius`, `in_circle`, `matched_before`, `error_scale`, `rows`,
-    `chooser`: as of `input_checks`.
+    Parameters
+    ----------
+    fit : LinearFit
+        The least-squares fit.
+    posterior : Posterior or None
+        Posterior, if one was sampled; its residuals are then used.
+    stars : Matches
+        Fitted stars, with errors.
+    shards : Shards
+        The same stars, for passes over the data.
+    table : Matches
+        Evenly spread sample of the stars, or all of them.
+    eliminated : SelfCalibrationMode or None
+        Solution including the positions of stars, if these were fitted.
+    centroid : MagnitudeErrors, 'residuals' or None
+        Centroid errors, if the fit estimated them; with 'residuals' they are the scatter of the
+        residuals.
+    known : bool
+        True if an earlier calibration covers the area without stars.
+    match_radius, in_circle, matched_before, error_scale, rows, chooser
+        See `input_checks`.
+
+    Returns
+    -------
+    Diagnostics
     """
     model, survey = fit.model, shards.survey
     shown = likelihood_shown(fit, posterior)
@@ -408,8 +430,8 @@ def diagnose_fit(
         sample = replace(sample, taken=_taken(eliminated, sample.table.row))
     if centroid == "residuals":
         centroid = centroid_scatter(sample, n_params=model.n_params)
-    sigma, things = survey.reference_sigma, "pairs" if rows == "stars" else rows
-    majority = majority_sentence(fit, posterior, quoted=sigma, things=things)
+    sigma, pair_word = survey.reference_sigma, "pairs" if rows == "stars" else rows
+    majority = majority_sentence(fit, posterior, quoted=sigma, things=pair_word)
     checks = input_checks(
         fit,
         table,
@@ -429,12 +451,12 @@ def diagnose_fit(
         coverage=tuple(
             coverage_of(
                 sums.binned[chip.number, bins["cells"]],
-                found.corners,
+                chip_survey.corners,
                 chip,
                 several=several,
                 known=known,
             )
-            for chip, bins, found in zip(
+            for chip, bins, chip_survey in zip(
                 model.chips, partitions.values(), survey.chips, strict=True
             )
         ),
@@ -455,12 +477,12 @@ def residual_sums(
 ) -> tuple[dict[int, dict[str, Bins]], StarSums]:
     """Bins of each chip by the name of the partition, and sums of residuals in them.
 
-    `shards` has all stars that were fitted; `solution` says where they lie and which are true, by
-    default the fit.
+    `shards` contains all fitted stars.  `solution` provides the residuals and the probabilities of
+    true matches; it is the fit by default.
     """
     partitions = {}
-    for chip, found in zip(fit.model.chips, shards.survey.chips, strict=True):
-        n = round(fit.n_used * found.n / len(shards))
+    for chip, chip_survey in zip(fit.model.chips, shards.survey.chips, strict=True):
+        n = round(fit.n_used * chip_survey.n / len(shards))
         side = int(np.clip(np.sqrt(n / STARS_PER_BIN), 4, MAX_BINS))
         partitions[chip.number] = partitions_for(n) | {SHOWN: (side, side)}
     wanted = {chip: tuple(dict.fromkeys(bins.values())) for chip, bins in partitions.items()}
@@ -477,8 +499,8 @@ def _misfits(
 ) -> tuple[Misfit, ...]:
     """Structure in the residuals of each chip; detections of one star count as one.
 
-    `partitions` and `sums` are those of `residual_sums`, whose detections are taken as they are
-    where stars have one each, or stay on disk.
+    `partitions` and `sums` are those of `residual_sums`.  They are used directly if each star has
+    one detection, or if the stars are not in memory.
     """
     code = stars.error_codes if stars.in_memory else None
     if code is None or len(distinct := np.unique(code)) == len(stars):
@@ -505,19 +527,19 @@ def misfits_of(
         binned = {
             name: sums.binned[chip.number, size] for name, size in bins.items() if name != SHOWN
         }
-        found = misfit_of(binned, order=fit.model.order, unit=fit.unit)
-        out.append(replace(found, chip=chip) if len(fit.model.chips) > 1 else found)
+        misfit = misfit_of(binned, order=fit.model.order, unit=fit.unit)
+        out.append(replace(misfit, chip=chip) if len(fit.model.chips) > 1 else misfit)
     return tuple(out)
 
 
 def _taken(eliminated: SelfCalibrationMode, rows: Int) -> Float:
-    """Fraction (N,) of the variance that places of stars take out of detections."""
+    """Fraction (N,) of the variance of detections that fitted positions of stars absorb."""
     from bayesdist.diagnose.selfcal.scores import taken_by_stars
 
-    own = eliminated.problem.rows
-    taken = np.zeros(max(int(own.max(initial=-1)), int(rows.max(initial=-1))) + 1)
-    taken[own] = taken_by_stars(eliminated)
-    return taken[rows]
+    problem_rows = eliminated.problem.rows
+    fraction = np.zeros(max(int(problem_rows.max(initial=-1)), int(rows.max(initial=-1))) + 1)
+    fraction[problem_rows] = taken_by_stars(eliminated)
+    return fraction[rows]
 
 
 @one_thread
@@ -540,19 +562,46 @@ def diagnose_posterior(
     eliminated: SelfCalibrationMode | None,
     periods: PeriodSettings | None,
 ) -> Diagnostics:
-    """Diagnostics of a posterior, with what is estimated and tested.
+    """Add estimates of correlated errors, and tests, to the diagnostics of a posterior.
 
-    `found`: those by residuals, of `diagnose_fit`, and `stars`, `shards` and `eliminated` as there.
-    `rng`: each result is made from its numbers from their beginning. `tested`: matches that the
-    score tests look at. `discrepancy`: of the size of correlated errors. `priors`: those of the
-    parameters that the posterior has. `match_radius`: within which the stars were matched, in the
-    unit of u and v. `structure`: whether there is structure beyond the model; not where look-up
-    tables were fitted to it. `exposures`: whether single exposures deviate; not where a hierarchy
-    of them was fitted. `settling`: what was done to the shifts of single chips after sampling.
-    `catalogue`: errors of the catalogue by code of the star. `periods`: that are compared.
+    Parameters
+    ----------
+    found : Diagnostics
+        Diagnostics from residuals, from `diagnose_fit`.
+    fit, posterior, stars, shards, eliminated
+        See `diagnose_fit`.
+    rng : numpy.random.Generator
+        Source of random numbers; it is restarted for each result.
+    tested : Matches
+        Matches for the score tests.
+    discrepancy : DiscrepancyPriors
+        Priors on the size of correlated errors.
+    priors : GaussianPriors or None
+        Priors of the parameters of the posterior.
+    match_radius : float or None
+        Radius within which the stars were matched, in the unit of u and v.
+    structure : bool
+        True to estimate structure beyond the model; False if look-up tables were fitted to it.
+    exposures : bool
+        True to estimate linear deviations of single exposures; False if a hierarchy of them was
+        fitted.
+    settling : Settling or None
+        Transformation of the shifts of single chips that was applied after sampling.
+    catalogue : StarErrors or None
+        Errors of the catalogue by star code.
+    periods : PeriodSettings or None
+        Periods to compare.
 
-    InputError where correlated errors cannot be estimated: no verdict could rest on anything then;
-    DegenerateError for a period with too few pairs.
+    Returns
+    -------
+    Diagnostics
+
+    Raises
+    ------
+    InputError
+        If correlated errors cannot be estimated, because no verdict would be justified.
+    DegenerateError
+        If a period has too few pairs.
     """
     in_memory = stars if stars.in_memory else None
     shared = None
@@ -594,14 +643,13 @@ def diagnose_posterior(
 def catalogue_covariance(
     fit: LinearFit, stars: Matches | None, errors: StarErrors | None
 ) -> StarCovariance | None:
-    """Covariance of the parameters by the errors of the catalogue.
+    """Covariance of the parameters due to the errors of the catalogue.
 
-    It is computed for the linear fit, whose covariance has no noise of sampling: with hundreds of
-    parameters a few thousand draws leave factors of several in the eigenvalues of theirs.
-    Polynomials and drift are followed exactly, frames as far as they are correlated with these.
-
-    `stars` have errors that contain the catalogue's, and codes. None where the catalogue has no
-    errors, or the matches no codes.
+    It is computed for the linear fit, because the covariance of the fit has no sampling noise: with
+    hundreds of parameters, a few thousand draws leave factors of several in the eigenvalues of
+    theirs.  Polynomials and drift are exact, frames follow according to their correlation with
+    these.  `stars` must have codes and errors that include those of the catalogue.  Returns None if
+    the catalogue has no errors, or if the matches have no codes.
     """
     if errors is None or stars is None or stars.star is None:
         return None

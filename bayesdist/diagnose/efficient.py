@@ -1,13 +1,14 @@
 """Efficient scores: columns of a likelihood, with the parameters of the model projected out.
 
-Tests add columns Z to the derivatives J of positions by the parameters, which are nuisance: with H
-the curvature and g the gradient of each detection, and P and r precision and pull of the priors,
+Tests add columns Z to the derivatives J of positions with respect to the parameters, which are
+nuisance parameters.  With H the curvature and g the gradient of each detection, and P and r the
+precision of the priors and their gradient,
 
     gain = C^-1 J^T H Z         C = J^T H J + P
     information = Z^T H Z - (J^T H Z)^T gain
     score = Z^T g - gain^T (J^T g + r)
 
-Where positions of stars are solved for, these are eliminated from all of the sums before.
+If positions of stars are fitted, they are eliminated from all these sums first.
 """
 
 from __future__ import annotations
@@ -21,9 +22,9 @@ from bayesdist.utils.arrays import Bool, Float, Int
 
 @dataclass(frozen=True, eq=False)
 class EfficientScore:
-    """Information and score of n columns, the parameters projected out."""
+    """Information and score of n columns with the parameters projected out."""
 
-    gain: Float  # (D, n) parameters that the columns are taken for
+    gain: Float  # (D, n) changes of the parameters that imitate the columns
     information: Float  # (n, n)
     score: Float  # (n,)
 
@@ -37,23 +38,24 @@ class EfficientScore:
         score: Float,
         rows: Int | slice = slice(None),
     ) -> EfficientScore:
-        """From the sums before, by the covariance (D, D) and the score (D,) of the parameters.
+        """Project the parameters out of information and score of columns.
 
-        `cross` (m, n) are products of parameters and columns, of some `rows` alone where the
-        columns have to do with few of the parameters.
+        `covariance` (D, D) and `nuisance_score` (D,) are those of the parameters.  `cross` (m, n)
+        is the information between parameters and columns, for the parameters `rows` only if the
+        columns depend on few of them.
         """
         gain = covariance[:, rows] @ cross
-        left = information - cross.T @ gain[rows]
-        return cls(gain, (left + left.T) / 2, score - gain.T @ nuisance_score)
+        projected = information - cross.T @ gain[rows]
+        return cls(gain, (projected + projected.T) / 2, score - gain.T @ nuisance_score)
 
 
 @dataclass(frozen=True, eq=False)
 class Directions:
-    """Combinations of columns that the parameters have left, in units of their information."""
+    """Combinations of columns that the parameters do not absorb, scaled to unit information."""
 
-    columns: Int  # (m,)
-    basis: Float  # (m, q) with unit information, all parameters projected out
-    score: Float  # (q,) also the step by which the fit would move
+    columns: Int  # (m,) indices of the columns
+    basis: Float  # (m, q) with unit information after projecting out all parameters
+    score: Float  # (q,) score, equal to the step of the fit
 
     @classmethod
     def of(
@@ -65,10 +67,12 @@ class Directions:
         known: Float,
         least: float,
     ) -> Directions:
-        """Directions of the `own` ones of some columns (m,), without what the others say of them.
+        """Directions of the columns marked as `own`, with all other columns projected out.
 
-        `combinations` (k, n) are those of the own ones that are asked for, `known` (k, k) their
-        information before anything is projected out, of which a direction must keep `least`.
+        `columns` (m,) are indices into `left`, and `own` (m,) is a mask of them.  `combinations`
+        (k, n) are the combinations of own columns to test, `known` (k, k) is the information of
+        these columns before anything is projected out, and `least` the fraction of it that a
+        direction must keep.
         """
         S = left.information[np.ix_(columns, columns)]
         A = _beside_others(S, own, combinations)
@@ -84,7 +88,7 @@ class Directions:
         return self.basis.shape[1]
 
     def squares(self, covariance: Float, square: Float) -> tuple[float, float]:
-        """Mean squares of the pattern that the score stands for, and of what noise makes of it.
+        """Mean squares of the pattern that corresponds to the score, and of its noise.
 
         `covariance` (q, q) is that of the score, `square` (m, m) the mean products of the columns.
         """
@@ -93,10 +97,10 @@ class Directions:
 
 
 def _beside_others(information: Float, own: Bool, directions: Float) -> Float:
-    """Directions (n, q) of the `own` regressors (n,), without what the others say of them.
+    """Directions (n, q) of the `own` regressors (n,), with the other regressors projected out.
 
-    `information` (n, n) is that of all, the parameters projected out; `directions` are combinations
-    of the own ones.
+    `information` (n, n) is that of all regressors with the parameters projected out; `directions`
+    are combinations of the own ones.
     """
     out = np.zeros((len(own), directions.shape[1]))
     out[own] = directions
@@ -106,11 +110,11 @@ def _beside_others(information: Float, own: Bool, directions: Float) -> Float:
 
 
 def independent_directions(whole: Float, left: Float, least: float) -> Float:
-    """Directions (n, q) of regressors that the parameters have left.
+    """Directions (n, q) of regressors that the parameters do not absorb.
 
     `whole` and `left` (n, n) are the information of the regressors before and after the parameters
-    are projected out, `least` the fraction of it that a direction must keep. Directions are in
-    units in which `whole` is the unit matrix.
+    are projected out, `least` is the fraction that a direction must keep.  Directions are scaled
+    such that `whole` becomes the unit matrix.
     """
     diagonal = np.diag(whole)
     scale = np.zeros(len(diagonal))
@@ -125,11 +129,10 @@ def independent_directions(whole: Float, left: Float, least: float) -> Float:
 def squares_of(
     score: Float, information: Float, covariance: Float, square: Float
 ) -> tuple[float, float]:
-    """Mean squares of the pattern that a score stands for, and of what noise makes of it.
+    """Mean squares of the pattern that corresponds to a score, noise included, and of its noise.
 
-    The first holds the second. `information` and `covariance` (q, q) are those of the directions
-    and of their `score` (q,), `square` (q, q) the mean products of the directions over the
-    detector.
+    `information` and `covariance` (q, q) are those of the directions and of their `score` (q,);
+    `square` (q, q) contains the mean products of the directions over the detector.
     """
     inverse = np.linalg.inv(information)
     step = inverse @ score

@@ -1,7 +1,7 @@
-"""The test of ACS ISR 2015-06, section 6: two exposures of the run laid on each other.
+"""The test of ACS ISR 2015-06, section 6: alignment of two exposures of the run.
 
 Corrected positions of the same stars differ by a shift, a rotation and a scale if the calibration
-is right, and by a pattern if it is not.
+is correct, and by a pattern if it is not.
 """
 
 from __future__ import annotations
@@ -20,32 +20,35 @@ from bayesdist.infer.solution.transforms import without_frames
 from bayesdist.model import LookupTable, corrected
 from bayesdist.utils.arrays import Float, Int
 
-MIN_OVERLAP = 0.5  # of the stars of the exposure that has fewer: what "overlap well" means
-MIN_SHARED_STARS = 100  # shared stars below which there is no map to be drawn
-STARS_PER_CELL = 12  # stars in a cell, on average
-MAX_CELLS = 24  # along an axis
+MIN_OVERLAP = 0.5  # smallest fraction of the stars of the exposure with fewer stars that both share
+MIN_SHARED_STARS = 100  # smallest number of shared stars for a map
+STARS_PER_CELL = 12  # average number per cell
+MAX_CELLS = 24  # along each axis
 
 
 @dataclass(frozen=True, eq=False)
 class Alignment:
-    """The similarity a = shift + scale R(rotation) b between two exposures, and what it leaves."""
+    """Similarity transformation between two exposures, and its residuals.
 
-    shift: Float  # (2,), pixels
+    The transformation is a = shift + scale R(rotation) b.
+    """
+
+    shift: Float  # (2,) pixels
     rotation: float  # radians, from xi to eta
     scale: float
-    position: Float  # (N, 2), (xi, eta) of the stars in exposure a, pixels
-    residual: Float  # (N, 2), a minus the transformed b, pixels
+    position: Float  # (N, 2) positions (xi, eta) of the stars in exposure a, pixels
+    residual: Float  # (N, 2) a minus the transformed b, pixels
 
     @property
     def rms(self) -> Float:
-        """Root mean square residual of each axis, shape (2,), pixels."""
+        """Root mean square residual per axis, shape (2,), pixels."""
         return np.sqrt(np.mean(self.residual**2, axis=0))
 
 
 def align(position_a: Float, position_b: Float) -> Alignment:
-    """Fit of shift, rotation and scale between positions (N, 2) of the same stars, in pixels.
+    """Fit shift, rotation and scale between positions (N, 2) of the same stars, in pixels.
 
-    Every star counts alike and none is clipped: the fit is that of `tweakwcs.fit_rscale`.
+    All stars have equal weight and none is clipped, as in `tweakwcs.fit_rscale`.
     """
     a, b = position_a @ [1, 1j], position_b @ [1, 1j]
     za, zb = a - a.mean(), b - b.mean()
@@ -63,27 +66,27 @@ def align(position_a: Float, position_b: Float) -> Alignment:
 
 @dataclass(frozen=True, eq=False)
 class OverlapTest:
-    """Two exposures of the run laid on each other, through the old files and the new ones."""
+    """Alignment of two exposures of the run, with the old files and with the new ones."""
 
     names: tuple[str, str]
     epochs: tuple[float, float]
-    pa_v3: tuple[float, float]  # NaN where it is not known
-    # old, new: of the same stars: through the known distortion of the start, and through the
-    # solution
+    pa_v3: tuple[float, float]  # roll angles in degrees; NaN if unknown
+    # old, new: alignment of the same stars with the distortion that the run started from, and with
+    # the solution
     old: Alignment
     new: Alignment
-    # binned_old, binned_new: over the area that both exposures see; axes (xi, eta), pixels
+    # binned_old, binned_new: over the common area of both exposures; axes (xi, eta), pixels
     binned_old: BinnedResiduals
     binned_new: BinnedResiduals
-    # (xi, eta) of the area's corner, which the cells count from, pixels
+    # (xi, eta) of the corner of the area, from which the cells are counted, pixels
     corner: tuple[float, float]
     pixel_mas: float
-    # True where the catalogue's proper motions between the two epochs were taken out
+    # True if the catalogue's proper motions between the two epochs were subtracted
     with_motions: bool
 
     @property
     def n_stars(self) -> int:
-        """Stars that both exposures have."""
+        """Number of stars in both exposures."""
         return len(self.new.residual)
 
 
@@ -97,12 +100,29 @@ def overlap_test(
     pixel: float,
     rolls: Mapping[str, float | None],
 ) -> OverlapTest | None:
-    """Lay the two exposures that are farthest apart in time on each other.
+    """Align the two exposures that are farthest apart in time.
 
-    `pairs` have raw pixels beside positions of the catalogue, `known` is the distortion of the
-    start, `tables` go with the solution, `unit_arcsec` is the size of the unit of u and v, `pixel`
-    that of a pixel in arcsec, `rolls` the PA_V3 of exposures where it is known. None where no two
-    exposures share enough stars.
+    Parameters
+    ----------
+    pairs : Matches
+        Raw pixels and positions of the catalogue.
+    solution : Solution
+        The solution to test.
+    known : Calibration
+        Distortion that the run started from.
+    tables : sequence of LookupTable
+        Look-up tables that belong to the solution.
+    unit_arcsec : float
+        Size of the unit of u and v in arcsec.
+    pixel : float
+        Size of a pixel in arcsec.
+    rolls : mapping
+        PA_V3 by the name of the exposure; None if it is unknown.
+
+    Returns
+    -------
+    OverlapTest or None
+        None if no two exposures share enough stars.
     """
     chosen = chosen_exposures(pairs)
     if chosen is None:
@@ -144,18 +164,22 @@ def overlap_test(
 def chosen_exposures(pairs: Matches) -> tuple[int, int] | None:
     """Codes of the two exposures farthest apart in time that share half of their stars.
 
-    `pairs` have codes of the catalogue's stars, and epochs. The earlier exposure comes first; None
-    where no two share enough.
+    `pairs` must have star codes and epochs.  The earlier exposure comes first.  Returns None if no
+    two exposures share enough stars.
     """
     if pairs.star is None or pairs.epoch is None:
         return None
     n = len(pairs.exposure_names)
     ones = np.ones(len(pairs))
-    seen = csr_array((ones, (pairs.exposure, pairs.star)), shape=(n, int(pairs.star.max()) + 1))
-    common = (seen @ seen.T).toarray()
-    own = np.diag(common)
-    epoch = np.bincount(pairs.exposure, pairs.epoch, n) / np.maximum(own, 1)
-    enough = (common >= MIN_OVERLAP * np.minimum.outer(own, own)) & (common >= MIN_SHARED_STARS)
+    incidence = csr_array(
+        (ones, (pairs.exposure, pairs.star)), shape=(n, int(pairs.star.max()) + 1)
+    )
+    common = (incidence @ incidence.T).toarray()
+    n_stars = np.diag(common)
+    epoch = np.bincount(pairs.exposure, pairs.epoch, n) / np.maximum(n_stars, 1)
+    enough = (common >= MIN_OVERLAP * np.minimum.outer(n_stars, n_stars)) & (
+        common >= MIN_SHARED_STARS
+    )
     apart = np.where(enough, np.abs(np.subtract.outer(epoch, epoch)), -1.0)
     a, b = (int(k) for k in np.unravel_index(int(apart.argmax()), apart.shape))
     if a == b or apart[a, b] <= 0:
@@ -164,7 +188,7 @@ def chosen_exposures(pairs: Matches) -> tuple[int, int] | None:
 
 
 def _shared(pairs: Matches, a: int, b: int) -> tuple[Int, Int]:
-    """Rows of the same stars in two exposures."""
+    """Indices of the rows of the same stars in two exposures."""
     star = pairs.column("star")
     of_a, of_b = (np.flatnonzero(pairs.exposure == code) for code in (a, b))
     _, first, second = np.intersect1d(star[of_a], star[of_b], return_indices=True)
@@ -172,23 +196,23 @@ def _shared(pairs: Matches, a: int, b: int) -> tuple[Int, Int]:
 
 
 def _known_plane(known: Calibration, pairs: Matches, rows: Int, epoch: float) -> Float:
-    """Positions (N, 2) through the known distortion, its drift included; arcseconds."""
+    """Positions (N, 2) according to the known distortion, including its drift; arcseconds."""
     then = None if known.no_date else epoch
     chips = pairs.chip_number[rows]
     out = np.empty((len(rows), 2))
     for number in np.unique(chips):
-        here = chips == number
-        x, y = pairs.x[rows[here]], pairs.y[rows[here]]
-        out[here] = known.forward(x, y, chip=int(number), epoch=then)
+        on_chip = chips == number
+        x, y = pairs.x[rows[on_chip]], pairs.y[rows[on_chip]]
+        out[on_chip] = known.forward(x, y, chip=int(number), epoch=then)
     return out
 
 
 def _solved_plane(
     solution: Solution, tables: Sequence[LookupTable], pairs: Matches, rows: Int, epoch: float
 ) -> Float:
-    """Positions (N, 2) through tables, polynomial and drift of a solution, in its unit.
+    """Positions (N, 2) according to tables, polynomial and drift of a solution, in its unit.
 
-    Without what is fitted for the single exposure: no file holds that.
+    Fitted terms of the single exposure are not included, because no file contains them.
     """
     chips = pairs.chip_number[rows]
     filters = np.asarray(pairs.filter_names)[pairs.filter[rows]]
@@ -199,9 +223,9 @@ def _solved_plane(
 
 
 def _at_first_epoch(plane: Float, pairs: Matches, rows: Int, motion: Float) -> Float:
-    """Positions with the catalogue's motions since the other epoch taken out.
+    """Positions with the catalogue's motions since the other epoch subtracted.
 
-    The catalogue is turned and scaled to the plane: pairs of one exposure say how.
+    The motions are rotated and scaled to the plane by aligning the catalogue with the exposure.
     """
     w = plane @ [1, 1j]
     z = pairs.u[rows] + 1j * pairs.v[rows]
@@ -212,23 +236,23 @@ def _at_first_epoch(plane: Float, pairs: Matches, rows: Int, motion: Float) -> F
 
 
 def _centred(plane: Float) -> Float:
-    """Positions (N, 2) about their mean."""
+    """Positions (N, 2) minus their mean."""
     return plane - plane.mean(axis=0)
 
 
 def _binned(
     old: Alignment, new: Alignment
 ) -> tuple[tuple[float, float], BinnedResiduals, BinnedResiduals]:
-    """Residuals in square cells over the area that both exposures see."""
+    """Residuals in square cells over the common area of both exposures."""
     corner = new.position.min(axis=0)
     width, height = np.ptp(new.position, axis=0) + 1e-6
     cell = np.sqrt(width * height * STARS_PER_CELL / len(new.position))
     cell = max(cell, max(width, height) / MAX_CELLS)
     bins = (max(1, round(width / cell)), max(1, round(height / cell)))
-    # cells count from 0.5, as pixels do
+    # cells are counted from 0.5, like pixels
     x, y = (new.position - corner + 0.5).T
     binned = [
-        binned_residuals(x, y, *one.residual.T, bins=bins, size=(float(width), float(height)))
-        for one in (old, new)
+        binned_residuals(x, y, *alignment.residual.T, bins=bins, size=(float(width), float(height)))
+        for alignment in (old, new)
     ]
     return (float(corner[0]), float(corner[1])), binned[0], binned[1]

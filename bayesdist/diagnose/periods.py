@@ -1,7 +1,7 @@
 """Does the distortion change with time?  Models and residuals of several periods (WSDC D-T033, C).
 
-One pass over the data gathers all of it: the normal equations of each period, its residuals in bins
-about the one model of all data, and which reference stars it has.
+All sums are accumulated in one pass over the data: the normal equations of each period, its
+residuals in bins with respect to the model of all data, and the codes of its reference stars.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from bayesdist.utils.distributions import chi2_isf, chi2_sf, f_sf
 from bayesdist.utils.limits import DIFFERENCE
 from bayesdist.utils.numbers import p_words
 
-MAX_BINS = 45  # along each side, as in Appendix C
+MAX_BINS = 45  # along each axis, as in Appendix C
 COMBINED = "combined"
 _FEWEST_STARS = 5
 
@@ -41,23 +41,23 @@ _FEWEST_STARS = 5
 class PeriodSettings:
     """Periods that are compared, and the limits of the comparison."""
 
-    # begin and end of each period, decimal years, as `sum_by_period`
+    # begin and end of each period in decimal years, as for `sum_by_period`
     spans: Mapping[str, tuple[float, float]]
-    bins: int  # on each axis, for the residuals
-    radial_weight: float = 1.0  # as the fit's
-    # difference of positions that does not matter, in the unit of u, v
+    bins: int  # number per axis, for the residuals
+    radial_weight: float = 1.0  # as in the fit
+    # difference of positions that is considered harmless, in the unit of u and v
     tolerance: float | None = None
-    unit_arcsec: float | None = None  # the unit of u, v in arcsec
+    unit_arcsec: float | None = None  # size of the unit of u and v in arcsec
 
 
 @dataclass(frozen=True, eq=False)
 class PeriodPart:
-    """Sums over some pairs of one period; parts of batches of the data add."""
+    """Sums over pairs of one period; sums over batches of the data can be added."""
 
     sums: PeriodSums
-    bins: tuple[BinnedSums, ...]  # residuals about the fit of all data, of each chip
-    n_rows: int  # pairs, those included that the fit leaves out
-    stars: Int  # sorted codes of the reference stars, each once; empty where they are not known
+    bins: tuple[BinnedSums, ...]  # residuals from the fit to all data, per chip
+    n_rows: int  # number of pairs, including those that the fit rejected
+    stars: Int  # sorted unique codes of the reference stars; empty if unknown
 
     def __add__(self, other: PeriodPart) -> PeriodPart:
         return PeriodPart(
@@ -70,16 +70,16 @@ class PeriodPart:
 
 @dataclass(frozen=True)
 class PatternChange:
-    """Means of bins in one period against those in all other periods."""
+    """Means of bins in one period compared with those in all other periods."""
 
     period: str
     axis: str
-    p_value: float  # probability of as large differences by chance
-    rms: float  # of the differences, their noise subtracted; 0 where noise alone is larger
-    # between the two patterns, noise included: near 1 where the same structure stays and noise is
+    p_value: float  # probability of so large differences by chance
+    rms: float  # of the differences, with their noise subtracted; 0 if the noise is larger
+    # between the two patterns, noise included: near 1 if the structure is constant and the noise is
     # small
     correlation: float
-    n_bins: int  # bins that hold five stars or more in both
+    n_bins: int  # number of bins with at least five stars in both
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,55 +88,56 @@ class TimeVariation:
 
     comparison: PeriodComparison
     spans: Mapping[str, tuple[float, float]]  # begin and end of each period, decimal years
-    changes: Mapping[str, PositionChange]  # of each period against the combined model
-    # first, last: the earliest and the latest period
+    changes: Mapping[str, PositionChange]  # differences of each period from the combined model
+    # names of the earliest and the latest period
     first: str
     last: str
-    ends: PositionChange  # the latest against the earliest
-    # as Table C-1, of each chip: all periods together, then each; in arcsec where the size of a
-    # pixel is known, else in the unit of u, v
+    ends: PositionChange  # difference of the latest period from the earliest
+    # like Table C-1, per chip: all periods together, then each period; in arcsec if the pixel size
+    # is known, otherwise in the unit of u and v
     residuals: tuple[StatisticsTable, ...]
-    patterns: tuple[tuple[PatternChange, ...], ...]  # of each chip, in the unit of u, v
-    tolerance: float | None  # difference of positions that does not matter, in the unit of u, v
-    n_outside: int  # pairs outside all periods
-    n_repeated: int  # reference stars that several periods have; 0 where stars have no codes
+    patterns: tuple[tuple[PatternChange, ...], ...]  # per chip, in the unit of u and v
+    # difference of positions that is considered harmless, in the unit of u and v
+    tolerance: float | None
+    n_outside: int  # number of pairs outside all periods
+    n_repeated: int  # number of reference stars in several periods; 0 if stars have no codes
 
     @property
     def significant(self) -> bool:
-        """True where one model of all periods is refuted."""
+        """True if a common model of all periods is rejected."""
         return self.comparison.homogeneity[2] < DIFFERENCE.value
 
     @property
     def is_material(self) -> bool:
-        """True where one model is refuted, and not known to be good enough all the same."""
+        """True if a common model is rejected and not known to be good enough nevertheless."""
         harmless = self.tolerance is not None and all_below(self.changes, self.tolerance)
         return self.significant and not harmless
 
     @property
     def verdict(self) -> str:
-        """Verdict on a change of the distortion, and on its size."""
+        """Sentence on a change of the distortion and its size."""
         return period_verdict(self.comparison, self.changes, self.tolerance)
 
     @property
     def pattern_sentence(self) -> str:
-        """Verdict on the pattern of the residuals in all periods, as a sentence."""
-        found = [one for chip in self.patterns for one in chip]
-        least = min(found, key=lambda one: one.p_value)
-        p = min(1.0, len(found) * least.p_value)
+        """Sentence on changes of the pattern of the residuals between periods."""
+        changes = [change for chip in self.patterns for change in chip]
+        worst = min(changes, key=lambda change: change.p_value)
+        p = min(1.0, len(changes) * worst.p_value)
         if p >= DIFFERENCE.value:
             return (
                 "The pattern of the residuals about one model is the same in all periods "
-                f"(least of {len(found)} probabilities, times their number: {p:.2g})."
+                f"(least of {len(changes)} probabilities, times their number: {p:.2g})."
             )
         return (
-            f"The pattern of the residuals about one model changes: in {least.period} the means of "
-            f"bins differ in {least.axis} by {least.rms:.2g} {self.comparison.model.unit} rms from "
-            f"those of the other periods (p = {p:.1g}, of {len(found)} tests)."
+            f"The pattern of the residuals about one model changes: in {worst.period} the means of "
+            f"bins differ in {worst.axis} by {worst.rms:.2g} {self.comparison.model.unit} rms from "
+            f"those of the other periods (p = {p:.1g}, of {len(changes)} tests)."
         )
 
     @property
     def cautions(self) -> tuple[str, ...]:
-        """Sentences that a reader of the comparison has to know."""
+        """Caveats of the comparison, as sentences."""
         out = []
         if self.n_outside:
             out.append(
@@ -152,15 +153,15 @@ class TimeVariation:
 
 
 def bins_for(n: int) -> int:
-    """Bins on each axis for so many pairs of the smallest period on a chip."""
+    """Number of bins per axis for `n` pairs on a chip in the period with the fewest pairs."""
     return int(np.clip(np.sqrt(n / STARS_PER_BIN), 2, MAX_BINS))
 
 
 def period_part(matches: Matches, *, fit: LinearFit, bins: int, radial_weight: float) -> PeriodPart:
-    """A task for `sum_by_period`.
+    """Sums over the pairs of one period: a task for `sum_by_period`.
 
-    `matches` are those of one period, `fit` is that of all data; `bins` are those on each axis,
-    `radial_weight` is the fit's.
+    `matches` are those of the period, `fit` is that of all data; `bins` is the number per axis, and
+    `radial_weight` is that of the fit.
     """
     stars, _ = prepare(fit.model, matches)
     used = fit.clip.keeps_of(stars)
@@ -169,8 +170,8 @@ def period_part(matches: Matches, *, fit: LinearFit, bins: int, radial_weight: f
     return PeriodPart(
         sums=sums_of_stars(stars, fit, radial_weight),
         bins=tuple(
-            band_bins(*(a[used & (chip == k)] for a in columns), bins=bins, size=one.size)
-            for k, one in enumerate(fit.model.chips)
+            band_bins(*(a[used & (chip == k)] for a in columns), bins=bins, size=chip_model.size)
+            for k, chip_model in enumerate(fit.model.chips)
         ),
         n_rows=len(matches),
         stars=np.zeros(0, np.int64) if matches.star is None else np.unique(matches.star),
@@ -184,11 +185,11 @@ def time_variation(
     *,
     rng: np.random.Generator,
 ) -> TimeVariation:
-    """Comparison of periods, in one pass over the data.
+    """Compare periods, in one pass over the data.
 
-    `fit` is that of all data, without frames and time dependence; `matches` have errors and epochs.
-    Raises InputError as `sum_by_period` and `compare_periods`, DegenerateError for a period with
-    too few pairs.
+    `fit` is that of all data, without frames and time dependence; `matches` must have errors and
+    epochs.  Raises InputError like `sum_by_period` and `compare_periods`, and DegenerateError if a
+    period has too few pairs.
     """
     periods, unit_arcsec = settings.spans, settings.unit_arcsec
     task = partial(period_part, fit=fit, bins=settings.bins, radial_weight=settings.radial_weight)
@@ -196,19 +197,20 @@ def time_variation(
     comparison = compare_periods(fit, {name: part.sums for name, part in parts.items()})
     first = min(periods, key=lambda name: periods[name])
     last = max(periods, key=lambda name: periods[name])
-    _, seen = np.unique(np.concatenate([p.stars for p in parts.values()]), return_counts=True)
+    _, n_periods = np.unique(np.concatenate([p.stars for p in parts.values()]), return_counts=True)
     by_chip = [
         {name: part.bins[k] for name, part in parts.items()} for k in range(len(fit.model.chips))
     ]
     try:
         residuals = tuple(
-            _residuals(one, fit.unit, unit_arcsec, rng, fit.model.n_terms) for one in by_chip
+            _residuals(chip_bins, fit.unit, unit_arcsec, rng, fit.model.n_terms)
+            for chip_bins in by_chip
         )
-        patterns = tuple(pattern_changes(one) for one in by_chip)
+        patterns = tuple(pattern_changes(chip_bins) for chip_bins in by_chip)
     except DegenerateError as error:
-        least = min(parts, key=lambda name: parts[name].n_rows)
+        fewest = min(parts, key=lambda name: parts[name].n_rows)
         raise DegenerateError(
-            f"period {least} has {parts[least].n_rows} pairs, too few for mean residuals in bins",
+            f"period {fewest} has {parts[fewest].n_rows} pairs, too few for mean residuals in bins",
             where="periods",
             do="give longer periods, or leave it out",
         ) from error
@@ -223,7 +225,7 @@ def time_variation(
         patterns=patterns,
         tolerance=settings.tolerance,
         n_outside=len(matches) - sum(part.n_rows for part in parts.values()),
-        n_repeated=int((seen > 1).sum()),
+        n_repeated=int((n_periods > 1).sum()),
     )
 
 
@@ -234,23 +236,24 @@ def _residuals(
     rng: np.random.Generator,
     n_terms: int,
 ) -> StatisticsTable:
-    """Table C-1: all periods together, then each of them."""
-    one, *others = periods.values()
-    together = sum(others, start=one)
+    """Table C-1: all periods together, then each period."""
+    first, *remaining = periods.values()
+    together = sum(remaining, start=first)
     rows = {COMBINED: together, **periods}
-    # of a part of the stars the model of all takes out the same part of its coefficients
+    # for a subset of the stars the common model absorbs the same fraction of its coefficients
     n_all = float(together.count.sum())
     absorbed = {
-        name: max(1, round(n_terms * float(one.count.sum()) / n_all)) for name, one in rows.items()
+        name: max(1, round(n_terms * float(bins.count.sum()) / n_all))
+        for name, bins in rows.items()
     }
     table = period_table(rows, rng=rng, arcsec_per_pixel=unit_arcsec or 1.0, absorbed=absorbed)
     return table if unit_arcsec else replace(table, unit=unit)
 
 
 def all_below(changes: Mapping[str, PositionChange], tolerance: float) -> bool:
-    """True if no period differs by more than a tolerance, with two sigma allowed for errors."""
+    """True if no period differs by more than a tolerance plus two standard errors."""
     # the largest value of a noisy field is biased high
-    return all(one.largest + 2 * one.sigma <= tolerance for one in changes.values())
+    return all(change.largest + 2 * change.sigma <= tolerance for change in changes.values())
 
 
 def period_verdict(
@@ -260,19 +263,19 @@ def period_verdict(
 ) -> str:
     """Sentence on the size, significance and importance of the change with time.
 
-    `changes` has every period against the combined model; differences of positions up to
-    `tolerance`, in the unit of u, v, do not matter.
+    `changes` contains every period compared with the combined model; differences of positions up to
+    `tolerance`, in the unit of u and v, are considered harmless.
     """
     chi2, dof, p = comparison.homogeneity
-    # the most significant, not the largest: the shortest period has the largest noise
-    name, most = max(changes.items(), key=lambda one: one[1].chi2)
+    # the most significant change: the largest one may be noise of the shortest period
+    name, worst = max(changes.items(), key=lambda change: change[1].chi2)
     unit = comparison.model.unit
     head = "The distortion changes" if p < DIFFERENCE.value else "No change is seen"
     out = (
         f"{head} (chi-square {chi2:.4g} for {dof} degrees of freedom, {p_words(p, 2, 1e-12)}): "
-        f"{name} differs most from the combined model, by up to {most.largest:.2g} +- "
-        f"{most.sigma:.1g} {unit} at ({most.at[0]:.0f}, {most.at[1]:.0f}), where noise alone "
-        f"makes {most.noise_median:.2g} (95 %: {most.noise_95:.2g})"
+        f"{name} differs most from the combined model, by up to {worst.largest:.2g} +- "
+        f"{worst.sigma:.1g} {unit} at ({worst.at[0]:.0f}, {worst.at[1]:.0f}), where noise alone "
+        f"makes {worst.noise_median:.2g} (95 %: {worst.noise_95:.2g})"
     )
     if tolerance is None:
         return out + "."
@@ -281,8 +284,8 @@ def period_verdict(
         return f"{out}; all periods are below {limit}."
     beyond = [
         name
-        for name, one in changes.items()
-        if one.p_value < DIFFERENCE.value and one.largest - 2 * one.sigma > tolerance
+        for name, change in changes.items()
+        if change.p_value < DIFFERENCE.value and change.largest - 2 * change.sigma > tolerance
     ]
     if beyond:
         return f"{out}; beyond {limit}: {', '.join(beyond)}."
@@ -290,22 +293,24 @@ def period_verdict(
 
 
 def pattern_changes(periods: Mapping[str, BinnedSums]) -> tuple[PatternChange, ...]:
-    """Pattern of every period against that of the rest.
+    """Pattern of every period compared with that of all other periods.
 
-    A single period shares its stars with the combined set, the rest does not: differences from the
-    rest have independent errors, and those from the combined set are the same, made smaller by the
-    share of the rest.
+    A single period shares its stars with the combined set, but not with the other periods:
+    differences from the latter have independent errors.  Differences from the combined set are the
+    same, reduced by the fraction of the other periods.
 
-    Periods are disjoint in their stars, two or more, all against one model in pixels; changes are
-    those in X and Y of each. Raises DegenerateError when fewer than three bins hold five stars in a
-    period and in the rest.
+    The periods, at least two, have no stars in common, and all residuals refer to one model, in
+    pixels.  Returns the changes in X and Y of each period.  Raises DegenerateError if fewer than
+    three bins contain five stars both in a period and in the others.
     """
     out = []
     for name in periods:
-        one, *others = (sums for other, sums in periods.items() if other != name)
-        rest = sum(others, start=one)
+        first, *remaining = (
+            sums for name_of_other, sums in periods.items() if name_of_other != name
+        )
+        other_periods = sum(remaining, start=first)
         out += [
-            _change(name, axis, periods[name].values(axis), rest.values(axis))
+            _change(name, axis, periods[name].values(axis), other_periods.values(axis))
             for axis in BAND_AXES[:2]
         ]
     return tuple(out)
@@ -329,6 +334,6 @@ def _change(period: str, axis: str, one: BinValues, rest: BinValues) -> PatternC
 
 
 def _p_value(t2: Float, dof: Float) -> float:
-    """Probability of larger squared t variables (n,), each by its normal variable."""
+    """P-value of squared t variables (n,), each transformed to a normal variable."""
     z2 = chi2_isf(f_sf(t2, 1, dof), 1)
     return float(chi2_sf(z2.sum(), z2.size))

@@ -1,6 +1,7 @@
-"""The door: the one room in which files are opened, decoded and checked, or written.
+"""File access: all reading, decoding, validation and writing of files.
 
-What is read is a regular file of a plausible size, whose content is no larger than its size allows;
-whatever libraries say of a damaged one is one `InputError`.  What is written appears whole or not
-at all.  Rooms above get arrays, tables, HDUs and trees, and open no file themselves.
+Only regular files of a plausible size are read, and their decoded content is limited in relation to
+that size. Any exception that a library raises for a damaged file becomes an `InputError`. Files are
+written atomically. Code above this layer gets arrays, tables, HDUs and trees, can assume that its
+input is valid, and opens no files itself.
 """

@@ -1,4 +1,4 @@
-"""ASDF files in memory; asdf is imported when a file needs it."""
+"""ASDF files in memory; the package asdf is imported only when a file needs it."""
 
 from __future__ import annotations
 
@@ -18,22 +18,23 @@ from bayesdist.files.budget import DAMAGED, Budget
 from bayesdist.files.documents import refuse_multiplied_yaml
 from bayesdist.files.faults import reason_of
 
-_TREE_END = re.compile(rb"\r?\n\.\.\.(\r?\n|$)")  # as asdf finds it
+_TREE_END = re.compile(rb"\r?\n\.\.\.(\r?\n|$)")  # same pattern as in asdf
 _MAGIC = b"\xd3BLK"
-_HEADER = struct.Struct(">I4sQQQ16s")  # flags, compression, bytes: allocated, used, of data; MD5
+_HEADER = struct.Struct(">I4sQQQ16s")  # flags, compression, sizes: allocated, used, data; MD5
 _STREAMED = 1
 
 
 def asdf_tree(raw: bytes, budget: Budget, *, max_order: int) -> Mapping[str, Any]:
-    """Tree of an ASDF file, its arrays in memory, and its polynomials of at most this order.
+    """Tree of an ASDF file with its arrays in memory.
 
-    FormatError for a file that is truncated or damaged, that refers to other files, or that holds
-    more than its budget; InputError where asdf is not installed.
+    `max_order`: largest order of polynomials. Raises FormatError if the file is truncated or
+    damaged, refers to other files, has polynomials of a higher order, or exceeds its limits;
+    InputError if asdf is not installed.
     """
     asdf = asdf_with_transforms(budget.where)
     plain = _uncompressed(raw, budget)
     with warnings.catch_warnings():
-        # tags of Roman's data models, where these are not installed
+        # warnings about tags of the Roman data models, if these are not installed
         warnings.simplefilter("ignore")
         try:
             tagged = asdf.util.load_yaml(io.BytesIO(plain), tagged=True)
@@ -42,7 +43,7 @@ def asdf_tree(raw: bytes, budget: Budget, *, max_order: int) -> Mapping[str, Any
                 return dict(file.tree)
         except FormatError:
             raise
-        except Exception as error:  # asdf, yaml and converters raise errors of all kinds
+        except Exception as error:  # asdf, yaml and converters raise many kinds of exceptions
             raise FormatError(
                 f"is an ASDF file that cannot be read: {reason_of(error)}",
                 where=budget.where,
@@ -51,10 +52,10 @@ def asdf_tree(raw: bytes, budget: Budget, *, max_order: int) -> Mapping[str, Any
 
 
 def asdf_with_transforms(where: str) -> ModuleType:
-    """The library, with its transforms; InputError where it is not installed."""
+    """Import asdf and its transforms; raises InputError if it is not installed."""
     try:
         import asdf
-        import asdf_astropy  # noqa: F401 - without it asdf knows no transforms
+        import asdf_astropy  # noqa: F401 - registers the transforms with asdf
     except ImportError as error:
         raise InputError(
             "is an ASDF file, for which the package asdf is not installed",
@@ -64,20 +65,20 @@ def asdf_with_transforms(where: str) -> ModuleType:
     return asdf
 
 
-# -- what asdf is given to read --------------------------------------------------------------------
+# -- preparation of the bytes that asdf reads ------------------------------------------------------
 
 
 def _uncompressed(raw: bytes, budget: Budget) -> bytes:
-    """The same file with blocks that are not compressed, and without an index of blocks.
+    """Rewrite a file with uncompressed blocks, and without a block index.
 
-    asdf decompresses whatever a block holds, whatever its header announces.
+    asdf itself would decompress a block without regard to the size in its header.
     """
-    found = _TREE_END.search(raw)
-    if found is None:
+    tree_end = _TREE_END.search(raw)
+    if tree_end is None:
         raise _damaged("its tree has no end", budget)
-    refuse_multiplied_yaml(raw[: found.end()].decode("utf-8", "replace"), budget)
-    parts, total = [raw[: found.end()]], 0
-    for flags, data in _blocks(raw, raw.find(_MAGIC, found.end()), budget):
+    refuse_multiplied_yaml(raw[: tree_end.end()].decode("utf-8", "replace"), budget)
+    parts, total = [raw[: tree_end.end()]], 0
+    for flags, data in _blocks(raw, raw.find(_MAGIC, tree_end.end()), budget):
         total += len(data)
         budget.refuse_content(total)
         sizes = (0,) * 3 if flags & _STREAMED else (len(data),) * 3
@@ -87,7 +88,7 @@ def _uncompressed(raw: bytes, budget: Budget) -> bytes:
 
 
 def _blocks(raw: bytes, at: int, budget: Budget) -> Iterator[tuple[int, bytes]]:
-    """Flags and data of the blocks from the byte `at` on, none where it is negative."""
+    """Flags and data of the blocks from byte `at`; no blocks if `at` is negative."""
     number, clock = 0, budget.clock()
     while at >= 0 and raw[at : at + 4] == _MAGIC:
         number += 1
@@ -112,13 +113,13 @@ def _blocks(raw: bytes, at: int, budget: Budget) -> Iterator[tuple[int, bytes]]:
 
 
 def _decompressed(raw: bytes, kind: str, size: int, budget: Budget) -> bytes:
-    """Data of a block; longer than `size` bytes, which it announces, if it holds more."""
-    most = size + 1  # 0 would be no limit
+    """Decompressed data of a block, at most one byte (or one lz4 part) more than `size` bytes."""
+    limit = size + 1  # 0 would be no limit
     try:
         if kind == "zlib":
-            return zlib.decompressobj().decompress(raw, most)
+            return zlib.decompressobj().decompress(raw, limit)
         if kind == "bzp2":
-            return bz2.BZ2Decompressor().decompress(raw, most)
+            return bz2.BZ2Decompressor().decompress(raw, limit)
         if kind == "lz4":
             return b"".join(_lz4_pieces(raw, size, budget))
     except (OSError, ValueError, zlib.error, struct.error, RuntimeError) as error:
@@ -132,10 +133,10 @@ def _decompressed(raw: bytes, kind: str, size: int, budget: Budget) -> bytes:
     return raw
 
 
-def _lz4_pieces(raw: bytes, most: int, budget: Budget) -> Iterator[bytes]:
-    """Pieces of a block of lz4, each after its length, and after the size that it has then.
+def _lz4_pieces(raw: bytes, limit: int, budget: Budget) -> Iterator[bytes]:
+    """Parts of an lz4 block, up to the first one that exceeds `limit` bytes in total.
 
-    The last is the first that leads beyond `most` bytes.
+    Each is preceded by its length and its decompressed size.
     """
     try:
         import lz4.block
@@ -146,7 +147,7 @@ def _lz4_pieces(raw: bytes, most: int, budget: Budget) -> Iterator[bytes]:
             do="install the package lz4, or write the file with zlib or without compression",
         ) from None
     at = total = 0
-    while at < len(raw) and total <= most:
+    while at < len(raw) and total <= limit:
         (n,) = struct.unpack_from(">I", raw, at)
         (size,) = struct.unpack_from("<I", raw, at + 4)
         total += size
@@ -156,9 +157,9 @@ def _lz4_pieces(raw: bytes, most: int, budget: Budget) -> Iterator[bytes]:
 
 
 def _refuse_larger(tree: Any, budget: Budget, max_order: int) -> None:
-    """Refuse arrays that are larger than their blocks, or elsewhere, and polynomials of high order.
+    """Refuse arrays that are too large or in other files, and polynomials of too high an order.
 
-    The steps of an array may be 0, so that its shape is no measure of its block.
+    The strides of an array may be 0, so its shape can exceed the size of its block.
     """
     nodes, clock, cells = [tree], budget.clock(), 0.0
     while nodes:
@@ -181,7 +182,7 @@ def _refuse_larger(tree: Any, budget: Budget, max_order: int) -> None:
 
 
 def _cells(node: Mapping[str, Any], budget: Budget) -> float:
-    """Numbers of an array, as its shape states them."""
+    """Number of elements of an array according to its shape."""
     if isinstance(node.get("source"), str):
         raise FormatError(
             "an array lies in another file", where=budget.where, do="write it with its arrays"
@@ -190,7 +191,7 @@ def _cells(node: Mapping[str, Any], budget: Budget) -> float:
 
 
 def _shape(node: Any) -> list[float]:
-    """Shape of an array in a block, or of one that stands in the tree; empty where it has none."""
+    """Shape of an array, in a block or inline in the tree; empty if it has none."""
     if isinstance(node, Mapping):
         shape = node.get("shape")
         if shape is None:

@@ -1,4 +1,4 @@
-"""Files that appear whole or not at all, and their fingerprints."""
+"""Atomic writing of files, and checksums."""
 
 from __future__ import annotations
 
@@ -13,15 +13,15 @@ from bayesdist.errors import InputError
 from bayesdist.files.regular import opened
 
 _MARK = ".bayesdist-"
-LONGEST_NAME = 200  # bytes, of 255 that file systems have room for, beside the mark
+LONGEST_NAME = 200  # bytes; file systems allow 255, which must also hold the mark
 _watchers: list[Callable[[Sequence[Path]], None]] = []
 
 
 @contextmanager
 def watched_writes(note: Callable[[Sequence[Path]], None]) -> Iterator[None]:
-    """Call a function with the paths that `atomic_path` writes, before a file takes its name.
+    """Call a function with the paths that `atomic_path` writes, before a file gets its final name.
 
-    `note`: where it raises, the file does not appear.
+    `note`: function of a sequence of paths. If it raises, the file is not created.
     """
     _watchers.append(note)
     try:
@@ -31,28 +31,28 @@ def watched_writes(note: Callable[[Sequence[Path]], None]) -> Iterator[None]:
 
 
 def announce(paths: Sequence[Path]) -> None:
-    """Tell those who watch writes of files to come, all at once: sooner than one by one."""
+    """Notify watchers of several files that will be written; faster than one by one."""
     for note in _watchers:
         note(paths)
 
 
 @contextmanager
 def atomic_path(path: str | os.PathLike[str]) -> Iterator[Path]:
-    """Path of a temporary file that takes the place of `path` when the block succeeds.
+    """Path of a temporary file that replaces `path` when the block succeeds.
 
-    The temporary file lies in the same folder and its name ends like that of `path`, so that
-    writers which go by the extension do the same.  When the block raises, it is removed and
-    whatever stood at `path` before is left as it was.
+    The temporary file is in the same folder and its name has the same ending as `path`, for writers
+    that depend on the extension. If the block raises, the temporary file is removed and an existing
+    file at `path` remains unchanged.
 
-    `path`: file to write. Result: where to write; no file is there yet. InputError when the system
-    refuses to write, naming the path and the reason (full disk, no permission).
+    `path`: file to write. Yields the path to write to, which does not exist yet. Raises InputError
+    with the path and the reason if the system refuses to write (full disk, no permission).
     """
     target = Path(path)
     temporary = target.with_name(f"{_MARK}{secrets.token_hex(4)}-{target.name}")
     try:
         yield temporary
         with temporary.open("rb+") as written:
-            os.fsync(written.fileno())  # a rename may reach the disk before the content does
+            os.fsync(written.fileno())  # otherwise the rename may reach the disk before the content
         announce([target])
         temporary.replace(target)
     except OSError as error:
@@ -68,23 +68,23 @@ def atomic_path(path: str | os.PathLike[str]) -> Iterator[Path]:
 
 
 def _reason(error: OSError) -> str:
-    """What the system says; HDF5 wraps it in lines of its own."""
+    """Reason given by the system; HDF5 embeds it in a longer message."""
     if error.errno:
         return os.strerror(error.errno)
     return str(error).strip().splitlines()[0][:160] if str(error).strip() else "unknown reason"
 
 
 def _concerns(error: OSError, temporary: Path, target: Path) -> bool:
-    """Whether an error is about the file being written, not about another that the block uses."""
-    if error.filename is None:  # a full disk carries no name
+    """True if an error is about the file being written, not another file used in the block."""
+    if error.filename is None:  # the error of a full disk has no file name
         return True
     return Path(os.fsdecode(error.filename)) in (temporary, target, target.parent)
 
 
 def made_folder(path: str | os.PathLike[str]) -> Path:
-    """A folder that is there from now on, with those above it.
+    """Create a folder, with its parents, unless it exists, and return its path.
 
-    InputError when the system refuses to make it, naming the path and the reason.
+    Raises InputError with the path and the reason if the system refuses to create it.
     """
     folder = Path(path)
     try:
@@ -101,12 +101,13 @@ def made_folder(path: str | os.PathLike[str]) -> Path:
 def path_within(
     folder: str | os.PathLike[str], name: str, *, where: str, links: bool = False
 ) -> Path:
-    """Path of a file below a folder, by its name there.
+    """Path of a file below a folder, from its name relative to that folder.
 
-    Names that stand in files which others may have written are not to lead anywhere else.
+    Names are read from files that other people may have written, so they must not lead elsewhere.
 
-    `where`: the file that has the name, for the error. `links`: follow symbolic links in the
-    folders of the path, too. InputError for a name that leads out of the folder.
+    `where`: the file that contains the name, for the error message. `links`: True to resolve
+    symbolic links in the folders of the path, too. Raises InputError if the name leads out of the
+    folder.
     """
     folder = Path(folder)
     path = folder / name
@@ -123,9 +124,9 @@ def path_within(
 
 
 def refuse_unsafe_name(name: str, *, where: str) -> None:
-    """Refuse (InputError) a file name that leads into another folder or that no system takes.
+    """Raise InputError for a file name that leads into another folder or is not portable.
 
-    `where`: the setting that the name is made from.
+    `where`: the setting from which the name is made.
     """
     if not name.isprintable() or {*name} & {*"/\\"} or not 0 < len(name.encode()) <= LONGEST_NAME:
         start = name if len(name) <= 60 else f"{name[:60]}..."
@@ -137,20 +138,20 @@ def refuse_unsafe_name(name: str, *, where: str) -> None:
 
 
 def is_leftover(name: str) -> bool:
-    """Whether a file name is that of a temporary file, left by a process that was killed."""
+    """True for the name of a temporary file, which a killed process may have left."""
     return name.startswith(_MARK)
 
 
 def remove_leftovers(folder: str | os.PathLike[str]) -> None:
-    """Remove the temporary files that killed processes left in a folder."""
+    """Remove temporary files of killed processes from a folder."""
     for path in Path(folder).glob(f"{_MARK}*"):
         path.unlink(missing_ok=True)
 
 
 def sha256_of(path: str | os.PathLike[str]) -> str:
-    """SHA-256 of a file's content.
+    """SHA-256 of the content of a file, as 64 hexadecimal digits.
 
-    Result: 64 hexadecimal digits. InputError when the file cannot be read.
+    Raises InputError if the file cannot be read.
     """
     with opened(path) as stream:
         return hashlib.file_digest(stream, "sha256").hexdigest()

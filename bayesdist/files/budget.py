@@ -1,4 +1,4 @@
-"""What the reading of one file may take; every reader of files holds what it finds against it."""
+"""Limits on the resources for reading one file, which every reader of files enforces."""
 
 from __future__ import annotations
 
@@ -12,26 +12,26 @@ from bayesdist.utils.memory import memory_limit, size_text
 
 @dataclass(frozen=True)
 class Limits:
-    """Limits of what a file of any format may hold.
+    """Limits on the content of a file of any format.
 
-    What may grow with the file has two values: what any file may hold, however small it is, and
-    what is allowed for each byte of a larger file, as it lies on the disk.
+    Quantities that may increase with the size of the file have two limits: an amount that any file
+    may have, however small it is, and an amount per byte of the file on disk.
     """
 
-    content: int = 2**25  # bytes after decompression, and of arrays
-    content_per_byte: float = 100  # tables of stars are compressed by less than ten
+    content: int = 2**25  # bytes after decompression, and bytes of arrays
+    content_per_byte: float = 100  # tables of stars are compressed by a factor below ten
     rows: int = 2**17
-    rows_per_byte: float = 0.5  # the numbers of one star take four bytes at least
-    cells: int = 2**20  # of tables, or numbers in arrays of a tree
+    rows_per_byte: float = 0.5  # the numbers of one star need at least four bytes
+    cells: int = 2**20  # of tables, or numbers in the arrays of a tree
     cells_per_byte: float = 8
-    seconds: float = 5  # of processor time
+    seconds: float = 5  # processor time
     seconds_per_byte: float = 5e-6
-    columns: int = 10_000  # FITS has 999; gbdes has one for each parameter
+    columns: int = 10_000  # FITS has at most 999; gbdes has one per parameter
     parts: int = 1000  # HDUs, or blocks of ASDF
-    nodes: int = 50_000  # of a tree, each as often as it is referred to; cards of a header
-    header: int = 2**20  # characters of YAML: a column takes a hundred
-    line: int = 2**16  # characters: a thousand columns take 25,000
-    depth: int = 64  # of groups, elements or brackets within each other; our own have ten
+    nodes: int = 50_000  # of a tree, with aliases counted each time; header cards
+    header: int = 2**20  # characters of a YAML header; a column needs about a hundred
+    line: int = 2**16  # characters of a line; a thousand columns need 25,000
+    depth: int = 64  # nesting of groups, elements or brackets; files of bayesdist have ten
 
 
 LIMITS = Limits()
@@ -40,17 +40,17 @@ DAMAGED = "it is damaged, or made to exhaust the memory: fetch or write it again
 
 @dataclass(frozen=True)
 class Budget:
-    """What one file may hold.
+    """Limits for one file.
 
-    Readers pass numbers that they find, or that the file announces: what exceeds the budget is
-    refused with a FormatError.
+    Readers pass the numbers that they find, or that the file announces. Numbers that exceed the
+    limits are refused with a FormatError.
 
     Parameters
     ----------
     where : str
-        Name of the file, for messages.
+        Name of the file, for error messages.
     size : int
-        Bytes of the file on the disk, before decompression.
+        Size of the file on disk, before decompression, in bytes.
     limits : Limits, optional
     """
 
@@ -60,17 +60,17 @@ class Budget:
 
     @property
     def content(self) -> int:
-        """Bytes that the file may hold, which is never more than fits in memory."""
-        most = max(self.limits.content, self.limits.content_per_byte * self.size)
-        return int(min(memory_limit(), most))
+        """Largest size of the content in bytes, limited by the available memory."""
+        limit = max(self.limits.content, self.limits.content_per_byte * self.size)
+        return int(min(memory_limit(), limit))
 
     @property
     def rows(self) -> int:
-        """Rows that its tables may have."""
+        """Largest number of rows of its tables."""
         return int(max(self.limits.rows, self.limits.rows_per_byte * self.size))
 
     def refuse_content(self, n_bytes: float) -> None:
-        """Refuse arrays or decompressed content of so many bytes, as the file announces them."""
+        """Refuse more than the allowed bytes of arrays or decompressed content."""
         if not n_bytes <= self.content:
             raise FormatError(
                 f"announces {size_text(n_bytes)} in a file of {size_text(self.size)}",
@@ -79,7 +79,7 @@ class Budget:
             )
 
     def refuse_rows(self, n: float, verb: str = "announces") -> None:
-        """Refuse a table of so many rows, which the file announces or, by `verb`, holds."""
+        """Refuse a table with more than the allowed rows; `verb` is 'announces' or 'holds'."""
         if not n <= self.rows:
             raise FormatError(
                 f"{verb} {n} rows in a file of {size_text(self.size)}",
@@ -88,9 +88,9 @@ class Budget:
             )
 
     def refuse_cells(self, n: float) -> None:
-        """Refuse tables of so many cells together."""
-        most = max(self.limits.cells, self.limits.cells_per_byte * self.size)
-        if not n <= most:
+        """Refuse tables with more than the allowed cells in total."""
+        limit = max(self.limits.cells, self.limits.cells_per_byte * self.size)
+        if not n <= limit:
             raise FormatError(
                 f"holds {n:.3g} cells in a file of {size_text(self.size)}",
                 where=self.where,
@@ -98,27 +98,27 @@ class Budget:
             )
 
     def refuse_columns(self, n: int) -> None:
-        """Refuse a table of so many columns."""
+        """Refuse a table with more than the allowed columns."""
         self._refuse(n, self.limits.columns, "columns", "keep those that are needed")
 
     def refuse_parts(self, n: int, what: str) -> None:
-        """Refuse a file of so many parts; `what` names them, as in 'HDUs'."""
+        """Refuse a file with more than the allowed parts; `what` names them, as in 'HDUs'."""
         self._refuse(n, self.limits.parts, what, "divide the file")
 
     def refuse_nodes(self, n: int, what: str) -> None:
-        """Refuse a tree of so many nodes; `what` names them, as in 'header cards'."""
+        """Refuse a tree with more than the allowed nodes; `what` names them, as in 'cards'."""
         self._refuse(n, self.limits.nodes, what, DAMAGED)
 
     def refuse_header(self, n: int) -> None:
-        """Refuse a header of YAML of so many characters."""
+        """Refuse a YAML header with more than the allowed characters."""
         self._refuse(n, self.limits.header, "characters in its header", DAMAGED)
 
     def refuse_depth(self, n: int, what: str) -> None:
-        """Refuse parts within each other; `what` names them, as in 'groups'."""
+        """Refuse more than the allowed nesting depth; `what` names the level, as in 'groups'."""
         self._refuse(n, self.limits.depth, f"{what} within each other", DAMAGED)
 
     def refuse_line(self, n: int, number: int) -> None:
-        """Refuse a line of so many characters; `number` counts from 1."""
+        """Refuse a line with more than the allowed characters; line numbers start at 1."""
         if n > self.limits.line:
             raise FormatError(
                 f"has {n} characters, and at most {self.limits.line} are read",
@@ -131,14 +131,14 @@ class Budget:
             raise FormatError(f"has more than {most} {what}", where=self.where, do=do)
 
     def clock(self) -> Callable[[], None]:
-        """Function to call while the file is read; it refuses what takes too long from now on."""
-        most = max(self.limits.seconds, self.limits.seconds_per_byte * self.size)
-        end = time.thread_time() + most
+        """Start a timer; the returned function raises FormatError once the allowed time is over."""
+        limit = max(self.limits.seconds, self.limits.seconds_per_byte * self.size)
+        end = time.thread_time() + limit
 
         def check() -> None:
             if time.thread_time() > end:
                 raise FormatError(
-                    f"takes more than {most:.3g} s to read in a file of {size_text(self.size)}",
+                    f"takes more than {limit:.3g} s to read in a file of {size_text(self.size)}",
                     where=self.where,
                     do=DAMAGED,
                 )

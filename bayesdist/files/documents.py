@@ -1,4 +1,4 @@
-"""JSON, TOML and YAML: trees of a plausible depth and size, with numbers that are numbers."""
+"""JSON, TOML and YAML documents: trees of limited depth and size."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ from bayesdist.files.regular import MOST_TEXT, read_text
 
 T = TypeVar("T")
 
-DEEPEST = LIMITS.depth  # brackets within each other
+DEEPEST = LIMITS.depth  # nesting of brackets
 
 
 def json_of(text: str, where: str, *, do: str = "restore it, or write it again") -> Any:
-    """Tree of a JSON text."""
+    """Parse a JSON text; raises FormatError if it is invalid or nested too deeply."""
     try:
         return _not_too_deep(json.loads(text), where, do)
     except (ValueError, RecursionError) as error:
@@ -30,9 +30,9 @@ def json_of(text: str, where: str, *, do: str = "restore it, or write it again")
 
 
 def toml_of(text: str, where: str) -> dict[str, Any]:
-    """Tree of a TOML text."""
+    """Parse a TOML text; raises FormatError if it is invalid or nested too deeply."""
     do = "correct it there"
-    if _longest_key(text) > DEEPEST:  # tomllib takes time and memory by the square of its parts
+    if _longest_key(text) > DEEPEST:  # time and memory of tomllib grow with the square of the parts
         raise FormatError(f"has a key of more than {DEEPEST} parts", where=where, do=do)
     try:
         return _not_too_deep(tomllib.loads(text), where, do)
@@ -44,7 +44,7 @@ _KEY_PART = re.compile(r"""(?:[\w-]++|"[^"\n]*+"|'[^'\n]*+')[ \t]*+(\.[ \t]*+)?"
 
 
 def _longest_key(text: str) -> int:
-    """Parts of the longest dotted key, or of what looks like one, on lines with many points."""
+    """Number of parts of the longest dotted key, or of text that resembles one."""
     longest = 0
     for line in text.splitlines():
         if line.count(".") < DEEPEST:
@@ -58,19 +58,19 @@ def _longest_key(text: str) -> int:
 
 
 def read_json(path: Path, *, do: str = "restore it, or write it again") -> Any:
-    """Tree of a JSON file; errors as of `read_text` and `json_of`."""
+    """Parse a JSON file; raises the errors of `read_text` and `json_of`."""
     return json_of(read_text(path, most=MOST_TEXT), str(path), do=do)
 
 
 def read_json_as(kind: TypeAdapter[T], path: Path, *, do: str) -> T:
-    """Content of a JSON file as a type; errors as of `read_json` and `model_of`."""
+    """Content of a JSON file as a type; raises the errors of `read_json` and `model_of`."""
     return model_of(kind, read_json(path, do=do), str(path), do=do)
 
 
 def model_of(kind: TypeAdapter[T], tree: Any, where: str, *, do: str) -> T:
-    """A tree as a type.
+    """Convert a tree to a type.
 
-    FormatError with the key that does not fit.
+    Raises FormatError with the first key that is invalid.
     """
     try:
         return kind.validate_python(tree)
@@ -86,34 +86,34 @@ def model_of(kind: TypeAdapter[T], tree: Any, where: str, *, do: str) -> T:
 
 
 def _not_too_deep(tree: Any, where: str, do: str) -> Any:
-    """The tree, unless its brackets are nested too deep for whoever goes through it."""
+    """Return the tree, or raise FormatError if it is nested too deeply for recursive functions."""
     level, depth = [tree], 1
-    while level := [one for one in level if isinstance(one, dict | list)]:
+    while level := [node for node in level if isinstance(node, dict | list)]:
         if depth > DEEPEST:
             raise FormatError(
                 f"has more than {DEEPEST} brackets within each other", where=where, do=do
             )
         level = [
-            inner for one in level for inner in (one.values() if isinstance(one, dict) else one)
+            inner for node in level for inner in (node.values() if isinstance(node, dict) else node)
         ]
         depth += 1
     return tree
 
 
 def refuse_multiplied_yaml(text: str, budget: Budget) -> None:
-    """Refuse YAML that is too deep, or whose aliases make a larger tree than is plausible.
+    """Refuse YAML that is nested too deeply or has aliases that expand to an implausible size.
 
-    An alias counts as many nodes as what it stands for, since programs that go through the tree
-    visit these each time.  FormatError also for a text that is no YAML.
+    An alias counts with all nodes of its target, because programs that traverse the tree visit them
+    each time. Raises FormatError also if the text is not YAML.
     """
     import yaml
 
-    text = re.sub(r"\A%ECSV.*", "", text)  # unknown to YAML
+    text = re.sub(r"\A%ECSV.*", "", text)  # not a YAML directive
     loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
     budget.refuse_header(len(text))
     clock = budget.clock()
-    sizes = dict[str, int]()  # nodes, by anchor
-    open_nodes = list[tuple[str | None, int]]()  # anchor, and nodes before it
+    sizes = dict[str, int]()  # number of nodes by anchor
+    open_nodes = list[tuple[str | None, int]]()  # anchor, and number of nodes before it
     n = 0
     try:
         for k, event in enumerate(yaml.parse(text, Loader=loader)):

@@ -1,4 +1,4 @@
-"""One error for whatever libraries raise on a damaged file."""
+"""Uniform errors for the exceptions that libraries raise for damaged files."""
 
 from __future__ import annotations
 
@@ -17,10 +17,11 @@ from bayesdist.errors import BayesdistError, FormatError, InputError
 
 @contextmanager
 def raising_interrupts() -> Iterator[None]:
-    """Raise KeyboardInterrupt for an error that comes of one.
+    """Raise KeyboardInterrupt for an exception that was caused by an interrupt.
 
-    A library that is interrupted in a callback, or as it closes a file, may fail in a way of its
-    own: HDF5 does so with a SystemError.  An interrupt that a script was handling before is none.
+    A library that is interrupted in a callback, or while it closes a file, may fail in other ways;
+    HDF5, for example, raises a SystemError. An interrupt that a script was already handling before
+    does not count.
     """
     before, handler = sys.exception(), signal.getsignal(signal.SIGINT)
     n_before = handler.n if isinstance(handler, InterruptHandler) else 0
@@ -55,27 +56,27 @@ class InterruptHandler:
 
 
 def _comes_of_interrupt(error: BaseException, before: BaseException | None) -> bool:
-    """Boolean: an error was raised from a KeyboardInterrupt, or during one after `before`."""
-    seen = {id(before)}
+    """True if an error was raised from a KeyboardInterrupt, or during one later than `before`."""
+    visited = {id(before)}
     open_ends: list[BaseException | None] = [error]
     while open_ends:
-        one = open_ends.pop()
-        if one is None or id(one) in seen:
+        cause = open_ends.pop()
+        if cause is None or id(cause) in visited:
             continue
-        if isinstance(one, KeyboardInterrupt):
+        if isinstance(cause, KeyboardInterrupt):
             return True
-        seen.add(id(one))
-        open_ends += [one.__cause__, one.__context__]
+        visited.add(id(cause))
+        open_ends += [cause.__cause__, cause.__context__]
     return False
 
 
 @contextmanager
 def naming_faults(path: Path, where: str = "") -> Iterator[None]:
-    """Turn any failure while a file is read into an error that names the file, or `where` in it.
+    """Convert any exception while a file is read to an error with its name, or with `where`.
 
-    Readers of damaged files raise exceptions of every kind, so all are caught; only our own pass as
-    they are.  InputError when the system refuses to read, FormatError when the content is not what
-    the format demands.
+    Readers of damaged files raise many kinds of exceptions, so all are caught; only InputError
+    passes unchanged. Raises InputError if the system refuses to read, FormatError if the content
+    does not conform to the format.
     """
     try:
         with raising_interrupts():
@@ -98,22 +99,23 @@ def naming_faults(path: Path, where: str = "") -> Iterator[None]:
 
 @contextmanager
 def restoring(path: Path, what: str, *, do: str) -> Iterator[None]:
-    """Turn any failure while an artefact is made from its file into one FormatError.
+    """Convert any exception while an object is restored from its file to a FormatError.
 
-    A file of a run's folder may have been changed by anybody: what is missing in it, or of another
-    shape, shows where objects are made from it.
+    A file in the folder of a run may have been changed. Missing or inconsistent content only shows
+    when objects are made from it.
 
-    `what`: with its article, as in 'a posterior'. `do`: by which the file is made again.
+    `what`: the object with its article, as in 'a posterior'. `do`: advice on how to make the file
+    again.
     """
     try:
         with raising_interrupts(), warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # of foreign files
+            warnings.simplefilter("ignore")  # caused by foreign files
             yield
     except BayesdistError as error:
         if str(path) in error.where:
             raise
-        where = f"{path}: {error.where}" if error.where else str(path)
-        raise FormatError(error.cause, where=where, do=do) from error
+        location = f"{path}: {error.where}" if error.where else str(path)
+        raise FormatError(error.cause, where=location, do=do) from error
     except Exception as error:
         raise FormatError(
             f"this is not {what} that bayesdist wrote, or it is damaged ({reason_of(error)})",
@@ -122,7 +124,7 @@ def restoring(path: Path, what: str, *, do: str) -> Iterator[None]:
         ) from error
 
 
-# what they say is about the reader's code, not about the file
+# messages of these exceptions are about the code of the reader, not about the file
 _OF_CODE = (
     ArithmeticError,
     AssertionError,
@@ -135,7 +137,7 @@ _OF_CODE = (
 
 
 def reason_of(error: Exception) -> str:
-    """First line of what an exception says of a file, or its kind where it says nothing."""
+    """First line of the message of an exception about a file, or its type if it has no message."""
     if isinstance(error, _OF_CODE):
         return "it is not laid out as this format demands"
     line = next(iter(str(error).strip().splitlines()), "") or type(error).__name__

@@ -1,4 +1,4 @@
-"""FITS files in memory, whose headers announce no more than follows them."""
+"""FITS files in memory, after checking that they contain the data that their headers announce."""
 
 from __future__ import annotations
 
@@ -18,16 +18,16 @@ RECORD = 2880  # bytes
 
 
 def open_fits(raw: bytes, budget: Budget) -> fits.HDUList:
-    """HDUs by astropy, with their data in memory.
+    """HDUs of a FITS file as astropy objects, with their data in memory.
 
-    FormatError for a file that is truncated, whose headers cannot be followed, or that announces
-    more than its budget.
+    Raises FormatError if the file is truncated, its headers are inconsistent, or it exceeds its
+    limits.
     """
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # of other programs' cards
+        warnings.simplefilter("ignore")  # caused by cards of other programs
         _refuse_unfounded(raw, budget)
-    # from memory: after a failure astropy leaves a file of its own open; compressed images stay
-    # the tables that they are, whose tiles are not decompressed
+    # from memory, because astropy would leave a file open after a failure; compressed images
+    # remain tables, so that their tiles are not decompressed
     return fits.open(
         io.BytesIO(raw), memmap=False, lazy_load_hdus=False, disable_image_compression=True
     )
@@ -35,7 +35,7 @@ def open_fits(raw: bytes, budget: Budget) -> fits.HDUList:
 
 def _refuse_unfounded(raw: bytes, budget: Budget) -> None:
     """Refuse a file that ends before the data that its headers announce."""
-    at, number, where, clock = 0, 0, budget.where, budget.clock()
+    at, number, file_name, clock = 0, 0, budget.where, budget.clock()
     while raw[at : at + 9] in HDU_STARTS:
         end = raw.find(b"END" + 77 * b" ", at)
         while end >= 0 and (end - at) % 80:
@@ -43,7 +43,7 @@ def _refuse_unfounded(raw: bytes, budget: Budget) -> None:
         if end < 0:
             raise FormatError(
                 f"ends within the header of HDU {number}",
-                where=where,
+                where=file_name,
                 do="it is truncated: fetch or write it again",
             )
         begin = at + padded(end + 80 - at)
@@ -55,7 +55,7 @@ def _refuse_unfounded(raw: bytes, budget: Budget) -> None:
             raise FormatError(
                 f"the header of HDU {number} announces {announced}, and "
                 f"{max(0, len(raw) - begin)} bytes follow",
-                where=where,
+                where=file_name,
                 do="it is truncated or damaged: fetch or write it again",
             )
         refuse_many_rows(header, budget)
@@ -65,16 +65,16 @@ def _refuse_unfounded(raw: bytes, budget: Budget) -> None:
 
 
 def refuse_many_rows(header: fits.Header, budget: Budget) -> None:
-    """Refuse a table of too many rows, which may have no bytes."""
+    """Refuse a table with too many rows, which may have a width of zero bytes."""
     rows = header.get("NAXIS2", 0)
     if header.get("XTENSION", "") in ("TABLE", "BINTABLE") and isinstance(rows, int):
         budget.refuse_rows(rows)
 
 
 def refuse_long_arrays(hdu: fits.BinTableHDU, budget: Budget) -> None:
-    """Refuse columns of arrays of any length which together exceed the budget.
+    """Refuse columns of variable-length arrays that together exceed the limits.
 
-    Each row states where in the heap its array lies, and all may state the same place.
+    Each row points to its array in the heap, and all rows may point to the same one.
     """
     total = 0.0
     for name, form in zip(hdu.columns.names, hdu.columns.formats, strict=True):
@@ -92,29 +92,35 @@ MOST = 999  # axes, and columns of a table (FITS 4.0, sections 4.4.1 and 7.3.1)
 
 
 def data_size(header: fits.Header) -> int | None:
-    """Bytes of data that a header announces (FITS 4.0, section 4.4.1); None for nonsense."""
+    """Size in bytes of the data of a header (FITS 4.0, section 4.4.1); None if it is invalid."""
     try:
         axes = header.get("NAXIS", 0)
         if max(axes, header.get("TFIELDS", 0)) > MOST:
             return None
         sides = [header[f"NAXIS{k + 1}"] for k in range(axes)]
-        bits, groups, more = header["BITPIX"], header.get("GCOUNT", 1), header.get("PCOUNT", 0)
+        bits, groups, parameters = (
+            header["BITPIX"],
+            header.get("GCOUNT", 1),
+            header.get("PCOUNT", 0),
+        )
     except KeyError:
-        return 0  # cards without those of an HDU
+        return 0  # without the mandatory cards of an HDU
     except (TypeError, ValueError, OverflowError, fits.VerifyError):
         return None
-    if not all(isinstance(one, int) for one in (*sides, bits, groups, more)):
+    if not all(
+        isinstance(number_in_header, int) for number_in_header in (*sides, bits, groups, parameters)
+    ):
         return None
-    if axes < 0 or min([*sides, groups, more, 0]) < 0:
+    if axes < 0 or min([*sides, groups, parameters, 0]) < 0:
         return None
     if header.get("GROUPS") is True and sides and sides[0] == 0:
         sides = sides[1:]  # random groups
     n = 1 if sides else 0
     for side in sides:
         n *= side
-    return abs(bits) // 8 * groups * (more + n)
+    return abs(bits) // 8 * groups * (parameters + n)
 
 
 def padded(n: int) -> int:
-    """Bytes of whole records."""
+    """Size in bytes, rounded up to complete records."""
     return -(-n // RECORD) * RECORD

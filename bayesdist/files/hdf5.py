@@ -1,4 +1,4 @@
-"""HDF5 and netCDF files, whose arrays are no larger than their file allows."""
+"""HDF5 and netCDF files, with checks that arrays are plausible for the size of the file."""
 
 from __future__ import annotations
 
@@ -29,11 +29,11 @@ if TYPE_CHECKING:
 def hdf5_arrays(
     path: Path, names: Sequence[str] | None = None, limits: Limits = LIMITS
 ) -> tuple[dict[str, NDArray[Any]], dict[str, Any]]:
-    """Arrays by name, and attributes, of an HDF5 file.
+    """Arrays of an HDF5 file by name, and its attributes.
 
-    `names`: arrays that are wanted; by default all at the top of the file. InputError for a path
-    that is no regular file. FormatError for arrays that the file cannot hold. OSError, KeyError as
-    h5py raises them for a damaged file.
+    `names`: names of the arrays to read; by default all at the top level of the file. Raises
+    InputError if the path is not a regular file, FormatError if arrays exceed the limits of the
+    file, and, like h5py, OSError or KeyError if the file is damaged.
     """
     with _checked(path, limits) as file:
         arrays = {name: file[name][...] for name in names or file}
@@ -49,25 +49,25 @@ class NetcdfGroup:
 
 
 def netcdf_groups(path: Path, limits: Limits = LIMITS) -> dict[str, NetcdfGroup]:
-    """Groups of a netCDF file by their names, '' at its top; errors as of `hdf5_arrays`.
+    """Groups of a netCDF file by name, with '' for the top level; errors as in `hdf5_arrays`.
 
-    A tree of xarray takes five times as long, and half a second to import.
+    xarray.DataTree would take five times as long, and half a second to import.
     """
     import h5py
 
     with _checked(path, limits) as file:
-        groups = {name: one for name, one in file.items() if isinstance(one, h5py.Group)}
+        groups = {name: member for name, member in file.items() if isinstance(member, h5py.Group)}
         return {name: _group(group) for name, group in {"": file, **groups}.items()}
 
 
 def _group(group: h5py.Group) -> NetcdfGroup:
-    """Content of a group; netCDF keeps single numbers as arrays of one."""
+    """Content of a group; netCDF stores scalar attributes as arrays of length one."""
     import h5py
 
     arrays = {
-        name: (one.asstr() if h5py.check_string_dtype(one.dtype) else one)[...]
-        for name, one in group.items()
-        if isinstance(one, h5py.Dataset)
+        name: (dataset.asstr() if h5py.check_string_dtype(dataset.dtype) else dataset)[...]
+        for name, dataset in group.items()
+        if isinstance(dataset, h5py.Dataset)
     }
     attrs = {
         name: value[0] if isinstance(value, np.ndarray) and value.shape == (1,) else value
@@ -78,7 +78,7 @@ def _group(group: h5py.Group) -> NetcdfGroup:
 
 @contextmanager
 def _checked(path: Path, limits: Limits = LIMITS) -> Iterator[h5py.File]:
-    """Context with an open file whose arrays can be read."""
+    """Context manager for an open file with arrays that are safe to read."""
     import h5py
 
     with opened(path) as stream:
@@ -88,33 +88,33 @@ def _checked(path: Path, limits: Limits = LIMITS) -> Iterator[h5py.File]:
         yield file
 
 
-_DEFLATE, _DEFLATE_RATIO = 1, 1032  # code of gzip in HDF5, and what zlib reaches at most
-_COMPRESSORS = {_DEFLATE, 4, 32000}  # szip and lzf, which hold no more than a hundred times as much
-_FILTERS = {2, 3, 5, 6}  # shuffle, fletcher32, nbit and scale-offset, of which sizes follow
+_DEFLATE, _DEFLATE_RATIO = 1, 1032  # filter code of gzip in HDF5, and largest compression of zlib
+_COMPRESSORS = {_DEFLATE, 4, 32000}  # szip and lzf compress by a factor of at most a hundred
+_FILTERS = {2, 3, 5, 6}  # shuffle, fletcher32, nbit and scale-offset have predictable sizes
 
 
 class _Announced:
-    """Bytes of arrays as a file announces them, each as often as a path leads to it.
+    """Size of arrays as announced by a file; an array counts once per path that leads to it.
 
-    Links may lead to one group by more paths than can be followed: each group is visited once.
+    Links can make the number of paths to a group very large, so each group is visited once.
     """
 
     def __init__(self, budget: Budget) -> None:
         self._budget = budget
         self._clock = budget.clock()
-        self._totals: dict[int, int] = {}  # by the address of a group that has been visited
+        self._totals: dict[int, int] = {}  # bytes by address of a visited group
         self._links = 0
         self._attributes = 0  # bytes of those of variable length
 
     def bytes_of(self, group: h5py.Group, depth: int = 1) -> int:
-        """Bytes in a group and those within it."""
+        """Size in bytes of the arrays in a group and its subgroups."""
         import h5py
 
         address = h5py.h5o.get_info(group.id).addr
         if address not in self._totals:
             self._budget.refuse_depth(depth, "groups")
             self._refuse_attributes(group)
-            self._totals[address] = 0  # for a group within itself
+            self._totals[address] = 0  # ends the recursion if a group contains itself
             self._totals[address] = sum(self._member(group, name, depth) for name in group)
         return self._totals[address]
 
@@ -125,17 +125,17 @@ class _Announced:
         self._budget.refuse_nodes(self._links, "groups and arrays")
         self._clock()
         link = group.get(name, getlink=True)
-        one = group.get(name) if isinstance(link, h5py.HardLink) else None
-        if isinstance(one, h5py.Group):
-            return self.bytes_of(one, depth + 1)
-        if isinstance(one, h5py.Dataset) and not one.external and not one.is_virtual:
-            self._refuse_inflated(one)
-            self._refuse_attributes(one)
-            self._refuse_texts(one)
-            # a chunk is read whole, also where the array is smaller
-            n = max(int(one.size or 0), math.prod(one.chunks or (0,)))
-            return n * one.dtype.itemsize
-        if not isinstance(one, h5py.Datatype):
+        member = group.get(name) if isinstance(link, h5py.HardLink) else None
+        if isinstance(member, h5py.Group):
+            return self.bytes_of(member, depth + 1)
+        if isinstance(member, h5py.Dataset) and not member.external and not member.is_virtual:
+            self._refuse_inflated(member)
+            self._refuse_attributes(member)
+            self._refuse_texts(member)
+            # a chunk is read completely, even if the array is smaller
+            n = max(int(member.size or 0), math.prod(member.chunks or (0,)))
+            return n * member.dtype.itemsize
+        if not isinstance(member, h5py.Datatype):
             soft = isinstance(link, h5py.SoftLink)
             raise FormatError(
                 f"{name!r} {'is a soft link' if soft else 'lies in another file'}",
@@ -176,7 +176,7 @@ class _Announced:
                 self._budget.refuse_content(self._attributes)
 
     def _refuse_inflated(self, array: h5py.Dataset) -> None:
-        """Refuse chunks of gzip that hold more than a chunk: HDF5 reads them to their end."""
+        """Refuse gzip chunks that decompress to more than a chunk: HDF5 would read all of it."""
         pipeline = array.id.get_create_plist()
         filters = [pipeline.get_filter(k)[0] for k in range(pipeline.get_nfilters())]
         compressors = [code for code in filters if code not in _FILTERS]
@@ -217,26 +217,26 @@ def _length(value: Any) -> int:
     return len(value) if isinstance(value, str | bytes) else 8
 
 
-# -- arrays of our own, each file with the fingerprint of what it belongs to -----------------------
+# -- arrays of bayesdist's own files, each with the fingerprint of the data they belong to ---------
 
 
 def read_arrays(
     path: Path, fingerprint: str, what: str, names: Sequence[str] | None = None, *, do: str
 ) -> dict[str, NDArray[Any]]:
-    """Arrays by name from a file of `write_arrays`.
+    """Read arrays from a file of `write_arrays`.
 
-    `fingerprint` is that of data and settings; `what`, with its article, is what the file has to
-    be; `names` are required, by default those in the file; `do` is advice for a file that cannot be
-    read.  FormatError when it is damaged, InputError when it is not there, or belongs to other data
-    or settings.
+    `fingerprint`: fingerprint of data and settings. `what`: expected content, with its article.
+    `names`: required arrays; by default all in the file. `do`: advice if the file cannot be read.
+    Raises FormatError if the file is damaged, InputError if it does not exist, or belongs to other
+    data or settings.
     """
     try:
         with restoring(path, what, do=do):
             arrays, marks = hdf5_arrays(path, names)
-            known = marks["fingerprint"]
-    except InputError as error:  # of the path: its reader does not know what to do
+            stored_fingerprint = marks["fingerprint"]
+    except InputError as error:  # about the path; add the advice for this file
         raise type(error)(error.cause, where=error.where, do=do) from error
-    if not isinstance(known, str) or known != fingerprint:
+    if not isinstance(stored_fingerprint, str) or stored_fingerprint != fingerprint:
         raise InputError(
             f"this is {what} of other data or settings",
             where=str(path),
@@ -246,18 +246,18 @@ def read_arrays(
 
 
 class _Written(io.FileIO):
-    """A file as HDF5 writes it; what the system refuses is raised once HDF5 has closed it.
+    """File object for HDF5 that raises an error of the system only after HDF5 has closed its file.
 
-    Of an error in between HDF5 fails again as it closes its file, and may end the process.
+    If an error is raised earlier, HDF5 fails again while closing and may terminate the process.
     """
 
     _refused: OSError | None = None
 
     def write(self, content: Any) -> int:
-        left = memoryview(content)
-        while len(left) and self._refused is None:
+        remaining = memoryview(content)
+        while len(remaining) and self._refused is None:
             try:
-                left = left[super().write(left) :]
+                remaining = remaining[super().write(remaining) :]
             except OSError as error:
                 self._refused = error
         return len(content)
@@ -276,9 +276,9 @@ class _Written(io.FileIO):
 
 
 def write_arrays(path: Path, fingerprint: str, arrays: Mapping[str, NDArray[Any]]) -> None:
-    """Write arrays by name to a file, whole or not at all.
+    """Write arrays to an HDF5 file atomically.
 
-    InputError when the system refuses to write.
+    Raises InputError if the system refuses to write.
     """
     import h5py
 

@@ -23,19 +23,19 @@ if TYPE_CHECKING:
     import pyarrow
     import pyarrow.parquet
 
-HEADER = "bayesdist"  # key of the metadata in which matches state what no column holds
-_BUFFER = 2**18  # bytes: without a buffer, Arrow loads the columns of a whole row group
+HEADER = "bayesdist"  # key of the metadata for properties of matches that are not in a column
+_BUFFER = 2**18  # bytes; without a buffer, Arrow loads the columns of an entire row group
 
 
 def open_parquet(
     path: Path, as_codes: Collection[str] = (), limits: Limits = LIMITS
 ) -> pyarrow.parquet.ParquetFile:
-    """Open file of which only the part being decoded is held in memory.
+    """Open a Parquet file; only the part being decoded is kept in memory.
 
-    Columns `as_codes` are decoded as dictionaries.  FormatError for columns of one name, and for a
-    file that announces more than its budget.
+    `as_codes`: columns that are decoded as dictionaries. Raises FormatError if columns have the
+    same name, or if the file announces more than its limits.
     """
-    import pyarrow.parquet  # 0.1 s that other formats need not wait for
+    import pyarrow.parquet  # takes 0.1 s, which other formats do not need
 
     with opened(path) as stream:
         budget = Budget(str(path), os.fstat(stream.fileno()).st_size, limits)
@@ -62,7 +62,7 @@ def open_parquet(
 
 
 def _refuse_announced(stored: pyarrow.parquet.ParquetFile, budget: Budget) -> None:
-    """Refuse rows, values and bytes that a file announces beyond its budget."""
+    """Refuse a file that announces more rows, values or bytes than its limits."""
     metadata, clock = stored.metadata, budget.clock()
     budget.refuse_rows(metadata.num_rows)
     budget.refuse_columns(metadata.num_columns)
@@ -180,14 +180,14 @@ def _after_thrift_value(raw: bytes, at: int, kind: int, depth: int) -> int:
 
 
 def text_columns(schema: pyarrow.Schema) -> frozenset[str]:
-    """Columns of text: strings, bytes or dictionaries."""
+    """Names of the text columns: strings, bytes or dictionaries."""
     from pyarrow import types
 
     kinds = (
         *(types.is_string, types.is_large_string),
         *(types.is_binary, types.is_large_binary, types.is_dictionary),
     )
-    return frozenset(one.name for one in schema if any(kind(one.type) for kind in kinds))
+    return frozenset(column.name for column in schema if any(kind(column.type) for kind in kinds))
 
 
 def nested_texts(stored: pyarrow.parquet.ParquetFile) -> frozenset[str]:
@@ -200,9 +200,9 @@ def nested_texts(stored: pyarrow.parquet.ParquetFile) -> frozenset[str]:
 
 
 def refuse_long_text(column: pyarrow.ChunkedArray | pyarrow.Array, budget: Budget) -> None:
-    """Refuse a column of dictionaries whose text would exceed the budget as an array of numpy.
+    """Refuse a dictionary column with text that exceeds the limits as a numpy array.
 
-    One text of a dictionary may stand in every row, at no cost to the file.
+    A single long text in a dictionary may be used in every row without enlarging the file.
     """
     import pyarrow.compute
     from pyarrow import types
@@ -218,7 +218,7 @@ def refuse_long_text(column: pyarrow.ChunkedArray | pyarrow.Array, budget: Budge
 
 
 def parquet_table(path: Path, limits: Limits = LIMITS) -> Table:
-    """All rows of a Parquet file as an astropy Table; FormatError where they exceed its budget."""
+    """All rows of a Parquet file as an astropy Table; raises FormatError beyond its limits."""
     budget = Budget(str(path), path.stat().st_size, limits)
     with open_parquet(path, limits=limits) as plain:
         texts = text_columns(plain.schema_arrow)
@@ -247,7 +247,7 @@ def _counted(stored: pyarrow.parquet.ParquetFile, budget: Budget) -> pyarrow.Tab
 def arrow_table(data: Any) -> Table:
     """Rows of an object with an Arrow stream (`__arrow_c_stream__`) as an astropy Table.
 
-    Its nulls are masked; units come from the metadata of its fields.
+    Null values are masked; units are read from the metadata of the fields.
     """
     import pyarrow
 
@@ -255,14 +255,17 @@ def arrow_table(data: Any) -> Table:
     units = parquet_units(rows.schema)
     names = rows.column_names
     return Table(
-        [parquet_column(one, units.get(n)) for n, one in zip(names, rows.columns, strict=True)],
+        [
+            parquet_column(column, units.get(n))
+            for n, column in zip(names, rows.columns, strict=True)
+        ],
         names=names,
         meta=parquet_header(rows.schema),
     )
 
 
 def parquet_column(values: pyarrow.ChunkedArray, unit: str | None) -> Column:
-    """A column of Arrow data as one of an astropy Table; its nulls are masked."""
+    """Convert a column of Arrow data to a column of an astropy Table; null values are masked."""
     array = values.combine_chunks()
     if not array.null_count:
         return Column(numpy_array(array), unit=unit)
@@ -273,16 +276,16 @@ def parquet_column(values: pyarrow.ChunkedArray, unit: str | None) -> Column:
 
 
 def numpy_array(values: pyarrow.Array) -> NDArray[Any]:
-    """Values (N,) of an Arrow array, arbitrary where null; numbers as a view that is read-only.
+    """Values (N,) of an Arrow array, arbitrary where null; numbers are a read-only view.
 
-    Arrow's own conversion imports pandas, which takes longer than to read a small table.
+    The conversion in Arrow imports pandas, which takes longer than reading a small table.
     """
     import pyarrow
     from pyarrow import types
 
     kind = values.type
     if types.is_floating(kind) or types.is_integer(kind):
-        if values.null_count:  # numbers without the bitmap of nulls
+        if values.null_count:  # use the numbers without the validity bitmap
             held = [None, values.buffers()[1]]
             values = pyarrow.Array.from_buffers(kind, len(values), held, offset=values.offset)
         return np.from_dlpack(values)
@@ -303,12 +306,12 @@ def numpy_array(values: pyarrow.Array) -> NDArray[Any]:
 
 
 def _is_string_view(kind: pyarrow.DataType) -> bool:
-    """True for the strings of polars, which older versions of pyarrow do not know."""
+    """True for the string type of polars, which older versions of pyarrow do not have."""
     return str(kind) == "string_view"
 
 
 def arrow_array(values: NDArray[Any]) -> pyarrow.Array:
-    """Arrow array of values (N,), a view of theirs where they are numbers; without pandas, too."""
+    """Convert values (N,) to an Arrow array, a view for numbers; does not import pandas."""
     import pyarrow
 
     plain = type(values) is np.ndarray and values.ndim == 1 and values.dtype.isnative
@@ -317,7 +320,7 @@ def arrow_array(values: NDArray[Any]) -> pyarrow.Array:
         kind = pyarrow.from_numpy_dtype(values.dtype)
         return pyarrow.Array.from_buffers(kind, len(values), [None, held])
     if plain and values.dtype.kind == "U":
-        texts = [str(one).encode() for one in values]
+        texts = [str(value).encode() for value in values]
         ends = np.cumsum([0, *map(len, texts)], dtype=np.int32)
         held = [None, pyarrow.py_buffer(ends), pyarrow.py_buffer(b"".join(texts))]
         return pyarrow.Array.from_buffers(pyarrow.string(), len(values), held)
@@ -325,7 +328,7 @@ def arrow_array(values: NDArray[Any]) -> pyarrow.Array:
 
 
 def parquet_header(schema: pyarrow.Schema) -> dict[str, Any]:
-    """Header of a table: that which astropy stores, or the entry `HEADER` of the metadata."""
+    """Header of a table: the one stored by astropy, or the entry `HEADER` of the metadata."""
     metadata = schema.metadata or {}
     if b"table_meta_yaml" in metadata:
         text = metadata[b"table_meta_yaml"].decode()
@@ -338,13 +341,13 @@ def parquet_header(schema: pyarrow.Schema) -> dict[str, Any]:
 
 
 def parquet_units(schema: pyarrow.Schema) -> dict[str, str]:
-    """Units of columns: of each field's own metadata, or of the header that astropy stores."""
+    """Units by column name, from the metadata of the fields or the header stored by astropy."""
     units: dict[str, str] = {}
     header = (schema.metadata or {}).get(b"table_meta_yaml")
     if header is not None:
         described = get_header_from_yaml(header.decode().splitlines())["datatype"]
-        units = {one["name"]: str(one["unit"]) for one in described if one.get("unit")}
-    for one in schema:
-        if one.metadata and b"unit" in one.metadata:
-            units[one.name] = one.metadata[b"unit"].decode()
+        units = {column["name"]: str(column["unit"]) for column in described if column.get("unit")}
+    for schema_field in schema:
+        if schema_field.metadata and b"unit" in schema_field.metadata:
+            units[schema_field.name] = schema_field.metadata[b"unit"].decode()
     return units

@@ -1,7 +1,7 @@
-"""Records as arrays by name: frozen dataclasses of numbers, texts, arrays, and each other.
+"""Serialisation of frozen dataclasses with numbers, texts, arrays and nested dataclasses.
 
-A record is written as a tree of its fields in JSON, in which an array stands by its name.  What is
-read back is equal to the last bit.
+A record is stored as arrays by name. One of them is the JSON tree of its fields, which refers to
+the other arrays by name. Values are restored exactly, to the last bit.
 """
 
 from __future__ import annotations
@@ -23,35 +23,35 @@ from bayesdist.files.hdf5 import read_arrays, write_arrays
 T = TypeVar("T")
 
 TREE = "tree"
-PACKAGE = "bayesdist."  # classes of others are not made from files
+PACKAGE = "bayesdist."  # only classes of this package are created from files
 
 
 def write_record(path: Path, record: Any, fingerprint: str = "") -> None:
-    """Write a record to an HDF5 file, with the fingerprint of what it belongs to."""
+    """Write a record to an HDF5 file, with the fingerprint of the data it belongs to."""
     write_arrays(path, fingerprint, record_to_arrays(record))
 
 
 def read_record(path: Path, kind: type[T], what: str, *, do: str, fingerprint: str = "") -> T:
-    """The record of a file.
+    """Read the record of a file.
 
-    `kind`, and `what` in words, with its article: what it has to be; `do`: by which the file is
-    made again. InputError for a file of another fingerprint, FormatError for one that holds no such
-    record.
+    `kind`: class of the record. `what`: the record in words, with its article, for error messages.
+    `do`: advice on how to make the file again. Raises InputError if the file has another
+    fingerprint, FormatError if it contains no such record.
     """
     arrays = read_arrays(path, fingerprint, what, do=do)
     with restoring(path, what, do=do):
-        found: T = record_from_arrays(arrays, kind)
-        return found
+        record: T = record_from_arrays(arrays, kind)
+        return record
 
 
 def record_to_arrays(record: Any) -> dict[str, NDArray[Any]]:
-    """Arrays by name that hold a record.
+    """Convert a record to arrays by name.
 
     Parameters
     ----------
     record : dataclass
-        Its fields are None, numbers, texts, arrays, tuples, lists, mappings, other such records, or
-        objects with ``to_dict`` and ``from_dict``.
+        Fields can be None, numbers, texts, arrays, tuples, lists, mappings, other such dataclasses,
+        or objects with ``to_dict`` and ``from_dict``.
 
     Returns
     -------
@@ -60,7 +60,7 @@ def record_to_arrays(record: Any) -> dict[str, NDArray[Any]]:
     Raises
     ------
     TypeError
-        For a field that is none of these.
+        If a field has another type.
 
     Examples
     --------
@@ -74,21 +74,21 @@ def record_to_arrays(record: Any) -> dict[str, NDArray[Any]]:
 
 
 def record_from_arrays(arrays: Mapping[str, NDArray[Any]], kind: type = object) -> Any:
-    """The record that `record_to_arrays` described.
+    """Restore a record from the arrays of `record_to_arrays`.
 
-    `kind`: which it has to be. TypeError, KeyError, AttributeError for arrays that are no such
-    record.
+    `kind`: class of the record. Raises TypeError, KeyError or AttributeError if the arrays do not
+    contain such a record.
     """
     tree = json_of(np.asarray(arrays[TREE], np.uint8).tobytes().decode(), "record")
-    found = _Reader(arrays).of(tree)
-    if not isinstance(found, kind):
-        raise TypeError(f"holds a {type(found).__name__}, and no {kind.__name__}")
-    return found
+    record = _Reader(arrays).of(tree)
+    if not isinstance(record, kind):
+        raise TypeError(f"holds a {type(record).__name__}, and no {kind.__name__}")
+    return record
 
 
 @runtime_checkable
 class _Described(Protocol):
-    """An object that describes itself in JSON."""
+    """An object that can be converted to and from a JSON tree."""
 
     def to_dict(self) -> dict[str, Any]: ...
 
@@ -97,13 +97,13 @@ class _Described(Protocol):
 
 
 class _Writer:
-    """The tree of a record, and its arrays; what stands twice in it is written once."""
+    """Builds the tree of a record and collects its arrays; repeated objects are stored once."""
 
     def __init__(self) -> None:
         self.arrays: dict[str, NDArray[Any]] = {}
         self._written: dict[
             int, tuple[Any, Any]
-        ] = {}  # by id: the object, kept alive, and its tree
+        ] = {}  # by id: the object, to keep it alive, and its tree
 
     def of(self, value: Any) -> Any:
         if value is None or isinstance(value, bool | int | float | str):
@@ -113,7 +113,7 @@ class _Writer:
         if isinstance(value, np.ndarray):
             return self._once(value, self._array)
         if isinstance(value, tuple | list):
-            return {type(value).__name__: [self.of(one) for one in value]}
+            return {type(value).__name__: [self.of(item) for item in value]}
         if isinstance(value, Mapping):
             return {"mapping": [[self.of(k), self.of(v)] for k, v in value.items()]}
         if isinstance(value, _Described):
@@ -123,7 +123,9 @@ class _Writer:
         raise TypeError(f"{type(value).__name__} cannot be written as arrays")
 
     def _fields(self, value: Any) -> dict[str, Any]:
-        named = [one.name for one in fields(value) if one.init and not one.name.startswith("_")]
+        named = [
+            entry.name for entry in fields(value) if entry.init and not entry.name.startswith("_")
+        ]
         return {name: self.of(getattr(value, name)) for name in named}
 
     def _once(self, value: Any, make: Any) -> Any:
@@ -144,7 +146,7 @@ class _Writer:
 
 
 class _Reader:
-    """A record from its tree; equal objects of one class are one object."""
+    """Restores a record from its tree; equal trees of one class give the same object."""
 
     def __init__(self, arrays: Mapping[str, NDArray[Any]]) -> None:
         self._arrays = arrays
@@ -158,9 +160,9 @@ class _Reader:
         if "texts" in tree:
             return np.array(tree["texts"])
         if "tuple" in tree:
-            return tuple(self.of(one) for one in tree["tuple"])
+            return tuple(self.of(item) for item in tree["tuple"])
         if "list" in tree:
-            return [self.of(one) for one in tree["list"]]
+            return [self.of(item) for item in tree["list"]]
         if "mapping" in tree:
             return {self.of(key): self.of(value) for key, value in tree["mapping"]}
         if "dict" in tree:
@@ -176,10 +178,10 @@ def _name(value: Any) -> str:
 
 
 def _class(name: str) -> Any:
-    """A class that records are made of; TypeError for a name of anything else."""
+    """Class with a given name; raises TypeError if it is not a record class of this package."""
     module, _, qualified = name.partition(":")
-    found = getattr(import_module(module), qualified, None) if module.startswith(PACKAGE) else None
-    held = isinstance(found, type) and (is_dataclass(found) or hasattr(found, "from_dict"))
-    if not held or found.__module__ != module:
+    cls = getattr(import_module(module), qualified, None) if module.startswith(PACKAGE) else None
+    held = isinstance(cls, type) and (is_dataclass(cls) or hasattr(cls, "from_dict"))
+    if not held or cls.__module__ != module:
         raise TypeError(f"{name} is no class of this package's records")
-    return found
+    return cls

@@ -1,6 +1,6 @@
-"""Bytes and text of regular files: no pipe, device or folder, and no more than fits in memory.
+"""Bytes and text of regular files; refuses pipes, devices, folders and files too large for memory.
 
-Files that are written in place, a log and a lock, are regular ones, too.
+Files that are written in place, such as logs and locks, must also be regular files.
 """
 
 from __future__ import annotations
@@ -18,9 +18,9 @@ from bayesdist.utils.memory import memory_limit, size_text
 
 PathLike = str | os.PathLike[str]
 
-MOST_HOLLOW = 1000  # times what was written: no file system compresses data as much
-PIECE = 2**24  # bytes that are read at once, where a file is longer than the system says
-MOST_TEXT = 2**28  # bytes of a configuration, or of a file of JSON
+MOST_HOLLOW = 1000  # ratio of file size to allocated blocks; no file system compresses as much
+PIECE = 2**24  # bytes read at a time, if a file is longer than the system reports
+MOST_TEXT = 2**28  # bytes of a configuration or a JSON file
 
 _KINDS = {
     stat.S_IFDIR: "a folder",
@@ -35,10 +35,10 @@ _REMOVE = "remove it, or choose another folder"
 
 @contextmanager
 def opened(path: PathLike) -> Iterator[io.BufferedReader]:
-    """Context with a regular file, open for reading bytes.
+    """Context manager for a regular file, open for reading bytes.
 
-    InputError for a path where there is none, none that the system lets us read, and a file of
-    holes.
+    Raises InputError if the path does not exist, cannot be read, is not a regular file, or is a
+    sparse file that is mostly holes.
     """
     try:
         stream = open(path, "rb", opener=_without_waiting)  # noqa: SIM115  in a context below
@@ -46,7 +46,7 @@ def opened(path: PathLike) -> Iterator[io.BufferedReader]:
         raise InputError("does not exist", where=str(path), do="check the path") from error
     except IsADirectoryError as error:
         raise _irregular(path, stat.S_IFDIR) from error
-    except (OSError, ValueError) as error:  # a zero byte in a name is a ValueError
+    except (OSError, ValueError) as error:  # ValueError: a zero byte in the name
         reason = getattr(error, "strerror", None) or error
         raise InputError(
             f"cannot be read ({reason})",
@@ -54,25 +54,25 @@ def opened(path: PathLike) -> Iterator[io.BufferedReader]:
             do="check the path and its permissions",
         ) from error
     with stream:
-        found = os.fstat(stream.fileno())
-        kind = stat.S_IFMT(found.st_mode)
+        status = os.fstat(stream.fileno())
+        kind = stat.S_IFMT(status.st_mode)
         if kind != stat.S_IFREG:
             raise _irregular(path, kind)
-        _refuse_hollow(path, found)
+        _refuse_hollow(path, status)
         yield stream
 
 
 def _without_waiting(path: str, flags: int) -> int:
-    """File descriptor; a pipe that nobody writes into is opened too, and not waited for."""
+    """File descriptor; a pipe without a writer is opened without waiting."""
     return os.open(path, flags | getattr(os, "O_NONBLOCK", 0))
 
 
 def descriptor_for_writing(path: PathLike, flags: int = 0) -> int:
-    """Descriptor of a regular file that is written in place, and made where there is none.
+    """Descriptor of a regular file that is written in place; created if it does not exist.
 
-    `flags`: of `os.open`, in addition.  A folder may come from others: a symbolic link is not
-    followed, since what it leads to would be overwritten.  InputError for a link, a pipe, a device
-    or a folder.  OSError, as the system raises it, for a file that cannot be opened.
+    `flags`: further flags of `os.open`. Symbolic links are not followed, because other people may
+    have created them in the folder, and their targets would be overwritten. Raises InputError for a
+    link, a pipe, a device or a folder, and OSError if the file cannot be opened.
     """
     flags |= os.O_RDWR | os.O_CREAT | getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0)
     try:
@@ -91,7 +91,7 @@ def descriptor_for_writing(path: PathLike, flags: int = 0) -> int:
 
 
 def _refuse_hollow(path: PathLike, found: os.stat_result) -> None:
-    """Refuse a large file of which hardly anything was written: to read its holes takes hours."""
+    """Refuse a large file that is mostly holes, which would take hours to read."""
     written = 512 * getattr(found, "st_blocks", found.st_size)
     if found.st_size > memory_limit() and found.st_size > MOST_HOLLOW * max(written, 1):
         raise InputError(
@@ -108,7 +108,7 @@ def _irregular(path: PathLike, kind: int, do: str = "give a regular file") -> In
 def read_bytes(path: PathLike, *, most: int | None = None) -> bytes:
     """Content of a file.
 
-    `most`: bytes that are plausible; by default what fits in memory.
+    `most`: largest plausible number of bytes; by default limited by the available memory.
     """
     most = memory_limit() if most is None else most
     with opened(path) as stream:
@@ -131,9 +131,9 @@ def read_bytes(path: PathLike, *, most: int | None = None) -> bytes:
 
 
 def read_up_to(stream: BinaryIO | io.BufferedIOBase, most: int, *, expected: int = PIECE) -> bytes:
-    """Bytes of a stream, at most one beyond `most`; read at once where it has as many as expected.
+    """Bytes of a stream, at most `most` + 1; read at once if it has the expected number of bytes.
 
-    Python allocates whatever is asked for before it reads.
+    Python allocates the requested number of bytes before it reads.
     """
     parts, n = [], expected + 1
     while n and (part := stream.read(n)):
@@ -144,15 +144,15 @@ def read_up_to(stream: BinaryIO | io.BufferedIOBase, most: int, *, expected: int
 
 
 def read_text(path: PathLike, *, most: int | None = None) -> str:
-    """Text of a file in UTF-8, with its line ends as they stand; errors as of `read_bytes`.
+    """Text of a UTF-8 file with its original line ends; raises the errors of `read_bytes`.
 
-    FormatError where it is no such text.
+    Raises FormatError if the file is not UTF-8 text.
     """
     return decoded(read_bytes(path, most=most), str(path))
 
 
 def decoded(raw: bytes, where: str) -> str:
-    """Text of bytes in UTF-8; FormatError where they are no such text."""
+    """Decode UTF-8 text; raises FormatError if the bytes are not UTF-8."""
     try:
         return raw.decode("utf-8")
     except UnicodeDecodeError as error:
@@ -164,7 +164,7 @@ def decoded(raw: bytes, where: str) -> str:
 
 
 def head_of(path: PathLike, n: int = 4096) -> bytes:
-    """The first bytes of a file; empty where it cannot be read, which is left to its reader."""
+    """First bytes of a file; empty if it cannot be read, which its reader will report."""
     try:
         with opened(path) as stream:
             return stream.read(n)

@@ -1,4 +1,4 @@
-"""Table files to an astropy Table; anything wrong with one becomes one clear error."""
+"""Read table files into an astropy Table; anything wrong with a file becomes one clear error."""
 
 from __future__ import annotations
 
@@ -15,6 +15,7 @@ from pathlib import Path
 import numpy as np
 from astropy.io import fits
 from astropy.table import Table, vstack
+from astropy.table.meta import get_header_from_yaml
 from astropy.utils.xml.iterparser import get_xml_iterator
 
 from bayesdist.errors import FormatError, InputError
@@ -25,6 +26,7 @@ from bayesdist.files.parquet import parquet_table
 from bayesdist.files.regular import head_of
 from bayesdist.files.text_tables import (
     MAYBE_FOREIGN_BYTES,
+    columns_of_numbers,
     is_text_table,
     mark_of,
     parse_text_table,
@@ -46,10 +48,10 @@ _COMMAS = re.compile(r"# delimiter: ['\"]?,")
 
 @contextmanager
 def _reading(path: Path) -> Iterator[None]:
-    """Context of `naming_faults` in which the warnings of readers are silenced.
+    """Context manager like `naming_faults` that also silences the warnings of readers.
 
-    Python keeps its rules for warnings once for all threads, so that several threads at a time must
-    do without.
+    Python has only one set of warning filters for all threads, so threads must not use this
+    concurrently.
     """
     with naming_faults(path), warnings.catch_warnings():
         warnings.simplefilter("ignore")  # units are checked later, column by column
@@ -58,9 +60,9 @@ def _reading(path: Path) -> Iterator[None]:
 
 
 def _whole_lines(lines: list[str], mark: str, path: Path) -> list[str]:
-    """Lines of a file without their ends; a list, since astropy takes a lone line for a file name.
+    """Lines of a file without line ends, as a list: astropy takes a single string for a file name.
 
-    FormatError if the last one is cut.
+    Raises FormatError if the last line is cut.
     """
     if lines and lines[0].startswith("# %ECSV"):
         head = takewhile(lambda line: line.startswith("#"), lines)
@@ -76,15 +78,22 @@ def _is_comment(line: str) -> bool:
 
 
 def read_ecsv(path: Path, limits: Limits = LIMITS) -> Table:
-    """Table of an ECSV file; errors as of `read_table`."""
+    """Table of an ECSV file; for errors see `read_table`."""
     with _reading(path):
         lines = read_lines(path, limits)
         refuse_multiplied_header(lines, _budget(path, limits))
         lines = _whole_lines(lines, " ", path)
         table = Table.read(lines, format="ascii.ecsv")
         mark = "," if any(map(_COMMAS.match, takewhile(_is_comment, lines))) else " "
-        refuse_foreign_numbers(table, lines, mark, where=str(path))
+        refuse_foreign_numbers(_columns_of_ecsv(lines), lines, mark, where=str(path))
         return table
+
+
+def _columns_of_ecsv(lines: list[str]) -> dict[str, bool]:
+    """True for each column of numbers of an ECSV file; a SkyCoord takes up two of them."""
+    header = [line[2:] for line in takewhile(_is_comment, lines)]
+    described = get_header_from_yaml(header[1:])["datatype"]  # the first line is the version
+    return {str(one["name"]): one["datatype"] not in ("string", "bool") for one in described}
 
 
 def _budget(path: Path, limits: Limits) -> Budget:
@@ -96,22 +105,22 @@ def _read_text(path: Path, limits: Limits) -> Table:
 
 
 def _read_separated(path: Path, limits: Limits, *, mark: str) -> Table:
-    """Table of a file that ends in .csv or .tsv, whose cells may be separated by another mark."""
+    """Table of a .csv or .tsv file; its separator may differ from the one its name suggests."""
     lines = read_lines(path, limits)
     rows = (line.rstrip("\r\n") for line in lines if line.strip() and not line.startswith("#"))
     names = next(rows, "")
-    found = mark_of([names, next(rows, names)])
-    if found is None and is_text_table(lines):
+    detected_mark = mark_of([names, next(rows, names)])
+    if detected_mark is None and is_text_table(lines):
         return _read_text(path, limits)
-    mark = found or mark
+    mark = detected_mark or mark
     lines = _whole_lines(without_empty_names(lines, mark), mark, path)
     cells = next(csv.reader([names], delimiter=mark), [])
     _budget(path, limits).refuse_columns(len(cells))
     refuse_numbers_as_names(cells, where=str(path))
-    # astropy takes a time for a comment that grows with the square of its length
-    lines = with_decimal_points([one for one in lines if one[:1] != "#"], mark, where=str(path))
+    # the time astropy needs for a comment grows with the square of its length
+    lines = with_decimal_points([line for line in lines if line[:1] != "#"], mark, where=str(path))
     table = Table.read(lines, format="ascii.csv", delimiter=mark, comment="#", guess=False)
-    refuse_foreign_numbers(table, lines, mark, where=str(path))
+    refuse_foreign_numbers(columns_of_numbers(table), lines, mark, where=str(path))
     return table
 
 
@@ -124,12 +133,12 @@ def _read_votable(path: Path, limits: Limits) -> Table:
     return table
 
 
-# cells that state that there is no number; whatever is no number either, astropy takes for such
+# cells for missing numbers; astropy would treat any other text that is not a number as missing, too
 _NO_NUMBER = {"", "null"}
 
 
 def _refuse_unreadable_cells(raw: bytes, path: Path) -> None:
-    """Refuse cells of a VOTable's columns of numbers that are neither numbers nor missing."""
+    """Refuse cells in numeric columns of a VOTable that are neither numbers nor missing."""
     fields, row, column = list[tuple[str, str]](), 0, 0
     with get_xml_iterator(io.BytesIO(raw)) as steps:
         for begins, tag, content, _ in steps:
@@ -175,23 +184,23 @@ def _read_fits(path: Path, limits: Limits) -> Table:
         if objects:
             return _ldac(hdus, objects)
         if tables:
-            # NaN stays NaN: to call it a missing value would name the wrong fault
+            # NaN stays NaN, so that errors are not reported as missing values
             return Table.read(tables[0], format="fits", mask_invalid=False)
     raise FormatError("holds no table extension", where=str(path), do="give a FITS table")
 
 
 def _ldac(hdus: fits.HDUList, objects: list[fits.BinTableHDU]) -> Table:
-    """Objects of a FITS_LDAC catalogue, with the date of the image; several are chips.
+    """Objects of a FITS_LDAC catalogue with the date of the image; several tables are chips.
 
-    Each table of objects follows the header of its image.  Chips with different dates have these in
-    a column.
+    Each table of objects follows the header of its image. If the dates of the chips differ, they
+    are stored in a column.
     """
     tables = [Table.read(hdu, format="fits", mask_invalid=False) for hdu in objects]
     images = [_image_header(hdu) for hdu in hdus if hdu.name == "LDAC_IMHEAD"]
     for number, table in enumerate(tables, 1):
         if len(tables) > 1 and "EXT_NUMBER" not in table.colnames:
             table["EXT_NUMBER"] = number
-        table.meta = {}  # settings of SExtractor
+        table.meta = {}  # drop the settings of SExtractor
     dates: dict[str, object] = {}
     for key in ("MJD-OBS", "DATE-OBS"):
         values = [image[key] for image in images if key in image]
@@ -207,10 +216,10 @@ def _ldac(hdus: fits.HDUList, objects: list[fits.BinTableHDU]) -> Table:
 
 
 def _image_header(hdu: fits.BinTableHDU) -> fits.Header:
-    """Header of the image that an LDAC_IMHEAD holds as text, in one string or one for each card.
+    """Image header stored as text in an LDAC_IMHEAD, either one string or one per card.
 
-    Strings of a FITS table lose their trailing blanks when they are read, so that they are filled
-    up to whole cards again.
+    Strings of a FITS table lose trailing blanks when they are read, so they are padded to complete
+    cards.
     """
     if hdu.data is None or not len(hdu.data):
         return fits.Header()
@@ -235,23 +244,25 @@ TABLE_SUFFIXES: dict[str, Callable[[Path, Limits], Table]] = {
 
 
 def is_binary(path: Path) -> bool:
-    """True where a file is no text; a file that cannot be read is left to its reader."""
+    """True if a file is not text; False if it cannot be read, which its reader will report."""
     head = head_of(path)
     return b"\0" in head or head.startswith(FITS_START)
 
 
 def is_fits(path: Path) -> bool:
-    """True where a file begins as FITS does."""
+    """True if a file starts like a FITS file."""
     return head_of(path).startswith(FITS_START)
 
 
 def read_table(path: Path, limits: Limits = LIMITS) -> Table:
-    """Table of a file, by its extension; one that is missing, damaged or unknown is refused.
+    """Read the table in a file; the format is determined by its extension.
 
-    Known are .ecsv, .csv, .tsv, .fits (first table extension, of FITS_LDAC the objects; also
-    .fits.gz), .parquet, .vot or .xml (VOTable), .tbl and .ipac; other names by content: FITS, and
-    text as `parse_text_table` knows it.  Each but .parquet may be compressed by gzip, bzip2 or xz,
-    with .gz, .bz2 or .xz at the end of its name or without.
+    Supported extensions are .ecsv, .csv, .tsv, .fits (first table extension, or the objects of
+    FITS_LDAC; also .fits.gz), .parquet, .vot or .xml (VOTable), .tbl and .ipac. Other files are
+    recognised by their content, if they are FITS or text tables as in `parse_text_table`. All but
+    .parquet may be compressed by gzip, bzip2 or xz, with or without .gz, .bz2 or .xz at the end of
+    the name. Raises InputError if the file does not exist or is of unknown type, FormatError if it
+    is damaged.
     """
     name = without_codec(path.name)
     reader = next((r for end, r in TABLE_SUFFIXES.items() if name.endswith(end)), None)

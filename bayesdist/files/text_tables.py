@@ -1,4 +1,4 @@
-"""Tables as text, recognised by how they begin."""
+"""Text tables, recognised by their first lines."""
 
 from __future__ import annotations
 
@@ -6,11 +6,10 @@ import csv
 import io
 import logging
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from itertools import takewhile
 
 from astropy.table import Table
-from astropy.table.meta import get_header_from_yaml
 
 from bayesdist.errors import FormatError
 from bayesdist.files.budget import Budget
@@ -22,7 +21,7 @@ _NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eEdD][+-]?\d+)?|nan|inf", re.IGNO
 _DECIMAL_COMMA = re.compile(r"[+-]?\d*,\d+([eEdD][+-]?\d+)?")
 _DECIMAL_POINT = re.compile(r"[+-]?(\d+\.\d*|\.\d+)([eEdD][+-]?\d+)?")
 _MAY_BE_THOUSANDS = re.compile(r"[+-]?[1-9]\d{0,2},\d{3}")
-# in cells that `_FOREIGN` matches, and in few others
+# matches cells that match `_FOREIGN`, and few others
 MAYBE_FOREIGN = re.compile(r"\d_\d|0[xX][0-9a-fA-F.]|[^\x00-\x7f]")
 MAYBE_FOREIGN_BYTES = re.compile(rb"\d_\d|[\x80-\xff]|&#")
 _FOREIGN = re.compile(
@@ -30,8 +29,8 @@ _FOREIGN = re.compile(
     r"|(?=.*(_|[^\x00-\x7f]))[\d_]*\.?[\d_]*\d([eE][+-]?[\d_]+)?\.?)"
 )
 _MARKS = (",", ";", "\t", None)  # None: blanks
-ROWS_ABOVE, FEWEST_ABOVE = 20, 3  # that the last cell is held against
-_DAOPHOT = "DAOPHOT"  # the program's own lists, not the tables of IRAF's version
+ROWS_ABOVE, FEWEST_ABOVE = 20, 3  # number of rows with which the last cell is compared
+_DAOPHOT = "DAOPHOT"  # lists of the original program, not tables of its IRAF version
 _DAOPHOT_COLUMNS = {
     9: ("id", "x", "y", "mag", "mag_err", "sky", "iterations", "chi", "sharp"),  # ALLSTAR
     7: ("id", "x", "y", "mag", "sharp", "round", "round_marginal"),  # FIND
@@ -40,12 +39,12 @@ _SEXTRACTOR = re.compile(r"#\s*1\s+[A-Z]\w*")
 
 
 def is_text_table(lines: Sequence[str]) -> bool:
-    """True where lines of text are a table with the names of its columns."""
+    """True if lines of text are a table with column names."""
     return _kind(lines) is not None
 
 
 def _kind(lines: Sequence[str]) -> str | None:
-    """Format, as astropy names it."""
+    """Name of the format in astropy; None if it is not a table."""
     first = next((line.strip() for line in lines if line.strip()), "")
     if first.startswith(("\\", "|")):
         return "ascii.ipac"
@@ -73,15 +72,15 @@ def _kind(lines: Sequence[str]) -> str | None:
 
 
 def _rows_of(lines: Sequence[str]) -> list[str]:
-    """Lines that are neither empty nor a comment, without the blanks around them."""
+    """Stripped lines, without empty lines and comments."""
     return [line.strip() for line in lines if line.strip() and not line.strip().startswith("#")]
 
 
 def mark_of(rows: Sequence[str]) -> str | None:
-    """Mark between the cells of rows, the first of which has the names; None for blanks.
+    """Separator between the cells of rows, with the names in the first row; None for blanks.
 
-    It divides the names and the first row of numbers into equally many cells; where no mark does,
-    it is the first that the names contain.
+    It divides the names and the first row of numbers into the same number of cells. If no separator
+    does, it is the first one that occurs in the names.
     """
     names = rows[0]
     present = [mark for mark in _MARKS if mark is None or mark in names]
@@ -93,9 +92,10 @@ def mark_of(rows: Sequence[str]) -> str | None:
 
 
 def refuse_numbers_as_names(cells: Sequence[str], *, where: str) -> None:
-    """Refuse a table without names, whose first row of numbers would be taken for them.
+    """Refuse a table without column names, which would use the first row of numbers as names.
 
-    Names may be numbers, as those of filters; half of them are not, and none has a fraction.
+    Some names may be numbers, such as those of filters, but fewer than half of them, and none has a
+    decimal point.
     """
     filled = [cell.strip() for cell in cells if cell.strip()]
     numbers = [cell for cell in filled if _NUMBER.fullmatch(cell) or _DECIMAL_COMMA.fullmatch(cell)]
@@ -109,10 +109,10 @@ def refuse_numbers_as_names(cells: Sequence[str], *, where: str) -> None:
 
 
 def with_decimal_points(lines: list[str], mark: str | None, *, where: str) -> list[str]:
-    """Lines of a table, without their ends, in which numbers with decimal commas have points.
+    """Replace decimal commas by points in lines of a table without line ends.
 
-    Cells are separated by `mark`, which is no comma.  Refused where some numbers have points, and
-    where the commas may divide thousands.
+    `mark`: separator of cells, not a comma. Raises FormatError if some numbers have points, or if
+    the commas may be thousands separators.
     """
     rows = _rows_of(lines)
     if mark == "," or not any("," in line for line in rows[1:]):
@@ -138,7 +138,7 @@ def _cells(line: str, mark: str | None) -> list[str]:
 
 
 def _pointed(line: str, mark: str | None) -> str:
-    """Line with points in place of decimal commas."""
+    """Line with decimal points instead of commas."""
     if line.lstrip().startswith("#"):
         return line
     cells = [
@@ -153,31 +153,28 @@ def _pointed(line: str, mark: str | None) -> str:
 
 
 def refuse_multiplied_header(lines: Sequence[str], budget: Budget) -> None:
-    """Refuse an ECSV file whose header of YAML has too many nodes; see `refuse_multiplied_yaml`."""
-    refuse_multiplied_yaml("\n".join(_header_lines(lines)), budget)
-
-
-def _header_lines(lines: Sequence[str]) -> list[str]:
-    """Lines of the YAML above an ECSV table."""
+    """Refuse an ECSV file with too many nodes in its header; see `refuse_multiplied_yaml`."""
     head = takewhile(lambda line: not line or line[0] == "#", map(str.strip, lines))
-    return [re.sub(r"^# ?", "", line) for line in head]
+    text = "\n".join(re.sub(r"^# ?", "", line) for line in head)
+    refuse_multiplied_yaml(text, budget)
 
 
 def parse_text_table(lines: Sequence[str], budget: Budget) -> Table:
-    """Table of lines of text, with their ends; a row of an IPAC table that is cut short is refused.
+    """Parse lines of text, with their line ends, as a table.
 
-    Known are an IPAC table, the ASCII_HEAD catalogue of SExtractor, a table of IRAF's daophot, a
-    list of DAOPHOT II or ALLSTAR, and columns under a line of names, with "#" before it or not,
-    separated by blanks, commas, semicolons or tabs.
+    Supported are IPAC tables, ASCII_HEAD catalogues of SExtractor, tables of IRAF's daophot, lists
+    of DAOPHOT II or ALLSTAR, and columns below a line of names, with or without a leading "#",
+    separated by blanks, commas, semicolons or tabs. Raises FormatError for other text, and for
+    tables with truncated rows.
     """
-    where = budget.where
+    file_name = budget.where
     ended = not lines or lines[-1].endswith(("\n", "\r"))
-    whole, lines = lines, [line.rstrip("\r\n") for line in lines]
+    original_lines, lines = lines, [line.rstrip("\r\n") for line in lines]
     kind = _kind(lines)
     if kind is None:
         raise FormatError(
             "has no line with the names of its columns",
-            where=where,
+            where=file_name,
             do="write one above the numbers",
         )
     if kind == "ascii.ecsv":
@@ -190,32 +187,32 @@ def parse_text_table(lines: Sequence[str], budget: Budget) -> Table:
     separated = kind in ("ascii.csv", "ascii.tab", "ascii.basic")
     mark = mark_of(rows) if separated else None
     if kind == _DAOPHOT:
-        return _daophot_list(lines, where)
+        return _daophot_list(lines, file_name)
     if kind == "ascii.ipac":
-        _refuse_short_rows(lines, where, ended=ended)
+        _refuse_short_rows(lines, file_name, ended=ended)
     else:
-        refuse_cut_end(whole, mark, where=where)
+        refuse_cut_end(original_lines, mark, where=file_name)
     if kind == "ascii.commented_header":
         heads = [k for k, line in enumerate(lines) if line.strip().startswith("#")]
-        # astropy takes a tab between two names for the mark between all of them
+        # astropy takes a tab between two names for the separator of all names
         lines = [line.replace("\t", " ") for k, line in enumerate(lines) if k not in heads[:-1]]
     elif separated:
         lines = without_empty_names(lines, mark)
-        lines = with_decimal_points(lines, mark, where=where)
+        lines = with_decimal_points(lines, mark, where=file_name)
         options["comment"] = "#"
         if mark is not None:
-            refuse_missing_cells(lines, mark, where=where)
+            refuse_missing_cells(lines, mark, where=file_name)
         if mark is None:
             lines = [line.replace("\t", " ") for line in lines]
         elif mark == ";":
             options["delimiter"] = mark
     table = Table.read(lines, format=kind, guess=False, **options)
-    refuse_foreign_numbers(table, lines, mark, where=where)
+    refuse_foreign_numbers(columns_of_numbers(table), lines, mark, where=file_name)
     return table
 
 
 def without_empty_names(lines: list[str], mark: str | None) -> list[str]:
-    """Lines of a table whose names are not followed by marks that the first row does not have."""
+    """Remove trailing separators after the names that the first row does not have."""
     rows = [k for k, line in enumerate(lines) if line.strip() and not line.lstrip().startswith("#")]
     if mark is None or len(rows) < 2:
         return lines
@@ -228,7 +225,7 @@ def without_empty_names(lines: list[str], mark: str | None) -> list[str]:
 
 
 def refuse_missing_cells(lines: Sequence[str], mark: str, *, where: str) -> None:
-    """Refuse rows with fewer cells than there are names: astropy fills them up in silence."""
+    """Refuse rows with fewer cells than names, which astropy fills up without a warning."""
     width, row = 0, 0
     for cells in csv.reader((line for line in lines if line[:1] != "#"), delimiter=mark):
         if not cells or cells == [""]:
@@ -243,10 +240,11 @@ def refuse_missing_cells(lines: Sequence[str], mark: str, *, where: str) -> None
 
 
 def refuse_cut_end(lines: Sequence[str], mark: str | None, *, where: str) -> None:
-    """Refuse a table whose last number has lost digits; warn of one that ends within a line.
+    """Refuse a table with a truncated last number; warn if the last line has no line end.
 
-    `lines` have their ends; `mark` separates cells, None where blanks do.  The last cell is held
-    against those above it: fewer decimals where all have as many, or less than half their length.
+    `lines` include line ends; `mark` separates cells, None for blanks. The last cell is compared
+    with those above it: it is truncated if it has fewer decimals although all others have the same
+    number, or less than half their length.
     """
     if not lines or lines[-1].endswith(("\n", "\r")):
         return
@@ -268,46 +266,39 @@ def refuse_cut_end(lines: Sequence[str], mark: str | None, *, where: str) -> Non
     log.warning("%s: its last line has no end, so that the file may be truncated", where)
 
 
-def refuse_foreign_numbers(
-    table: Table, lines: Sequence[str], mark: str | None, *, where: str
-) -> None:
-    """Refuse cells that Python or C takes for numbers, and no format of tables does.
+def columns_of_numbers(table: Table) -> dict[str, bool]:
+    """True for each column of a table that holds numbers."""
+    return {name: table[name].dtype.kind in "iuf" for name in table.colnames}
 
-    They are digits with underscores ("1_00"), hexadecimal numbers ("0x64"), and digits of other
-    scripts.  `lines` are those of the table, whose cells are separated by `mark`, or by blanks or
-    the bars of an IPAC table.  In columns of text such cells are names.
+
+def refuse_foreign_numbers(
+    columns: Mapping[str, bool], lines: Sequence[str], mark: str | None, *, where: str
+) -> None:
+    """Refuse cells that Python or C would read as numbers, but that no table format allows.
+
+    These are digits with underscores ("1_00"), hexadecimal numbers ("0x64"), and digits of other
+    scripts. `columns`: True for each column of numbers, in the order of the file. `lines`: lines of
+    the table, with cells separated by `mark`, or by blanks or the bars of an IPAC table. In text
+    columns such cells are allowed.
     """
-    numeric: dict[str, bool] | None = None  # by column
+    names = list(columns)
     for number, line in enumerate(lines, start=1):
         if not MAYBE_FOREIGN.search(line) or line[:1] in ("#", "\\", "|"):
             continue
-        if numeric is None:
-            numeric = _numeric_columns(table, lines)
         cells = [cell.strip() for cell in _cells(line, mark)]
-        names = list(numeric) if len(cells) == len(numeric) else [""] * len(cells)
-        for name, cell in zip(names, cells, strict=True):
-            if _FOREIGN.fullmatch(cell) and numeric.get(name, True):
-                column = f", column {name!r}" if name else ""
+        complete = len(cells) == len(names)
+        for k, cell in enumerate(cells):
+            if _FOREIGN.fullmatch(cell) and (not complete or columns[names[k]]):
+                name = f", column {names[k]!r}" if complete else ""
                 raise FormatError(
                     f"{cell[:40]!r} is no number",
-                    where=f"{where}, line {number}{column}",
+                    where=f"{where}, line {number}{name}",
                     do="write it in decimal digits, without marks between them",
                 )
 
 
-def _numeric_columns(table: Table, lines: Sequence[str]) -> dict[str, bool]:
-    """Names of the columns as in the file, with True for those of numbers.
-
-    Of several columns in an ECSV file astropy may make one, such as a SkyCoord or a Time.
-    """
-    if lines[0].startswith("# %ECSV"):
-        datatypes = get_header_from_yaml(_header_lines(lines))["datatype"]
-        return {column["name"]: column["datatype"] != "string" for column in datatypes}
-    return {name: table[name].dtype.kind in "iuf" for name in table.colnames}
-
-
 def _daophot_list(lines: Sequence[str], where: str) -> Table:
-    """List of DAOPHOT II or ALLSTAR, three lines above the stars; one row for each star."""
+    """Table from a list of DAOPHOT II or ALLSTAR: three header lines, and one row per star."""
     if len(lines) < 2 or lines[1].split()[:1] == ["2"]:
         raise FormatError(
             "is a list of aperture photometry, with several lines for each star",
@@ -328,7 +319,7 @@ def _daophot_list(lines: Sequence[str], where: str) -> Table:
 
 
 def _refuse_short_rows(lines: Sequence[str], where: str, *, ended: bool) -> None:
-    """Refuse rows that end before the last column begins: astropy drops or shortens them."""
+    """Refuse rows that end before the last column begins; astropy drops or shortens them."""
     header = next((line.rstrip() for line in lines if line.startswith("|")), "")
     last_column = header[:-1].rfind("|")
     row = 0
@@ -336,7 +327,7 @@ def _refuse_short_rows(lines: Sequence[str], where: str, *, ended: bool) -> None
         if line[:1] in ("\\", "|") or not line:
             continue
         row += 1
-        # without an end of line the last number may have lost its last digits
+        # without a line end the last number may have lost its last digits
         cut = number == len(lines) - 1 and not ended and len(line) < len(header) - 1
         if cut or len(line.rstrip()) <= last_column:
             raise FormatError(

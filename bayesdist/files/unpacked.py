@@ -1,4 +1,4 @@
-"""Content of files that gzip, bzip2 or xz have compressed, within the budget of the file."""
+"""Content of files compressed by gzip, bzip2 or xz, within the limits of the file."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from bayesdist.files.budget import LIMITS, Budget, Limits
 from bayesdist.files.regular import PIECE, PathLike, decoded, read_bytes
 from bayesdist.utils.memory import size_text
 
-# how content begins by which a codec is known, its name, and its reader of a stream
+# pattern at the start of the content, name of the codec, and its reader of a stream
 CODECS: tuple[tuple[re.Pattern[bytes], str, Callable[[io.BytesIO], Any]], ...] = (
     (re.compile(rb"\x1f\x8b"), "gzip", lambda stream: gzip.GzipFile(fileobj=stream)),
     (re.compile(rb"BZh[1-9](1AY&SY|\x17rE8P\x90)"), "bzip2", bz2.BZ2File),
@@ -30,7 +30,7 @@ _UNKNOWN = ((b"PK\3\4", "zip"), (b"\x1f\x9d", "compress"), (b"(\xb5/\xfd", "zstd
 
 
 def without_codec(name: str) -> str:
-    """Name of a file in lower case, without the end that says by what it is compressed."""
+    """File name in lower case, without the extension of a compressed file."""
     name = name.lower()
     for suffix in CODEC_SUFFIXES:
         name = name.removesuffix(suffix)
@@ -42,27 +42,27 @@ def _codec(raw: bytes) -> tuple[str, Callable[[io.BytesIO], Any]] | None:
 
 
 def read_unpacked(path: PathLike, limits: Limits = LIMITS) -> tuple[bytes, Budget]:
-    """Content of a file, decompressed, with what it may hold; errors as of `unpacked`."""
+    """Decompressed content of a file, with its limits; for errors see `unpacked`."""
     raw = read_bytes(path)
     budget = Budget(str(path), len(raw), limits)
     return unpacked(raw, budget), budget
 
 
 def unpacked(raw: bytes, budget: Budget) -> bytes:
-    """Content of a file, decompressed where gzip, bzip2 or xz have compressed it.
+    """Content of a file, decompressed if it was compressed by gzip, bzip2 or xz.
 
-    FormatError for a broken file, for one that holds more than its budget, and for one that is
-    compressed twice or in another way.
+    Raises FormatError if the file is broken, exceeds its limits, or is compressed twice or in
+    another way.
     """
-    known = _codec(raw)
-    if known is None:
-        for start, other in _UNKNOWN:
+    detected = _codec(raw)
+    if detected is None:
+        for start, other_codec in _UNKNOWN:
             if raw.startswith(start):
                 raise FormatError(
-                    f"is compressed by {other}", where=budget.where, do="decompress it first"
+                    f"is compressed by {other_codec}", where=budget.where, do="decompress it first"
                 )
         return raw
-    codec, reader = known
+    codec, reader = detected
     try:
         with reader(io.BytesIO(raw)) as stream:
             content = _read(stream, budget)
@@ -83,21 +83,22 @@ def unpacked(raw: bytes, budget: Budget) -> bytes:
 
 
 def _read(stream: Any, budget: Budget) -> bytes | None:
-    """Bytes of a stream; None where there are more than its budget."""
+    """Bytes of a stream; None if there are more than the limit."""
     clock = budget.clock()
-    parts, left = list[bytes](), budget.content + 1
-    while left and (part := stream.read(min(left, PIECE))):
+    parts, remaining = list[bytes](), budget.content + 1
+    while remaining and (part := stream.read(min(remaining, PIECE))):
         parts.append(part)
-        left -= len(part)
+        remaining -= len(part)
         clock()
-    return b"".join(parts) if left else None
+    return b"".join(parts) if remaining else None
 
 
 def read_lines(path: PathLike, limits: Limits = LIMITS) -> list[str]:
-    """Lines of a text file, with their ends and without a byte order mark, decompressed.
+    """Lines of a text file, decompressed, with line ends and without a byte order mark.
 
-    Errors as of `read_bytes` and `unpacked`; FormatError for text that is not in UTF-8 or has a
-    NUL, at which readers in C end a cell, and for lines, cells or a line beyond the budget.
+    Raises the errors of `read_bytes` and `unpacked`, and FormatError if the text is not UTF-8 or
+    contains NUL, at which readers in C end a cell, or if lines, cells or the length of a line
+    exceed the limits.
     """
     raw, budget = read_unpacked(path, limits)
     nul = raw.find(b"\0")
@@ -121,7 +122,7 @@ def read_lines(path: PathLike, limits: Limits = LIMITS) -> list[str]:
 
 
 def _cells(raw: bytes) -> int:
-    """Cells of a text table, whatever separates them."""
+    """Number of cells of a text table, for any of the possible separators."""
     marks = np.isin(np.frombuffer(raw, np.uint8), np.frombuffer(b" ,;\t\r\n", np.uint8))
     between_blanks = int(np.count_nonzero(marks[1:] > marks[:-1]))
     return max(between_blanks, *(raw.count(mark) for mark in (b",", b";", b"\t")))

@@ -1,4 +1,4 @@
-"""VOTables that fetch nothing, and hold no more than their file allows."""
+"""Check that a VOTable refers to no other files and holds no more than its size allows."""
 
 from __future__ import annotations
 
@@ -11,21 +11,21 @@ from xml.parsers import expat
 from bayesdist.errors import FormatError
 from bayesdist.files.budget import DAMAGED, Budget
 
-_PIECE = 2**16  # bytes that are parsed before the clock is read
-_CHUNK_ROWS = 256  # for which astropy makes room before it reads any
+_PIECE = 2**16  # bytes that are parsed between readings of the clock
+_CHUNK_ROWS = 256  # rows for which astropy allocates memory before it reads any
 _BYTES = {
     "boolean": 1, "unsignedByte": 1, "char": 1, "short": 2, "unicodeChar": 2, "int": 4,
     "float": 4, "long": 8, "double": 8, "floatComplex": 8, "doubleComplex": 16,
 }  # fmt: skip
-_WIDEN = {"char": 4, "unicodeChar": 2}  # of text in memory
+_WIDEN = {"char": 4, "unicodeChar": 2}  # size of text in memory relative to the file
 
 
 def refuse_unsafe_votable(raw: bytes, budget: Budget) -> None:
-    """Refuse a VOTable before astropy reads it.
+    """Refuse an unsafe VOTable before astropy reads it.
 
-    FormatError for a document type, for data that lie elsewhere (`href`), for sizes that exceed
-    the budget, and for what is no XML.  The encoding and entities are those that a parser of XML
-    sees, so that nothing can be hidden by them.
+    Raises FormatError for a document type, data in other files (`href`), sizes that exceed the
+    limits, and text that is not XML. Encoding and entities are interpreted by an XML parser, so
+    they cannot hide any of these.
     """
     scan = _Scan(budget)
     parser = expat.ParserCreate()
@@ -48,13 +48,13 @@ def refuse_unsafe_votable(raw: bytes, budget: Budget) -> None:
 
 
 def _local(name: str) -> str:
-    """Name without the prefix of its namespace."""
+    """Name without its namespace prefix."""
     return name.rpartition(":")[2]
 
 
 @dataclass
 class _Scan:
-    """Handlers of a parser, which count what has been read so far."""
+    """Handlers of an XML parser that count what has been read so far."""
 
     budget: Budget
     depth: int = 0
@@ -62,8 +62,9 @@ class _Scan:
     rows: int = 0
     cells: int = 0
     in_stream: bool = False
-    letters: int = 0  # of a stream of binary data
-    fields: list[tuple[int, int]] = field(default_factory=list)  # least bytes in a stream, memory
+    letters: int = 0  # in a stream of binary data
+    # for each field: least number of bytes in a stream, and bytes in memory
+    fields: list[tuple[int, int]] = field(default_factory=list)
 
     def doctype(self, *_: object) -> NoReturn:
         raise FormatError(
@@ -125,17 +126,17 @@ class _Scan:
         self.budget.refuse_rows(int(rows))
 
     def _sizes(self, attributes: dict[str, str]) -> tuple[int, int]:
-        """Bytes of a cell: at least in a stream, and in memory."""
+        """Size of a cell in bytes: at least in a stream, and in memory."""
         kind, sides = attributes.get("datatype", "char"), attributes.get("arraysize", "1")
         n = math.prod(int(side[:18]) for side in re.findall(r"[0-9]+", sides))
         unit = _BYTES.get(kind, 1)
         if "*" in sides:
-            return 4, 8  # a length, and a reference
+            return 4, 8  # a length, and a pointer
         return (-(-n // 8) if kind == "bit" else unit * n), unit * n * _WIDEN.get(kind, 1)
 
     def _refuse_stream(self) -> None:
-        """Refuse rows of binary data, in base64, that are too many, or have no bytes."""
-        width = sum(least for least, _ in self.fields)
+        """Refuse too many rows of base64 binary data, and rows without bytes."""
+        width = sum(width_in_stream for width_in_stream, _ in self.fields)
         if not width:
             raise FormatError("has rows of no bytes", where=self.budget.where, do=DAMAGED)
         rows = self.letters * 3 // 4 // width

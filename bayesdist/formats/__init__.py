@@ -1,7 +1,7 @@
-"""Calibration files and star lists of single formats: their classes, readers and writers.
+"""Classes, readers and writers of individual file formats for calibrations and star lists.
 
-`bayesdist.read_calibration` and `bayesdist.Calibration.write` serve all formats in the same way;
-the names in this module give access to everything that a file of one format holds::
+`bayesdist.read_calibration` and `bayesdist.Calibration.write` support all formats in the same way.
+The names in this module give access to everything that a file of one format contains::
 
     from bayesdist.formats import read_idctab
     table = read_idctab("acs_wfc_idc.fits")

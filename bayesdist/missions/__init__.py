@@ -1,1 +1,1 @@
-"""Missions: each uses the core from outside, as anybody's own instrument would."""
+"""Missions: plug-ins for single instruments, which use the core like an external package."""

@@ -1,4 +1,4 @@
-"""The distortion as mathematics: bases, frames, time dependence, look-up tables, and the model."""
+"""Distortion model: polynomial basis, exposure frames, time dependence, and look-up tables."""
 
 from bayesdist.model.basis import PolynomialBasis, polynomial_terms
 from bayesdist.model.distortion import DistortionModel

@@ -1,8 +1,8 @@
-"""Two-dimensional polynomials in products of Legendre polynomials over the detector.
+"""Two-dimensional polynomials as products of Legendre polynomials over the detector.
 
-Raw pixel monomials are hopelessly conditioned (3e16 at order 5); Legendre products over the
-detector are nearly orthogonal for stars spread evenly.  Coefficients are converted to monomials of
-pixel offsets, with their covariance, only where a product is written.
+Monomials of the pixel coordinates are ill-conditioned (condition number 3e16 at order 5), whereas
+Legendre products are nearly orthogonal for stars that cover the detector uniformly.  Coefficients
+are converted to monomials of pixel offsets, with their covariance, only when files are written.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from bayesdist.errors import InputError
 from bayesdist.utils.arrays import Float
 
 MAX_ORDER = 12
-# Points whose basis values are held at once: 91 terms (order 12) of them are 24 MB.
+# points that are evaluated together: their 91 terms (order 12) take 24 MB
 BLOCK = 32768
 
 
@@ -30,13 +30,13 @@ BLOCK = 32768
 def polynomial_terms(order: int) -> tuple[tuple[int, int], ...]:
     """Powers (i, j) of x and y up to a total order.
 
-    Sorted by total order, then by falling power of x: 1, x, y, x^2, xy, y^2, ... as Equations 1-2
-    of ACS ISR 2015-06 number them.
+    The terms are sorted by total order, then by descending power of x: 1, x, y, x^2, xy, y^2, ...,
+    as in Equations 1-2 of ACS ISR 2015-06.
 
     Parameters
     ----------
     order : int
-        Total order, 0 or more.
+        Total order, 0 or higher.
 
     Returns
     -------
@@ -47,14 +47,14 @@ def polynomial_terms(order: int) -> tuple[tuple[int, int], ...]:
 
 
 def polynomial_values(coefficients: Float, x: ArrayLike, y: ArrayLike) -> Float:
-    """Values of the sum of coefficients[i, j] x^i y^j, at points of any shape.
+    """Evaluate the sum of coefficients[i, j] x^i y^j at points of any shape.
 
-    By Horner's scheme in place, without what is zero: numpy's takes eight times as long for a
-    triangle of coefficients at many points.
+    This is Horner's scheme in place that skips coefficients of zero.  For a triangular coefficient
+    matrix and many points, `numpy.polynomial.polynomial.polyval2d` takes eight times as long.
     """
     x, y = np.broadcast_arrays(np.asarray(x, float), np.asarray(y, float))
     out = np.zeros(x.shape)
-    for row in coefficients[::-1].tolist():  # at few points numpy takes longer for a row than for y
+    for row in coefficients[::-1].tolist():  # lists are faster than arrays for single numbers
         out *= x
         while row and row[-1] == 0.0:
             row.pop()
@@ -72,19 +72,19 @@ def polynomial_values(coefficients: Float, x: ArrayLike, y: ArrayLike) -> Float:
 
 
 def point_blocks(n: int) -> Iterator[slice]:
-    """Slices of n points into blocks whose basis values can be held at once."""
+    """Slices that divide n points into blocks of at most `BLOCK`, to limit memory."""
     for start in range(0, n, BLOCK):
         yield slice(start, min(start + BLOCK, n))
 
 
 def as_pair(values: Sequence[float]) -> tuple[float, float]:
-    """Numbers of x and y from any sequence of two."""
+    """Convert a sequence of two numbers to a tuple of floats."""
     a, b = values
     return float(a), float(b)
 
 
 def _legendre_derivatives(order: int) -> Float:
-    """Matrix whose column i holds the Legendre coefficients of P_i'."""
+    """Square matrix with the Legendre coefficients of P_i' in column i."""
     out = np.zeros((order + 1, order + 1))
     for i in range(1, order + 1):
         out[:i, i] = legendre.legder(np.eye(order + 1)[i, : i + 1])
@@ -92,7 +92,7 @@ def _legendre_derivatives(order: int) -> Float:
 
 
 def _converted(order: int, convert: Callable[..., Any]) -> Float:
-    """Matrix whose row i holds the coefficients in another basis of the i-th function of one."""
+    """Square matrix with the i-th basis function, converted to another basis, in row i."""
     out = np.zeros((order + 1, order + 1))
     for i in range(order + 1):
         out[i, : i + 1] = convert(np.eye(order + 1)[i, : i + 1])
@@ -100,7 +100,7 @@ def _converted(order: int, convert: Callable[..., Any]) -> Float:
 
 
 def _substitute(order: int, scale: float, shift: float) -> Float:
-    """Matrix whose row i holds the power coefficients in z of (scale z + shift)^i."""
+    """Square matrix with the coefficients of z^k in (scale z + shift)^i in row i, column k."""
     out = np.zeros((order + 1, order + 1))
     for i in range(order + 1):
         for k in range(i + 1):
@@ -109,31 +109,31 @@ def _substitute(order: int, scale: float, shift: float) -> Float:
 
 
 def _product_matrix(terms: tuple[tuple[int, int], ...], mx: Float, my: Float) -> Float:
-    """Coefficient map (new, old) of a change of basis that acts on each axis by itself."""
+    """Matrix (new, old) that converts 2-D coefficients, from the matrices of the two axes."""
     i, j = np.array(terms).T
     return mx[np.ix_(i, i)].T * my[np.ix_(j, j)].T
 
 
 @dataclass(frozen=True)
 class PolynomialBasis:
-    """Legendre products P_i(X) P_j(Y) with i + j <= order over one chip.
+    """Products P_i(X) P_j(Y) of Legendre polynomials with i + j <= order over one chip.
 
-    X and Y run over [-1, 1] from edge to edge of the detector (pixels 0.5 to n + 0.5, FITS
-    1-based).
+    X and Y are detector coordinates scaled to [-1, 1] between the edges of the chip (pixels 0.5 to
+    n + 0.5, FITS 1-based).
 
     Parameters
     ----------
     order : int
         Total order, 1 to 12.
     size : tuple of float
-        Columns and rows of the detector, in pixels.
+        Numbers of columns and rows of the chip.
     reference_pixel : tuple of float
-        Zero point (xref, yref) of the monomial form, FITS 1-based pixels.
+        Origin (xref, yref) of the monomial form, in FITS 1-based pixels.
 
     Raises
     ------
     InputError
-        For an order outside 1..12 or a size that is not positive.
+        If the order is not from 1 to 12 or the size is not positive.
 
     Examples
     --------
@@ -166,12 +166,12 @@ class PolynomialBasis:
 
     @property
     def terms(self) -> tuple[tuple[int, int], ...]:
-        """Powers (i, j) in the order of the coefficients."""
+        """Degrees (i, j) of the basis functions, in the order of the coefficients."""
         return polynomial_terms(self.order)
 
     @property
     def n_terms(self) -> int:
-        """Number of terms of one axis."""
+        """Number of basis functions, that is, of coefficients per axis."""
         return (self.order + 1) * (self.order + 2) // 2
 
     @property
@@ -182,11 +182,11 @@ class PolynomialBasis:
 
     @property
     def half_size(self) -> tuple[float, float]:
-        """Half the detector's extent on x and y: the length of X = 1, in pixels."""
+        """Half the size of the chip along x and y in pixels, the scale of X and Y."""
         return self.size[0] / 2, self.size[1] / 2
 
     def scaled(self, x: ArrayLike, y: ArrayLike) -> tuple[Float, Float]:
-        """Pixels to [-1, 1].
+        """Scale pixel coordinates to [-1, 1].
 
         Parameters
         ----------
@@ -196,7 +196,8 @@ class PolynomialBasis:
         Returns
         -------
         X, Y : ndarray
-            Same shapes; -1 and 1 at the outer edges of the first and last pixel.
+            Scaled coordinates of the same shapes; -1 and 1 are the outer edges of the first and
+            last pixel.
         """
         nx, ny = self.size
         return (
@@ -205,7 +206,7 @@ class PolynomialBasis:
         )
 
     def evaluate(self, x: ArrayLike, y: ArrayLike) -> Float:
-        """Values of all basis functions.
+        """Values of all basis functions at pixel positions.
 
         Parameters
         ----------
@@ -219,11 +220,12 @@ class PolynomialBasis:
         return self.evaluate_scaled(*self.scaled(x, y))
 
     def evaluate_scaled(self, X: ArrayLike, Y: ArrayLike) -> Float:
-        """Values of all basis functions at positions that `scaled` has brought to [-1, 1].
+        """Values of all basis functions at scaled coordinates.
 
         Parameters
         ----------
         X, Y : array_like, shape (...)
+            Coordinates from `scaled`.
 
         Returns
         -------
@@ -236,21 +238,21 @@ class PolynomialBasis:
 
     @cached_property
     def derivatives(self) -> tuple[Float, Float]:
-        """Matrices (n_terms, n_terms) from a polynomial's coefficients to its derivatives'.
+        """Matrices (n_terms, n_terms) for the derivatives with respect to x and to y.
 
-        By x and by y, per pixel: the derivative of a polynomial is one of lower order in the same
-        basis.
+        Multiplied by the coefficients of a polynomial, they give the coefficients of its derivative
+        in the same basis, per pixel.
         """
-        of_one = _legendre_derivatives(self.order)
+        derivative_matrix = _legendre_derivatives(self.order)
         i, j = np.array(self.terms).T
         half_x, half_y = self.half_size
         return (
-            of_one[np.ix_(i, i)] * (j[:, None] == j) / half_x,
-            of_one[np.ix_(j, j)] * (i[:, None] == i) / half_y,
+            derivative_matrix[np.ix_(i, i)] * (j[:, None] == j) / half_x,
+            derivative_matrix[np.ix_(j, j)] * (i[:, None] == i) / half_y,
         )
 
     def gradient(self, x: ArrayLike, y: ArrayLike) -> tuple[Float, Float]:
-        """Derivatives of all basis functions by the pixel.
+        """Derivatives of all basis functions with respect to the pixel coordinates.
 
         Parameters
         ----------
@@ -273,7 +275,10 @@ class PolynomialBasis:
 
     @cached_property
     def monomial_matrix(self) -> Float:
-        """Matrix (n_terms, n_terms) from Legendre to monomial coefficients of pixel offsets."""
+        """Matrix (n_terms, n_terms) that converts Legendre to monomial coefficients.
+
+        The monomials are (x - xref)^i (y - yref)^j.
+        """
         to_powers = _converted(self.order, legendre.leg2poly)
         axes = [
             # X = (x' - c) / s with the centre c measured from the reference pixel
@@ -292,7 +297,7 @@ class PolynomialBasis:
         return _product_matrix(self.terms, *axes)
 
     def to_scaled_powers(self, coef: ArrayLike) -> Float:
-        """Coefficients of X^i Y^j: the form that Horner's rule wants.
+        """Convert Legendre coefficients to coefficients of X^i Y^j, as for Horner's scheme.
 
         Parameters
         ----------
@@ -312,19 +317,21 @@ class PolynomialBasis:
     def to_monomials(
         self, coef: ArrayLike, cov: ArrayLike | None = None
     ) -> Float | tuple[Float, Float]:
-        """Coefficients of (x - xref)^i (y - yref)^j, with their covariance.
+        """Convert Legendre coefficients to coefficients of (x - xref)^i (y - yref)^j.
 
         Parameters
         ----------
         coef : array_like, shape (..., n_terms)
-            Legendre coefficients of one axis, in the unit of u, v.
+            Legendre coefficients of one axis, in the unit of u and v.
         cov : array_like, shape (n_terms, n_terms), optional
-            Their covariance.
+            Covariance of the Legendre coefficients.
 
         Returns
         -------
-        ndarray, same shape as `coef`; with `cov`, a pair with the covariance of the result
-            In the unit of u, v per pixel^(i + j).
+        monomials : ndarray, same shape as `coef`
+            In the unit of u and v per pixel^(i + j).
+        covariance : ndarray, shape (n_terms, n_terms)
+            Covariance of the result; only returned if `cov` is given.
         """
         m = self.monomial_matrix
         out = np.asarray(coef, float) @ m.T
@@ -333,16 +340,16 @@ class PolynomialBasis:
         return out, m @ np.asarray(cov, float) @ m.T
 
     def from_monomials(self, coef: ArrayLike) -> Float:
-        """Legendre coefficients from those of (x - xref)^i (y - yref)^j.
+        """Convert coefficients of (x - xref)^i (y - yref)^j to Legendre coefficients.
 
         Parameters
         ----------
         coef : array_like, shape (..., n_terms)
-            In the unit of u, v per pixel^(i + j).
+            Monomial coefficients, in the unit of u and v per pixel^(i + j).
 
         Returns
         -------
         ndarray, same shape
-            In the unit of u, v.
+            Legendre coefficients, in the unit of u and v.
         """
         return np.asarray(coef, float) @ self._inverse_monomial_matrix.T

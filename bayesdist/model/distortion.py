@@ -1,14 +1,17 @@
-"""Distortion model: structure without values, and its predictions.
+"""Distortion model: parameters, predicted positions, and their derivatives.
 
-For a star on chip c in exposure e at epoch t, at FITS pixel (x, y):
+The position (u, v) of a star on chip c in exposure e at epoch t, measured at FITS pixel (x, y), is
 
     w = sum_k C_ck(t) phi_k(x, y)          (u, v) = T_e(w) = o + d_e + M_e (w - o)
 
-With `chip_deviations` every chip but the first, whose reference pixel lies at c, deviates itself:
+where phi_k are the Legendre products of `PolynomialBasis` and T_e is the frame of the exposure.
+With `chip_deviations` every chip except the first has an additional linear transformation about
+the position c of its reference pixel:
 
     w' = w + d_ec + L_ec (w - c)     (u, v) = o + d_e + M_e (w' - o) - (M_e - R_e) (c - o)
 
-T_e of a polynomial is a polynomial, so every (chip, exposure, epoch) has *effective coefficients*.
+T_e of a polynomial is again a polynomial.  The coefficients of this polynomial for one chip,
+exposure and epoch are called *effective coefficients*.
 """
 
 from __future__ import annotations
@@ -26,27 +29,29 @@ from bayesdist.model.effective import EffectiveCoefficients
 from bayesdist.model.grouping import Groups, group_by
 from bayesdist.utils.arrays import Float, Int
 
-NO_EXPOSURE = -1  # code of the polynomial itself where it is no exposure's
+NO_EXPOSURE = -1  # exposure code that stands for the polynomial without any exposure frame
 
 
 @dataclass(frozen=True)
 class DistortionModel(EffectiveCoefficients):
-    """Structure of a distortion solution, without its values.
+    """Parametric form of a distortion solution, without parameter values.
 
-    theta holds first the *global* parameters (Legendre coefficients of each chip and axis, then
-    the time-dependent terms of each chip), then one *local* block for each exposure but the first.
+    The parameter vector theta starts with the *global* parameters: the Legendre coefficients of
+    each chip and axis, followed by the time-dependent terms of each chip.  They are followed by one
+    *local* block per exposure, except for the first exposure.
 
-    Polynomials and frames are determined only together: what all frames have in common is a change
-    of the polynomials.  The *gauge* separates the two.
+    A transformation that is common to all frames is degenerate with the polynomials.  The *gauge*
+    removes this degeneracy:
 
-    - "first": the frame of the first exposure is the identity.  The polynomials are those of that
-      exposure, with its shift, roll angle, scale and shear.
-    - "held": the first exposure's shift and rotation are held at given values, exactly: they are no
-      parameters.  Its scale and shear are parameters like those of all others, and stand at the end
-      of the global ones.  Then scale and shear are *deviations* from polynomials that belong to no
-      exposure, and need a prior by which they scatter about zero; without it they are
-      degenerate with the linear terms, and `fit_linear` says so.  Held at the first exposure's roll
-      and zero point, the polynomials lie along the detector's axes, and so do the shears.
+    - "first": the frame of the first exposure is the identity.  The polynomials include the shift,
+      roll angle, scale and shear of that exposure.
+    - "held": the shift and rotation of the first exposure are fixed at the values in `held` and are
+      not parameters.  Its scale and shear are parameters, as for all other exposures, at the end of
+      the global parameters.  Scale and shear are then *deviations* from polynomials that do not
+      belong to any single exposure.  They require a prior with zero mean; without it they are
+      degenerate with the linear terms, and `fit_linear` reports this.  If the first exposure is
+      held at its roll angle and zero point, the polynomials and shears are aligned with the
+      detector axes.
 
     Parameters
     ----------
@@ -56,35 +61,38 @@ class DistortionModel(EffectiveCoefficients):
     unit : str
         Unit of u and v.
     time : TimeDependence, optional
-        Its terms are monomials of (x - xref) / (nx / 2), (y - yref) / (ny / 2): a rate is the drift
-        in the unit of u, v per year at half the detector's size from the reference pixel.
+        Linear drift of some terms.  These terms are monomials of (x - xref) / (nx / 2) and
+        (y - yref) / (ny / 2), so that a rate is the drift, in the unit of u and v per year, at half
+        the chip's size from the reference pixel.
     frames : str
         Transformation of each exposure, one of `FRAME_KINDS`.
     exposures : tuple of str
-        Names; the first one defines the gauge.
+        Names of the exposures; the first one defines the gauge.
     origin : tuple of float
         Point (u, v) about which frames rotate and scale.
     gauge : str
         'first' or 'held'.
     held : tuple of float
-        With 'held': shift_u, shift_v (unit of u, v) and rotation (radians) of the first exposure.
+        Shift_u, shift_v (unit of u and v) and rotation (radians) of the first exposure, for the
+        gauge 'held'.
     chip_deviations : bool
-        True where every chip but the first one has linear deviations of its own in each exposure.
-        Needs gauge 'held': they have to scatter about zero as the others do.  Scale and shear of a
-        frame then act on each chip about its own reference pixel, so that the distance between the
-        chips, a lever of thousands of pixels, does not pass for a measurement of their scale.
+        True if every chip except the first has an additional linear deviation in each exposure.
+        It requires the gauge 'held', since these deviations also need a prior with zero mean.
+        Scale and shear of a frame then act on each chip about the reference pixel of that chip.
+        Otherwise the distance between the chips, thousands of pixels, would be taken for a precise
+        measurement of their scale.
 
     Raises
     ------
     InputError
-        For an unknown kind of frame, no chip, a time-dependent term above the order, or a gauge
-        that does not go with the frames.
+        If the kind of frame is unknown, no chip is given, a time-dependent term exceeds the order,
+        or the gauge is incompatible with the frames.
 
     Examples
     --------
     >>> chip = bd.Chip(1, "W2", (1016, 1016), (508.5, 508.5))
     >>> model = bd.DistortionModel(3, (chip,))
-    >>> model.n_params  # ten coefficients along each axis
+    >>> model.n_params  # ten coefficients per axis
     20
     >>> model.predict(np.zeros(20), [1.0, 508.5], [1.0, 508.5])
     array([[0., 0.],
@@ -99,19 +107,19 @@ class DistortionModel(EffectiveCoefficients):
         exposure: ArrayLike | None = None,
         chip: ArrayLike | None = None,
     ) -> Groups:
-        """Groups of stars with equal effective coefficients.
+        """Group stars that have the same effective coefficients.
 
         Parameters
         ----------
         n : int
             Number of stars.
         epoch : array_like, optional
-            Decimal years, one or N; needed by a model with time dependence.
+            Decimal years, scalar or shape (n,); required by a model with time dependence.
         exposure : array_like, optional
-            Codes into `exposures` or names, one or N; None is the polynomial itself, without a
-            frame.
+            Indices into `exposures`, or names, scalar or shape (n,).  By default the polynomial
+            without an exposure frame is used.
         chip : array_like, optional
-            Chip numbers, one or N; None is the first chip.
+            Chip numbers, scalar or shape (n,); the first chip by default.
 
         Returns
         -------
@@ -120,7 +128,7 @@ class DistortionModel(EffectiveCoefficients):
         Raises
         ------
         InputError
-            For an unknown chip or exposure, or a missing epoch.
+            If a chip or exposure is unknown or the epoch is missing.
         """
         codes = np.zeros(n, np.int64)
         if chip is not None:
@@ -133,7 +141,9 @@ class DistortionModel(EffectiveCoefficients):
         time = np.zeros(n)
         if self.time is not None:
             if epoch is None:
-                raise InputError("the model depends on time and no epoch is given", do="give one")
+                raise InputError(
+                    "the model depends on time, but no epoch is given", do="give an epoch"
+                )
             time = np.broadcast_to(np.asarray(epoch, float), (n,))
         return group_by(codes, np.asarray(frame, np.int64), time)
 
@@ -141,17 +151,17 @@ class DistortionModel(EffectiveCoefficients):
         if np.issubdtype(exposure.dtype, np.integer):
             codes = exposure.astype(np.int64)
             if codes.size and not (codes.min() >= 0 and codes.max() < len(self.exposures)):
-                raise InputError(f"exposure codes must lie in 0..{len(self.exposures) - 1}")
+                raise InputError(f"exposure codes must be from 0 to {len(self.exposures) - 1}")
             return codes
-        known = {name: code for code, name in enumerate(self.exposures)}
+        code_of = {name: code for code, name in enumerate(self.exposures)}
         flat = [str(name) for name in np.atleast_1d(exposure).ravel()]
-        unknown = [name for name in flat if name not in known]
+        unknown = [name for name in flat if name not in code_of]
         if unknown:
             raise InputError(f"there is no exposure {unknown[0]!r}")
-        return np.array([known[name] for name in flat], np.int64).reshape(np.shape(exposure))
+        return np.array([code_of[name] for name in flat], np.int64).reshape(np.shape(exposure))
 
     def drift_terms(self, chip: int | None = None) -> Float:
-        """Legendre coefficients (n terms, K) of the monomials of a chip (by number) that drift."""
+        """Legendre coefficients (n drifting terms, K) of a chip's drifting monomials."""
         return self.drift_columns[0][0 if chip is None else self.chip_code(chip)]
 
     def predict(
@@ -164,16 +174,16 @@ class DistortionModel(EffectiveCoefficients):
         exposure: ArrayLike | None = None,
         chip: ArrayLike | None = None,
     ) -> Float:
-        """Positions (u, v) of detector pixels.
+        """Predicted positions (u, v) of detector pixels.
 
         Parameters
         ----------
         theta : array_like, shape (..., n_params)
-            One or many parameter vectors.
+            One or more parameter vectors.
         x, y : array_like, shape (N,)
             FITS 1-based pixels.
         epoch, exposure, chip : array_like, optional
-            As in `groups`; each one value or N of them.
+            See `groups`; each is a scalar or has shape (N,).
 
         Returns
         -------
@@ -183,7 +193,7 @@ class DistortionModel(EffectiveCoefficients):
         Raises
         ------
         InputError
-            When theta has another length, or as `groups`.
+            If theta has a wrong length, or an argument is invalid (see `groups`).
         """
         theta = self._checked(theta)
         x, y = np.broadcast_arrays(np.atleast_1d(x), np.atleast_1d(y))
@@ -205,13 +215,13 @@ class DistortionModel(EffectiveCoefficients):
         exposure: ArrayLike | None = None,
         chip: ArrayLike | None = None,
     ) -> Float:
-        """Derivatives of the positions by every parameter.
+        """Derivatives of the positions with respect to every parameter.
 
         Parameters
         ----------
         theta : array_like, shape (n_params,)
         x, y, epoch, exposure, chip
-            As in `predict`.
+            See `predict`.
 
         Returns
         -------
@@ -237,18 +247,18 @@ class DistortionModel(EffectiveCoefficients):
         exposure: ArrayLike | None = None,
         chip: ArrayLike | None = None,
     ) -> Float:
-        """Derivatives of the positions by the pixel.
+        """Derivatives of the positions with respect to the pixel coordinates.
 
         Parameters
         ----------
         theta : array_like, shape (n_params,)
         x, y, epoch, exposure, chip
-            As in `predict`.
+            See `predict`.
 
         Returns
         -------
         ndarray, shape (N, 2, 2)
-            [[du/dx, du/dy], [dv/dx, dv/dy]], in the unit of u, v per pixel.
+            [[du/dx, du/dy], [dv/dx, dv/dy]], in the unit of u and v per pixel.
         """
         px, py = np.broadcast_arrays(np.atleast_1d(x), np.atleast_1d(y))
         groups = self.groups(px.size, epoch=epoch, exposure=exposure, chip=chip)
@@ -257,20 +267,21 @@ class DistortionModel(EffectiveCoefficients):
     def linearised(
         self, theta: ArrayLike, groups: Groups, x: Float, y: Float
     ) -> tuple[Float, Float]:
-        """Positions of pixels, and their derivatives by the pixel.
+        """Predicted positions and their derivatives with respect to the pixel coordinates.
 
         Parameters
         ----------
         theta : array_like, shape (n_params,)
         groups : Groups
-            Of the pixels.
+            Groups of the N pixels, from `groups`.
         x, y : ndarray, shape (N,)
+            FITS 1-based pixels.
 
         Returns
         -------
         position : ndarray, shape (N, 2)
         slope : ndarray, shape (N, 2, 2)
-            As of `slopes`.
+            See `slopes`.
         """
         effective = self.effective(self._checked(theta), groups)
         position, slope = np.empty((x.size, 2)), np.empty((x.size, 2, 2))
@@ -283,7 +294,7 @@ class DistortionModel(EffectiveCoefficients):
         return position, slope
 
     def pixel_size(self, theta: ArrayLike, chip: int | None = None) -> float:
-        """Size of a pixel at a chip's reference pixel, in the unit of u, v.
+        """Pixel scale at the reference pixel of a chip, in the unit of u and v per pixel.
 
         Parameters
         ----------
@@ -294,23 +305,23 @@ class DistortionModel(EffectiveCoefficients):
         Returns
         -------
         float
-            1 where u and v are pixels, else the square root of the pixel's area, without drift and
-            frames.
+            1 if the unit of u and v is the pixel; otherwise the square root of the pixel area,
+            without drift and frames.
         """
         return 1.0 if self.unit == "pix" else self.linear_scale(theta, chip)
 
     def linear_scale(self, theta: ArrayLike, chip: int | None = None) -> float:
-        """Size of a pixel in the unit that u and v are counted in, even if that is called pixels.
+        """Pixel scale at the reference pixel, not assumed to be 1 even if u and v are in pixels.
 
         Parameters
         ----------
         theta, chip
-            As of `pixel_size`.
+            See `pixel_size`.
 
         Returns
         -------
         float
-            Square root of the pixel's area at the reference pixel, without drift and frames.
+            Square root of the pixel area in the unit of u and v, without drift and frames.
         """
         theta, basis = np.asarray(theta, float), self.basis(chip)
         linear = [
@@ -322,29 +333,29 @@ class DistortionModel(EffectiveCoefficients):
         theta = np.asarray(theta, float)
         if theta.shape[-1:] != (self.n_params,):
             raise InputError(
-                f"theta has {theta.shape[-1] if theta.ndim else 0} values and the model has "
+                f"theta has {theta.shape[-1] if theta.ndim else 0} values, but the model has "
                 f"{self.n_params} parameters"
             )
         return theta
 
     def to_dict(self) -> dict[str, Any]:
-        """Structure as JSON-able data, for files."""
-        values = {one.name: getattr(self, one.name) for one in fields(self) if one.init}
+        """Model as data that can be written as JSON; see `from_dict`."""
+        values = {item.name: getattr(self, item.name) for item in fields(self) if item.init}
         return _plain(values)
 
     @classmethod
     def from_dict(cls, data: Mapping[str, Any]) -> DistortionModel:
-        """Model that `to_dict` described.
+        """Model from the data that `to_dict` returned.
 
         Raises
         ------
         InputError
-            For a description that lacks a value, or has one too many or of another type: an
-            earlier version may have meant something else by it.
+            If a value is missing, unknown or of the wrong type.  Such data are not converted, since
+            they may come from a version in which they had another meaning.
         """
-        from pydantic import TypeAdapter, ValidationError  # 0.1 s that others need not wait for
+        from pydantic import TypeAdapter, ValidationError  # takes 0.1 s to import
 
-        names = {one.name for one in fields(cls) if one.init}
+        names = {item.name for item in fields(cls) if item.init}
         faults = [f"{name!r} is missing" for name in sorted(names - set(data))]
         faults += [f"{name!r} is not known" for name in sorted(set(data) - names)]
         if not faults:
@@ -354,18 +365,18 @@ class DistortionModel(EffectiveCoefficients):
                 first = error.errors()[0]
                 faults = [f"{'.'.join(map(str, first['loc']))!r}: {first['msg']}"]
         raise InputError(
-            f"another version wrote this description, or it is damaged: {faults[0]}",
+            f"this model was written by another version or is damaged: {faults[0]}",
             where="model",
             do="fit again",
         )
 
 
 def _plain(value: Any) -> Any:
-    """A value as JSON has it: mappings, lists, numbers and texts."""
+    """Convert a value to the types of JSON: mappings, lists, numbers and strings."""
     if is_dataclass(value) and not isinstance(value, type):
         value = asdict(value)
     if isinstance(value, Mapping):
-        return {str(key): _plain(one) for key, one in value.items()}
+        return {str(key): _plain(element) for key, element in value.items()}
     if isinstance(value, tuple | list):
-        return [_plain(one) for one in value]
+        return [_plain(element) for element in value]
     return value.item() if isinstance(value, np.generic) else value

@@ -1,7 +1,7 @@
-"""Effective coefficients: a chip of an exposure at an epoch as one polynomial of the pixels.
+"""Effective coefficients: the polynomial of the pixels for one chip, exposure and epoch.
 
-Fits, samplers and predictions use a model through the map from theta to effective coefficients, and
-its derivative, alone.
+Fits, samplers and predictions use a model only through the map from theta to the effective
+coefficients and the derivatives of this map.
 """
 
 from __future__ import annotations
@@ -32,9 +32,19 @@ class EffectiveCoefficients(ParameterLayout):
     """Effective coefficients of groups of stars, and their derivatives."""
 
     def polynomials(self, theta: ArrayLike, chip: Int, epoch: Float) -> Float:
-        """Legendre coefficients of w, before the exposure frame.
+        """Legendre coefficients of w, the position before the exposure frame is applied.
 
-        `theta`: (..., n_params). `chip` (G,): chip codes. `epoch`: (G,). Result: (..., G, 2, K).
+        Parameters
+        ----------
+        theta : array_like, shape (..., n_params)
+        chip : ndarray of int, shape (G,)
+            Chip codes.
+        epoch : ndarray, shape (G,)
+            Decimal years.
+
+        Returns
+        -------
+        ndarray, shape (..., G, 2, K)
         """
         theta = np.asarray(theta, float)
         K = self.n_terms
@@ -42,14 +52,14 @@ class EffectiveCoefficients(ParameterLayout):
         out = poly[..., chip, :, :]
         if self.time is not None:
             for c in np.unique(chip):
-                own = chip == c
-                d = self._drift(self.time, int(c), epoch[own])
-                by_time = theta[..., self.drift_slice(int(c))]
-                out[..., own, :, :] += np.einsum("gakm,...m->...gak", d, by_time)
+                on_chip = chip == c
+                d = self._drift(self.time, int(c), epoch[on_chip])
+                drift_values = theta[..., self.drift_slice(int(c))]
+                out[..., on_chip, :, :] += np.einsum("gakm,...m->...gak", d, drift_values)
         return out
 
     def _drift(self, time: TimeDependence, chip: int, epoch: Float) -> Float:
-        """Derivatives (G, 2, K, n_tdd) of a chip's polynomial by its tdd parameters at epochs."""
+        """Derivatives (G, 2, K, n_tdd) of a chip's coefficients with respect to its drift."""
         columns, axes = self.drift_columns
         weights = time.weights(epoch)
         out = np.zeros((len(weights), 2, self.n_terms, len(axes), time.n_values))
@@ -58,13 +68,14 @@ class EffectiveCoefficients(ParameterLayout):
         return out.reshape(len(weights), 2, self.n_terms, self.n_tdd)
 
     def frame(self, theta: ArrayLike, exposure: int) -> tuple[Float, Float]:
-        """Linear part (..., 2, 2) and shift (..., 2) of T_e for an exposure code."""
+        """Linear part (..., 2, 2) and shift (..., 2) of the frame T_e of an exposure code."""
         return frame_matrix(*self._frame_parameters(np.asarray(theta, float), exposure))
 
     def _frame_parameters(self, theta: Float, exposure: int | Int) -> tuple[str, Float]:
-        """Kind of a frame, and all its parameters (..., q), held ones included.
+        """Kind of a frame and all its parameters (..., q), including those that are held fixed.
 
-        Of one exposure, or of several (n,) that are all later than the first: then (..., n, q).
+        `exposure` is one code, or the codes (n,) of several exposures that do not include the first
+        one; in this case the parameters have shape (..., n, q).
         """
         first = int(np.ravel(exposure)[0])
         if not self.has_frame(first):
@@ -82,28 +93,37 @@ class EffectiveCoefficients(ParameterLayout):
         return self.frames, out
 
     def _about_chip(self, w: Float, chip_code: int) -> Float:
-        """w (..., K) of a chip, less its value at the reference pixel."""
+        """Coefficients (..., K) of w minus its value at the reference pixel of the chip."""
         out = w.copy()
         out[..., 0] -= w @ self.bases[chip_code].monomial_matrix[0]
         return out
 
     def effective(self, theta: ArrayLike, groups: Groups) -> Float:
-        """Effective Legendre coefficients of each group: the whole model as polynomials.
+        """Effective Legendre coefficients of each group.
 
-        `theta`: (..., n_params). Result: (..., G, 2, K).
+        Parameters
+        ----------
+        theta : array_like, shape (..., n_params)
+        groups : Groups
+
+        Returns
+        -------
+        ndarray, shape (..., G, 2, K)
         """
         theta = np.asarray(theta, float)
         out = self.polynomials(theta, groups.chip, groups.epoch)
         o = np.asarray(self.origin)
         for rows in self._alike(groups):
             chip, exposure = int(groups.chip[rows[0]]), groups.exposure[rows]
-            own = self.own_slice(chip, int(exposure[0]))
+            deviation = self.own_slice(chip, int(exposure[0]))
             if not self.has_frame(int(exposure[0])):
                 continue
             w = out[..., rows, :, :]
-            centre = w @ self.bases[chip].monomial_matrix[0]  # of the chip, before its deviations
-            if own.stop:
-                L, d = chip_matrix(theta[..., self.frame_columns(exposure)][..., own])
+            centre = (
+                w @ self.bases[chip].monomial_matrix[0]
+            )  # reference pixel without chip deviation
+            if deviation.stop:
+                L, d = chip_matrix(theta[..., self.frame_columns(exposure)][..., deviation])
                 w += np.einsum("...ab,...bk->...ak", L, self._about_chip(w, chip))
                 w[..., 0] += d
             frame = self._frame_parameters(theta, exposure)
@@ -118,29 +138,47 @@ class EffectiveCoefficients(ParameterLayout):
         return out
 
     def _alike(self, groups: Groups) -> list[Int]:
-        """Indices of groups of one chip: of the first exposure, and of all later ones."""
+        """Indices of the groups of each chip, separately for the first and for later exposures."""
         kind = 3 * groups.chip + np.sign(groups.exposure)
-        return [np.flatnonzero(kind == one) for one in np.unique(kind)]
+        return [np.flatnonzero(kind == value) for value in np.unique(kind)]
 
     def effective_jacobian(self, theta: ArrayLike, groups: Groups) -> list[tuple[Int, Float]]:
-        """Derivatives of the effective coefficients.
+        """Derivatives of the effective coefficients with respect to the parameters, per group.
 
-        `theta` (n_params,): the point at which the frames are linearised. Result: `columns` (m,)
-        are the entries of theta that the group depends on (global ones first), `derivative` (2, K,
-        m).
+        Parameters
+        ----------
+        theta : array_like, shape (n_params,)
+            Point at which the frames are linearised.
+        groups : Groups
+
+        Returns
+        -------
+        list of (ndarray of int, shape (m,); ndarray, shape (2, K, m))
+            For each group the entries of theta on which it depends, global parameters first, and
+            the derivatives with respect to them.
         """
         out = [(np.zeros(0, np.int64), np.zeros(0))] * len(groups)
         for rows, columns, derivative in self.jacobian_blocks(theta, groups):
-            for g, *one in zip(rows, columns, derivative, strict=True):
-                out[g] = tuple(one)
+            for g, *group_derivative in zip(rows, columns, derivative, strict=True):
+                out[g] = tuple(group_derivative)
         return out
 
     def jacobian_blocks(self, theta: ArrayLike, groups: Groups) -> Iterator[tuple[Int, Int, Float]]:
-        """Derivatives of the effective coefficients, many groups at a time.
+        """Derivatives of the effective coefficients for many groups at a time.
 
-        `theta`, `groups`: as of `effective_jacobian`. Result: `rows` (n,): groups of one chip that
-        depend on the same global parameters, and on as many of their exposures; `columns` (n, m):
-        entries of theta, global ones first; `derivative` (n, 2, K, m).
+        Parameters
+        ----------
+        theta, groups
+            See `effective_jacobian`.
+
+        Yields
+        ------
+        rows : ndarray of int, shape (n,)
+            Indices of groups that depend on the same global parameters and on equal numbers of
+            frame parameters.
+        columns : ndarray of int, shape (n, m)
+            Entries of theta on which each group depends, global parameters first.
+        derivative : ndarray, shape (n, 2, K, m)
         """
         theta = np.asarray(theta, float)
         K, o = self.n_terms, np.asarray(self.origin)
@@ -150,14 +188,14 @@ class EffectiveCoefficients(ParameterLayout):
             n, first = len(rows), int(exposure[0])
             frame = self._frame_parameters(theta, exposure)
             M, _ = frame_matrix(*frame)
-            block, own = self.frame_columns(exposure), self.own_slice(chip, first)
+            block, deviation = self.frame_columns(exposure), self.own_slice(chip, first)
             about_chip = self._about_chip(poly, chip)
 
-            # by the polynomial's coefficients, then by the parameters of the drift
+            # with respect to the polynomial's coefficients, then to the drift parameters
             columns = [np.r_[slice(2 * K * chip, 2 * K * (chip + 1))]]
             direct = np.einsum("nab,kl->nakbl", M, np.eye(K))
-            if own.stop:
-                L, d = chip_matrix(theta[block][:, own])
+            if deviation.stop:
+                L, d = chip_matrix(theta[block][:, deviation])
                 R, turning = rigid_part(*frame)
                 at_centre = self.bases[chip].monomial_matrix[0]
                 direct += np.einsum("nab,kl->nakbl", M @ L, self._about_chip(np.eye(K), chip).T)
@@ -168,10 +206,10 @@ class EffectiveCoefficients(ParameterLayout):
                 columns.append(np.r_[self.drift_slice(chip)])
                 drift = self._drift(self.time, chip, groups.epoch[rows])
                 blocks.append(direct @ drift.reshape(n, 2 * K, -1))
-            columns = [np.broadcast_to(one, (n, len(one))) for one in columns]
+            columns = [np.broadcast_to(part, (n, len(part))) for part in columns]
             if block.size:
                 w = poly.copy()
-                if own.stop:
+                if deviation.stop:
                     w += L @ about_chip
                     w[..., 0] += d
                 w[..., 0] -= o
@@ -179,19 +217,19 @@ class EffectiveCoefficients(ParameterLayout):
                 shift[:, 0, 0, 0] = shift[:, 1, 0, 1] = 1.0
                 tangent = frame_tangent(*frame)
                 by_frame = np.einsum("nmab,nbk->nakm", tangent, w)
-                if own.stop:
+                if deviation.stop:
                     off = poly @ at_centre - o
                     by_frame[:, :, 0] -= np.einsum("nmab,nb->nam", tangent - turning, off)
-                of_all = np.concatenate([shift, by_frame], axis=-1)
+                by_all_frame = np.concatenate([shift, by_frame], axis=-1)
                 names = frame_names(self.frames)
                 fitted = [k for k in self.free_frame_names(first) if k in names]
                 columns.append(block[:, : len(fitted)])
-                blocks.append(of_all[..., [names.index(k) for k in fitted]])
-                if own.stop:
+                blocks.append(by_all_frame[..., [names.index(k) for k in fitted]])
+                if deviation.stop:
                     shapes, shifts = chip_matrix(np.eye(len(CHIP_DEVIATIONS)))
-                    by_own = np.einsum("mab,nbk->nakm", shapes, about_chip)
-                    by_own[:, :, 0] += shifts.T
-                    columns.append(block[:, own])
-                    blocks.append(np.einsum("nab,nbkm->nakm", M, by_own))
-            derivative = [one.reshape(n, 2, K, -1) for one in blocks]
+                    by_deviation = np.einsum("mab,nbk->nakm", shapes, about_chip)
+                    by_deviation[:, :, 0] += shifts.T
+                    columns.append(block[:, deviation])
+                    blocks.append(np.einsum("nab,nbkm->nakm", M, by_deviation))
+            derivative = [part.reshape(n, 2, K, -1) for part in blocks]
             yield rows, np.concatenate(columns, axis=1), np.concatenate(derivative, axis=-1)

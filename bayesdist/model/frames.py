@@ -1,20 +1,20 @@
-"""The transformation T_e of one exposure: shift, rotation, scale, shear.
+"""Exposure frames: the transformation T_e of one exposure by shift, rotation, scale and shear.
 
     T(w) = o + d + M (w - o)
     M = R(rotation) [(1 + scale) I + shear_plus diag(1, -1) + shear_cross offdiag(1, 1)]
 
-about a fixed origin o, so that shifts and linear terms are nearly uncorrelated.  R turns u towards
-v by an angle in radians.  Each kind has the parameters of the one before it and some more, with the
-same meaning.  Scale and shear act along the axes of w, before the rotation: they are deviations of
-the detector, small at any roll angle, and a Gaussian prior on each of them by itself makes sense.
+The origin o is fixed such that shifts and linear terms are nearly uncorrelated.  R rotates from u
+towards v by an angle in radians.  Each kind of frame adds parameters to the previous kind.  Scale
+and shear act along the axes of w, before the rotation.  They are therefore deviations of the
+detector, small at any roll angle, for which independent Gaussian priors are appropriate.
 Near zero, M = I + scale I + rotation J + shear_plus diag(1, -1) + shear_cross offdiag(1, 1).
 
-A chip may deviate by itself from the one that the frame is bound to.  About the position c of its
-reference pixel,
+A chip may deviate from the first chip.  About the position c of its reference pixel,
 
     w -> w + d + L (w - c)      L = scale I + rotation J + shear_plus diag(1, -1) + shear_cross ...
 
-These are small, and taken as linear.  Scale and shear of the frame then act about c too.
+The deviations are small, so that they are linearised.  Scale and shear of the frame then also act
+about c.
 """
 
 from __future__ import annotations
@@ -37,9 +37,8 @@ FRAME_KINDS = tuple(_NAMES)
 RIGID = ("shift_u", "shift_v", "rotation")  # pointing of the telescope
 DEVIATIONS = ("scale", "shear_plus", "shear_cross")  # deviations of the detector from its mean
 
-CHIP_DEVIATIONS = (*RIGID, *DEVIATIONS)  # of one chip against the reference chip
-
-# matrices that the linear parameters multiply near zero
+CHIP_DEVIATIONS = (*RIGID, *DEVIATIONS)  # of one chip relative to the first chip
+# derivatives of M with respect to the linear parameters at zero
 LINEAR_MATRICES = {
     "rotation": np.array([[0.0, -1.0], [1.0, 0.0]]),
     "scale": np.array([[1.0, 0.0], [0.0, 1.0]]),
@@ -49,7 +48,7 @@ LINEAR_MATRICES = {
 
 
 def frame_names(kind: str) -> tuple[str, ...]:
-    """Names of the parameters of one exposure's frame."""
+    """Names of the parameters of a frame of this kind."""
     return _NAMES[kind]
 
 
@@ -62,51 +61,57 @@ def _rotation(angle: Float) -> Float:
 
 
 def _parts(kind: str, p: Float) -> tuple[Float, Float]:
-    """Rotation (..., 2, 2), and the symmetric factor after it (..., 2, 2)."""
+    """Rotation (..., 2, 2) and symmetric factor (..., 2, 2) of M, in this order."""
     names = frame_names(kind)
-    behind = np.broadcast_to(np.eye(2), (*p.shape[:-1], 2, 2)).copy()
+    symmetric = np.broadcast_to(np.eye(2), (*p.shape[:-1], 2, 2)).copy()
     for name in DEVIATIONS:
         if name in names:
-            behind += p[..., names.index(name), None, None] * LINEAR_MATRICES[name]
+            symmetric += p[..., names.index(name), None, None] * LINEAR_MATRICES[name]
     angle = p[..., names.index("rotation")] if "rotation" in names else np.zeros(p.shape[:-1])
-    return _rotation(angle), behind
+    return _rotation(angle), symmetric
 
 
 def frame_matrix(kind: str, p: ArrayLike) -> tuple[Float, Float]:
-    """Linear part M (..., 2, 2) and shift d (..., 2) of T, for parameters (..., q)."""
+    """Linear part M (..., 2, 2) and shift d (..., 2) of a frame with parameters (..., q)."""
     p = np.asarray(p, float)
-    turn, behind = _parts(kind, p)
-    return turn @ behind, np.zeros((*p.shape[:-1], 2)) if kind == "none" else p[..., :2].copy()
+    rotation, symmetric = _parts(kind, p)
+    return rotation @ symmetric, np.zeros((*p.shape[:-1], 2)) if kind == "none" else p[
+        ..., :2
+    ].copy()
 
 
 def frame_tangent(kind: str, p: ArrayLike) -> Float:
-    """Derivatives (..., q - 2, 2, 2) of M by each parameter after the two shifts."""
+    """Derivatives (..., q - 2, 2, 2) of M with respect to the parameters after the shifts."""
     p = np.asarray(p, float)
     names = frame_names(kind)[2:]
-    turn, behind = _parts(kind, p)
-    quarter = LINEAR_MATRICES["rotation"]
+    rotation, symmetric = _parts(kind, p)
+    quarter_turn = LINEAR_MATRICES["rotation"]
     out = np.zeros((*p.shape[:-1], len(names), 2, 2))
     for k, name in enumerate(names):
-        by_name = quarter @ behind if name == "rotation" else LINEAR_MATRICES[name]
-        out[..., k, :, :] = turn @ by_name
+        by_name = quarter_turn @ symmetric if name == "rotation" else LINEAR_MATRICES[name]
+        out[..., k, :, :] = rotation @ by_name
     return out
 
 
 def rigid_part(kind: str, p: ArrayLike) -> tuple[Float, Float]:
-    """Rotation R (..., 2, 2) in M, and its derivatives (..., q - 2, 2, 2) after the two shifts."""
+    """Rotation R (..., 2, 2) in M, and its derivatives (..., q - 2, 2, 2).
+
+    The derivatives are with respect to the parameters after the shifts.
+    """
     p = np.asarray(p, float)
     names = frame_names(kind)[2:]
-    turn, _ = _parts(kind, p)
+    rotation, _ = _parts(kind, p)
     tangent = np.zeros((*p.shape[:-1], len(names), 2, 2))
     if "rotation" in names:
-        tangent[..., names.index("rotation"), :, :] = turn @ LINEAR_MATRICES["rotation"]
-    return turn, tangent
+        tangent[..., names.index("rotation"), :, :] = rotation @ LINEAR_MATRICES["rotation"]
+    return rotation, tangent
 
 
 def chip_matrix(p: ArrayLike) -> tuple[Float, Float]:
-    """Matrix L (..., 2, 2) and shift d (..., 2) of a chip's deviations (..., 6), `CHIP_DEVIATIONS`.
+    """Matrix L (..., 2, 2) and shift d (..., 2) of a chip with deviations p (..., 6).
 
-    L is linear in p: `chip_matrix` of the unit vectors is its derivative.
+    The parameters are in the order of `CHIP_DEVIATIONS`.  L and d are linear in p, so that their
+    derivatives are the `chip_matrix` of the unit vectors.
     """
     p = np.asarray(p, float)
     L = np.zeros((*p.shape[:-1], 2, 2))
@@ -116,7 +121,7 @@ def chip_matrix(p: ArrayLike) -> tuple[Float, Float]:
 
 
 def nearest_frame(kind: str, M: ArrayLike, d: ArrayLike) -> Float:
-    """Parameters (q,) of the frame of a kind nearest to a linear map, in the Frobenius norm."""
+    """Parameters (q,) of the frame that is closest to a linear map in the Frobenius norm."""
     M = np.asarray(M, float)
     # M z = a z + b conj(z) with z = u + i v; a is the similarity nearest to M
     a = complex(M[0, 0] + M[1, 1], M[1, 0] - M[0, 1]) / 2

@@ -1,4 +1,4 @@
-"""Detector grid of all maps; arrays on it are indexed [iy, ix]."""
+"""Detector grid of all maps; arrays of values on the grid are indexed [iy, ix]."""
 
 from __future__ import annotations
 
@@ -9,19 +9,19 @@ from bayesdist.utils.arrays import Float, Int
 from bayesdist.utils.memory import require_memory
 
 DEFAULT_GRID = (33, 17)
-BYTES_OF_POINT = 500  # at least: its position, the polynomial there, and some draws
+BYTES_OF_POINT = 500  # lower bound: position, basis functions and some draws of one point
 
 
 def grid_pixels(size: tuple[float, float], grid: tuple[int, int]) -> tuple[Float, Float]:
-    """Columns (nx,) and rows (ny,) of the grid, FITS 1-based, evenly from pixel 1 to the size.
+    """Pixels x (nx,) and y (ny,) of a regular grid from pixel 1 to the size, FITS 1-based.
 
-    InputError for a grid that is not two whole numbers of at least 2.
+    Raises InputError unless the grid is given by two integers of at least 2.
     """
     if len(grid) != 2 or any(int(n) != n or n < 2 for n in grid):
         raise InputError(
             f"the grid is {list(grid)}",
             where="assess.grid",
-            do="give two whole numbers of at least 2, points on x and on y",
+            do="give two integers of at least 2, the numbers of points along x and y",
         )
     nx, ny = (int(n) for n in grid)
     require_memory(
@@ -34,15 +34,16 @@ def grid_pixels(size: tuple[float, float], grid: tuple[int, int]) -> tuple[Float
 
 
 def mesh(x: Float, y: Float) -> tuple[Float, Float]:
-    """Pixels (ny * nx,) of the grid points, x and y, in the order of a flattened [iy, ix] array."""
+    """Pixels x and y (ny * nx,) of all grid points, in the order of a flattened [iy, ix] array."""
     X, Y = np.meshgrid(x, y)
     return X.ravel(), Y.ravel()
 
 
 def cell_index(X: Float, Y: Float, bins: tuple[int, int]) -> Int:
-    """Cell of each position (N,), counted along x first; X and Y run from -1 to 1 over the chip.
+    """Index (N,) of the cell that contains each position; the index along x varies fastest.
 
-    Positions beyond are in the outermost cells.
+    X and Y are coordinates scaled to [-1, 1] over the chip.  Positions outside are assigned to the
+    outermost cells.
     """
     ix, iy = (
         np.clip(((z + 1) * (0.5 * n)).astype(np.int64), 0, n - 1)
@@ -52,7 +53,7 @@ def cell_index(X: Float, Y: Float, bins: tuple[int, int]) -> Int:
 
 
 def outline_pixels(size: tuple[float, float]) -> tuple[Float, Float]:
-    """Pixels once around a chip: its edges are not straight on the sky."""
+    """Pixels along the outline of a chip, nine per side since the sides are curved on the sky."""
     nx, ny = size
     t = np.linspace(0, 1, 9)
     x = 0.5 + nx * np.concatenate([t, 1 + 0 * t, 1 - t, 0 * t])
@@ -61,6 +62,6 @@ def outline_pixels(size: tuple[float, float]) -> tuple[Float, Float]:
 
 
 def position_of_largest(values: Float, x: Float, y: Float) -> tuple[float, float]:
-    """Pixel (x, y) at which a map (ny, nx) is largest, NaN apart."""
+    """Pixel (x, y) of the maximum of a map (ny, nx), ignoring NaN."""
     iy, ix = np.unravel_index(int(np.nanargmax(values)), values.shape)
     return float(x[ix]), float(y[iy])

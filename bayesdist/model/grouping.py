@@ -1,8 +1,7 @@
-"""Stars with one set of effective coefficients in common.
+"""Groups of stars with the same effective coefficients.
 
-Within one chip, exposure and epoch the whole model -- polynomial, time dependence, frame -- is a
-single polynomial of the pixel position.  The data constrain the parameters through these groups
-alone.
+For one chip, exposure and epoch the complete model (polynomial, time dependence, frame) is a single
+polynomial of the pixel position.  The data constrain the parameters only through these polynomials.
 """
 
 from __future__ import annotations
@@ -23,9 +22,9 @@ class Groups:
     index : ndarray of int, shape (N,)
         Group of each star.
     chip, exposure : ndarray of int, shape (G,)
-        Codes into the model's chips and exposures.
+        Chip and exposure of each group, as indices into the model's chips and exposures.
     epoch : ndarray, shape (G,)
-        Decimal years; 0 where the model has no time dependence.
+        Decimal years; 0 if the model has no time dependence.
     """
 
     index: Int
@@ -37,14 +36,14 @@ class Groups:
         return len(self.chip)
 
     def same(self, other: Groups) -> bool:
-        """True where the groups are equal, apart from their members."""
+        """True if two sets of groups are equal, apart from their members."""
         return all(
             np.array_equal(getattr(self, name), getattr(other, name))
             for name in ("chip", "exposure", "epoch")
         )
 
     def members(self) -> list[Int]:
-        """Indices of the stars of each group, each list in rising order."""
+        """Indices of the stars of each group, in ascending order."""
         if not len(self):
             return []
         order = np.argsort(self.index, kind="stable")
@@ -53,8 +52,11 @@ class Groups:
 
 
 def group_by(chip: Int, exposure: Int, epoch: Float) -> Groups:
-    """Groups of equal chip, exposure (codes) and epoch (decimal years) in that order, each (N,)."""
-    # stars of one group mostly stand together: only the first star of each run is sorted
+    """Groups of stars with equal chip, exposure and epoch, sorted by these in this order.
+
+    `chip` and `exposure` are codes and `epoch` is in decimal years, each of shape (N,).
+    """
+    # stars of a group are usually adjacent, so only the first star of each sequence is sorted
     heads = _starts_of_runs(chip, exposure, epoch)
     chip_of, exposure_of, epoch_of = chip[heads], exposure[heads], epoch[heads]
     order = np.lexsort((epoch_of, exposure_of, chip_of))
@@ -71,7 +73,7 @@ def group_by(chip: Int, exposure: Int, epoch: Float) -> Groups:
 
 
 def _starts_of_runs(*columns: Int | Float) -> Int:
-    """Boolean mask of the rows that differ from the ones before them, the first row included."""
+    """Indices of the rows that differ from the previous row, including the first row."""
     starts = np.ones(len(columns[0]), bool)
     if len(starts):
         starts[1:] = np.logical_or.reduce([c[1:] != c[:-1] for c in columns])
@@ -79,7 +81,7 @@ def _starts_of_runs(*columns: Int | Float) -> Int:
 
 
 def merge_groups(a: Groups, b: Groups) -> tuple[Groups, Int, Int]:
-    """Groups of either, in the order in which `group_by` gives them.
+    """Union of two sets of groups, in the order of `group_by`.
 
     Parameters
     ----------
@@ -88,9 +90,9 @@ def merge_groups(a: Groups, b: Groups) -> tuple[Groups, Int, Int]:
     Returns
     -------
     groups : Groups
-        Without members.
+        Union of the groups, without members.
     of_a, of_b : ndarray of int
-        Indices of the groups of `a` and of `b` in it.
+        Indices of the groups of `a` and of `b` in the union.
     """
     union = group_by(
         np.concatenate([a.chip, b.chip]),

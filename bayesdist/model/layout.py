@@ -1,4 +1,4 @@
-"""Structure of a distortion model, and the only parameter layout."""
+"""Chips of a detector, and the layout of the parameter vector of a distortion model."""
 
 from __future__ import annotations
 
@@ -31,12 +31,12 @@ class Chip:
     Parameters
     ----------
     number : int
-        As in the data and in the IDCTAB column DETCHIP.
+        Chip number, as in the data and in the column DETCHIP of an IDCTAB.
     name : str
     size : tuple of float or Quantity
-        Columns, rows.
+        Numbers of columns and rows.
     reference_pixel : tuple of float or Quantity
-        Zero point of the polynomial, FITS 1-based pixels.
+        Origin of the polynomial, in FITS 1-based pixels.
 
     Examples
     --------
@@ -58,36 +58,37 @@ class Chip:
         refuse_control_characters([str(self.name)], f"chip {self.number}")
         for name in ("size", "reference_pixel"):
             pair = getattr(self, name)
-            several = isinstance(pair, Sequence) and not isinstance(pair, str)
-            if hasattr(pair, "unit") or (several and any(hasattr(one, "unit") for one in pair)):
+            is_pair = isinstance(pair, Sequence) and not isinstance(pair, str)
+            if hasattr(pair, "unit") or (is_pair and any(hasattr(side, "unit") for side in pair)):
                 pixels = values_in(pair, "pix", name, where=f"chip {self.number}")
                 object.__setattr__(self, name, tuple(pixels.tolist()))
         check_pixels(self.size, "size", self.number, positive=True)
         check_pixels(self.reference_pixel, "reference_pixel", self.number)
 
     def quadrature(self, nodes: int) -> tuple[Float, Float, Float]:
-        """Gauss-Legendre quadrature over the area of the chip.
+        """Nodes and weights for Gauss-Legendre quadrature over the area of the chip.
 
         Parameters
         ----------
         nodes : int
-            On each axis: exact for polynomials of degree 2 nodes - 1 in x and in y.
+            Number of nodes per axis.  The quadrature is exact for polynomials up to degree
+            2 nodes - 1 in x and in y.
 
         Returns
         -------
         x, y : ndarray, shape (nodes^2,)
             FITS 1-based pixels.
         weight : ndarray, shape (nodes^2,)
-            Square pixels; they add up to the area.
+            Weights in square pixels; their sum is the area of the chip.
         """
-        at, weight = leggauss(nodes)
+        node, weight = leggauss(nodes)
         nx, ny = self.size
-        x, y = np.meshgrid((nx + 1 + nx * at) / 2, (ny + 1 + ny * at) / 2)
+        x, y = np.meshgrid((nx + 1 + nx * node) / 2, (ny + 1 + ny * node) / 2)
         return x.ravel(), y.ravel(), nx * ny / 4 * np.outer(weight, weight).ravel()
 
 
 def check_pixels(pair: Any, name: str, chip: Any, *, positive: bool = False) -> None:
-    """Refuse anything but two finite numbers of pixels, which may have to be positive."""
+    """Raise InputError unless `pair` has two finite numbers, and positive ones if required."""
     try:
         pixels = np.asarray(pair, float)
     except (TypeError, ValueError):
@@ -106,17 +107,17 @@ class Parameter:
 
     name: str
     unit: str
-    kind: str  # 'polynomial', 'tdd' or 'frame'
-    chip: int | None = None  # number; of a frame's parameter: a chip's own deviation
+    kind: str  # 'polynomial', 'tdd' (time-dependent distortion) or 'frame'
+    chip: int | None = None  # chip number; for frames only if the parameter is a chip deviation
     axis: str | None = None  # 'u' or 'v'
-    i: int | None = None  # degree in x, Legendre ('polynomial') or monomial ('tdd')
+    i: int | None = None  # degree in x: Legendre for 'polynomial', monomial for 'tdd'
     j: int | None = None  # degree in y
     exposure: str | None = None
 
 
 @dataclass(frozen=True)
 class ParameterLayout:
-    """Fields of `DistortionModel`, which describes them, and the order of its parameters."""
+    """Fields of a `DistortionModel` (documented there), and the layout of its parameters."""
 
     order: int
     chips: tuple[Chip, ...]
@@ -152,20 +153,20 @@ class ParameterLayout:
             )
         if not self.chips:
             raise InputError("no chip is given", where="chip", do="describe at least one chip")
-        for what, given in (
+        for label, labels in (
             ("chip number", [c.number for c in self.chips]),
             ("chip name", [c.name for c in self.chips]),
             ("exposure", self.exposures),
         ):
-            name, count = Counter(given).most_common(1)[0]
+            name, count = Counter(labels).most_common(1)[0]
             if count > 1:
                 raise InputError(
-                    f"{what} {name!r} stands twice", where="model", do="name each one once"
+                    f"{label} {name!r} occurs twice", where="model", do="list each one once"
                 )
         for axis, i, j in self.time.terms if self.time else ():
             if i + j > self.order:
                 raise InputError(
-                    f"term {axis}_{i}_{j} is above the polynomial order {self.order}",
+                    f"term {axis}_{i}_{j} exceeds the polynomial order {self.order}",
                     where="model.tdd.terms",
                     do="raise model.order or drop the term",
                 )
@@ -181,25 +182,26 @@ class ParameterLayout:
             )
         if self.gauge == "first" and any(self.held):
             raise InputError(
-                f"the first exposure is held at {self.held} and is the identity",
+                f"the first exposure is held at {self.held}, but gauge 'first' requires the "
+                "identity",
                 where="model.held",
-                do="choose gauge 'held' or leave the values out",
+                do="choose gauge 'held' or remove the values",
             )
         if self.gauge == "held" and self.frames == "none":
             raise InputError(
-                "gauge 'held' holds the frame of the first exposure, and there are no frames",
+                "gauge 'held' fixes the frame of the first exposure, but there are no frames",
                 where="model.gauge",
                 do="choose a kind of frame or gauge 'first'",
             )
         if self.chip_deviations and self.gauge != "held":
             raise InputError(
-                "chips that deviate by themselves have the polynomials for their mean",
+                "chip deviations need polynomials that are the mean of all exposures",
                 where="model.chip_deviations",
                 do="choose gauge 'held'",
             )
         if self.frames == "shift" and self.held[2]:
             raise InputError(
-                "a frame 'shift' has no rotation to be held",
+                "a frame of kind 'shift' has no rotation that could be held",
                 where="model.held",
                 do="choose another kind of frame",
             )
@@ -211,56 +213,56 @@ class ParameterLayout:
 
     @property
     def n_terms(self) -> int:
-        """Polynomial terms of one chip and axis."""
+        """Number of polynomial terms per chip and axis."""
         return self.bases[0].n_terms
 
     @property
     def summary(self) -> str:
-        """Summary in a few words."""
+        """Order, chips, frames and number of parameters in a few words."""
         names = ", ".join(chip.name or str(chip.number) for chip in self.chips[:4])
         chips = f"{len(self.chips)} chip{'s' if len(self.chips) > 1 else ''}"
-        more = ", ..." if len(self.chips) > 4 else ""
+        ellipsis = ", ..." if len(self.chips) > 4 else ""
         frames = f", frames '{self.frames}'" if self.n_frame else ""
         drift = f", {len(self.time.terms)} terms of time" if self.time is not None else ""
         return (
-            f"order {self.order}, {chips} ({names}{more}){frames}{drift}, "
+            f"order {self.order}, {chips} ({names}{ellipsis}){frames}{drift}, "
             f"{self.n_params} parameters"
         )
 
     @property
     def n_frame(self) -> int:
-        """Parameters of one exposure: of its frame, and of the chips' own deviations."""
+        """Number of parameters per exposure: its frame and the chip deviations."""
         return len(frame_names(self.frames)) + len(self._own_names)
 
     @cached_property
     def _own_names(self) -> tuple[str, ...]:
-        """Names of the deviations of single chips."""
+        """Names of the chip deviations."""
         if not self.chip_deviations:
             return ()
         return tuple(f"{chip.name}.{name}" for chip in self.chips[1:] for name in CHIP_DEVIATIONS)
 
     @property
     def n_tdd(self) -> int:
-        """Time-dependent parameters of one chip."""
+        """Number of time-dependent parameters per chip."""
         return len(self.time.terms) * self.time.n_values if self.time else 0
 
     @property
     def n_polynomial(self) -> int:
-        """Polynomial coefficients of all chips."""
+        """Number of polynomial coefficients of all chips."""
         return 2 * self.n_terms * len(self.chips)
 
     @property
     def n_distortion(self) -> int:
-        """Parameters of the polynomials and of their drift: all but the frames."""
+        """Number of parameters of the polynomials and their drift, without the frames."""
         return self.n_polynomial + self.n_tdd * len(self.chips)
 
     @property
     def n_global(self) -> int:
-        """Parameters that are in no local block."""
+        """Number of parameters outside of the local blocks."""
         return self.n_distortion + len(self.free_frame_names(0))
 
     def free_frame_names(self, exposure: int) -> tuple[str, ...]:
-        """Names of the fitted parameters of an exposure (by code): frame, then single chips."""
+        """Names of the fitted parameters of an exposure code: frame, then chip deviations."""
         if exposure > 0:
             return (*frame_names(self.frames), *self._own_names)
         if self.gauge == "first" or exposure < 0:
@@ -313,46 +315,43 @@ class ParameterLayout:
 
     @property
     def units(self) -> tuple[str, ...]:
-        """Units of the entries of theta ('' where there is none)."""
+        """Units of the entries of theta ('' if dimensionless or in radians)."""
         return tuple(p.unit for p in self.parameters)
 
     def chip_code(self, number: int) -> int:
-        """Index of a chip by its number.
-
-        InputError when no chip has that number.
-        """
+        """Code (index) of a chip number; raises InputError if there is no such chip."""
         for code, chip in enumerate(self.chips):
             if chip.number == number:
                 return code
         raise InputError(
             f"there is no chip {number}",
-            do=f"known chips are {', '.join(str(c.number) for c in self.chips)}",
+            do=f"choose one of the chips {', '.join(str(c.number) for c in self.chips)}",
         )
 
     def basis(self, chip: int | None = None) -> PolynomialBasis:
-        """Polynomial basis of a chip (by number; the first one by default)."""
+        """Polynomial basis of a chip number (default: the first chip)."""
         return self.bases[0 if chip is None else self.chip_code(chip)]
 
     def coefficient_slice(self, chip: int | None, axis: int) -> slice:
-        """Slice of theta with the Legendre coefficients of a chip (number) and axis (0 u, 1 v)."""
+        """Slice of theta with the Legendre coefficients of a chip number and axis (0 u, 1 v)."""
         code = 0 if chip is None else self.chip_code(chip)
         start = (2 * code + axis) * self.n_terms
         return slice(start, start + self.n_terms)
 
     def tdd_slice(self, chip: int | None = None) -> slice:
-        """Slice of theta with the time-dependent parameters of a chip (by number).
+        """Slice of theta with the time-dependent parameters of a chip number.
 
-        They are per year, and per half side of the chip for each power of x and y.
+        Rates are per year.  They refer to monomials in units of half the size of the chip.
         """
         return self.drift_slice(0 if chip is None else self.chip_code(chip))
 
     def drift_slice(self, chip_code: int) -> slice:
-        """Slice of theta with the time-dependent parameters of a chip (by code)."""
+        """Slice of theta with the time-dependent parameters of a chip code."""
         start = self.n_polynomial + chip_code * self.n_tdd
         return slice(start, start + self.n_tdd)
 
     def frame_slice(self, exposure: int) -> slice:
-        """Slice of theta with the `free_frame_names` of an exposure (by code)."""
+        """Slice of theta with the parameters `free_frame_names` of an exposure code."""
         if not self.free_frame_names(exposure):
             return slice(0, 0)
         if exposure == 0:
@@ -361,7 +360,10 @@ class ParameterLayout:
         return slice(start, start + self.n_frame)
 
     def frame_columns(self, exposure: int | Int) -> Int:
-        """Entries (..., q) of theta of exposures (codes), which are all the first or all later."""
+        """Indices (..., q) into theta of the frame parameters of one or more exposure codes.
+
+        The codes must not contain the first exposure together with others.
+        """
         codes = np.asarray(exposure)
         first = int(codes.flat[0])
         block = self.frame_slice(first)
@@ -369,17 +371,20 @@ class ParameterLayout:
 
     @property
     def local_blocks(self) -> tuple[slice, ...]:
-        """Local blocks of theta, one for each exposure but the first."""
+        """Local blocks of theta, one per exposure except the first."""
         if not self.n_frame:
             return ()
         return tuple(self.frame_slice(e) for e in range(1, len(self.exposures)))
 
     def has_frame(self, exposure: int) -> bool:
-        """True where an exposure (by code) has a frame that is not the identity."""
+        """True if the frame of an exposure code is not the identity."""
         return self.n_frame > 0 and (exposure > 0 or (exposure == 0 and self.gauge == "held"))
 
     def own_slice(self, chip_code: int, exposure: int) -> slice:
-        """Slice of `frame_slice` of an exposure with a chip's own deviations (by codes), if any."""
+        """Slice within the `frame_slice` of an exposure with the deviations of a chip (by codes).
+
+        The slice is empty if the chip has no deviations.
+        """
         if not (self.chip_deviations and chip_code > 0 and self.has_frame(exposure)):
             return slice(0, 0)
         n, q = len(self.free_frame_names(exposure)) - len(self._own_names), len(CHIP_DEVIATIONS)
@@ -387,7 +392,10 @@ class ParameterLayout:
 
     @cached_property
     def drift_columns(self) -> tuple[tuple[Float, ...], Int]:
-        """Legendre coefficients (n terms, K) of each drifting monomial, for each chip; and axes."""
+        """Legendre coefficients (n terms, K) of the drifting monomials per chip, and their axes.
+
+        Axes (n terms,) are 0 for u and 1 for v.
+        """
         if self.time is None:
             return tuple(np.zeros((0, self.n_terms)) for _ in self.chips), np.zeros(0, np.int64)
         columns = []

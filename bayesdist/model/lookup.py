@@ -1,10 +1,10 @@
-"""Look-up tables: the part of the distortion that no polynomial follows.
+"""Look-up tables for the part of the distortion that polynomials cannot describe.
 
-A table holds small shifts of the pixel at the nodes of a grid.  Between the nodes it is bilinear,
-beyond the outermost ones constant: exactly as astropy.wcs and the HST pipeline use a D2IMFILE, so
-that a table has one meaning everywhere.
+A table contains small shifts of the pixel position at the nodes of a grid.  Between nodes it is
+interpolated bilinearly, and beyond the outermost nodes it is constant, exactly as astropy.wcs and
+the HST pipeline apply a D2IMFILE.
 
-    x' = x + D_chip(x, y)             detector table, common to all filters
+    x' = x + D_chip(x, y)             detector table, valid for all filters
     x'' = x' + F_chip,filter(x')      filter table, evaluated at the corrected pixel
 """
 
@@ -24,29 +24,29 @@ from bayesdist.utils.arrays import Bool, Float, Int
 
 @dataclass(frozen=True, eq=False)
 class LookupTable:
-    """Shifts of the pixel at the nodes of a regular grid on one chip.
+    """Shifts of the pixel position at the nodes of a regular grid on one chip.
 
     Parameters
     ----------
     chip : int
         Chip number.
     values : array_like, shape (2, ny, nx)
-        Pixels, *added* to x (first plane) and to y (second plane).
+        Shifts in pixels, *added* to x (first plane) and to y (second plane).
     filter : str
-        Filter that the table belongs to; '' is the detector's own table, which holds in every one.
+        Filter to which the table applies; '' is the detector table, which applies to all filters.
     first : tuple of float
         Pixel (x, y) of node [0, 0], FITS 1-based.  The default is the centre of a bin of 64 pixels.
     step : tuple of float
-        Pixels between nodes along x and y.
+        Distance of the nodes along x and y, in pixels.
     sigma : array_like, shape (2, ny, nx), optional
-        Standard error of each node value, pixels.  The sigma of an interpolated shift needs the
-        covariance of the nodes: it is not offered here.
+        Standard error of each node value, in pixels.  Errors of interpolated shifts are not
+        available, since they require the covariance of the nodes.
 
     Raises
     ------
     InputError
-        For arrays of another shape, values that are not finite, a sigma below zero, or a step that
-        is not above zero.
+        If an array has a wrong shape, a value is not finite, a sigma is negative, or a step is not
+        positive.
 
     Examples
     --------
@@ -66,31 +66,31 @@ class LookupTable:
 
     def __post_init__(self) -> None:
         values = np.array(self.values, float)
-        where = f"look-up table {self.label}"
+        location = f"look-up table {self.label}"
         if values.ndim != 3 or values.shape[0] != 2 or min(values.shape[1:]) < 2:
             raise InputError(
                 f"the values have shape {values.shape}",
-                where=where,
-                do="give an array (2, ny, nx) with two nodes or more along each axis",
+                where=location,
+                do="give an array (2, ny, nx) with at least two nodes along each axis",
             )
-        _refuse(~np.isfinite(values), values, "value", where, "fill the empty nodes first")
+        _refuse(~np.isfinite(values), values, "value", location, "fill the empty nodes first")
         if self.sigma is not None:
             sigma = np.array(self.sigma, float)
             if sigma.shape != values.shape:
                 raise InputError(
-                    f"sigma has shape {sigma.shape} and the values {values.shape}",
-                    where=where,
+                    f"sigma has shape {sigma.shape}, but the values have {values.shape}",
+                    where=location,
                     do="give one sigma for each value",
                 )
             bad = ~np.isfinite(sigma) | (sigma < 0)
-            _refuse(bad, sigma, "sigma", where, "give a finite sigma, zero or above")
+            _refuse(bad, sigma, "sigma", location, "give a finite sigma of at least zero")
             object.__setattr__(self, "sigma", sigma)
         first, step = as_pair(self.first), as_pair(self.step)
         if not (np.isfinite(first).all() and np.isfinite(step).all() and min(step) > 0):
             raise InputError(
-                f"node [0, 0] at {first} and steps of {step} pixels make no grid",
-                where=where,
-                do="give finite pixels and steps above zero",
+                f"node [0, 0] at {first} and steps of {step} pixels do not define a grid",
+                where=location,
+                do="give a finite pixel and positive steps",
             )
         object.__setattr__(self, "values", values)
         object.__setattr__(self, "first", first)
@@ -98,24 +98,24 @@ class LookupTable:
 
     @property
     def label(self) -> str:
-        """Chip and filter of the table in words, for messages."""
+        """Chip and filter of the table, for messages."""
         return f"of chip {self.chip}" + (f", filter {self.filter}" if self.filter else "")
 
     @property
     def shape(self) -> tuple[int, int]:
-        """Nodes along y and x: (ny, nx)."""
+        """Numbers of nodes along y and x: (ny, nx)."""
         ny, nx = self.values.shape[1:]
         return ny, nx
 
     def nodes(self) -> tuple[Float, Float]:
-        """Pixels of the nodes, FITS 1-based: x (nx,) and y (ny,)."""
+        """Pixel coordinates x (nx,) and y (ny,) of the nodes, FITS 1-based."""
         ny, nx = self.shape
         x: Float = self.first[0] + self.step[0] * np.arange(nx, dtype=float)
         y: Float = self.first[1] + self.step[1] * np.arange(ny, dtype=float)
         return x, y
 
     def weights(self, x: ArrayLike, y: ArrayLike) -> tuple[Int, Float]:
-        """Nodes that a pixel is interpolated from, and their weights.
+        """Nodes and weights for the bilinear interpolation at pixel positions.
 
         Parameters
         ----------
@@ -125,14 +125,14 @@ class LookupTable:
         Returns
         -------
         index : ndarray of int64, shape (N, 4)
-            Into the node values flattened as ``values.reshape(2, -1)``.
+            Indices of the nodes in ``values.reshape(2, -1)``.
         weight : ndarray, shape (N, 4)
-            Bilinear, never below 0, sum 1.
+            Weights of the nodes; they are not negative and their sum is 1.
 
         Raises
         ------
         InputError
-            When a pixel is not finite.
+            If a pixel is not finite.
         """
         ix, fx, _ = self._cell(x, 0)
         iy, fy, _ = self._cell(y, 1)
@@ -143,7 +143,7 @@ class LookupTable:
         return index, np.stack([gx * gy, fx * gy, gx * fy, fx * fy], axis=-1)
 
     def evaluate(self, x: ArrayLike, y: ArrayLike) -> Float:
-        """Shifts to be added to pixels.
+        """Interpolated shifts, to be added to the pixel positions.
 
         Parameters
         ----------
@@ -153,21 +153,23 @@ class LookupTable:
         Returns
         -------
         ndarray, shape (N, 2)
-            Pixels; beyond the outermost nodes the value at the nearest point of the grid.
+            Shifts in pixels.  Beyond the outermost nodes this is the value at the nearest point of
+            the grid.
 
         Raises
         ------
         InputError
-            When a pixel is not finite.
+            If a pixel is not finite.
         """
         index, weight = self.weights(x, y)
         flat = self.values.reshape(2, -1)
         return np.stack([(plane[index] * weight).sum(axis=-1) for plane in flat], axis=-1)
 
     def gradient(self, x: ArrayLike, y: ArrayLike) -> Float:
-        """Derivatives of the corrected pixel by the pixel.
+        """Derivatives of the corrected with respect to the original pixel position.
 
-        Along each axis constant between nodes; on a node that of the cell above it.
+        The derivative along an axis is constant along it between nodes.  At a node it is that of
+        the cell with the higher pixel coordinates.
 
         Parameters
         ----------
@@ -177,12 +179,12 @@ class LookupTable:
         Returns
         -------
         ndarray, shape (N, 2, 2)
-            [[dx'/dx, dx'/dy], [dy'/dx, dy'/dy]]: the identity where the table is flat.
+            [[dx'/dx, dx'/dy], [dy'/dx, dy'/dy]]; the identity if the table is constant.
 
         Raises
         ------
         InputError
-            When a pixel is not finite.
+            If a pixel is not finite.
         """
         ix, fx, in_x = self._cell(x, 0)
         iy, fy, in_y = self._cell(y, 1)
@@ -196,13 +198,13 @@ class LookupTable:
         return out
 
     def _cell(self, pixel: ArrayLike, axis: int) -> tuple[Int, Float, Bool]:
-        """Lower node, fraction of the step above it, and a mask of the pixels on the grid."""
+        """Lower node, distance from it in steps, and a mask that is True inside the grid."""
         pixel = np.atleast_1d(np.asarray(pixel, float))
         if not np.isfinite(pixel).all():
             raise InputError(
-                f"a pixel {'xy'[axis]} is not finite",
+                f"a pixel coordinate {'xy'[axis]} is not finite",
                 where=f"look-up table {self.label}",
-                do="drop such rows first",
+                do="remove such rows first",
             )
         n = self.values.shape[2 - axis]
         node = (pixel - self.first[axis]) / self.step[axis]
@@ -220,39 +222,38 @@ def corrected(
     chip: ArrayLike,
     filter: ArrayLike = "",
 ) -> tuple[Float, Float]:
-    """Pixels after the look-up tables: the detector's first, then the filter's.
+    """Apply look-up tables to pixel positions: first the detector table, then the filter table.
+
+    The filter table is evaluated at the pixel that was corrected with the detector table.
 
     Parameters
     ----------
     tables : sequence of LookupTable
-        At most one for each chip and filter.  A chip or a filter without table is left as it is.
+        At most one table per chip and filter.  Pixels of a chip or filter without a table are not
+        changed.
     x, y : array_like, shape (N,)
         FITS 1-based pixels.
     chip : int or array_like, shape (N,)
         Chip numbers.
     filter : str or array_like, shape (N,)
-        Filters; '' asks for the detector's table alone.
+        Filters; with '' only the detector table is applied.
 
     Returns
     -------
     x, y : ndarray, shape (N,)
-        New arrays.
+        Corrected pixels, FITS 1-based; the input arrays are not modified.
 
     Raises
     ------
     InputError
-        When two tables have the same chip and filter, or a pixel is not finite.
-
-    Notes
-    -----
-    The filter's table is evaluated at the pixel that the detector's table has corrected.
+        If two tables have the same chip and filter, or a pixel is not finite.
     """
     count = Counter((table.chip, table.filter) for table in tables)
     for table in tables:
         if count[table.chip, table.filter] > 1:
             raise InputError(
-                f"{count[table.chip, table.filter]} look-up tables {table.label}",
-                do="give one at most for each chip and filter",
+                f"there are {count[table.chip, table.filter]} look-up tables {table.label}",
+                do="give at most one for each chip and filter",
             )
     x, y = np.broadcast_arrays(np.atleast_1d(np.asarray(x, float)), np.asarray(y, float))
     x, y = x.copy(), y.copy()
@@ -270,7 +271,7 @@ def corrected(
 
 
 def _refuse(bad: Bool, array: Float, what: str, where: str, do: str) -> None:
-    """Refuse a table with a bad node, naming the first."""
+    """Raise an error that names the first invalid node of a table, if there is one."""
     if bad.any():
         axis, row, column = np.argwhere(bad)[0]
         raise InputError(

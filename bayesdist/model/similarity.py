@@ -1,10 +1,10 @@
-"""A model whose (u, v) are shifted, rotated and scaled as a whole.
+"""Similarity transformations of a solution: (u, v) are shifted, rotated and scaled.
 
-With u + i v as one complex number the change is a multiplication and an addition:
+For the complex number u + i v this is a multiplication and an addition:
 
     u' + i v' = shift + turn (u + i v)
 
-It is linear in the polynomials of both axes together, and in their drifting terms.
+The transformation is linear in the coefficients of both axes and in their drifts.
 """
 
 from __future__ import annotations
@@ -20,9 +20,10 @@ from bayesdist.utils.arrays import Float
 
 
 def turned_model(model: DistortionModel) -> DistortionModel:
-    """Structure of a turned model without frames: drifting terms come in pairs of both axes.
+    """Model for the transformed solution of a model without frames.
 
-    The terms that drifted come first, then their partners on the other axis.
+    A rotation mixes the axes, so that each drifting term needs a counterpart on the other axis.
+    The original drifting terms come first, followed by their counterparts.
     """
     time = model.time
     if time is None:
@@ -33,10 +34,22 @@ def turned_model(model: DistortionModel) -> DistortionModel:
 
 
 def turned(model: DistortionModel, theta: ArrayLike, turn: ArrayLike, shift: ArrayLike) -> Float:
-    """Parameters (..., D') of `turned_model` for shift + turn (u + i v), from those (..., D).
+    """Parameters of `turned_model` for the positions shift + turn (u + i v).
 
-    The argument of `turn` is the rotation from u towards v, its modulus the scale; `shift` is added
-    to u (real part) and to v (imaginary part).
+    Parameters
+    ----------
+    model : DistortionModel
+        Original model, without frames.
+    theta : array_like, shape (..., D)
+        Parameters of the original model.
+    turn : array_like of complex, shape (...)
+        The argument is the rotation from u towards v, the modulus is the scale.
+    shift : array_like of complex, shape (...)
+        Added to u (real part) and to v (imaginary part).
+
+    Returns
+    -------
+    ndarray, shape (..., D')
     """
     theta = np.asarray(theta, float)
     turn = np.asarray(turn, complex)[..., None]

@@ -1,9 +1,9 @@
-"""Terms of the polynomial that drift linearly with time, segment by segment.
+"""Polynomial terms that drift linearly with time in one or more segments.
 
     C(t) = C + step_s + rate_s (t - t0_s)          for t in segment s; step_0 = 0
 
-This is Equation 3 of ACS ISR 2015-06, where the segments are before and after Servicing Mission 4
-and each has its own reference date.
+This is Equation 3 of ACS ISR 2015-06, in which the segments before and after Servicing Mission 4
+have different reference dates.
 """
 
 from __future__ import annotations
@@ -23,22 +23,22 @@ AXES = ("u", "v")
 
 @dataclass(frozen=True)
 class TimeDependence:
-    """Drifting terms, their reference dates, and the dates at which the drift may break.
+    """Polynomial terms that drift linearly, and the dates at which value and rate may change.
 
     Parameters
     ----------
     terms : tuple of (str, int, int)
-        Axis ('u' or 'v'), power of x, power of y.
+        Axis ('u' or 'v'), power of x and power of y of each drifting term.
     epoch0 : tuple of float
-        Reference date of each segment, decimal years; one date serves all segments.
+        Reference date of each segment in decimal years; a single date is used for all segments.
     breaks : tuple of float
-        Dates at which a new segment begins, rising.
+        Start dates of the second and further segments in decimal years, ascending.
 
     Raises
     ------
     InputError
-        For an unknown axis, a repeated term, breaks that do not rise, or a number of reference
-        dates that is neither one nor one for each segment.
+        If an axis is unknown, a term is repeated, the breaks are not in ascending order, or the
+        number of reference dates is neither one nor the number of segments.
 
     Examples
     --------
@@ -52,60 +52,60 @@ class TimeDependence:
     breaks: tuple[float, ...] = ()
 
     def __post_init__(self) -> None:
-        where = "model.tdd"
+        location = "model.tdd"
         for term in self.terms:
             if not _is_term(term):
                 raise InputError(
                     f"term {term!r} is not (axis, power of x, power of y)",
-                    where=f"{where}.terms",
-                    do="write for example ['u', 1, 0]",
+                    where=f"{location}.terms",
+                    do="write, for example, ['u', 1, 0]",
                 )
         if len(set(self.terms)) != len(self.terms):
             raise InputError(
-                "a term stands twice", where=f"{where}.terms", do="name each term once"
+                "a term is repeated", where=f"{location}.terms", do="list each term once"
             )
         if list(self.breaks) != sorted(set(self.breaks)):
             raise InputError(
-                f"breaks {list(self.breaks)} do not rise",
-                where=f"{where}.breaks",
-                do="sort them and name each once",
+                f"breaks {list(self.breaks)} are not in ascending order",
+                where=f"{location}.breaks",
+                do="sort them and list each date once",
             )
         if len(self.epoch0) == 1:
             object.__setattr__(self, "epoch0", self.epoch0 * self.n_segments)
         elif len(self.epoch0) != self.n_segments:
             raise InputError(
                 f"{len(self.epoch0)} reference dates for {self.n_segments} segments",
-                where=f"{where}.epoch0",
-                do="give one date, or one for each segment",
+                where=f"{location}.epoch0",
+                do="give one date, or one per segment",
             )
 
         for name in ("epoch0", "breaks"):
             if not all(isinstance(date, Real) for date in getattr(self, name)):
                 raise InputError(
                     f"{name} is {getattr(self, name)!r}",
-                    where=where,
+                    where=location,
                     do="give dates in decimal years",
                 )
 
     @property
     def n_segments(self) -> int:
-        """Number of segments: one more than the breaks."""
+        """Number of segments, which is one more than the number of breaks."""
         return len(self.breaks) + 1
 
     @property
     def n_values(self) -> int:
-        """Parameters of one term: a rate for each segment, a step for each but the first."""
+        """Number of parameters per term: a rate per segment, and a step per later segment."""
         return 2 * self.n_segments - 1
 
     def value_names(self) -> tuple[str, ...]:
-        """Names of one term's parameters, in their order: rate, step_2, rate_2, ..."""
+        """Names of the parameters of a term, in order: rate, step_2, rate_2, ..."""
         names = ["rate"]
         for s in range(1, self.n_segments):
             names += [f"step_{s + 1}", f"rate_{s + 1}"]
         return tuple(names)
 
     def weights(self, epoch: ArrayLike) -> Float:
-        """Derivatives of a coefficient by each parameter of a drifting term, at an epoch.
+        """Derivatives of a coefficient with respect to the parameters of its drift.
 
         Parameters
         ----------
@@ -115,7 +115,8 @@ class TimeDependence:
         Returns
         -------
         ndarray, shape (N, n_values)
-            1 in the column of the segment's step, t - t0 in that of its rate, else 0.
+            1 for the step of the segment that contains the epoch, t - t0 for its rate, and 0 for
+            all other parameters.
         """
         t = np.atleast_1d(np.asarray(epoch, float))
         segment = np.searchsorted(self.breaks, t, side="right")

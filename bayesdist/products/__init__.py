@@ -1,4 +1,4 @@
-"""Calibration files that pipelines read, each with its uncertainty: written, read, and checked."""
+"""Calibration files for pipelines: writing with uncertainties, reading, and checking."""
 
 import lazy_loader
 

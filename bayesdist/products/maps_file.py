@@ -1,8 +1,8 @@
-"""FITS files of maps over the detector: errors of positions, and areas of pixels.
+"""FITS files of maps over the detector: position uncertainties and pixel areas.
 
-Of areas the image stands in the primary HDU for one chip, as the observatory's files have it, and
-in extensions SCI, 1 and on for several, in the order of an exposure's own.  Standard deviations
-follow as ERR.
+A pixel area map of one chip is written to the primary HDU, as in the observatory's files. Maps of
+several chips are written to extensions SCI,1 and so on, in the order of the extensions of an
+exposure. Standard deviations follow as extensions ERR.
 """
 
 from __future__ import annotations
@@ -33,14 +33,15 @@ def write_maps(
     converged: bool = True,
     notes: Sequence[str] = (),
 ) -> None:
-    """Write uncertainty maps of all chips of a detector as maps.fits, replaced atomically.
+    """Write uncertainty maps of all chips of a detector atomically as maps.fits.
 
-    Extensions LSQ_SIGMA_U, LSQ_SIGMA_V, LSQ_CORR hold the least-squares ones (outliers rejected),
-    MIX_SIGMA_U, MIX_SIGMA_V, MIX_CORR those of the mixture posterior, REL_SIGMA_U and so on those
-    of its relative positions, whatever the gauge, where the gauge matters; AREA and AREA_SIGMA the
-    relative pixel area.  Where there are several chips, the number of the chip follows each name,
-    as in MIX_SIGMA_U_2.  A linear WCS gives the detector pixel of each grid point.  `converged` and
-    `notes` on the posterior go to the primary header.
+    Extensions LSQ_SIGMA_U, LSQ_SIGMA_V and LSQ_CORR hold the least-squares results (outliers
+    rejected), and MIX_SIGMA_U, MIX_SIGMA_V and MIX_CORR those of the mixture posterior. If the
+    gauge matters, REL_SIGMA_U and so on hold the gauge-independent uncertainty of relative
+    positions. AREA and AREA_SIGMA are the relative pixel area and its standard deviation. With
+    several chips, the chip number follows each name, as in MIX_SIGMA_U_2. A linear WCS gives the
+    detector pixel of each grid point. `converged` and `notes` describe the posterior and are
+    written to the primary header.
     """
     hdus: list[fits.PrimaryHDU | fits.ImageHDU] = [fits.PrimaryHDU()]
     hdus[0].header["CREATOR"] = "bayesdist"
@@ -99,29 +100,41 @@ def write_pam(
     detector: str = "",
     source: str = "",
 ) -> None:
-    """Write pixel area maps of an image, whole or not at all.
+    """Write pixel area maps of an image atomically.
 
-    `maps`: one for each chip, in the order of the exposure's extensions. `instrument`, `detector`:
-    INSTRUME and DETECTOR; left out where empty. `source`: the calibration, for the header.
-    InputError without maps, or when the file cannot be written.
+    Parameters
+    ----------
+    path : path-like
+        Output file.
+    maps : sequence of PixelAreaMap
+        One map per chip, in the order of the exposure's extensions.
+    instrument, detector : str
+        INSTRUME and DETECTOR; omitted if empty.
+    source : str
+        Name of the calibration, for the header.
+
+    Raises
+    ------
+    InputError
+        If `maps` is empty, or the file cannot be written.
     """
     if not maps:
         raise InputError("there is no map to write", where=str(path), do="give one for each chip")
     primary = fits.PrimaryHDU()
     hdus: list[fits.PrimaryHDU | fits.ImageHDU] = [primary]
-    for version, one in enumerate(maps, start=1):
-        planes = [("SCI", one.area), ("ERR", one.sigma)]
+    for version, area_map in enumerate(maps, start=1):
+        planes = [("SCI", area_map.area), ("ERR", area_map.sigma)]
         for name, values in planes:
             if values is None:
                 continue
             data = values.astype(np.float32)
             if len(maps) == 1 and name == "SCI":
                 primary.data = data
-                _describe(primary.header, one)
+                _describe(primary.header, area_map)
                 continue
             hdu = fits.ImageHDU(data, name=name)
             hdu.header["EXTVER"] = version
-            _describe(hdu.header, one)
+            _describe(hdu.header, area_map)
             hdus.append(hdu)
     for keyword, text in (("INSTRUME", instrument), ("DETECTOR", detector)):
         if text:

@@ -1,7 +1,7 @@
-"""All formats, and functions for a file of any of them.
+"""All file formats, and functions that work on a file of any format.
 
-A format is a module of `bayesdist.products.formats`, or the module `format` of a folder there, that
-has a FORMAT: a new one is found by that alone.
+A format is a module of `bayesdist.products.formats`, or the module `format` of a subpackage of it,
+that defines FORMAT. New formats are discovered by this name alone.
 """
 
 from __future__ import annotations
@@ -38,41 +38,55 @@ if TYPE_CHECKING:
 
 @cache
 def all_formats() -> tuple[Format, ...]:
-    """Formats in the order in which a file is tried against them."""
-    found = []
+    """All formats, in the order in which they are tried on a file."""
+    found_formats = []
     for entry in pkgutil.iter_modules(formats.__path__):
         if entry.name == "common":
             continue
         name = f"{formats.__name__}.{entry.name}" + (".format" if entry.ispkg else "")
-        one = getattr(import_module(name), "FORMAT", None)
-        if one is not None:
-            found.append(one)
-    return tuple(sorted(found, key=lambda one: one.rank))
+        format_ = getattr(import_module(name), "FORMAT", None)
+        if format_ is not None:
+            found_formats.append(format_)
+    return tuple(sorted(found_formats, key=lambda format_: format_.rank))
 
 
 def open_document(path: str | os.PathLike[str]) -> Document:
-    """Document of a file, whose format is recognized by its content.
+    """Open a file and recognize its format by its content.
 
-    InputError when the file cannot be read or is of no format. FormatError when it is of a format
-    and broken.
+    Parameters
+    ----------
+    path : path-like
+        File of any format.
+
+    Returns
+    -------
+    Document
+        Parsed file with its format.
+
+    Raises
+    ------
+    InputError
+        If the file cannot be read or is of no known format.
+    FormatError
+        If the file is of a known format but damaged.
     """
     return recognized(read_content(path))
 
 
 def recognized(content: Content) -> Document:
-    """Document of content in memory; as `open_document`."""
-    for one in all_formats():
+    """Document of content in memory; see `open_document`."""
+    for format_ in all_formats():
         with readable(content.name):
-            holds = one.parse(content)
+            holds = format_.parse(content)
         if holds is not None:
-            return Document(content.name, one, holds)
+            return Document(content.name, format_, holds)
     if content.damage is not None:
         raise content.damage
-    *others, last = (one.title for one in all_formats())
+    *titles, last_title = (format_.title for format_ in all_formats())
     raise InputError(
         "is of no kind that is understood here",
         where=content.name,
-        do=f"give {', '.join(others)}, or {last}",
+        do=f"give {', '.join(titles)}, or {last_title}",
     )
 
 
@@ -82,30 +96,48 @@ def read_calibration(
     filter: str | None = None,
     size: tuple[float, float] | None = None,
 ) -> Calibration:
-    """Calibration of a file of any format.
+    """Read a calibration from a file of any format.
 
-    `filter`, `size`: as in `Choice`. InputError for a file that holds none, a filter or band that
-    it does not have or that has to be named, or a SIP header without a size.
+    Parameters
+    ----------
+    path : path-like
+        File of any format that holds a calibration.
+    filter : str, optional
+        Filter or band, if the file has several calibrations.
+    size : tuple of float, optional
+        Columns and rows, for a header that does not state them.
+
+    Returns
+    -------
+    Calibration
+        Calibration with its covariance if the file states one.
+
+    Raises
+    ------
+    InputError
+        If the file holds no calibration, does not have the filter, needs a filter or band, or is a
+        SIP header without a size.
     """
     return open_document(path).calibration(Choice(filter, size))
 
 
 def describe(path: str | os.PathLike[str]) -> str:
-    """Text on the content of a calibration file of any format, with its findings.
+    """Text that describes a calibration file of any format, with the findings of its checks.
 
     Parameters
     ----------
-    path : path
+    path : path-like
+        File of any format.
 
     Returns
     -------
     str
-        Several lines, as `bayesdist inspect` prints them.
+        Several lines, as printed by `bayesdist inspect`.
 
     Raises
     ------
     InputError
-        For a file that cannot be read or is of no known format.
+        If the file cannot be read or is of no known format.
 
     Examples
     --------
@@ -123,21 +155,22 @@ def describe(path: str | os.PathLike[str]) -> str:
 
 
 def lint(path: str | os.PathLike[str]) -> tuple[Finding, ...]:
-    """Faults and peculiarities of a calibration file of any format.
+    """Check a calibration file of any format for errors and peculiarities.
 
     Parameters
     ----------
-    path : path
+    path : path-like
+        File of any format.
 
     Returns
     -------
     tuple of Finding
-        Each with `level` ('error', 'warning' or 'note'), `where` and `message`.
+        Findings, each with `level` ('error', 'warning' or 'note'), `where` and `message`.
 
     Raises
     ------
     InputError
-        For a file that cannot be read or is of no known format.
+        If the file cannot be read or is of no known format.
 
     Examples
     --------
@@ -156,14 +189,16 @@ def lint(path: str | os.PathLike[str]) -> tuple[Finding, ...]:
 
 def product_settings() -> dict[str, type[FormatSettings]]:
     """Settings of the formats that can be built, by key: the sections of [products]."""
-    return {one.key: one.settings for one in all_formats() if one.settings is not None}
+    return {
+        format_.key: format_.settings for format_ in all_formats() if format_.settings is not None
+    }
 
 
 def format_of(key: str) -> Format:
-    """Format of a key that can be built; InputError where there is none."""
-    for one in all_formats():
-        if one.key == key and one.build is not None:
-            return one
+    """Format that can be built, by its key; InputError if there is none."""
+    for format_ in all_formats():
+        if format_.key == key and format_.build is not None:
+            return format_
     names = sorted(product_settings())
     near = get_close_matches(str(key).lower(), names, n=1, cutoff=0.5)
     meant = f"use {near[0]!r} if that is meant, or " if near else ""
@@ -174,14 +209,14 @@ def format_of(key: str) -> Format:
 
 
 def list_formats() -> Table:
-    """Formats of calibration files.
+    """Table of all calibration file formats.
 
     Returns
     -------
     astropy.table.Table
-        One row for each format: `name`, as `bayesdist.Calibration.write` takes it; `title`; and
-        whether files of it can be `read` as a calibration, `written` from one, and hold look-up
-        `tables` and the dependence on `time`.
+        One row per format: `name`, as accepted by `bayesdist.Calibration.write`; `title`; and
+        whether files of that format can be `read` as a calibration, `written` from one, and hold
+        look-up `tables` and the dependence on `time`.
 
     Examples
     --------
@@ -213,18 +248,18 @@ def build(
     settings: FormatSettings,
     options: BuildOptions = BuildOptions(),  # noqa: B008
 ) -> tuple[Built, ...]:
-    """Files of a format, built and not written; values that the format cannot hold are refused."""
-    one = format_of(key)
-    if calibration.model.order > one.highest_order:
+    """Build the files of a format in memory; InputError for values that the format cannot hold."""
+    format_ = format_of(key)
+    if calibration.model.order > format_.highest_order:
         raise InputError(
-            f"the order is {calibration.model.order}, and polynomials of {one.title} go "
-            f"up to order {one.highest_order}",
+            f"the order is {calibration.model.order}, and polynomials of {format_.title} go "
+            f"up to order {format_.highest_order}",
             where=f"products.{key}",
-            do=f"give order {one.highest_order} (--order of convert), or choose another format",
+            do=f"give order {format_.highest_order} (--order of convert), or choose another format",
         )
-    if one.holds_tables and not calibration.before:
+    if format_.holds_tables and not calibration.before:
         calibration = replace(calibration, before=options.tables)
-    files = required(one.build, f"files of {one.title} cannot be built")(
+    files = required(format_.build, f"files of {format_.title} cannot be built")(
         calibration, settings, options
     )
     for file in files:
@@ -235,21 +270,22 @@ def build(
 def read_back(
     key: str, files: Sequence[Built], calibration: Calibration, options: BuildOptions
 ) -> Sequence[ReadBack]:
-    """What files of a format say of positions; they were built of a calibration with options.
+    """Evaluate positions by the files of a format.
 
-    By default files are read as other programs have them, without those that stand beside them for
-    their covariance; several files, each of one chip, are one.
+    `calibration` and `options` are those that the files were built from. By default, files are read
+    as other programs read them, without their stored parameters, and several files of one chip each
+    are combined into one.
     """
-    found = format_of(key).read_back
-    if found is not None:
-        return found(files, calibration, options)
+    reader = format_of(key).read_back
+    if reader is not None:
+        return reader(files, calibration, options)
     parts: dict[int, ReadBack] = {}
-    for one in files:
-        if one.kind == PARAMETERS:
+    for built in files:
+        if built.kind == PARAMETERS:
             continue
-        document = recognized(Content(one.file_name, one.content))
+        document = recognized(Content(built.file_name, built.content))
         used = document.calibration(Choice(as_used=True))
-        chips = used.numbers if one.chip is None else (one.chip,)
-        part = by_calibrations(one.file_name, [used], calibration.model.time)
+        chips = used.numbers if built.chip is None else (built.chip,)
+        part = by_calibrations(built.file_name, [used], calibration.model.time)
         parts |= dict.fromkeys(chips, part)
     return [of_chips(parts)]

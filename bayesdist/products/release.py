@@ -1,7 +1,7 @@
-"""A calibration as the set of files that a pipeline takes in.
+"""Write a calibration as the complete set of files that the HST pipeline needs.
 
-One IDCTAB for each period, since a file holds one drift; one D2IMFILE, since the detector's pixels
-do not change; one NPOLFILE for each filter.
+There is one IDCTAB per period, because a file holds only one drift; one D2IMFILE, because the
+detector's pixels do not change; and one NPOLFILE per filter.
 """
 
 from __future__ import annotations
@@ -30,20 +30,20 @@ Filter = str | tuple[str, ...]
 
 @dataclass(frozen=True)
 class Period:
-    """Years that one IDCTAB serves.
+    """Range of dates covered by one IDCTAB.
 
     Parameters
     ----------
     name : str
-        Part of the file's name, as "pre" and "post".
+        Part of the file name, such as "pre" or "post".
     years : tuple of float
         First and last date, decimal years.
     segment : int
-        Segment of the solution's time dependence, from 0.
+        Segment of the solution's time dependence, counted from 0.
     useafter : str, optional
-        USEAFTER, as "Mar 01 2002 00:00:00".
+        USEAFTER, such as "Mar 01 2002 00:00:00".
     pedigree : str, optional
-        PEDIGREE, as "INFLIGHT 01/03/2002 01/05/2009".
+        PEDIGREE, such as "INFLIGHT 01/03/2002 01/05/2009".
     """
 
     name: str
@@ -55,17 +55,18 @@ class Period:
 
 @dataclass(frozen=True)
 class Release:
-    """Files that were written, and drifts that they do not hold.
+    """Files that were written, and drifts that they could not store.
 
     Parameters
     ----------
     idctabs : dict of str to Path
-        By the name of the period.
+        IDCTABs by the name of their period.
     d2im : Path or None
+        D2IMFILE; None if there are no detector tables.
     npol : dict of str to Path
-        By filter.
+        NPOLFILEs by filter.
     lost : dict of str to tuple of Loss
-        By the name of the period: drifts that no file could store, with their size.
+        Drifts that could not be stored, with their size, by the name of the period.
     """
 
     idctabs: dict[str, Path]
@@ -75,7 +76,7 @@ class Release:
 
     @property
     def paths(self) -> list[Path]:
-        """All files."""
+        """Paths of all files."""
         middle = [] if self.d2im is None else [self.d2im]
         return [*self.idctabs.values(), *middle, *self.npol.values()]
 
@@ -101,58 +102,67 @@ def write_release(
     Parameters
     ----------
     folder : path-like
-        Made where it is not there.
+        Output folder, which is created if it does not exist.
     name : str
-        Beginning of the names of all files.
+        First part of all file names.
     calibrations : mapping of filter to Calibration
-        Free of velocity aberration, with all segments, in the system of the orientation.  The
-        first one's drift is stored, and must hold for the others (see `storable`).
+        Calibrations free of velocity aberration, with all segments, in the coordinate system of the
+        orientation. The drift of the first calibration is stored, and must be valid for the others
+        (see `storable`).
     orientation : Orientation
+        Orientation of (u, v) in V2, V3.
     periods : sequence of Period
-        One for each IDCTAB.
+        One period for each IDCTAB.
     tables : sequence of LookupTable
-        The detector's (filter '') and those of filters, at most one for each chip and filter.
+        Tables of the detector (filter '') and of filters, at most one for each chip and filter.
     stand_ins : mapping of filter to filter, optional
-        Filters without a calibration of their own, and whose rows serve them.  stwcs stops at an
-        exposure whose filters no row names.
+        For each filter without a calibration, the filter that provides its rows. stwcs stops at an
+        exposure if no row has its filters.
     instrument, detector : str
+        INSTRUME and DETECTOR.
     scale_arcsec : float
         SCALE: size of the pixels onto which images are drizzled.
     limit_mas : float
-        Largest drift that may stay out of a file.
+        Largest drift that may be left out of a file.
     description : str
         DESCRIP of all files.
     history : sequence of str
-        Lines for HISTORY of all files.
+        HISTORY lines of all files.
 
     Returns
     -------
     Release
+        Paths of the files, and the drifts that were left out.
 
     Raises
     ------
     InputError
-        For no filter or period, periods of one name, a table or stand-in of a filter that has no
-        solution, whatever `oriented`, `storable` and `idctab_from_solution` refuse, or a file that
-        cannot be written.  No file is written unless all IDCTABs could be made.
+        If there is no filter or no period, if two periods have the same name, if a table or
+        stand-in names a filter without a calibration, for the reasons given in `oriented`,
+        `storable` and `idctab_from_solution`, or if a file cannot be written. No file is written
+        unless all IDCTABs can be built.
     DegenerateError
-        When the linear part of a chip is singular.
+        If the linear part of a chip is singular.
     """
     stand_ins = stand_ins or {}
     _check(calibrations, periods, tables, stand_ins)
-    turned = {filter: oriented(one, orientation) for filter, one in calibrations.items()}
-    made: dict[str, IdcTab] = {}
+    turned = {
+        filter: oriented(calibration, orientation) for filter, calibration in calibrations.items()
+    }
+    built: dict[str, IdcTab] = {}
     lost: dict[str, tuple[Loss, ...]] = {}
     for period in periods:
-        rows, left = _stored(turned, period, limit_mas)
-        lost[period.name] = tuple(entry for some in left.values() for entry in some)
+        rows, losses = _stored(turned, period, limit_mas)
+        lost[period.name] = tuple(
+            entry for filter_losses in losses.values() for entry in filter_losses
+        )
         notes = [
             f"{filter}: {entry}." if len(rows) > 1 else f"{entry}."
-            for filter, some in left.items()
-            for entry in some
+            for filter, filter_losses in losses.items()
+            for entry in filter_losses
         ]
-        served = {stand_in: rows[other] for stand_in, other in stand_ins.items()}
-        made[period.name] = idctab_from_solution(
+        served = {stand_in: rows[substitute] for stand_in, substitute in stand_ins.items()}
+        built[period.name] = idctab_from_solution(
             rows | served,
             instrument=instrument,
             detector=detector,
@@ -171,9 +181,9 @@ def write_release(
         )
 
     folder = made_folder(folder)
-    idctabs = {period: _path(folder, f"{name}_{period}_idc.fits", "the name") for period in made}
+    idctabs = {period: _path(folder, f"{name}_{period}_idc.fits", "the name") for period in built}
     for period_name, path in idctabs.items():
-        write_idctab(made[period_name], path)
+        write_idctab(built[period_name], path)
     first = periods[0]
     common: dict[str, Any] = {
         "description": description,
@@ -196,7 +206,7 @@ def write_release(
         write_npol(
             [t for t in tables if t.filter == filter],
             npol[filter],
-            idctab=made[first.name],
+            idctab=built[first.name],
             filters=combination_of(filter, instrument),
             **common,
         )
@@ -204,7 +214,7 @@ def write_release(
 
 
 def _path(folder: Path, name: str, source: str) -> Path:
-    """Path of a file of the set; `source` of its name is for the error."""
+    """Path of a file of the release; `source` names the part of its name in the error message."""
     refuse_unsafe_name(name, where=f"{source} of the release")
     return folder / name
 
@@ -212,12 +222,12 @@ def _path(folder: Path, name: str, source: str) -> Path:
 def _stored(
     calibrations: Mapping[str, Calibration], period: Period, limit_mas: float
 ) -> tuple[dict[Filter, Calibration], dict[Filter, tuple[Loss, ...]]]:
-    """Calibrations of a period with the first one's drift, and the drifts left out, by filter."""
+    """Calibrations of a period with the drift of the first one, and the losses, by filter."""
     rows: dict[Filter, Calibration] = {}
     lost: dict[Filter, tuple[Loss, ...]] = {}
-    for filter, one in calibrations.items():
+    for filter, calibration in calibrations.items():
         rows[filter], lost[filter] = storable(
-            one,
+            calibration,
             years=period.years,
             segment=period.segment,
             limit_mas=limit_mas,
@@ -241,18 +251,18 @@ def _check(
         raise InputError(
             "two periods have one name", where="periods", do="give each a name of its own"
         )
-    known = f"solutions are given for {', '.join(map(str, calibrations))}"
+    available = f"solutions are given for {', '.join(map(str, calibrations))}"
     for table in tables:
         if table.filter and table.filter not in calibrations:
             raise InputError(
                 f"the look-up table {table.label} is of a filter without a solution",
                 where="tables",
-                do=known,
+                do=available,
             )
-    for filter, other in stand_ins.items():
-        if other not in calibrations:
+    for filter, stand_in in stand_ins.items():
+        if stand_in not in calibrations:
             raise InputError(
-                f"{other!r} is to stand in for {filter!r} and has no solution",
+                f"{stand_in!r} is to stand in for {filter!r} and has no solution",
                 where="stand_ins",
-                do=known,
+                do=available,
             )

@@ -1,4 +1,4 @@
-"""Headers of any projection, sampled through astropy.wcs and fitted by a polynomial."""
+"""Sample a header of any projection through astropy.wcs and fit a polynomial."""
 
 from __future__ import annotations
 
@@ -27,13 +27,13 @@ if TYPE_CHECKING:
     from astropy.wcs import WCS
 
 FIRST_ORDER, LAST_ORDER = 2, 9  # orders that are tried
-GOOD_PIX = 1e-3  # largest distance at which no higher order is tried, pixels
-_GRID = 65  # points of each axis at which the polynomial is compared with astropy.wcs
+GOOD_PIX = 1e-3  # pixels; stop raising the order when the largest distance is below this
+_GRID = 65  # points per axis at which the polynomial is compared with astropy.wcs
 
 
 @dataclass(frozen=True, eq=False)
 class SampledCalibration:
-    """Polynomial on a tangent plane that follows a header, and its distance from the header."""
+    """Polynomial on a tangent plane fitted to a header, and its distance from the header."""
 
     calibration: Calibration
     order: int
@@ -41,11 +41,11 @@ class SampledCalibration:
     rms_pix: float
     pixel_arcsec: float  # mean side of a pixel
     projection: str  # code of the header's projection
-    system: str  # celestial system of the header, ICRS in the calibration
+    system: str  # celestial system of the header; the calibration is in ICRS
 
     @property
     def sentence(self) -> str:
-        """How well the polynomial follows the header."""
+        """Sentence on the distance between the polynomial and the header."""
         mas = 1e3 * self.pixel_arcsec
         source = f"{self.projection}, {self.system.upper()}"
         return (
@@ -61,23 +61,23 @@ def sampled_calibration(
     order: int | None = None,
     size: tuple[float, float] | None = None,
 ) -> SampledCalibration:
-    """Calibration of a header of any projection that astropy.wcs reads.
+    """Calibration of a header of any projection that astropy.wcs can read.
 
     Parameters
     ----------
-    path : path
-        FITS file or text file of cards; its first header with two celestial axes is used.
+    path : path-like
+        FITS file, or text file of cards. Its first header with two celestial axes is used.
     order : int, optional
-        Order of the polynomial; by default the lowest from 2 to 9 that follows the header to
-        0.001 pixels, or the best of them.
+        Order of the polynomial. The default is the lowest order from 2 to 9 that agrees with the
+        header to 0.001 pixels, or else the best of these orders.
     size : tuple of float, optional
         Columns and rows, for a header that does not state them.
 
     Returns
     -------
     SampledCalibration
-        One chip without errors, in arcsec on the plane that touches the sky (ICRS) at the reference
-        pixel, or in the middle of the image if the reference pixel lies outside.
+        One chip without errors, in arcsec on the plane tangent to the sky (ICRS) at the reference
+        pixel, or at the middle of the image if the reference pixel is outside the image.
 
     Raises
     ------
@@ -91,11 +91,11 @@ def sampled_calibration(
     positions = _Positions.of(wcs, stated, content.name)
     tried = range(FIRST_ORDER, LAST_ORDER + 1) if order is None else (order,)
     best: tuple[float, float, ChipMap] | None = None
-    for one in tried:
+    for trial_order in tried:
         fitted = fitted_map(
             positions.plane,
             content.name,
-            order=one,
+            order=trial_order,
             size=stated,
             reference_pixel=positions.pixel,
             unit="arcsec",
@@ -126,7 +126,7 @@ def sampled_calibration(
 
 
 def _celestial(content: Content) -> tuple[fits.Header, WCS]:
-    """First header with two celestial axes, and its world coordinates by astropy.wcs."""
+    """First header with two celestial axes, and its WCS."""
     for hdu in content.hdus:
         if not (holds_wcs(hdu.header) or projection_code(hdu.header)):
             continue
@@ -149,19 +149,19 @@ def _celestial(content: Content) -> tuple[fits.Header, WCS]:
 
 @dataclass(frozen=True, eq=False)
 class _Positions:
-    """Positions of pixels by astropy.wcs, in ICRS and on a tangent plane."""
+    """Pixel positions computed by astropy.wcs, in ICRS and on a tangent plane."""
 
     wcs: WCS
     size: tuple[float, float]
     where: str
-    pixel: tuple[float, float]  # where the plane touches the sky
-    point: tuple[float, float]  # RA and Dec there, degrees
+    pixel: tuple[float, float]  # tangent point in pixels
+    point: tuple[float, float]  # RA and Dec of the tangent point, degrees
     pixel_arcsec: float
     system: str
 
     @classmethod
     def of(cls, wcs: WCS, size: tuple[float, float], where: str) -> _Positions:
-        """Positions about the reference pixel, or about the middle of the image."""
+        """Positions with the tangent point at the reference pixel, or else at the image centre."""
         from astropy.wcs.utils import wcs_to_celestial_frame
 
         try:
@@ -176,7 +176,7 @@ class _Positions:
         inside = 0.5 <= x <= size[0] + 0.5 and 0.5 <= y <= size[1] + 0.5
         pixel = (x, y) if inside else ((size[0] + 1) / 2, (size[1] + 1) / 2)
         bare = cls(wcs, size, where, pixel, (0.0, 0.0), 1.0, system)
-        # a step of a pixel along each axis
+        # offsets of one pixel along each axis
         ra, dec = bare.sky(pixel[0] + np.array([0.0, 1.0, 0.0]), pixel[1] + np.array([0.0, 0, 1]))
         point = float(ra[0]), float(dec[0])
         u, v = tangent_plane(ra, dec, point)
@@ -184,7 +184,7 @@ class _Positions:
         return cls(wcs, size, where, pixel, point, float(np.sqrt(area)), system)
 
     def sky(self, x: Float, y: Float) -> tuple[Float, Float]:
-        """RA and Dec (N,) in ICRS, degrees, of pixels that count from 1."""
+        """RA and Dec (N,) in ICRS, degrees, of FITS 1-based pixels."""
         from astropy.coordinates import SkyCoord
         from astropy.wcs.utils import wcs_to_celestial_frame
 
@@ -192,10 +192,10 @@ class _Positions:
             warnings.simplefilter("ignore")
             world = np.asarray(self.wcs.all_pix2world(np.column_stack([x, y]), 1), float)
             lon, lat = world[:, self.wcs.wcs.lng], world[:, self.wcs.wcs.lat]
-            known = np.isfinite(lon) & np.isfinite(lat)
-            if not known.all():
+            finite = np.isfinite(lon) & np.isfinite(lat)
+            if not finite.all():
                 raise InputError(
-                    f"has no position on the sky for {100 * np.mean(~known):.2g} % of the image",
+                    f"has no position on the sky for {100 * np.mean(~finite):.2g} % of the image",
                     where=self.where,
                     do="cut the image where the projection ends, or give --size of a part",
                 )
@@ -208,8 +208,8 @@ class _Positions:
                     where=self.where,
                     do="give a header of right ascension and declination",
                 )
-            found = at.icrs
-        return np.asarray(found.ra.deg, float), np.asarray(found.dec.deg, float)
+            icrs = at.icrs
+        return np.asarray(icrs.ra.deg, float), np.asarray(icrs.dec.deg, float)
 
     def plane(self, x: Float, y: Float) -> Float:
         """Positions (2, N) on the tangent plane, arcsec."""

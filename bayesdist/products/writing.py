@@ -1,7 +1,7 @@
-"""Calibrations written as files of any format: from Python, and by `bayesdist convert`.
+"""Write calibrations to files of any format, from Python and by `bayesdist convert`.
 
-A calibration is refused if the format cannot represent all of it.  The caller then says what to
-do: an epoch for a calibration that depends on time, an order for a polynomial in place of look-up
+A calibration is refused if the format cannot represent all of it. The caller must then choose: an
+epoch for a calibration that depends on time, an order for a polynomial that replaces look-up
 tables.
 """
 
@@ -35,8 +35,9 @@ from bayesdist.utils.quantities import Epoch, Number, value_in, year_of
 
 log = logging.getLogger("bayesdist")
 
-CALLER = 3  # frames from here to whoever calls `Calibration.write`
-LONGEST_NAME = 40  # characters of a file name from which names in headers are made: a card has 68
+CALLER = 3  # stack frames from here to the caller of `Calibration.write`
+# characters; names in headers are derived from the file name, and a card holds 68
+LONGEST_NAME = 40
 
 
 def write_calibration(
@@ -90,25 +91,25 @@ def write_calibration(
                 "this file exists", where=str(place), do="replace it with overwrite=True"
             )
     write_built(built, places)
-    remarks = (*notes, *(w for one in built for w in one.warnings))
+    remarks = (*notes, *(w for part in built for w in part.warnings))
     for text in dict.fromkeys(remarks):
         warnings.warn(f"{places[-1]}: {text}", BayesdistWarning, stacklevel=CALLER)
-    for text in dict.fromkeys(note for one in built for note in one.notes):
+    for text in dict.fromkeys(note for part in built for note in part.notes):
         log.info("%s: %s", places[-1], text)
     return places
 
 
 def settings_of(key: str, values: Mapping[str, Any]) -> FormatSettings:
-    """Settings of a format that can be built, as of its table in a configuration.
+    """Validated settings of a format that can be built; `values` are its configuration keys.
 
-    InputError for keys that it does not have, values that it cannot use, and values that it needs.
+    InputError for unknown keys, invalid values and missing values.
     """
     kind = product_settings()[key]
-    known = list(kind.model_fields)
+    keys = list(kind.model_fields)
     for name in values:
-        if not known:
+        if not keys:
             raise InputError(f"{key} has no settings", where=f"products.{key}.{name}", do="omit it")
-        require_known(name, known, f"setting of {key}", where=f"products.{key}")
+        require_known(name, keys, f"setting of {key}", where=f"products.{key}")
     try:
         return kind(**values)
     except ValidationError as error:
@@ -117,21 +118,22 @@ def settings_of(key: str, values: Mapping[str, Any]) -> FormatSettings:
         missing = [
             name for name, fault in zip(names, faults, strict=True) if fault["type"] == "missing"
         ]
-        what, where = faults[0]["msg"].lower(), f"products.{key}.{names[0]}"
+        problem, location = faults[0]["msg"].lower(), f"products.{key}.{names[0]}"
         if missing:
-            what, where = f"needs {', '.join(missing)}", f"products.{key}"
+            problem, location = f"needs {', '.join(missing)}", f"products.{key}"
         raise InputError(
-            what, where=where, do=f"the settings of {key} are {', '.join(known) or 'none'}"
+            problem, where=location, do=f"the settings of {key} are {', '.join(keys) or 'none'}"
         ) from None
 
 
 def representable(
     calibration: Calibration, target: Format, order: int | None, epoch: float | None
 ) -> tuple[Calibration, list[str]]:
-    """Calibration that a format can hold, and notes on what was done for it.
+    """Calibration that a format can represent, and notes on what was changed.
 
-    Look-up tables that the format has no room for go into a polynomial of its highest order, or of
-    `order`, to which the polynomial of the calibration is brought as well.
+    Look-up tables that the format cannot hold are absorbed into a polynomial of order `order`, by
+    default the highest order of the format. The polynomial of the calibration is converted to that
+    order as well.
     """
     tables = bool(calibration.before or calibration.after)
     if order is None and (not tables or target.holds_tables):
@@ -149,33 +151,33 @@ def representable(
         worst, rms = max(worst, largest), max(rms, mean)
     n_coefficients = 2 * next(iter(maps.values())).basis.n_terms
     cov = _joint_covariance(calibration, epoch, n_coefficients)
-    made = calibration_of_maps(maps, calibration.name, cov=cov, errors=calibration.errors)
-    what = "its look-up tables go" if tables else f"its order {calibration.model.order} goes"
-    note = f"{what} into a polynomial of order {wanted}: {worst:.3g} pix off at worst"
+    fitted = calibration_of_maps(maps, calibration.name, cov=cov, errors=calibration.errors)
+    source = "its look-up tables go" if tables else f"its order {calibration.model.order} goes"
+    note = f"{source} into a polynomial of order {wanted}: {worst:.3g} pix off at worst"
     note += f", {rms:.3g} rms"
     return replace(
-        calibration, solution=made.solution, before=(), after=(), inverses={}, reference_date=None,
-        undated="",
+        calibration, solution=fitted.solution, before=(), after=(), inverses={},
+        reference_date=None, undated="",
     ), [note]  # fmt: skip
 
 
 def _joint_covariance(calibration: Calibration, epoch: float | None, size: int) -> Float | None:
-    """Covariance of all chips, for polynomials of `size` coefficients a chip."""
+    """Joint covariance of all chips for polynomials with `size` coefficients per chip."""
     cov = calibration.joint_covariance(calibration.numbers, epoch, origin="stated")
     if cov is None:
         return None
     n, K = len(calibration.numbers), calibration.model.n_terms
     out = np.zeros((n, 2, size // 2, n, 2, size // 2))
-    same = min(K, size // 2)
+    n_common = min(K, size // 2)
     parts = cov.reshape(n, 2, K, n, 2, K)
-    out[:, :, :same, :, :, :same] = parts[:, :, :same, :, :, :same]
+    out[:, :, :n_common, :, :, :n_common] = parts[:, :, :n_common, :, :, :n_common]
     return out.reshape(n * size, n * size)
 
 
 def refuse_unknown_scale(
     calibration: Calibration, target: Format, settings: FormatSettings, scale: float | None
 ) -> None:
-    """Refuse u and v in pixels of unknown size for a file that states angles."""
+    """Raise InputError if u and v are in pixels of unknown scale and the file states angles."""
     if calibration.unit == "pix" and scale is None and target.needs_scale(settings):
         raise InputError(
             f"is in pixels of unknown size, and {target.title} states angles",
@@ -191,7 +193,7 @@ def built_for(
     options: BuildOptions,
     target: Path,
 ) -> tuple[Built, ...]:
-    """Files of a format, named after the target where that is a file and headers can state it."""
+    """Files of a format, named after the target if it is a file name that a header can state."""
     name = target.name
     if not target.is_dir() and len(name) <= LONGEST_NAME and name.isascii() and name.isprintable():
         options = replace(options, file_name=name)
@@ -201,26 +203,26 @@ def built_for(
 def places_of(built: Sequence[Built], target: Path) -> list[Path]:
     """Output paths: inside `target` if it is a folder, else `target` and its companion files.
 
-    InputError for a file name where there are several files beside those with parameters.
+    InputError if `target` is a file name but there are several files that hold no parameters.
     """
     if target.is_dir():
-        return [target / one.file_name for one in built]
-    names = [one.file_name for one in built if one.kind != PARAMETERS]
+        return [target / part.file_name for part in built]
+    names = [part.file_name for part in built if part.kind != PARAMETERS]
     if len(names) > 1:
         raise InputError(
             f"{len(names)} files are made ({', '.join(names)})",
             where=str(target),
             do="name a folder that exists",
         )
-    return [target.parent / one.file_name if one.kind == PARAMETERS else target for one in built]
+    return [target.parent / part.file_name if part.kind == PARAMETERS else target for part in built]
 
 
 def write_built(built: Sequence[Built], places: Sequence[Path]) -> None:
     """Write all files to temporary names, then rename them."""
     with ExitStack() as stack:
-        # the last that is entered is the first to take its name: a file follows those beside it
-        for place, one in reversed(list(zip(places, built, strict=True))):
-            stack.enter_context(atomic_path(place)).write_bytes(one.content)
+        # contexts exit in reverse order: each file is renamed after its companions are in place
+        for place, part in reversed(list(zip(places, built, strict=True))):
+            stack.enter_context(atomic_path(place)).write_bytes(part.content)
 
 
 def _formats_with_tables() -> list[str]:
@@ -228,7 +230,7 @@ def _formats_with_tables() -> list[str]:
 
 
 def _mas(scale: Number | None) -> float | None:
-    """Scale in mas; InputError if it is no angle, or not positive."""
+    """Scale in mas; InputError if it is not an angle or not positive."""
     if scale is None:
         return None
     value = value_in(scale, "mas", "scale_mas")

@@ -1,4 +1,4 @@
-"""Contents of a page: registry of its figures and tables, and the sections of the report."""
+"""Contents of a page: a registry of figures and tables, and the sections of the report."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ When = Callable[[Any], bool]
 
 @dataclass(frozen=True, eq=False)
 class Plot:
-    """Figure and its words."""
+    """A figure with its texts."""
 
     figure: Figure
     title: str
@@ -28,39 +28,39 @@ class Plot:
 
 @dataclass(frozen=True)
 class Section:
-    """Section of a page; title and `printed` (on paper) may be functions of the results."""
+    """Section of a page; `title` and `printed` (shown on paper) may be functions of the results."""
 
     name: str
     title: str | Callable[[Any], str]
-    empty: str = ""  # text in place of missing tables; a section without it is left out
-    parent: str = ""  # section that it is a part of
+    empty: str = ""  # text shown instead of missing tables; without it the section is left out
+    parent: str = ""  # name of the section that contains this one
     printed: bool | When = True
 
     def title_of(self, results: Any) -> str:
-        """Title in the page of some results."""
+        """Title for a page with these results."""
         return self.title if isinstance(self.title, str) else self.title(results)
 
     def is_printed(self, results: Any) -> bool:
-        """True where the section is on paper."""
+        """True if the section is shown on paper."""
         return self.printed(results) if callable(self.printed) else self.printed
 
 
 @dataclass(frozen=True)
 class Entry:
-    """Figure, table or data of a page; `each` gives name and argument of each of many figures."""
+    """Figure, table or data of a page; `each` returns names and arguments of several figures."""
 
-    name: str  # of the function; of a figure also that of its files
-    section: str  # data belong to none
+    name: str  # of the function, and of the files of a figure
+    section: str  # empty for data
     kind: Kind
-    make: Callable[..., Any]  # of the results and an item of `each`: Plot, TextTable(s) or data
+    make: Callable[..., Any]  # function of the results and an item of `each`
     needs: tuple[str, ...] = ()  # attributes of the results that must be neither None nor empty
-    when: When | None = None  # condition that no attribute states
+    when: When | None = None  # further condition on the results
     each: Callable[[Any], Mapping[str, Any]] | None = None
-    printed: bool | When = False  # on paper
-    folded: bool = False  # shown on the screen when a reader asks for it
+    printed: bool | When = False  # shown on paper
+    folded: bool = False  # on screen, shown only when a reader opens it
 
     def applies(self, results: Any) -> bool:
-        """True where it can be made of these results."""
+        """True if it can be made from these results."""
         if not all(_present(results, path) for path in self.needs):
             return False
         return self.when is None or self.when(results)
@@ -68,7 +68,7 @@ class Entry:
 
 @dataclass(frozen=True)
 class Item:
-    """Entry in the page of some results; its function gets the results and `arguments`."""
+    """An entry for a page with given results; its function takes the results and `arguments`."""
 
     name: str
     section: str
@@ -78,12 +78,12 @@ class Item:
     folded: bool = False
 
     def made(self, results: Any) -> Any:
-        """Figure, table or data made of the results."""
+        """Figure, table or data made from the results."""
         return self.make(results, *self.arguments)
 
 
 class Registry:
-    """Figures, tables and data that one kind of page can show, in sections in the page's order."""
+    """Figures, tables and data of one kind of page, in sections that are in the page's order."""
 
     def __init__(self, name: str, sections: Sequence[Section]) -> None:
         self.name, self.sections = name, tuple(sections)
@@ -99,7 +99,7 @@ class Registry:
         printed: bool | When = False,
         folded: bool = False,
     ) -> Callable[[Make], Make]:
-        """Decorator of a function that makes a `Plot`, in our style; parameters as of `Entry`."""
+        """Decorator for a function that makes a `Plot`; for the parameters see `Entry`."""
         options = {"needs": needs, "when": when, "each": each, "printed": printed}
         options["folded"] = folded
         return self._decorator(section, "figure", options)
@@ -107,11 +107,11 @@ class Registry:
     def table(
         self, section: str, *, needs: tuple[str, ...] = (), when: When | None = None
     ) -> Callable[[Make], Make]:
-        """Decorator of a function that makes a `TextTable`, several, or None."""
+        """Decorator for a function that makes one or several `TextTable`, or None."""
         return self._decorator(section, "table", {"needs": needs, "when": when})
 
     def data(self, *, needs: tuple[str, ...] = ()) -> Callable[[Make], Make]:
-        """Decorator of a function that makes data for the scripts of the page."""
+        """Decorator for a function that makes data for the scripts of the page."""
         return self._decorator("", "data", {"needs": needs})
 
     def _decorator(
@@ -129,12 +129,12 @@ class Registry:
 
     @property
     def entries(self) -> tuple[Entry, ...]:
-        """Entries in the order of sections, then of registration."""
+        """Entries in the order of the sections, then of registration."""
         order = ["", *(section.name for section in self.sections)]
         return tuple(sorted(self._entries, key=lambda entry: order.index(entry.section)))
 
     def items(self, results: Any, kind: Kind) -> tuple[Item, ...]:
-        """Items that can be made of some results, in the order of the page."""
+        """Items that can be made from these results, in the order of the page."""
         out = []
         for entry in self.entries:
             if entry.kind != kind or not entry.applies(results):
@@ -152,7 +152,7 @@ class Registry:
 
 
 def _present(results: Any, path: str) -> bool:
-    """True where an attribute, or one of an attribute, is neither None nor empty."""
+    """True if a (nested) attribute is neither None nor empty."""
     value = reduce(
         lambda of, name: None if of is None else getattr(of, name), path.split("."), results
     )
@@ -164,7 +164,7 @@ REPORT = Registry(
     (
         Section("status", "Status"),
         Section("holdout", "Held-out stars"),
-        # a campaign's matching describes its data
+        # in a campaign, the section on matching describes the data
         Section("data", "Data", printed=lambda r: r.campaign is None),
         Section("campaign", "Campaign"),
         Section("campaign-matching", "Catalogue and matching", parent="campaign"),
@@ -174,7 +174,7 @@ REPORT = Registry(
             "campaign-release",
             "Released files and the alignment of two exposures",
             parent="campaign",
-            printed=False,  # the products have their files
+            printed=False,  # these products are in files
         ),
         Section("selfcal", "Gauge and stars"),
         Section(
@@ -201,7 +201,7 @@ REPORT = Registry(
 )
 
 
-# page and heading by section of the report
+# documentation page and heading that explain a section of the report
 EXPLAINED = {
     "status": ("report", "On top"),
     "data": ("your_table", ""),
@@ -224,9 +224,9 @@ EXPLAINED = {
     "products": ("files", ""),
     "provenance": ("files", ""),
 }
-_ANY = ("report", "Figures")  # of pages that are not the report of a run
+_ANY = ("report", "Figures")  # for pages other than the report of a run
 
-# section of the report that has the numbers behind a group of the status table
+# section of the report with the details of a group of the status table
 _SECTIONS = {
     "Held-out truth": "holdout",
     "Campaign": "campaign",
@@ -245,11 +245,11 @@ _SECTIONS = {
 
 
 def explanation_of(section: str) -> str:
-    """Command that shows the page about a section, and the heading to look for."""
+    """Command that shows the documentation of a section, and the heading to look for."""
     page, heading = EXPLAINED.get(section, _ANY)
     return f"bayesdist docs {page}" + (f", “{heading}”" if heading else "")
 
 
 def section_of(group: str) -> str:
-    """Section of the report behind a group of the status table; the group itself if none is."""
+    """Section of the report for a group of the status table; the group itself if there is none."""
     return _SECTIONS.get(group, group)

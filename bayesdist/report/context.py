@@ -1,4 +1,4 @@
-"""Input of the report of a run, and what a campaign adds to it."""
+"""Input of the report of a run, and the additional results of a campaign."""
 
 from __future__ import annotations
 
@@ -36,66 +36,66 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Product:
-    """File that the run wrote."""
+    """A file that the run wrote."""
 
-    path: str  # relative to the run's folder
-    what: str
-    checks: tuple[Check, ...] = ()  # of the file as written, such as its closure
+    path: str  # relative to the folder of the run
+    what: str  # description
+    checks: tuple[Check, ...] = ()  # checks of the written file, such as its closure
 
 
 @dataclass(frozen=True, eq=False)
 class ChipResults:
-    """Results of the assessment of one chip."""
+    """Results for one chip."""
 
     chip: Chip
     formal_map: UncertaintyMap  # of the least-squares fit
     posterior_map: UncertaintyMap | None
-    displacement: VectorMap  # distortion with its zeroth order suppressed
+    displacement: VectorMap  # distortion without its constant term
     non_linear: VectorMap
     area: AreaMap
     binned: BinnedResiduals
-    place: tuple[int, int] = (0, 0)  # row (0 on top) and column of the chip among the others
-    relative_map: UncertaintyMap | None = None  # of relative positions, where the gauge matters
+    place: tuple[int, int] = (0, 0)  # row (0 at the top) and column of the chip on the detector
+    relative_map: UncertaintyMap | None = None  # of relative positions, if the gauge matters
 
     @property
     def maps(self) -> tuple[UncertaintyMap, ...]:
-        """Uncertainty maps that are shown: two, or one where there is no other.
+        """The last two of the available uncertainty maps; these are shown.
 
-        Least squares and posterior; or posterior and relative positions, where there are such.
+        The order is least squares, posterior, and relative positions.
         """
-        known = (self.formal_map, self.posterior_map, self.relative_map)
-        return tuple(m for m in known if m is not None)[-2:]
+        available = (self.formal_map, self.posterior_map, self.relative_map)
+        return tuple(m for m in available if m is not None)[-2:]
 
     @property
     def best_map(self) -> UncertaintyMap:
-        """Uncertainty map of the posterior where there is one, else of least squares."""
+        """Uncertainty map of the posterior if there is one, else of least squares."""
         return self.formal_map if self.posterior_map is None else self.posterior_map
 
 
 @dataclass(frozen=True, eq=False)
 class SelfcalResults:
-    """Results that a run without a catalogue adds."""
+    """Additional results of a run without a catalogue."""
 
-    words: str  # the gauge in words
-    gauge: Table  # as gauge.ecsv
-    matching: Table  # one row for each exposure
-    stars: Table  # as stars.ecsv
+    words: str  # description of the gauge
+    gauge: Table  # content of gauge.ecsv
+    matching: Table  # one row per exposure
+    stars: Table  # content of stars.ecsv
     outlines: tuple[Float, ...]  # (M, 2), closed, of each chip in each exposure, on the sky
-    held: tuple[str, ...]  # parameters that the gauge holds
+    held: tuple[str, ...]  # parameters that the gauge constrains
     summary: Mapping[str, Any]  # as in summary.json
 
 
 @dataclass(frozen=True)
 class Terminology:
-    """Names by which a report calls what differs between the kinds of runs."""
+    """Terms of a report that differ between the kinds of runs."""
 
-    rows: str  # that are fitted
-    all_rows: str  # as they come into the fit
+    rows: str  # name of the rows that are fitted
+    all_rows: str  # name of the rows before rejection
     false_rows: str
-    rejection: str  # sampling rejects nothing
-    fit: str  # before sampling
+    rejection: str  # sampling itself rejects nothing
+    fit: str  # the fit before sampling
     constraint: str  # on parameters that the data do not constrain
-    leverage: str = ""  # clause on why residuals are smaller than errors; else empty
+    leverage: str = ""  # clause on why residuals are smaller than errors; may be empty
 
 
 MATCHED = Terminology(
@@ -119,37 +119,37 @@ DETECTED = Terminology(
 
 @dataclass(frozen=True, eq=False)
 class ReportInput:
-    """Results of a run, as the report shows them.
+    """Results of a run in the form needed by the report.
 
-    Columns of `coefficients`, Legendre coefficients and all other parameters: name, chip, axis, i,
-    j, lsq_value, lsq_sigma (least squares), mean, sd, lo68, hi68, lo95, hi95, rhat, ess_bulk, unit;
-    those of the posterior may be missing or masked.
+    Columns of `coefficients`, which contains Legendre coefficients and all other parameters: name,
+    chip, axis, i, j, lsq_value, lsq_sigma (least squares), mean, sd, lo68, hi68, lo95, hi95, rhat,
+    ess_bulk, unit; those of the posterior may be missing or masked.
     """
 
-    name: str  # of the calibration: the title
-    config: Mapping[str, Any]  # resolved
-    stars: StarSample  # all, or a sample of very many: those drawn one by one
+    name: str  # of the calibration, used as title
+    config: Mapping[str, Any]  # resolved configuration
+    stars: StarSample  # all stars, or a sample if there are too many to draw individually
     exposures: ExposureSums  # of all stars, at the least-squares fit
     fit: LinearFit
-    posterior: Posterior | None  # None: errors are then called formal
+    posterior: Posterior | None  # if None, errors are called formal
     chips: tuple[ChipResults, ...]  # in the order of the model's chips
     coefficients: Table
     budget: ErrorBudget | None = None
-    surface: BudgetSurface | None = None  # budget at every position and epoch, for the page
+    surface: BudgetSurface | None = None  # budget at every position and epoch, for the HTML page
     margins: tuple[Margin, ...] = ()
-    validity: tuple[ValidityPeriod, ...] = ()  # empty where nothing depends on time
+    validity: tuple[ValidityPeriod, ...] = ()  # empty if nothing depends on time
     products: tuple[Product, ...] = ()
-    checks: tuple[Check, ...] = ()  # criteria and remarks but those of requirements and products
+    checks: tuple[Check, ...] = ()  # all checks except those of requirements and products
     score_tests: tuple[ScoreTest, ...] = ()  # of the residuals
-    magnitude_errors: MagnitudeErrors | None = None  # where the stars had no errors
-    added_errors: GroupedErrors | None = None  # beyond the quoted ones, by groups
-    flagged: Int | None = None  # (E,), stars more likely false than not
+    magnitude_errors: MagnitudeErrors | None = None  # if the stars had no quoted errors
+    added_errors: GroupedErrors | None = None  # in addition to the quoted errors, by group
+    flagged: Int | None = None  # (E,), number of stars that are more likely false than true
     provenance: Mapping[str, Any] = field(default_factory=dict)  # nested
-    campaign: CampaignResults | None = None  # of a run on star lists
-    previous: tuple[Comparison, ...] = ()  # minus the release that is replaced, of each chip
-    periods: TimeVariation | None = None  # models of several periods compared
+    campaign: CampaignResults | None = None  # for a run on star lists
+    previous: tuple[Comparison, ...] = ()  # difference from the previous release, per chip
+    periods: TimeVariation | None = None  # comparison of the models of several periods
     held_out: HoldoutValidation | None = None  # stars set aside before the fit
-    selfcal: SelfcalResults | None = None  # of a run without a catalogue
+    selfcal: SelfcalResults | None = None  # for a run without a catalogue
 
     @property
     def unit(self) -> str:
@@ -158,13 +158,13 @@ class ReportInput:
 
     @property
     def simulated(self) -> bool:
-        """True where the configuration says that the input is simulated."""
+        """True if the configuration marks the input as simulated."""
         kinds = ("data", "campaign", "selfcal")
         return any(bool(self.setting(kind, "simulated", False)) for kind in kinds)
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """Sentences that belong on top."""
+        """Sentences to show at the top of the report."""
         return warnings_of(self.checks)
 
     @property
@@ -174,20 +174,20 @@ class ReportInput:
 
     @property
     def sample(self) -> str:
-        """'a sample of 200 000 of 11 213 542 stars'; empty where all stars are shown."""
+        """'a sample of 200 000 of 11 213 542 stars'; empty if all stars are shown."""
         if not self.stars.partial:
             return ""
-        some, every = count(len(self.stars)), count(self.stars.n_total)
-        return f"a sample of {some} of {every} {self.words.rows}"
+        n_shown, n_all = count(len(self.stars)), count(self.stars.n_total)
+        return f"a sample of {n_shown} of {n_all} {self.words.rows}"
 
     @property
     def provisional(self) -> bool:
-        """True where the sampler's results must not be relied on."""
+        """True if the sampler has not converged, so that its results are unreliable."""
         return self.posterior is not None and not self.posterior.convergence.converged
 
     @property
     def solution(self) -> LinearFit | Posterior:
-        """Posterior where there is one, else the fit."""
+        """Posterior if there is one, else the fit."""
         return self.fit if self.posterior is None else self.posterior
 
     @property
@@ -197,52 +197,52 @@ class ReportInput:
 
     @property
     def several(self) -> bool:
-        """True where the detector has more than one chip."""
+        """True if the detector has more than one chip."""
         return len(self.chips) > 1
 
     def length(self, value: float) -> str:
-        """Length in the unit of u and v, and in mas where the size of a pixel is known."""
+        """Length in the unit of u and v, and in mas if the size of a pixel is known."""
         return with_mas(value, self.unit, self.scale_mas)
 
     def marked(self, text: str) -> str:
-        """Number that depends on the sampler, with a dagger where that did not converge."""
+        """Number that depends on the sampler, with a dagger if the sampler did not converge."""
         return f"{text}\u202f†" if self.provisional and text != MISSING else text
 
     def on_chip(self, chip: Chip) -> str:
-        """' of WFC1' where there are several chips, else nothing."""
+        """' of WFC1' if there are several chips, else empty."""
         return f" of {chip.name}" if self.several else ""
 
     def position(self, pixel: tuple[float, float], chip: int) -> str:
-        """'(508, 509)', with the name of the chip where there are several."""
-        where = next(c.chip for c in self.chips if c.chip.number == chip)
-        return "({:.0f}, {:.0f})".format(*pixel) + self.on_chip(where)
+        """'(508, 509)', with the name of the chip if there are several."""
+        chip_with_position = next(c.chip for c in self.chips if c.chip.number == chip)
+        return "({:.0f}, {:.0f})".format(*pixel) + self.on_chip(chip_with_position)
 
     @property
     def held(self) -> frozenset[str]:
-        """Parameters that a prior or the gauge holds: they are no measurements."""
+        """Parameters that a prior or the gauge constrains, which are not measurements."""
         if self.selfcal is not None:
             return frozenset(self.selfcal.held)
         return frozenset(() if self.campaign is None else self.campaign.held)
 
     @property
     def scale_mas(self) -> float | None:
-        """Size of a pixel in mas, where the configuration gives it."""
+        """Size of a pixel in mas, if the configuration states it."""
         value = self.config.get("detector", {}).get("scale_mas")
         return None if value is None else float(value)
 
     def setting(self, section: str, key: str, default: Any) -> Any:
-        """Value of the resolved configuration."""
+        """Value from the resolved configuration."""
         return self.config.get(section, {}).get(key, default)
 
     def sampled_mean(self, key: str) -> float:
-        """Posterior mean of 'f', 'j' or 's_out'; 0 where it was not sampled."""
+        """Posterior mean of 'f', 'j' or 's_out'; 0 if it was not sampled."""
         if self.posterior is None or key not in self.posterior.hyper:
             return 0.0
         return float(np.mean(self.posterior.hyper[key]))
 
 
 def needed(value: T | None) -> T:
-    """Value that the registry has found to be there."""
+    """Value that must not be None here, because the registry has checked it."""
     if value is None:
         raise LookupError("a figure is drawn without what it needs")
     return value
@@ -250,26 +250,26 @@ def needed(value: T | None) -> T:
 
 @dataclass(frozen=True, eq=False)
 class CatalogStars:
-    """Errors of the catalogue, as quoted, and the limit above which its motions are not used."""
+    """Quoted errors of the catalogue, and the limit above which its proper motions are not used."""
 
     mag: Float  # (N,), instrumental
-    sigma: Float | None  # (N,), of the positions, hypot of both axes
-    sigma_motion: Float | None  # (N,), of the proper motions, the larger axis
-    limit: tuple[Float, Float] | None  # magnitudes and largest errors used; None where all are
+    sigma: Float | None  # (N,), errors of the positions, hypot of both axes
+    sigma_motion: Float | None  # (N,), errors of the proper motions, the larger axis
+    limit: tuple[Float, Float] | None  # magnitudes and largest errors used; None for no limit
     unit: str
-    n_used: int  # stars that the selection leaves
+    n_used: int  # number of selected stars
 
 
 @dataclass(frozen=True, eq=False)
 class Detections:
-    """Quality of the detections, and the cuts."""
+    """Quality of the detections, and the selection cuts."""
 
-    mag: Float  # (N,), of those that are drawn
+    mag: Float  # (N,), of the detections that are drawn
     q: Float  # (N,)
-    kept: Bool  # (N,), True where they pass the cuts
-    n_total: int  # of all
-    n_kept: int  # of all
-    mag_cuts: tuple[float, ...]  # magnitudes beyond which detections are left out
+    kept: Bool  # (N,), True if they pass the cuts
+    n_total: int  # number of all detections
+    n_kept: int  # number of all detections that pass the cuts
+    mag_cuts: tuple[float, ...]  # limits in magnitude
     q_max: float | None
 
 
@@ -286,28 +286,28 @@ class Footprints:
 
 @dataclass(frozen=True, eq=False)
 class ChipResiduals:
-    """Residuals on one chip, without the look-up tables and, where there are any, with them.
+    """Residuals on one chip, without look-up tables and, if there are any, with them.
 
-    Each time the polynomial is fitted, and a linear map of each exposure.  Residuals (N, 2) are of
-    the same matches, data minus model in pixels, brought to the detector's axes: exposures are
-    rolled, and what belongs to the detector shows only along x and y.
+    In both cases the polynomial and a linear map of each exposure are fitted. Residuals (N, 2) are
+    data minus model of the same matches in pixels, rotated to the detector axes, because exposures
+    have different rolls and effects of the detector are visible only along x and y.
     """
 
     chip: Chip
     without: Float
     with_tables: Float | None
     binned_without: BinnedResiduals
-    binned_with: BinnedResiduals | None  # of the same cells
+    binned_with: BinnedResiduals | None  # in the same cells
 
 
 @dataclass(frozen=True, eq=False)
 class LinearSeries:
-    """Linear terms of the exposures, each fitted by itself."""
+    """Linear terms of the exposures, each fitted separately."""
 
-    exposures: Table  # as series.ecsv
-    drift: Table  # as drift.ecsv
+    exposures: Table  # content of series.ecsv
+    drift: Table  # content of drift.ecsv
     vafactor: Float  # (E,)
-    pa_v3: Float  # (E,), degrees, NaN where it is not known
+    pa_v3: Float  # (E,), degrees, NaN if unknown
     breaks: tuple[float, ...]
 
     @property
@@ -317,7 +317,7 @@ class LinearSeries:
 
     @property
     def labels(self) -> tuple[str, ...]:
-        """Terms with the names of their chips, 'WFC1.A_2'."""
+        """Names of the terms with their chips, 'WFC1.A_2'."""
         names = self.exposures.colnames
         return tuple(n for n in names if f"sigma_{n}" in names)
 
@@ -328,18 +328,18 @@ class LinearSeries:
 
     @property
     def outlying(self) -> Bool:
-        """Mask of the exposures that are more likely off the line than not."""
+        """Mask of the exposures that are more likely outliers than not."""
         return np.asarray(self.exposures["outlier_probability"], float) > 0.5
 
 
 @dataclass(frozen=True, eq=False)
 class CampaignResults:
-    """Results that a campaign adds to a run."""
+    """Additional results of a campaign."""
 
-    summary: Mapping[str, Any]  # as summary.json
-    config: Mapping[str, Any]  # resolved
+    summary: Mapping[str, Any]  # as in summary.json
+    config: Mapping[str, Any]  # resolved configuration
     filter: str
-    matching: Table  # as matching.ecsv
+    matching: Table  # content of matching.ecsv
     chips: tuple[Chip, ...]  # in the order of the model
     unit: str  # of u and v
     catalog: CatalogStars | None = None
@@ -350,16 +350,16 @@ class CampaignResults:
     tables: tuple[LookupTable, ...] = field(default=())
     series: LinearSeries | None = None
     overlap: OverlapTest | None = None
-    held: tuple[str, ...] = ()  # parameters constrained by their prior alone
+    held: tuple[str, ...] = ()  # parameters constrained only by their prior
 
     def section(self, name: str) -> Mapping[str, Any]:
-        """Part of summary.json; empty where there is none."""
-        found: Mapping[str, Any] = self.summary.get(name) or {}
-        return found
+        """Section of summary.json; empty if there is none."""
+        part: Mapping[str, Any] = self.summary.get(name) or {}
+        return part
 
     @property
     def table_filters(self) -> tuple[str, ...]:
-        """Filters of the tables in order; '' is the detector's own."""
+        """Filters of the tables in order; '' for the tables of the detector."""
         return tuple(dict.fromkeys(table.filter for table in self.tables))
 
     def chip_name(self, number: int) -> str:

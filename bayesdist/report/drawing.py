@@ -1,4 +1,4 @@
-"""Figures as files: each laid out and drawn once, and once more as PDF if asked for."""
+"""Draw figures to files: each is laid out and drawn once, and again as PDF on request."""
 
 from __future__ import annotations
 
@@ -35,19 +35,19 @@ Kind = Literal["png", "svg"]
 
 DPI = 150
 MARGIN = 8  # pixels around the drawing
-MOST_VECTORS = 1000  # marks: more are sooner drawn, and smaller, as pixels
-MIN_FIGURES_SHARED = 20  # fewer are drawn sooner than another process has started
+MOST_VECTORS = 1000  # marks; figures with more are faster to draw, and smaller, as PNG
+MIN_FIGURES_SHARED = 20  # fewer are drawn faster than another process starts
 
-_received: list[Any] = []  # of a process that draws for another one
+_received: list[Any] = []  # results, in a process that draws for another one
 
 
 @dataclass(frozen=True)
 class Drawing:
-    """Figure as a file, with the words of its `Plot` and its numbers."""
+    """A figure as a file, with the texts of its `Plot` and its numbers."""
 
     file: bytes
     kind: Kind
-    width: float  # inches, at which its letters have the size they were set in
+    width: float  # inches, at which text has its nominal size
     pdf: bytes | None = None
     title: str = ""
     text: str = ""
@@ -55,9 +55,9 @@ class Drawing:
     numbers: str = ""  # CSV
 
 
-@figure_style()  # mathematical text and ticks read the settings only when drawn
+@figure_style()  # mathematical text and ticks read rcParams only when drawn
 def render(plot: Plot, kind: Kind = "png", *, pdf: bool = False) -> Drawing:
-    """Figure as a file of one kind, and as PDF if asked for; equal figures give equal files."""
+    """Draw a figure as PNG or SVG, and as PDF on request; equal figures give equal files."""
     box = _laid_out(plot.figure)
     return Drawing(
         _png(plot.figure, box) if kind == "png" else _svg(plot.figure, box),
@@ -75,11 +75,12 @@ def render(plot: Plot, kind: Kind = "png", *, pdf: bool = False) -> Drawing:
 def draw_all(
     registry: Registry, results: Any, *, pdf: bool = False, processes: int = 1
 ) -> dict[str, Drawing]:
-    """Figures of a page, by name in its order, each made, drawn and released; `pdf`: as PDF too.
+    """Make and draw all figures of a page; returns them by name in the order of the page.
 
-    Each is drawn once: as SVG what is on paper or has few marks, else as PNG.
+    Figures that are printed or have few marks are drawn as SVG, others as PNG. `pdf`: True to draw
+    them as PDF, too.
 
-    More than one of `processes` import the main module of this process anew: a script must guard
+    If `processes` is larger than 1, new processes import the main module again: a script must guard
     its work by ``if __name__ == "__main__"``.
     """
     items = registry.items(results, "figure")
@@ -94,16 +95,16 @@ def draw_all(
 def _drawn_together(
     items: Sequence[Item], results: Any, pdf: bool, processes: int
 ) -> dict[str, Drawing]:
-    # not a fork: threads of numerical libraries run here
+    # do not fork, because threads of numerical libraries are running
     with ProcessPoolExecutor(
         processes, mp_context=get_context("spawn"), initializer=_receive, initargs=(results,)
     ) as pool:
         drawn = pool.map(partial(_drawn, pdf=pdf), items)
-        return {item.name: one for item, one in zip(items, drawn, strict=True)}
+        return {item.name: drawing for item, drawing in zip(items, drawn, strict=True)}
 
 
 def _receive(results: Any) -> None:
-    """Store the input of the figures: once for each process, as it may be large."""
+    """Store the results once per process, because they may be large."""
     _received.append(results)
 
 
@@ -118,35 +119,35 @@ def _drawing(item: Item, results: Any, pdf: bool) -> Drawing:
 
 
 def _marks(figure: Figure) -> int:
-    """Number of marks a figure has as vectors: points, arrows, segments, cells."""
-    found = 0
+    """Number of marks of a figure drawn as vectors: points, arrows, segments, cells."""
+    n_marks = 0
     for ax in figure.axes:
-        for one in ax.collections:
-            found += max(len(one.get_paths()), len(np.asarray(one.get_offsets())))
+        for collection in ax.collections:
+            n_marks += max(len(collection.get_paths()), len(np.asarray(collection.get_offsets())))
         for line in ax.lines:
             if str(line.get_marker()) != "None" and not line.get_rasterized():
-                found += len(np.atleast_1d(line.get_xdata()))
-    return found
+                n_marks += len(np.atleast_1d(line.get_xdata()))
+    return n_marks
 
 
 @figure_style()
 def png_of(figure: Figure) -> bytes:
-    """PNG file of 256 colours of a figure: a third of the size, without a visible difference."""
+    """PNG file of a figure with 256 colours: a third of the size without a visible difference."""
     return _png(figure, _laid_out(figure))
 
 
 def _laid_out(figure: Figure) -> Bbox:
-    """Box (inches) of the area of a figure that is drawn on, with room around it.
+    """Lay out a figure; returns the bounding box (inches) of its content with a margin.
 
-    All positions are fixed, so that each file is drawn once.
+    All positions are fixed afterwards, so that each file is drawn only once.
     """
     plain_ticks(figure)
     for ax in figure.axes:
         for spine in ax.spines.values():
-            if type(spine) is Spine:  # it lies on the frame, and would measure all ticks again
+            if type(spine) is Spine:  # spines are on the frame and would measure all ticks again
                 spine.set_in_layout(False)
         for axis in (ax.xaxis, ax.yaxis):
-            if not axis.label.get_text():  # it would be placed all the same
+            if not axis.label.get_text():  # an empty label would be placed nevertheless
                 axis.label.set_visible(False)
     figure.set_dpi(DPI)
     renderer = FigureCanvasAgg(figure).get_renderer()
@@ -155,14 +156,14 @@ def _laid_out(figure: Figure) -> Bbox:
         with _measured_once(figure):
             engine.execute(figure)
     box = _with_labels(figure.get_tightbbox(renderer), figure, renderer)
-    figure.set_layout_engine(None)  # an engine, even 'none', would have each file drawn twice
+    figure.set_layout_engine(None)  # any engine, even 'none', would draw each file twice
     return Bbox(box.padded(MARGIN / DPI).get_points())
 
 
 def _with_labels(box: Bbox, figure: Figure, renderer: Any) -> Bbox:
-    """Box (inches) that also holds labels which are longer than their axes.
+    """Extend a box (inches) by labels that are longer than their axes.
 
-    Matplotlib before 3.11.2 leaves out what of them is beyond the ends of the axis.
+    Matplotlib before 3.11.2 ignores the part of a label beyond the ends of its axis.
     """
     inches = figure.dpi_scale_trans.inverted()
     ends = {"x": [box.x0, box.x1], "y": [box.y0, box.y1]}
@@ -176,10 +177,9 @@ def _with_labels(box: Bbox, figure: Figure, renderer: Any) -> Bbox:
 
 @contextmanager
 def _measured_once(figure: Figure) -> Iterator[None]:
-    """Context in which the labels of each panel keep the room that they had at first.
+    """Context manager in which the labels of each panel are measured only once.
 
-    Matplotlib measures them again after it has moved the panels, which takes as long as drawing
-    them.
+    Matplotlib measures them again after moving the panels, which takes as long as drawing them.
     """
     panels = figure.axes
     for ax in panels:
@@ -192,7 +192,7 @@ def _measured_once(figure: Figure) -> Iterator[None]:
 
 
 def _measuring_once(ax: Axes) -> Callable[..., Any]:
-    """The function `get_tightbbox` of a panel, whose labels keep their room when it is moved."""
+    """Replacement for `get_tightbbox` of a panel that measures its labels only once."""
     measure, beyond = ax.get_tightbbox, list[Any]()
 
     def box(renderer: Any, *options: Any, **more: Any) -> Any:
@@ -200,10 +200,10 @@ def _measuring_once(ax: Axes) -> Callable[..., Any]:
             place = ax.get_axes_locator()
             ax.apply_aspect(None if place is None else place(ax, renderer))
             return Bbox(ax.bbox.get_points() + beyond[0])
-        found = measure(renderer, *options, **more)
-        if found is not None:
-            beyond.append(found.get_points() - ax.bbox.get_points())
-        return found
+        extent = measure(renderer, *options, **more)
+        if extent is not None:
+            beyond.append(extent.get_points() - ax.bbox.get_points())
+        return extent
 
     return box
 
@@ -213,16 +213,18 @@ def _png(figure: Figure, box: Bbox) -> bytes:
     quick = {"compress_level": 0}
     figure.savefig(drawn, format="png", dpi=DPI, bbox_inches=box, pil_kwargs=quick)
     image = Image.open(drawn).convert("RGB")
-    # colours are chosen on every other pixel each way, in a fourth of the time
-    some = image.resize((-(-image.width // 2), -(-image.height // 2)), Image.Resampling.NEAREST)
-    colors = some.quantize(256, method=Image.Quantize.MEDIANCUT)
-    few = image.quantize(palette=colors, dither=Image.Dither.NONE)
-    palette = few.getpalette() or []
-    page = 3 * int(few.getpixel((0, 0)))  # type: ignore[arg-type]  # one number of such an image
-    palette[page : page + 3] = image.crop((0, 0, 1, 1)).tobytes()  # it would be a shade darker
-    few.putpalette(palette)
+    # the palette is chosen from every other pixel in each direction, in a quarter of the time
+    subsample = image.resize(
+        (-(-image.width // 2), -(-image.height // 2)), Image.Resampling.NEAREST
+    )
+    colors = subsample.quantize(256, method=Image.Quantize.MEDIANCUT)
+    reduced = image.quantize(palette=colors, dither=Image.Dither.NONE)
+    palette = reduced.getpalette() or []
+    page = 3 * int(reduced.getpixel((0, 0)))  # type: ignore[arg-type]  # a single number
+    palette[page : page + 3] = image.crop((0, 0, 1, 1)).tobytes()  # exact background colour
+    reduced.putpalette(palette)
     buffer = io.BytesIO()
-    few.save(buffer, format="png", dpi=(DPI, DPI))
+    reduced.save(buffer, format="png", dpi=(DPI, DPI))
     return buffer.getvalue()
 
 
@@ -239,7 +241,7 @@ def _svg(figure: Figure, box: Bbox) -> bytes:
 
 
 def save_figures(figures: Mapping[str, Figure], folder: str | os.PathLike[str]) -> tuple[Path, ...]:
-    """Paths of figures, drawn and written as PNG files to a folder, which is made if need be."""
+    """Draw figures and write them as PNG files to a folder, created if needed; returns paths."""
     images = {f"{name}.png": png_of(figure) for name, figure in figures.items()}
     return _saved(images, made_folder(folder))
 
@@ -247,9 +249,9 @@ def save_figures(figures: Mapping[str, Figure], folder: str | os.PathLike[str]) 
 def save_drawings(
     drawings: Mapping[str, Drawing], folder: str | os.PathLike[str]
 ) -> tuple[Path, ...]:
-    """Paths of figures, written as they were drawn to a folder, which is made if need be."""
-    files = {f"{name}.{one.kind}": one.file for name, one in drawings.items()}
-    files |= {f"{name}.pdf": one.pdf for name, one in drawings.items() if one.pdf}
+    """Write drawn figures to a folder, created if needed; returns their paths."""
+    files = {f"{name}.{drawing.kind}": drawing.file for name, drawing in drawings.items()}
+    files |= {f"{name}.pdf": drawing.pdf for name, drawing in drawings.items() if drawing.pdf}
     return _saved(files, made_folder(folder))
 
 

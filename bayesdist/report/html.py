@@ -1,4 +1,4 @@
-"""Short summary of a run as HTML for notebooks and as plain text."""
+"""Short summary of a run, as HTML for notebooks and as plain text."""
 
 from __future__ import annotations
 
@@ -26,21 +26,21 @@ if TYPE_CHECKING:
 
 Row = Mapping[str, str]  # cells by heading
 
-MAX_ROWS = 12  # of a table; the report has all of them
+MAX_ROWS = 12  # of a table; the report contains all rows
 MAX_WARNINGS = 8
-WIDTH = 88  # letters of a line of text
+WIDTH = 88  # characters of a line of text
 MARKS = {"pass": "✓", "warn": "!", "fail": "✗", "note": "·"}
-# dark enough on white and light enough on black, and told apart in every colour blindness
+# visible on white and on black, and distinguishable with any colour blindness
 COLORS = {"pass": "#009E73", "warn": "#E69F00", "fail": "#D55E00", "note": "#888888"}
 
-# of the page behind it, be it light or dark: nothing here sets a background or a text colour
+# transparent, because the notebook may be light or dark: no background or text colour is set
 _PLAIN = "background:none;color:inherit"
 _RULE = "1px solid rgba(128,128,128,0.4)"
 
 
 @dataclass(frozen=True)
 class RunSummary:
-    """What the representation of a run shows, in words.
+    """Content of the representation of a run.
 
     Parameters
     ----------
@@ -51,12 +51,12 @@ class RunSummary:
     headline : str
         The verdict in words.
     warnings : sequence of str
-        Sentences that a reader of the numbers has to know.
+        Sentences that a reader of the numbers must know.
     facts : sequence of (str, str)
-        Labels and values, such as stars, exposures and convergence.
+        Labels and values, such as the numbers of stars and exposures, and convergence.
     margins_rows, budget_rows : sequence of dict of str to str
-        Rows of the tables: cells by heading, the same headings in each row; see `margin_rows` and
-        `budget_rows`.
+        Rows of the tables as cells by heading, with the same headings in each row; see
+        `margin_rows` and `budget_rows`.
     """
 
     title: str
@@ -69,7 +69,7 @@ class RunSummary:
 
     @property
     def tables(self) -> tuple[tuple[str, Sequence[Row]], ...]:
-        """Captions and rows of the tables that have rows."""
+        """Captions and rows of the tables that are not empty."""
         tables = (("Margins", self.margins_rows), ("Error budget", self.budget_rows))
         return tuple((caption, rows) for caption, rows in tables if rows)
 
@@ -104,7 +104,7 @@ def margin_rows(margins: Sequence[Margin]) -> list[dict[str, str]]:
 
 
 def budget_rows(budget: ErrorBudget, *, scale_mas: float | None = None) -> list[dict[str, str]]:
-    """Rows of the table of the budget: each term's rms per axis over the detector, the total last.
+    """Rows of the budget table: rms per axis of each term over the detector, the total last.
 
     Parameters
     ----------
@@ -138,8 +138,8 @@ def budget_rows(budget: ErrorBudget, *, scale_mas: float | None = None) -> list[
 def summary_html(summary: RunSummary) -> str:
     """HTML block of a run for a notebook: verdict, warnings, facts, margins, budget.
 
-    It has no script and no style sheet, takes its colours from the page, light or dark, and all
-    text in it is escaped. Long tables are cut; a line says how many rows are left out.
+    It has no script and no style sheet, inherits the colours of the page, light or dark, and
+    escapes all text. Long tables are cut, with a line that states the number of omitted rows.
 
     Parameters
     ----------
@@ -212,7 +212,7 @@ def _text(text: str) -> str:
 
 
 def summary_text(summary: RunSummary) -> str:
-    """Plain text of a run with the content of `summary_html`.
+    """Plain text of a run with the same content as `summary_html`.
 
     Parameters
     ----------
@@ -265,23 +265,23 @@ def _wrapped(text: str, first: str) -> str:
     return fill(text, WIDTH, initial_indent=first, subsequent_indent=" " * len(first))
 
 
-# -- both -----------------------------------------------------------------------------------------
+# -- HTML and plain text --------------------------------------------------------------------------
 
 
 def _cut(items: Sequence[str], most: int) -> tuple[Sequence[str], int]:
-    """First items, and the number of those that are left out."""
+    """First items, and the number of omitted ones."""
     return (items, 0) if len(items) <= most else (items[: most - 1], len(items) - most + 1)
 
 
 def _shown(rows: Sequence[Row]) -> tuple[list[Row], int]:
-    """First rows and the last one, which may be a total, and the number of those between."""
+    """First rows and the last one, which may be a total, and the number of omitted rows."""
     if len(rows) <= MAX_ROWS:
         return list(rows), 0
     return [*rows[: MAX_ROWS - 2], rows[-1]], len(rows) - MAX_ROWS + 1
 
 
 def _columns_of_words(rows: Sequence[Row]) -> set[str]:
-    """Headings of the columns in which some cell begins neither with a number nor is missing."""
+    """Headings of the columns with at least one cell that is neither a number nor missing."""
 
     def numeric(cell: str) -> bool:
         return cell == MISSING or cell.lstrip("−-+<>≤≥~ \u202f")[:1].isdigit()

@@ -1,4 +1,4 @@
-"""One page for many runs: status, worst margin and validity of each, in a table that sorts."""
+"""Overview page of many runs: a sortable table with status, worst margin and validity period."""
 
 from __future__ import annotations
 
@@ -17,37 +17,37 @@ from bayesdist.utils.numbers import MISSING, count, number
 
 @dataclass(frozen=True)
 class OverviewRow:
-    """What the page says of one run; None where the run has not got so far."""
+    """Row of the page for one run; None for results that the run does not have yet."""
 
-    name: str  # folder of the run, as it was given
-    link: str  # to its report, relative to the page; empty where there is none
+    name: str  # folder of the run, as given
+    link: str  # to its report, relative to the page; empty if there is none
     detector: str
     simulated: bool
-    level: str  # 'pass', 'warn', 'fail', or 'note' where there is no verdict
+    level: str  # 'pass', 'warn', 'fail', or 'note' if there is no verdict
     headline: str
     worst_margin: float | None  # percent of the limit
     worst_requirement: str
     valid_until: float | None  # decimal year
-    open_ended: bool  # the validity period lasts at least until then
+    open_ended: bool  # True if the validity period lasts at least until then
     epoch: float | None
-    uncertainty: str  # largest, per axis, with its unit
+    uncertainty: str  # largest uncertainty per axis, with its unit
     n_used: int | None
     chi2_per_dof: float | None
     began: str
 
     @property
     def key(self) -> int:
-        """Rank of the level: the worst one first."""
+        """Sort key of the level; the worst one comes first."""
         return -LEVELS.index(self.level)
 
     @property
     def status(self) -> Level:
-        """Level as a cell."""
+        """Level as a table cell."""
         return Level(self.level)
 
     @property
     def cells(self) -> tuple[tuple[str, bool], ...]:
-        """Texts of the cells behind the headline, and whether each is a number."""
+        """Texts of the cells after the headline, each with True if it is a number."""
         margin = MISSING if self.worst_margin is None else f"{self.worst_margin:.0f}"
         until = MISSING if self.valid_until is None else f"{self.valid_until:.1f}"
         return (
@@ -75,8 +75,8 @@ HEADS = (
 
 
 def write_overview(path: str | os.PathLike[str], rows: Sequence[OverviewRow]) -> list[OverviewRow]:
-    """Rows as the page shows them, the worst runs first, once it is written."""
-    never = math.inf  # runs without a margin last
+    """Write the overview page; returns the rows in its order, with the worst runs first."""
+    never = math.inf  # sort runs without a margin last
     ordered = sorted(
         rows, key=lambda row: (row.key, never if row.worst_margin is None else row.worst_margin)
     )

@@ -1,4 +1,4 @@
-"""Pages made of a registry and results: sections with their tables and pictures, templates."""
+"""Pages built from a registry and results: sections with tables and pictures, and templates."""
 
 from __future__ import annotations
 
@@ -20,55 +20,55 @@ from bayesdist.report.figures.style import HALF_WIDTH
 from bayesdist.report.texttable import Level, TextTable
 from bayesdist.utils.numbers import MISSING
 
-REPORT = "bayesdist.report"  # whose templates all pages share
-_AS_BROWSERS_SAY = {"svg": "svg+xml", "png": "png"}
-HALF, WIDE = HALF_WIDTH + 0.1, 5.3  # inches; margins are cut off, or added
+REPORT = "bayesdist.report"  # package with the templates that all pages share
+_AS_BROWSERS_SAY = {"svg": "svg+xml", "png": "png"}  # MIME subtypes
+HALF, WIDE = HALF_WIDTH + 0.1, 5.3  # inches, including tolerance for trimmed or added margins
 
 
 @dataclass(frozen=True)
 class Picture:
-    """Figure as a page holds it."""
+    """A figure as embedded in a page."""
 
     name: str
-    data: str  # file, base64
-    kind: str  # of the file, as browsers call it
-    width: float  # inches, at which its letters have the size they were set in
+    data: str  # file content in base64
+    kind: str  # MIME subtype of the file
+    width: float  # inches, at which text has its nominal size
     words: Drawing  # title, text and text alternative
-    printed: bool = True  # True where it is on paper
-    folded: bool = False  # True where it is shown when a reader asks for it
-    number: int = 0  # by which the page calls it; 0 where figures are not numbered
+    printed: bool = True  # True if it is shown on paper
+    folded: bool = False  # True if it is shown only when a reader opens it
+    number: int = 0  # figure number; 0 if figures are not numbered
 
     @property
     def place(self) -> str:
-        """'half' where two stand side by side, 'wide' where a caption has no room next to it."""
+        """'half' if two fit side by side, 'wide' if there is no room for a caption next to it."""
         return "half" if self.width <= HALF else "wide" if self.width > WIDE else ""
 
     @property
     def hundredths(self) -> int:
-        """Width in hundredths of an inch, by which the style sheet knows it."""
+        """Width in hundredths of an inch, as used in the style sheet."""
         return round(100 * self.width)
 
 
 @dataclass(frozen=True)
 class Part:
-    """Section with its content."""
+    """A section with its content."""
 
     name: str
     title: str
     tables: tuple[TextTable, ...]
     pictures: tuple[Picture, ...]
-    parts: tuple[Part, ...] = ()  # sections within it
-    empty: str = ""  # text in place of tables; empty where there are some
-    printed: bool = True  # True where it is on paper
-    on_top: tuple[Picture, ...] = ()  # its pictures that stand on top of the page
+    parts: tuple[Part, ...] = ()  # subsections
+    empty: str = ""  # text shown instead of tables; empty if there are tables
+    printed: bool = True  # True if it is shown on paper
+    on_top: tuple[Picture, ...] = ()  # its pictures that are shown at the top of the page
 
 
 def numbered(
     top: Sequence[Picture], parts: Sequence[Part]
 ) -> tuple[tuple[Picture, ...], tuple[Part, ...]]:
-    """Pictures on top of a page, and its sections, with figures and tables numbered in order.
+    """Number the figures and tables of a page, pictures at the top first.
 
-    The numbers are the same on the screen and on paper, which leaves some out.
+    The numbers are the same on screen and on paper, where some figures are left out.
     """
     figures, tables = count(1), count(1)
     top = tuple(replace(picture, number=next(figures)) for picture in top)
@@ -87,14 +87,14 @@ def numbered(
 
 
 def parts_of(registry: Registry, results: Any, drawings: Mapping[str, Drawing]) -> tuple[Part, ...]:
-    """Sections of a page that have content, or a reason for having none, in the registry's order.
+    """Sections of a page that have content, or a text for missing content, in registry order.
 
-    Figures that are not among `drawings` are left out.
+    Figures that are not in `drawings` are left out.
     """
     tables: dict[str, list[TextTable]] = {}
     for item in registry.items(results, "table"):
-        made = _several(item.made(results))
-        folded = (replace(one, folded=one.folded or one.is_long) for one in made)
+        tables_of_item = _several(item.made(results))
+        folded = (replace(table, folded=table.folded or table.is_long) for table in tables_of_item)
         tables.setdefault(item.section, []).extend(folded)
     pictures: dict[str, list[Picture]] = {}
     for item in registry.items(results, "figure"):
@@ -109,12 +109,12 @@ def parts_of(registry: Registry, results: Any, drawings: Mapping[str, Drawing]) 
         for section in registry.sections:
             if section.parent != parent:
                 continue
-            shown = tuple(sorted(tables.get(section.name, ()), key=lambda one: one.folded))
+            shown = tuple(sorted(tables.get(section.name, ()), key=lambda table: table.folded))
             part = Part(
                 section.name,
                 section.title_of(results),
                 shown,
-                tuple(sorted(pictures.get(section.name, ()), key=lambda one: one.folded)),
+                tuple(sorted(pictures.get(section.name, ()), key=lambda picture: picture.folded)),
                 tuple(within(section.name)),
                 "" if shown else section.empty,
                 section.is_printed(results),
@@ -135,7 +135,7 @@ def _several(made: TextTable | Iterable[TextTable] | None) -> Iterable[TextTable
 def picture_of(
     name: str, drawing: Drawing, *, printed: bool = True, folded: bool = False
 ) -> Picture:
-    """Figure as a page holds it."""
+    """Embed a drawing in a page."""
     data = base64.b64encode(drawing.file).decode("ascii")
     return Picture(
         name, data, _AS_BROWSERS_SAY[drawing.kind], drawing.width, drawing, printed, folded
@@ -144,13 +144,15 @@ def picture_of(
 
 @functools.cache
 def template(name: str, package: str = REPORT) -> jinja2.Template:
-    """Template of a package by its file name; it may include those of the report.
+    """Template of a package by its file name; it may include templates of the report.
 
-    A variable that it needs and is not given is an error.
+    Rendering raises an error if a variable of the template is missing.
     """
     packages = dict.fromkeys((package, REPORT))
     environment = jinja2.Environment(
-        loader=jinja2.ChoiceLoader([jinja2.PackageLoader(one) for one in packages]),
+        loader=jinja2.ChoiceLoader(
+            [jinja2.PackageLoader(package_name) for package_name in packages]
+        ),
         autoescape=".html" in name,
         undefined=jinja2.StrictUndefined,
         trim_blocks=True,
@@ -159,7 +161,7 @@ def template(name: str, package: str = REPORT) -> jinja2.Template:
     )
     environment.filters["md"] = _markdown
     environment.filters["css"] = _css
-    # letters and digits that can end no attribute
+    # letters and digits, which cannot end an HTML attribute
     environment.filters["base64"] = lambda text: base64.b64encode(text.encode()).decode("ascii")
     environment.globals["explanation_of"] = explanation_of
     environment.globals["policy"] = _policy
@@ -169,20 +171,20 @@ def template(name: str, package: str = REPORT) -> jinja2.Template:
     return environment.get_template(name)
 
 
-# characters with a meaning in Markdown, in our text or in that of a user's file
+# characters with a meaning in Markdown, in texts of bayesdist or of the user's files
 _SPECIAL = str.maketrans(
     {"|": "\\|", "*": "\\*", "`": "\\`", "[": "\\[", "<": "&lt;", "&": "&amp;", "\n": " "}
 )
 
 
-# numbers as terminals have them: a power of ten, a minus at the beginning of a word
+# numbers as formatted for terminals: a power of ten, a minus sign at the start of a word
 _POWER = re.compile(r"(?<![\w.])(-?\d+(?:\.\d+)?)e([+-])0*(\d+)\b")
 _MINUS = re.compile(r"(?<![^\s(=±])-(?=\.?\d)")
 _RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
 
 def _typeset(value: object) -> object:
-    """Text for the page: sentences are written for terminals too; commands and data stay."""
+    """Format a sentence written for terminals typographically; commands and data are unchanged."""
     if not isinstance(value, str) or isinstance(value, Markup):
         return value
     if " " not in value or value.startswith("bayesdist "):
@@ -196,14 +198,14 @@ def _raised(found: re.Match[str]) -> str:
 
 
 def _markdown(value: object) -> str:
-    """Line of Markdown that shows the text as it is."""
+    """Escape a text for a line of Markdown."""
     if isinstance(value, Level):
         return {"pass": "pass", "warn": "**warn**", "fail": "**FAIL**", "note": MISSING}[value]
     return str(value).translate(_SPECIAL)
 
 
 def _policy(style: str, script: str) -> str:
-    """What a page may do: apply its one style sheet, run its one script, show pictures in it."""
+    """Content security policy of a page: only its style sheet, its script and embedded images."""
     allowed = {"default": "'none'", "img": "data:", "style": _hash(style)}
     if script:
         allowed["script"] = _hash(script)
@@ -212,21 +214,21 @@ def _policy(style: str, script: str) -> str:
 
 
 def _hash(text: str) -> str:
-    """Text of an element as a policy names it, once it has been typeset for the page."""
+    """Hash of the text of an element, after typesetting, as used in the policy."""
     digest = hashlib.sha256(str(_typeset(text)).encode("utf-8")).digest()
     return f"'sha256-{base64.b64encode(digest).decode('ascii')}'"
 
 
 def _widths(parts: Iterable[Part]) -> list[int]:
-    """Widths of all pictures of some sections, each once."""
-    found: set[int] = set()
+    """Widths of all pictures of some sections, without duplicates."""
+    widths: set[int] = set()
     for part in parts:
         pictures = (*part.pictures, *part.on_top)
-        found.update((picture.hundredths for picture in pictures), _widths(part.parts))
-    return sorted(found)
+        widths.update((picture.hundredths for picture in pictures), _widths(part.parts))
+    return sorted(widths)
 
 
 def _css(value: object) -> Markup:
-    """String of a style sheet: all but plain letters by number and a space."""
+    """String for a style sheet, with special characters escaped by their code."""
     plain = "".join(c if c.isalnum() or c in " .,:" else f"\\{ord(c):x} " for c in str(value))
     return Markup(f'"{plain}"')

@@ -1,4 +1,4 @@
-"""Plots of a run, by name: the namespace ``run.plot``."""
+"""Plots of a run by name: the namespace ``run.plot``."""
 
 from __future__ import annotations
 
@@ -38,11 +38,11 @@ class RunPlots:
     diagnostics : Diagnostics
     evaluation : Evaluation
     solution : LinearFit or Posterior, optional
-        Solution whose distortion is shown; the posterior by default, or the fit without one.
+        Solution with the distortion to show; by default the posterior, or the fit if there is none.
     scale_mas : float, optional
         Size of a pixel in mas, for plots with ``mas=True``; that of the evaluation by default.
     magnitude_errors : MagnitudeErrors, optional
-        Errors by magnitude that the stars were given.
+        Errors by magnitude that were assigned to the stars.
     rows : str
         Word for the rows of the data in labels, such as 'stars' or 'detections'.
     """
@@ -57,7 +57,7 @@ class RunPlots:
     rows: str = "stars"
 
     def __dir__(self) -> list[str]:
-        """Names of the plots alone, for completion in notebooks."""
+        """Names of the plots only, for completion in notebooks."""
         fields = set(self.__dataclass_fields__)
         return [n for n in object.__dir__(self) if n not in fields and not n.startswith("_")]
 
@@ -95,8 +95,8 @@ class RunPlots:
         Raises
         ------
         InputError
-            For an unknown chip or kind, for a map that the run does not have, or if mas are asked
-            for and the size of a pixel is unknown.
+            If the chip or kind is unknown, the run does not have the map, or ``mas=True`` and the
+            size of a pixel is unknown.
         """
         require_known(which, MAPS, "map", where="which")
         of = {"posterior": "maps", "formal": "formal", "relative": "relative"}
@@ -107,9 +107,9 @@ class RunPlots:
                 where="plot.map",
                 do="plot the map 'posterior'",
             )
-        found = maps[self._index(chip)]
+        selected_map = maps[self._index(chip)]
         options = {"name": self._name(chip)} | options
-        return plots.plot_map(found, ax, kind=kind, scale_mas=self._scale(mas), **options)
+        return plots.plot_map(selected_map, ax, kind=kind, scale_mas=self._scale(mas), **options)
 
     def distortion(
         self,
@@ -128,8 +128,8 @@ class RunPlots:
         chip : int, optional
             Number of the chip; the first one by default.
         part : str
-            'no_constant' for all of it but its value at the reference pixel, 'non_linear' for the
-            terms of order 2 and more.
+            'no_constant' for the distortion minus its value at the reference pixel, 'non_linear'
+            for only the terms of order 2 and higher.
         mas : bool
             True to state lengths in mas.
         **options
@@ -142,7 +142,7 @@ class RunPlots:
         Raises
         ------
         InputError
-            For an unknown chip or part, or if mas are asked for and the size of a pixel is unknown.
+            If the chip or part is unknown, or ``mas=True`` and the size of a pixel is unknown.
         """
         from bayesdist.assess.vectors import diagram_vectors
 
@@ -168,7 +168,7 @@ class RunPlots:
         ax : matplotlib.axes.Axes, optional
         kind : str
             'position': mean residual of each cell of a chip as a vector. 'histogram': core of the
-            residuals with the distribution that is expected (with ``tails=True`` all of them).
+            residuals with the expected distribution (with ``tails=True`` all residuals).
             'magnitude': density of the residuals against magnitude. 'x', 'y', 'colour', 'epoch':
             means in bins of that quantity, with their errors.
         axis : str
@@ -185,7 +185,7 @@ class RunPlots:
         Raises
         ------
         InputError
-            For an unknown kind, axis or chip, or a quantity that the stars do not have.
+            If the kind, axis or chip is unknown, or the stars do not have the quantity.
         """
         require_known(kind, RESIDUAL_KINDS, "kind of residuals", where="kind")
         sample, unit = self.diagnostics.sample, self.fit.model.unit
@@ -216,7 +216,7 @@ class RunPlots:
         Raises
         ------
         InputError
-            If the run has one exposure.
+            If the run has only one exposure.
         """
         scatter = self.diagnostics.sample.by_exposure
         return plots.plot_exposures(required(scatter, "the run has one exposure"), ax)
@@ -248,7 +248,7 @@ class RunPlots:
         Raises
         ------
         InputError
-            For an unknown chip, or if mas are asked for and the size of a pixel is unknown.
+            If the chip is unknown, or ``mas=True`` and the size of a pixel is unknown.
         """
         scale_mas = self._scale(mas)
         if chip is not None and self._several:
@@ -291,7 +291,7 @@ class RunPlots:
         Raises
         ------
         InputError
-            For an unknown requirement, or if the solution does not depend on time.
+            If the requirement is unknown, or the solution does not depend on time.
         """
         periods = {period.requirement.name: period for period in self.evaluation.validity}
         if not periods:
@@ -325,7 +325,7 @@ class RunPlots:
         Raises
         ------
         InputError
-            For an unknown parameter, or if nothing was sampled.
+            If a parameter is unknown, or nothing was sampled.
         """
         return plots.plot_corner(self._sampled("corner"), parameters, fig=fig)
 
@@ -363,12 +363,12 @@ class RunPlots:
         Raises
         ------
         InputError
-            For an unknown parameter, or if nothing was sampled.
+            If the parameter is unknown, or nothing was sampled.
         """
         return plots.plot_ranks(self._sampled("ranks"), parameter, ax)
 
     def __repr__(self) -> str:
-        """Names of the plots that this run has, with what each shows."""
+        """Names of the plots that this run has, with a description of each."""
         left_out = set()
         if self.posterior is None:
             left_out |= {"corner", "correlations", "ranks"}
@@ -391,7 +391,7 @@ class RunPlots:
 
     @property
     def _shown(self) -> Solution:
-        """Solution whose distortion is shown."""
+        """Solution with the distortion to show."""
         if self.solution is not None:
             return self.solution
         return self.fit if self.posterior is None else self.posterior
@@ -400,22 +400,22 @@ class RunPlots:
         return 0 if chip is None else self.fit.model.chip_code(chip)
 
     def _name(self, chip: int | None) -> str:
-        """Name of a chip for titles; empty if there is one chip."""
+        """Name of a chip for titles; empty if there is only one chip."""
         chosen = self.fit.model.chips[self._index(chip)]
         return (chosen.name or f"chip {chosen.number}") if self._several else ""
 
     def _scale(self, mas: bool) -> float | None:
-        """Size of a pixel if mas are asked for."""
+        """Size of a pixel in mas if requested, else None."""
         if not mas:
             return None
-        given = self.evaluation.settings.scale_mas if self.scale_mas is None else self.scale_mas
-        if given is None and self.fit.model.unit == "pix":
+        scale_mas = self.evaluation.settings.scale_mas if self.scale_mas is None else self.scale_mas
+        if scale_mas is None and self.fit.model.unit == "pix":
             raise InputError(
                 "the size of a pixel is unknown",
                 where="plot",
                 do="give the run its pixel scale (detector.scale_mas), or plot pixels",
             )
-        return given
+        return scale_mas
 
     def _sampled(self, name: str) -> Posterior:
         if self.posterior is None:

@@ -1,4 +1,4 @@
-"""Report of a run: its page, and its Markdown form."""
+"""Report of a run, as an HTML page and as Markdown."""
 
 from __future__ import annotations
 
@@ -24,8 +24,8 @@ _PROVISIONAL = (
     " on its draws and may be wrong by more than their stated errors. Sample longer, or look at the"
     " reasons, before anything is used."
 )
-MOST_NAMED = 4  # chips that are listed by name
-STRIP = ("margins", "uncertainty_radius", "distortion")  # figures on top of the page
+MOST_NAMED = 4  # largest number of chips that are listed by name
+STRIP = ("margins", "uncertainty_radius", "distortion")  # figures at the top of the page
 _FOOTER = (
     "u and v are the reference axes; x runs to the right and y up, in FITS"
     " pixels (centre of the first pixel = 1)."
@@ -42,14 +42,15 @@ _PRINT_WORDS = (
 
 
 def draw_report(r: ReportInput, *, pdf: bool = False, processes: int = 1) -> dict[str, Drawing]:
-    """Figures of the report of a run as files, by name, in its order; `pdf`: as PDF too."""
+    """Draw the figures of the report of a run, by name in its order; `pdf`: also as PDF."""
     return draw_all(REPORT, r, pdf=pdf, processes=processes)
 
 
 def render_report(r: ReportInput, drawings: Mapping[str, Drawing]) -> str:
-    """Report as a whole HTML document that needs no other file.
+    """Report as a complete, self-contained HTML document.
 
-    Its script computes from numbers in the page; without scripts all tables and figures are shown.
+    Its script computes from numbers embedded in the page; without scripts all tables and figures
+    are shown.
     """
     data = {item.name: _embedded(item.made(r)) for item in REPORT.items(r, "data")}
     return template("report.html.jinja").render(
@@ -62,22 +63,22 @@ def render_report(r: ReportInput, drawings: Mapping[str, Drawing]) -> str:
 
 
 def _embedded(data: Any) -> Markup:
-    """Data as JSON that may stand within a page: nothing in it can end the element."""
+    """Data as JSON that can be embedded in a page: it cannot end the surrounding element."""
     text = json.dumps(data, ensure_ascii=False, allow_nan=False, separators=(",", ":"))
     return Markup(text.replace("<", "\\u003c"))
 
 
 def render_markdown(r: ReportInput, drawings: Mapping[str, Drawing]) -> str:
-    """Report with all tables, figures and words as Markdown; figures are links into figures/."""
+    """Report as Markdown with all tables, figures and texts; figures are links into figures/."""
     return template("report.md.jinja").render(**_contents(r, drawings))
 
 
 def write_report(
     path: str | os.PathLike[str], r: ReportInput, drawings: Mapping[str, Drawing]
 ) -> None:
-    """Write the report, and its Markdown form with .md for .html.
+    """Write the report as HTML, and as Markdown with the extension .md.
 
-    InputError when the file cannot be written.
+    Raises InputError if a file cannot be written.
     """
     texts = {
         Path(path): render_report(r, drawings),
@@ -89,29 +90,31 @@ def write_report(
 
 
 def _with_strip(contents: dict[str, Any]) -> dict[str, Any]:
-    """Contents with the figures of `STRIP` on top instead of in their sections, all numbered."""
+    """Move the figures of `STRIP` from their sections to the top, and number all figures."""
     top: dict[str, Picture] = {}
 
     def without(part: Part) -> Part:
         on_top = tuple(p for p in part.pictures if p.name in STRIP)
         top.update({p.name: p for p in on_top})
-        others = tuple(p for p in part.pictures if p.name not in STRIP)
-        return replace(part, pictures=others, on_top=on_top)
+        remaining_pictures = tuple(p for p in part.pictures if p.name not in STRIP)
+        return replace(part, pictures=remaining_pictures, on_top=on_top)
 
     parts = [contents["status"], *(without(part) for part in contents["parts"])]
-    strip, (status, *others) = numbered([top[name] for name in STRIP if name in top], parts)
-    return contents | {"strip": strip, "status": status, "parts": others}
+    strip, (status, *remaining_pictures) = numbered(
+        [top[name] for name in STRIP if name in top], parts
+    )
+    return contents | {"strip": strip, "status": status, "parts": remaining_pictures}
 
 
 def _contents(r: ReportInput, drawings: Mapping[str, Drawing]) -> dict[str, Any]:
-    """Content of both forms of the report."""
+    """Content that both formats of the report share."""
     parts = parts_of(REPORT, r, drawings)
     status = next(part for part in parts if part.name == "status")
-    others: list[Part] = [part for part in parts if part is not status]
+    other_parts: list[Part] = [part for part in parts if part is not status]
     return {
         "run": r,
         "status": status,
-        "parts": others,
+        "parts": other_parts,
         "provisional": _PROVISIONAL,
         "footer": f"Made by {_maker(r)}. {_FOOTER}",
         "chips": _chips(r),
@@ -121,7 +124,7 @@ def _contents(r: ReportInput, drawings: Mapping[str, Drawing]) -> dict[str, Any]
 
 
 def _maker(r: ReportInput) -> str:
-    """Version and time by which a copy on paper is traced to its run, as far as they are known."""
+    """Version and time that identify the run of a printed copy, as far as they are known."""
     versions = r.provenance.get("versions", {})
     began = moment(r.provenance.get("created", ""))
     return " ".join(
@@ -136,7 +139,7 @@ def _maker(r: ReportInput) -> str:
 
 
 def _chips(r: ReportInput) -> str:
-    """Names and sizes of the chips, those of equal size together."""
+    """Names and sizes of the chips, grouped by size."""
     names: dict[str, list[str]] = {}
     for c in r.chips:
         size = "{:g} × {:g}".format(*c.chip.size)

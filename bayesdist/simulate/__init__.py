@@ -1,4 +1,4 @@
-"""Data sets of known truth."""
+"""Simulated data sets with known truth."""
 
 from bayesdist.simulate.matches import Truth, simulate_matches, simulate_partitioned
 

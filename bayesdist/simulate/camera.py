@@ -1,4 +1,4 @@
-"""A SExtractor catalogue of one exposure matched to Gaia, simulated, with its own mistakes."""
+"""Simulated SExtractor catalogue of one exposure, matched to Gaia, with false matches."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ if TYPE_CHECKING:
 
 SIZE = 2048  # pixels on each axis
 SCALE = 0.2 / 3600  # degrees
-EPOCH = 2024.3  # of the exposure
+EPOCH = 2024.3  # decimal year of the exposure
 GAIA_EPOCH = 2016.0
 FALSE = 0.02  # fraction of matches that are false
 
 
 def camera() -> WCS:
-    """WCS of the exposure: a tangent plane at (150, 2) degrees, and SIP of order 3.
+    """WCS of the exposure: tangent plane at (150, 2) degrees with SIP distortion of order 3.
 
-    The distortion reaches 2 pixels.
+    The distortion is at most about 2 pixels.
     """
     from astropy.wcs import WCS, Sip
 
@@ -37,10 +37,10 @@ def camera() -> WCS:
 
 
 def matched_to_gaia(n: int, rng: np.random.Generator) -> Table:
-    """Matched stars of one exposure, with centroid errors that grow with the magnitude.
+    """Table of n matched stars of one exposure, with centroid errors that depend on magnitude.
 
-    The columns have the names and the units of both programs; ALPHA_J2000 and DELTA_J2000 of
-    SExtractor are left out, since they are no reference.
+    The columns have the names and units of SExtractor and of the Gaia archive.  ALPHA_J2000 and
+    DELTA_J2000 of SExtractor are omitted, since they are not reference positions.
     """
     from astropy.table import Table
 

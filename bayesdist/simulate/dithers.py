@@ -1,4 +1,4 @@
-"""Stars of a dense field in dithered exposures: where each falls on the detector."""
+"""Simulated dithered exposures of a dense field: pointings, and pixel positions of the stars."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ from bayesdist.model import Chip, DistortionModel
 from bayesdist.model.grid import mesh
 from bayesdist.utils.arrays import Bool, Float, Int
 
-MOST_STEPS = 30
-CLOSE = 1e-9  # pixels
-EDGE = 9  # points along each side of a chip that its outline on the sky is found from
-OUTSIDE = 0.1  # of the detector's size: no star is sought beyond
+MOST_STEPS = 30  # maximum number of Newton steps
+CLOSE = 1e-9  # pixels: Newton steps below this have converged
+EDGE = 9  # points along each side of a chip, to find its extent on the sky
+OUTSIDE = 0.1  # of the chip's size: margin around the chip in which stars are searched for
 
 
 def dither_pattern(
@@ -25,11 +25,32 @@ def dither_pattern(
     least: float = 5.0,
     largest: float = 0.75,
 ) -> tuple[Float, Float]:
-    """Offsets (n, 2) in pixels and rolls (n,) in radians that sample all scales, the first being 0.
+    """Offsets and roll angles of dithered exposures that sample all spatial scales.
 
-    As the program that calibrated ACS (ACS handbook, 4.1.1): the lengths are spread evenly in their
-    logarithm, from `least` pixels to `largest` times the detector's smaller side, the directions at
-    random; the roll angles are taken in turn.
+    As in the calibration programme of ACS (ACS handbook, 4.1.1), the logarithms of the offset
+    lengths are uniformly distributed, the directions are random, and the roll angles are used
+    cyclically.
+
+    Parameters
+    ----------
+    n : int
+        Number of exposures.
+    size : tuple of float
+        Columns and rows of the detector.
+    rolls_deg : sequence of float
+        Roll angles in degrees.
+    rng : numpy.random.Generator
+    least : float
+        Smallest offset in pixels.
+    largest : float
+        Largest offset, as a fraction of the smaller side of the detector.
+
+    Returns
+    -------
+    offsets : ndarray, shape (n, 2)
+        Offsets in pixels; 0 for the first exposure.
+    rolls : ndarray, shape (n,)
+        Roll angles relative to the first exposure, in radians.
     """
     length = np.exp(rng.uniform(np.log(least), np.log(largest * min(size)), n))
     angle = rng.uniform(0, 2 * np.pi, n)
@@ -47,10 +68,10 @@ def dithered_model(
     *,
     frames: str = "shift_rotation",
 ) -> tuple[DistortionModel, Float]:
-    """Model of dithered exposures and its true parameters (D,).
+    """Model of dithered exposures, and its true parameters (D,).
 
-    `coefficients` (chips, 2, K) are Legendre's, in pixels, `offsets` and `rolls` as from
-    `dither_pattern`.
+    `coefficients` (chips, 2, K) are Legendre coefficients in pixels.  `offsets` and `rolls` are
+    those of `dither_pattern`.
     """
     order = int((np.sqrt(8 * coefficients.shape[2] + 1) - 3) / 2)
     centre = coefficients[:, :, 0].mean(axis=0)
@@ -71,7 +92,7 @@ def dithered_model(
 
 
 def sky_seen(model: DistortionModel, theta: Float) -> tuple[Float, Float]:
-    """Lowest and highest corner (2,) of the rectangle that holds all exposures' corners."""
+    """Lower and upper corner (2,) of the rectangle that contains the corners of all exposures."""
     corners = []
     for chip in model.chips:
         right, top = (n + 0.5 for n in chip.size)
@@ -85,14 +106,26 @@ def sky_seen(model: DistortionModel, theta: Float) -> tuple[Float, Float]:
 def stars_on_detector(
     model: DistortionModel, theta: Float, sky: Float
 ) -> tuple[Float, Float, Int, Int, Int]:
-    """Pixels x, y (N,) of the stars in all exposures; exposures, chip numbers, rows of `sky`."""
+    """Detections of the stars at positions `sky` (S, 2) in all exposures.
+
+    Returns
+    -------
+    x, y : ndarray, shape (N,)
+        FITS 1-based pixels of the detections.
+    exposure, chip : ndarray of int, shape (N,)
+        Exposure codes and chip numbers.
+    star : ndarray of int, shape (N,)
+        Rows of `sky`.
+    """
     columns = []
     for e in range(len(model.exposures)):
         for chip in model.chips:
             around = np.flatnonzero(_within(sky, *_outline(model, theta, e, chip)))
-            x, y, seen = pixels_of(model, theta, sky[around], e, chip)
-            k = around[seen]
-            columns.append((x[seen], y[seen], np.full(len(k), e), np.full(len(k), chip.number), k))
+            x, y, on_chip = pixels_of(model, theta, sky[around], e, chip)
+            k = around[on_chip]
+            columns.append(
+                (x[on_chip], y[on_chip], np.full(len(k), e), np.full(len(k), chip.number), k)
+            )
     x, y, exposure, number, star = (np.concatenate(part) for part in zip(*columns, strict=True))
     return x, y, exposure, number, star
 
@@ -100,7 +133,7 @@ def stars_on_detector(
 def _outline(
     model: DistortionModel, theta: Float, exposure: int, chip: Chip
 ) -> tuple[Float, Float]:
-    """Lowest and highest corner (2,) of a rectangle of the sky that holds a chip with room."""
+    """Lower and upper corner (2,) of a rectangle on the sky that contains a chip with a margin."""
     x, y = mesh(*(np.linspace(0.5, n + 0.5, EDGE) for n in chip.size))
     points = model.predict(theta, x, y, exposure=exposure, chip=chip.number)
     room = OUTSIDE * np.ptp(points, axis=0)
@@ -108,16 +141,16 @@ def _outline(
 
 
 def _within(points: Float, low: Float, high: Float) -> Bool:
-    """Boolean mask (N,) of the points (N, 2) in a rectangle."""
+    """Boolean mask (N,) that is True for points (N, 2) inside a rectangle."""
     return np.all((points > low) & (points < high), axis=1)
 
 
 def pixels_of(
     model: DistortionModel, theta: Float, sky: Float, exposure: int, chip: Chip
 ) -> tuple[Float, Float, Bool]:
-    """Pixels x, y (S,) of stars on a chip by Newton's method, and a mask (S,) of those it sees.
+    """Pixels x, y (S,) of stars on a chip, by Newton's method, and a mask (S,).
 
-    Pixels of stars that it does not see are meaningless.
+    The mask is True for stars that fall on the chip; the pixels of all other stars are meaningless.
     """
     basis = model.basis(chip.number)
     groups = model.groups(1, exposure=exposure, chip=chip.number)
@@ -141,5 +174,5 @@ def pixels_of(
         near[near] = inside
         if not inside.any() or max(np.abs(dx[inside]).max(), np.abs(dy[inside]).max()) < CLOSE:
             break
-    seen = near & (x > 0.5) & (x < nx + 0.5) & (y > 0.5) & (y < ny + 0.5)
-    return x, y, seen
+    on_chip = near & (x > 0.5) & (x < nx + 0.5) & (y > 0.5) & (y < ny + 0.5)
+    return x, y, on_chip

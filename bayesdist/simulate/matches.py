@@ -1,4 +1,4 @@
-"""Simulated matches of a given distortion, as a calibration would have measured them."""
+"""Simulated matches for a given distortion model, with measurement errors and false matches."""
 
 from __future__ import annotations
 
@@ -18,23 +18,25 @@ from bayesdist.utils.arrays import Bool, Float, Int
 from bayesdist.utils.quantities import Number, Random, generator_of, value_in, whole_number
 
 _AT_ONCE, _STEP = 65_536, 8192
-CHUNK = 1_000_000  # matches in memory at a time
+CHUNK = 1_000_000  # maximum number of matches in memory
 
 
 @dataclass(frozen=True, eq=False)
 class Truth:
-    """Truth of a simulation.
+    """Parameters and false matches of a simulation.
 
     Parameters
     ----------
     model : DistortionModel
     theta : ndarray, shape (D,)
+        True parameters of the model.
     fraction : float
         Probability of a false match.
     jitter : float
-        Error beyond the quoted ones, in the unit of u, v.
+        Error per axis that is added in quadrature to the quoted errors, in the unit of u and v.
     outlier_scale : float
-        Standard deviation of false matches on each axis, or the radius of the match circle.
+        Standard deviation per axis of the offsets of false matches, or the radius of the match
+        circle, in the unit of u and v.
     false : ndarray of bool, shape (N,)
         True for false matches.
     """
@@ -61,26 +63,29 @@ def simulate_matches(
     outliers: str = "gaussian",
     epochs: ArrayLike | None = None,
 ) -> tuple[Matches, Truth]:
-    """Stars spread evenly over the chips and exposures, with known errors and false matches.
+    """Simulate matches that are distributed uniformly over the chips and exposures of a model.
 
     Parameters
     ----------
     model : DistortionModel
     theta : array_like, shape (D,)
-        Its true parameters.
+        True parameters of the model.
     n : int
         Number of matches.
     rng : int or numpy.random.Generator
-        Seed, or source of the random numbers.
+        Seed or random generator.
     sigma : float, Quantity, pair of ndarray, or callable
-        Quoted errors: one number, one for each star and axis, or a function of the magnitudes.
+        Quoted errors per axis, in the unit of u and v: one number, two arrays of shape (n,) for u
+        and v, or a function that returns these two arrays for the magnitudes.
     mag : ndarray, shape (n,), optional
+        Magnitudes; required if `sigma` is a function.
     fraction, jitter, outlier_scale : float
-        As in `Truth`.
+        See `Truth`.
     outliers : str
-        'gaussian' or 'uniform' (on the match circle of radius `outlier_scale`).
+        Distribution of the offsets of false matches: 'gaussian', or 'uniform' on the match circle
+        of radius `outlier_scale`.
     epochs : array_like, optional
-        Date of each exposure.
+        Date of each exposure in decimal years.
 
     Returns
     -------
@@ -90,7 +95,8 @@ def simulate_matches(
     Raises
     ------
     InputError
-        For an unknown kind of outliers, no matches, or a fraction outside of 0 to 1.
+        If the kind of outliers is unknown, there are no matches, a fraction is not from 0 to 1, or
+        `sigma` is a function and `mag` is missing.
 
     Examples
     --------
@@ -117,7 +123,7 @@ def simulate_matches(
 
     if callable(sigma):
         if mag is None:
-            raise InputError("errors by magnitude need magnitudes", do="give mag")
+            raise InputError("errors that depend on magnitude need magnitudes", do="give mag")
         sigma_u, sigma_v = sigma(mag)
     elif isinstance(sigma, tuple):
         sigma_u, sigma_v = sigma
@@ -151,25 +157,27 @@ def simulate_matches(
 def simulate_partitioned(
     folder: str | os.PathLike[str], n: int, simulate: Callable[[int], tuple[Matches, Truth]]
 ) -> Truth:
-    """Truth of matched stars that are written to a folder of Parquet files as they come.
+    """Simulate matches in chunks and write them to a folder of Parquet files.
 
     Parameters
     ----------
     folder : path-like
-        As `write_partitioned`.
+        Folder for the files; see `write_partitioned`.
     n : int
+        Total number of matches.
     simulate : callable
-        Makes so many matches, at most `CHUNK`, and their truth.
+        Function of a number of matches, at most `CHUNK`, that returns simulated matches and their
+        truth, such as `simulate_matches` with all other arguments fixed.
 
     Returns
     -------
     Truth
-        `false` has one byte for each pair, in the order of the files.
+        Truth of the first chunk, with `false` for all n matches in the order of the files.
 
     Raises
     ------
     InputError
-        As `simulate` and `write_partitioned`.
+        If `simulate` or `write_partitioned` raise it.
 
     Examples
     --------

@@ -1,4 +1,4 @@
-"""Dither patterns: pointings and rolls of exposures."""
+"""Dither patterns: pointings and roll angles of exposures."""
 
 from __future__ import annotations
 
@@ -14,16 +14,16 @@ from bayesdist.model import Chip, DistortionModel
 from bayesdist.model.grid import mesh
 from bayesdist.utils.arrays import Float
 
-GAP = 50.0  # pixels between chips without a given position
-ONE_LINE = 0.02  # of the spread along the offsets, below which that across them counts as none
+GAP = 50.0  # default gap between chips, pixels
+ONE_LINE = 0.02  # pointings with a smaller axis ratio count as lying along one line
 
 
 @dataclass(frozen=True, eq=False)
 class DitherPattern:
-    """Pointings and rolls of some exposures, relative to the first."""
+    """Pointings and roll angles of exposures, relative to the first one."""
 
     name: str
-    offsets: Float  # (E, 2), of the detector's middle, pixels along the first one's axes
+    offsets: Float  # (E, 2), of the detector centre, pixels along the axes of the first exposure
     rolls: Float  # (E,), radians
 
     def __len__(self) -> int:
@@ -31,30 +31,30 @@ class DitherPattern:
 
     @cached_property
     def reach(self) -> float:
-        """Largest distance of two pointings, pixels."""
+        """Largest distance between two pointings, in pixels."""
         return float(pdist(self.offsets).max(initial=0.0))
 
     @property
     def along_one_line(self) -> bool:
-        """True where the pointings differ, and along one line only."""
+        """True if the pointings differ only along one line."""
         spread = np.linalg.svd(self.offsets - self.offsets.mean(axis=0), compute_uv=False)
         return bool(spread[0] > 0 and spread[1:].max(initial=0.0) < ONE_LINE * spread[0])
 
 
 def grid_offsets(n: tuple[int, int], step: tuple[float, float]) -> Float:
-    """Offsets (n_x n_y, 2) of a regular grid, row by row from zero; `step` is in pixels."""
+    """Offsets (n_x n_y, 2) of a regular grid in pixels, row by row, starting at zero."""
     return np.stack(
         mesh(np.arange(n[0], dtype=float) * step[0], np.arange(n[1], dtype=float) * step[1]), axis=1
     )
 
 
 def rolls_in_turn(n: int, n_offsets: int, rolls: Sequence[float]) -> Float:
-    """Rolls (n,) of exposures that go round some offsets: every offset meets every roll.
+    """Roll angles (n,) of exposures such that every offset is combined with every roll angle.
 
-    Offsets repeat after `n_offsets` exposures, `rolls` are taken in turn.
+    The offsets repeat after `n_offsets` exposures; the roll angles are used cyclically.
     """
     k = np.arange(n)
-    # where both would repeat together, the rolls go one further
+    # when the combinations would start to repeat, the roll angles are advanced by one
     return np.asarray(rolls, float)[(k + k // lcm(n_offsets, len(rolls))) % len(rolls)]
 
 
@@ -63,8 +63,8 @@ def flat_coefficients(
 ) -> Float:
     """Legendre coefficients (chips, 2, K) of chips without distortion.
 
-    `places` are the positions of the chips' reference pixels, in pixels; by default one above the
-    other, the first one below, fifty pixels between them.
+    `places` are the positions (u, v) of the chips' reference pixels, in pixels.  By default the
+    chips are stacked upwards, beginning with the first, with gaps of `GAP` pixels.
     """
     model = DistortionModel(order, tuple(chips))
     out, above = np.zeros((len(chips), 2, model.n_terms)), 0.0

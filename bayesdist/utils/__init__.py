@@ -1,1 +1,1 @@
-"""Small tools of every room: types of arrays, numbers for readers, limits, files, memory."""
+"""Helpers for all subpackages: array types, number formatting, limits, random streams, memory."""

@@ -1,4 +1,4 @@
-"""Types of arguments of public functions, checked where the user calls them."""
+"""Type checks for the arguments of public functions."""
 
 from __future__ import annotations
 
@@ -17,35 +17,35 @@ R = TypeVar("R")
 
 
 def takes(**kinds: type | tuple[type, ...]) -> Callable[[Callable[P, R]], Callable[P, R]]:
-    """Decorator that refuses arguments of another type.
+    """Decorator that checks the types of arguments at each call.
 
     Parameters
     ----------
     **kinds : type or tuple of type
-        Types of an argument.  The default of the function, such as None, is always admitted.
+        Allowed types of the argument of that name.  Its default, such as None, is always allowed.
 
     Raises
     ------
     InputError
-        By the decorated function, if an argument has another type.
+        Raised by the decorated function if an argument has another type.
     """
 
     def decorated(function: Callable[P, R]) -> Callable[P, R]:
-        known = signature(function)
+        parameters = signature(function)
 
         @wraps(function)
         def checked(*args: P.args, **kwargs: P.kwargs) -> R:
-            given = known.bind(*args, **kwargs).arguments
+            arguments = parameters.bind(*args, **kwargs).arguments
             for name, kind in kinds.items():
-                value = given.get(name, known.parameters[name].default)
-                if value is known.parameters[name].default or isinstance(value, kind):
+                value = arguments.get(name, parameters.parameters[name].default)
+                if value is parameters.parameters[name].default or isinstance(value, kind):
                     continue
-                several = kind if isinstance(kind, tuple) else (kind,)
+                allowed = kind if isinstance(kind, tuple) else (kind,)
                 raise InputError(
                     f"{name} is a {type(value).__name__}",
                     where=function.__name__,
-                    do=f"give a {' or '.join(map(_name_of, several))}"
-                    + (_OF_A_TABLE if several[0].__name__ == "Matches" else ""),
+                    do=f"give a {' or '.join(map(_name_of, allowed))}"
+                    + (_OF_A_TABLE if allowed[0].__name__ == "Matches" else ""),
                 )
             return function(*args, **kwargs)
 

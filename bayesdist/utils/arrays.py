@@ -1,4 +1,4 @@
-"""Types of arrays, by what they hold: positions and errors, numbers of rows, masks."""
+"""Type aliases of numpy arrays."""
 
 from __future__ import annotations
 

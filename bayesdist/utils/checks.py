@@ -1,6 +1,7 @@
-"""Checks: what was found, against what limit, and what it means for whoever uses the numbers.
+"""Checks of a run: value, limit, outcome, and the consequence for users of the numbers.
 
-Each is a row of the status table: nothing warns, and nothing keeps a verdict open, that has none.
+Each check is a row of the status table.  All warnings, and all reasons for which a verdict on a
+requirement is left undecided, come from checks.
 """
 
 from __future__ import annotations
@@ -11,7 +12,7 @@ from dataclasses import dataclass
 LEVELS = ("note", "pass", "warn", "fail")  # from the least to the worst
 LARGER, EITHER = "larger", "either"
 
-# in which order a reader meets them
+# order of the groups in the status table
 GROUPS = (
     "Held-out truth",
     "Sampling",
@@ -31,46 +32,48 @@ GROUPS = (
 
 @dataclass(frozen=True)
 class Check:
-    """One criterion."""
+    """Comparison of one diagnostic with its limit: a row of the status table."""
 
-    group: str  # what it concerns: one of `GROUPS`
-    name: str  # what was checked, with its unit
-    value: float | str = ""  # what was found; empty where the sentence says it
-    limit: str = ""  # what is asked, in words; empty where nothing is
-    level: str = "note"  # 'pass', 'warn', 'fail', or 'note' where nothing is asked
-    # what a reader of the numbers has to know, as a clause; empty where that is nothing
+    group: str  # subject, one of `GROUPS`
+    name: str  # quantity that was checked, with its unit
+    value: float | str = ""  # its value; empty if the sentence contains it
+    limit: str = ""  # the limit in words; empty if there is none
+    level: str = "note"  # 'pass', 'warn' or 'fail'; 'note' if there is no limit
+    # consequence for users of the numbers, as a clause; empty if there is none
     sentence: str = ""
-    # what the sentence does to verdicts: `LARGER` where errors can only be larger for it, so that
-    # nothing is met, and what is missed is missed all the same; `EITHER` where errors may be
-    # smaller too, so that nothing is decided; empty where verdicts stand
+    # effect on the verdicts about requirements.  `LARGER`: the true errors can only be larger than
+    # stated, so that no requirement counts as met, but a missed one remains missed.  `EITHER`: the
+    # true errors may be larger or smaller, so that all requirements are undecided.  Empty: none.
     doubt: str = ""
 
     @property
     def text(self) -> str:
-        """The sentence with a capital."""
+        """The sentence with its first letter capitalized."""
         return self.sentence[:1].upper() + self.sentence[1:]
 
 
 def in_order(checks: Iterable[Check]) -> tuple[Check, ...]:
-    """Checks by their groups, in each as they come."""
-    return tuple(sorted(checks, key=lambda one: GROUPS.index(one.group)))
+    """Checks sorted by group; the order within each group is preserved."""
+    return tuple(sorted(checks, key=lambda check: GROUPS.index(check.group)))
 
 
 def level_of(good: bool, bad: str = "fail") -> str:
-    """'pass' for what is good, else another level."""
+    """'pass' if the criterion is met, otherwise the level `bad`."""
     return "pass" if good else bad
 
 
 def worst(checks: Iterable[Check]) -> str:
-    """The worst level of some checks; 'pass' where nothing is wrong."""
-    return max((one.level for one in checks), key=LEVELS.index, default="pass")
+    """Most severe level of the checks; 'pass' if there are none."""
+    return max((check.level for check in checks), key=LEVELS.index, default="pass")
 
 
 def warnings_of(checks: Iterable[Check]) -> tuple[str, ...]:
-    """Sentences of the checks that warn or fail."""
-    return tuple(one.text for one in checks if one.sentence and one.level in ("warn", "fail"))
+    """Sentences of the checks with level 'warn' or 'fail'."""
+    return tuple(
+        check.text for check in checks if check.sentence and check.level in ("warn", "fail")
+    )
 
 
 def doubts_of(checks: Iterable[Check]) -> tuple[Check, ...]:
-    """Checks that keep verdicts from being given."""
-    return tuple(one for one in checks if one.doubt)
+    """Checks that affect the verdicts about requirements (those with a `doubt`)."""
+    return tuple(check for check in checks if check.doubt)

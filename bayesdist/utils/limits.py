@@ -1,7 +1,7 @@
-"""Limits that decide something: each stands here once, with the reason for its value.
+"""Limits on diagnostics, each defined once with the reason for its value.
 
-A limit on a size of the data below which a quantity is not computed at all is none of these; it
-stands where it is computed.
+Minimum amounts of data, below which a quantity is not computed at all, are defined in the modules
+that compute the quantity.
 """
 
 from __future__ import annotations
@@ -11,14 +11,15 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class Limit:
-    """A number that decides, and why it is that number.
+    """Limit on a diagnostic, and the reason for its value.
 
     Parameters
     ----------
     value : float
     sense : str
-        'at most' or 'at least': on which side of it all is well.
+        'at most' or 'at least': the side of the limit on which the criterion is met.
     reason : str
+        Reason for the value, or its unit and meaning, for the documentation.
 
     Examples
     --------
@@ -31,12 +32,12 @@ class Limit:
     reason: str
 
     def met_by(self, value: float) -> bool:
-        """Whether a value is on the good side, or on the limit itself; never for NaN."""
+        """True if a value meets the criterion or equals the limit; False for NaN."""
         return value <= self.value if self.sense == "at most" else value >= self.value
 
     @property
     def words(self) -> str:
-        """The limit as tables show it."""
+        """Sense and value as shown in tables, such as 'at most 0.7'."""
         return f"{self.sense} {self.value:g}"
 
 
@@ -45,10 +46,10 @@ class Limit:
 PARETO_K = Limit(
     0.7, "at most", "above it importance weights cannot be trusted (Vehtari et al. 2024)"
 )
-IMPORTANCE_EFFICIENCY = Limit(0.1, "at least", "below it the proposal has missed what it proposes")
-MEAN_ERROR = Limit(0.1, "at most", "of a posterior sd: adds half a percent to the error of a mean")
+IMPORTANCE_EFFICIENCY = Limit(0.1, "at least", "below it the proposal misses part of the posterior")
+MEAN_ERROR = Limit(0.1, "at most", "posterior sd: increases the error of a mean by half a percent")
 DRAWS_PER_WALKER = Limit(
-    5.0, "at least", "many walkers must not make up for walkers that do not mix"
+    5.0, "at least", "a large number of walkers must not hide that the walkers do not mix"
 )
 
 # -- fit and quoted errors ------------------------------------------------------------------------
@@ -56,92 +57,96 @@ DRAWS_PER_WALKER = Limit(
 CHI2_TOO_SMALL = Limit(
     0.8, "at least", "per degree of freedom: quoted errors right within some ten percent"
 )
-CHI2_TOO_SMALL_CHANCE = Limit(1e-3, "at least", "probability of so small a chi-square by chance")
+CHI2_TOO_SMALL_CHANCE = Limit(1e-3, "at least", "probability of a chi-square as small by chance")
 CHI2_TOO_LARGE = Limit(
     1.5, "at most", "per degree of freedom: quoted errors right within some twenty percent"
 )
 EXPOSURE_CHI2 = Limit(
-    1.5, "at most", "times the chi-square of all exposures, or less by it: errors of one differ"
+    1.5, "at most", "ratio, either way, to the chi-square of all exposures: its errors differ"
 )
 LEFT_OUT = Limit(
-    0.2, "at most", "of the stars: rejection that takes more has shaped what it was to protect"
+    0.2, "at most", "fraction of the stars: more rejections would shape the solution itself"
 )
-CONDITION = Limit(1e8, "at most", "leaves half the digits of a double")
+CONDITION = Limit(1e8, "at most", "half the digits of a double remain")
 QUOTED_ERRORS = Limit(
-    20.0, "at most", "times the quoted errors, beyond which jitter would be nearly all there is"
+    20.0, "at most", "times the quoted errors: beyond it the total error is almost all jitter"
 )
-FALSE_MAJORITY = Limit(0.5, "at most", "with more false than true matches these may be by chance")
+FALSE_MAJORITY = Limit(
+    0.5, "at most", "if most matches are false, the others may be chance matches"
+)
 WIDENED_ERRORS = Limit(
-    5.0, "at most", "times the quoted error: a mixture that widens true matches to hold false ones"
+    5.0, "at most", "times the quoted error: beyond it the mixture absorbs false matches as true"
 )
 MATCH_RADIUS = Limit(
-    5.0, "at least", "errors of a star, within which true matches are lost about poor positions"
+    5.0, "at least", "errors of a star: below it true matches of poorly measured stars are lost"
 )
-PIXEL_SIZE = Limit(3.0, "at most", "factor by which two kinds of pixels differ")
-EPOCH_SHIFT = Limit(5.0, "at most", "standard errors: a shift is one of many things looked for")
-TREND = Limit(
-    1e-3, "at least", "probability of a trend of deviations by chance, over all of their kinds"
-)
+PIXEL_SIZE = Limit(3.0, "at most", "ratio of two pixel scales that can still be a coincidence")
+EPOCH_SHIFT = Limit(5.0, "at most", "standard errors: a shift is one of many effects tested")
+TREND = Limit(1e-3, "at least", "probability of a trend by chance, over all kinds of deviations")
 GAUGE_CONTRADICTION = Limit(
-    1e-4, "at least", "probability of what is known of the gauge, given the detections"
+    1e-4, "at least", "probability of the gauge constraints, given the detections"
 )
 
 # -- residuals ------------------------------------------------------------------------------------
 
 STRUCTURE = Limit(
-    1e-4, "at least", "probability of as much structure by chance, over all tests together"
+    1e-4, "at least", "probability of as much structure by chance, over all tests combined"
 )
 STRUCTURE_SEEN = Limit(
-    0.5, "at least", "of all patterns, below which that none is found says little"
+    0.5,
+    "at least",
+    "fraction of all patterns that would be detected: if fewer, no finding means little",
 )
 STRUCTURE_IN_BUDGET = Limit(
-    0.5, "at least", "of the structure that is found in residuals, for the budget to hold it"
+    0.5, "at least", "fraction of the structure found in residuals that the budget must include"
 )
-SCORE_TESTS = Limit(
-    1e-3, "at least", "probability that any test of a run finds something where nothing is"
-)
-UNCOVERED = Limit(0.05, "at most", "of the area: what may be missing at the edges of a detector")
+SCORE_TESTS = Limit(1e-3, "at least", "probability that any test of a run gives a false positive")
+UNCOVERED = Limit(0.05, "at most", "fraction of the area: gaps at the edges of a detector")
 UNCOVERED_BY_CHANCE = Limit(
-    3.0, "at most", "times the gap that as many evenly scattered stars leave on average"
+    3.0, "at most", "times the mean gap left by the same number of uniformly scattered stars"
 )
 BEYOND_STARS = Limit(
-    0.03, "at most", "of the longer side: a grid reaches this far beyond the outermost stars"
+    0.03,
+    "at most",
+    "of the longer side: distance of the grid's edge from the outermost stars",
 )
 
 # -- held-out stars -------------------------------------------------------------------------------
 
-HELD_OUT = Limit(50, "at least", "stars, without which nothing can be said")
-HELD_OUT_UNUSUAL = Limit(0.01, "at least", "probability by chance, over all tests together")
-HELD_OUT_DOUBTFUL = Limit(1e-3, "at least", "probability by chance that no verdict stands against")
+HELD_OUT = Limit(50, "at least", "stars: fewer do not constrain the errors")
+HELD_OUT_UNUSUAL = Limit(0.01, "at least", "probability by chance, over all tests combined")
+HELD_OUT_DOUBTFUL = Limit(1e-3, "at least", "probability by chance: below it no verdict is given")
 HELD_OUT_RATIO = Limit(
-    1.05, "at most", "of predicted errors: less is not material, however significant"
+    1.05,
+    "at most",
+    "times the predicted errors: a smaller excess is not material",
 )
-HELD_OUT_DISTRIBUTION = Limit(0.02, "at most", "of a distribution function: less is not material")
-HELD_OUT_TAILS = Limit(1.5, "at most", "times the stars expected in tails: less is not material")
+HELD_OUT_DISTRIBUTION = Limit(
+    0.02, "at most", "of a distribution function: smaller is not material"
+)
+HELD_OUT_TAILS = Limit(1.5, "at most", "times the stars expected in tails: fewer are not material")
 
 # -- matching -------------------------------------------------------------------------------------
 
-COMPLETENESS = Limit(
-    0.8, "at least", "below it stars are missed for a reason that selects among them"
-)
+COMPLETENESS = Limit(0.8, "at least", "below it the missing stars are probably a biased selection")
 FALSE_MATCHES = Limit(
-    0.01, "at most", "the outlier model takes more, but so many say that matching went wrong"
+    0.01, "at most", "the outlier model tolerates more, but more suggest that matching failed"
 )
 
 # -- comparisons and verdicts ---------------------------------------------------------------------
 
-DIFFERENCE = Limit(0.01, "at least", "probability by chance under which a difference is called one")
-CONFIDENCE = Limit(0.99, "at least", "of the Monte-Carlo interval that a verdict rests on")
+DIFFERENCE = Limit(0.01, "at least", "probability by chance: below it a difference is significant")
+CONFIDENCE = Limit(0.99, "at least", "level of the Monte-Carlo interval used for verdicts")
 EXCEEDS = Limit(
-    0.95, "at least", "probability that a limit is exceeded, for a requirement to be called missed"
+    0.95, "at least", "probability that the limit is exceeded, for a requirement to count as missed"
 )
 COUNTING_ERROR = Limit(
-    0.005, "at most", "of a probability near the one asked for, for its estimate to decide"
+    0.005, "at most", "Monte-Carlo error of a probability close to the required one, for a verdict"
 )
 
 # -- files ----------------------------------------------------------------------------------------
 
 SKY_CLOSURE = Limit(
-    1e-3, "at most", "of a pixel: a header that misses its solution by more is wrong"
+    1e-3, "at most", "pixels: a header that deviates from its solution by more is wrong"
 )
-FILE_ERROR = Limit(0.3, "at most", "of the total error: it makes that 4 % larger")
+FILE_ERROR = Limit(0.3, "at most", "of the total error: increases it by 4 %")

@@ -1,6 +1,6 @@
-"""Correlation of Gaussian fields, by separation and correlation length.
+"""Matern correlation functions and draws of Gaussian random fields.
 
-The Matern field of smoothness 3/2 has a slope everywhere (Rasmussen and Williams 2006,
+The smoothness is 3/2, so that fields are once differentiable (Rasmussen and Williams 2006,
 Section 4.2).
 """
 
@@ -14,18 +14,21 @@ from bayesdist.utils.arrays import Float
 
 SMOOTHNESS = 1.5
 
-# fractions of a variance, each with the correlation length of its field
+# components of a field: (fraction of the variance, correlation length) of each
 Correlation = Sequence[tuple[float, float]]
 
 
 def matern(separation: Float) -> Float:
-    """Correlation by separation in correlation lengths."""
+    """Matern 3/2 correlation at a separation, given in units of the correlation length."""
     z = np.sqrt(2 * SMOOTHNESS) * separation
     return np.asarray((1 + z) * np.exp(-z))
 
 
 def correlation_at(separation: Float, correlation: Correlation) -> Float:
-    """Correlation of a sum of fields; what the fractions leave of 1 is independent."""
+    """Correlation of a sum of fields at a separation, in the unit of the correlation lengths.
+
+    If the fractions add up to less than 1, the remaining variance is uncorrelated.
+    """
     out = np.zeros(np.shape(separation))
     for fraction, length in correlation:
         out = out + fraction * matern(separation / length)
@@ -37,12 +40,14 @@ def drawn_fields(
 ) -> Float:
     """Draws (N, n) of the correlated part of a field of unit variance, at positions (N, 2).
 
-    Each is a sum of waves with random phases, whose frequencies have the spectral density of the
-    field: over all draws the covariance is exact (Rahimi and Recht 2007).
+    Each draw is a sum of waves with random phases and with frequencies drawn from the spectral
+    density of the field (random Fourier features, Rahimi and Recht 2007).  The covariance, averaged
+    over all draws, is exact.
     """
     out = np.zeros((len(at), n))
     for fraction, length in correlation:
-        # draws with the same frequencies are independent; over many frequencies none matters
+        # draws that use the same frequencies are uncorrelated; new frequencies for every 50 draws
+        # reduce the error of the covariance that comes from the finite number of frequencies
         step = max(1, min(n, 50))
         for start in range(0, n, step):
             stop = min(start + step, n)

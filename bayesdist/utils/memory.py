@@ -1,4 +1,4 @@
-"""Memory that this machine has, what would need more of it, and what is free again."""
+"""Memory limit of a single object, and the release of unused memory."""
 
 from __future__ import annotations
 
@@ -12,47 +12,59 @@ from bayesdist.errors import MemoryLimitError
 
 
 def memory_limit() -> int:
-    """Bytes that one object may take: half the memory of the machine, or of what it allows us."""
+    """Maximum size of one object in bytes: half the physical memory or address space limit."""
     try:
-        found = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
-    except (AttributeError, OSError, ValueError):  # systems that do not tell
+        physical = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+    except (AttributeError, OSError, ValueError):  # not available on all systems
         return sys.maxsize
     try:
         import resource
 
         allowed = resource.getrlimit(resource.RLIMIT_AS)[0]
     except ImportError:
-        return found // 2
-    return (found if allowed == resource.RLIM_INFINITY else min(found, allowed)) // 2
+        return physical // 2
+    return (physical if allowed == resource.RLIM_INFINITY else min(physical, allowed)) // 2
 
 
 def require_memory(n_bytes: float, what: str, *, where: str = "", do: str) -> None:
-    """Refuse a computation before it takes more memory than it may.
+    """Raise an error if a computation needs more memory than `memory_limit`.
 
-    `n_bytes`: that it needs, at least. `what`: as in "the grid of 100000 x 100000 positions".
-    `where`, `do`: as of `BayesdistError`.
+    Parameters
+    ----------
+    n_bytes : float
+        Lower bound of the required memory.
+    what : str
+        Object for the message, such as "the grid of 100000 x 100000 positions".
+    where, do : str
+        See `BayesdistError`.
+
+    Raises
+    ------
+    MemoryLimitError
+        If `n_bytes` exceeds the limit.
     """
-    most = memory_limit()
-    if n_bytes > most:
+    limit = memory_limit()
+    if n_bytes > limit:
         raise MemoryLimitError(
-            f"{what} would take {size_text(n_bytes)} of memory, and at most {size_text(most)} are "
-            "to be had here",
+            f"{what} would take {size_text(n_bytes)} of memory, but at most {size_text(limit)} are "
+            "available",
             where=where,
             do=do,
         )
 
 
 def release_memory() -> None:
-    """Give memory that is free back to the system, where the C library keeps it for later (glibc).
+    """Return unused memory to the operating system (glibc only; otherwise do nothing).
 
-    Arrays of a few MB leave gaps between those that stay: a fifth of all memory after large files.
+    glibc keeps freed memory for later use, and freed arrays of a few MB leave gaps between the
+    remaining ones: after large files have been read, this is a fifth of all memory.
     """
     with suppress(AttributeError, OSError, TypeError):  # other systems have no such function
         ctypes.CDLL(None).malloc_trim(0)
 
 
 def size_text(n_bytes: float) -> str:
-    """A number of bytes in words, as '74 GB'."""
+    """Number of bytes with a unit, such as '74 GB'."""
     units = ("bytes", "kB", "MB", "GB", "TB")
     power = min(len(units) - 1, int(math.log10(max(n_bytes, 1.0))) // 3)
     return f"{n_bytes / 1000**power:.3g} {units[power]}"

@@ -1,4 +1,7 @@
-"""Numbers and lengths for readers: significant digits, readable units, never 'NaN'."""
+"""Formatting of numbers, probabilities and lengths: significant digits and readable units.
+
+Values that are missing or not a number are shown as a dash (`MISSING`), never as 'NaN'.
+"""
 
 from __future__ import annotations
 
@@ -13,8 +16,8 @@ from numpy.typing import ArrayLike
 MISSING = "–"
 _SUPERSCRIPTS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 _MINUS = str.maketrans("-", "−")
-_LEAST_P = 1e-300  # tails of distributions underflow not far below
-NAME_WIDTH = 10  # of a line of a name that is broken
+_LEAST_P = 1e-300  # smaller probabilities are shown as a bound, since doubles soon underflow
+NAME_WIDTH = 10  # maximum characters per line in `broken_name`
 _MAX_DECIMALS = 10  # beyond this a fixed-point number is harder to read than a power of ten
 
 
@@ -30,7 +33,7 @@ def _finite(value: Any) -> float | None:
 
 
 def _infinite(value: Any) -> str:
-    """Text for a value that is no finite number: a diagnostic may well be infinite."""
+    """Text for a value that is not a finite number; diagnostics can be infinite."""
     if value is np.ma.masked:
         return MISSING
     try:
@@ -40,28 +43,31 @@ def _infinite(value: Any) -> str:
 
 
 def _power_of_ten(x: float, decimals: int, exponent: int) -> str:
-    # decimal, as 10.0**exponent would underflow for the smallest doubles
+    # Decimal is used because 10.0**exponent would underflow for the smallest doubles
     mantissa = f"{Decimal(x).scaleb(-exponent):.{decimals}f}".translate(_MINUS)
     return f"{mantissa}\u202f×\u202f10{str(exponent).translate(_SUPERSCRIPTS)}"
 
 
 def number(value: Any, digits: int = 3) -> str:
-    """Number to some significant digits; powers of ten where very small or large; or `MISSING`."""
+    """Number with some significant digits, with a power of ten if it is very small or large.
+
+    `MISSING` if the value is missing or not a number.
+    """
     x = _finite(value)
     if x is None:
         return _infinite(value)
     if x == 0:
         return "0"
-    exponent = int(f"{x:.{digits - 1}e}".split("e")[1])  # after rounding: 9.99 may become 10
+    exponent = int(f"{x:.{digits - 1}e}".split("e")[1])  # after rounding, as 9.99 may become 10
     if -4 <= exponent < max(digits, 6):
         return f"{x:.{max(0, digits - 1 - exponent)}f}".translate(_MINUS)
     return _power_of_ten(x, digits - 1, exponent)
 
 
 def rounded(value: Any, sigma: Any) -> str:
-    """Number to the second significant digit of its standard deviation.
+    """Number rounded to the second significant digit of its standard deviation.
 
-    `MISSING` for what is not a finite number; five digits where sigma is none or zero.
+    `MISSING` if the value is not a finite number; five digits if sigma is missing or zero.
     """
     x, s = _finite(value), _finite(sigma)
     if x is None:
@@ -77,26 +83,26 @@ def rounded(value: Any, sigma: Any) -> str:
 
 
 def interval(low: Any, high: Any, sigma: Any) -> str:
-    """Interval, each end to the second digit of a standard deviation."""
+    """Interval with both ends rounded to the second significant digit of a standard deviation."""
     if _finite(low) is None or _finite(high) is None:
         return MISSING
     return f"{rounded(low, sigma)} to {rounded(high, sigma)}"
 
 
 def count(value: Any) -> str:
-    """A whole number with its digits in groups of three."""
+    """Integer with its digits in groups of three."""
     x = _finite(value)
     return MISSING if x is None else f"{round(x):,}".replace(",", "\u202f").translate(_MINUS)
 
 
 def percent(value: Any, digits: int = 3) -> str:
-    """A fraction in percent."""
+    """Fraction as a percentage."""
     x = _finite(value)
     return MISSING if x is None else f"{number(100 * x, digits)}\u202f%"
 
 
 def probability(p: Any) -> str:
-    """Probability of chance with its sign; a bound where a double cannot tell it from zero."""
+    """p-value such as 'p = 0.02', or an upper bound if it is close to underflow."""
     x = _finite(p)
     if x is not None and 0 <= x < _LEAST_P:
         return f"p < 10{str(round(math.log10(_LEAST_P))).translate(_SUPERSCRIPTS)}"
@@ -104,12 +110,12 @@ def probability(p: Any) -> str:
 
 
 def p_words(p: float, digits: int = 1, least: float = 1e-300) -> str:
-    """Probability in a sentence of ASCII text: 'p = 0.02'; below `least` that bound."""
+    """p-value in ASCII, such as 'p = 0.02'; 'p < least' if it is below `least`."""
     return f"p < {least:g}" if p < least else f"p = {p:.{digits}g}"
 
 
 def broken_name(name: str) -> str:
-    """Long name of a parameter on several lines, broken after its points."""
+    """Long parameter name on several lines, broken after its dots."""
     lines = [""]
     for part in name.replace(".", ".\0").split("\0"):
         if lines[-1] and len(lines[-1]) + len(part) > NAME_WIDTH:
@@ -119,28 +125,31 @@ def broken_name(name: str) -> str:
 
 
 def counted(fraction: Any, error: Any, n: Any) -> str:
-    """Probability counted in n draws: '> 0.9993', a bound, where all or none are counted."""
+    """Probability estimated from n draws, rounded to its error.
+
+    If all or no draws are counted, the text is a bound such as '> 0.9993'.
+    """
     p, draws = _finite(fraction), _finite(n)
     if p is None or draws is None or draws <= 0:
         return MISSING
     decimals = max(1, math.ceil(math.log10(draws)))
-    least = math.ceil(10**decimals / draws) / 10**decimals  # one draw, rounded up
+    lowest = math.ceil(10**decimals / draws) / 10**decimals  # probability of one draw, rounded up
     if p * draws < 0.5:
-        return f"< {least:.{decimals}f}"
+        return f"< {lowest:.{decimals}f}"
     if (1 - p) * draws < 0.5:
-        return f"> {1 - least:.{decimals}f}"
+        return f"> {1 - lowest:.{decimals}f}"
     return rounded(p, error)
 
 
 def probability_words(fraction: Any, error: Any, n: Any) -> str:
-    """Probability counted in n draws, in ASCII: 'P = 0.953 +- 0.004', or 'P > 0.9993'."""
+    """Probability estimated from n draws, in ASCII: 'P = 0.953 +- 0.004' or 'P > 0.9993'."""
     text = counted(fraction, error, n)
     return f"P {text}" if text[0] in "<>" else f"P = {text} +- {error:.1g}"
 
 
 # -- lengths and their units ----------------------------------------------------------------------
 
-# (factor, name) from the largest unit down
+# units for display, largest first: (factor from the native unit, name)
 _LADDERS: dict[str, tuple[tuple[float, str], ...]] = {
     "pix": ((1.0, "pix"), (1e3, "10⁻³ pix"), (1e6, "10⁻⁶ pix")),
     "deg": ((1.0, "deg"), (3.6e3, "arcsec"), (3.6e6, "mas"), (3.6e9, "µas")),
@@ -151,21 +160,30 @@ _LADDERS: dict[str, tuple[tuple[float, str], ...]] = {
 
 @dataclass(frozen=True)
 class Scale:
-    """Unit for display, and the factor that numbers in the native unit are multiplied by."""
+    """Unit for display, and the factor that converts from the native unit."""
 
     factor: float
     unit: str
 
     def text(self, value: float, digits: int = 3) -> str:
-        """Text in this unit of a number in the native unit."""
+        """Number, given in the native unit, as text in this unit."""
         times = "\u202f×\u202f" if self.unit.startswith("10") else "\u202f"
         return f"{value * self.factor:.{digits}g}{times}{self.unit}".replace("-", "−")
 
 
 def display_scale(unit: str, values: ArrayLike) -> Scale:
-    """Unit in which the largest of some finite values needs few zeros.
+    """Unit in which the largest of the finite values is written with few zeros.
 
-    The native unit may be one per year ("pix/yr"); an unknown one is kept as it is.
+    Parameters
+    ----------
+    unit : str
+        Native unit; a rate such as "pix/yr" is allowed.  Unknown units are kept.
+    values : array_like
+        Values in the native unit.
+
+    Returns
+    -------
+    Scale
     """
     base, _, rate = unit.partition("/")
     steps = ladder(base)
@@ -176,7 +194,7 @@ def display_scale(unit: str, values: ArrayLike) -> Scale:
     largest = float(size.max()) if size.size else 0.0
     if largest == 0.0:
         return Scale(*next(step for step in steps if step[0] == 1.0))
-    # pixels have no name for a thousandth, so that 0.0266 pix reads better than 26.6 × 10⁻³ pix
+    # a thousandth of a pixel has no name, so 0.0266 pix is easier to read than 26.6 × 10⁻³ pix
     readable = 0.000999 if base == "pix" else 0.0999
     for factor, name in steps:
         if largest * factor >= readable:
@@ -185,12 +203,12 @@ def display_scale(unit: str, values: ArrayLike) -> Scale:
 
 
 def ladder(unit: str) -> tuple[tuple[float, str], ...]:
-    """Units in which lengths of a native unit are shown: (factor, name), the largest first."""
+    """Display units for lengths in a native unit: (factor, name), largest first."""
     return _LADDERS.get(unit, ((1.0, unit),))
 
 
 def length_scale(unit: str, like: float) -> Scale:
-    """Unit of lengths in tables and sentences: pixels, or the angle that one needs."""
+    """Display unit of lengths like `like`: pixels, or an angular unit that avoids zeros."""
     return Scale(1.0, "pix") if unit == "pix" else display_scale(unit, like)
 
 
@@ -202,10 +220,26 @@ def with_mas(
     *,
     like: float | None = None,
 ) -> str:
-    """Length with its unit, and in mas where the size of a pixel is known.
+    """Length with its unit, followed by its value in mas if the pixel scale is known.
 
-    An example is ``"0.00930 pix (25.6 mas)"``; a dash where the value is not finite. `like`: a
-    length shown with it, whose unit is taken.
+    An example is ``"0.00930 pix (25.6 mas)"``.
+
+    Parameters
+    ----------
+    value : float
+        Length in `unit`; a dash is returned if it is not finite.
+    unit : str
+    scale_mas : float or None
+        Pixel scale in mas per pixel.
+    digits : int
+        Significant digits.
+    like : float, optional
+        Length that determines the display unit (default: `value`), so that lengths shown side by
+        side have the same unit.
+
+    Returns
+    -------
+    str
     """
     if not np.isfinite(value):
         return MISSING
@@ -218,7 +252,7 @@ def with_mas(
 
 
 def size_of(value: float, unit: str = "pix", digits: int = 3) -> str:
-    """Length in the unit that needs few zeros; pixels are written as plain numbers."""
+    """Length in the display unit that avoids zeros; pixels are written as plain numbers."""
     if unit == "pix":
         return with_mas(value, unit, None, digits)
     return display_scale(unit, value).text(value, digits)

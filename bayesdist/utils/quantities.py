@@ -1,4 +1,4 @@
-"""Quantities, dates, directions and seeds that users give, as the plain values of this package."""
+"""Conversion of quantities, dates, directions and seeds from users into plain numbers."""
 
 from __future__ import annotations
 
@@ -34,23 +34,23 @@ Epoch: TypeAlias = Union[float, str, date, "Time", "Quantity"]
 Direction: TypeAlias = Union[tuple[float, float], "SkyCoord", tuple["Quantity", "Quantity"]]
 Random: TypeAlias = int | np.random.Generator
 
-YEARS = (1800.0, 2200.0)  # decimal years; an epoch outside is in another unit or no date
+YEARS = (1800.0, 2200.0)  # decimal years; epochs outside are in another unit or not dates
 UNITS = ("pix", "arcsec", "mas", "deg")
 
 
 def value_in(value: Number, unit: str, what: str, *, where: str = "") -> float:
-    """Value of a number or a Quantity in a unit.
+    """Convert a number or a Quantity to a unit.
 
     Parameters
     ----------
     value : float or astropy.units.Quantity
-        A plain number is in `unit` already.
+        Plain numbers are taken to be in `unit`.
     unit : str
-        Unit of the result, as astropy writes it.
+        Unit of the result, in the notation of astropy.
     what : str
-        Name of the argument, for the error.
+        Name of the argument, for the error message.
     where : str, optional
-        File or key, for the error.
+        File or key, for the error message.
 
     Returns
     -------
@@ -70,39 +70,39 @@ def value_in(value: Number, unit: str, what: str, *, where: str = "") -> float:
     values = values_in(value, unit, what, where=where)
     if values.ndim:
         raise InputError(
-            f"{what} holds {values.size} values", where=where, do=f"give one number in {unit}"
+            f"{what} has {values.size} values", where=where, do=f"give one number in {unit}"
         )
     return float(values)
 
 
 def values_in(values: Any, unit: str, what: str, *, where: str = "") -> Float:
-    """Values of numbers or a Quantity in a unit, as an array; see `value_in`."""
+    """Convert numbers or a Quantity to a unit, as an array; see `value_in`."""
     if hasattr(values, "to_value"):
         import astropy.units as apu
 
         try:
             return np.asarray(values.to_value(apu.Unit(unit)), float)
         except apu.UnitConversionError:
-            given = str(values.unit) or "no unit"
+            given_unit = str(values.unit) or "no unit"
             raise InputError(
-                f"{what} is given in {given}, which cannot be converted to {unit}",
+                f"{what} is given in {given_unit}, which cannot be converted to {unit}",
                 where=where,
-                do=scale_advice(given, unit, what) or f"give {what} in {unit}",
+                do=scale_advice(given_unit, unit, what) or f"give {what} in {unit}",
             ) from None
-    if isinstance(values, tuple | list) and any(hasattr(one, "to_value") for one in values):
-        return np.array([value_in(one, unit, what, where=where) for one in values])
+    if isinstance(values, tuple | list) and any(hasattr(item, "to_value") for item in values):
+        return np.array([value_in(item, unit, what, where=where) for item in values])
     try:
         return np.asarray(values, float)
     except (TypeError, ValueError):
         raise InputError(
-            f"{what} is {values!r}, which is no number",
+            f"{what} is {values!r}, which is not a number",
             where=where,
             do=f"give a number in {unit}, or a Quantity",
         ) from None
 
 
 def scale_advice(given: str, unit: str, what: str) -> str:
-    """Advice on a number in pixels where an angle is needed, or the reverse; else empty."""
+    """Advice for a value in pixels if an angle is required, or the reverse; otherwise empty."""
     angles = ("arcsec", "mas", "deg")
     if given == "pix" and unit in angles:
         return f"multiply {what} by the size of a pixel in {unit}"
@@ -112,7 +112,7 @@ def scale_advice(given: str, unit: str, what: str) -> str:
 
 
 def whole_number(value: Any, what: str, *, least: int, where: str = "") -> int:
-    """Whole number that is at least `least`; InputError for any other value."""
+    """Convert to an integer of at least `least`; raises InputError for any other value."""
     if isinstance(value, int | np.integer) and not isinstance(value, bool) and value >= least:
         return int(value)
     raise InputError(
@@ -121,9 +121,10 @@ def whole_number(value: Any, what: str, *, least: int, where: str = "") -> int:
 
 
 def unit_name(value: Any, what: str, *, where: str = "") -> str | None:
-    """Name among 'pix', 'arcsec', 'mas' and 'deg' of the unit of a Quantity; None for a number.
+    """Unit of a Quantity as 'pix', 'arcsec', 'mas' or 'deg'; None for a plain number.
 
-    Other angles are named 'mas'; InputError for a unit that is neither an angle nor the pixel.
+    The result is 'mas' for any other angular unit.  Raises InputError if the unit is neither an
+    angle nor the pixel.
     """
     if not hasattr(value, "to_value"):
         return None
@@ -135,15 +136,15 @@ def unit_name(value: Any, what: str, *, where: str = "") -> str | None:
 
 
 def year_of(epoch: Epoch, what: str = "epoch", *, where: str = "") -> float:
-    """Decimal year of a date.
+    """Convert a date to a decimal year.
 
     Parameters
     ----------
     epoch : float, str, datetime.date, astropy.time.Time or astropy.units.Quantity
-        Decimal year; text with a decimal year or an ISO date; a date; a time; a number of years; or
-        a Modified Julian Date as a number of days.
+        A decimal year; a string with a decimal year or an ISO date; a date; a time; a Quantity in
+        years; or a Quantity in days, which is taken as a Modified Julian Date.
     what, where : str, optional
-        As for `value_in`.
+        See `value_in`.
 
     Returns
     -------
@@ -152,7 +153,7 @@ def year_of(epoch: Epoch, what: str = "epoch", *, where: str = "") -> float:
     Raises
     ------
     InputError
-        If it is no date between 1800 and 2200.
+        If `epoch` is not a date between 1800 and 2200.
 
     Examples
     --------
@@ -162,13 +163,13 @@ def year_of(epoch: Epoch, what: str = "epoch", *, where: str = "") -> float:
     year = _year(epoch)
     if year is None:
         raise InputError(
-            f"{what} is {epoch!r}, which is no date",
+            f"{what} is {epoch!r}, which is not a date",
             where=where,
             do="give a decimal year, an ISO date or an astropy Time",
         )
     if not YEARS[0] <= year <= YEARS[1]:
         raise InputError(
-            f"{what} is {year:g}, which is no year",
+            f"{what} is {year:g}, which is not a year from 1800 to 2200",
             where=where,
             do="give a decimal year, an ISO date or an astropy Time",
         )
@@ -176,7 +177,7 @@ def year_of(epoch: Epoch, what: str = "epoch", *, where: str = "") -> float:
 
 
 def _year(epoch: Any) -> float | None:
-    """Decimal year, unchecked; None if `epoch` is no date."""
+    """Decimal year without a range check; None if `epoch` is not a date."""
     if isinstance(epoch, str):
         try:
             return float(epoch)
@@ -197,7 +198,7 @@ def _year(epoch: Any) -> float | None:
             if epoch.unit != apu.d:
                 return float(epoch.to_value(apu.yr))
             return float(Time(epoch.value, format="mjd", scale="tt").decimalyear)
-        # TT has no leap seconds: dates stay as they are written
+        # TT has no leap seconds, so that no date is shifted
         return float(Time(np.datetime64(epoch) if isinstance(epoch, date) else epoch,
                           scale="tt").decimalyear)  # fmt: skip
     except (TypeError, ValueError, apu.UnitsError):
@@ -205,23 +206,25 @@ def _year(epoch: Any) -> float | None:
 
 
 def direction_in(point: Direction, what: str, *, where: str = "") -> tuple[float, float]:
-    """Right ascension and declination (ICRS) in degrees of a direction.
+    """Convert a direction to ICRS right ascension and declination in degrees.
 
     Parameters
     ----------
     point : SkyCoord, or pair of float or Quantity
-        Plain numbers are degrees.  A SkyCoord of another frame is transformed to ICRS.
+        Right ascension and declination; plain numbers are in degrees.  A SkyCoord in another frame
+        is transformed to ICRS.
     what, where : str, optional
-        As for `value_in`.
+        See `value_in`.
 
     Returns
     -------
     ra, dec : float
+        Degrees.
 
     Raises
     ------
     InputError
-        If it is not one direction.
+        If `point` is not a single direction.
 
     Examples
     --------
@@ -233,26 +236,29 @@ def direction_in(point: Direction, what: str, *, where: str = "") -> tuple[float
     icrs = getattr(point, "icrs", None)
     if icrs is not None:
         if icrs.shape:
-            raise InputError(f"{what} holds {icrs.size} directions", where=where, do=do)
+            raise InputError(f"{what} has {icrs.size} directions", where=where, do=do)
         return float(icrs.ra.deg), float(icrs.dec.deg)
     try:
         ra, dec = point
     except (TypeError, ValueError):
         raise InputError(
-            f"{what} is {point!r}, which is no direction", where=where, do=do
+            f"{what} is {point!r}, which is not a direction", where=where, do=do
         ) from None
-    ra, dec = (value_in(one, "deg", what, where=where) for one in (ra, dec))
+    ra, dec = (value_in(coordinate, "deg", what, where=where) for coordinate in (ra, dec))
     if not (np.isfinite(ra) and abs(dec) <= 90.0):
-        raise InputError(f"{what} is ({ra:g}, {dec:g}), which is no direction", where=where, do=do)
+        raise InputError(
+            f"{what} is ({ra:g}, {dec:g}), which is not a direction", where=where, do=do
+        )
     return ra, dec
 
 
 def generator_of(rng: Random) -> np.random.Generator:
-    """Random generator from a seed; a generator is returned as it is.
+    """Random generator from a seed; a generator is returned unchanged.
 
     Parameters
     ----------
     rng : int or numpy.random.Generator
+        Seed, 0 or larger, or a generator.
 
     Returns
     -------
@@ -261,7 +267,7 @@ def generator_of(rng: Random) -> np.random.Generator:
     Raises
     ------
     InputError
-        If it is neither.
+        If `rng` is neither a seed nor a generator.
 
     Examples
     --------
@@ -275,5 +281,5 @@ def generator_of(rng: Random) -> np.random.Generator:
         return np.random.default_rng(int(rng))
     raise InputError(
         f"rng is {rng!r}, which is neither a seed nor a generator",
-        do="give a whole number of 0 or more, or numpy.random.default_rng(seed)",
+        do="give an integer of at least 0, or numpy.random.default_rng(seed)",
     )

@@ -1,4 +1,4 @@
-"""Random numbers that several results share, and those that follow from given bits."""
+"""Reproducible random numbers: streams derived from the seed of a run, restarts, and hashing."""
 
 from __future__ import annotations
 
@@ -7,23 +7,27 @@ from numpy.typing import NDArray
 
 from bayesdist.utils.quantities import Random, generator_of
 
-ASSESSMENT = (
-    2  # of the random streams that follow from the seed of a run; the sampler has the first
-)
+# number of the random stream for the assessment among those derived from the seed of a run; the
+# sampler uses the first one
+ASSESSMENT = 2
 
 
 def assessment_rng(seed: Random) -> np.random.Generator:
-    """Random numbers of the assessment: of the seed of a run, or a generator that is given.
+    """Random generator of the assessment, derived from the seed of a run.
 
     Parameters
     ----------
     seed : int or numpy.random.Generator
-        Seed of a run, 0 or more; a generator is returned unchanged.
+        Seed of the run, 0 or larger; a generator is returned unchanged.
+
+    Returns
+    -------
+    numpy.random.Generator
 
     Raises
     ------
     InputError
-        For anything else.
+        If `seed` is neither a seed nor a generator.
 
     Examples
     --------
@@ -32,19 +36,29 @@ def assessment_rng(seed: Random) -> np.random.Generator:
     """
     if isinstance(seed, np.random.Generator):
         return seed
-    generator_of(seed)  # refuses what is no seed
+    generator_of(seed)  # raises an error for an invalid seed
     return np.random.default_rng([seed, ASSESSMENT])
 
 
 def restarted(rng: np.random.Generator) -> np.random.Generator:
-    """A generator of the same numbers from their beginning.
+    """New generator that starts again at the beginning of another generator's stream.
 
-    Results that are compared are made from the same numbers, in whatever order they are made.
+    It allows results to be compared that are computed from the same random numbers, independently
+    of the order of computation.
 
     Parameters
     ----------
     rng : numpy.random.Generator
-        As `numpy.random.default_rng` makes it.
+        Generator that was made from a seed, as by `numpy.random.default_rng`.
+
+    Returns
+    -------
+    numpy.random.Generator
+
+    Raises
+    ------
+    TypeError
+        If the generator was not made from a seed.
 
     Examples
     --------
@@ -59,7 +73,7 @@ def restarted(rng: np.random.Generator) -> np.random.Generator:
 
 
 def mixed(bits: NDArray[np.uint64]) -> NDArray[np.uint64]:
-    """Bits that depend on all bits: the finaliser of SplitMix64 (Steele, Lea and Flood 2014)."""
+    """Hash of 64-bit integers: the finaliser of SplitMix64 (Steele, Lea and Flood 2014)."""
     out = bits + np.uint64(0x9E3779B97F4A7C15)
     out = (out ^ (out >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
     out = (out ^ (out >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)

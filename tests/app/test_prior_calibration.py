@@ -268,10 +268,10 @@ def test_what_does_not_go_together_is_refused():
     other = bd.DistortionModel(2, (replace(CHIP, size=(900.0, 800.0)),), "pix")
     wrong = {
         "needs a covariance": (replace(calibration, errors="sigma"), model),
-        "order 2, and the model of order 1": (calibration, model_of(1)),
+        "order 2, but the model is of order 1": (calibration, model_of(1)),
         "chip 1 of 1000 x 800": (calibration, other),
         "stars are in arcsec": (calibration, model_of(2, "arcsec")),
-        "does not drift": (
+        "does not have the same drift": (
             calibration,
             model_of(2, time=bd.TimeDependence((("u", 1, 0),), (2010.0,))),
         ),

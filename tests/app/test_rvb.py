@@ -233,9 +233,9 @@ def test_wrong_commands_write_nothing(tmp_path):
     )
     out = ("-o", tmp_path / "out")
     begin = ("wise", "rvb", "transform", path, *out)
-    refused(tmp_path, *begin, "--band", "W4", words=["no transformation is asked for"])
+    refused(tmp_path, *begin, "--band", "W4", words=["no transformation is given"])
     refused(tmp_path, *begin, "--dx", 1, words=["several bands: W1 (300 pairs), W4 (600 pairs)"])
-    refused(tmp_path, *begin, "--dx", 1, "--band", "W2", words=["holds no W2"])
+    refused(tmp_path, *begin, "--dx", 1, "--band", "W2", words=["does not contain W2"])
     refused(tmp_path, *begin, "--dx", "nan", "--band", "W4", words=["shift_u", "nan"])
     refused(tmp_path, *begin, "--dx", 1, "--columns", "u", words=["--columns", "KEY=NAME"])
     refused(tmp_path, *begin, "--dx", 1, "--columns", "w=u", words=["'w'", "no quantity"])
@@ -243,7 +243,7 @@ def test_wrong_commands_write_nothing(tmp_path):
             words=["none.tbl"])  # fmt: skip
     folder = write_rvb_table(rvb_pairs(), tmp_path / "set" / "a.parquet").parent
     refused(tmp_path, "wise", "rvb", "transform", folder, "-o", folder / "out", "--dx", 1,
-            words=["inside the folder of its input"])  # fmt: skip
+            words=["inside the input folder"])  # fmt: skip
     (tmp_path / "out").mkdir()
     (tmp_path / "out" / "mine").touch()
     refused(tmp_path, *begin, "--dx", 1, "--band", "W4", words=["out: is in use"])

@@ -167,7 +167,7 @@ def test_the_command_writes_what_python_gives(calibration, stars, tmp_path):
         "coefficients, with their covariance (correlated between stars)",
         "catalogue (the same for all stars)",
         "unmodelled structure (correlated between stars over 30 to 120 pixels)",
-        "centroids (of each star by itself)",
+        "centroids (independent for each star)",
     ):
         assert line in done.out
     expected = calibration.to_sky(stars, centroids=("sx", "sy"), covariance=True)
@@ -238,7 +238,7 @@ def test_tables_of_photutils_count_from_zero_in_every_command(calibration, stars
 
 def test_planes_that_are_not_on_the_sky_are_refused(calibration, stars):
     for plane, message in (
-        (Plane("free"), "where its plane touches the sky"),
+        (Plane("free"), "tangent point of its plane"),
         (Plane("aperture", v2v3=(0.0, 0.0)), "V2, V3"),
     ):
         with pytest.raises(InputError, match=message):
@@ -291,8 +291,8 @@ def test_a_header_of_a_given_crval_is_applied_where_others_have_it(
 @pytest.mark.parametrize("to", ["tpv", "cpdis"])
 @pytest.mark.parametrize(
     ("plane", "unit", "crval", "message"),
-    [(Plane("sky", point=POINT), "arcsec", POINT, "leave it out"),
-     (Plane(), "arcsec", (150.0, 91.0), "no right ascension and declination"),
+    [(Plane("sky", point=POINT), "arcsec", POINT, "omit it"),
+     (Plane(), "arcsec", (150.0, 91.0), "not a right ascension and declination"),
      (Plane(), "pix", POINT, "pixels of unknown size")],
     ids=["two points", "no position", "no scale"],
 )  # fmt: skip

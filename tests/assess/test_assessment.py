@@ -214,7 +214,7 @@ def test_what_is_not_diagnosed(steps, given, words):
         (("Gaia", 1.0, "px"), {}, "unknown unit 'px'"),
         (("Gaia", 1.0 * u.s), {}, "sigma is given in s"),
         (("Gaia", (1.0 * u.mas, 1.0)), {}, "one sigma has a unit and the other has none"),
-        (("Gaia", "small"), {}, "no number"),
+        (("Gaia", "small"), {}, "which is not a number"),
         (("Gaia", 0.0), {}, "its error is 0, and no source is given for that"),
         (("Gaia", 0.0), {"source": "given by the user"}, "no source is given for that"),
         (("Gaia proper motions", 1.0), {}, "the name is that of proper motions"),

@@ -110,9 +110,9 @@ def test_seeds_and_units(pixels):
     [
         ({"n_draws": 1}, "n_draws is 1; give a whole number of 2 or more"),
         ({"rng": 1.5}, "rng is 1.5, which is neither a seed nor a generator"),
-        ({"chip": None}, "camera: has 2 chips, and none is named; give chip, one of 1, 2"),
+        ({"chip": None}, "camera: has 2 chips, but none is given; give chip, one of 1, 2"),
         ({"x": np.ones(N) * u.deg}, "x is given in deg, which cannot be converted to pix"),
-        ({"point": 3.0}, "point is 3.0, which is no direction; give a SkyCoord"),
+        ({"point": 3.0}, "point is 3.0, which is not a direction; give a SkyCoord"),
     ],
 )
 def test_wrong_input_is_one_sentence(pixels, change, says):

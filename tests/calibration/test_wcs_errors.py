@@ -115,7 +115,7 @@ def test_draws_are_plain_and_repeatable():
         assert one.pixel_to_world_values(3.0, 4.0) == same.pixel_to_world_values(3.0, 4.0)
         back = one.world_to_pixel_values(*one.pixel_to_world_values(3.0, 4.0))
         assert_allclose(back, (3.0, 4.0), atol=1e-9)
-        with pytest.raises(InputError, match="states no errors"):
+        with pytest.raises(InputError, match="has no errors"):
             one.covariance(3.0, 4.0)
     assert wcs.draw(0, 1) == []
     assert "draw 2" in repr(first[1])

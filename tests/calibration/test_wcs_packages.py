@@ -61,7 +61,7 @@ def test_gwcs_with_a_fitted_inverse_is_written_and_read(tmp_path):
         back = np.stack(other.world_to_pixel_values(ra, dec))
     assert apart(wcs.pixel_to_world_values(x, y), (ra, dec)) < LIMIT * PIXEL
     assert_allclose(back, [x, y], rtol=0, atol=1e-4)
-    with pytest.raises(InputError, match="behind its polynomial"):
+    with pytest.raises(InputError, match="after its polynomial"):
         camera(tables=True).wcs().to_gwcs(inverse_order=7)
 
 
@@ -143,7 +143,7 @@ def test_what_sip_cannot_hold_is_fitted_as_well_as_it_says(wcs):
 
 
 def test_a_plane_without_sky_has_no_sip_header():
-    with pytest.raises(InputError, match="give wcs the point"):
+    with pytest.raises(InputError, match="give the argument point"):
         folded().wcs().to_fits_sip()
 
 

@@ -147,7 +147,7 @@ def test_arrays_that_lie_in_other_files(tmp_path):
 def test_what_would_not_fit_into_memory_is_refused(monkeypatch):
     monkeypatch.setattr(memory, "memory_limit", lambda: 2_000_000)
     memory.require_memory(2e6, "a grid", do="take fewer")
-    with pytest.raises(InputError, match=r"a grid would take 80 GB of memory, and at most 2 MB"):
+    with pytest.raises(InputError, match=r"a grid would take 80 GB of memory, but at most 2 MB"):
         memory.require_memory(8e10, "a grid", do="take fewer")
     with pytest.raises(InputError, match=r"1e\+288 TB"):
         memory.require_memory(1e300, "a grid", do="take fewer")

@@ -361,13 +361,13 @@ def test_errors_of_the_structure():
         model_of("twist")
     with pytest.raises(InputError, match="no chip"):
         model_of("none", chips=())
-    with pytest.raises(InputError, match="v_0_2 is above the polynomial order 1"):
+    with pytest.raises(InputError, match="v_0_2 exceeds the polynomial order 1"):
         model_of("none", order=1)
     with pytest.raises(InputError, match=r"unknown gauge 'mean'.*first or held"):
         model_of("affine", gauge="mean")
     with pytest.raises(InputError, match="there are no frames"):
         model_of("none", gauge="held")
-    with pytest.raises(InputError, match="is the identity"):
+    with pytest.raises(InputError, match="requires the identity"):
         model_of("affine", held=(1.0, 0.0, 0.0))
     with pytest.raises(InputError, match="'shift' has no rotation"):
         model_of("shift", gauge="held", held=(1.0, 0.0, 0.1))
@@ -376,7 +376,7 @@ def test_errors_of_the_structure():
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"gauge": None}, "model: another version wrote this.*'gauge' is missing; fit again"),
+        ({"gauge": None}, "written by another version.*'gauge' is missing; fit again"),
         ({"shear": [1.0]}, "'shear' is not known"),
         ({"order": "3"}, "'order': Input should be a valid integer"),
         ({"chips": [{"number": 1}]}, "'chips.0.name': Field required"),
@@ -395,7 +395,7 @@ def test_errors_of_prediction():
     model = model_of("affine")
     theta = some_theta(model)
     x = y = np.array([10.0, 20.0])
-    with pytest.raises(InputError, match="time and no epoch"):
+    with pytest.raises(InputError, match="time, but no epoch"):
         model.predict(theta, x, y)
     with pytest.raises(InputError, match="no chip 7"):
         model.predict(theta, x, y, epoch=2005.0, chip=7)

@@ -151,12 +151,12 @@ def bad(value: float) -> np.ndarray:
     ("values", "names", "message"),
     [
         (np.zeros((3, 4)), {}, r"the values have shape \(3, 4\)"),
-        (np.zeros((2, 1, 4)), {}, "two nodes or more"),
+        (np.zeros((2, 1, 4)), {}, "at least two nodes"),
         (bad(np.nan), {}, "the value of y at node row 3, column 1 is nan"),
         (GOOD, {"sigma": bad(-0.1)}, "the sigma of y at node row 3, column 1 is -0.1"),
         (GOOD, {"sigma": np.zeros((2, 4, 3))}, r"sigma has shape \(2, 4, 3\)"),
-        (GOOD, {"step": (64.0, 0.0)}, "make no grid"),
-        (GOOD, {"first": (np.nan, 1.0)}, "make no grid"),
+        (GOOD, {"step": (64.0, 0.0)}, "do not define a grid"),
+        (GOOD, {"first": (np.nan, 1.0)}, "do not define a grid"),
     ],
 )
 def test_what_is_no_table_is_refused(values, names, message) -> None:

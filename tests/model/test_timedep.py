@@ -53,9 +53,9 @@ def test_one_date_serves_all_segments():
     [
         (((("w", 1, 0),), (2004.5,)), r"model\.tdd\.terms"),
         (((("u", -1, 0),), (2004.5,)), r"model\.tdd\.terms"),
-        (((("u", 1, 0), ("u", 1, 0)), (2004.5,)), "stands twice"),
-        ((TERMS, (2004.5,), (2010.0, 2009.0)), "do not rise"),
-        ((TERMS, (2004.5,), (2009.0, 2009.0)), "do not rise"),
+        (((("u", 1, 0), ("u", 1, 0)), (2004.5,)), "a term is repeated"),
+        ((TERMS, (2004.5,), (2010.0, 2009.0)), "not in ascending order"),
+        ((TERMS, (2004.5,), (2009.0, 2009.0)), "not in ascending order"),
         ((TERMS, (2004.5, 2005.5)), "2 reference dates for 1 segments"),
         ((TERMS, (), (2009.4,)), "0 reference dates for 2 segments"),
     ],

@@ -339,7 +339,7 @@ def test_ways_to_say_where_a_subarray_lies():
 def test_what_is_no_subarray_is_refused(tmp_path):
     with pytest.raises(InputError, match="has no LTV1"):
         subarray_of_header({"NAXIS1": 512, "NAXIS2": 512}, SIZE)
-    with pytest.raises(InputError, match="LTM above zero"):
+    with pytest.raises(InputError, match="positive LTM"):
         Subarray((0.0, 0.0), (0.0, 1.0))
     image = fits.ImageHDU(np.zeros((4, 4), np.float32), name="SCI")
     image.header["CCDCHIP"] = 7
@@ -351,7 +351,7 @@ def test_what_is_no_subarray_is_refused(tmp_path):
     with pytest.raises(InputError, match="chip 1: has no LTV1"):
         subarrays_of_image(headers(tmp_path / "b.fits"), {1: SIZE})
     fits.PrimaryHDU().writeto(tmp_path / "c.fits")
-    with pytest.raises(FormatError, match="no extension SCI"):
+    with pytest.raises(FormatError, match="no SCI extension"):
         subarrays_of_image(headers(tmp_path / "c.fits"), {1: SIZE})
 
 
@@ -369,7 +369,7 @@ def test_what_cannot_be_applied_is_refused(real, wfc):
         calibration_of(s, "made up").in_frame()
     flat = wfc.chips[2].coefficients * np.array([[1.0], [0.0]])
     folded = replace(wfc, chips={2: replace(wfc.chips[2], coefficients=flat)})
-    with pytest.raises(InputError, match="to a line"):
+    with pytest.raises(InputError, match="singular linear part"):
         folded.inverse([0.0], [0.0], chip=2)
 
 

@@ -291,4 +291,4 @@ def test_commands_take_the_tables(tmp_path):
     path = of_others(tmp_path)
     (tmp_path / "stars.csv").write_text("x,y\n31,9\n150,200\n")
     good("apply", path, tmp_path / "stars.csv", "-o", tmp_path / "out.csv")
-    assert "followed by a polynomial" in good("compare", path, path).out
+    assert "approximated by a polynomial" in good("compare", path, path).out

@@ -314,7 +314,7 @@ def test_wrong_references_are_refused(truth) -> None:
     for message, call in (
         ("no epoch", lambda: laid_on(truth, reference)),
         ("mirrored", lambda: laid_on(flipped, reference, **names)),
-        ("pixels and the solution", lambda: laid_on(other, reference, **names)),
+        ("pixels, but in the solution", lambda: laid_on(other, reference, **names)),
         (
             "scale is -1",
             lambda: laid_on(truth, reference, scale_arcsec=-1, **names),

@@ -137,8 +137,8 @@ def test_it_comes_back_from_a_file(tmp_path) -> None:
         ("pix", {}, "tangent point is given beside u, v in pixels"),
         ("arcsec", {"origin": (0.0, 0.0)}, "tangent point is given beside"),
         ("arcsec", {"crval": (200.0, -30.0)}, "90 degrees or more"),
-        ("arcsec", {"crval": (20.0, 95.0)}, "no right ascension and declination"),
-        ("arcsec", {"crval": (20.0, float("nan"))}, "no right ascension and declination"),
+        ("arcsec", {"crval": (20.0, 95.0)}, "not a right ascension and declination"),
+        ("arcsec", {"crval": (20.0, float("nan"))}, "not a right ascension and declination"),
     ],
 )
 def test_what_cannot_be_is_refused(unit, options, message) -> None:

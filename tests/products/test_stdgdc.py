@@ -259,4 +259,4 @@ def test_commands_take_the_tables_of_others(tmp_path):
     back = (tmp_path / "b.csv").read_text().splitlines()[-1].split(",")
     assert_allclose([float(v) for v in back[2:4]], [31, 9], atol=1e-7)
     out = good("compare", path, tmp_path / "stdgdc.fits").out
-    assert "followed by a polynomial of order 9" in out
+    assert "approximated by a polynomial of order 9" in out

@@ -1,1 +1,1 @@
-"""A run diagnosed and evaluated: settings, error terms, checks."""
+"""Diagnosis and evaluation of a run: settings, error terms, checks."""

@@ -1,4 +1,4 @@
-"""Checks of a run beside what residuals say: of its kind, the sampling, the fit, the catalogue."""
+"""Checks of a run other than those of residuals: kind of run, sampling, fit, catalogue."""
 
 from __future__ import annotations
 
@@ -22,9 +22,9 @@ def run_checks(
     config: Config,
     series: Mapping[str, Any] | None,
 ) -> tuple[Check, ...]:
-    """Checks of a run that has been sampled, or of a fit alone, beside those of its diagnostics.
+    """Checks of a run that has been sampled, or of a fit alone, in addition to its diagnostics.
 
-    `series` is the section 'time_dependence' of summary.json, of runs that have one.
+    `series` is the section 'time_dependence' of summary.json; None if the run has none.
     """
     catalogue = motions = None
     if data.matched.has_catalogue:
@@ -43,7 +43,7 @@ def run_checks(
 
 
 def _kind_checks(data: FitData, series: Mapping[str, Any] | None) -> tuple[Check, ...]:
-    """Checks of matching, tables and exposures, and of what fixes the gauge."""
+    """Checks of matching, tables and exposures, and of the constraints on the gauge."""
     matched, fitted = data.matched, data.fitted
     if fitted.solved is not None:
         solved = fitted.solved
@@ -52,7 +52,8 @@ def _kind_checks(data: FitData, series: Mapping[str, Any] | None) -> tuple[Check
             "Constraints": solved.contradictions,
             "Detections": matched.warnings,
         }
-        settled = set(solved.gauge.settled)  # by the choice of a gauge: no fault of the data
+        # settled by the choice of a gauge, so that they are not a fault of the data
+        settled = set(solved.gauge.settled)
         return tuple(
             Check("Gauge", name, level="note" if text in settled else "warn", sentence=text)
             for name, texts in named.items()
@@ -66,8 +67,8 @@ def _kind_checks(data: FitData, series: Mapping[str, Any] | None) -> tuple[Check
 
 GROUP = "Campaign"
 
-# sections whose warnings a reader has to know, with their names and what they do to verdicts;
-# deviations that go with time are in no draw of the errors of a later exposure
+# sections with warnings for the reader, their titles, and their effect on verdicts; deviations that
+# drift with time are not included in the errors drawn for a later exposure
 WARNING = {
     "matching": ("Matching", ""),
     "deviations": ("Deviations of the exposures", LARGER),
@@ -77,17 +78,17 @@ WARNING = {
 
 
 def campaign_checks(summary: Mapping[str, Any]) -> tuple[Check, ...]:
-    """Criteria of matching, tables and series, and what their stages found odd."""
+    """Checks of matching, tables and series, including warnings of their stages."""
     m, tables, time = (summary.get(k) or {} for k in ("matching", "tables", "time_dependence"))
-    least = float(m["completeness"]["least"])
+    lowest = float(m["completeness"]["least"])
     false = float(m["false_fraction"])
     out = [
         Check(
             GROUP,
             "Matching: completeness of the exposures",
-            f"{percent(m['completeness']['median'])} at the median, {percent(least)} at least",
+            f"{percent(m['completeness']['median'])} at the median, {percent(lowest)} at least",
             f"at least {percent(COMPLETENESS.value, 2)} in each",
-            level_of(COMPLETENESS.met_by(least), "warn"),
+            level_of(COMPLETENESS.met_by(lowest), "warn"),
         ),
         Check(
             GROUP,
@@ -106,13 +107,13 @@ def campaign_checks(summary: Mapping[str, Any]) -> tuple[Check, ...]:
         out.append(_converged("Series of linear terms converged", time))
         off = len(time.get("outlying_exposures", ()))
         out.append(Check(GROUP, "Exposures that lie off the lines", count(off)))
-    for what, key in (
+    for title, key in (
         ("Exposures that went wrong in the joint fit", "exposures_outlying"),
         ("Exposures that could not be fitted alone", "exposures_skipped"),
     ):
         names = ", ".join(str(name) for name in summary.get(key) or ())
         if names:
-            out.append(Check(GROUP, what, names, "none", "warn"))
+            out.append(Check(GROUP, title, names, "none", "warn"))
     out += [
         Check(GROUP, name, level="warn", sentence=text, doubt=doubt)
         for part, (name, doubt) in WARNING.items()

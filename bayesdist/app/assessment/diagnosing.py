@@ -1,4 +1,4 @@
-"""Diagnostics of the solution of a run, stars that were held out among them."""
+"""Diagnostics of the solution of a run, including held-out stars."""
 
 from __future__ import annotations
 
@@ -28,10 +28,10 @@ from bayesdist.infer.catalogue.star_errors import StarInfluence, star_influence
 
 
 def diagnose_run(posterior: Posterior, data: FitData, config: Config, base: Path) -> Diagnostics:
-    """Diagnostics of a posterior, and of the stars that were held out."""
+    """Diagnostics of a posterior and of the held-out stars."""
     fitted = data.fitted
     scatter, tables = fitted.scatter, fitted.tables.tables
-    found = diagnose_posterior(
+    diagnostics = diagnose_posterior(
         diagnose_residuals(posterior, data, config),
         data.fit,
         posterior,
@@ -42,8 +42,8 @@ def diagnose_run(posterior: Posterior, data: FitData, config: Config, base: Path
         discrepancy=config.discrepancy.priors(),
         priors=fitted.priors,
         match_radius=config.match_radius(data.matched.stars.match_radius),
-        # tables that were fitted have taken it; their errors, and what they leave between their
-        # nodes, are terms of the budget
+        # fitted tables have absorbed the structure; their errors and the distortion between their
+        # nodes are terms of the budget
         structure=scatter is None or config.tables.method == "none",
         exposures=scatter is None,
         settling=None if scatter is None else scatter.offsets,
@@ -51,22 +51,22 @@ def diagnose_run(posterior: Posterior, data: FitData, config: Config, base: Path
         eliminated=None if fitted.solved is None else fitted.solved.mode,
         periods=period_settings(data, config),
     )
-    found = replace(found, overlap=data.matched.overlap(posterior, tables))
+    diagnostics = replace(diagnostics, overlap=data.matched.overlap(posterior, tables))
     if data.held is None:
-        return found
-    errors = errors_of_run(posterior, found, data, config)
+        return diagnostics
+    errors = errors_of_run(posterior, diagnostics, data, config)
     settings = evaluation_settings(data, config)
-    predictive = predictive_of_run(posterior, found, errors, data, settings)
+    predictive = predictive_of_run(posterior, diagnostics, errors, data, settings)
     held = holdout_validation(predictive, data.held, whole=data.matched.whole)
-    return replace(found, holdout=held)
+    return replace(diagnostics, holdout=held)
 
 
 def diagnose_residuals(posterior: Posterior | None, data: FitData, config: Config) -> Diagnostics:
-    """Diagnostics by residuals, of a posterior or of a fit alone."""
+    """Diagnostics from residuals, of a posterior or of a fit alone."""
     fitted, kind = data.fitted, kind_of(config)
-    # errors of centroids that the fit has found
+    # True if centroid errors were estimated by the fit
     measured = fitted.scatter is not None or fitted.solved is not None
-    found = diagnose_fit(
+    diagnostics = diagnose_fit(
         data.fit,
         posterior,
         data.stars,
@@ -83,12 +83,14 @@ def diagnose_residuals(posterior: Posterior | None, data: FitData, config: Confi
         chooser=kind.chooser,
     )
     if config.field == WHOLE:
-        return found
+        return diagnostics
     inside = partial(in_region, config.field, data.model.chips[0].size)
-    return replace(found, coverage=tuple(one.within(inside) for one in found.coverage))
+    return replace(
+        diagnostics, coverage=tuple(coverage.within(inside) for coverage in diagnostics.coverage)
+    )
 
 
-TOGETHER = 1.5  # steps between nodes over which tables err as one: what their covariance comes to
+TOGETHER = 1.5  # node spacings over which errors of tables are correlated, from their covariance
 
 
 def predictive_of_run(
@@ -98,11 +100,11 @@ def predictive_of_run(
     data: FitData,
     settings: EvaluationSettings,
 ) -> Predictive:
-    """The solution as it is assessed, as it predicts stars that are held out of `found`.
+    """Predictive distribution of the assessed solution for the held-out stars.
 
-    Quoted errors and jitter hold what the model leaves out at a position, as each star errs by it;
-    neighbours err by it together.  Exposures that were fitted jointly scatter, and have errors of
-    the catalogue and of tables.
+    Quoted errors and jitter include the distortion that the model leaves out at a position.  That
+    error is common to neighbouring stars.  Exposures that were fitted jointly scatter, and have
+    errors of the catalogue and of tables in addition.
     """
     scatter = data.fitted.scatter
     if scatter is not None:
@@ -127,20 +129,20 @@ def predictive_of_run(
 
 
 def _known_stars(data: FitData) -> StarInfluence | None:
-    """Influence of the catalogue's errors on the fit, of stars of exposures held out whole.
+    """Influence of the catalogue errors on the fit, for stars of exposures held out entirely.
 
-    These stars were in the fit, in other exposures: that is no part of their residuals.
+    These stars were fitted in other exposures, which does not show in their residuals.
     """
     errors, held = data.matched.star_errors, data.matched.held
     if errors is None or held is None or held.star is None:
         return None
-    whole = np.isin(held.exposure_names, data.matched.whole)
-    codes = np.unique(held.star[whole[held.exposure]])
+    is_held = np.isin(held.exposure_names, data.matched.whole)
+    codes = np.unique(held.star[is_held[held.exposure]])
     return star_influence(data.fit, data.stars, errors, codes)
 
 
 def holdout_table(found: HoldoutValidation) -> Table:
-    """All tests, the most telling first."""
+    """Table of all tests, the most significant first."""
     names = "name part is_omnibus where n value expected p_value p_corrected limit".split()
     table = Table({name: [getattr(t, name) for t in found.tests] for name in names})
     table["lo95"], table["hi95"] = np.array([t.interval for t in found.tests]).T
@@ -164,6 +166,6 @@ def holdout_summary(found: HoldoutValidation) -> dict[str, Any]:
     return Holdout.row(
         found,
         n_excluded=found.n_left_out,
-        coverage=[CoverageRow.row(one, sigma=one.level) for one in found.coverage],
-        tests=[HoldoutTest.row(one) for one in found.tests],
+        coverage=[CoverageRow.row(row, sigma=row.level) for row in found.coverage],
+        tests=[HoldoutTest.row(row) for row in found.tests],
     )

@@ -1,4 +1,4 @@
-"""The error model of a run, and where and with which random numbers it is assessed."""
+"""Error model of a run, and the positions, date and random numbers of its assessment."""
 
 from __future__ import annotations
 
@@ -26,15 +26,16 @@ from bayesdist.utils import streams
 
 
 def assessment_rng(config: Config) -> np.random.Generator:
-    """Random numbers of the assessment, from their beginning."""
+    """Random number generator of the assessment, in its initial state."""
     return streams.assessment_rng(config.sampler.seed)
 
 
 def assessment_epoch(data: FitData, config: Config) -> float | None:
-    """Epoch of the assessment, decimal years.
+    """Epoch of the assessment in decimal years.
 
-    Where none is given, the date from which a product is to be used, or the latest date of the
-    stars if that is later: errors of a drift grow with time.
+    By default it is the date from which a product is to be used, or the latest date of the stars if
+    that is later, because errors of a drift grow with time.  None if the model does not depend on
+    time.
     """
     if config.assess.epoch is not None or data.model.time is None:
         return config.assess.epoch
@@ -42,12 +43,12 @@ def assessment_epoch(data: FitData, config: Config) -> float | None:
 
 
 def evaluation_settings(data: FitData, config: Config) -> EvaluationSettings:
-    """Where and how errors are evaluated."""
+    """Settings of the evaluation of errors, including the dates of the stars."""
     return replace(rehearsal_settings(data, config), dates=data.dates)
 
 
 def rehearsal_settings(data: FitData, config: Config) -> EvaluationSettings:
-    """Settings of an evaluation, without the dates of the stars, which only verdicts name."""
+    """Settings of an evaluation without the dates of the stars, which only verdicts mention."""
     measured = data.fitted.scatter is not None or data.fitted.solved is not None
     return EvaluationSettings(
         grid=config.assess.grid,
@@ -56,7 +57,7 @@ def rehearsal_settings(data: FitData, config: Config) -> EvaluationSettings:
         years_ahead=config.assess.years_ahead,
         scale_mas=config.detector.scale_mas,
         single=config.assess.exposure == "single",
-        # errors of centroids that the fit has found hold nothing else
+        # centroid errors estimated by the fit include no other errors
         contained=() if measured else config.held_in_residuals(data.model.unit),
         given=tuple(block.name for block in config.budget if block.stated),
         field=config.field,
@@ -64,10 +65,10 @@ def rehearsal_settings(data: FitData, config: Config) -> EvaluationSettings:
 
 
 def idle_dates(config: Config, requirements: Sequence[Requirement], where: str = "") -> str:
-    """Sentence on dates that have no effect, as nothing in the model depends on time; '' for none.
+    """Sentence on dates without effect because the model does not depend on time; empty if none.
 
-    They may well document when the data are from, so that they are no error.  `where` is the file
-    of the requirements, if it is not the configuration.
+    Such dates may document when the data were taken and are therefore not refused. `where` is the
+    file of the requirements if it is not the configuration.
     """
     if config.campaign is not None or config.time() is not None:
         return ""
@@ -84,7 +85,7 @@ def idle_dates(config: Config, requirements: Sequence[Requirement], where: str =
 
 
 def errors_of_fit(solution: Solution, data: FitData, config: Config) -> ErrorModel:
-    """The error model of a solution alone, without terms that rest on residuals."""
+    """Error model of a solution alone, without terms derived from residuals."""
     scale = pixel_scale_of(solution, scale_mas=config.detector.scale_mas)
     return error_model(solution, _given_terms(solution, data, config), pixel_scale=scale)
 
@@ -92,7 +93,7 @@ def errors_of_fit(solution: Solution, data: FitData, config: Config) -> ErrorMod
 def errors_of_run(
     posterior: Posterior, found: Diagnostics, data: FitData, config: Config
 ) -> ErrorModel:
-    """The error model of a posterior with what residuals say."""
+    """Error model of a posterior, including terms derived from residuals."""
     fitted, joint = data.fitted, data.fitted.scatter is not None
     terms = _given_terms(posterior, data, config)
     if fitted.scatter is not None:
@@ -103,22 +104,22 @@ def errors_of_run(
         terms,
         hierarchy=fitted.linear if joint else None,
         catalogue=data.matched.catalogue_name,
-        aligned=joint,  # errors in a new exposure, whose shift and rotation its user fits
+        aligned=joint,  # errors of a new exposure after its user fits shift and rotation
         single=not joint and config.assess.exposure == "single",
-        frames=fitted.solved is not None,  # exposures overlap in part
-        structure_left=not fitted.tables.position_sigma,  # errors of tables stand for it
+        frames=fitted.solved is not None,  # exposures overlap partly
+        structure_left=not fitted.tables.position_sigma,  # otherwise included in the table errors
         pixel_scale=pixel_scale_of(posterior, scale_mas=config.detector.scale_mas),
     )
 
 
 def _given_terms(solution: Solution, data: FitData, config: Config) -> list[ErrorTerm]:
-    """Terms of the user, and of tables where exposures were fitted jointly."""
+    """Terms given by the user, and those of tables if exposures were fitted jointly."""
     tables = () if data.fitted.scatter is None else _table_terms(solution, data, config)
     return [*config.linear_terms(solution), *tables, *config.user_terms(solution.model.unit)]
 
 
 def _variation(solution: Solution, scatter: ExposureScatter, matched: Matched) -> ExposureVariation:
-    """Deviation of a new exposure: as those at hand scatter, velocity aberration among it."""
+    """Deviation of a new exposure from the measured scatter, including velocity aberration."""
     return ExposureVariation(
         solution.model,
         np.asarray(solution.mean, float),
@@ -129,7 +130,7 @@ def _variation(solution: Solution, scatter: ExposureScatter, matched: Matched) -
 
 
 def _table_terms(solution: Solution, data: FitData, config: Config) -> tuple[LocalErrors, ...]:
-    """Terms of the errors of the tables, and of the distortion between their nodes."""
+    """Terms for the errors of the tables, and for the distortion between their nodes."""
     stored, block = data.fitted.tables, config.tables
     epoch = assessment_epoch(data, config)
     between = interpolation_term(stored.between, solution, grid=config.assess.grid, epoch=epoch)
@@ -137,25 +138,26 @@ def _table_terms(solution: Solution, data: FitData, config: Config) -> tuple[Loc
         return between
     source = MEASURED
     if block.detector is not None:
-        given = f"{GIVEN}: errors of the detector's tables in {block.detector}"
-        source = given if block.method == "none" else f"{MEASURED}, and {given}"
+        of_detector = f"{GIVEN}: errors of the detector's tables in {block.detector}"
+        source = of_detector if block.method == "none" else f"{MEASURED}, and {of_detector}"
     name = "look-up tables"
     tables = LocalErrors.on_grid(name, stored.position_sigma, solution.model, source)
     return (tables, *between)
 
 
 def published_tables(stored: StoredLookupTables, *, held: bool) -> tuple[LookupTable, ...]:
-    """The tables with the errors that a user meets: of the nodes, and of what lies between.
+    """Look-up tables with the errors that apply to their user.
 
-    What is between the nodes of a pattern is at the nodes too: the value of a table there is
-    that of the area around.  It counts in the tables that were fitted in this run: `held` are the
-    detector's tables of another run.
+    These are the errors at the nodes and the distortion between them, added in quadrature.  The
+    same distortion affects the values at the nodes, which are averages over their surroundings.  It
+    is added to the tables fitted in this run; `held` is True if the detector's tables are from
+    another run.
     """
     out = []
     for table in stored.tables:
         between = stored.between.get(table.chip)
         if table.sigma is not None and between is not None and bool(table.filter) == held:
-            whole = np.sqrt(table.sigma**2 + between.left.mean[:, None, None])
-            table = replace(table, sigma=whole)
+            total = np.sqrt(table.sigma**2 + between.left.mean[:, None, None])
+            table = replace(table, sigma=total)
         out.append(table)
     return tuple(out)

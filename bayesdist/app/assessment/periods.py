@@ -1,4 +1,4 @@
-"""The periods of a configuration: what is compared, and what of it goes into the files of a run."""
+"""Comparison of periods: settings, table, and section of summary.json."""
 
 from __future__ import annotations
 
@@ -17,26 +17,27 @@ from bayesdist.diagnose.periods import PeriodSettings, TimeVariation, bins_for
 from bayesdist.diagnose.residuals.sample import SAMPLE
 from bayesdist.errors import InputError
 
-# of the largest difference of two models
+# attributes of the largest difference of two models
 POSITION = "largest sigma at chip noise_median noise_95 p_value chi2 dof p_field"
 
 
 def check_pairs(raw: Matches, config: Config) -> dict[str, int]:
-    """About how many pairs each period has, from the epochs of some; empty without periods.
+    """Approximate number of pairs in each period, from the epochs of all or a sample.
 
-    Pairs without epochs and a period without pairs are refused, before anything is sampled.
+    Empty if there are no periods.  Raises InputError for pairs without epochs and for a period
+    without pairs, before anything is sampled.
     """
     spans = config.spans()
     if not spans:
         return {}
-    where = ", ".join(raw.sources)
+    files = ", ".join(raw.sources)
     if not raw.has_epoch:
         raise InputError(
-            "[periods] needs an epoch for every pair", where=where, do="map column 'epoch'"
+            "[periods] needs an epoch for every pair", where=files, do="map column 'epoch'"
         )
-    some = raw if raw.in_memory else raw.sample(SAMPLE)
-    epoch = some.column("epoch")
-    share = len(raw) / len(some)
+    subset = raw if raw.in_memory else raw.sample(SAMPLE)
+    epoch = subset.column("epoch")
+    share = len(raw) / len(subset)
     out = {}
     for name, (start, stop) in spans.items():
         n = int(((epoch >= start) & (epoch < stop)).sum())
@@ -46,7 +47,7 @@ def check_pairs(raw: Matches, config: Config) -> dict[str, int]:
             raise InputError(
                 f"the period about MJD {name} has no pairs: they go from MJD {first:.3f} to "
                 f"{last:.3f}, and it from {begin:.3f} to {end:.3f}",
-                where=where,
+                where=files,
                 do="correct periods.centres and periods.days, or leave the period out",
             )
         out[name] = round(n * share)
@@ -54,20 +55,20 @@ def check_pairs(raw: Matches, config: Config) -> dict[str, int]:
 
 
 def period_settings(data: FitData, config: Config) -> PeriodSettings | None:
-    """Settings of a comparison of periods; None where none are asked for."""
+    """Settings of the comparison of periods; None if none are configured."""
     if config.periods is None:
         return None
     fit = data.fit
-    least = min(check_pairs(data.placed, config).values())
+    fewest = min(check_pairs(data.placed, config).values())
     scale = pixel_scale_of(fit, scale_mas=config.detector.scale_mas)
     angle = fit.unit != "pix" or scale is not None
     limits = [
         convert(r.limit, r.unit, fit.unit, scale, where=f"requirement {r.name!r}")
-        for r in (one.in_unit_of(fit.unit) for one in config.requirements())
+        for r in (requirement.in_unit_of(fit.unit) for requirement in config.requirements())
     ]
     return PeriodSettings(
         config.spans(),
-        bins=bins_for(least // len(fit.model.chips)),
+        bins=bins_for(fewest // len(fit.model.chips)),
         radial_weight=config.fit.radial_weight,
         tolerance=min(limits, default=None),
         unit_arcsec=convert(1.0, fit.unit, "arcsec", scale) if angle else None,
@@ -75,7 +76,7 @@ def period_settings(data: FitData, config: Config) -> PeriodSettings | None:
 
 
 def periods_table(found: TimeVariation) -> Table:
-    """Differences of all coefficients: each period against the combined model, and the ends."""
+    """Differences of all coefficients: each period from the combined model, and last from first."""
     comparison = found.comparison
     parts = []
     for name, against in (*((n, None) for n in comparison.names), (found.last, found.first)):
@@ -146,9 +147,9 @@ def periods_summary(found: TimeVariation) -> dict[str, Any]:
             for table, number in zip(found.residuals, numbers, strict=True)
         ],
         "patterns": [
-            attributes(one, "period axis p_value rms correlation n_bins") | {"chip": number}
+            attributes(pattern, "period axis p_value rms correlation n_bins") | {"chip": number}
             for several, number in zip(found.patterns, numbers, strict=True)
-            for one in several
+            for pattern in several
         ],
     }
 

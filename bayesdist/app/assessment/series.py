@@ -1,4 +1,4 @@
-"""Linear terms against time: what the exposures show, and what may be predicted."""
+"""Linear terms as a function of time: series of exposures, and predicted drift."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ from bayesdist.infer.series import Series, SeriesPosterior, TrendModel, describe
 log = logging.getLogger("bayesdist")
 
 N_EPOCHS = 25  # epochs at which the drift is tabulated
-MIN_EXPOSURES = 8  # exposures below which nothing is said of time
+MIN_EXPOSURES = 8  # fewest exposures for a statement about time
 
 
 def write_series_tables(run: RunDirectory, fitted: Fitted, config: Config) -> None:
-    """Write series.ecsv and drift.ecsv, and a section of summary.json."""
+    """Write series.ecsv and drift.ecsv, and the section 'time_dependence' of summary.json."""
     series = required(fitted.alone, "fits of single exposures")
     time, seed = fitted.linear.model.time, config.sampler.seed
     if time is None or len(series.names) < MIN_EXPOSURES:
@@ -58,7 +58,7 @@ def write_series_tables(run: RunDirectory, fitted: Fitted, config: Config) -> No
 
 
 def _disagreements(known: Sequence[str], outlying: Sequence[str]) -> Iterator[str]:
-    """Where the exposures alone and the joint fit, which knows of outlying ones, disagree."""
+    """Clause on exposures that are outliers when fitted alone, but not in the joint fit."""
     missed = [name for name in outlying if name not in known]
     if missed:
         yield (
@@ -68,7 +68,7 @@ def _disagreements(known: Sequence[str], outlying: Sequence[str]) -> Iterator[st
 
 
 def _verdict(series: Series, k: int, breaks: tuple[float, ...], seed: int) -> dict[str, object]:
-    """Which trend one term takes, by held-out exposures."""
+    """Trend that describes one term best, judged by held-out exposures."""
     verdict = describe(series.only(series.coefficients[k]), breaks=breaks, seed=seed)
     return {"term": series.coefficients[k], "claim": verdict.claim, "text": verdict.text}
 
@@ -91,8 +91,8 @@ def _changes(posterior: SeriesPosterior) -> list[dict[str, object]]:
         changes = dict(zip(("step", "slope_change"), posterior.change(number), strict=True))
         for k, name in enumerate(posterior.series.coefficients):
             row: dict[str, object] = {"break": date, "term": name}
-            for part, found in changes.items():
-                row |= {part: float(found.value[k]), f"sigma_{part}": float(found.sigma[k])}
+            for part, change in changes.items():
+                row |= {part: float(change.value[k]), f"sigma_{part}": float(change.sigma[k])}
             out.append(row)
     return out
 
@@ -109,10 +109,10 @@ def _exposures(series: Series, posterior: SeriesPosterior) -> Table:
 
 def _predictions(posterior: SeriesPosterior) -> Table:
     first, last = posterior.series.span
-    found = posterior.predict(np.linspace(first, last, N_EPOCHS))
-    columns: dict[str, object] = {"epoch": found.epoch}
+    prediction = posterior.predict(np.linspace(first, last, N_EPOCHS))
+    columns: dict[str, object] = {"epoch": prediction.epoch}
     for k, name in enumerate(posterior.series.coefficients):
-        columns[name] = found.mean[:, k]
-        columns[f"sigma_{name}"] = found.sigma[:, k]
-        columns[f"sigma_new_{name}"] = found.sigma_new[:, k]
+        columns[name] = prediction.mean[:, k]
+        columns[f"sigma_{name}"] = prediction.sigma[:, k]
+        columns[f"sigma_new_{name}"] = prediction.sigma_new[:, k]
     return Table(columns)

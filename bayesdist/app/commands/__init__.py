@@ -1,1 +1,1 @@
-"""Commands of the core: small functions beside their options, which load what they need."""
+"""Commands of the core: short functions with their options, which import code when needed."""

@@ -1,4 +1,4 @@
-"""Calibrations, in whatever file or run they are: shown, applied, compared, watched, released."""
+"""Commands on calibrations in files or runs: inspect, apply, convert, compare, monitor, release."""
 
 from __future__ import annotations
 
@@ -107,7 +107,7 @@ def apply(file: str, table: str, output: str, **options: Any) -> None:
     FILE is an IDCTAB, a run, or any file that 'compare' takes; TABLE has columns x, y, chip, or
     x_out, y_out for the inverse.
     """
-    own = {key: options.pop(key) for key in ("point", "centroids", "joint")}
+    sky_options = {key: options.pop(key) for key in ("point", "centroids", "joint")}
     origin = options.pop("pixel_origin")
     origin = None if origin is None else float(origin)
     if not options.pop("sky"):
@@ -118,8 +118,10 @@ def apply(file: str, table: str, output: str, **options: Any) -> None:
     from bayesdist.app.commands.on_files.sky import sky_to_table
 
     shared = ("columns", "chip", "filter", "epoch", "size", "force")
-    kept = {key: options.pop(key) for key in shared}
-    click.echo(sky_to_table(file, table, output, pixel_origin=origin, **own, **kept))
+    common_options = {key: options.pop(key) for key in shared}
+    click.echo(
+        sky_to_table(file, table, output, pixel_origin=origin, **sky_options, **common_options)
+    )
 
 
 @command(calls=f"{ON_FILES}.convert:convert")

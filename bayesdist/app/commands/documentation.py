@@ -1,4 +1,4 @@
-"""Pages of the documentation, which are part of the package: they are read without a network."""
+"""Pages of the documentation, which is part of the package and needs no network."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from bayesdist.errors import InputError
 from bayesdist.files.regular import read_text
 
 _PACKAGE = Path(bayesdist.version.__file__).parent
-_FOLDERS = (_PACKAGE / "docs", _PACKAGE.parent / "docs")  # as installed, and in the source
+_FOLDERS = (_PACKAGE / "docs", _PACKAGE.parent / "docs")  # installed, and in the source tree
 
 
 @command()
@@ -38,9 +38,9 @@ def docs(page: str | None) -> None:
 
 
 def _pages() -> dict[str, Path]:
-    """Files of the pages by name."""
+    """Files of the documentation pages by name."""
     for folder in _FOLDERS:
-        found = {path.stem: path for path in sorted(folder.glob("*.md"))}
-        if found:
-            return found
+        pages = {path.stem: path for path in sorted(folder.glob("*.md"))}
+        if pages:
+            return pages
     raise InputError("the documentation is not installed", do="install the package again")

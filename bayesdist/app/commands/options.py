@@ -1,4 +1,4 @@
-"""Groups of commands that are loaded when first asked for, and options that commands share."""
+"""Groups of commands that are imported on first use, and options that commands share."""
 
 from __future__ import annotations
 
@@ -16,7 +16,18 @@ from bayesdist.mission import load_object
 
 
 class LazyGroup(click.Group):
-    """A group whose commands are named as "module:object"."""
+    """Group of commands that are imported on first use.
+
+    Parameters
+    ----------
+    name : str
+    help : str
+        Help text of the group.
+    lazy : mapping of str to str
+        Location of each command as "module:object", by the name of the command.
+    **options
+        Passed to `click.Group`.
+    """
 
     def __init__(self, name: str, *, help: str, lazy: Mapping[str, str], **options: Any) -> None:
         super().__init__(name, help=help, **options)
@@ -27,11 +38,11 @@ class LazyGroup(click.Group):
         return list(self._lazy)
 
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
-        """Command of a name, loaded; None for an unknown one."""
+        """Load the command of a name; None if the name is unknown."""
         return self.load(self._lazy[cmd_name]) if cmd_name in self._lazy else None
 
     def format_epilog(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
-        """Write the epilog: without one of its own, the example of the first command."""
+        """Write the epilog, by default the example of the first command."""
         if not self.epilog:
             first = self.get_command(ctx, self.list_commands(ctx)[0])
             self.epilog = None if first is None else first.epilog
@@ -40,21 +51,21 @@ class LazyGroup(click.Group):
     def resolve_command(
         self, ctx: click.Context, args: list[str]
     ) -> tuple[str | None, click.Command | None, list[str]]:
-        """Command of the arguments; a name that is unknown is answered with similar ones."""
+        """Command of the arguments; the error for an unknown name suggests similar ones."""
         try:
             return super().resolve_command(ctx, args)
         except click.UsageError as error:
             similar = get_close_matches(args[0], self.list_commands(ctx), n=2)
             if not similar or "Did you mean" in error.format_message():
                 raise
-            said = " or ".join(repr(name) for name in similar)
+            suggestion = " or ".join(repr(name) for name in similar)
             raise click.UsageError(
-                f"No such command {args[0]!r}. Did you mean {said}?", ctx
+                f"No such command {args[0]!r}. Did you mean {suggestion}?", ctx
             ) from None
 
     @staticmethod
     def load(target: str) -> click.Command:
-        """Command that "module:object" names."""
+        """Load the command at "module:object"."""
         command = load_object(target)
         if not isinstance(command, click.Command):
             raise InputError("is no command", where=target, do="mend the package that names it")
@@ -62,7 +73,7 @@ class LazyGroup(click.Group):
 
 
 class CommaList(click.ParamType):
-    """Values that are separated by commas."""
+    """Values separated by commas."""
 
     name = "list"
 
@@ -78,7 +89,7 @@ class CommaList(click.ParamType):
 
 
 class _ColumnNames(click.ParamType):
-    """Pairs KEY=NAME that are separated by commas."""
+    """Pairs KEY=NAME separated by commas."""
 
     name = "columns"
 
@@ -134,16 +145,16 @@ class Unused:
 
 
 class _Command(click.Command):
-    """A command that refuses options which it does not use in the mode that is asked for."""
+    """Command that refuses options that it does not use in the chosen mode."""
 
     unused: tuple[Unused, ...] = ()
-    example: str = ""  # as of `command`
-    calls: str = ""  # as of `command`
+    example: str = ""  # see `command`
+    calls: str = ""  # see `command`
 
     def invoke(self, ctx: click.Context) -> Any:
         """Run the command, unless an option would be ignored."""
-        for one in self.unused:
-            one.refuse(ctx)
+        for rule in self.unused:
+            rule.refuse(ctx)
         return super().invoke(ctx)
 
 
@@ -155,12 +166,22 @@ def command(
     unused: Sequence[Unused] = (),
     **settings: Any,
 ) -> Callable[[Callable[..., int | None]], click.Command]:
-    """Decorator of a command, which takes --quiet.
+    """Decorator for a command with the option --quiet.
 
-    `calls`: as "module:function", what the command does: it is loaded when that runs, takes the
-    options (and the command line, to be `recorded`), and returns what is printed.  Without it the
-    decorated function does all by itself, and returns the exit code.  `unused`: options that are
-    refused in some modes.  `example`: a command line without 'bayesdist', which the help ends with.
+    Parameters
+    ----------
+    calls : str
+        Function that carries out the command, as "module:function".  It is imported when the
+        command runs, receives the options, and returns the text to print.  If it is empty the
+        decorated function does everything and returns the exit code.
+    example : str
+        Command line without 'bayesdist' that is shown at the end of the help.
+    recorded : bool
+        Pass the command line to the function, as its argument `command`.
+    unused : sequence of Unused
+        Options that are refused in some modes.
+    **settings
+        Passed to `click.command`.
     """
     quiet = click.option(
         "-q",
@@ -179,11 +200,15 @@ def command(
             click.echo(load_object(calls)(**options))
 
         epilog = f"Example: bayesdist {example}" if example else None
-        made = click.command(cls=_Command, epilog=epilog, **settings)(
+        click_command = click.command(cls=_Command, epilog=epilog, **settings)(
             quiet(calling if calls else function)
         )
-        made.unused, made.calls, made.example = tuple(unused), calls, example
-        return made
+        click_command.unused, click_command.calls, click_command.example = (
+            tuple(unused),
+            calls,
+            example,
+        )
+        return click_command
 
     return decorated
 

@@ -1,4 +1,4 @@
-"""Exposures and dither patterns to observe, and the order to fit."""
+"""Commands for planning: exposures, dither patterns, and the polynomial order."""
 
 from __future__ import annotations
 

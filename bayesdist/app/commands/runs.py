@@ -1,4 +1,4 @@
-"""A run: its configuration, what would become of it, all of it, its stages, and what it says."""
+"""Commands on runs: initial configuration, check, run, stages, requirements, budget, report."""
 
 from __future__ import annotations
 
@@ -84,7 +84,7 @@ def run(line: str, config: str, output: str | None, **options: Any) -> None:
 
     folder = f"{Path(config).with_suffix('')}-run" if output is None else output
     path = whole_job(config, folder, command=line, **options)
-    click.echo(results_text(RunDirectory(path)))  # its input was checked when it began
+    click.echo(results_text(RunDirectory(path)))  # not `open`: the inputs were checked at the start
 
 
 @command(

@@ -1,4 +1,4 @@
-"""Simulated input that belongs to no mission."""
+"""Simulated input that is not specific to a mission."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The configuration file: every key, its type and its default."""
+"""Configuration file: all keys with their types and defaults."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Places and dates of the assessment, errors that the data cannot show, requirements."""
+"""Configuration of the assessment, of errors that the data cannot show, and of requirements."""
 
 from __future__ import annotations
 
@@ -27,9 +27,9 @@ from bayesdist.assess.terms.parameters import one_size_kinds
 from bayesdist.assess.terms.solution import COEFFICIENTS, EXPOSURE_FRAME, TIME_DEPENDENCE
 
 Probability = Annotated[float, Field(gt=0, lt=1)]
-GridPoints = Annotated[int, Field(ge=2, le=10_000)]  # more than a detector has pixels says nothing
+GridPoints = Annotated[int, Field(ge=2, le=10_000)]  # no more than a detector has pixels
 
-# rows of every budget, and what its totals are called
+# names of rows that every budget has, including totals
 MEASURED_TERMS = (
     *(COEFFICIENTS, TIME_DEPENDENCE, EXPOSURE_FRAME),
     *("total", "model", STRUCTURE, STRUCTURE_IN_FIT, DEVIATIONS, FIELDS, FIELDS_IN_FIT),
@@ -38,7 +38,7 @@ MEASURED_TERMS = (
 
 
 class Assess(Section):
-    """Where and when errors are assessed."""
+    """Positions and dates at which errors are assessed."""
 
     epoch: Epoch | None = None
     grid: tuple[GridPoints, GridPoints] = (33, 17)
@@ -48,43 +48,43 @@ class Assess(Section):
 
 
 class BudgetBlock(Section):
-    """An error term that the data cannot show."""
+    """Error term that the data cannot show."""
 
     name: str
     kind: str
     sigma_u: Annotated[float, Field(ge=0)] | None = None
     sigma_v: Annotated[float, Field(ge=0)] | None = None
     sigma: Annotated[float, Field(ge=0)] | None = None
-    unit: Unit | None = None  # of sigma_u and sigma_v: pixels, if u and v are
+    unit: Unit | None = None  # unit of sigma_u and sigma_v; default pixels if u and v are in pixels
     source: str = GIVEN
     included_in_scatter: bool = False
 
     @field_validator("kind")
     @classmethod
     def _known_kind(cls, kind: str) -> str:
-        *others, last = known = (*TERM_KINDS, *one_size_kinds())
-        if kind not in known:  # in the words of a Literal
-            listed = ", ".join(map(repr, others))
+        *first_kinds, last = kinds = (*TERM_KINDS, *one_size_kinds())
+        if kind not in kinds:  # worded like the error of a Literal
+            listed = ", ".join(map(repr, first_kinds))
             raise PydanticCustomError("literal_error", f"Input should be {listed} or {last!r}")
         return kind
 
     @property
     def of_catalogue(self) -> bool:
-        """Boolean: the row is the error of the reference catalogue's positions."""
+        """True if the row is the error of the positions in the reference catalogue."""
         return names_catalogue(self.name)
 
     @property
     def of_motions(self) -> bool:
-        """Boolean: the row is the error of proper motions."""
+        """True if the row is the error of proper motions."""
         return names_motions(self.name)
 
     @property
     def stated(self) -> bool:
-        """Boolean: the row states an error; one of size 0 does so with its source only."""
+        """True if the row states an error; a size of 0 counts only with a source."""
         return is_stated((self.sigma_u, self.sigma_v, self.sigma), self.source)
 
     def faults(self) -> Iterator[str]:
-        """A sigma that is not as the kind has it."""
+        """Faults of sigmas that do not suit the kind of the term."""
         axes = self.sigma_u is not None and self.sigma_v is not None
         neither = self.sigma_u is None and self.sigma_v is None
         of_kind = f"a budget term of kind {self.kind!r} has"
@@ -106,12 +106,12 @@ class BudgetBlock(Section):
 
 
 class RequirementBlock(Section):
-    """A limit on a statistic of the position error."""
+    """Limit on a statistic of the position error."""
 
     name: str
     statistic: str
     limit: PositiveFloat
-    unit: Unit | None = None  # pixels, if u and v are
+    unit: Unit | None = None  # default pixels if u and v are in pixels
     probability: Probability = 0.95
     epoch: Epoch | None = None
     chip: int | None = None

@@ -1,4 +1,4 @@
-"""A run that begins with star lists and a catalogue: its configuration."""
+"""Configuration of a campaign, which begins with star lists and a catalogue."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from bayesdist.app.config.section import Epoch, Section, Unit
 
 
 class StarListsBlock(Section):
-    """Star lists, and which of their detections are used."""
+    """Star lists, and the cuts on their detections."""
 
     lists: str | list[str]
     columns: dict[str, str] | None = None
@@ -33,12 +33,12 @@ class StarListsBlock(Section):
 
     @property
     def list_names(self) -> list[str]:
-        """Names of the star lists as they are given."""
+        """Names of the star lists as given."""
         return [self.lists] if isinstance(self.lists, str) else self.lists
 
 
 class CampaignBlock(StarListsBlock):
-    """Star lists, the catalogue that they are matched with, and what is known of the exposures."""
+    """Star lists, the catalogue to match them with, and properties of the exposures."""
 
     catalog: str
     exposures: str
@@ -54,7 +54,7 @@ class CampaignBlock(StarListsBlock):
 
 
 class CampaignConfig(RunConfig):
-    """A run that begins with star lists and a catalogue."""
+    """Configuration of a run that begins with star lists and a catalogue."""
 
     data: ClassVar[None] = None
     selfcal: ClassVar[None] = None
@@ -73,13 +73,13 @@ class CampaignConfig(RunConfig):
     products: CampaignProducts = CampaignProducts()
 
     def faults(self) -> Iterator[str]:
-        """Those of every run, and no chips."""
+        """Faults of any run, and missing chips."""
         yield from super().faults()
         if not self.chip:
             yield "a [campaign] has no [[chip]] blocks; give them, one as the reference"
 
     def named_files(self, base: Path) -> list[Path]:
-        """Lists, catalogue and log, and what is taken over from other runs."""
+        """Lists, catalogue and log, and files taken over from other runs."""
         block, tdd = self.campaign, self.model.tdd
         named = [block.catalog, block.exposures, block.initial_distortion, *block.list_names]
         files = [base / name for name in dict.fromkeys(named)]
@@ -91,5 +91,5 @@ class CampaignConfig(RunConfig):
 
     @property
     def named_detector(self) -> str:
-        """Empty: formats of one detector do not know those of campaigns by name."""
+        """Empty, because formats for a single detector do not list those of campaigns by name."""
         return ""

@@ -1,6 +1,6 @@
-"""A run that begins with matched stars: its configuration, and how the files are read.
+"""Configuration of a run that begins with matched stars, and of the reading of its files.
 
-A format that a mission adds may have keys of its own: its section is a subclass of `Data`.
+The section [data] of a mission format may have additional keys; its class is derived from `Data`.
 """
 
 from __future__ import annotations
@@ -36,11 +36,11 @@ from bayesdist.errors import InputError
 from bayesdist.infer.compare.period_dates import check_periods, mjd_periods
 from bayesdist.mission import load_object, missions
 
-LENGTHS = ("mm", "um")  # units that a plate scale brings to arcsec
+LENGTHS = ("mm", "um")  # units that a plate scale converts to arcsec
 
 
 class Data(Section):
-    """Matched stars, and how their files are read."""
+    """Matched stars, and options for reading their files."""
 
     matches: str | list[str]
     format: str = "auto"
@@ -56,15 +56,15 @@ class Data(Section):
     same_position: Literal["one_star", "separate_stars"] = "one_star"
     simulated: bool = False
 
-    one_array: ClassVar[bool] = False  # matches of this format are of one chip
+    one_array: ClassVar[bool] = False  # True if matches of this format are from a single chip
 
     @property
     def has_nominal(self) -> bool:
-        """Boolean: columns of nominal positions are named."""
+        """True if columns of nominal positions are named."""
         return names_nominal(self.columns)
 
     def paths(self, base: Path) -> Path | list[Path]:
-        """The files of matches; one path where one name is given, which may be a pattern."""
+        """Files of matches; a single path, which may be a pattern, if one name is given."""
         if isinstance(self.matches, str):
             return base / self.matches
         return [base / name for name in self.matches]
@@ -80,7 +80,7 @@ class Data(Section):
         return unit
 
     def faults(self) -> Iterator[str]:
-        """Nominal positions of what is no table, and lengths without a plate scale."""
+        """Faults of lengths without a plate scale, and of nominal positions outside of tables."""
         if self.unit in LENGTHS and self.plate_scale is None:
             yield (
                 f"data.unit is {self.unit!r}, and positions are in pixels or angles; "
@@ -94,21 +94,21 @@ class Data(Section):
 
 
 def names_nominal(columns: Mapping[str, str] | None) -> bool:
-    """Boolean: columns of nominal positions are named."""
+    """True if columns of nominal positions are named."""
     return any((columns or {}).get(key) for key in ("u_nominal", "v_nominal"))
 
 
 def data_sections() -> dict[str, type[Data]]:
-    """Sections of the formats that have keys of their own, by the name of the format."""
+    """Section classes of formats that have additional keys, by format name."""
     return {
-        name: load_object(where)
+        name: load_object(target)
         for mission in missions().values()
-        for name, where in mission.data_sections.items()
+        for name, target in mission.data_sections.items()
     }
 
 
 def _of_its_format(raw: Any, handler: Any, info: ValidationInfo) -> Data:
-    """Section [data] as the class that its format asks for."""
+    """Validate a section [data] as the class of its format."""
     if isinstance(raw, Data):
         return raw
     if not isinstance(raw, Mapping) or not isinstance(raw.get("format", ""), str):
@@ -117,18 +117,18 @@ def _of_its_format(raw: Any, handler: Any, info: ValidationInfo) -> Data:
     kind = Data
     if format not in FORMATS or raw.keys() - Data.model_fields.keys():
         sections = data_sections()
-        known = (*FORMATS, *mission_formats(), *sections)
-        if format not in known:
-            listed = ", ".join(map(repr, known))
+        formats = (*FORMATS, *mission_formats(), *sections)
+        if format not in formats:
+            listed = ", ".join(map(repr, formats))
             raise ValueError(f"data.format is {format!r}, which is no format; give one of {listed}")
         kind = sections.get(format, Data)
-        for name, other in sections.items():
-            for key in raw.keys() & other.model_fields.keys() - kind.model_fields.keys():
+        for name, section in sections.items():
+            for key in raw.keys() & section.model_fields.keys() - kind.model_fields.keys():
                 raise ValueError(
                     f"data.{key} is given, but data.format is {format!r}; set the format to "
                     f"{name!r}, or leave {key} out"
                 )
-    if info.mode == "json":  # there arrays may become tuples
+    if info.mode == "json":  # in JSON mode arrays may become tuples
         return kind.model_validate_json(json.dumps(raw), strict=True)
     return kind.model_validate(raw)
 
@@ -137,14 +137,14 @@ DataOfFormat = Annotated[SerializeAsAny[Data], WrapValidator(_of_its_format)]
 
 
 class Periods(Section):
-    """Periods whose models are compared."""
+    """Periods to be compared."""
 
     centres: list[float]
     days: PositiveFloat
 
 
 class MatchesConfig(RunConfig):
-    """A run that begins with matched stars."""
+    """Configuration of a run that begins with matched stars."""
 
     campaign: ClassVar[None] = None
     selfcal: ClassVar[None] = None
@@ -163,18 +163,18 @@ class MatchesConfig(RunConfig):
     products: MatchedProducts = MatchedProducts()
 
     def named_files(self, base: Path) -> Path | list[Path]:
-        """The files of matches; one path where one name is given."""
+        """Files of matches; a single path if one name is given."""
         return self.data.paths(base)
 
     def files_of_priors(self, base: Path) -> list[Path]:
-        """The file of the earlier calibration, where one is the prior."""
+        """File of the earlier calibration that is used as a prior, if any."""
         block = self.prior_calibration
         return [] if block is None else [calibration_file(base / block.source)]
 
     def of_order(self, order: int) -> Self:
-        """This configuration with polynomials of another order, without priors and extra weights.
+        """Configuration with polynomials of another order, without priors and extra weights.
 
-        Names of priors may be those of parameters that another order does not have.
+        Priors are dropped because they may name parameters that another order does not have.
         """
         fit = self.fit.model_copy(update={"radial_weight": 1.0})
         return (
@@ -184,12 +184,12 @@ class MatchesConfig(RunConfig):
         )
 
     def faults(self) -> Iterator[str]:
-        """Those of every run, and settings of matched stars that do not go together."""
+        """Faults of any run, and contradictory settings of matched stars."""
         yield from super().faults()
-        names = [one.parameter for one in self.prior]
-        twice = next((name for name in names if names.count(name) > 1), None)
-        if twice is not None:
-            yield f"two [[prior]] blocks are of {twice!r}; give each parameter one"
+        names = [block.parameter for block in self.prior]
+        duplicate = next((name for name in names if names.count(name) > 1), None)
+        if duplicate is not None:
+            yield f"two [[prior]] blocks are of {duplicate!r}; give each parameter one"
         if self.data.one_array and self.chip:
             yield (
                 f"matches of the format {self.data.format!r} are of one array; give "
@@ -229,12 +229,12 @@ class MatchesConfig(RunConfig):
 
     @property
     def compares_jitters(self) -> bool:
-        """Boolean: groups of stars may have jitters of their own, if the data ask for it."""
+        """True if groups of stars may have separate jitters, if the data support it."""
         quoted = self.data.sigma != "by_magnitude"
         return quoted and self.outliers.jitter == "fit" and self.outliers.jitter_by != "one"
 
     def circle_faults(self) -> Iterator[str]:
-        """Settings that cannot go with matches in circles about their nominal positions."""
+        """Faults of settings that contradict matching in circles about nominal positions."""
         cut = "matches with nominal positions and a match radius are cut by the match circle"
         if self.data.sigma == "by_magnitude":
             yield (
@@ -258,14 +258,14 @@ class MatchesConfig(RunConfig):
             )
 
     def spans(self) -> dict[str, tuple[float, float]]:
-        """Begin and end of each of the periods, decimal years; empty where none are asked for."""
+        """Start and end of each period in decimal years; empty if there are none."""
         if self.periods is None:
             return {}
         centres = self.periods.centres
-        twice = next((c for c in centres if centres.count(c) > 1), None)
-        if twice is not None:
+        duplicate = next((c for c in centres if centres.count(c) > 1), None)
+        if duplicate is not None:
             raise InputError(
-                f"the period centred on {twice:.10g} is given twice",
+                f"the period centred on {duplicate:.10g} is given twice",
                 where="periods.centres",
                 do="give each once",
             )

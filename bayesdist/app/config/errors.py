@@ -1,4 +1,4 @@
-"""One sentence on what is wrong with a configuration, in the user's words."""
+"""Errors of a configuration, as one sentence in the words of the user."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from bayesdist.errors import ConfigError
 
 Location = tuple[str | int, ...]
 
-# what pydantic asks for, in the words of TOML
+# types in pydantic errors, described in terms of TOML
 _KINDS = {
     "int_type": "a whole number",
     "float_type": "a number",
@@ -42,7 +42,7 @@ RENAMED = {
     "tables.rounds": "max_iterations",
 }
 
-# what to set in place of a key that a kind of run does not have
+# advice for a key that a kind of run does not have
 INSTEAD = {
     ("selfcal", "model.frames"): "set selfcal.frames",
     ("selfcal", "outliers.match_radius"): "set selfcal.match_radius",
@@ -59,16 +59,17 @@ Kind = type[BaseModel]
 def as_config_error(
     kinds: Kind | Mapping[str, Kind], error: ValidationError, where: str
 ) -> ConfigError:
-    """The first thing that is wrong, with its key.
+    """ConfigError for the first fault of a configuration, with its key.
 
-    `kinds`: what the file was validated against, or that by the section that says which one.
+    `kinds` is the model that the file was validated against, or a mapping of the possible models by
+    the section that distinguishes them.
     """
     # an unknown key is usually the cause of a missing one
     details = sorted(error.errors(), key=lambda e: e["type"] != "extra_forbidden")
     first = details[0]
     if isinstance(kinds, Mapping):
-        for one in details:
-            one["loc"], tag = one["loc"][1:], next(iter(one["loc"]), "")
+        for detail in details:
+            detail["loc"], tag = detail["loc"][1:], next(iter(detail["loc"]), "")
     else:
         kinds, tag = {"": kinds}, ""
     key = _dotted(first["loc"])
@@ -80,7 +81,7 @@ def as_config_error(
     if first["type"] in ("value_error", "no_kind"):
         cause, _, do = first["msg"].removeprefix("Value error, ").partition("; ")
         return ConfigError(cause, where=where, do=do)
-    # of a value that may be of several types each type says what it would take
+    # there is one detail for each type that the value may have
     wanted = dict.fromkeys(_wanted(e) for e in details if _dotted(e["loc"]) == key)
     return ConfigError(
         f"{first['input']!r} does not fit",
@@ -90,23 +91,27 @@ def as_config_error(
 
 
 def _unknown_key(kinds: Mapping[str, Kind], kind: str, location: Location) -> tuple[str, str]:
-    """Cause and advice for a key that a kind does not know."""
+    """Cause and advice for a key that a kind of configuration does not have."""
     parts = [part for part in location if isinstance(part, str) and not _is_branch(part)]
     name, path = parts[-1], ".".join(parts)
     if path in RENAMED:
         return f"unknown key {name!r}: it is called {RENAMED[path]!r} now", "rename it"
-    others = [f"[{k}]" for k in kinds if k != kind and name in _known_keys(kinds[k], parts[:-1])]
-    if others:
-        cause = f"unknown key {name!r}: it is of {' and '.join(others)}, and this is a [{kind}]"
+    other_kinds = [
+        f"[{k}]" for k in kinds if k != kind and name in _known_keys(kinds[k], parts[:-1])
+    ]
+    if other_kinds:
+        cause = (
+            f"unknown key {name!r}: it is of {' and '.join(other_kinds)}, and this is a [{kind}]"
+        )
         return cause, INSTEAD.get((kind, path), "leave it out")
-    known = _known_keys(kinds[kind], parts[:-1])
-    near = get_close_matches(name, known, 1, cutoff=0.4)
-    do = f"use {near[0]!r} if that is meant" if near else f"known: {', '.join(sorted(known))}"
+    keys = _known_keys(kinds[kind], parts[:-1])
+    near = get_close_matches(name, keys, 1, cutoff=0.4)
+    do = f"use {near[0]!r} if that is meant" if near else f"known: {', '.join(sorted(keys))}"
     return f"unknown key {name!r}", do
 
 
 def _wanted(detail: Any) -> str:
-    """Values that would fit, in words."""
+    """Description of the values that would be valid."""
     if detail["type"] == "list_type" and isinstance(detail["input"], dict):
         return "its header double brackets, for there may be several"
     if detail["type"] in _KINDS:
@@ -118,12 +123,12 @@ def _wanted(detail: Any) -> str:
 
 
 def _is_branch(part: str | int) -> bool:
-    """Boolean: part of a location names a branch of a union, not a key."""
+    """True if part of a location names a branch of a union rather than a key."""
     return isinstance(part, str) and ("[" in part or part in _BRANCHES)
 
 
 def _dotted(location: Location) -> str:
-    """A location as the user writes it, its blocks counted from 1."""
+    """Location as the user writes it; blocks are counted from 1."""
     out = ""
     for part in location:
         if isinstance(part, int):
@@ -134,7 +139,7 @@ def _dotted(location: Location) -> str:
 
 
 def _known_keys(kind: Kind, sections: Sequence[str]) -> list[str]:
-    """Keys of a section, given by the names that lead to it; none where it is not known."""
+    """Keys of the section at the end of a path of names; empty if it is unknown."""
     current: Any = kind
     for name in sections:
         field = _fields(current).get(name)
@@ -145,20 +150,20 @@ def _known_keys(kind: Kind, sections: Sequence[str]) -> list[str]:
 
 
 def _fields(kind: Kind) -> dict[str, FieldInfo]:
-    """Fields of a section, and those of the sections that formats of missions derive from it."""
+    """Fields of a section, including those of its subclasses for mission formats."""
     return {
         name: field
-        for one in (kind, *kind.__subclasses__())
-        for name, field in one.model_fields.items()
+        for section in (kind, *kind.__subclasses__())
+        for name, field in section.model_fields.items()
     }
 
 
 def _section_of(annotation: Any) -> Any:
-    """The model within an annotation; None where there is none."""
+    """Model within an annotation; None if there is none."""
     if isinstance(annotation, type) and issubclass(annotation, BaseModel):
         return annotation
     for inner in getattr(annotation, "__args__", ()):
-        found = _section_of(inner)
-        if found is not None:
-            return found
+        section = _section_of(inner)
+        if section is not None:
+            return section
     return None

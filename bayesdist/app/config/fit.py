@@ -1,6 +1,6 @@
-"""Settings by which a model is fitted and sampled; a kind of run has the keys that it uses.
+"""Settings of fitting and sampling; each kind of run has the keys that it uses.
 
-What a kind does not have is a constant of its class, so that nobody has to ask for the kind.
+Keys that a kind lacks are constants of its class, so that code need not distinguish the kinds.
 """
 
 from __future__ import annotations
@@ -17,13 +17,13 @@ from bayesdist.infer import Compute, OutlierMixture
 
 
 class HoldoutBlock(Section):
-    """Stars and exposures that are set aside before anything is fitted."""
+    """Stars and exposures that are held out before the fit."""
 
     fraction: Annotated[float, Field(ge=0, le=0.9)] = 0.0
     exposures: list[str] | PositiveInt = Field(default_factory=list)
 
     def faults(self) -> Iterator[str]:
-        """Nothing that is set aside."""
+        """Fault of a section that holds nothing out."""
         if not self.fraction and not self.exposures:
             yield "[holdout] sets nothing aside; give a fraction of the stars, or exposures"
 
@@ -35,19 +35,19 @@ class _Fit(Section):
 
 
 class Fit(_Fit):
-    """The linear fit."""
+    """Linear fit."""
 
     radial_weight: PositiveFloat = 1.0
 
 
 class CampaignFit(_Fit):
-    """The linear fit of a campaign."""
+    """Linear fit of a campaign."""
 
     radial_weight: ClassVar[float] = 1.0
 
 
 class _Outliers(Section):
-    """Errors beyond the quoted ones, and the fraction of false matches."""
+    """Errors in addition to the quoted ones, and the fraction of false matches."""
 
     if TYPE_CHECKING:
 
@@ -61,7 +61,7 @@ class _Outliers(Section):
     jitter_scale: PositiveFloat | None = None
 
     def mixture(self, match_radius: float | None) -> OutlierMixture:
-        """The outlier mixture within a radius of the match."""
+        """Outlier mixture with the given match radius."""
         return OutlierMixture(
             model=self.model,
             match_radius=match_radius,
@@ -73,7 +73,7 @@ class _Outliers(Section):
 
 
 class SelfcalOutliers(_Outliers):
-    """False detections, which are uniform within the radius of the match."""
+    """False detections, which are uniform within the match radius."""
 
     match_radius: ClassVar[None] = None
     outlier_scale: ClassVar[None] = None
@@ -89,18 +89,18 @@ class _Mixture(_Outliers):
 
 
 class CampaignOutliers(_Mixture):
-    """The outlier mixture of a campaign."""
+    """Outlier mixture of a campaign."""
 
     jitter_by: ClassVar[Literal["auto"]] = "auto"
 
 
 class Outliers(_Mixture):
-    """The outlier mixture, with jitters of groups of stars."""
+    """Outlier mixture, with jitters of groups of stars."""
 
     jitter_by: Literal["auto", "one", "chip", "exposure", "filter"] = "auto"
 
     def faults(self) -> Iterator[str]:
-        """Jitters of groups beside the one that is given."""
+        """Fault of jitters for groups when a single jitter is given."""
         if self.jitter_by not in ("auto", "one") and self.jitter != "fit":
             yield (
                 f"outliers.jitter_by is {self.jitter_by!r}, and outliers.jitter gives the one "
@@ -118,7 +118,7 @@ class _Sampler(Section):
 
 
 class Sampler(_Sampler):
-    """Method of sampling, when to stop, and from which seed."""
+    """Sampling method, stopping criteria and seed."""
 
     method: Literal["exact", "certified"] = "exact"
     second_stage: Literal["auto", "always", "never"] = "auto"
@@ -126,7 +126,7 @@ class Sampler(_Sampler):
 
 
 class SelfcalSampler(_Sampler):
-    """When to stop, and from which seed."""
+    """Stopping criteria and seed of a self-calibration."""
 
     method: ClassVar[Literal["exact"]] = "exact"
     second_stage: ClassVar[Literal["auto"]] = "auto"
@@ -134,7 +134,7 @@ class SelfcalSampler(_Sampler):
 
 
 class ComputeBlock(Section):
-    """Where the work is done."""
+    """Resources for the computation."""
 
     engine: Literal["threads", "dask"] = "threads"
     scheduler: str | None = None
@@ -143,7 +143,7 @@ class ComputeBlock(Section):
     scratch: str | None = None
 
     def faults(self) -> Iterator[str]:
-        """Settings of a cluster where there is none, or another's."""
+        """Faults of cluster settings without a cluster, or with an existing cluster."""
         for key in ("scheduler", "workers", "scratch"):
             if self.engine != "dask" and getattr(self, key) is not None:
                 yield (
@@ -162,12 +162,12 @@ class ComputeBlock(Section):
             )
 
     def resources(self) -> Compute:
-        """Where the work is done."""
+        """Resources for the computation."""
         return Compute(**self.model_dump())
 
 
 class DiscrepancyBlock(Section):
-    """Prior medians of what the model may leave out."""
+    """Prior medians of distortion that the model may leave out."""
 
     higher_order: PositiveFloat = DiscrepancyPriors.higher_order
     structure: PositiveFloat = DiscrepancyPriors.structure
@@ -176,5 +176,5 @@ class DiscrepancyBlock(Section):
     star: PositiveFloat = DiscrepancyPriors.star
 
     def priors(self) -> DiscrepancyPriors:
-        """The block as priors."""
+        """Priors of this section."""
         return DiscrepancyPriors(**self.model_dump())

@@ -1,4 +1,4 @@
-"""The distortion model, its priors, and look-up tables; a kind of run has the keys that it uses."""
+"""Distortion model, its priors, and look-up tables; each kind of run has the keys that it uses."""
 
 from __future__ import annotations
 
@@ -33,13 +33,13 @@ class Tdd(_Drift):
 
 
 class CampaignTdd(_Drift):
-    """Terms that drift linearly with time, perhaps as in the run of another filter."""
+    """Terms that drift linearly with time, optionally at the rates of another run."""
 
     rates: str = "free"
 
 
 class Polynomials(Section):
-    """Order of the polynomials, and where they are centred."""
+    """Order and reference pixel of the polynomials."""
 
     order: Annotated[int, Field(ge=1, le=MAX_ORDER)]
     reference_pixel: Pair | None = None
@@ -53,7 +53,7 @@ class MatchedModel(Polynomials):
 
 
 class CampaignModel(Polynomials):
-    """Structure of the distortion model; the frames of the exposures are the campaign's own."""
+    """Structure of the distortion model; a campaign defines the frames of its exposures itself."""
 
     frames: ClassVar[Literal["none"]] = "none"
 
@@ -69,7 +69,7 @@ class SelfcalModel(Polynomials):
 
 
 class PriorBlock(Section):
-    """A Gaussian prior on one parameter."""
+    """Gaussian prior on one parameter."""
 
     parameter: str
     mean: float
@@ -77,7 +77,7 @@ class PriorBlock(Section):
 
 
 class PriorCalibrationBlock(Section):
-    """An earlier calibration of the detector, which is the prior of this one."""
+    """Earlier calibration of the detector that is used as a prior."""
 
     source: str
     frame: FrameKind | None = None
@@ -87,7 +87,7 @@ class PriorCalibrationBlock(Section):
 
 
 class TablesBlock(Section):
-    """Look-up tables that are fitted: the detector's, or the filter's over those of a detector."""
+    """Look-up tables to fit: of the detector, or of the filter in addition to the detector's."""
 
     detector: str | None = None
     method: Literal["field", "binned", "none"] = "field"

@@ -1,4 +1,4 @@
-"""Files for pipelines that a run is asked for: a table for each format that can be built."""
+"""Products for pipelines: one section for each format that can be written."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from bayesdist.products.formats.common.document import FormatSettings
 from bayesdist.products.registry import product_settings
 from bayesdist.utils.quantities import year_of
 
-_USEAFTER = ("%b %d %Y %H:%M:%S", "%b %d %Y")  # as reference files of HST have it
+_USEAFTER = ("%b %d %Y %H:%M:%S", "%b %d %Y")  # as in reference files of HST
 
 
 def _as_part(name: str) -> str:
-    """A part of the name of a file, which leads into no other folder."""
+    """Validate a part of a file name, which must not lead to another folder."""
     if not name or not name.isprintable() or {*name} & {*"/\\"}:
         raise ValueError(
             f"{name!r} cannot be part of the name of a file; give letters without slashes"
@@ -30,7 +30,7 @@ FileNamePart = Annotated[str, AfterValidator(_as_part)]
 
 
 class PeriodBlock(Section):
-    """The years that one IDCTAB serves, and the segment of the drift that it holds."""
+    """Years of validity of one IDCTAB, and the segment of the drift that it contains."""
 
     name: FileNamePart
     years: tuple[float, float]
@@ -40,7 +40,7 @@ class PeriodBlock(Section):
 
 
 class ReleaseBlock(Section):
-    """IDCTABs, D2IMFILE and NPOLFILE, along V2 and V3 as an existing IDCTAB lies."""
+    """IDCTABs, D2IMFILE and NPOLFILE, with V2 and V3 oriented as in an existing IDCTAB."""
 
     name: FileNamePart
     reference: str
@@ -52,38 +52,38 @@ class ReleaseBlock(Section):
 
 
 class Products(Section):
-    """Files for pipelines, and the release that they replace."""
+    """Products for pipelines, and the release that they replace."""
 
-    previous: str | None = None  # a calibration of any format, or a run
+    previous: str | None = None  # calibration of any format, or a run
 
     if TYPE_CHECKING:
 
         @property
         def release(self) -> ReleaseBlock | None:
-            """What a release is made of, where the kind of run has one."""
+            """Section of the release; None if there is none."""
 
     def faults(self) -> Iterator[str]:
-        """A date of use that is none."""
+        """Fault of an invalid date of use."""
         try:
             self.useafter_years()
         except InputError as error:
             yield f"useafter: {error.cause}; give 'Mar 01 2002 00:00:00'"
 
     def useafter_years(self) -> tuple[float, ...]:
-        """Dates from which the files are to be used, decimal years; none where none is given."""
+        """Dates of use of the files in decimal years; empty if none are given."""
         release = getattr(self, "release", None)
         files = (*self.asked().values(), *(() if release is None else release.period))
-        given = (getattr(one, "useafter", None) for one in files)
-        return tuple(_year_of_keyword(text) for text in given if text)
+        dates = (getattr(file, "useafter", None) for file in files)
+        return tuple(_year_of_keyword(text) for text in dates if text)
 
     def asked(self) -> dict[str, FormatSettings]:
-        """Settings of the files that are asked for, by format."""
-        found = {key: getattr(self, key, None) for key in product_settings()}
-        return {key: settings for key, settings in found.items() if settings is not None}
+        """Settings of the requested files, by format."""
+        sections = {key: getattr(self, key, None) for key in product_settings()}
+        return {key: settings for key, settings in sections.items() if settings is not None}
 
 
 def _year_of_keyword(text: str) -> float:
-    """Decimal year of a date as USEAFTER has it, 'Mar 01 2002 00:00:00', or of an ISO date."""
+    """Decimal year of a USEAFTER date, such as 'Mar 01 2002 00:00:00', or of an ISO date."""
     date = " ".join(text.split())
     for pattern in _USEAFTER:
         try:
@@ -95,7 +95,7 @@ def _year_of_keyword(text: str) -> float:
 
 
 class _Single(Products):
-    release: ClassVar[ReleaseBlock | None] = None  # the set of a release is of a campaign
+    release: ClassVar[ReleaseBlock | None] = None  # only campaigns have releases
 
 
 class _Release(Products):
@@ -103,9 +103,11 @@ class _Release(Products):
 
 
 def _products(name: str, base: type[Products], *without: str) -> Any:
-    """The base with a table for each format, but for those that this kind of run does not make."""
-    known = product_settings()
-    fields: dict[str, Any] = {key: (known[key] | None, None) for key in known if key not in without}
+    """Subclass of `base` with a section for each format, except those in `without`."""
+    formats = product_settings()
+    fields: dict[str, Any] = {
+        key: (formats[key] | None, None) for key in formats if key not in without
+    }
     return create_model(name, __base__=base, **fields)
 
 

@@ -1,4 +1,4 @@
-"""Configurations of the three kinds and other files of sections, read and checked."""
+"""Reading and validation of configurations of all kinds, and of other TOML files."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from bayesdist.files.documents import toml_of
 from bayesdist.files.regular import MOST_TEXT, read_text
 from bayesdist.utils.text import refuse_control_characters
 
-# by the section that says of which kind a configuration is
+# by the section that determines the kind of a configuration
 KINDS: dict[str, type[RunConfig]] = {
     "data": MatchesConfig,
     "campaign": CampaignConfig,
@@ -33,9 +33,9 @@ KINDS: dict[str, type[RunConfig]] = {
 
 
 def _kind_of(raw: Any) -> str | None:
-    """The section that says of which kind a configuration is; None where not just one does."""
-    found = [kind for kind in KINDS if isinstance(raw, dict) and raw.get(kind) is not None]
-    return found[0] if len(found) == 1 else None
+    """Section that determines the kind of a configuration; None unless there is exactly one."""
+    kinds = [kind for kind in KINDS if isinstance(raw, dict) and raw.get(kind) is not None]
+    return kinds[0] if len(kinds) == 1 else None
 
 
 Config: TypeAlias = MatchesConfig | CampaignConfig | SelfcalConfig
@@ -57,13 +57,13 @@ CONFIG: TypeAdapter[Config] = TypeAdapter(
 )
 
 
-# numbers of configurations: in all units beyond whatever is meant, and far from overflow
+# limits on numbers: beyond plausible values in any unit, but far from overflow
 LEAST, MOST, MOST_WHOLE = 1e-20, 1e15, 2**63 - 1
 
 
 @contextmanager
 def _as_config_errors(where: str = "") -> Iterator[None]:
-    """Errors of input as those of a configuration; with its file in front, where it is named."""
+    """Convert InputError to ConfigError, with the name of the file if given."""
     try:
         yield
     except InputError as error:
@@ -78,19 +78,49 @@ class _RequirementFile(Section):
 def load_config(path: str | Path) -> tuple[Config, str]:
     """Read a configuration file.
 
-    The text is the file as it stands.
+    Parameters
+    ----------
+    path : path
+
+    Returns
+    -------
+    config : MatchesConfig, CampaignConfig or SelfcalConfig
+    text : str
+        Unchanged text of the file.
+
+    Raises
+    ------
+    ConfigError
+        If the file cannot be read or the configuration is invalid.
     """
     text = load_text(path)
     return parse_config(text, str(path)), text
 
 
 def parse_config(text: str, where: str) -> Config:
-    """A configuration from the text of a file; `where` names it in errors."""
+    """Validate a configuration.
+
+    Parameters
+    ----------
+    text : str
+        Configuration in TOML.
+    where : str
+        Name of the configuration in errors.
+
+    Returns
+    -------
+    MatchesConfig, CampaignConfig or SelfcalConfig
+
+    Raises
+    ------
+    ConfigError
+        If the configuration is invalid.
+    """
     raw = _settings(text, where, begin="write one by 'bayesdist init'")
     config = _validated(CONFIG, KINDS, raw, where)
     with _as_config_errors(where):
         config.time()
-        # matches may state their radius, which is not known before they are read
+        # matches may state their radius, which is unknown until they are read
         config.mixture(None if config.data is None else 1.0)
         config.user_terms()
         config.requirements()
@@ -99,7 +129,24 @@ def parse_config(text: str, where: str) -> Config:
 
 
 def config_of_record(settings: Mapping[str, Any], where: str) -> Config:
-    """A configuration as the record of a run holds it."""
+    """Configuration from the record of a run.
+
+    Parameters
+    ----------
+    settings : mapping
+        Configuration as stored in run.json.
+    where : str
+        Name of the record in errors.
+
+    Returns
+    -------
+    MatchesConfig, CampaignConfig or SelfcalConfig
+
+    Raises
+    ------
+    ConfigError
+        If the settings are invalid, for example if they are from another version.
+    """
     try:
         return CONFIG.validate_python(settings)
     except ValidationError as error:
@@ -107,7 +154,22 @@ def config_of_record(settings: Mapping[str, Any], where: str) -> Config:
 
 
 def load_requirements(path: str | Path) -> tuple[Requirement, ...]:
-    """Read the ``[[requirement]]`` blocks of a file, which may be a whole configuration."""
+    """Read the ``[[requirement]]`` blocks of a file.
+
+    Parameters
+    ----------
+    path : path
+        TOML file, which may be a complete configuration.
+
+    Returns
+    -------
+    tuple of Requirement
+
+    Raises
+    ------
+    ConfigError
+        If the file cannot be read, has no such blocks, or a block is invalid.
+    """
     text, begin = load_text(path), "give it [[requirement]] blocks"
     settings = _settings(text, str(path), begin=begin)
     if "requirement" in settings and settings.keys() & {"data", "detector", "model"}:
@@ -119,18 +181,24 @@ def load_requirements(path: str | Path) -> tuple[Requirement, ...]:
 
 
 def load_text(path: str | Path) -> str:
-    """Text of a file as it stands, with its line ends."""
+    """Text of a configuration file, unchanged including its line endings.
+
+    Raises ConfigError if the file cannot be read.
+    """
     with _as_config_errors():
         return read_text(path, most=MOST_TEXT)
 
 
 def validated(kind: type[Section], text: str, where: str, *, begin: str) -> Any:
-    """A file of sections from its text."""
+    """Validate the text of a TOML file as a section class.
+
+    `where` is the name of the file in errors, `begin` the advice if it holds no settings.
+    """
     return _validated(TypeAdapter(kind), kind, _settings(text, where, begin=begin), where)
 
 
 def _settings(text: str, where: str, *, begin: str) -> dict[str, Any]:
-    """Settings of a TOML text, of which there have to be some."""
+    """Settings of a TOML text; raises ConfigError if it is empty."""
     with _as_config_errors():
         raw = toml_of(text.removeprefix("\ufeff"), where)
     if not raw:
@@ -142,9 +210,9 @@ def _settings(text: str, where: str, *, begin: str) -> dict[str, Any]:
             continue
         large = MOST_WHOLE if isinstance(value, int) else MOST
         if abs(value) > large or 0 < abs(value) < LEAST:
-            said = str(value) if len(str(value)) < 30 else f"{str(value)[:20]}..."
+            number = str(value) if len(str(value)) < 30 else f"{str(value)[:20]}..."
             raise ConfigError(
-                f"{said} is no plausible number",
+                f"{number} is no plausible number",
                 where=f"{where}: {key}",
                 do=f"give one between {LEAST:g} and {large:g}",
             )
@@ -152,7 +220,7 @@ def _settings(text: str, where: str, *, begin: str) -> dict[str, Any]:
 
 
 def _leaves(tree: Any, key: str) -> Iterator[tuple[str, int | float | str]]:
-    """Texts of a tree and numbers that are finite, with their keys."""
+    """Keys and values of all texts and finite numbers of a tree."""
     if isinstance(tree, dict):
         for name, inner in tree.items():
             yield from _leaves(inner, f"{key}.{name}" if key else name)
@@ -169,9 +237,9 @@ def _validated(
     raw: Mapping[str, Any],
     where: str,
 ) -> Any:
-    """Settings as sections; `kinds` names these in errors."""
+    """Validate settings; `kinds` are the models, for errors."""
     try:
-        # by way of JSON: there arrays may become tuples, but no text a number
+        # validated as JSON, in which arrays may become tuples but text does not become a number
         return adapter.validate_json(json.dumps(raw, default=str), strict=True)
     except ValidationError as error:
         raise as_config_error(kinds, error, where) from error

@@ -46,12 +46,12 @@ from bayesdist.infer import Compute, OutlierMixture
 from bayesdist.infer.solution.solution import Solution
 from bayesdist.model import Chip, TimeDependence
 
-FREE = "free"  # rates that no other run says anything of
+FREE = "free"  # rates that are not taken from another run
 TABLES, POSTERIOR = "tables.h5", "posterior.nc"
 
 
 class RunConfig(Section):
-    """Sections of every configuration of a run; each kind adds those that are of its own type."""
+    """Sections of every configuration of a run; each kind adds further sections."""
 
     if TYPE_CHECKING:
         model: MatchedModel | CampaignModel | SelfcalModel
@@ -70,13 +70,13 @@ class RunConfig(Section):
     discrepancy: DiscrepancyBlock = DiscrepancyBlock()
 
     def faults(self) -> Iterator[str]:
-        """Names that are taken, chips or a detector that cannot be, files that are not for it."""
+        """Faults of names, chips and detector, and of products that do not suit the detector."""
         yield from same_names("budget", [b.name for b in self.budget])
         yield from same_names("requirement", [r.name for r in self.requirement])
-        taken = next((b.name for b in self.budget if b.name in MEASURED_TERMS), None)
-        if taken is not None:
+        reserved = next((b.name for b in self.budget if b.name in MEASURED_TERMS), None)
+        if reserved is not None:
             yield (
-                f"a [[budget]] block has the name {taken!r}, which is that of a measured row; "
+                f"a [[budget]] block has the name {reserved!r}, which is that of a measured row; "
                 "give it another"
             )
         yield from detector_faults(self.chip, self.detector, self.model.reference_pixel)
@@ -90,46 +90,47 @@ class RunConfig(Section):
 
     @property
     def named_detector(self) -> str:
-        """Name by which formats of one detector know theirs."""
+        """Name of the detector, for formats that are specific to one detector."""
         return self.detector.name
 
     @property
     def compares_jitters(self) -> bool:
-        """Boolean: groups of stars may have jitters of their own, if the data ask for it."""
+        """True if groups of stars may have separate jitters, if the data support it."""
         return False
 
     def named_files(self, base: Path) -> Path | list[Path]:
-        """Files, patterns and folders that the solution is made from, each once.
+        """Files, patterns and folders that the solution is made from, without duplicates.
 
-        Relative names are relative to `base`; matches have one path where one name is given.
+        Relative names are relative to `base`.  The result is a single path for matches with one
+        name.
         """
         raise NotImplementedError
 
     def files_of_products(self, base: Path) -> list[Path]:
-        """Files that only the products and the report of a run are made from."""
+        """Files that are used only by the products and the report of a run."""
         release, named = self.products.release, self.named_files(base)
-        found = [] if release is None else [base / release.reference]
+        files = [] if release is None else [base / release.reference]
         if self.products.previous is not None:
-            found.append(previous_file(base / self.products.previous))
-        others = named if isinstance(named, list) else [named]
-        return [path for path in found if path not in others]
+            files.append(previous_file(base / self.products.previous))
+        solution_files = named if isinstance(named, list) else [named]
+        return [path for path in files if path not in solution_files]
 
-    def files_of_priors(self, base: Path) -> list[Path]:  # noqa: ARG002 - of one kind of run
-        """Files of earlier calibrations that are priors of this one."""
+    def files_of_priors(self, base: Path) -> list[Path]:  # noqa: ARG002 - used by one kind of run
+        """Files of earlier calibrations that are used as priors."""
         return []
 
     def of_order(self, order: int) -> Self:
-        """This configuration with polynomials of another order."""
+        """Configuration with polynomials of another order."""
         return self.model_copy(update={"model": self.model.model_copy(update={"order": order})})
 
     def holding_at_most(self, memory_mb: float) -> Self:
-        """The same configuration with at most so many megabytes of stars in memory."""
-        most = min(memory_mb, self.compute.memory_mb)
-        compute = self.compute.model_copy(update={"memory_mb": most})
+        """Configuration with at most `memory_mb` megabytes of stars in memory."""
+        limit = min(memory_mb, self.compute.memory_mb)
+        compute = self.compute.model_copy(update={"memory_mb": limit})
         return self.model_copy(update={"compute": compute})
 
     def chips(self) -> tuple[Chip, ...]:
-        """Chips of the model; empty for a detector of one chip."""
+        """Chips of the model; empty for a detector with one chip."""
         return chips_of(self.chip)
 
     def time(self) -> TimeDependence | None:
@@ -138,40 +139,40 @@ class RunConfig(Section):
 
     @property
     def has_free_rates(self) -> bool:
-        """Boolean: the drift is that of this run's own exposures."""
+        """True if the drift is determined by the exposures of this run."""
         return self.model.tdd is None or self.model.tdd.rates == FREE
 
     def match_radius(self, stated: float | None) -> float | None:
-        """Radius in which stars were matched: the configured one, or else that which they state."""
+        """Match radius: the configured one, or else that which the matches state."""
         configured = self.outliers.match_radius
         return stated if configured is None else configured
 
     def mixture(self, stated: float | None = None) -> OutlierMixture:
-        """Outlier mixture; `stated` is the match radius that the stars state."""
+        """Outlier mixture; `stated` is the match radius that the matches state."""
         return self.outliers.mixture(self.match_radius(stated))
 
     def resources(self) -> Compute:
-        """Where the work is done."""
+        """Resources for the computation."""
         return self.compute.resources()
 
     def spans(self) -> dict[str, tuple[float, float]]:
-        """Begin and end of each of the periods, decimal years; empty where none are asked for."""
+        """Start and end of each period in decimal years; empty if there are none."""
         return {}
 
     @property
     def states_catalogue(self) -> bool:
-        """Boolean: a [[budget]] row states the error of the catalogue's positions."""
+        """True if a [[budget]] row states the error of the catalogue positions."""
         return any(row.stated and row.of_catalogue for row in self.budget)
 
     @property
     def states_motions(self) -> bool:
-        """Boolean: a [[budget]] row states the error of proper motions."""
+        """True if a [[budget]] row states the error of proper motions."""
         return any(row.stated and row.of_motions for row in self.budget)
 
     def user_terms(self, unit: str = "pix") -> tuple[UserTerm, ...]:
-        """The user's terms of the error budget that are the same at every position.
+        """User's terms of the error budget that do not depend on position.
 
-        `unit`: of u and v. InputError if it is an angle, and a term has no unit.
+        `unit` is that of u and v.  Raises InputError if it is an angle and a term has no unit.
         """
         return tuple(
             UserTerm(
@@ -188,7 +189,7 @@ class RunConfig(Section):
         )
 
     def linear_terms(self, solution: Solution) -> tuple[ErrorTerm, ...]:
-        """The user's terms of the error budget that have one size: scale, rotation, a mission's."""
+        """User's terms of the error budget with a single size: scale, rotation, mission terms."""
         return tuple(
             one_size_term(b.name, b.kind, b.sigma, solution, said_by_user(b.source))
             for b in self.budget
@@ -196,61 +197,62 @@ class RunConfig(Section):
         )
 
     def in_residuals(self, unit: str = "pix") -> tuple[UserTerm, ...]:
-        """User's terms that the scatter of the residuals includes; `unit` as of `user_terms`."""
+        """User's terms included in the scatter of the residuals; `unit` is that of u and v."""
         return tuple(term for term in self.user_terms(unit) if term.included_in_scatter)
 
     def held_in_residuals(self, unit: str) -> list[tuple[str, float, float]]:
-        """Name and standard deviation on each axis of these terms, in the unit of u and v."""
+        """Name and sigma per axis, in the unit of u and v, of terms included in the residuals."""
         scale = self.detector.scale_mas
         return [(t.name, *t.sigma(unit, scale)) for t in self.in_residuals(unit)]
 
     def requirements(self) -> tuple[Requirement, ...]:
-        """The requirements; the field of the detector is the region of those that name none."""
+        """Requirements; those without a region apply to the field of the detector."""
         return self.within_field(Requirement(**r.model_dump()) for r in self.requirement)
 
     @property
     def field(self) -> Region:
-        """The part of the detector that sees the sky."""
-        given = self.detector.field
-        if given is None:
+        """Part of the detector that sees the sky."""
+        block = self.detector.field
+        if block is None:
             return WHOLE
-        circle = given.model_dump() if isinstance(given, Circle) else given
+        circle = block.model_dump() if isinstance(block, Circle) else block
         return check_region(circle, "detector.field")
 
     def within_field(self, requirements: Iterable[Requirement]) -> tuple[Requirement, ...]:
-        """Requirements, of which those without a region are on the field of the detector."""
+        """Requirements with the field of the detector in place of a missing region."""
         return tuple(
-            replace(one, region=self.field) if one.region == WHOLE else one for one in requirements
+            replace(requirement, region=self.field) if requirement.region == WHOLE else requirement
+            for requirement in requirements
         )
 
 
 def _unit_of(block: BudgetBlock, unit: str) -> str:
-    """Unit of the sizes of a [[budget]] row; nothing is nothing in any unit."""
+    """Unit of the sizes of a [[budget]] row; a size of zero needs no unit."""
     if not (block.sigma_u or block.sigma_v):
         return block.unit or "pix"
     return stated_unit(block.unit, unit, f"budget term {block.name!r}")
 
 
-# -- files of other runs that a configuration goes by ----------------------------------------------
+# -- files of other runs that a configuration uses -------------------------------------------------
 
 
 def tables_file(path: Path) -> Path:
-    """File of a detector's tables: a D2IMFILE as it is named, or that of a run."""
+    """File of a detector's tables: the D2IMFILE itself, or the file in a run."""
     return path if path.is_file() else _file_of_run(path, TABLES, "tables.detector")
 
 
 def rates_file(folder: Path) -> Path:
-    """File of the posterior of a run whose drift is taken over."""
+    """File of the posterior of a run that provides the drift."""
     return _file_of_run(folder, POSTERIOR, "model.tdd.rates")
 
 
 def calibration_file(path: Path) -> Path:
-    """File of an earlier calibration: one of any format as it is named, or a run's posterior."""
+    """File of an earlier calibration: the file itself, or the posterior of a run."""
     return path if path.is_file() else _file_of_run(path, POSTERIOR, "prior_calibration.source")
 
 
 def previous_file(path: Path) -> Path:
-    """File of the release that is replaced: one of any format, or a run's posterior."""
+    """File of the release to be replaced: the file itself, or the posterior of a run."""
     return path if path.is_file() else _file_of_run(path, POSTERIOR, "products.previous")
 
 

@@ -1,4 +1,4 @@
-"""Tables of the configuration file: what one is, and the detector with its chips."""
+"""Base class of the sections of a configuration file, and sections for detector and chips."""
 
 from __future__ import annotations
 
@@ -11,19 +11,19 @@ from pydantic import BaseModel, ConfigDict, Field, PositiveFloat, model_validato
 from bayesdist.model import Chip
 
 Unit = Literal["pix", "arcsec", "mas", "deg"]
-Epoch = Annotated[float, Field(ge=1800, le=2200)]  # decimal years; others are days, or slips
+Epoch = Annotated[float, Field(ge=1800, le=2200)]  # decimal years; other numbers are days or errors
 RightAscensionDeclination = tuple[  # degrees
     Annotated[float, Field(ge=-180, le=360)], Annotated[float, Field(ge=-90, le=90)]
 ]
 
 
 class Section(BaseModel):
-    """A table of the file; keys that it does not know are errors."""
+    """Section of a configuration file; unknown keys are errors."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
     def faults(self) -> Iterator[str]:
-        """What is wrong with the table as a whole, as 'cause; advice': the first is reported."""
+        """Faults of the section as a whole, as 'cause; advice'; the first one is reported."""
         yield from ()
 
     @model_validator(mode="after")
@@ -38,14 +38,14 @@ Block = TypeVar("Block", bound="ChipBlock")
 
 
 class Circle(Section):
-    """A round field on a detector, in pixels."""
+    """Circular field on a detector, in pixels."""
 
     centre: tuple[float, float]
     radius: PositiveFloat
 
 
 class Detector(Section):
-    """A detector of one chip."""
+    """Detector with one chip."""
 
     name: str = ""
     mission: str = ""
@@ -56,7 +56,7 @@ class Detector(Section):
 
 
 class RunDetector(Detector):
-    """A detector of a run, whose errors are evaluated over the part that sees the sky."""
+    """Detector of a run, with the field over which errors are evaluated."""
 
     field: Circle | list[tuple[float, float]] | None = None
 
@@ -74,7 +74,7 @@ class ChipBlock(Section):
 def detector_faults(
     chips: Sequence[ChipBlock], detector: Detector, reference_pixel: Pair | None
 ) -> Iterator[str]:
-    """Chips that contradict each other, or no detector at all."""
+    """Faults of contradictory chips, and of a missing detector."""
     if sum(c.reference for c in chips) > 1:
         yield "reference = true stands in several [[chip]] blocks; keep it in one"
     for key in ("number", "name"):
@@ -89,14 +89,14 @@ def detector_faults(
 
 
 def same_names(block: str, names: Sequence[object], key: str = "name") -> Iterator[str]:
-    """Blocks of one name, or of another key that each has to itself."""
-    twice = next((name for name, n in Counter(names).items() if n > 1), None)
-    if twice is not None:
-        yield f"two [[{block}]] blocks have the {key} {twice!r}; give each its own"
+    """Fault of blocks with equal names, or equal values of another unique key."""
+    duplicate = next((name for name, n in Counter(names).items() if n > 1), None)
+    if duplicate is not None:
+        yield f"two [[{block}]] blocks have the {key} {duplicate!r}; give each its own"
 
 
 def reference_first(chips: Sequence[Block]) -> list[Block]:
-    """The blocks with the reference chip in front: it defines the frame."""
+    """Blocks with that of the reference chip, which defines the frame, as the first."""
     return sorted(chips, key=lambda c: not c.reference)
 
 
@@ -107,7 +107,7 @@ def chips_of(chips: Sequence[ChipBlock]) -> tuple[Chip, ...]:
 
 
 def one_chip(detector: Detector, reference_pixel: Pair | None, number: int, name: str) -> Chip:
-    """The chip of a detector that has one; its middle where no pixel is named."""
+    """Chip of a detector that has only one; its reference pixel is the centre by default."""
     if detector.size is None:
         raise ValueError("detector.size is missing; give columns and rows")
     nx, ny = detector.size

@@ -1,4 +1,4 @@
-"""A run that begins with star lists alone: its configuration, and the constraints of its gauge."""
+"""Configuration of a self-calibration, which begins with star lists alone, and of its gauge."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ MinDetections = Annotated[int, Field(ge=2)]
 
 
 def scale_faults(sigma: float | None, frames: Frames) -> Iterator[str]:
-    """A scatter of the scales of exposures that have none."""
+    """Fault of a scatter of scales when the exposures have no scales."""
     if sigma is not None and "scale" not in frames:
         yield (
             "gauge.exposure_scale_sigma is given, and the exposures have no scales; set "
@@ -31,7 +31,7 @@ def scale_faults(sigma: float | None, frames: Frames) -> Iterator[str]:
 
 
 class SelfcalBlock(StarListsBlock):
-    """Star lists of dithered exposures, and how their detections become stars."""
+    """Star lists of dithered exposures, and the matching of their detections to stars."""
 
     exposures: str | None = None
     sigma: Literal["measured", "columns"] | PositiveFloat = "measured"
@@ -45,7 +45,7 @@ class SelfcalBlock(StarListsBlock):
     motion: Literal["none", "proper_motion", "parallax"] = "none"
 
     def faults(self) -> Iterator[str]:
-        """A radius that would grow."""
+        """Fault of a match radius that would increase."""
         if self.start_radius is not None and self.start_radius < self.match_radius:
             yield (
                 "selfcal.start_radius is smaller than selfcal.match_radius; begin with the larger "
@@ -54,7 +54,7 @@ class SelfcalBlock(StarListsBlock):
 
 
 class ScaleTie(Section):
-    """The size of a pixel, as another detector has it."""
+    """Pixel size as measured by another detector."""
 
     mas: PositiveFloat
     sigma: PositiveFloat
@@ -62,7 +62,7 @@ class ScaleTie(Section):
 
 
 class ReferenceBlock(Section):
-    """Stars of a catalogue that are among the detected ones."""
+    """Reference stars in a catalogue."""
 
     catalog: str
     columns: dict[str, str] | None = None
@@ -73,7 +73,7 @@ class ReferenceBlock(Section):
 
 
 class GaugeBlock(Section):
-    """Constraints beside the detections, each with its error."""
+    """Constraints in addition to the detections, each with its error."""
 
     offsets: str | None = None
     offset_sigma: PositiveFloat | None = None
@@ -83,7 +83,7 @@ class GaugeBlock(Section):
     reference: ReferenceBlock | None = None
 
     def faults(self) -> Iterator[str]:
-        """Errors of offsets that are not given."""
+        """Faults of errors without the offsets that they apply to."""
         for key in ("offset_sigma", "roll_sigma_deg"):
             if getattr(self, key) is not None and self.offsets is None:
                 yield (
@@ -93,7 +93,7 @@ class GaugeBlock(Section):
 
 
 class SelfcalConfig(RunConfig):
-    """A run that begins with star lists alone."""
+    """Configuration of a run that begins with star lists alone."""
 
     data: ClassVar[None] = None
     campaign: ClassVar[None] = None
@@ -113,7 +113,7 @@ class SelfcalConfig(RunConfig):
     products: SelfcalProducts = SelfcalProducts()
 
     def faults(self) -> Iterator[str]:
-        """Those of every run, and settings that go with other frames, or without a scale."""
+        """Faults of any run, and of settings that contradict the frames or need a scale."""
         yield from super().faults()
         if names_nominal(self.selfcal.columns):
             yield (
@@ -131,15 +131,15 @@ class SelfcalConfig(RunConfig):
             yield "detector.scale_mas is missing, which turns pixels into seconds of arc; give it"
 
     def named_files(self, base: Path) -> list[Path]:
-        """Lists, the first solution, and what is known beside the detections."""
+        """Star lists, log, initial distortion, and files of the constraints."""
         block, gauge = self.selfcal, self.gauge
         first, reference = block.initial_distortion, gauge.reference
         if first is not None and (base / first).is_dir():
-            first = f"{first}/{POSTERIOR}"  # of a run
+            first = f"{first}/{POSTERIOR}"  # posterior of a run
         named = [*block.list_names, block.exposures, first, gauge.offsets]
         named.append(None if reference is None else reference.catalog)
         return [base / name for name in dict.fromkeys(named) if name is not None]
 
-    def mixture(self, stated: float | None = None) -> OutlierMixture:  # noqa: ARG002 - of stars
-        """Outlier mixture, within the configured radius of a detection."""
+    def mixture(self, stated: float | None = None) -> OutlierMixture:  # noqa: ARG002 - used for matched stars
+        """Outlier mixture, within the configured match radius of a detection."""
         return self.outliers.mixture(self.selfcal.match_radius)

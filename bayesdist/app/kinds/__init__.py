@@ -1,1 +1,1 @@
-"""Values and pure functions of `match`, `fit` and `sample`, for each kind of run."""
+"""Inputs, matching, fitting and sampling for each kind of run."""

@@ -1,4 +1,4 @@
-"""Errors of stars as a fit took them, and the scatter of exposures that were fitted jointly."""
+"""Measurement errors assumed by a fit, and the scatter of exposures that were fitted jointly."""
 
 from __future__ import annotations
 
@@ -15,17 +15,29 @@ from bayesdist.utils.arrays import Float
 
 @dataclass(frozen=True, eq=False)
 class ErrorLaw:
-    """Law by which errors of stars, fitted or held out, follow from the quoted ones."""
+    """Rule that derives the errors of fitted and held-out stars from the quoted errors.
 
-    factor: float = 1.0  # on all quoted errors; 1 where they will do
-    # errors of the centroids, in place of the quoted ones
+    Parameters
+    ----------
+    factor : float
+        Factor on all quoted errors; 1 if these are adequate.
+    by_magnitude : MagnitudeErrors or None
+        Centroid errors as a function of magnitude, which replace the quoted errors or are added to
+        them.
+    added : AddedErrors or None
+        Additional errors of groups of stars, added in quadrature.
+    with_catalogue : bool
+        True if `by_magnitude` is added in quadrature to the quoted errors, because these are the
+        errors of the catalogue.
+    """
+
+    factor: float = 1.0
     by_magnitude: MagnitudeErrors | None = None
-    added: AddedErrors | None = None  # beyond these, by groups of stars
-    # errors by magnitude are added in quadrature to the quoted ones, which are the catalogue's
+    added: AddedErrors | None = None
     with_catalogue: bool = False
 
     def applied(self, matches: Matches) -> Matches:
-        """Matches with these errors; they themselves where the quoted errors stand."""
+        """Matches with these errors applied; returned unchanged if the quoted errors are kept."""
         if self.factor != 1.0:
             matches = matches.with_scaled_errors(self.factor)
         if self.by_magnitude is not None:
@@ -40,23 +52,33 @@ QUOTED = ErrorLaw()
 
 @dataclass(frozen=True, eq=False)
 class ExposureScatter:
-    """Scatter of the linear terms of exposures about those of the model."""
+    """Scatter of the linear terms of the exposures about those of the model.
 
-    kinds: tuple[str, ...]  # kinds of deviation
-    tau: Float  # (n, k), draws of the scatter of each kind
-    offsets: Settling  # how the constant terms of chips follow from the shifts of single chips
+    Parameters
+    ----------
+    kinds : tuple of str
+        Names of the k linear terms that scatter.
+    tau : ndarray, shape (n, k)
+        Posterior draws of the standard deviation of each term.
+    offsets : Settling
+        Relation between the constant terms of chips and the shifts of single chips.
+    """
+
+    kinds: tuple[str, ...]
+    tau: Float
+    offsets: Settling
 
     def averaged(self, posterior: Posterior, rng: np.random.Generator) -> Posterior:
-        """The posterior with the chips where the exposures have them on average."""
-        some = self.tau[rng.integers(len(self.tau), size=len(posterior.flat))]
-        flat = self.offsets.draws(posterior.flat, some, rng)
+        """Posterior in which each chip has its mean position over the exposures."""
+        tau = self.tau[rng.integers(len(self.tau), size=len(posterior.flat))]
+        flat = self.offsets.draws(posterior.flat, tau, rng)
         before, after = posterior.flat.std(axis=0), flat.std(axis=0)
         scale = np.divide(after, before, out=np.ones_like(after), where=before > 0)
         c = posterior.convergence
-        scale = np.append(scale, np.ones(len(c.names) - len(scale)))  # hyperparameters stand last
+        scale = np.append(scale, np.ones(len(c.names) - len(scale)))  # hyperparameters come last
         return replace(
             posterior,
             theta=flat.reshape(posterior.theta.shape),
-            # of as many effective draws, which scatter less
+            # the number of effective draws is unchanged, but the draws scatter less
             convergence=replace(c, mcse_mean=c.mcse_mean * scale, mcse_sd=c.mcse_sd * scale),
         )

@@ -1,4 +1,4 @@
-"""A fit and the stars that it was made from, which are read once for all that follows the fit."""
+"""A fit and the stars that it used, which are read once for all later steps."""
 
 from __future__ import annotations
 
@@ -20,24 +20,24 @@ from bayesdist.utils.arrays import Float
 
 
 class StarReader:
-    """Reads stars, and remembers those that it was asked for last."""
+    """Reader of stars that caches the most recent request."""
 
     def __init__(self, compute: Compute | None = None) -> None:
         self.compute = compute or Compute()
-        # those that were asked for, with which errors, and what came of it
+        # requested stars, their error law, and the stars with these errors
         self._read: tuple[Matches, ErrorLaw, Matches] | None = None
         self._shards: Shards | None = None
         self._sample: Matches | None = None
 
     def matches(self, stars: Matches, errors: ErrorLaw = QUOTED) -> Matches:
-        """The stars with their errors."""
+        """Stars with their errors."""
         if self._read is None or self._read[0] is not stars or self._read[1] is not errors:
             self.close()
             self._read = stars, errors, errors.applied(stars)
         return self._read[2]
 
     def shards(self, model: DistortionModel, stars: Matches, errors: ErrorLaw = QUOTED) -> Shards:
-        """The stars as passes of a model go over them; closed by whoever closes the reader."""
+        """Stars split into shards for passes of a model; closed together with the reader."""
         matches = self.matches(stars, errors)
         if self._shards is None or self._shards.model != model:
             self._close_shards()
@@ -45,22 +45,25 @@ class StarReader:
         return self._shards
 
     def sample(self, stars: Matches, errors: ErrorLaw = QUOTED) -> Matches:
-        """Some of the stars, or all where they are not many."""
+        """Evenly spread subset of the stars, or all of them if they are few."""
         matches = self.matches(stars, errors)
         if self._sample is None:
             self._sample = matches.sample(SAMPLE)
         return self._sample
 
     def moved(self, stars: Matches) -> None:
-        """Take note that the stars that were asked for last lie in other files now."""
-        if self._read is None or self.compute.engine == "dask":  # workers may read them again
+        """Update the cache after the files of the stars in use were moved.
+
+        `stars` are the same stars, which refer to the new files.
+        """
+        if self._read is None or self.compute.engine == "dask":  # workers may read the files again
             self.close()
         else:
             errors = self._read[1]
             self._read = stars, errors, errors.applied(stars)
 
     def close(self) -> None:
-        """Let go of the stars, and of whoever holds them."""
+        """Release the stars, and the workers that hold them."""
         self._close_shards()
         self._read = self._sample = None
 
@@ -72,11 +75,15 @@ class StarReader:
 
 @dataclass(frozen=True, eq=False)
 class FitData:
-    """A fit and its stars: where its tables move them, with its errors."""
+    """A fit and its stars.
+
+    The pixels of the stars are corrected by the look-up tables of the fit, and the errors are those
+    that the fit assumed.
+    """
 
     matched: Matched
     fitted: Fitted
-    # reads the stars once for all passes over them
+    # cache: the stars are read once for all passes
     reader: StarReader = field(default_factory=StarReader)
 
     @property
@@ -91,50 +98,50 @@ class FitData:
 
     @cached_property
     def placed(self) -> Matches:
-        """Stars at the pixels that the tables move them to, with their quoted errors."""
+        """Stars with pixels corrected by the look-up tables, and with their quoted errors."""
         return self.fitted.placed(self.matched.stars)
 
     @property
     def _law(self) -> ErrorLaw:
-        """Errors on top of those of the placed stars: detections of solved stars have theirs."""
+        """Errors that remain to be applied; none for a self-calibration, which has applied them."""
         return QUOTED if self.fitted.solved is not None else self.fitted.errors
 
     @cached_property
     def stars(self) -> Matches:
-        """Stars that were fitted, with their errors."""
+        """Fitted stars with their errors."""
         return self.reader.matches(self.placed, self._law)
 
     @cached_property
     def held(self) -> Matches | None:
-        """Stars that are held out, in the same way; None where there are none."""
+        """Held-out stars with pixels and errors as for fitted stars; None if there are none."""
         held = self.matched.held
         return None if held is None else self.fitted.errors.applied(self.fitted.placed(held))
 
     @property
     def shards(self) -> Shards:
-        """All stars that were fitted, as passes go over them."""
+        """All fitted stars, split into shards for passes over the data."""
         return self.reader.shards(self.model, self.placed, self._law)
 
     @property
     def sample(self) -> Matches:
-        """Evenly spread ones of them, or all."""
+        """Evenly spread subset of the fitted stars, or all of them if they are few."""
         return self.reader.sample(self.placed, self._law)
 
     @cached_property
     def dates(self) -> Float:
-        """Distinct dates of the stars, decimal years; none where they have none."""
+        """Distinct dates of the stars in decimal years; empty if they have no dates."""
         return dates_of(self.placed if self.placed.in_memory else self.sample)
 
     @cached_property
     def last_epoch(self) -> float:
-        """Latest date of the stars, decimal years; they have dates where the model drifts."""
+        """Latest date of the stars in decimal years; they must have dates if the model drifts."""
         if self.placed.in_memory:
             return float(np.max(self.placed.column("epoch")))
         return float(np.max(self.shards.groups.epoch))
 
     @property
     def error_scale_sentence(self) -> str:
-        """Sentence on quoted errors that are far too small; empty where they will do."""
+        """Sentence about quoted errors that are far too small; empty if they are adequate."""
         if self.fitted.errors.factor == 1.0:
             return ""
         return error_scale_sentence(

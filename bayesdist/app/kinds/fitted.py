@@ -1,4 +1,4 @@
-"""Artefact of the stage 'fit': the least-squares solution, and what its stars were given."""
+"""Artefact of the stage 'fit': the least-squares solution and the inputs that it depends on."""
 
 from __future__ import annotations
 
@@ -35,23 +35,23 @@ SOLUTION, GAUGE = "solution.h5", "gauge.ecsv"
 
 @dataclass(frozen=True, eq=False)
 class SelfCalibrated:
-    """The mode of a self-calibration, with its gauge and matches."""
+    """Mode of a self-calibration with its gauge and matches."""
 
     mode: SelfCalibrationMode
     gauge: Gauge  # degeneracies of the detections, and the constraints that remove them
-    fixed: Mapping[str, str]  # what fixes each property of the solution
-    gauge_words: str  # in which gauge the solution stands, as a sentence
+    fixed: Mapping[str, str]  # constraint on each property of the solution, by its name
+    gauge_words: str  # sentence that states the gauge of the solution
     gauge_table: Table  # one row for each property of the solution
-    matches: Matches  # detections beside their stars
-    arrays: Mapping[str, NDArray[Any]]  # from which the solution is made again
-    # where what is known beside the detections does not go with them, as sentences
+    matches: Matches  # detections matched with their stars
+    arrays: Mapping[str, NDArray[Any]]  # from which the solution is restored
+    # sentences about constraints that contradict the detections
     contradictions: tuple[str, ...] = ()
-    references: ReferenceCatalog | None = None  # stars that a catalogue has, too
-    # where the plane of the stars touches the sky, in u and v; None if the sky is taken as flat
+    references: ReferenceCatalog | None = None  # reference stars that are also in a catalogue
+    # point (u, v) where the tangent plane of the stars touches the sky; None if the sky is flat
     contact: tuple[float, float] | None = None
 
     def save(self, folder: Path) -> None:
-        """Write the files of a run's folder that belong to it."""
+        """Write the solution and the gauge to the folder of a run."""
         write_arrays(folder / SOLUTION, "", self.arrays)
         write_table(self.gauge_table, folder / GAUGE)
 
@@ -59,23 +59,23 @@ class SelfCalibrated:
 T = TypeVar("T")
 
 FIT, PARTS, TABLES, MAGNITUDE_ERRORS = "fit.nc", "fit.h5", "tables.h5", "magnitude_errors.ecsv"
-RESTS_ON = ("errors", "priors", "grouped", "scatter", "alone", "facts")  # what fit.h5 holds
+RESTS_ON = ("errors", "priors", "grouped", "scatter", "alone", "facts")  # content of fit.h5
 FIT_AGAIN = "run the stage 'fit' again"
 
 
 @dataclass(frozen=True, eq=False)
 class StoredLookupTables:
-    """Look-up tables of a run, with their errors."""
+    """Look-up tables of a run with their errors."""
 
-    tables: tuple[LookupTable, ...] = ()  # the detector's first
-    # (ny, nx, 2), by chip: errors of positions by those of all tables, in the unit of u, v
+    tables: tuple[LookupTable, ...] = ()  # tables of the detector come first
+    # by chip, (ny, nx, 2): position errors caused by the errors of all tables, in the unit of u, v
     position_sigma: Mapping[int, Float] = field(default_factory=dict)
-    # by chip, where it has been measured: what all tables leave between their nodes
+    # by chip, if measured: distortion between the nodes that no table follows
     between: Mapping[int, BetweenNodes] = field(default_factory=dict)
 
 
 def write_tables(path: Path, stored: StoredLookupTables) -> None:
-    """Write look-up tables to a file; without tables there is none."""
+    """Write look-up tables to a file, or remove the file if there are no tables."""
     if stored.tables:
         write_record(path, stored)
     else:
@@ -83,7 +83,10 @@ def write_tables(path: Path, stored: StoredLookupTables) -> None:
 
 
 def read_tables(path: Path, *, do: str) -> StoredLookupTables:
-    """Read what `write_tables` wrote; nothing where there is no file."""
+    """Look-up tables of a file written by `write_tables`; empty if there is no file.
+
+    `do` completes the message of an error: what the user should do.
+    """
     if not path.exists():
         return StoredLookupTables()
     return read_record(path, StoredLookupTables, "a file of look-up tables", do=do)
@@ -91,31 +94,34 @@ def read_tables(path: Path, *, do: str) -> StoredLookupTables:
 
 @dataclass(frozen=True, eq=False)
 class Fitted:
-    """A least-squares solution with all that it rests on; what a kind of run lacks is None."""
+    """A least-squares solution with everything that it depends on.
+
+    Fields that do not apply to the kind of run are None.
+    """
 
     linear: LinearFit
     errors: ErrorLaw  # of fitted and held-out stars
     priors: GaussianPriors
-    # errors beyond the quoted ones, where groups of stars were compared
+    # errors in addition to the quoted ones, if groups of stars were compared
     grouped: GroupedErrors | None = None
-    # empty where there are none
     tables: StoredLookupTables = field(default_factory=StoredLookupTables)
-    scatter: ExposureScatter | None = None  # how exposures deviate, where they were fitted jointly
-    alone: Series | None = None  # linear terms of exposures that were each fitted alone
-    # solution and gauge of detections whose stars are not known otherwise
+    scatter: ExposureScatter | None = None  # None if exposures were not fitted jointly
+    alone: Series | None = None  # linear terms of exposures that were fitted one by one
+    # solution and gauge of a self-calibration
     solved: SelfCalibrated | None = None
-    # sections of summary.json that only the making of the fit knows
+    # sections of summary.json that are known only while the fit is made
     facts: Mapping[str, Any] = field(default_factory=dict)
 
     @property
     def gauge_words(self) -> str:
-        """In which gauge the products stand, as a sentence; empty where that is no question."""
+        """Sentence that states the gauge of the products; empty except for self-calibrations."""
         return "" if self.solved is None else self.solved.gauge_words
 
     def placed(self, stars: Matches) -> Matches:
-        """Stars at the pixels that the tables move them to, on their chips, with quoted errors.
+        """Stars with pixels corrected by the look-up tables, without those moved off their chip.
 
-        Of a self-calibration they are the detections beside the stars as they were solved.
+        Their errors are the quoted ones.  For a self-calibration the result is the detections,
+        matched with the positions of the solved stars.
         """
         if self.solved is not None:
             return self.solved.matches
@@ -130,7 +136,7 @@ class Fitted:
         return inside_chips(corrected_matches(self.tables.tables, stars), self.linear.model)
 
     def save(self, folder: Path) -> None:
-        """Write the files of a run's folder that belong to it."""
+        """Write the fit to the folder of a run."""
         write_tables(folder / TABLES, self.tables)
         if self.errors.by_magnitude is not None:
             write_table(Table(vars(self.errors.by_magnitude)), folder / MAGNITUDE_ERRORS)
@@ -141,27 +147,43 @@ class Fitted:
 
 
 def load_fitted(folder: Path) -> Fitted:
-    """The fit of an earlier stage, but for the solution of detections."""
+    """Load the fit of an earlier stage from the folder of a run.
+
+    The solution of a self-calibration is not included; see `load_selfcal`.
+    """
     tables = read_tables(folder / TABLES, do=FIT_AGAIN)
     return Fitted(load_fit(folder / FIT), tables=tables, **_read_parts(folder))
 
 
 def load_errors(folder: Path) -> ErrorLaw:
-    """The errors of the stars of an earlier fit; InputError as `load_fitted`."""
+    """Load the error law of an earlier fit; raises InputError as `load_fitted` does."""
     errors: ErrorLaw = _read_parts(folder)["errors"]
     return errors
 
 
 def _read_parts(folder: Path) -> dict[str, Any]:
-    """What a fit rests on, by name."""
-    what = "what a fit rests on"
-    found = read_record(folder / PARTS, dict, what, do=FIT_AGAIN)
-    with restoring(folder / PARTS, what, do=FIT_AGAIN):
-        return {name: found[name] for name in RESTS_ON}
+    """Parts of a fit other than the solution and the tables, by name."""
+    content = "what a fit rests on"
+    parts = read_record(folder / PARTS, dict, content, do=FIT_AGAIN)
+    with restoring(folder / PARTS, content, do=FIT_AGAIN):
+        return {name: parts[name] for name in RESTS_ON}
 
 
 def converged_posterior(path: Path, use: str) -> Posterior:
-    """The posterior of another run that this one goes by; `use` is for what, as a clause."""
+    """Load the posterior of another run, which must have converged.
+
+    Parameters
+    ----------
+    path : Path
+        File of the posterior.
+    use : str
+        Clause that completes the error message: what the posterior is needed for.
+
+    Raises
+    ------
+    InputError
+        If the run has not converged.
+    """
     posterior: Posterior = load_posterior(path)
     if not posterior.convergence.converged:
         raise InputError(
@@ -173,7 +195,10 @@ def converged_posterior(path: Path, use: str) -> Posterior:
 
 
 def required(part: T | None, what: str) -> T:
-    """A part of a fit that its kind of run has."""
+    """Return a part of a fit that may be None; raises InputError if it is None.
+
+    `what` is the name of the part in the error message.
+    """
     if part is None:
         raise InputError(f"has no {what}", where=FIT, do=FIT_AGAIN)
     return part

@@ -1,4 +1,4 @@
-"""The three kinds of runs, which differ in all that comes before the posterior."""
+"""The three kinds of runs, which differ in every step before the posterior."""
 
 from __future__ import annotations
 
@@ -23,36 +23,56 @@ from bayesdist.infer import Posterior
 
 @dataclass(frozen=True)
 class Kind:
-    """Matched stars, a campaign, or a self-calibration.
+    """Functions that implement one kind of run: matched stars, a campaign, or a self-calibration.
 
-    Each takes configurations, inputs and matches of its own types.
+    Configurations, inputs and matches have different types for each kind.
+
+    Parameters
+    ----------
+    read : callable
+        ``read(config, base)`` reads the inputs of a run; paths are relative to the folder `base`.
+    match : callable
+        ``match(inputs, config)`` returns the fitted and the held-out stars.
+    fit : callable
+        ``fit(matched, config, base, reader)`` returns the least-squares solution.
+    sample : callable
+        ``sample(data, config, folder=, progress=)`` returns the posterior of a fit; checkpoints are
+        written to `folder`.
+    load_matched : callable, optional
+        ``load_matched(folder, inputs, summary)`` loads the matches of an earlier stage from the
+        folder of a run and its summary.json.  None if the stars are matched again instead.
+    load_fitted : callable
+        ``load_fitted(folder, matched)`` loads the fit of an earlier stage; `matched` is a function
+        that returns the matches, called only if they are needed.
+    refuse : callable
+        ``refuse(inputs)`` raises InputError if the inputs are inconsistent.  Problems of matched
+        stars are found by their fit.
+    lines : callable
+        ``lines(inputs)`` returns the lines that the command `check` prints about the inputs, or
+        None if those about the fit are more informative.
+    outline : callable, optional
+        ``outline(inputs)`` returns the shape of the solution, from which products are written on
+        trial before stars are matched.  None if the fit is used for that.
+    begins_with : str
+        First stage: 'match', or 'fit' if the stars are matched already.
+    rows : str
+        Word for the rows of the data.
+    chooser : str
+        Words for the step that rejects outlying rows.
     """
 
-    # of (config, base): all that a run begins with, its inputs; paths are relative to `base`
     read: Callable[[Any, Path], Any]
-    # of (inputs, config): stars that are fitted, and those that are held out
     match: Callable[[Any, Any], Matched]
-    # of (matched, config, base, reader): the least-squares solution
     fit: Callable[[Any, Any, Path, StarReader], Fitted]
-    # of (data, config, folder=, progress=): the posterior of the fit; checkpoints are in the folder
     sample: Callable[..., Posterior] = sample_stars
-    # of (folder, inputs, summary): the matches of an earlier stage, from a run's folder and its
-    # summary.json; without it they are matched again
     load_matched: Callable[[Path, Any, Mapping[str, Any]], Matched] | None = None
-    # of (folder, matched): the fit of an earlier stage; `matched` is called where that needs the
-    # matches
     load_fitted: Callable[[Path, Callable[[], Any]], Fitted] = lambda folder, _: load_fitted(folder)
-    # of inputs: refuses what does not go together; what is wrong with matched stars shows in their
-    # fit
     refuse: Callable[[Any], None] = lambda inputs: None
-    # of inputs: what `check` says of them; None where the fit says more
     lines: Callable[[Any], Iterator[str] | None] = lambda inputs: None
-    # of inputs: shape of the solution, from which files are made on trial before stars are matched;
-    # None where the fit serves for that
     outline: Callable[[Any], Outline] | None = None
-    begins_with: str = "match"  # its first stage: 'match', or 'fit' where stars are matched already
-    rows: str = "stars"  # what a row of the data is, in words
-    chooser: str = "least-squares fit"  # what leaves out rows that are far off, in words
+    begins_with: str = "match"
+    rows: str = "stars"
+    chooser: str = "least-squares fit"
 
 
 MATCHES = Kind(read=read_stars, match=match_stars, fit=fit_stars, begins_with="fit")
@@ -60,7 +80,7 @@ MATCHES = Kind(read=read_stars, match=match_stars, fit=fit_stars, begins_with="f
 
 @cache
 def _campaign() -> Kind:
-    """A campaign; like self-calibrations it is imported where there is one."""
+    """Functions of a campaign; imported only when needed, as those of self-calibrations."""
     from bayesdist.app.kinds.campaign.fit import fit_campaign
     from bayesdist.app.kinds.campaign.input_validation import refuse_campaign
     from bayesdist.app.kinds.campaign.inputs import outline_of_campaign, read_campaign
@@ -80,6 +100,7 @@ def _campaign() -> Kind:
 
 @cache
 def _selfcal() -> Kind:
+    """Functions of a self-calibration."""
     from bayesdist.app.kinds.selfcal.fit import fit_selfcal, load_selfcal, sample_detections
     from bayesdist.app.kinds.selfcal.inputs import outline_of_selfcal, read_selfcal, refuse_selfcal
     from bayesdist.app.kinds.selfcal.matched import load_matched_selfcal
@@ -101,7 +122,7 @@ def _selfcal() -> Kind:
 
 
 def kind_of(config: Config) -> Kind:
-    """The kind of run that a configuration is of."""
+    """Kind of run that a configuration describes."""
     if config.campaign is not None:
         return _campaign()
     return _selfcal() if config.selfcal is not None else MATCHES

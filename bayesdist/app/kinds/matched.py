@@ -1,4 +1,4 @@
-"""Artefact of the stage 'match': the stars of a run, and those that are set aside."""
+"""Artefact of the stage 'match': the fitted and the held-out stars of a run."""
 
 from __future__ import annotations
 
@@ -32,28 +32,28 @@ MATCHING = "matching.ecsv"
 
 @dataclass(frozen=True)
 class Outline:
-    """What is known of a solution before stars are matched."""
+    """Properties of a solution that are known before stars are matched."""
 
-    model: DistortionModel  # without frames of exposures
+    model: DistortionModel  # without the frames of exposures
     pixel: float  # size of a pixel in the unit of u and v
     filter: str = ""
-    tables: tuple[LookupTable, ...] = ()  # at the nodes that the run's own will have
+    tables: tuple[LookupTable, ...] = ()  # with the nodes that the fitted tables will have
 
 
 @dataclass(frozen=True, eq=False)
 class Matched:
-    """Matches of a run, in two parts, as they were read or found."""
+    """Matches of a run, divided into fitted and held-out stars."""
 
-    section: ClassVar[str] = ""  # of summary.json, that has the facts
-    has_catalogue: ClassVar[bool] = True  # positions of stars come from a reference catalogue
-    along_detector: ClassVar[bool] = False  # u and v are so, and not along the sky
+    section: ClassVar[str] = ""  # section of summary.json that holds `facts`
+    has_catalogue: ClassVar[bool] = True  # star positions come from a reference catalogue
+    along_detector: ClassVar[bool] = False  # u and v are along the detector axes, not along the sky
 
-    stars: Matches  # that are fitted
-    held: Matches | None = None  # that are held out
-    whole: tuple[str, ...] = ()  # exposures that are held out whole
+    stars: Matches  # fitted stars
+    held: Matches | None = None  # held-out stars
+    whole: tuple[str, ...] = ()  # exposures that are held out entirely
     facts: Mapping[str, Any] = field(default_factory=dict)
-    table: Table | None = None  # one row for each exposure of star lists
-    catalogue: ReferenceCatalog | None = None  # where more than the matches is known
+    table: Table | None = None  # one row per exposure of star lists
+    catalogue: ReferenceCatalog | None = None  # None if only the matches are known
 
     @property
     def warnings(self) -> tuple[str, ...]:
@@ -62,37 +62,37 @@ class Matched:
 
     @property
     def tangent_point(self) -> tuple[float, float] | None:
-        """Sky position of (u, v) = (0, 0), degrees; None where u, v are not along the sky."""
+        """RA and Dec of (u, v) = (0, 0) in degrees; None if u, v are not along the sky."""
         return None if self.along_detector else self.stars.tangent_point
 
     @property
     def mirrored(self) -> bool:
-        """Boolean: u has the sign opposite to the catalogue's."""
+        """True if u has the opposite sign to that of the catalogue."""
         return self.facts.get("parity") == "mirrored"
 
     @property
     def filter(self) -> str:
-        """The one filter of the exposures; empty where it has no name."""
+        """Filter of the exposures; empty if it has no name."""
         return ""
 
     @property
     def states_errors(self) -> bool:
-        """Boolean: the catalogue has columns of errors."""
+        """True if the catalogue has columns of position errors."""
         return self.catalogue is not None and self.catalogue.sigma_u is not None
 
     @property
     def states_motion_errors(self) -> bool:
-        """Boolean: the catalogue has columns of errors of proper motions."""
+        """True if the catalogue has columns of proper-motion errors."""
         return self.catalogue is not None and self.catalogue.sigma_pm_u is not None
 
     @property
     def star_errors(self) -> StarErrors | None:
-        """Errors of the catalogue by code of the star; None where it has none."""
+        """Errors of the catalogue by star code; None if there are none."""
         return None
 
     @property
     def catalogue_name(self) -> str:
-        """Name of the file of the reference catalogue, or what it is."""
+        """File name of the reference catalogue, or 'catalogue' if it is unknown."""
         return "catalogue" if self.catalogue is None else Path(self.catalogue.source).name
 
     def of_order(self, order: int) -> Self:
@@ -100,7 +100,7 @@ class Matched:
         return self
 
     def with_motions(self, table: Matches) -> Matches:
-        """Matches with what the catalogue states of the motions of their stars."""
+        """Matches with the proper motions and their errors from the catalogue, if it has them."""
         if self.catalogue is None or table.star is None:
             return table
         names = ("pm_u", "pm_v", "sigma_pm_u", "sigma_pm_v")
@@ -110,21 +110,21 @@ class Matched:
         return table.with_columns(**dict(zip(names, motions[table.star].T, strict=True)))
 
     def aberration(self, scatter: ExposureScatter, solution: Solution) -> ScaleError | None:
-        """Error of the scale by velocity aberration, which is among the scatter; None for none."""
+        """Scale error by velocity aberration, a part of the exposure scatter; None if unknown."""
         return None
 
     def overlap(self, posterior: Posterior, tables: tuple[LookupTable, ...]) -> OverlapTest | None:
-        """Two exposures far apart in time laid on each other; None where none are known so."""
+        """Comparison of two exposures far apart in time; None if it does not apply."""
         return None
 
     def save(self, folder: Path) -> None:
-        """Write the files of a run's folder that belong to it."""
+        """Write the matches to the folder of a run."""
         if self.table is not None:
             write_table(self.table, folder / MATCHING)
 
 
 def columns_by_code(catalog: ReferenceCatalog, *names: str) -> Float | None:
-    """Columns of a catalogue by code of the star (codes, n); None where it lacks one of them."""
+    """Catalogue columns by star code (codes, n); None if the catalogue lacks any of them."""
     out = np.zeros((int(catalog.star.max()) + 1, len(names)))
     for k, name in enumerate(names):
         values = getattr(catalog, name)
@@ -137,28 +137,39 @@ def columns_by_code(catalog: ReferenceCatalog, *names: str) -> Float | None:
 def set_aside(
     config: Config, matches: Matches, needed: int = 0
 ) -> tuple[Matches, Matches | None, tuple[str, ...]]:
-    """Matches that are fitted, those that are held out, and exposures that are so as a whole.
+    """Matches to fit, held-out matches, and the names of exposures that are held out entirely.
 
-    `needed`: so many of the first exposures define the gauge and cannot be held out.
+    Parameters
+    ----------
+    config : Config
+        Its section [holdout] says which stars are held out; without it none are.
+    matches : Matches
+    needed : int
+        Number of leading exposures that define the gauge and therefore cannot be held out.
+
+    Raises
+    ------
+    InputError
+        If too few stars would be held out, or an exposure that defines the gauge is named.
     """
     block = config.holdout
     if block is None:
         return matches, None, ()
-    whole = _whole_exposures(block, config.sampler.seed, matches.exposure_names, needed)
-    split = split_matches(matches, HoldoutSpec(block.fraction, whole, config.sampler.seed))
+    held_exposures = _whole_exposures(block, config.sampler.seed, matches.exposure_names, needed)
+    split = split_matches(matches, HoldoutSpec(block.fraction, held_exposures, config.sampler.seed))
     if not HELD_OUT.met_by(len(split.held)):
         raise InputError(
             f"{len(split.held)} of {len(matches)} stars are held out, which say too little",
             where=", ".join(matches.sources),
             do=f"hold out at least {HELD_OUT.value}: raise holdout.fraction",
         )
-    return split.kept, split.held, whole
+    return split.kept, split.held, held_exposures
 
 
 def _whole_exposures(
     block: HoldoutBlock, seed: int, names: tuple[str, ...], needed: int
 ) -> tuple[str, ...]:
-    """Exposures that are set aside whole: the named ones, or so many drawn by the seed."""
+    """Exposures to hold out entirely: those named, or a number drawn with the seed."""
     if isinstance(block.exposures, int):
         return exposures_drawn(names[needed:], block.exposures, seed)
     for name in block.exposures:

@@ -1,4 +1,4 @@
-"""Star lists of exposures, and the known distortion they are first seen through."""
+"""Star lists of exposures, and the initial distortion that is applied to them."""
 
 from __future__ import annotations
 
@@ -19,42 +19,44 @@ from bayesdist.products import IdcTab, read_idctab
 from bayesdist.products.formats.idctab.calibration import idctab_calibration
 from bayesdist.utils.arrays import Bool, Float, Int
 
-OFF_CHIP = 0.02  # of a list's detections beyond the edge of a chip: more are no stray ones
-EDGE = 1.0  # pixels: half of one to the edge, and half of one for lists that count from 0
+OFF_CHIP = 0.02  # fraction of a list's detections tolerated beyond the edge of a chip
+EDGE = 1.0  # pixels: half a pixel to the edge, and half for lists that count from 0
 
 
 @dataclass(frozen=True, eq=False)
 class StarLists:
-    """Star lists, and which of their detections pass the cuts."""
+    """Star lists with the cuts that are applied to their detections."""
 
     lists: tuple[Detections, ...]
     cuts: StarCuts
 
     def __len__(self) -> int:
-        """Detections of all lists."""
-        return sum(len(one) for one in self.lists)
+        """Number of detections in all lists."""
+        return sum(len(detections) for detections in self.lists)
 
     @property
     def names(self) -> list[str]:
-        """Exposures of the lists."""
-        return [one.name for one in self.lists]
+        """Names of the exposures, one per list."""
+        return [detections.name for detections in self.lists]
 
     def of(self, names: Collection[str]) -> StarLists:
-        """Lists of some exposures."""
-        return replace(self, lists=tuple(one for one in self.lists if one.name in names))
+        """Star lists of the named exposures."""
+        return replace(
+            self, lists=tuple(detections for detections in self.lists if detections.name in names)
+        )
 
     @cached_property
     def _tested(self) -> list[tuple[Bool, dict[str, int]]]:
-        return [self.cuts.passed(one) for one in self.lists]
+        return [self.cuts.passed(detections) for detections in self.lists]
 
     @property
     def passed(self) -> list[Bool]:
-        """Boolean mask of the detections that pass, by list."""
+        """Boolean masks of the detections that pass the cuts, one per list."""
         return [good for good, _ in self._tested]
 
     @property
     def cut(self) -> dict[str, int]:
-        """Detections that do not pass, by reason."""
+        """Number of detections that fail the cuts, by reason."""
         out: dict[str, int] = {}
         for _, reasons in self._tested:
             for reason, count in reasons.items():
@@ -63,44 +65,58 @@ class StarLists:
 
     @property
     def cut_words(self) -> str:
-        """Number of the detections that do not pass, by reason."""
+        """Numbers of the detections that fail the cuts, with their reasons, as text."""
         return ", ".join(f"{count} {reason}" for reason, count in self.cut.items())
 
 
 def lists_of(block: StarListsBlock, base: Path, *, errors: bool = False) -> StarLists:
-    """All star lists that a configuration names, with `errors` of their own; relative to `base`.
+    """Read all star lists that a configuration names.
 
-    Each place is read alone: a list whose name stands in two is an exposure given twice, not two.
+    Each entry of the configuration is read separately, so that lists of the same name in two
+    entries are recognised as one exposure given twice, not as two exposures.
+
+    Parameters
+    ----------
+    block : StarListsBlock
+    base : Path
+        Folder that the names of the lists are relative to.
+    errors : bool
+        True if the lists have columns of errors.
     """
     names = block.list_names
     lists = (
-        one for name in names for one in read_star_lists(base / name, block.columns, errors=errors)
+        detections
+        for name in names
+        for detections in read_star_lists(base / name, block.columns, errors=errors)
     )
     return StarLists(tuple(lists), StarCuts(block.mag, block.saturation, block.q_max))
 
 
 def refuse_other_chips(lists: Sequence[Detections], chips: Sequence[Chip], key: str) -> None:
-    """Refuse detections off the chips of a configuration, and chips without any.
+    """Refuse detections off the configured chips, and chips without detections.
 
-    Nothing is checked without [[chip]] blocks. `key`: of the configuration, names the lists.
+    Nothing is checked if the configuration has no [[chip]] blocks. `key` is the configuration key
+    that names the lists, for the error message.
     """
-    known = {chip.number: chip for chip in chips}
-    if not known:
+    chip_of = {chip.number: chip for chip in chips}
+    if not chip_of:
         return
-    seen: set[int] = set()
-    for one in lists:
-        for number in one.chips:
-            rows = one.chip == number
-            if number not in known:
+    used: set[int] = set()
+    for detections in lists:
+        for number in detections.chips:
+            rows = detections.chip == number
+            if number not in chip_of:
                 raise InputError(
                     f"{int(rows.sum())} detections are on chip {number}, which no [[chip]] block "
                     "describes",
-                    where=one.where,
-                    do=f"add a block, or leave them out (known: {', '.join(map(str, known))})",
+                    where=detections.where,
+                    do=f"add a block, or leave them out (known: {', '.join(map(str, chip_of))})",
                 )
-            _refuse_off_chip(one.x[rows], one.y[rows], known[number], one.where)
-        seen.update(one.chips)
-    empty = [chip.name for chip in chips if chip.number not in seen]
+            _refuse_off_chip(
+                detections.x[rows], detections.y[rows], chip_of[number], detections.where
+            )
+        used.update(detections.chips)
+    empty = [chip.name for chip in chips if chip.number not in used]
     if empty:
         raise InputError(
             f"no exposure has a detection on chip {', '.join(empty)}",
@@ -123,20 +139,20 @@ def _refuse_off_chip(x: Float, y: Float, chip: Chip, where: str) -> None:
 
 
 def known_calibration(tab: IdcTab | Path, filter: str | None) -> Calibration:
-    """The calibration of an IDCTAB in a filter, or in any where it does not name that one."""
-    known = read_idctab(tab) if isinstance(tab, Path) else tab
-    names = {name for row in known.filters() for name in row}
-    return idctab_calibration(known, filter if filter in names else None)
+    """Calibration of an IDCTAB in a filter, or without a filter if it does not list that one."""
+    table = read_idctab(tab) if isinstance(tab, Path) else tab
+    names = {name for row in table.filters() for name in row}
+    return idctab_calibration(table, filter if filter in names else None)
 
 
 def start_of(tab: IdcTab | Path, unit_arcsec: float, filter: str | None = None) -> Start:
-    """The distortion of an IDCTAB, to a unit of u and v, up to rotation and shift."""
-    known = known_calibration(tab, filter)
-    return lambda x, y, chip: known.forward(x, y, chip=chip) / unit_arcsec
+    """Distortion of an IDCTAB in the given unit of u and v, up to rotation and shift."""
+    calibration = known_calibration(tab, filter)
+    return lambda x, y, chip: calibration.forward(x, y, chip=chip) / unit_arcsec
 
 
 def positions_by_chip(start: Start, x: Float, y: Float, chip: Int) -> Float:
-    """Positions (N, 2) of pixels on chips with numbers (N,)."""
+    """Positions (N, 2) of pixels x, y (N,) on the chips with numbers `chip` (N,)."""
     out = np.empty((len(x), 2))
     for number in np.unique(chip):
         rows = chip == number

@@ -1,1 +1,1 @@
-"""Files for pipelines, and what they differ from the solution by."""
+"""Products for pipelines, and their differences from the solution."""

@@ -1,4 +1,4 @@
-"""Files for pipelines, written and compared with the solution, and headers with the stars."""
+"""Writing of products for pipelines, and comparison with the solution and the stars."""
 
 from __future__ import annotations
 
@@ -47,11 +47,30 @@ def export(
     *,
     source: str = "",
 ) -> list[dict[str, Any]]:
-    """Write the files that a configuration asks for, and list what is known of each.
+    """Write the configured products and list their properties.
 
-    Their errors are compared with the budget of the `evaluation`, headers on the sky with the
-    stars.  `found`: whose errors of the parameters the files have, too.  Each entry has path, kind,
-    findings, and what else is known of the file.
+    File errors are compared with the budget of the evaluation, and headers on the sky with the
+    stars.
+
+    Parameters
+    ----------
+    evaluation : Evaluation or None
+    posterior : Posterior
+    found : Diagnostics or None
+        Diagnostics, which add their errors to those of the parameters.
+    data : FitData
+    config : Config
+    base : Path
+        Folder that file names in the configuration are relative to.
+    folder : Path
+        Folder to write to.
+    source : str
+        Name of the solution in the files.
+
+    Returns
+    -------
+    list of dict
+        One entry per file: path, kind, findings, and other properties.
     """
     product = product_of(posterior, found, data, config, source)
     budget = [] if evaluation is None else evaluation.budget.rows()
@@ -94,13 +113,13 @@ def export(
                 log.info("export: %s: %s", path.name, note)
                 findings.append(f"note: {note}")
             products.append(entry | dict(built.summary) | {"findings": findings})
-    for one in products:
-        _compare(one, budget)
+    for entry_of_file in products:
+        _compare(entry_of_file, budget)
     return products
 
 
 def _left_out(key: str, product: ProductInput) -> tuple[str, ...]:
-    """Warning on the look-up tables of a run that a format has no room for."""
+    """Warning if a format cannot hold the look-up tables of a run."""
     if not product.options.tables or format_of(key).holds_tables:
         return ()
     return (
@@ -110,7 +129,7 @@ def _left_out(key: str, product: ProductInput) -> tuple[str, ...]:
 
 
 def _compare(product: dict[str, Any], budget: Sequence[dict[str, Any]]) -> None:
-    """Note what the budget says of a file, and what the total is for whoever uses it."""
+    """Add file errors from the budget to an entry, and the total error for users of the file."""
     for row in budget:
         files, _, direction = row["name"].rpartition(", ")
         path = product["path"]
@@ -129,16 +148,16 @@ def _compare(product: dict[str, Any], budget: Sequence[dict[str, Any]]) -> None:
                 )
 
 
-FALSE = 0.5  # probability above which a match is taken for a false one
+FALSE = 0.5  # outlier probability above which a match counts as false
 
 
 def sky_closure(
     product: ProductInput, stars: StarSample, path: Path, chip: int
 ) -> tuple[dict[str, Any], list[str]] | None:
-    """How far a header as written is from stars and solution, for summary.json, and its faults.
+    """Distance of a header as written from stars and solution, for summary.json, and its faults.
 
-    None where the stars are not on the sky, or none is left: of several exposures with frames only
-    the first one counts, whose header it is.
+    None if the stars are not on the sky or none remain.  If exposures have frames, only the first
+    one is compared, because the header is for that exposure.
     """
     point, solution = product.calibration.plane.point, product.solution
     if point is None:
@@ -164,28 +183,28 @@ def sky_closure(
     when = {} if model.time is None else {"epoch": product.options.epoch}
     uv = model.predict(solution.mean, x, y, chip=chip, **when)
     u, v = uv.T * arcsec
-    own = SkyCoord(*sky_of_plane(u, v, point), unit="deg")
+    predicted = SkyCoord(*sky_of_plane(u, v, point), unit="deg")
     east, north = (float(a.to_value(apu.arcsec).mean()) for a in true.spherical_offsets_to(at))
-    found = {
-        "n": int(mine.sum()),  # without those that are probably false matches
+    sky = {
+        "n": int(mine.sum()),  # without probable false matches
         "rms_arcsec": float(np.sqrt(np.mean(true.separation(at).arcsec ** 2))),
-        # of header minus star
+        # header minus star
         "mean_east_arcsec": east,
         "mean_north_arcsec": north,
-        "solution_arcsec": float(own.separation(at).arcsec.max()),  # the largest
+        "solution_arcsec": float(predicted.separation(at).arcsec.max()),  # maximum
     }
-    far = found["solution_arcsec"]
+    far = sky["solution_arcsec"]
     off = far / (model.pixel_size(solution.mean) * arcsec)
     faithful = SKY_CLOSURE.met_by(off)
     log.log(
         logging.INFO if faithful else logging.WARNING,
-        f"export: {path.name}: on the sky by astropy.wcs {found['rms_arcsec']:.4g} arcsec rms from "
-        f"RA, Dec of {found['n']} stars, on average {east:+.2g} east and {north:+.2g} north; "
+        f"export: {path.name}: on the sky by astropy.wcs {sky['rms_arcsec']:.4g} arcsec rms from "
+        f"RA, Dec of {sky['n']} stars, on average {east:+.2g} east and {north:+.2g} north; "
         f"{far:.2g} arcsec at most from the solution",
     )
     if faithful:
-        return found, []
-    return found, [
+        return sky, []
+    return sky, [
         f"error: sky: astropy.wcs puts pixels up to {far:.3g} arcsec ({off:.2g} px) from where the "
         "solution has them"
     ]

@@ -1,4 +1,4 @@
-"""Calibration files of a solution as the configuration asks for them; released sets of files."""
+"""Calibration files of a solution as configured, and files of a release."""
 
 from __future__ import annotations
 
@@ -36,33 +36,33 @@ from bayesdist.products import Period, read_calibration, write_release
 from bayesdist.products.formats.common.document import BuildOptions, Built
 from bayesdist.products.registry import build, lint
 
-# rows of a budget that the covariance of the exported solution holds, or another row
+# rows of a budget that are included in the covariance of the exported solution, or in another row
 IN_COVARIANCE = (
     *(COEFFICIENTS, TIME_DEPENDENCE, EXPOSURE_FRAME, STRUCTURE_IN_FIT, DEVIATIONS),
     *(CATALOGUE, MOTIONS, ABERRATION),
 )
 
 
-REHEARSED_SIGMA = 1e-3  # pixels, of each coefficient: files state their errors
+REHEARSED_SIGMA = 1e-3  # pixels: assumed error of each coefficient, because files state errors
 
 
 @dataclass(frozen=True, eq=False)
 class ProductInput:
-    """Ingredients of the files of a run."""
+    """Ingredients of the products of a run."""
 
-    solution: Solution  # with the frames of its exposures
-    calibration: Calibration  # of it, with what the files say of its run
+    solution: Solution  # including the frames of its exposures
+    calibration: Calibration  # of the solution, with facts of its run
     options: BuildOptions
-    aligned: bool = False  # the user of a file fits shift and rotation of an exposure
+    aligned: bool = False  # True if users of a file fit shift and rotation of an exposure
 
 
 def further_errors(
     budget: Sequence[Mapping[str, Any]], discrepancy: Mapping[str, Any] | None = None
 ) -> tuple[FurtherError, ...]:
-    """Rows of a budget of errors that the covariance of the exported solution does not hold.
+    """Rows of an error budget that the covariance of the exported solution does not include.
 
-    `discrepancy` are the facts of the estimated one, by which its structure is correlated between
-    positions.
+    `discrepancy` is the section 'discrepancy' of summary.json, which states the correlation of
+    structure between positions.
     """
     correlation = tuple((discrepancy or {}).get("structure_correlation", ()))
     return tuple(
@@ -88,10 +88,10 @@ def with_facts_of_run(
     budget: Sequence[Mapping[str, Any]],
     discrepancy: Mapping[str, Any] | None = None,
 ) -> Calibration:
-    """Calibration of the solution of a run, with all else that the run knows.
+    """Calibration of the solution of a run with further facts of the run.
 
-    That is the size of a pixel, the look-up tables, and the rows of the budget that the covariance
-    does not hold, correlated between positions as the facts of the `discrepancy` say.
+    These are the pixel size, the look-up tables, and the rows of the budget that the covariance
+    does not include, with the correlation between positions that `discrepancy` states.
     """
     mas, unit = config.detector.scale_mas, calibration.unit
     if unit != "pix" and mas is not None:
@@ -102,21 +102,21 @@ def with_facts_of_run(
 
 
 def product_input(solution: Solution, data: FitData, config: Config, source: str) -> ProductInput:
-    """Ingredients of the files of a solution; they say that it is from `source`, or a detector."""
+    """Ingredients of the products of a solution; `source` is its name in the files."""
     fitted, model = data.fitted, data.model
     plane, point = Plane(), data.matched.tangent_point
     if point is not None:
         note = ""
         if model.frames != "none" and len(model.exposures) > 1:
-            # for which exposure a file is right on the sky, as they differ
+            # exposures have different frames, so that a file on the sky is for one of them
             first = model.exposures[0]
             note = f"On the sky it is exposure {first}: others have frames of their own."
         plane = Plane("sky", point=point, note=note)
     epoch, tables = assessment_epoch(data, config), fitted.tables.tables
-    found = _input_of(solution, config, source, plane, data.matched.filter, epoch, tables)
+    ingredients = _input_of(solution, config, source, plane, data.matched.filter, epoch, tables)
     notes = (fitted.gauge_words,) if fitted.gauge_words else ()
-    calibration = replace(found.calibration, notes=notes)
-    return replace(found, calibration=calibration, aligned=fitted.scatter is not None)
+    calibration = replace(ingredients.calibration, notes=notes)
+    return replace(ingredients, calibration=calibration, aligned=fitted.scatter is not None)
 
 
 def _input_of(
@@ -130,15 +130,15 @@ def _input_of(
 ) -> ProductInput:
     detector = config.detector
     name = source or detector.name or "solution"
-    found = calibration_of(solution, name, plane=plane, detector=detector.name, filter=filter)
+    calibration = calibration_of(solution, name, plane=plane, detector=detector.name, filter=filter)
     scale = None if detector.scale_mas is None else detector.scale_mas / 1000
-    return ProductInput(solution, found, BuildOptions(epoch, scale, tables))
+    return ProductInput(solution, calibration, BuildOptions(epoch, scale, tables))
 
 
 def rehearse_files(product: ProductInput, config: Config) -> None:
-    """Make the files that the configuration asks for, with the names of its error terms.
+    """Make the configured products, with the names of the error terms, without writing them.
 
-    Nothing is written; whatever a format cannot hold is refused.
+    Raises if a format cannot hold the solution.
     """
     rows = tuple(
         FurtherError(block.name, block.kind, 0.0, 0.0, block.source) for block in config.budget
@@ -147,7 +147,7 @@ def rehearse_files(product: ProductInput, config: Config) -> None:
 
 
 def rehearse_outline(outline: Outline, config: Config, base: Path, source: str) -> None:
-    """Make all files of a run from a solution of undistorted chips, before stars are matched."""
+    """Make all products from a solution of undistorted chips, before stars are matched."""
     model, time = outline.model, outline.model.time
     chips = fitted_polynomials(undistorted(model.chips, outline.pixel), model.chips, model.order)
     mean = np.zeros(model.n_params)
@@ -169,9 +169,9 @@ def rehearse_outline(outline: Outline, config: Config, base: Path, source: str) 
 
 
 def solution_of(posterior: Posterior, found: Diagnostics | None, fitted: Fitted) -> Posterior:
-    """Posterior with all errors of the parameters that were found, as it is exported and shown.
+    """Posterior with all errors of the parameters that were found, as exported and shown.
 
-    Neither catalogue nor matches are needed for it.
+    Neither the catalogue nor the matches are needed.
     """
     return with_diagnosed_errors(
         posterior, found, None if fitted.scatter is None else fitted.linear
@@ -181,12 +181,12 @@ def solution_of(posterior: Posterior, found: Diagnostics | None, fitted: Fitted)
 def product_of(
     posterior: Posterior, found: Diagnostics | None, data: FitData, config: Config, source: str
 ) -> ProductInput:
-    """Ingredients of the files of a posterior with all errors of the parameters."""
+    """Ingredients of the products of a posterior with all errors of the parameters."""
     return product_input(solution_of(posterior, found, data.fitted), data, config, source)
 
 
 def made_files(product: ProductInput, config: Config) -> dict[str, tuple[Built, ...]]:
-    """Files by the key of their format."""
+    """Content of the configured products, by the key of their format."""
     return {
         key: build(key, product.calibration, settings, product.options)
         for key, settings in config.products.asked().items()
@@ -202,11 +202,28 @@ def write_files(
     tables: Sequence[LookupTable],
     history: Sequence[str] = (),
 ) -> list[dict[str, Any]]:
-    """Write the files of one filter or several, as the configuration of one run says.
+    """Write the files of a release for one or several filters, as configured by one run.
 
-    `chip`: whose axes and zero point define the gauge. `solutions`: the configuration's own first:
-    V2 and V3 lie as the reference says of it. `history`: lines for HISTORY of all files. An entry
-    is path, kind, findings, and of an IDCTAB period and lost.
+    Parameters
+    ----------
+    block : ReleaseBlock
+    chip : int
+        Chip that defines the gauge by its axes and zero point.
+    base : Path
+        Folder that file names in the configuration are relative to.
+    folder : Path
+        Folder to write to.
+    solutions : mapping of str to Solution
+        Solutions by filter.  The first one must be that of the configuration: V2 and V3 are
+        oriented as the reference states for it.
+    tables : sequence of LookupTable
+    history : sequence of str
+        Lines for HISTORY in all files.
+
+    Returns
+    -------
+    list of dict
+        One entry per file: path, kind, findings and, for an IDCTAB, period and lost.
     """
     calibrations = {
         filter: calibration_of(
@@ -228,7 +245,7 @@ def write_files(
         block.name,
         calibrations,
         orientation,
-        [Period(**one.model_dump()) for one in block.period],
+        [Period(**row.model_dump()) for row in block.period],
         tables=tables,
         instrument=block.instrument,
         detector=block.detector,
@@ -238,11 +255,11 @@ def write_files(
     )
     out: list[dict[str, Any]] = []
     for period, path in written.idctabs.items():
-        lost = [asdict(one) for one in written.lost.get(period, ())]
+        lost = [asdict(row) for row in written.lost.get(period, ())]
         out.append(_entry(path, "IDCTAB") | {"period": period, "lost": lost})
-    others = [] if written.d2im is None else [("D2IMFILE", written.d2im)]
-    others += [("NPOLFILE", path) for path in written.npol.values()]
-    return out + [_entry(path, kind) for kind, path in others]
+    lookup_files = [] if written.d2im is None else [("D2IMFILE", written.d2im)]
+    lookup_files += [("NPOLFILE", path) for path in written.npol.values()]
+    return out + [_entry(path, kind) for kind, path in lookup_files]
 
 
 def _entry(path: Path, kind: str) -> dict[str, Any]:

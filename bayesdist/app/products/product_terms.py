@@ -1,10 +1,10 @@
-"""Differences of the files of a run from its solution, read back from the files as written.
+"""Differences between products as written and the solution of their run.
 
-What a file says of positions its format knows (`read_back`).  A SIP header holds one chip at one
-date: drift is left out at any other, look-up tables always.  An IDCTAB lies along axes of its own
-and counts in its own pixels: the best shift, rotation and, once for all dates, scale are taken out;
-of a released set the look-up tables are applied as well.  An inverse is compared with the forward
-terms of its own file, between which a user goes to and fro.
+Each format reads its files back (`read_back`).  A SIP header holds one chip at one date: drift to
+other dates and look-up tables are always left out.  An IDCTAB has axes and a pixel of its own: the
+best-fitting shift, rotation and (common to all dates) scale are removed; the look-up tables of a
+released set are applied as well.  An inverse is compared with the forward terms of its own file,
+because users transform back and forth with the same file.
 """
 
 from __future__ import annotations
@@ -36,32 +36,32 @@ log = logging.getLogger("bayesdist")
 
 
 FORWARD, INVERSE = "forward", "inverse"
-GRID = (33, 33)  # points over which files are laid on the solution
-ROUNDING = 1e-9  # of a pixel
-SKY_ROUNDING = 2e-9  # arcsec: what double precision leaves of an RA of 360 degrees, and back
+GRID = (33, 33)  # grid on which files are aligned with the solution
+ROUNDING = 1e-9  # pixels
+SKY_ROUNDING = 2e-9  # arcsec: rounding error of converting to an RA near 360 degrees and back
 
 
 def product_terms(product: ProductInput, config: Config, base: Path) -> tuple[Known, ...]:
-    """Terms of the files that the configuration asks for.
+    """Error terms of the configured products.
 
-    They are read back from their bytes, so that digits and orders are those of the files; nothing
-    of the run is touched.
+    The products are read back from their bytes, so that digits and orders are those of the files;
+    the folder of the run is not changed.
     """
-    found: list[ReadBack] = []
+    files_read: list[ReadBack] = []
     for key, files in made_files(product, config).items():
-        found += read_back(key, files, product.calibration, product.options)
+        files_read += read_back(key, files, product.calibration, product.options)
     release = config.products.release
     if release is None:
-        return tuple(_terms(product, found))
+        return tuple(_terms(product, files_read))
     with TemporaryDirectory() as folder:
         number = config.chips()[0].number
         sets = _released(product, release, number, base, Path(folder))
-        found.append(by_calibrations(release.name, sets, product.solution.model.time))
-        return tuple(_terms(product, found))
+        files_read.append(by_calibrations(release.name, sets, product.solution.model.time))
+        return tuple(_terms(product, files_read))
 
 
 def file_errors(product: ProductInput, config: Config, base: Path) -> tuple[Known, ...]:
-    """As `product_terms`; none where the files cannot be made, of which the export complains."""
+    """As `product_terms`; empty if the files cannot be made, which the export reports."""
     try:
         return product_terms(product, config, base)
     except BayesdistError as error:
@@ -70,15 +70,15 @@ def file_errors(product: ProductInput, config: Config, base: Path) -> tuple[Know
 
 
 def _terms(product: ProductInput, files: Sequence[ReadBack]) -> Iterator[Known]:
-    """Forward terms against the solution, and the inverse where a file has one."""
-    for one in files:
-        yield _term(product, one.file, FORWARD, _forward(product, one))
-        if one.missed is not None:
-            yield _term(product, one.file, INVERSE, _in_unit(product, one.missed))
+    """Forward terms against the solution, and the inverse if a file has one."""
+    for file in files:
+        yield _term(product, file.file, FORWARD, _forward(product, file))
+        if file.missed is not None:
+            yield _term(product, file.file, INVERSE, _in_unit(product, file.missed))
 
 
 def _forward(product: ProductInput, file: ReadBack) -> Positions:
-    """Positions by a file less those of the solution, as its user sees them."""
+    """Difference between the positions of a file and of the solution, as its user sees it."""
     if file.own_axes or product.aligned:
         return _Laid(product, file.forward, scaled=file.own_axes)
     return lambda x, y, c, t: file.forward(x, y, c, t) - _solution(product, x, y, c, t)
@@ -87,7 +87,7 @@ def _forward(product: ProductInput, file: ReadBack) -> Positions:
 def _released(
     product: ProductInput, block: ReleaseBlock, number: int, base: Path, folder: Path
 ) -> list[Calibration]:
-    """The files of a release, one set for each segment: of several periods of one, the first."""
+    """Calibrations of a release, one per segment; of several periods of a segment the first."""
     filter = product.calibration.filter
     solutions = {filter: product.solution}
     entries = write_files(block, number, base, folder, solutions, product.options.tables)
@@ -97,11 +97,11 @@ def _released(
     sets = {}
     for entry in entries:
         if entry["kind"] == "IDCTAB":
-            one = read_calibration(folder / entry["path"], filter=filter)
+            calibration = read_calibration(folder / entry["path"], filter=filter)
             tables = [] if npol is None else [npol.table(chip) for chip in npol.chips]
-            pixel = one.pixel()[0]
+            pixel = calibration.pixel()[0]
             after = [replace(table, values=pixel * table.values, sigma=None) for table in tables]
-            sets[entry["period"]] = replace(one, before=tuple(before), after=tuple(after))
+            sets[entry["period"]] = replace(calibration, before=tuple(before), after=tuple(after))
     segments: dict[int, Calibration] = {}
     for period in block.period:
         segments.setdefault(period.segment, sets[period.name])
@@ -113,22 +113,22 @@ def _released(
 
 def _term(product: ProductInput, file: str, direction: str, shift: Positions) -> Known:
     solution = product.solution
-    least = ROUNDING * solution.model.pixel_size(solution.mean)
+    threshold = ROUNDING * solution.model.pixel_size(solution.mean)
     if product.calibration.plane.point is not None:
-        least = max(least, SKY_ROUNDING / ARCSEC[solution.model.unit])
+        threshold = max(threshold, SKY_ROUNDING / ARCSEC[solution.model.unit])
     against = "the solution" if direction == FORWARD else "its forward terms"
     source = f"{MEASURED}: as written, against {against}"
 
     def rounded(x: Float, y: Float, chip: int, epoch: float | None) -> Float:
-        # displacements below this are digits of the arithmetic
-        found = np.asarray(shift(x, y, chip, epoch), float)
-        return np.where(np.abs(found) < least, 0.0, found)
+        # smaller displacements are rounding errors
+        displacement = np.asarray(shift(x, y, chip, epoch), float)
+        return np.where(np.abs(displacement) < threshold, 0.0, displacement)
 
     return Known(Row(f"{file}, {direction}", PRODUCT, source, in_total=False), rounded)
 
 
 def _solution(product: ProductInput, x: Float, y: Float, chip: int, epoch: float | None) -> Float:
-    """Positions (N, 2) by the solution: tables where it has some, then the polynomials."""
+    """Positions (N, 2) of the solution: look-up tables, if any, followed by the polynomials."""
     solution = product.solution
     if product.options.tables:
         x, y = corrected(product.options.tables, x, y, chip=chip, filter=product.calibration.filter)
@@ -137,7 +137,7 @@ def _solution(product: ProductInput, x: Float, y: Float, chip: int, epoch: float
 
 
 def _in_unit(product: ProductInput, missed: Positions) -> Positions:
-    """Displacements of pixels as those of positions."""
+    """Displacements in pixels converted to displacements of positions."""
     solution = product.solution
 
     def shift(x: Float, y: Float, chip: int, epoch: float | None) -> Float:
@@ -150,10 +150,15 @@ def _in_unit(product: ProductInput, missed: Positions) -> Positions:
 
 
 class _Laid:
-    """Positions by a file, laid on those of the solution over all chips at once, less these.
+    """Difference between the solution and positions of a file, aligned with it over all chips.
 
-    `place`: positions by the file, in a unit of its own where `scaled`. `scaled`: whether the
-    file's scale is a convention of its own, found at the date of the assessment.
+    Parameters
+    ----------
+    product : ProductInput
+    place : callable
+        Positions of the file, in an arbitrary unit if `scaled`.
+    scaled : bool
+        True if the scale of the file is a convention; it is fitted at the date of the assessment.
     """
 
     def __init__(self, product: ProductInput, place: Positions, *, scaled: bool) -> None:
@@ -178,20 +183,23 @@ class _Laid:
     def _fitted(
         self, epoch: float | None, size: float | None = None
     ) -> tuple[complex, complex, bool]:
-        """Shift and factor, of a given size, by least squares; mirrored where that is nearer."""
+        """Least-squares shift and factor, of a given size if any, and the better parity.
+
+        The result is complex shift, complex factor, and True if mirrored.
+        """
         z, w = [], []
         for chip in self.product.solution.model.chips:
             x, y = mesh(*grid_pixels(chip.size, GRID))
             z.append(_solution(self.product, x, y, chip.number, epoch) @ [1, 1j])
             w.append(self.place(x, y, chip.number, epoch) @ [1, 1j])
-        here, there = np.concatenate(z), np.concatenate(w)
-        found = []
+        target, positions = np.concatenate(z), np.concatenate(w)
+        fits = []
         for mirrored in (False, True):
-            v = there.conj() if mirrored else there
-            factor = np.vdot(v - v.mean(), here) / np.vdot(v - v.mean(), v)
+            v = positions.conj() if mirrored else positions
+            factor = np.vdot(v - v.mean(), target) / np.vdot(v - v.mean(), v)
             if size is not None:
                 factor *= size / abs(factor)
-            zero = (here - factor * v).mean()
-            found.append((float(np.std(here - zero - factor * v)), zero, factor, mirrored))
-        _, zero, factor, mirrored = min(found, key=lambda one: one[0])
+            zero = (target - factor * v).mean()
+            fits.append((float(np.std(target - zero - factor * v)), zero, factor, mirrored))
+        _, zero, factor, mirrored = min(fits, key=lambda candidate: candidate[0])
         return complex(zero), complex(factor), mirrored

@@ -1,4 +1,4 @@
-"""Artefacts of a run: each is made when what it was made from has changed."""
+"""Artefacts of a run: each is made again when its ingredients have changed."""
 
 from __future__ import annotations
 

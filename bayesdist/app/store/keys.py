@@ -1,4 +1,4 @@
-"""Values as plain JSON, and keys of artefacts: a hash of what each was made from."""
+"""Conversion of values to plain JSON, and keys of artefacts: hashes of their ingredients."""
 
 from __future__ import annotations
 
@@ -15,30 +15,50 @@ from pydantic_core import to_jsonable_python
 
 @dataclass(frozen=True)
 class Adjustable:
-    """Settings that may change while a stage is resumed: in its key, not in its checkpoints."""
+    """Settings that may change when a stage is resumed.
+
+    They are part of the key of the stage, but not of that of its checkpoints.
+
+    Parameters
+    ----------
+    value : object
+        Settings that `as_json` can convert.
+    """
 
     value: Any
 
 
 def as_json(value: Any) -> Any:
-    """A value as plain JSON: null for what is not a finite number; TypeError for unknown content.
+    """Convert a value to plain JSON.
 
-    Settings, dataclasses, arrays, paths, and mappings and sequences of these become mappings,
-    lists, text, numbers and None.  A set has no order, and is refused.
+    Parameters
+    ----------
+    value : object
+        Settings, dataclasses, arrays, paths, or mappings and sequences of these.
+
+    Returns
+    -------
+    object
+        Mappings, lists, text, numbers and None.  Numbers that are not finite become None.
+
+    Raises
+    ------
+    TypeError
+        If the value contains anything else, or a set, which has no order.
     """
     _refuse_sets(value)
     return to_jsonable_python(value, inf_nan_mode="null", fallback=_plain)
 
 
 def attributes(one: Any, names: str) -> dict[str, Any]:
-    """Attributes of an object as a row, by their names; None each where there is no object."""
+    """Attributes of an object by name, as a row; all None if the object is None."""
     return {name: None if one is None else getattr(one, name) for name in names.split()}
 
 
 def _refuse_sets(value: Any) -> None:
-    """TypeError for a set anywhere in a value: pydantic would list it in the order of hashes."""
+    """Raise TypeError for a set anywhere in a value: pydantic would list it in hash order."""
     if value is None or isinstance(value, str | int | float | np.ndarray):
-        return  # at once: whether these are models or mappings takes long to find out
+        return  # first, because tests for models and mappings are slow
     if isinstance(value, set | frozenset):
         raise TypeError(f"{type(value).__name__} is no JSON and cannot be in a record or a key")
     if isinstance(value, dict):
@@ -49,12 +69,12 @@ def _refuse_sets(value: Any) -> None:
         if not isinstance(value, Mapping):
             return
         value = value.values()
-    for one in value:
-        _refuse_sets(one)
+    for element in value:
+        _refuse_sets(element)
 
 
 def _plain(value: Any) -> Any:
-    """What pydantic does not know, as lists, numbers and dictionaries."""
+    """Convert values that pydantic cannot serialise to lists, numbers and dictionaries."""
     if isinstance(value, np.ndarray | np.generic):
         return value.tolist()
     if isinstance(value, Mapping):
@@ -68,29 +88,41 @@ def digest_of(value: Any) -> str:
 
 
 def digest_of_plain(plain: Any) -> str:
-    """SHA-256 of plain JSON, as by `as_json`."""
+    """SHA-256 of a value that is already plain JSON, as returned by `as_json`."""
     text = json.dumps(plain, sort_keys=True, separators=(",", ":"))
     return hashlib.sha256(text.encode()).hexdigest()
 
 
 def differences(known: Any, now: Any, path: str = "") -> Iterator[tuple[str, Any, Any]]:
-    """Dotted path, old and new value of whatever differs between two values of plain JSON.
+    """Compare two values of plain JSON.
 
-    Mappings are compared key by key, lists of equal length row by row where they hold mappings.
+    Mappings are compared key by key, and lists of mappings of equal length row by row.
+
+    Parameters
+    ----------
+    known, now : object
+        Old and new value.
+    path : str
+        Dotted path that the values are found at.
+
+    Yields
+    ------
+    tuple of str, object, object
+        Dotted path, old value and new value of each difference.
     """
     if isinstance(known, Mapping) and isinstance(now, Mapping):
         for key in dict.fromkeys([*known, *now]):
             at = f"{path}.{key}" if path else str(key)
             yield from differences(known.get(key), now.get(key), at)
     elif _rows(known) and _rows(now) and len(known) == len(now):
-        for k, (one, other) in enumerate(zip(known, now, strict=True)):
-            yield from differences(one, other, f"{path}[{k + 1}]" if path else "")
+        for k, (old_row, new_row) in enumerate(zip(known, now, strict=True)):
+            yield from differences(old_row, new_row, f"{path}[{k + 1}]" if path else "")
     elif known != now:
         yield path, known, now
 
 
 def difference(known: Any, now: Any) -> str:
-    """The first difference in words, '' where there is none."""
+    """Sentence on the first difference between two values; empty if they are equal."""
     for path, old, new in differences(known, now):
         if path.startswith("from."):
             return f"{path.removeprefix('from.')} has other results"
@@ -99,11 +131,11 @@ def difference(known: Any, now: Any) -> str:
 
 
 def _rows(value: Any) -> bool:
-    """Boolean: a list of mappings."""
-    return isinstance(value, list) and all(isinstance(one, Mapping) for one in value)
+    """True for a list of mappings."""
+    return isinstance(value, list) and all(isinstance(row, Mapping) for row in value)
 
 
 def shown(value: Any) -> str:
-    """A value as text that is not too long for a line."""
+    """Text of a value, shortened to fit on a line."""
     text = "none" if value is None else json.dumps(value, ensure_ascii=False)
     return text if len(text) <= 60 else f"{text[:57]}..."

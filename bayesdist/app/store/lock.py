@@ -1,4 +1,4 @@
-"""One process at a time in a folder: a lock that ends with its process, and who holds it."""
+"""Lock that restricts a folder to one process, names its holder, and ends with the process."""
 
 from __future__ import annotations
 
@@ -17,21 +17,21 @@ from bayesdist.errors import InputError
 from bayesdist.files.atomic import made_folder
 from bayesdist.files.regular import descriptor_for_writing
 
-# some systems know no such locks
+# not available on all systems
 fcntl: Any = import_module("fcntl") if find_spec("fcntl") else None
 
 LOCK = ".bayesdist.lock"
-LONGEST = 200  # bytes that are read of it
+LONGEST = 200  # bytes to read of a lock file
 
 log = logging.getLogger("bayesdist")
 
 
 @contextmanager
 def locked(folder: Path) -> Iterator[None]:
-    """Keep other processes from writing into a folder, which is made where it is not there.
+    """Lock a folder against other processes, and create it if necessary.
 
-    The lock is that of a file, not the file itself: one that a killed process has left holds
-    nobody up.
+    The lock is held on an open file; the existence of the file does not matter.  A file left behind
+    by a killed process therefore blocks nothing.
     """
     made_folder(folder)
     if fcntl is None:
@@ -48,7 +48,7 @@ def locked(folder: Path) -> Iterator[None]:
         yield
     finally:
         with suppress(OSError):
-            path.unlink()  # while it is held: nobody else's is removed
+            path.unlink()  # while the lock is held, so that no other process's file is removed
         os.close(held)
 
 
@@ -73,22 +73,22 @@ def _acquired(path: Path) -> int:
                 where=str(path.parent),
                 do="wait until it has ended, or choose another folder",
             ) from error
-        except OSError as error:  # file systems that know no locks
+        except OSError as error:  # file systems without locks
             log.debug("%s cannot be locked: %s", path, error)
             return held
         if _is_at(held, path):
             return held
-        os.close(held)  # its holder has removed it meanwhile
+        os.close(held)  # the previous holder has removed the file in the meantime
 
 
 def _is_at(held: int, path: Path) -> bool:
-    """Boolean: an open file still has its name."""
+    """True if an open file still has its name."""
     with suppress(FileNotFoundError):
         return os.path.samestat(os.fstat(held), path.lstat())
     return False
 
 
 def _read(held: int) -> str:
-    """Words in a lock; empty where there are none."""
+    """Text in a lock file; empty if there is none."""
     text = os.pread(held, LONGEST, 0).decode("utf-8", errors="replace")
     return "".join(c for c in text if c.isprintable())

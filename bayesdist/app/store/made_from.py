@@ -1,4 +1,4 @@
-"""Ingredients of the stages of a run: inputs by name, settings, and the stages before them."""
+"""Ingredients of the stages of a run: inputs by name, settings, and the preceding stages."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ from bayesdist.version import __version__
 
 
 def input_name(path: Path, *bases: Path) -> str:
-    """Name of an input: relative to the first of some folders that it is below, else its path.
+    """Name of an input relative to the first of some folders that contains it, otherwise its path.
 
-    As a name it is that of the configuration: '../data/x' stays so.
+    Names are compared as written in the configuration: '../data/x' stays unchanged.
     """
     for base in bases:
         with suppress(ValueError):
@@ -27,18 +27,18 @@ def input_name(path: Path, *bases: Path) -> str:
 
 
 def hashes_of(config: Config, base: Path, *before: Path) -> dict[str, str]:
-    """SHA-256 of every file that a configuration names, by its name.
+    """SHA-256 of every file that a configuration names, by file name.
 
-    `base` is the folder that names are relative to, `before` are those that it was.
+    `base` is the folder that names are relative to; `before` are folders that it was in earlier.
     """
     base = base.resolve()
-    others = [*config.files_of_products(base), *config.files_of_priors(base)]
-    named = [*input_files(config.named_files(base)), *others]
+    further = [*config.files_of_products(base), *config.files_of_priors(base)]
+    named = [*input_files(config.named_files(base)), *further]
     return {input_name(path, base, *before): sha256_of(path) for path in named}
 
 
 def places_of(base: Path, run: Path) -> dict[str, str]:
-    """Facts of a record on where inputs are: by themselves, and as seen from the run."""
+    """Entries of a record that locate the inputs: their folder, also relative to the run."""
     base = base.resolve()
     places = {"base": str(base)}
     with suppress(ValueError):  # another drive
@@ -47,14 +47,14 @@ def places_of(base: Path, run: Path) -> dict[str, str]:
 
 
 def base_of(facts: Mapping[str, Any], run: Path) -> Path:
-    """Folder that inputs are relative to, by the facts of a record."""
+    """Folder that inputs are relative to, from the entries of a record."""
     recorded = Path(facts["base"])
     names = [name for name in facts["inputs"] if not Path(name).is_absolute()]
-    beside = (run / facts.get("base_from_run", recorded)).resolve()
-    return beside if names and all((beside / name).exists() for name in names) else recorded
+    relocated = (run / facts.get("base_from_run", recorded)).resolve()
+    return relocated if names and all((relocated / name).exists() for name in names) else recorded
 
 
-# stages in order; `revision` is raised when the numbers of a stage, or its files, change
+# stages in order; `revision` is raised when the results or files of a stage change
 STAGES = {
     "match": Stage(revision=2),
     "fit": Stage(revision=4),
@@ -65,7 +65,7 @@ STAGES = {
     "report": Stage(),
 }
 
-# stages that a stage cannot do without
+# stages that a stage requires
 NEEDS = {
     "match": (),
     "fit": (),
@@ -76,51 +76,65 @@ NEEDS = {
     "report": ("fit", "sample", "diagnose", "evaluate"),
 }
 
-# when to stop: the sampler goes on from its chains where these are others
+# stopping criteria: if they change the sampler continues its chains
 LIMITS = ("max_steps", "target_ess", "target_rhat")
 
-# sections that nothing goes by before there is a posterior
+# sections that are not used before the posterior
 LATER = ("assess", "budget", "requirement", "discrepancy", "periods", "products")
 
-# sections that change no number
+# sections that do not affect results
 NOWHERE = ("compute",)
 
 
 def settings_of(config: Config) -> tuple[dict[str, Any], dict[str, Any], dict[str, Any]]:
-    """Settings of a run by what they decide: the solution, the length of chains, and all later."""
-    whole = as_json(config.model_dump())
-    later = {key: whole.pop(key) for key in LATER if key in whole}
-    limits = {"sampler": {key: whole["sampler"].pop(key) for key in LIMITS}}
+    """Settings of a run, divided by what they affect.
+
+    Returns
+    -------
+    tuple of dict
+        Settings that affect the solution, those that limit the length of the chains, and those that
+        affect only later stages.
+    """
+    settings = as_json(config.model_dump())
+    later = {key: settings.pop(key) for key in LATER if key in settings}
+    limits = {"sampler": {key: settings["sampler"].pop(key) for key in LIMITS}}
     for key in NOWHERE:
-        whole.pop(key, None)
+        settings.pop(key, None)
     if _is_on_the_grid(config):
-        whole["assess"] = {"grid": later["assess"]["grid"]}
-    return whole, limits, later
+        settings["assess"] = {"grid": later["assess"]["grid"]}
+    return settings, limits, later
 
 
 def made_from_of(
     stage: str, before: Mapping[str, Made[object]], config: Config, facts: Mapping[str, Any]
 ) -> tuple[object, ...] | None:
-    """Ingredients of a stage; None where a stage is missing that it needs.
+    """Ingredients of a stage; None if a stage that it needs is missing.
 
-    `before` are the stages before it that stand; `facts` of the record have the inputs with their
-    hashes, and requirements in place of the configured ones.
+    Parameters
+    ----------
+    stage : str
+    before : mapping of str to Made
+        Preceding stages that are up to date.
+    config : Config
+    facts : mapping
+        Entries of the record: inputs with their hashes, and requirements that replace the
+        configured ones.
     """
     begins_with = () if config.data is not None or stage == "match" else ("match",)
     if not before.keys() >= {*begins_with, *NEEDS[stage]}:
         return None
     solution, limits, later = settings_of(config)
-    own = [as_json(vars(one)) for one in config.requirements()]
-    later["requirement"] = facts.get("requirements", own)
+    configured = [as_json(vars(item)) for item in config.requirements()]
+    later["requirement"] = facts.get("requirements", configured)
     base = Path(facts["base"])
-    of_products = {input_name(one, base) for one in config.files_of_products(base)}
+    of_products = {input_name(item, base) for item in config.files_of_products(base)}
     inputs = {k: v for k, v in facts["inputs"].items() if k not in of_products}
     if stage in ("match", "fit"):
         return solution, {"inputs": inputs}, *before.values()
     if stage == "sample":
         return solution, *before.values(), Adjustable(limits)
     if stage == "diagnose":
-        return before["fit"], before["sample"], Adjustable(_of_diagnoses(later, own, config))
+        return before["fit"], before["sample"], Adjustable(_of_diagnoses(later, configured, config))
     if stage == "evaluate":
         return before["fit"], before["sample"], before["diagnose"], Adjustable(later)
     later["files"] = {k: v for k, v in facts["inputs"].items() if k in of_products}
@@ -128,29 +142,30 @@ def made_from_of(
 
 
 def _of_diagnoses(later: Mapping[str, Any], own: list[Any], config: Config) -> dict[str, Any]:
-    """Settings that decide what residuals say."""
-    found = {key: later[key] for key in ("discrepancy", "periods") if key in later}
+    """Settings that affect the diagnostics."""
+    settings = {key: later[key] for key in ("discrepancy", "periods") if key in later}
     if later.get("periods"):
-        found["requirement"] = own  # the tightest limit is the tolerance of periods
-    if config.holdout is not None:  # what is held out is predicted with all errors of a position
-        found |= {key: later[key] for key in ("assess", "budget")}
-        found["useafter"] = config.products.useafter_years()  # which may be the epoch of assess
-    return found
+        settings["requirement"] = own  # the tightest limit is the tolerance of periods
+    if config.holdout is not None:  # held-out stars are predicted with all position errors
+        settings |= {key: later[key] for key in ("assess", "budget")}
+        # may be the epoch of the assessment
+        settings["useafter"] = config.products.useafter_years()
+    return settings
 
 
 def _is_on_the_grid(config: Config) -> bool:
-    """Boolean: the fit writes errors of tables on the grid of the assessment."""
+    """True if the fit writes errors of tables on the grid of the assessment."""
     tables = config.tables
     return config.campaign is not None and (tables.method != "none" or tables.detector is not None)
 
 
 def changes(known: Config, now: Config) -> Iterator[tuple[str, Any, Any]]:
-    """Dotted key, old and new value of whatever differs between two configurations."""
+    """Dotted key, old value and new value of each difference between two configurations."""
     yield from differences(as_json(known.model_dump()), as_json(now.model_dump()))
 
 
 def is_adjustable(key: str, config: Config) -> bool:
-    """Boolean: a run may be resumed with another value of a key."""
+    """True if a run may be resumed with another value of the key."""
     section, _, name = key.partition(".")
     if key.startswith("assess.grid") and _is_on_the_grid(config):
         return False
@@ -160,7 +175,7 @@ def is_adjustable(key: str, config: Config) -> bool:
 
 
 def with_seed(config: Config, seed: int | None) -> Config:
-    """A configuration with another seed; as it is where none is given."""
+    """Configuration with another seed; unchanged if the seed is None."""
     if seed is None:
         return config
     sampler = config.sampler.model_copy(update={"seed": seed})

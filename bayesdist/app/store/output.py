@@ -1,4 +1,4 @@
-"""Files and folders that a command writes: whole or not at all, and never over others."""
+"""Atomic writing of output files and folders, which never overwrite other files."""
 
 from __future__ import annotations
 
@@ -19,19 +19,19 @@ from bayesdist.infer import Posterior
 
 
 def refuse_existing(path: Path, force: bool) -> None:
-    """Refuse a file that is there already, unless it may be replaced."""
+    """Refuse a file that exists, unless it may be replaced."""
     if path.exists() and not force:
         raise InputError("this file exists", where=str(path), do="replace it by --force")
 
 
 def write_table(table: Table, path: Path) -> None:
-    """Write a table as ECSV, whole or not at all."""
+    """Write a table as ECSV, atomically."""
     with atomic_path(path) as temporary:
         table.write(temporary, format="ascii.ecsv")
 
 
 def provenance_notes(posterior: Posterior, gauge: str) -> dict[str, bool | str]:
-    """Notes on the draws and the gauge for the head of a file."""
+    """Metadata on the convergence and the gauge, for the header of a file."""
     label = posterior.approximation
     return {
         "converged": posterior.convergence.converged,
@@ -45,7 +45,7 @@ SCHEMA = 1  # of records of commands
 
 @contextmanager
 def record_folder(path: Path, name: str, command: str) -> Iterator[tuple[Path, dict[str, Any]]]:
-    """A new folder, and a record to be filled, which is written when the block succeeds."""
+    """Create a folder and a record to be filled, which is written when the block succeeds."""
     with atomic_directory(path) as folder:
         record: dict[str, Any] = {"schema": SCHEMA, "command": command, "versions": versions()}
         yield folder, record
@@ -54,9 +54,9 @@ def record_folder(path: Path, name: str, command: str) -> Iterator[tuple[Path, d
 
 @contextmanager
 def atomic_directory(path: Path) -> Iterator[Path]:
-    """A folder that takes its name when the block succeeds, and else is removed.
+    """Create a folder that appears under its name if the block succeeds, and is removed otherwise.
 
-    `path`: new, or empty. Result: where to write.
+    `path` must not exist or be empty.  Yields the temporary folder to write to.
     """
     if path.exists() and (not path.is_dir() or any(path.iterdir())):
         raise InputError(
@@ -77,7 +77,7 @@ def atomic_directory(path: Path) -> Iterator[Path]:
         yield temporary
         mask = os.umask(0)
         os.umask(mask)
-        temporary.chmod(0o777 & ~mask)  # a temporary folder is its owner's alone
+        temporary.chmod(0o777 & ~mask)  # temporary folders are readable only by their owner
         temporary.replace(path)
     finally:
         shutil.rmtree(temporary, ignore_errors=True)

@@ -1,4 +1,4 @@
-"""run.json: what a run is made from, and for each stage what it was made from and what it wrote."""
+"""run.json: ingredients of a run, and the ingredients and files of each stage."""
 
 from __future__ import annotations
 
@@ -26,7 +26,14 @@ PACKAGES = ("arviz-stats", "astropy", "emcee", "h5py", "numba", "numpy", "scipy"
 
 
 def write_json(path: Path, value: Any) -> None:
-    """Write a JSON file, replaced atomically."""
+    """Write a JSON file, replaced atomically.
+
+    Parameters
+    ----------
+    path : Path
+    value : object
+        Value that `as_json` can convert.
+    """
     write_text(path, json_text(as_json(value)))
 
 
@@ -37,7 +44,7 @@ def write_text(path: Path, text: str) -> None:
 
 
 def json_text(plain: Any) -> str:
-    """Plain JSON, as by `as_json`, as the text of a file."""
+    """Text of a JSON file from plain JSON, as returned by `as_json`."""
     return to_json(plain, indent=1).decode() + "\n"
 
 
@@ -45,21 +52,21 @@ _version = cache(metadata.version)
 
 
 def versions() -> dict[str, str]:
-    """Versions of Python, the platform, and the packages that matter."""
+    """Versions of Python, the platform, and the packages that affect results, by name."""
     out = {"python": sys.version.split()[0], "platform": platform.platform()}
-    out["bayesdist"] = __version__  # also where it runs from a source tree
+    out["bayesdist"] = __version__  # also if run from a source tree
     out |= {name: _version(name) for name in PACKAGES}
     return out
 
 
 class _Part(BaseModel):
-    """A part of run.json; numbers are no texts in it."""
+    """Part of run.json; strings are not converted to numbers."""
 
     model_config = ConfigDict(strict=True, extra="forbid")
 
 
 class _Head(_Part):
-    """What every version of the package writes into run.json."""
+    """Entries that every version of the package writes to run.json."""
 
     model_config = ConfigDict(extra="allow")
     schema_: int = Field(alias="schema")
@@ -67,35 +74,46 @@ class _Head(_Part):
 
 
 class FileMark(_Part):
-    """Size and SHA-256 of a file as it was written."""
+    """Size and SHA-256 of a file when it was written."""
 
     size: Annotated[int, Field(ge=0)]
     sha256: Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
 
     @classmethod
     def of(cls, path: Path) -> FileMark:
-        """Mark of a file as it is now."""
+        """Mark of a file in its present state."""
         return cls(size=path.stat().st_size, sha256=sha256_of(path))
 
 
 def _as_sections(raw: dict[str, Any]) -> dict[str, Any]:
-    """Sections of summary.json as they stand, if they are such."""
+    """Validate sections of summary.json and return them unchanged."""
     Sections.model_validate(raw)
     return raw
 
 
 class Artefact(_Part):
-    """Ingredients of a stage, and the files that it wrote."""
+    """Ingredients of a stage, and the files that it wrote.
 
-    key: str  # hash of `parts`
-    # revision of the stage, settings, and digests of the artefacts before it
+    Parameters
+    ----------
+    key : str
+        Hash of `parts`.
+    parts : dict
+        Revision of the stage, settings, and digests of the preceding artefacts.
+    files : dict of str to FileMark
+        Marks of the files by their path in the folder.
+    sections : dict
+        Sections of summary.json.
+    """
+
+    key: str
     parts: dict[str, Any]
-    files: dict[str, FileMark]  # by their path in the folder
-    sections: Annotated[dict[str, Any], AfterValidator(_as_sections)]  # of summary.json
+    files: dict[str, FileMark]
+    sections: Annotated[dict[str, Any], AfterValidator(_as_sections)]
 
     @property
     def digest(self) -> str:
-        """Hash of what was written; of what it was made from where nothing was."""
+        """Hash of the written files and sections; of the ingredients if nothing was written."""
         written = {name: mark.sha256 for name, mark in self.files.items()}
         return digest_of([written, self.sections] if written or self.sections else self.parts)
 
@@ -118,7 +136,7 @@ class _Whole(_Head):
     stages: dict[str, _StageNote]
     under_way: _UnderWay | None
     checkpoints: dict[str, str]
-    # facts of runs; a store by itself has none
+    # entries of runs, which a bare store does not have
     config: dict[str, Any] = Field(default_factory=dict)
     base: str = ""
     base_from_run: str = ""
@@ -134,20 +152,31 @@ _HEAD, _WHOLE = TypeAdapter(_Head), TypeAdapter(_Whole)
 
 @dataclass
 class Record:
-    """Content of run.json."""
+    """Content of run.json.
 
-    facts: dict[str, Any]  # what the run is made from: configuration, inputs, versions
-    artefacts: dict[str, Artefact] = field(default_factory=dict)  # of the stages that have ended
-    # when each of them ended, and how long it took
+    Parameters
+    ----------
+    facts : dict
+        Ingredients of the run: configuration, inputs, versions.
+    artefacts : dict of str to Artefact
+        Artefacts of completed stages.
+    stages : dict of str to dict
+        For each completed stage when it ended, and how long it took.
+    under_way : dict or None
+        Name of the stage in progress or interrupted, and the files that it may have written.
+    checkpoints : dict of str to str
+        For each stage with checkpoints the hash of their ingredients.
+    """
+
+    facts: dict[str, Any]
+    artefacts: dict[str, Artefact] = field(default_factory=dict)
     stages: dict[str, dict[str, Any]] = field(default_factory=dict)
-    # of the stage that has begun and not ended: its name, and the files that it may have written
     under_way: dict[str, Any] | None = None
-    # of stages with checkpoints: the hash of what these were made from
     checkpoints: dict[str, str] = field(default_factory=dict)
 
     @classmethod
     def read(cls, path: Path) -> Record:
-        """Content of a run.json."""
+        """Read a run.json; raises InputError if it has another schema or was changed."""
         do = "restore it, or choose another folder"
         facts = read_json(path, do=do)
         head = model_of(_HEAD, facts, str(path), do=do)
@@ -159,7 +188,7 @@ class Record:
                 where=str(path),
                 do="use that version, or choose another folder",
             )
-        whole = model_of(_WHOLE, facts, str(path), do=do)
+        content = model_of(_WHOLE, facts, str(path), do=do)
         if facts.pop("sha256") != digest_of_plain(facts):
             raise InputError(
                 "was changed since bayesdist wrote it (its checksum is another)",
@@ -167,11 +196,11 @@ class Record:
                 do=do,
             )
         del facts["schema"], facts["artefacts"]
-        rest = {key: facts.pop(key) for key in ("stages", "under_way", "checkpoints")}
-        return cls(facts, whole.artefacts, **rest)
+        entries = {key: facts.pop(key) for key in ("stages", "under_way", "checkpoints")}
+        return cls(facts, content.artefacts, **entries)
 
     def copied(self) -> Record:
-        """The same content, of which entries can be put, replaced and removed."""
+        """Copy in which entries can be added, replaced and removed."""
         under_way = self.under_way and {**self.under_way, "files": [*self.under_way["files"]]}
         return Record(
             dict(self.facts),
@@ -183,12 +212,12 @@ class Record:
 
     @property
     def file_names(self) -> set[str]:
-        """Files that stages have written, or may have."""
-        found = {name for one in self.artefacts.values() for name in one.files}
-        return found.union((self.under_way or {}).get("files", ()))
+        """Files that stages have written or may have written."""
+        names = {name for artefact in self.artefacts.values() for name in artefact.files}
+        return names.union((self.under_way or {}).get("files", ()))
 
     def begins_files(self, names: Set[str]) -> bool:
-        """Note that the stage under way writes files; False where that is known of all."""
+        """Note that the current stage writes files; False if all of them were noted before."""
         if self.under_way is None or names <= set(self.under_way["files"]):
             return False
         self.under_way["files"] = sorted({*names, *self.under_way["files"]})
@@ -196,11 +225,11 @@ class Record:
 
     def write(self, path: Path) -> None:
         """Replace run.json."""
-        whole = {"schema": SCHEMA, **self.facts, "stages": self.stages}
-        whole |= {
+        content = {"schema": SCHEMA, **self.facts, "stages": self.stages}
+        content |= {
             "artefacts": self.artefacts,
             "under_way": self.under_way,
             "checkpoints": self.checkpoints,
         }
-        plain = as_json(whole)
+        plain = as_json(content)
         write_text(path, json_text(plain | {"sha256": digest_of_plain(plain)}))

@@ -1,4 +1,4 @@
-"""Folders, inputs and settings with which a run is refused, before anything is written."""
+"""Refusal of unsuitable folders, inputs and settings of a run before anything is written."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from bayesdist.files.atomic import is_leftover
 
 
 def refuse_inside_input(folder: Path, config: Config, base: Path) -> None:
-    """Refuse a run whose own Parquet files would become part of its input."""
+    """Refuse a run inside a folder of its input, because its files would become inputs."""
     named = config.named_files(base)
     for path in named if isinstance(named, list) else [named]:
         if path.is_dir() and folder.resolve().is_relative_to(path.resolve()):
@@ -27,10 +27,10 @@ def refuse_inside_input(folder: Path, config: Config, base: Path) -> None:
 
 
 def refuse_foreign_files(folder: Path, text: str, inputs: Iterable[Path] = ()) -> None:
-    """Raise InputError if a run would begin in a folder that holds other files.
+    """Raise InputError if a run would begin in a folder that contains other files.
 
-    A config.toml with the text of the configuration is allowed, because a stage may be run on it,
-    and so are inputs of the run.
+    Allowed are inputs of the run, and a config.toml with the text of the configuration, because
+    stages can be run on such a folder.
     """
     if not folder.is_dir():
         return
@@ -55,10 +55,24 @@ def refuse_another_solution(
     inputs: Mapping[str, str],
     seed: int | None,
 ) -> None:
-    """Refuse to resume with inputs or settings that the solution was not made from.
+    """Refuse to resume a run with inputs or settings that differ from those of its solution.
 
-    `known`: the configuration that the run began with, whose `record` has the facts. `seed`: that
-    of the command line.
+    Parameters
+    ----------
+    folder : Path
+        Folder of the run.
+    known : Config
+        Configuration that the run began with.
+    record : mapping
+        Entries of the record of the run.
+    config : Config
+        Configuration to resume with.
+    base : Path
+        Folder that inputs are relative to.
+    inputs : mapping of str to str
+        SHA-256 of the inputs by name.
+    seed : int or None
+        Seed given on the command line.
     """
     path = folder / "config.toml"
     if seed is not None and seed != known.sampler.seed:
@@ -67,7 +81,7 @@ def refuse_another_solution(
             where=str(folder),
             do="leave --seed out, or start again with --force",
         )
-    if path.exists():  # the command line may have given another seed than the file
+    if path.exists():  # the seed of the file may have been replaced on the command line
         known = with_seed(known, parse_config(load_text(path), str(path)).sampler.seed)
     for key, old, new in changes(known, config):
         if not is_adjustable(key, known):
@@ -77,17 +91,17 @@ def refuse_another_solution(
                 do="resume with the old value, or start again with --force",
             )
     base, before = base.resolve(), Path(record["base"])
-    of_products = {input_name(one, base) for one in config.files_of_products(base)}
-    of_products |= {input_name(one, before) for one in known.files_of_products(before)}
+    of_products = {input_name(file, base) for file in config.files_of_products(base)}
+    of_products |= {input_name(file, before) for file in known.files_of_products(before)}
     refuse_other_inputs(record["inputs"], inputs, base, but=of_products)
 
 
 def refuse_edited(folder: Path, known: Config) -> None:
-    """Refuse a config.toml that was edited in place: the run goes by what it was given."""
+    """Refuse a run if its config.toml was edited in place after the run began."""
     path = folder / "config.toml"
     if not path.exists():
         return
-    # the command line may have given another seed
+    # the seed may have been replaced on the command line
     now = with_seed(load_config(path)[0], known.sampler.seed)
     keys = [key for key, *_ in changes(known, now)]
     if keys:
@@ -103,7 +117,10 @@ def refuse_edited(folder: Path, known: Config) -> None:
 def refuse_other_inputs(
     known: Mapping[str, str], now: Mapping[str, str], base: Path, but: Collection[str] = ()
 ) -> None:
-    """Refuse inputs that are not those of the record, but for some; `base` is where they are."""
+    """Refuse inputs that differ from those of the record, except for the names in `but`.
+
+    `base` is the folder of the inputs.
+    """
     for name in sorted((known.keys() | now.keys()) - set(but)):
         if known.get(name) != now.get(name):
             raise InputError(

@@ -1,4 +1,4 @@
-"""A run directory: one folder that holds everything about one calibration."""
+"""Run directory: one folder that holds everything about one calibration."""
 
 from __future__ import annotations
 
@@ -37,21 +37,21 @@ from bayesdist.files.atomic import atomic_path, made_folder, remove_leftovers
 
 T = TypeVar("T")
 
-PAIRS = "pairs"  # folder of matches, of a campaign and of formats that are selected from
-UNSAVED = Path("a run in memory")  # stands for the folder of a run that has none
+PAIRS = "pairs"  # folder of matches, for campaigns and for formats that are read in part
+UNSAVED = Path("a run in memory")  # in place of the folder of a run in memory
 
 
 def part_files(folder: Path) -> list[Path]:
-    """Parts that are there, in order."""
+    """Existing part files of a folder, in order."""
     return sorted(folder.glob("part-" + 5 * "[0-9]" + ".parquet"))
 
 
 class RunDirectory(ArtefactStore):
-    """The folder of a run: its configuration and inputs, and the artefacts of its stages."""
+    """Folder of a run: its configuration and inputs, and the artefacts of its stages."""
 
     def __init__(self, path: str | Path) -> None:
         super().__init__(Path(path), STAGES, head_of)
-        self._text = ""  # of a planned run's configuration
+        self._text = ""  # configuration of a planned run
         self._adopted: tuple[Config, str, dict[str, Any]] | None = None
 
     def __truediv__(self, name: str) -> Path:
@@ -72,10 +72,35 @@ class RunDirectory(ArtefactStore):
         seed: int | None = None,
         command: str = "",
     ) -> RunDirectory:
-        """A run that may be resumed in a folder, or may begin there; nothing is written yet.
+        """Prepare to resume the run in a folder, or to begin one there, without writing anything.
 
-        `text`: the configuration as written by the user. `base`: folder that inputs are relative
-        to. `resume`, `force`: resume the run that is there, or replace it.
+        Parameters
+        ----------
+        path : path
+            Folder of the run.
+        config : Config
+        text : str
+            The configuration as written by the user.
+        base : Path
+            Folder that inputs are relative to.
+        resume : bool
+            Resume an existing run.
+        force : bool
+            Replace an existing run.
+        seed : int, optional
+            Seed that replaces the configured one.
+        command : str
+            Command line, for the record.
+
+        Returns
+        -------
+        RunDirectory
+
+        Raises
+        ------
+        InputError
+            If the folder holds other files or a run that is neither resumed nor replaced, or the
+            run cannot be resumed with this configuration or these inputs.
         """
         run = cls(path)
         if run.path.exists() and not run.path.is_dir():
@@ -93,7 +118,7 @@ class RunDirectory(ArtefactStore):
             run._adopted = config, text, {"inputs": inputs, **places_of(base, run.path)}
             return run
         if run.is_initialized:
-            run.record  # noqa: B018 - refuse to replace what nobody can tell from other files
+            run.record  # noqa: B018 - refuse to replace a run with an unreadable record
         else:
             refuse_foreign_files(run.path, text, (base / name for name in inputs))
         run._plan(with_seed(config, seed), text, base, inputs, command)
@@ -109,7 +134,7 @@ class RunDirectory(ArtefactStore):
         text : str
             The configuration as TOML.
         files : bool
-            True if the stars are read from files, of which the record gets the hashes.
+            True if the stars are read from files, whose hashes are recorded.
         """
         run, base = cls(UNSAVED), Path.cwd()
         run._plan(config, text, base, hashes_of(config, base) if files else {}, "")
@@ -132,7 +157,7 @@ class RunDirectory(ArtefactStore):
 
     @property
     def is_initialized(self) -> bool:
-        """Boolean: the folder holds a run."""
+        """True if the folder holds a run."""
         return (self / "run.json").exists()
 
     @property
@@ -147,14 +172,14 @@ class RunDirectory(ArtefactStore):
 
     @property
     def text(self) -> str:
-        """The configuration of a planned run as its user wrote it, in TOML."""
+        """Configuration of a planned run in TOML, as the user wrote it."""
         return self._text
 
     def begin(self) -> None:
-        """Write down what is about to be done.
+        """Write the configuration and the record.
 
-        Another run that stands there is removed; a resumed one takes over the settings that may
-        change.
+        An existing run is removed if it is to be replaced; a resumed run takes over the settings
+        that may change.
         """
         if self._planned is None:
             self._adopt()
@@ -168,15 +193,17 @@ class RunDirectory(ArtefactStore):
         planned.write(self / "run.json")
 
     def _adopt(self) -> None:
-        """Take over what a resumed run was given in another way, and put summary.json right."""
+        """Take over the changed settings of a resumed run, and restore summary.json."""
         remove_leftovers(self.path)
         if self._adopted is not None:
-            config, text, found = self._adopted
-            record, known = self.record, self.config
-            changed = {key for key, *_ in changes(known, with_seed(config, known.sampler.seed))}
-            if changed or record.facts != record.facts | found:
-                config = with_seed(config, known.sampler.seed)
-                record.facts |= {"config": as_json(config.model_dump()), **found}
+            config, text, facts = self._adopted
+            record, old_config = self.record, self.config
+            changed = {
+                key for key, *_ in changes(old_config, with_seed(config, old_config.sampler.seed))
+            }
+            if changed or record.facts != record.facts | facts:
+                config = with_seed(config, old_config.sampler.seed)
+                record.facts |= {"config": as_json(config.model_dump()), **facts}
                 if any(key.startswith("requirement") for key in changed):
                     record.facts.pop("requirements", None)
                 self._write_text(text)
@@ -191,7 +218,7 @@ class RunDirectory(ArtefactStore):
 
     @classmethod
     def open(cls, path: str | Path) -> RunDirectory:
-        """A run that exists, or a folder with a config.toml that becomes one."""
+        """Open an existing run, or plan one in a folder that contains a config.toml."""
         run = cls(path)
         if run.is_initialized:
             refuse_edited(run.path, run.config)
@@ -205,7 +232,7 @@ class RunDirectory(ArtefactStore):
         raise run.not_a_run_error()
 
     def not_a_run_error(self) -> InputError:
-        """The error for a place that holds no run; a demo has its run in a folder of its own."""
+        """Error for a folder that is not a run; it names the run inside the folder of a demo."""
         within = self / "run"
         cause = "is no run: it has neither run.json nor config.toml"
         if not self.path.exists():
@@ -224,7 +251,7 @@ class RunDirectory(ArtefactStore):
 
     @property
     def facts(self) -> dict[str, Any]:
-        """Facts that the run is made from: configuration, inputs, seed, versions."""
+        """Ingredients of the run: configuration, inputs, seed, versions."""
         facts = self.record.facts
         for name in ("config", "base", "inputs", "seed", "versions", "created"):
             if name not in facts:
@@ -239,23 +266,23 @@ class RunDirectory(ArtefactStore):
     def base(self) -> Path:
         """Folder that inputs are relative to.
 
-        It is found from the run as it was when that began, if inputs are there: a run may have been
-        moved together with them.  Else it is where it was.
+        If all inputs exist at the recorded path relative to the run, that folder is used, because
+        the run may have been moved together with them.  Otherwise it is the recorded folder.
         """
         return base_of(self.facts, self.path)
 
     def note(self, **facts: Any) -> None:
-        """Add facts to run.json."""
+        """Add entries to run.json."""
         record = self.record
         record.facts |= as_json(facts)
         record.write(self / "run.json")
 
     @property
     def config(self) -> Config:
-        """The resolved configuration."""
+        """Resolved configuration."""
         try:
             return config_of_record(self.facts["config"], str(self / "run.json"))
-        except ConfigError as error:  # made by a version that allowed other settings
+        except ConfigError as error:  # written by a version with other settings
             raise InputError(
                 error.cause, where=error.where, do="start again with --force"
             ) from error
@@ -263,10 +290,24 @@ class RunDirectory(ArtefactStore):
     # -- stages -----------------------------------------------------------------------------------
 
     def make(self, stage: str, function: Callable[[], T], *, force: bool = False) -> Made[T]:
-        """The artefact of a stage: made where it, or what it was made from, is not as it was.
+        """Artefact of a stage, which is made unless it is up to date.
 
-        `function` writes files into the folder and sections by `summarise`; with `force` it is
-        called also where the artefact stands.
+        Parameters
+        ----------
+        stage : str
+        function : callable
+            Writes files to the folder, and sections by `summarise`.
+        force : bool
+            Call the function even if the artefact is up to date.
+
+        Returns
+        -------
+        Made
+
+        Raises
+        ------
+        InputError
+            If a stage that is needed has not been run.
         """
         made_from = self._made_from(stage)
         if made_from is None:
@@ -278,33 +319,35 @@ class RunDirectory(ArtefactStore):
         return self.stage(stage, function, *made_from, force=force)
 
     def done(self, stage: str) -> bool:
-        """Boolean: a stage has ended, and what it was made from is as it was."""
+        """True if a stage has ended and its artefact is up to date."""
         return stage in self._standing()
 
     def _standing(self, before: str = "") -> dict[str, Made[object]]:
-        """Stages that stand, of all or of those before one, in order."""
+        """Stages that are up to date, in order; only those before the given one, if any."""
         config, facts = self.config, self.facts
-        found: dict[str, Made[object]] = {}
+        current: dict[str, Made[object]] = {}
         for name in STAGES:
             if name == before:
                 break
-            made_from = made_from_of(name, found, config, facts)
-            made = None if made_from is None else self.standing(name, *made_from)
-            if made is not None:
-                found[name] = made
-        return found
+            made_from = made_from_of(name, current, config, facts)
+            artefact = None if made_from is None else self.standing(name, *made_from)
+            if artefact is not None:
+                current[name] = artefact
+        return current
 
     def _made_from(
         self, stage: str, requirements: Sequence[Requirement] | None = None
     ) -> tuple[object, ...] | None:
-        """Ingredients of a stage now; None where a stage is missing that it needs."""
+        """Present ingredients of a stage; None if a stage that it needs is missing."""
         facts = self.facts
         if requirements is not None:
-            facts = facts | {"requirements": [as_json(vars(one)) for one in requirements]}
+            facts = facts | {
+                "requirements": [as_json(vars(requirement)) for requirement in requirements]
+            }
         return made_from_of(stage, self._standing(stage), self.config, facts)
 
     def require(self, stage: str, needs: Sequence[str]) -> None:
-        """Refuse a stage, or another command, whose predecessors do not stand."""
+        """Refuse a stage or another command if a stage in `needs` is not up to date."""
         for earlier in needs:
             do = f"run 'bayesdist stage {earlier} {self.path}'"
             if earlier not in self.record.artefacts:
@@ -322,7 +365,10 @@ class RunDirectory(ArtefactStore):
                 )
 
     def damage(self, stage: str) -> tuple[str, str] | None:
-        """A file that is not as a stage wrote it, and what is wrong with it; None without one."""
+        """First file that differs from what a stage wrote, and a description of the damage.
+
+        None if all files are intact.
+        """
         artefact = self.record.artefacts.get(stage)
         name = "" if artefact is None else self.harmed(artefact, thorough=True)
         if not name:
@@ -332,7 +378,7 @@ class RunDirectory(ArtefactStore):
         return name, f"is not as stage '{stage}' wrote it"
 
     def refuse_damaged(self, stage: str) -> None:
-        """Refuse to go by files that are not as their stage wrote them."""
+        """Refuse to use files that differ from what their stage wrote."""
         damage = self.damage(stage)
         if damage is not None:
             raise InputError(
@@ -343,23 +389,24 @@ class RunDirectory(ArtefactStore):
 
     @contextmanager
     def judged_by(self, requirements: Sequence[Requirement]) -> Iterator[None]:
-        """Write margins by other requirements: the evaluation is by these from now on.
+        """Write margins for other requirements inside this context.
 
-        Until other ones are given, or the configuration's own are changed.
+        They remain the requirements of the evaluation until others are given or the configured ones
+        change.
         """
         made_from = self._made_from("evaluate", requirements) if self.done("evaluate") else None
-        blocks = [as_json(vars(one)) for one in requirements]
-        own = [as_json(vars(one)) for one in self.config.requirements()]
+        blocks = [as_json(vars(requirement)) for requirement in requirements]
+        configured = [as_json(vars(requirement)) for requirement in self.config.requirements()]
         with self.amended("evaluate", *(made_from or ())) as facts:
             yield
             facts.pop("requirements", None)
-            if blocks != own:
+            if blocks != configured:
                 facts["requirements"] = blocks
 
     # -- the end ----------------------------------------------------------------------------------
 
     def clear(self, *others: str) -> None:
-        """Remove what a run wrote, and nothing else."""
+        """Remove the files that the run wrote, and no others."""
         pairs = part_files(self / PAIRS)
         names = [path.relative_to(self.path).as_posix() for path in pairs]
         super().clear(*others, "config.toml", "bayesdist.log", *names)

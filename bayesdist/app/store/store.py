@@ -1,4 +1,4 @@
-"""Artefacts in a folder: loaded where what they were made from stands, and else made."""
+"""Store of artefacts in a folder: loaded if they are up to date, otherwise made."""
 
 from __future__ import annotations
 
@@ -34,31 +34,56 @@ log = logging.getLogger("bayesdist")
 
 @dataclass(frozen=True)
 class Stage:
-    """Revision and checkpoints of a stage."""
+    """Properties of a stage.
 
-    revision: int = 1  # raised when the numbers of the stage change
-    # patterns of the files by which it goes on where it was interrupted
+    Parameters
+    ----------
+    revision : int
+        Raised when the results of the stage change.
+    checkpoints : tuple of str
+        File-name patterns of the checkpoints, from which an interrupted stage continues.
+    """
+
+    revision: int = 1
     checkpoints: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
 class Made(Generic[T]):
-    """An artefact that stands."""
+    """An artefact that is up to date.
 
-    name: str  # of its stage
-    digest: str  # hash of what was written: what is made from the artefact has it in its key
-    # what the stage has given; None where it was not run now, as the artefact stood before
+    Parameters
+    ----------
+    name : str
+        Name of its stage.
+    digest : str
+        Hash of what the stage wrote.  It is part of the key of artefacts that depend on this one.
+    value : object or None
+        Return value of the stage; None if the stage was not run because its artefact was up to
+        date.
+    """
+
+    name: str
+    digest: str
     value: T | None = None
 
 
 class ArtefactStore:
-    """Artefacts in a folder, each by the content that it was made from.
+    """Artefacts in a folder, each identified by the content of its ingredients.
 
-    An artefact stands while its key, a hash of what it was made from, and its files are as they
-    were.  What a stage writes is noted in run.json before it takes its name, so that all of it is
-    known at whatever moment a process is killed.
+    An artefact is up to date if its key, a hash of its ingredients, and its files are unchanged.  A
+    file is noted in run.json before it appears under its name, so that all files of a stage are
+    known even if the process is killed.
 
-    `head`: what summary.json says of the run as a whole, from the facts of run.json.
+    Parameters
+    ----------
+    path : Path
+        The folder.
+    stages : mapping of str to Stage
+        Stages in order.
+    head : callable
+        ``head(facts)`` returns the entries of summary.json about the run as a whole, from the
+        entries of run.json.
     """
 
     def __init__(
@@ -69,9 +94,10 @@ class ArtefactStore:
     ) -> None:
         self.path, self.stages, self.head = path, stages, head
         self._planned: Record | None = None
-        self._read: tuple[tuple[int, ...], Record] | None = None  # while run.json stays as it is
-        self._known: dict[str, tuple[tuple[int, ...], FileMark]] = {}  # by name, of files as read
-        # of the stage that is being made here
+        self._read: tuple[tuple[int, ...], Record] | None = None  # with the times of run.json
+        # by file name, with the times of the file
+        self._known: dict[str, tuple[tuple[int, ...], FileMark]] = {}
+        # of the stage that is being made by this process
         self._making = ""
         self._sections: dict[str, Any] = {}
         self._written: set[str] = set()
@@ -80,7 +106,7 @@ class ArtefactStore:
 
     @property
     def record(self) -> Record:
-        """Content of run.json, or of what it will be."""
+        """Content of run.json, or its planned content."""
         if self._planned is not None:
             return self._planned
         path = self.path / RECORD
@@ -94,25 +120,25 @@ class ArtefactStore:
 
     @property
     def summary(self) -> dict[str, Any]:
-        """Sections of summary.json: of the stages that have ended, and of the one under way.
+        """Sections of summary.json: those of completed stages, and those of the current stage.
 
-        A stage that is made anew sees those of the stages before it and its own.  Sections of a
-        function that is called by itself, outside of a stage, are here and in no file.
+        A stage sees only the sections of preceding stages and its own.  Sections of a function that
+        is called outside of a stage are included here, but not written to a file.
         """
         return self._merged(self.record, before=self._making) | self._sections
 
     def _merged(self, record: Record, before: str = "") -> dict[str, Any]:
-        """Sections of the artefacts, later stages in place of earlier ones."""
+        """Sections of all artefacts; those of later stages replace those of earlier ones."""
         out: dict[str, Any] = {}
         for name in self.stages:
-            if name == before:  # never, where that is empty
+            if name == before:  # never, if that is empty
                 break
             if name in record.artefacts:
                 out |= record.artefacts[name].sections
         return out
 
     def standing(self, name: str, *made_from: object) -> Made[Any] | None:
-        """The artefact of a stage, where its key and the sizes of its files are as they were."""
+        """Artefact of a stage if its key and file sizes are unchanged, otherwise None."""
         artefact = self.record.artefacts.get(name)
         if artefact is None or artefact.key != digest_of(self._parts(name, made_from)):
             return None
@@ -121,16 +147,22 @@ class ArtefactStore:
         return Made(name, artefact.digest)
 
     def _parts(self, name: str, made_from: tuple[object, ...]) -> dict[str, Any]:
-        """Ingredients of an artefact, as run.json has them."""
-        made = {one.name: one.digest for one in made_from if isinstance(one, Made)}
-        parts: dict[str, Any] = {"revision": self.stages[name].revision, "from": made}
-        for one in made_from:
-            if not isinstance(one, Made):
-                parts |= as_json(one.value if isinstance(one, Adjustable) else one)
+        """Ingredients of an artefact, as stored in run.json."""
+        digests = {
+            ingredient.name: ingredient.digest
+            for ingredient in made_from
+            if isinstance(ingredient, Made)
+        }
+        parts: dict[str, Any] = {"revision": self.stages[name].revision, "from": digests}
+        for ingredient in made_from:
+            if not isinstance(ingredient, Made):
+                parts |= as_json(
+                    ingredient.value if isinstance(ingredient, Adjustable) else ingredient
+                )
         return parts
 
     def harmed(self, artefact: Artefact, *, thorough: bool) -> str:
-        """The first file of an artefact that is not as its stage left it, '' where all are."""
+        """First file of an artefact that differs from what its stage wrote; empty if none does."""
         for name, mark in artefact.files.items():
             path = self.path / name
             if not path.is_file() or path.stat().st_size != mark.size:
@@ -140,14 +172,14 @@ class ArtefactStore:
         return ""
 
     def _mark(self, name: str) -> FileMark:
-        """Mark of a file, which is read once while its times stay as they are."""
+        """Mark of a file, which is read again only if its times have changed."""
         now = _times(self.path / name)
         if self._known.get(name, (None, None))[0] != now:
             self._known[name] = now, FileMark.of(self.path / name)
         return self._known[name][1]
 
     def locked(self) -> AbstractContextManager[None]:
-        """Keep other processes from writing into the folder; the lock dies with the process."""
+        """Lock the folder against other processes; the lock ends with the process."""
         return locked(self.path)
 
     # -- making -----------------------------------------------------------------------------------
@@ -155,19 +187,32 @@ class ArtefactStore:
     def stage(
         self, name: str, function: Callable[[], T], *made_from: object, force: bool = False
     ) -> Made[T]:
-        """The artefact of a stage, which is made unless it stands; with `force` also where it does.
+        """Artefact of a stage, which is made unless it is up to date.
 
-        `function` writes files into the folder, and sections by `summarise`; `made_from` are
-        `Made`, and mappings that can be plain JSON.
+        Parameters
+        ----------
+        name : str
+        function : callable
+            Writes files to the folder, and sections by `summarise`.
+        *made_from : Made or mapping
+            Ingredients; mappings must be convertible to plain JSON.
+        force : bool
+            Call the function even if the artefact is up to date.
+
+        Returns
+        -------
+        Made
         """
         parts, record = self._parts(name, made_from), self.record
-        key, known = digest_of(parts), record.artefacts.get(name)
-        harmed = "" if known is None else self.harmed(known, thorough=True)
-        if known is not None and known.key == key and not harmed and not force:
+        key, previous = digest_of(parts), record.artefacts.get(name)
+        harmed = "" if previous is None else self.harmed(previous, thorough=True)
+        if previous is not None and previous.key == key and not harmed and not force:
             log.info("%s: done before", name)
-            return Made(name, known.digest)
-        log.info("%s: begins%s", name, _reason(known, parts, harmed))
-        fixed = tuple(one for one in made_from if not isinstance(one, Adjustable))
+            return Made(name, previous.digest)
+        log.info("%s: begins%s", name, _reason(previous, parts, harmed))
+        fixed = tuple(
+            ingredient for ingredient in made_from if not isinstance(ingredient, Adjustable)
+        )
         self._begin(record, name, digest_of(self._parts(name, fixed)), harmed)
         started = monotonic()
         with self._noted(name):
@@ -176,17 +221,17 @@ class ArtefactStore:
         return Made(name, artefact.digest, value)
 
     def summarise(self, **sections: Any) -> None:
-        """Replace sections of summary.json, for the stage that is under way."""
+        """Replace sections of summary.json for the current stage."""
         self._sections |= as_json(sections)
 
     @contextmanager
     def amended(self, name: str, *made_from: object) -> Iterator[dict[str, Any]]:
-        """Note what a command writes as part of a stage; yields facts of the record, to be changed.
+        """Record files that a command adds to a stage; yields the entries of the record to change.
 
-        `made_from` is what the artefact is made from afterwards; nothing where it does not stand.
+        `made_from` are the new ingredients of the artefact; empty if it is not up to date.
         """
         record, self._sections = self.record, {}
-        known = record.artefacts.get(name)
+        previous = record.artefacts.get(name)
         written: set[str] = set()
 
         def note(paths: Sequence[Path]) -> None:
@@ -194,45 +239,47 @@ class ArtefactStore:
 
         with watched_writes(note):
             yield record.facts
-        parts = self._parts(name, made_from) if known and made_from else {}
-        known = known or Artefact(key="", parts={}, files={}, sections={})
-        files = {one: FileMark.of(self.path / one) for one in written if self._is_there(one)}
-        files = {one: mark for one, mark in known.files.items() if self._is_there(one)} | files
-        sections = {**known.sections, **self._sections}
+        parts = self._parts(name, made_from) if previous and made_from else {}
+        previous = previous or Artefact(key="", parts={}, files={}, sections={})
+        files = {file: FileMark.of(self.path / file) for file in written if self._is_there(file)}
+        files = {
+            file: mark for file, mark in previous.files.items() if self._is_there(file)
+        } | files
+        sections = {**previous.sections, **self._sections}
         key = digest_of(parts) if parts else ""
         record.artefacts[name] = Artefact(key=key, parts=parts, files=files, sections=sections)
         self._sections = {}
         self._write(record)
 
     def _begin(self, record: Record, name: str, checkpoints: str, harmed: str) -> None:
-        """Note that a stage begins, and remove what it wrote before: it must not see that."""
+        """Note that a stage begins, and remove its earlier files, which it must not see."""
         patterns = self.stages[name].checkpoints
         before = record.under_way or {"stage": name, "files": []}
-        known = record.artefacts.pop(name, None)
+        previous = record.artefacts.pop(name, None)
         record.stages.pop(name, None)
         remove_leftovers(self.path)
-        files = set(known.files) if known else set()
+        files = set(previous.files) if previous else set()
         if before["stage"] == name:
             files |= set(before["files"])
         else:
-            self._remove(before["files"], record)  # of another stage that did not end
+            self._remove(before["files"], record)  # of another stage that was interrupted
         record.under_way = {"stage": name, "files": sorted(files)}
         if patterns:
             if record.checkpoints.get(name) != checkpoints or _is_one_of(harmed, patterns):
                 if record.checkpoints.pop(name, None) is not None:
-                    self._write(record)  # first: what is half removed never counts
+                    self._write(record)  # first: partly removed checkpoints are never used
                 self._remove(self._checkpoints(name), record)
             record.checkpoints[name] = checkpoints
         self._sections, self._written = {}, set()
-        self._write(record)  # first: what is half removed never counts
-        self._remove({one for one in files if not _is_one_of(one, patterns)}, record)
+        self._write(record)  # first: partly removed files are never used
+        self._remove({file for file in files if not _is_one_of(file, patterns)}, record)
 
     def _end(self, name: str, key: str, parts: dict[str, Any], seconds: float) -> Artefact:
         """Note that a stage has ended."""
         record = self.record
-        written = {one for one in self._written if self._is_there(one)}
+        written = {file for file in self._written if self._is_there(file)}
         written |= set(self._checkpoints(name))
-        marks = {one: FileMark.of(self.path / one) for one in sorted(written)}
+        marks = {file: FileMark.of(self.path / file) for file in sorted(written)}
         artefact = Artefact(key=key, parts=parts, files=marks, sections=self._sections)
         self._drop_sections(record, name, artefact)
         record.artefacts[name], record.under_way, self._sections = artefact, None, {}
@@ -244,35 +291,37 @@ class ArtefactStore:
         return artefact
 
     def _drop_sections(self, record: Record, name: str, artefact: Artefact) -> None:
-        """Drop sections of a stage from later ones that added to them, made from something else."""
+        """Drop the sections of a stage from later artefacts that were made from another version."""
         stale: set[str] = set()
         for later in list(self.stages)[list(self.stages).index(name) + 1 :]:
-            known = record.artefacts.get(later)
-            made_from = {} if known is None else known.parts.get("from", {})
-            if known is not None and (
+            affected = record.artefacts.get(later)
+            made_from = {} if affected is None else affected.parts.get("from", {})
+            if affected is not None and (
                 made_from.get(name, artefact.digest) != artefact.digest or stale & made_from.keys()
             ):
                 stale.add(later)
-                kept = {k: v for k, v in known.sections.items() if k not in artefact.sections}
-                record.artefacts[later] = known.model_copy(update={"sections": kept})
+                remaining = {
+                    k: v for k, v in affected.sections.items() if k not in artefact.sections
+                }
+                record.artefacts[later] = affected.model_copy(update={"sections": remaining})
 
     def _in_order(self, found: dict[str, Any]) -> dict[str, Any]:
-        """Entries of stages that are there, in the order of these."""
-        return {one: found[one] for one in self.stages if one in found}
+        """Entries of stages, in the order of the stages."""
+        return {stage: found[stage] for stage in self.stages if stage in found}
 
     def _is_there(self, name: str) -> bool:
-        """Boolean: a file of the folder exists."""
+        """True if a file of the folder exists."""
         return (self.path / name).is_file()
 
     @contextmanager
     def _noted(self, stage: str) -> Iterator[None]:
-        """Note in run.json whatever is written, before it takes its name."""
+        """Note all written files in run.json before they appear under their names."""
 
         def note(paths: Sequence[Path]) -> None:
             names = self._own(paths) - self._written
-            if not names:  # as of run.json itself, which need not be read again then
+            if not names:  # for example run.json itself
                 return
-            for name in names:  # a folder of the run may be a link to one of other files
+            for name in names:  # a folder inside the run may be a link to a foreign one
                 path_within(self.path, name, where=str(self.path), links=True)
             record = self.record
             if record.begins_files(names):
@@ -287,25 +336,29 @@ class ArtefactStore:
             self._making = ""
 
     def _own(self, paths: Sequence[Path]) -> set[str]:
-        """Names of the files that lie in the folder, without checkpoints and the record itself."""
+        """Names of files inside the folder, without checkpoints and the record itself."""
         folder = self.path.absolute()
         places = (path.absolute() for path in paths)
         names = {p.relative_to(folder).as_posix() for p in places if p.is_relative_to(folder)}
-        checkpoints = tuple(one for stage in self.stages.values() for one in stage.checkpoints)
+        checkpoints = tuple(
+            pattern for stage in self.stages.values() for pattern in stage.checkpoints
+        )
         return {n for n in names - {RECORD, SUMMARY} if not _is_one_of(n, checkpoints)}
 
     def _checkpoints(self, name: str) -> list[str]:
-        """Files by which a stage goes on, as they are there."""
-        found = (path for one in self.stages[name].checkpoints for path in self.path.glob(one))
-        return sorted(path.name for path in found)
+        """Existing checkpoint files of a stage."""
+        paths = (
+            path for pattern in self.stages[name].checkpoints for path in self.path.glob(pattern)
+        )
+        return sorted(path.name for path in paths)
 
     def _write(self, record: Record) -> None:
-        """Write run.json, and summary.json where it is another."""
+        """Write run.json, and summary.json if it has changed."""
         self.restore_summary(record)
         record.write(self.path / RECORD)
 
     def restore_summary(self, record: Record | None = None) -> None:
-        """Write summary.json as the stages that have ended have it, where it is not so."""
+        """Write summary.json from the completed stages, unless it is up to date."""
         record = record or self.record
         path, sections = self.path / SUMMARY, self._merged(record)
         if not sections:
@@ -319,31 +372,31 @@ class ArtefactStore:
     # -- removing ---------------------------------------------------------------------------------
 
     def clear(self, *others: str) -> None:
-        """Remove what the run wrote, and some other files; the record goes last."""
+        """Remove the files of the run and some others; the record is removed last."""
         record = self.record
         files = record.file_names
-        files |= {one for name in self.stages for one in self._checkpoints(name)}
+        files |= {file for name in self.stages for file in self._checkpoints(name)}
         record.artefacts = {}
         self._remove({*files, *others, SUMMARY}, record)
         self._remove({RECORD}, record)
 
     def _remove(self, names: Any, record: Record) -> None:
-        """Remove files that belong to no other artefact, and the folders that they leave empty."""
-        others = {one for artefact in record.artefacts.values() for one in artefact.files}
+        """Remove files that belong to no other artefact, and folders that become empty."""
+        needed = {entry for artefact in record.artefacts.values() for entry in artefact.files}
         folders = set()
-        for name in set(names) - others:
+        for name in set(names) - needed:
             path = path_within(self.path, name, where=str(self.path), links=True)
             path.unlink(missing_ok=True)
             folders.add(path.parent)
         for folder in folders - {self.path}:
             if folder.is_dir():
                 remove_leftovers(folder)
-                if not any(not is_leftover(one.name) for one in folder.iterdir()):
+                if not any(not is_leftover(entry.name) for entry in folder.iterdir()):
                     folder.rmdir()
 
 
 def _times(path: Path) -> tuple[int, ...]:
-    """What is another number once a file is another; () where there is none."""
+    """Numbers that change whenever the file changes; empty if there is no file."""
     try:
         status = path.stat()
     except OSError:
@@ -352,7 +405,7 @@ def _times(path: Path) -> tuple[int, ...]:
 
 
 def _reason(known: Artefact | None, parts: Mapping[str, Any], harmed: str) -> str:
-    """Why an artefact is made anew, as the end of a line; '' where it was never made."""
+    """Reason for making an artefact again, as the end of a line; empty if it is made first."""
     if known is None:
         return ""
     if harmed:
@@ -362,5 +415,5 @@ def _reason(known: Artefact | None, parts: Mapping[str, Any], harmed: str) -> st
 
 
 def _is_one_of(name: str, patterns: tuple[str, ...]) -> bool:
-    """Boolean: a file name fits one of some patterns."""
-    return any(fnmatch(name, one) for one in patterns)
+    """True if a file name matches one of some patterns."""
+    return any(fnmatch(name, pattern) for pattern in patterns)

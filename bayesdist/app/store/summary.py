@@ -1,4 +1,4 @@
-"""summary.json, what scripts read of a run, as a model, of which the package has a JSON Schema."""
+"""Data model of summary.json, the results of a run for scripts; the package has its JSON Schema."""
 
 from __future__ import annotations
 
@@ -12,20 +12,20 @@ Number = float | None  # null where it is not finite, or not known
 
 
 class Part(BaseModel):
-    """A part of summary.json; a later version of the package may add keys to it."""
+    """Part of summary.json; later versions of the package may add keys to it."""
 
     model_config = ConfigDict(extra="allow", frozen=True)
 
     @classmethod
     def row(cls, *objects: Any, **others: Any) -> dict[str, Any]:
-        """Row with these fields: of `others`, or else of the first object that has one."""
+        """Row with these fields, each from `others`, or else from the first object that has it."""
         return {name: cls._value(name, objects, others) for name in cls.model_fields}
 
     @staticmethod
     def _value(name: str, objects: tuple[Any, ...], others: dict[str, Any]) -> Any:
         if name in others:
             return others[name]
-        return getattr(next(one for one in objects if hasattr(one, name)), name)
+        return getattr(next(source for source in objects if hasattr(source, name)), name)
 
 
 class MeanAndSd(Part):
@@ -36,7 +36,7 @@ class MeanAndSd(Part):
 
 
 class AddedErrorRow(Part):
-    """Error beyond the quoted one that a group of matches has along an axis."""
+    """Error of a group of matches along an axis, in addition to the quoted one."""
 
     label: str
     axis: str
@@ -49,7 +49,7 @@ class AddedErrorRow(Part):
 
 
 class MapRow(Part):
-    """Largest errors of positions over a chip."""
+    """Largest position errors over a chip."""
 
     chip: int
     sigma_u_max: Number
@@ -87,7 +87,7 @@ class StructureRow(Part):
 
 
 class ScoreTestRow(Part):
-    """A targeted test of the residuals for what the model lacks."""
+    """Targeted test of the residuals for an effect that the model lacks."""
 
     name: str
     statistic: Number
@@ -103,7 +103,7 @@ class ScoreTestRow(Part):
 
 
 class CoverageRow(Part):
-    """Fraction of the stars within so many sigma of the prediction."""
+    """Fraction of the stars within a number of sigma of the prediction."""
 
     axis: str
     sigma: float
@@ -114,7 +114,7 @@ class CoverageRow(Part):
 
 
 class HoldoutTest(Part):
-    """A test of the stars that were held out."""
+    """Test of the held-out stars."""
 
     name: str
     part: str
@@ -128,7 +128,7 @@ class HoldoutTest(Part):
 
 
 class BudgetRow(Part):
-    """A row of the error budget: rms over all chips."""
+    """Row of the error budget: rms over all chips."""
 
     name: str
     kind: Literal["random", "systematic", "scale", "rotation", "local", "product"] | str
@@ -140,7 +140,7 @@ class BudgetRow(Part):
 
 
 class WorstPosition(Part):
-    """Where a requirement is met worst."""
+    """Position with the largest error for a requirement."""
 
     chip: int
     x: float
@@ -149,7 +149,7 @@ class WorstPosition(Part):
 
 
 class MarginRow(Part):
-    """How a requirement is met."""
+    """Margin of a requirement."""
 
     name: str
     statistic: str
@@ -178,7 +178,7 @@ class MarginRow(Part):
 
 
 class ValidityRow(Part):
-    """Until when a requirement is met."""
+    """Date until which a requirement is met."""
 
     name: str
     probability: float
@@ -189,7 +189,7 @@ class ValidityRow(Part):
 
 
 class ProductRow(Part):
-    """A file for a pipeline, and what was verified on it as written."""
+    """File for a pipeline, and the results of checks of the file as written."""
 
     path: str
     kind: str
@@ -200,7 +200,7 @@ class ProductRow(Part):
 
 
 class Data(Part):
-    """What was read and used."""
+    """Numbers of rows that were read and used, and their sources."""
 
     n_rows: int
     n_used: int
@@ -214,7 +214,7 @@ class Data(Part):
 
 
 class AddedErrors(Part):
-    """Errors beyond the quoted ones that groups of matches have."""
+    """Errors of groups of matches, in addition to the quoted ones."""
 
     grouping: str
     by: str = Field(description="what the groups differ in; empty for one group")
@@ -245,7 +245,7 @@ class GeometryRow(Part):
 
 
 class Fit(Part):
-    """The least-squares fit."""
+    """Least-squares fit."""
 
     order: int
     chi2: Number
@@ -261,7 +261,7 @@ class Fit(Part):
 
 
 class Outliers(Part):
-    """The outlier mixture."""
+    """Outlier mixture."""
 
     model: Literal["gaussian", "uniform", "none"]
     unit: str
@@ -273,7 +273,7 @@ class Outliers(Part):
 
 
 class Sampler(Part):
-    """How the posterior was drawn, and whether the chains have converged."""
+    """Sampling of the posterior, and convergence of the chains."""
 
     method: str
     exact: bool = Field(description="false of draws that stand for the posterior")
@@ -293,7 +293,7 @@ class Sampler(Part):
 
 
 class Map(MapRow):
-    """Largest errors of positions: of all chips, and of each."""
+    """Largest position errors: of all chips, and of each chip."""
 
     unit: str
     epoch: Number
@@ -309,7 +309,7 @@ class Misfit(MisfitRow):
 
 
 class CorrelatedErrors(Part):
-    """What the model may leave out, as the residuals of all stars show it."""
+    """Distortion that the model may leave out, estimated from the residuals of all stars."""
 
     structure: list[StructureRow]
     unit: str
@@ -317,7 +317,7 @@ class CorrelatedErrors(Part):
 
 
 class Holdout(Part):
-    """How the prediction holds for stars that were set aside."""
+    """Quality of the prediction for held-out stars."""
 
     n: int
     n_excluded: int = Field(description="stars of exposures with too few to be predicted")
@@ -330,7 +330,7 @@ class Holdout(Part):
 
 
 class Periods(Part):
-    """Whether the distortion changes with time."""
+    """Change of the distortion with time."""
 
     verdict: str
     significant: bool
@@ -340,20 +340,20 @@ class Periods(Part):
 
 
 class Warned(Part):
-    """A section with warnings."""
+    """Section with warnings."""
 
     warnings: list[str] = Field(default_factory=list)
 
 
 class Verdict(Part):
-    """The worst of all checks, requirements and validity periods, in words."""
+    """Worst of all checks, requirements and validity periods, in words."""
 
     level: Literal["pass", "warn", "fail"]
     headline: str
 
 
 class Sections(Part):
-    """What the stages that have ended found, section by section."""
+    """Results of the completed stages, by section."""
 
     matching: Warned | None = Field(None, description="of a campaign")
     selfcal: Warned | None = Field(None, description="of a self-calibration")
@@ -385,7 +385,7 @@ class Sections(Part):
 
 
 class Summary(Sections):
-    """Content of summary.json: the run as a whole, and what the stages that have ended found."""
+    """Content of summary.json: the run as a whole, and the results of the completed stages."""
 
     schema_: Literal[2] = Field(alias="schema")
     bayesdist: str = Field(description="version of the package")
@@ -396,9 +396,9 @@ class Summary(Sections):
 
 
 def head_of(facts: Mapping[str, Any]) -> dict[str, Any]:
-    """What summary.json says of the run as a whole."""
+    """Entries of summary.json about the run as a whole."""
     config = facts["config"]
-    kind = next(one for one in ("data", "campaign", "selfcal") if one in config)
+    kind = next(name for name in ("data", "campaign", "selfcal") if name in config)
     chips = " and ".join(chip["name"] for chip in config["chip"])
     parts = [config["detector"]["name"] or chips, config[kind].get("filter")]
     return {

@@ -1,1 +1,1 @@
-"""Files of results: tables, arrays and sections of summary.json."""
+"""Result files: tables, arrays and sections of summary.json."""

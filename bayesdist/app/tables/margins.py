@@ -1,4 +1,4 @@
-"""Margins of a run: rows of summary.json, margins.ecsv, and text for the screen."""
+"""Margins of a run: rows of summary.json, margins.ecsv, and text for the terminal."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from bayesdist.assess import Margin, Requirement
 from bayesdist.assess.maps.uncertainty import per_axis
 from bayesdist.utils.numbers import probability_words
 
-# of what a requirement is, beside chip and epoch
+# attributes that define the scope of a requirement, in addition to chip and epoch
 SCOPE = ("region", "epochs", "relative", "separation", "magnitude")
 
 
 def margin_rows(margins: Sequence[Margin]) -> list[dict[str, Any]]:
-    """Margins as plain rows, for files and for the screen."""
+    """Margins as plain rows, for files and for the terminal."""
     return [
         MarginRow.row(
             m,
@@ -34,7 +34,7 @@ def margin_rows(margins: Sequence[Margin]) -> list[dict[str, Any]]:
 
 
 def margin_table(margins: Sequence[Margin], *, several: bool) -> Table:
-    """Margins as margins.ecsv has them; with chips where there are several."""
+    """Table of margins.ecsv; `several` is True if there are several chips."""
     columns: dict[str, list[Any]] = {}
     for m, row in zip(margins, margin_rows(margins), strict=True):
         flat = {k: v for k, v in row.items() if k not in ("interval", "worst", "rests_on", *SCOPE)}
@@ -52,22 +52,22 @@ def margin_table(margins: Sequence[Margin], *, several: bool) -> Table:
 
 
 def judged_requirements(run: RunDirectory) -> tuple[Requirement, ...]:
-    """The requirements behind the margins in summary.json."""
+    """Requirements of the margins in summary.json."""
     return tuple(requirement_of(row) for row in run.summary.get("margins", []))
 
 
 def requirement_of(row: Mapping[str, Any]) -> Requirement:
-    """The requirement behind one row of the margins in summary.json."""
+    """Requirement of one row of the margins in summary.json."""
     keys = ("name", "statistic", "limit", "unit", "probability", "epoch", "chip", *SCOPE)
-    # runs of earlier versions had one chip and named none, and no part of it
-    known = {k: row[k] for k in keys if row.get(k) is not None}
-    if "epochs" in known:
-        del known["epoch"]  # the worst one of them
-    return Requirement(**known)
+    # runs of earlier versions had a single unnamed chip and no regions
+    arguments = {k: row[k] for k in keys if row.get(k) is not None}
+    if "epochs" in arguments:
+        del arguments["epoch"]  # the worst epoch of the range
+    return Requirement(**arguments)
 
 
 def results_text(run: RunDirectory) -> str:
-    """Geometry, budget, margins, verdict of the sampler, and where the report is."""
+    """Text with geometry, budget, margins, convergence, and the location of the report."""
     summary = run.summary
     c = summary["sampler"]
     state = (
@@ -95,7 +95,7 @@ def results_text(run: RunDirectory) -> str:
 
 
 def _budget_row(row: Mapping[str, Any]) -> dict[str, Any]:
-    """A row of the budget for the screen: u, v and per axis, with the error of the latter."""
+    """Row of the budget for the terminal: u, v and per axis, with the error of the latter."""
     error = row["radial_error"]
     return {key: row[key] for key in ("name", "kind", "u", "v")} | {
         "per axis": float(per_axis(row["u"], row["v"])),
@@ -110,7 +110,7 @@ def _probability(row: Mapping[str, Any]) -> str:
 
 
 def reasons_of(rows: Sequence[Mapping[str, Any]]) -> list[str]:
-    """Sentences on the requirements that are not met: the reason, and what would help."""
+    """Sentences on the requirements that are not met: the reason, and a remedy."""
     out = []
     for r in rows:
         if r["verdict"] != "met":
@@ -121,7 +121,7 @@ def reasons_of(rows: Sequence[Mapping[str, Any]]) -> list[str]:
 
 
 def margins_text(rows: list[dict]) -> str:
-    """Margins as a table for the screen; what the statistic is of, where that is said of one."""
+    """Table of margins for the terminal, with a column 'scope' if any requirement has one."""
     scopes = [requirement_of(r).scope for r in rows]
     shown = [
         {

@@ -37,7 +37,7 @@ log = logging.getLogger("bayesdist")
 
 
 def fingerprint_of(fit: LinearFit, posterior: Posterior) -> str:
-    """Hash of the numbers of a fit and of the posterior's draws, to which a file belongs."""
+    """Hash of a fit and of the draws of a posterior, which identifies files made from them."""
     digest = hashlib.sha256()
     for values in (fit.mean, fit.cov, posterior.theta):
         digest.update(np.ascontiguousarray(values).tobytes())
@@ -68,16 +68,16 @@ def write_diagnostics(
 
 
 def load_diagnostics(run: RunDirectory, fit: LinearFit, posterior: Posterior) -> Diagnostics | None:
-    """Diagnostics of a fit and a posterior; None where there are none of just these."""
-    path, again = run / DIAGNOSTICS, f"run 'bayesdist stage diagnose {run.path}' again"
+    """Diagnostics of a fit and a posterior; None if the run has none made from these."""
+    path, advice = run / DIAGNOSTICS, f"run 'bayesdist stage diagnose {run.path}' again"
     if not path.exists():
         return None
     mark = fingerprint_of(fit, posterior)
     try:
-        return read_record(path, Diagnostics, "diagnostics", do=again, fingerprint=mark)
+        return read_record(path, Diagnostics, "diagnostics", do=advice, fingerprint=mark)
     except FormatError:
         raise
-    except InputError:  # of another fit or posterior
+    except InputError:  # made from another fit or posterior
         return None
 
 
@@ -86,7 +86,7 @@ def _row(test: ScoreTest) -> dict[str, Any]:
     row = asdict(test)
     for key in ("held_by", "group", "doubt"):
         del row[key]
-    # JSON has no infinity: what no effect can show has no smallest size
+    # JSON has no infinity: the smallest size is null if no effect would be detected
     return row | {"smallest": test.smallest if np.isfinite(test.smallest) else None}
 
 
@@ -117,8 +117,8 @@ def write_evaluation(
 ) -> None:
     """Write an evaluation: maps.fits, tables, sections of summary.json, and evaluation.h5.
 
-    `solution` is the posterior with all errors of the parameters, `gauge` that in which it stands,
-    as a sentence; empty where that is no question.
+    `solution` is the posterior with all errors of the parameters. `gauge` is a sentence that states
+    its gauge; empty except for self-calibrations.
     """
     head = provenance_notes(posterior, gauge)
     maps = [*found.formal, *found.maps, *found.relative]
@@ -150,19 +150,19 @@ def save_margins(
     margins: Sequence[Margin],
     validity: Sequence[ValidityPeriod],
 ) -> None:
-    """Replace the margins and validity periods of a run by others."""
+    """Replace the margins and validity periods of a run."""
     _write_margins(run, posterior, provenance_notes(posterior, gauge), margins, validity)
     if (run / EVALUATION).exists():
-        found = load_evaluation(run, fit, posterior)
-        found = replace(found, margins=tuple(margins), validity=tuple(validity))
-        write_record(run / EVALUATION, found, fingerprint_of(fit, posterior))
+        evaluation = load_evaluation(run, fit, posterior)
+        evaluation = replace(evaluation, margins=tuple(margins), validity=tuple(validity))
+        write_record(run / EVALUATION, evaluation, fingerprint_of(fit, posterior))
 
 
 def load_evaluation(run: RunDirectory, fit: LinearFit, posterior: Posterior) -> Evaluation:
-    """The evaluation of a fit and a posterior; InputError where there is none of just these."""
-    again = f"run 'bayesdist stage evaluate {run.path}' again"
+    """Evaluation of a fit and a posterior; raises InputError if there is none made from these."""
+    advice = f"run 'bayesdist stage evaluate {run.path}' again"
     mark = fingerprint_of(fit, posterior)
-    return read_record(run / EVALUATION, Evaluation, "an evaluation", do=again, fingerprint=mark)
+    return read_record(run / EVALUATION, Evaluation, "an evaluation", do=advice, fingerprint=mark)
 
 
 def _budget_table(found: Evaluation, head: Mapping[str, Any]) -> Table:
@@ -191,9 +191,12 @@ def _write_margins(
     _write_validity(run / "validity_periods.ecsv", validity)
     dates = [
         ValidityRow.row(
-            one, one.requirement, probability=one.requirement.probability, until=one.epoch[-1]
+            period,
+            period.requirement,
+            probability=period.requirement.probability,
+            until=period.epoch[-1],
         )
-        for one in validity
+        for period in validity
     ]
     run.summarise(margins=margin_rows(margins), validity_periods=dates)
 
@@ -221,7 +224,7 @@ def _write_validity(path: Path, validity: Sequence[ValidityPeriod]) -> None:
 
 
 def _map_summary(found: Evaluation) -> dict[str, Any]:
-    """The worst of all chips, and each chip."""
+    """Largest errors over all chips, and those of each chip."""
     chips: list[dict[str, Any]] = [
         {
             **attributes(m, "chip sigma_u_max sigma_v_max radius_max position_of_max"),
@@ -232,8 +235,8 @@ def _map_summary(found: Evaluation) -> dict[str, Any]:
         }
         for m, least_squares in zip(found.maps, found.formal, strict=True)
     ]
-    for chip, one in zip(chips, found.relative, strict=bool(found.relative)):
-        chip["radius_max_relative"] = one.radius_max
+    for chip, relative in zip(chips, found.relative, strict=bool(found.relative)):
+        chip["radius_max_relative"] = relative.radius_max
     worst = max(chips, key=lambda c: c["radius_max"])
     largest = (
         *("sigma_u_max", "sigma_v_max", "ce68_max", "ce95_max"),

@@ -1,4 +1,4 @@
-"""The error budget: what the error of each position is made of."""
+"""Error budget: the contributions to the error of each position."""
 
 from __future__ import annotations
 
@@ -28,22 +28,36 @@ JOINTLY = "errors of the parameters, combined by draws"
 
 @dataclass(frozen=True, eq=False)
 class BudgetTerm:
-    """One contribution to the position error."""
+    """One contribution to the position error.
+
+    Parameters
+    ----------
+    name : str
+        Name of the row.
+    kind : str
+        'random'; 'systematic' (shared by all stars, like errors of the model's parameters); 'local'
+        (shared by stars near a position); or 'product' (known deviation of a file, in no total).
+    u, v : ndarray, shape (P,)
+        Standard deviations in the unit of the budget; for products the displacements.
+    source : str
+        Begins with 'measured in this run', 'given by the user' or 'published'.
+    relative_error : float or None
+        Relative uncertainty of the standard deviations; for draws their Monte-Carlo error. None if
+        it is unknown.
+    by_chip : mapping of int to (float or None)
+        Relative uncertainty by chip number, if it differs; `relative_error` is for the first chip.
+    of_parameters : bool
+        True for errors of the model's parameters, which are correlated.
+    """
 
     name: str
-    # 'random', 'systematic' (as the parts of the model, which all stars share), 'local' (shared by
-    # the stars at one position), or 'product' (of a file, known, and in no total)
     kind: str
-    # (P,), standard deviations, in the unit of the budget; of products the displacements' sizes
     u: Float
-    v: Float  # (P,)
-    source: str  # begins with 'measured in this run', 'given by the user' or 'published'
-    # how well the standard deviations are known themselves, relative to their size: of draws the
-    # Monte-Carlo error.  None where it is not known
+    v: Float
+    source: str
     relative_error: float | None = None
-    # the same by chip number, where that differs; `relative_error` is that of the first chip
     by_chip: Mapping[int, float | None] = field(default_factory=dict)
-    of_parameters: bool = False  # True for errors of the model's parameters, which are correlated
+    of_parameters: bool = False
 
     @property
     def radial(self) -> Float:
@@ -51,29 +65,32 @@ class BudgetTerm:
         return np.hypot(self.u, self.v)
 
     def on(self, chip: int, rows: slice) -> BudgetTerm:
-        """Budget on one chip, whose positions are some of the rows."""
-        known = self.by_chip.get(chip, self.relative_error)
-        return replace(self, u=self.u[rows], v=self.v[rows], relative_error=known, by_chip={})
+        """The term on one chip, at a slice of its positions."""
+        relative_error = self.by_chip.get(chip, self.relative_error)
+        return replace(
+            self, u=self.u[rows], v=self.v[rows], relative_error=relative_error, by_chip={}
+        )
 
 
 @dataclass(frozen=True, eq=False)
 class ErrorBudget:
-    """Contributions to the errors of positions, or of their differences to the first one.
+    """Contributions to the errors of positions, or of their differences from the first one.
 
     Parameters
     ----------
     domain : EvaluationDomain
-        N positions; P = N, or N - 1 where errors are those of differences to the first.
+        N positions; P = N, or N - 1 for errors of differences from the first position.
     unit : str
+        Unit of all errors, that of u and v.
     terms : tuple of BudgetTerm
-        Errors of parameters first, then local ones, and the user's.
+        Errors of parameters first, followed by local ones and those stated by the user.
     total : BudgetTerm
-        All terms together.  Rows of one term are correlated, so this may be smaller than any of
+        Sum of all terms. Rows of one term are correlated, so the total may be smaller than any of
         them.
     n_draws : int
-        Draws behind the model's parts: their relative error is about 1 / sqrt(2 n_draws).
+        Number of draws of the model's parts: their relative error is about 1 / sqrt(2 n_draws).
     products : tuple of BudgetTerm
-        What files differ by from the solution: in no total.
+        Deviations of files from the solution, which are not included in the total.
     notes : tuple of str
         Sentences on what the budget lacks, such as measured terms if the residuals were not
         examined.
@@ -130,7 +147,7 @@ class ErrorBudget:
 
     @property
     def _where(self) -> str:
-        """Words on the positions and the epoch."""
+        """Description of the positions and the epoch."""
         chips = ", ".join(map(str, self.domain.chips))
         several = "s" if len(self.domain.chips) > 1 else ""
         words = f"at {self.x.size} positions on chip{several} {chips}"
@@ -143,14 +160,14 @@ class ErrorBudget:
         return words if self.epoch is None else f"{words} in {self.epoch:.2f}"
 
     def _cells(self) -> list[tuple[str, ...]]:
-        """Texts of a table: its head, and one row for each term."""
+        """Cells of a text table: the header, followed by one row per term."""
         units = [f"{name} [{self.unit}]" for name in ("u", "v", "radial")]
         out = [("term", *units, "relative uncertainty", "kind", "source")]
         for row in self.rows():
             sizes = [f"{row[name]:.3g}" for name in ("u", "v", "radial")]
             relative = _relative_error(row)
-            known = f"{100 * relative:.1f} %" if np.isfinite(relative) else "unknown"
-            out.append((row["name"], *sizes, known, row["kind"], row["source"]))
+            percentage = f"{100 * relative:.1f} %" if np.isfinite(relative) else "unknown"
+            out.append((row["name"], *sizes, percentage, row["kind"], row["source"]))
         return out
 
     def to_table(self) -> QTable:
@@ -199,7 +216,7 @@ class ErrorBudget:
 
     @property
     def _compared(self) -> slice:
-        """Rows of the positions, without the one that the others are compared with."""
+        """Slice of the positions, without the first one if it is the reference of differences."""
         return slice(1 if self.domain.relative else 0, None)
 
     @property
@@ -224,19 +241,21 @@ class ErrorBudget:
 
     @property
     def model(self) -> BudgetTerm | None:
-        """Errors of the model's parameters jointly; None if fewer than two terms are of them.
+        """Joint error of the model's parameters; None if fewer than two terms are of parameters.
 
-        The parts are correlated: this is what they leave of the total, beside independent terms,
-        and may be smaller than any of them.
+        It is the total minus the independent terms in quadrature. Since the parts are correlated,
+        it may be smaller than any of them.
         """
         parts = [t for t in self.terms if t.of_parameters]
         if len(parts) < 2:
             return None
-        others = [t for t in self.terms if not t.of_parameters]
+        independent = [t for t in self.terms if not t.of_parameters]
         u, v = (
             np.sqrt(
                 np.maximum(
-                    getattr(self.total, axis) ** 2 - sum(getattr(t, axis) ** 2 for t in others), 0.0
+                    getattr(self.total, axis) ** 2
+                    - sum(getattr(t, axis) ** 2 for t in independent),
+                    0.0,
                 )
             )
             for axis in "uv"
@@ -245,7 +264,7 @@ class ErrorBudget:
 
     @property
     def dominant(self) -> Int:
-        """Index into `terms` of the one with the largest radial error, (P,)."""
+        """Index into `terms` of the term with the largest radial error, shape (P,)."""
         return np.argmax([t.radial for t in self.terms], axis=0)
 
     @property
@@ -256,7 +275,7 @@ class ErrorBudget:
 
     @property
     def chips(self) -> tuple[ErrorBudget, ...]:
-        """The budget of each chip by itself."""
+        """Budget of each chip."""
         return tuple(
             replace(
                 self,
@@ -270,7 +289,7 @@ class ErrorBudget:
 
     @property
     def axes(self) -> tuple[Float, Float]:
-        """Columns (nx,) and rows (ny,) of the grid, of a budget over the grid of one chip."""
+        """Columns (nx,) and rows (ny,) of the grid, for a budget over the grid of one chip."""
         if self.domain.grid is None:
             return self.x, self.y[:1]
         [number] = self.domain.chips
@@ -278,24 +297,24 @@ class ErrorBudget:
         return grid_pixels(place.chip.size, self.domain.grid)
 
     def on_grid(self, values: NDArray[Any]) -> NDArray[Any]:
-        """Values (N,) of a budget over the grid of one chip as a map (ny, nx), NaN off it."""
+        """Map (ny, nx) of values (N,) of a budget over the grid of one chip; NaN elsewhere."""
         x, y = self.axes
-        found = np.full((y.size, x.size), np.nan)
-        found[np.searchsorted(y, self.y), np.searchsorted(x, self.x)] = values
-        return found
+        gridded = np.full((y.size, x.size), np.nan)
+        gridded[np.searchsorted(y, self.y), np.searchsorted(x, self.x)] = values
+        return gridded
 
     def rows(self) -> list[dict[str, Any]]:
-        """The budget as a table: one row for each term and each product, the total last.
+        """The budget as a list of rows: each term, each product, and the total last.
 
-        The total is known as well as its terms are: not where one of them was given without an
-        error.  A budget made without diagnostics has no rows of measured errors beyond those of the
-        parameters: structure, differences between exposures; see `notes`.
+        The uncertainty of the total follows from those of its terms and is unknown if a term was
+        stated without one. A budget without diagnostics has no rows of measured errors except those
+        of the parameters: structure and differences between exposures are missing; see `notes`.
 
         Returns
         -------
         list of dict
-            name, kind, u, v, radial (root mean squares over the positions), radial_error (how well
-            that is known; None where it is not), source.
+            name, kind, u, v, radial (rms over the positions), radial_error (uncertainty of radial;
+            None if unknown), source.
         """
         rows = []
         for t in self.every:
@@ -316,56 +335,59 @@ class ErrorBudget:
         total = rows[-1]
         if total["radial"] > 0:
             parts = [(r["radial"], r["radial_error"]) for r in rows[:-1] if r["kind"] != PRODUCT]
-            known = [(radial, error) for radial, error in parts if error is not None]
-            spread = sum((radial * error) ** 2 for radial, error in known) ** 0.5
-            # a term of nothing needs no error
-            whole = len(known) == sum(radial > 0 or error is not None for radial, error in parts)
-            total["radial_error"] = spread / total["radial"] if whole else None
+            with_error = [(radial, error) for radial, error in parts if error is not None]
+            spread = sum((radial * error) ** 2 for radial, error in with_error) ** 0.5
+            # a term of size zero needs no uncertainty
+            complete = len(with_error) == sum(
+                radial > 0 or error is not None for radial, error in parts
+            )
+            total["radial_error"] = spread / total["radial"] if complete else None
         return rows
 
     def rows_by_chip(self) -> list[dict[str, Any]]:
-        """As `rows`, followed by those of each chip alone; column chip is 'all' or its number."""
+        """Result of `rows`, followed by the rows of each chip; chip is 'all' or the chip number."""
         alone = zip(self.domain.chips, self.chips, strict=True)
         parts = [("all", self.rows()), *((str(chip), b.rows()) for chip, b in alone)]
         return [{"chip": chip} | row for chip, rows in parts for row in rows]
 
 
 def _relative_error(row: Mapping[str, Any]) -> float:
-    """Relative error of the radial size of a row; nan if it is not known."""
+    """Relative error of the radial size of a row; NaN if it is unknown."""
     if row["radial_error"] is None or not row["radial"] > 0:
         return float("nan")
     return float(row["radial_error"] / row["radial"])
 
 
 def budget_of(errors: DrawnErrors, domain: EvaluationDomain) -> ErrorBudget:
-    """The error budget of positions, or of their differences to the first one.
+    """Error budget of positions, or of their differences from the first one.
 
-    Terms are independent of each other, so that their squares add up to the total; rows of one term
-    may be correlated, and the term counts as they do together.
+    Terms are independent of each other, so their squares add up to the total. Rows of one term may
+    be correlated; the total includes their joint error.
 
-    InputError for a missing epoch, and a magnitude where no errors by magnitude are known.
+    Raises InputError if the epoch is missing, or the domain has a magnitude but no errors by
+    magnitude are known.
     """
     monte_carlo = (2.0 * errors.n_effective) ** -0.5
     fields = errors.at(domain)
     terms: list[tuple[bool, BudgetTerm]] = []
     products = []
-    for one in fields:
-        for row, part, square in one.by_row():
-            known = {c: part.relative_error(c, monte_carlo) for c in domain.chips}
+    for term_errors in fields:
+        for row, part, square in term_errors.by_row():
+            relative_errors = {c: part.relative_error(c, monte_carlo) for c in domain.chips}
             u, v = np.sqrt(square).T
-            first = known[domain.chips[0]]
-            found = BudgetTerm(
-                row.name, row.kind, u, v, row.source, first, known, part.of_parameters
+            first = relative_errors[domain.chips[0]]
+            term = BudgetTerm(
+                row.name, row.kind, u, v, row.source, first, relative_errors, part.of_parameters
             )
             if row.kind == PRODUCT:
-                products.append(found)
+                products.append(term)
             else:
-                terms.append((not part.of_parameters, found))
-    u, v = np.sqrt(sum(one.total() for one in fields)).T
+                terms.append((not part.of_parameters, term))
+    u, v = np.sqrt(sum(term_errors.total() for term_errors in fields)).T
     return ErrorBudget(
         domain,
         errors.unit,
-        # errors of parameters come first, whatever else their term holds
+        # errors of parameters come first, even if their term has other rows
         tuple(t for _, t in sorted(terms, key=lambda pair: pair[0])),
         BudgetTerm(TOTAL, TOTAL, u, v, TOGETHER),
         errors.n_draws,
@@ -383,14 +405,15 @@ def place_budget(
     magnitude: float | None = None,
     relative: bool = False,
 ) -> ErrorBudget:
-    """The error budget of some positions, or of their differences to the first one.
+    """Error budget of given positions, or of their differences from the first one.
 
-    `x`, `y`: (N,), FITS 1-based pixels; two or more for relative errors. `chip`: chip number.
-    `epoch`: decimal years; needed by a model with time dependence. `magnitude`: of the stars: their
-    centroids' errors are a term then. `relative`: errors of the differences to the first position,
-    in one image: what all positions share drops out, and what is independent counts twice.
-    InputError for an unknown chip, a position off the chip, a missing epoch, a magnitude where no
-    errors by magnitude are known, and relative errors of one position.
+    `x`, `y`: FITS 1-based pixels, shape (N,); at least two for relative errors. `chip`: chip
+    number. `epoch`: decimal years; required if the model depends on time. `magnitude`: magnitude
+    of the stars, for which the error of their centroids is included. `relative`: True for errors of
+    the differences from the first position in the same image; errors common to all positions cancel
+    and independent errors count twice. Raises InputError if the chip is unknown, a position is off
+    the chip, the epoch is missing, a magnitude is given but no errors by magnitude are known, or a
+    relative error of a single position is requested.
     """
     return budget_of(
         errors,
@@ -401,8 +424,8 @@ def place_budget(
 
 
 def with_product(total: float, product: float) -> float:
-    """Root mean square of an error of mean zero together with a displacement that never changes.
+    """Rms of an error with zero mean plus a constant displacement.
 
-    A constant is independent of every error: the squares add up exactly.
+    A constant is independent of any error, so the squares add up exactly.
     """
     return float(np.hypot(total, product))

@@ -1,10 +1,10 @@
-"""The error budget everywhere and at all times, small enough to be carried along in a page.
+"""The error budget at every position and epoch, compact enough to be embedded in a web page.
 
-Every part of the model's error is a polynomial of the pixel.  So its second moments say all: the
-variance at any pixel, or of the difference of two, is a quadratic form of them.  Within one segment
-of the drift they are polynomials of time: quadratic where the coefficients are linear in time,
-which three epochs fix, and of the fourth degree where the drift has a curvature.  More epochs are
-used until the moments at other epochs follow.
+Every part of the model's error is a polynomial of the pixel position. Its second moments therefore
+contain everything: the variance at any pixel, or of the difference between two pixels, is a
+quadratic form of the moments. Within one segment of the drift the moments are polynomials of time:
+of degree 2 if the coefficients are linear in time, which three epochs determine, and of degree 4 if
+the drift has a curvature. Epochs are added until the moments at other epochs are reproduced.
 """
 
 from __future__ import annotations
@@ -31,33 +31,33 @@ from bayesdist.errors import InputError
 from bayesdist.model import DistortionModel
 from bayesdist.utils.arrays import Float
 
-JOINT = "model"  # all errors of parameters together
-NUMBERS_OF_NODES = (3, 5, 9, 17)  # in one segment of the drift: the first that is good enough
-PROBES = (0.07, 0.31, 0.82)  # parts of a segment where the interpolation is compared
-FOLLOWED = 1e-6  # largest difference there, relative to the largest moment
-CONSTANT = 1e-9  # moments that change less, relative to the largest, do not depend on time
+JOINT = "model"  # name of the joint error of all parameters
+NUMBERS_OF_NODES = (3, 5, 9, 17)  # epochs per segment of the drift: the first sufficient number
+PROBES = (0.07, 0.31, 0.82)  # fractions of a segment at which the interpolation is tested
+FOLLOWED = 1e-6  # largest interpolation error, relative to the largest moment
+CONSTANT = 1e-9  # relative change below which moments are taken as independent of time
 
 
 @dataclass(frozen=True, eq=False)
 class BudgetSpan:
-    """Years within one segment of the drift."""
+    """Moments within one segment of the drift."""
 
-    # epochs from the first to the last one, decimal years, between which the moments follow
+    # epochs from the first to the last, decimal years, between which moments are interpolated by
     # Lagrange's polynomial; empty for a model without time dependence
     nodes: tuple[float, ...]
-    # (n, 2, K, K), by chip number and part: mean products of the Legendre coefficients of the error
-    # in u and in v, at each of the nodes; n = 1 for a part that does not depend on time.  The joint
+    # (n, 2, K, K), by chip number and part: mean products of the Legendre coefficients of the
+    # errors in u and in v, at each node; n = 1 for a part that does not depend on time. The joint
     # error is the last part
     moments: dict[int, dict[str, Float]]
 
 
 @dataclass(frozen=True, eq=False)
 class GridRow:
-    """A row that is no polynomial: values on the grid."""
+    """A row that is not a polynomial: values on the grid."""
 
     row: Row
-    # (n, N, 2), for each span, by chip number: of an error its standard deviations, n = 1; of a
-    # file its displacements at the nodes, linear in time between them, n = 1 for those that do not
+    # (n, N, 2) by chip number, for each span: for an error its standard deviations, n = 1; for a
+    # file its displacements at the nodes, linear in time between them, n = 1 if they do not
     # depend on time
     values: tuple[dict[int, Float], ...]
 
@@ -67,15 +67,16 @@ class BudgetSurface:
     """The error budget as a function of position, epoch and magnitude."""
 
     model: DistortionModel
-    epoch: float | None  # at which the budget is quoted
-    # points on x and y of a chip over which it is averaged, and on which `local` is known
+    epoch: float | None  # epoch at which the budget is quoted
+    # number of points along x and y of a chip, over which the budget is averaged and at which
+    # `local` is given
     grid: tuple[int, int]
-    spans: tuple[BudgetSpan, ...]  # in the order of time
-    parts: tuple[Row, ...]  # errors of parameters, whose moments are in the spans
+    spans: tuple[BudgetSpan, ...]  # in chronological order
+    parts: tuple[Row, ...]  # errors of parameters; their moments are in `spans`
     local: tuple[GridRow, ...]  # other errors, at the epoch at which the budget is quoted
-    constant: tuple[tuple[Row, Float], ...]  # (2,), errors that are as large everywhere
+    constant: tuple[tuple[Row, Float], ...]  # (2,), errors that are equal at all positions
     centroid: MagnitudeErrors | None
-    products: tuple[GridRow, ...] = ()  # in no total
+    products: tuple[GridRow, ...] = ()  # not included in the total
 
 
 def budget_surface(
@@ -87,21 +88,21 @@ def budget_surface(
 ) -> BudgetSurface:
     """Second moments of all errors of a position.
 
-    `errors`: the same draws as those of a budget give the same numbers. `grid`: points on x and y
-    of a chip. `epoch`: decimal years, at which the budget is quoted; the first of the years by
-    default. `years`: first and last epoch; needed by a model with time dependence. InputError for a
-    model with time dependence and no years, or years that do not rise.
+    `errors`: with the draws of a budget, the surface reproduces its numbers. `grid`: number of
+    points along x and y of a chip. `epoch`: decimal years, epoch at which the budget is quoted; the
+    first of `years` by default. `years`: first and last epoch; required if the model depends on
+    time. Raises InputError if the model depends on time and `years` is missing or not ascending.
     """
     model = errors.solution.model
     ends = _ends(model, years)
     if epoch is None and ends[0]:
         epoch = ends[0][0]
-    spans = tuple(_span(errors, one, epoch) for one in ends)
-    nodes = [one.nodes for one in spans]
+    spans = tuple(_span(errors, segment, epoch) for segment in ends)
+    nodes = [span.nodes for span in spans]
     domain = EvaluationDomain.of_chips(model, grid, epoch=epoch)
     parts, local, constant, products = [], list[GridRow](), [], list[GridRow]()
-    for draws, one in zip(errors.draws, errors.at(domain), strict=True):
-        for row, part, values in one.by_row():
+    for draws, term_errors in zip(errors.draws, errors.at(domain), strict=True):
+        for row, part, values in term_errors.by_row():
             if part.of_parameters:
                 parts.append(row)
             elif isinstance(draws, Known):
@@ -128,7 +129,10 @@ def budget_surface(
 def _shifts(draws: Known, domain: EvaluationDomain, nodes: Sequence[float]) -> dict[int, Float]:
     """Displacements (n, N, 2) by chip number, at the nodes of a span."""
     moved = [draws.on(domain.at(epoch), Image()).shift for epoch in nodes or (None,)]
-    return {chip: _short(np.stack([one[rows] for one in moved])) for chip, rows in domain.by_chip()}
+    return {
+        chip: _short(np.stack([displacement[rows] for displacement in moved]))
+        for chip, rows in domain.by_chip()
+    }
 
 
 def _ends(
@@ -143,14 +147,14 @@ def _ends(
     edges = [first, *(b for b in model.time.breaks if first < b < last), last]
     out = []
     for start, stop in pairwise(edges):
-        # a break belongs to what begins there
+        # at a break the later segment applies
         end = stop if stop == last else float(np.nextafter(stop, start))
         out.append((start, end))
     return tuple(out)
 
 
 def _span(errors: DrawnErrors, ends: Sequence[float], epoch: float | None) -> BudgetSpan:
-    """Moments of one segment of the drift, at as many epochs as they need."""
+    """Moments in one segment of the drift, at as many epochs as interpolation requires."""
     if not ends:
         return BudgetSpan((), _moments(errors, ()))
     start, end = ends
@@ -165,64 +169,64 @@ def _span(errors: DrawnErrors, ends: Sequence[float], epoch: float | None) -> Bu
 
 
 def _nodes(start: float, end: float, n: int, epoch: float | None) -> tuple[float, ...]:
-    """Chebyshev's extrema in a segment, one of them moved to the epoch that is quoted."""
+    """Chebyshev extrema in a segment; the nearest one is moved to the quoted epoch."""
     at = 0.5 * (start + end) - 0.5 * (end - start) * np.cos(np.pi * np.arange(n) / (n - 1))
     at[0], at[-1] = start, end
     if epoch is not None and start < epoch < end:
         nearest = 1 + int(np.argmin(np.abs(at[1:-1] - epoch)))
         before, after = at[nearest - 1], at[nearest + 1]
         room = 0.25 * min(after - at[nearest], at[nearest] - before)
-        # nodes close to each other would amplify rounding
+        # nodes that are too close would amplify rounding errors
         if before + room < epoch < after - room:
             at[nearest] = epoch
     return tuple(float(t) for t in at)
 
 
 def lagrange_weights(nodes: Sequence[float], epoch: float) -> Float:
-    """Weights (n,) of the nodes at an epoch."""
+    """Lagrange interpolation weights (n,) of the nodes at an epoch."""
     t = np.asarray(nodes, float)
     factors = [np.prod((epoch - np.delete(t, k)) / (t[k] - np.delete(t, k))) for k in range(len(t))]
     return np.array(factors)
 
 
 def _follows(span: BudgetSpan, probes: Sequence[float], truth: dict[int, dict[str, Float]]) -> bool:
-    """True if the interpolated moments are those at the probes."""
+    """True if the interpolated moments agree with those at the probes."""
     for chip, parts in span.moments.items():
         for part, at_nodes in parts.items():
             limit = FOLLOWED * np.abs(at_nodes).max()
             for k, epoch in enumerate(probes):
                 asked = truth[chip][part]
                 weights = lagrange_weights(span.nodes, epoch) if len(at_nodes) > 1 else np.ones(1)
-                found = np.tensordot(weights, at_nodes, 1)
-                if np.abs(found - asked[k if len(asked) > 1 else 0]).max() > limit:
+                interpolated = np.tensordot(weights, at_nodes, 1)
+                if np.abs(interpolated - asked[k if len(asked) > 1 else 0]).max() > limit:
                     return False
     return True
 
 
 def _moments(errors: DrawnErrors, nodes: Sequence[float]) -> dict[int, dict[str, Float]]:
-    """By chip number and part, moments (n, 2, K, K) at the nodes; the joint ones are the last."""
+    """Moments (n, 2, K, K) at the nodes, by chip number and part; the joint ones are last."""
     model = errors.solution.model
     epochs = nodes or (None,)
-    # moments know of no positions: any will do
+    # moments do not depend on the positions of the domain
     domain = EvaluationDomain.of_chips(model, (2, 2), epoch=epochs[0])
     at = [errors.at(domain.at(epoch)) for epoch in epochs]
     out: dict[int, dict[str, Float]] = {chip.number: {} for chip in model.chips}
     for chip, moments in out.items():
         by_node = [_of_parameters(fields, chip) for fields in at]
         for part in by_node[0]:
-            moments[part] = _short(np.stack([one[part] for one in by_node]))
+            moments[part] = _short(np.stack([moments_at_node[part] for moments_at_node in by_node]))
     return out
 
 
 def _of_parameters(fields: Sequence[ErrorField], chip: int) -> dict[str, Float]:
-    """Moments (2, K, K) of each part on a chip, and of all together."""
+    """Moments (2, K, K) of each part on a chip, and of their joint error."""
     out: dict[str, Float] = {}
     joint: Float | float = 0.0
-    for one in fields:
-        for part in one.parts:
+    for term_errors in fields:
+        for part in term_errors.parts:
             if isinstance(part, PolynomialField):
                 out[part.rows[0].name] = _second(part.coefficients[chip])
-        added = [p.coefficients[chip] for p in one.summed if isinstance(p, PolynomialField)]
+        added = [p.coefficients[chip] for p in term_errors.summed if isinstance(p, PolynomialField)]
         if added:
             joint = joint + _second(sum(added[1:], added[0]))
     return out | {JOINT: np.asarray(joint)}
@@ -235,6 +239,6 @@ def _second(e: Float) -> Float:
 
 
 def _short(moments: Float) -> Float:
-    """Values of one node where all are the same."""
+    """Moments reduced to a single node if they are equal at all nodes."""
     change = np.abs(moments - moments[:1]).max()
     return moments[:1] if change <= CONSTANT * np.abs(moments).max() else moments

@@ -1,4 +1,4 @@
-"""A change of a released solution as maps over the detector, and in words."""
+"""Changes of a released solution as maps over the detector, and in sentences."""
 
 from __future__ import annotations
 
@@ -18,32 +18,32 @@ from bayesdist.utils.numbers import p_words
 
 @dataclass(frozen=True, eq=False)
 class Monitored:
-    """Change of a release that new matches show."""
+    """Change of a released solution as measured from new matches."""
 
     change: Change
-    # new minus released, one for each chip, in pixels: the mean change, or that from its date on
+    # new minus released, one per chip, in pixels: the mean change, or the change since `date`
     maps: tuple[Comparison, ...]
     date: ChangeDate | None  # None for matches without epochs
-    misfit: Misfit  # structure that even the fit of the new matches leaves
+    misfit: Misfit  # structure that remains after the fit of the new matches
     pixel_mas: float | None = None
 
     @property
     def scatters(self) -> bool:
-        """True if periods scatter more than their errors, which then are not independent."""
+        """True if periods scatter more than their errors, so that errors are not independent."""
         return self.date is not None and self.date.p_scatter < DIFFERENCE.value
 
     @property
     def p_value(self) -> float:
-        """Probability that chance makes as large a mean change.
+        """Probability of a mean change at least as large by chance.
 
-        By the scatter of the periods in place of the errors where it is significantly larger.
+        If the scatter of the periods is significantly larger than their errors, it is used instead.
         """
         test = self.change.test
         return self._judged(test.chi2, test.dof, test.p_value)
 
     @property
     def p_since(self) -> float | None:
-        """Probability that chance makes as large a change at one of several dates."""
+        """Probability of a change at least as large by chance at one of several dates."""
         if self.date is None or len(self.date.gain) == 1:
             return None
         gain, n = float(self.date.gain.max()), len(self.date.gain)
@@ -57,7 +57,7 @@ class Monitored:
 
     @property
     def p_either(self) -> float:
-        """Probability of both tests together: twice the smaller one."""
+        """Probability of the two tests combined: twice the smaller one."""
         return (
             self.p_value if self.p_since is None else min(1.0, 2 * min(self.p_value, self.p_since))
         )
@@ -69,7 +69,7 @@ class Monitored:
 
     @property
     def since_a_date(self) -> bool:
-        """True if the change from a date on is given, which is more significant than the mean."""
+        """True if the change starts at a date and is then more significant than the mean change."""
         return is_late(self.change, self.date)
 
     @property
@@ -79,7 +79,7 @@ class Monitored:
 
     @property
     def verdict(self) -> str:
-        """One sentence."""
+        """The verdict in one sentence."""
         m, late = self.worst, self.since_a_date
         test = self.date.change.test if late and self.date is not None else self.change.test
         x, y = m.position_of_largest
@@ -120,7 +120,7 @@ class Monitored:
 
     @property
     def doubts(self) -> list[str]:
-        """Sentences on reasons for doubt."""
+        """Reasons for doubt, as sentences."""
         out = []
         if self.scatters and self.date is not None:
             out.append(
@@ -133,7 +133,7 @@ class Monitored:
 
 
 def is_late(change: Change, date: ChangeDate | None) -> bool:
-    """True if a change within the new matches is significant, and more so than the mean one."""
+    """True if a change within the new matches is significant, and more so than the mean change."""
     if date is None or not np.isfinite(date.after):
         return False
     return date.p_value < min(DIFFERENCE.value / 2, change.test.p_value)
@@ -146,10 +146,10 @@ def change_maps(
     names: tuple[str, str],
     grid: tuple[int, int],
 ) -> tuple[Comparison, ...]:
-    """The change of each chip over its grid.
+    """Maps of the change of each chip over its grid.
 
-    `names`: of the new matches and of the release. Returns new minus released; whose errors are
-    both in the covariance of the first.
+    `names`: names of the new matches and of the released solution. Returns new minus released; the
+    errors of both are in the covariance of the new one.
     """
     model, out = change.model, []
     size = 2 * model.n_terms

@@ -1,8 +1,8 @@
-"""Do two calibrations differ, where, by how much, and is it more than their errors?
+"""Compare two calibrations: where and by how much they differ, and how significantly.
 
-The chi-square of the whole field needs no choice of how shift, rotation and scale are taken out:
-with the covariance of what remains, every linear way gives the same value, with four degrees of
-freedom fewer.
+The chi-square of the whole field does not depend on how shift, rotation and scale are removed. With
+the covariance of the remaining difference, every linear method gives the same value, with four
+degrees of freedom fewer.
 """
 
 from __future__ import annotations
@@ -41,36 +41,37 @@ __all__ = [
 ]
 
 
-NOISE_SEED = 20150206  # of the noise fields: the same comparison gives the same numbers
+NOISE_SEED = 20150206  # seed of the noise fields, so that a comparison is reproducible
 
 
 @dataclass(frozen=True, eq=False)
 class Comparison:
-    """Difference that remains between two calibrations, in pixels of A without distortion.
+    """Difference that remains between two calibrations, in undistorted pixels of A.
 
     Parameters
     ----------
     a, b : ChipMap
+        The two calibrations.
     frame : CommonFrame
-        The difference A - B as a polynomial, and what was taken out.
+        The difference A - B as a polynomial, and what was removed from it.
     x : ndarray, shape (nx,)
     y : ndarray, shape (ny,)
         Grid, FITS 1-based pixels.
     du, dv : ndarray, shape (ny, nx)
         The difference along x and y.
     sigma_u, sigma_v, correlation : ndarray, shape (ny, nx), optional
-        Its errors; None without covariance.
+        Errors of the difference; None without a covariance.
     chi2 : ndarray, shape (ny, nx), optional
-        Of both axes, two degrees of freedom; NaN where the errors are zero.
+        Chi-square of both axes, with two degrees of freedom; NaN where the errors are zero.
     field : FieldTest, optional
-        Of all terms whose errors are known.
+        Test of all terms with known errors.
     unknown_rms : float
-        Rms over the detector of the terms that no covariance speaks of; 0 where there are none.
+        Rms over the detector of the terms without a covariance; 0 if there are none.
     largest_z : float, optional
-        Of the Legendre coefficients, in units of their errors.
+        Largest Legendre coefficient in units of its error.
     p_largest_z, p_largest_chi2 : float, optional
-        Share of noise fields whose largest ``|z|``, and whose largest chi-square on the grid, is as
-        large: they account for the search.
+        Fraction of noise fields in which the largest ``|z|``, or the largest chi-square on the
+        grid, is at least as large; this accounts for the number of values searched.
     """
 
     a: ChipMap
@@ -92,7 +93,7 @@ class Comparison:
 
     @property
     def similarity(self) -> Similarity:
-        """Shift, rotation and scale between both."""
+        """Shift, rotation and scale between the calibrations."""
         return self.frame.similarity
 
     @property
@@ -128,19 +129,19 @@ class Comparison:
 
     @property
     def noise_rms(self) -> float | None:
-        """Rms length that the errors alone would make."""
+        """Rms length of the difference expected from the errors alone."""
         if self.sigma_u is None or self.frame.cov is None:
             return None
         return float(np.sqrt(self.frame.norm @ np.diag(self.frame.cov)))
 
     @property
     def errors_of(self) -> str:
-        """Whose errors the significance rests on: 'both', 'A', 'B' or 'none'."""
+        """Calibrations with known errors: 'both', 'A', 'B' or 'none'."""
         return with_errors(self.a.cov, self.b.cov)
 
     @property
     def differs(self) -> bool | None:
-        """True if the difference is more than the errors; None where these are not known."""
+        """True if the difference is significant; None if the errors are unknown."""
         return None if self.field is None else self.field.p_value < DIFFERENCE.value
 
 
@@ -158,15 +159,15 @@ def compare(
     Parameters
     ----------
     a, b : ChipMap
-        With independent errors.
+        Calibrations with independent errors.
     rng : numpy.random.Generator
-        For the probabilities that account for a search.
+        Generator of the noise fields.
     grid : tuple of int
-        Points on x and y.
+        Number of points along x and y.
     keep : bool
-        Leave shift, rotation and scale in.
+        True to keep shift, rotation and scale in the difference.
     n_draws : int
-        Noise fields.  No fraction of them is stated below 1 / (n_draws + 1).
+        Number of noise fields. Probabilities are never stated below 1 / (n_draws + 1).
 
     Returns
     -------
@@ -175,7 +176,7 @@ def compare(
     Raises
     ------
     InputError
-        As `common_frame`; for a bad grid.
+        If the grid is invalid; see also `common_frame`.
     """
     frame = common_frame(a, b, keep=keep)
     basis, d = frame.basis, frame.difference
@@ -192,23 +193,27 @@ def compare(
         K = basis.n_terms
         uu, vv, uv = position_moments(frame.cov.reshape(2, K, 2, K), basis, X, Y)
         chi2 = _of_two(du, dv, uu, vv, uv)
-        sigma_u, sigma_v, correlation = (one.reshape(shape) for one in sigmas_of(uu, vv, uv))
+        sigma_u, sigma_v, correlation = (values.reshape(shape) for values in sigmas_of(uu, vv, uv))
         draws = draws_of_sum(zip(frame.shares, (a, b), strict=True))
         field = chi_square(
             d.ravel(), frame.raw_cov, without=frame.taken, norm=frame.norm, draws=draws
         )
-        rest = ~known_terms(frame.raw_cov)
-        rest[[0, K]] &= not frame.taken.shape[1]
-        unknown = float(np.sqrt(frame.norm[rest] @ d.ravel()[rest] ** 2))
+        untested = ~known_terms(frame.raw_cov)
+        untested[[0, K]] &= not frame.taken.shape[1]
+        unknown = float(np.sqrt(frame.norm[untested] @ d.ravel()[untested] ** 2))
         sigma = term_sigmas(frame)
         noise = rng.standard_normal((n_draws, 2 * K)) @ _root(frame.cov).T
-        known = sigma > 0
-        z_max = float(np.abs(d.ravel()[known] / sigma[known]).max(initial=0.0))
-        p_z = _share(np.abs(noise[:, known] / sigma[known]).max(axis=1, initial=0.0), z_max)
+        tested_terms = sigma > 0
+        z_max = float(np.abs(d.ravel()[tested_terms] / sigma[tested_terms]).max(initial=0.0))
+        p_z = _share(
+            np.abs(noise[:, tested_terms] / sigma[tested_terms]).max(axis=1, initial=0.0), z_max
+        )
         fields = (n.reshape(2, K) @ phi.T for n in noise)
-        others = np.array([_of_two(along_x, along_y, uu, vv, uv) for along_x, along_y in fields])
+        noise_chi2 = np.array(
+            [_of_two(along_x, along_y, uu, vv, uv) for along_x, along_y in fields]
+        )
         top = float(np.nanmax(chi2, initial=0.0))
-        p_chi2 = _share(np.nanmax(others, axis=1, initial=0.0), top)
+        p_chi2 = _share(np.nanmax(noise_chi2, axis=1, initial=0.0), top)
         chi2 = chi2.reshape(shape)
     return Comparison(
         a=a,
@@ -231,7 +236,7 @@ def compare(
 
 
 def term_sigmas(frame: CommonFrame) -> Float:
-    """Standard deviations (2 K,) of the difference; 0 for terms that were taken out."""
+    """Standard deviations (2 K,) of the difference; 0 for terms that were removed."""
     variance, raw = (
         np.diag(required(cov, "neither calibration has errors"))
         for cov in (frame.cov, frame.raw_cov)
@@ -252,16 +257,16 @@ def _root(cov: Float) -> Float:
 
 
 def _share(noise: Float, value: float) -> float:
-    """Fraction of noise that is as large as a value."""
+    """Fraction of noise values that are at least as large as a value."""
     return float((1 + (noise >= value).sum()) / (len(noise) + 1))
 
 
 def comparison_table(found: Comparison) -> Table:
-    """Difference of each coefficient.
+    """Table of the difference of each coefficient.
 
-    Returns columns: form ('legendre': of products over the detector; 'monomial': of pixel offsets
-    from the reference pixel of A), axis, i, j, difference, sigma and z (NaN where no error is
-    known, or the term was taken out), unit.
+    Returns columns form ('legendre': products of Legendre polynomials over the detector;
+    'monomial': powers of pixel offsets from the reference pixel of A), axis, i, j, difference,
+    sigma and z (NaN if no error is known or the term was removed), unit.
     """
     frame = found.frame
     K, basis = frame.basis.n_terms, frame.basis
@@ -284,7 +289,7 @@ def comparison_table(found: Comparison) -> Table:
             i, j = basis.terms[n % K]
             sigma_n = np.nan if errors is None or not errors[n] > 0 else float(errors[n])
             if form == "monomial" and not (found.a.correlated and found.b.correlated) and i + j < 2:
-                sigma_n = np.nan  # rests on correlations
+                sigma_n = np.nan  # needs correlations, which are unknown
             unit = "pix" if form == "legendre" else _unit(i + j)
             value = float(values[n])
             rows.append((form, AXES[n // K], i, j, value, sigma_n, value / sigma_n, unit))
@@ -293,15 +298,15 @@ def comparison_table(found: Comparison) -> Table:
 
 
 def _unit(order: int) -> str:
-    """Unit of a monomial's coefficient where positions are in pixels."""
+    """Unit of the coefficient of a monomial, for positions in pixels."""
     return {0: "pix", 1: ""}.get(order, f"pix^{1 - order}")
 
 
 def difference_table(found: Comparison) -> Table:
-    """The difference over the grid, point by point.
+    """Table of the difference at each point of the grid.
 
-    Returns columns x, y, du, dv and, where errors are known, sigma_u, sigma_v, correlation, chi2;
-    in pixels.
+    Returns columns x, y, du, dv and, if errors are known, sigma_u, sigma_v, correlation, chi2; in
+    pixels.
     """
     X, Y = np.meshgrid(found.x, found.y)
     columns = {"x": X, "y": Y, "du": found.du, "dv": found.dv}
@@ -319,7 +324,7 @@ def difference_table(found: Comparison) -> Table:
 def gap_table(gaps: Sequence[GapDifference]) -> Table:
     """Table of the offsets of chips from the reference chip, A minus B.
 
-    `gaps`: one for each chip but the reference. Returns columns: chip, reference, quantity,
+    `gaps`: one per chip, without the reference chip. Returns columns chip, reference, quantity,
     difference, sigma and z (NaN without errors), unit.
     """
     quantities = (("shift_x", "pix"), ("shift_y", "pix"), ("scale", ""), ("rotation", "rad"))

@@ -1,12 +1,12 @@
-"""Two calibrations laid on each other: the similarity between them, separated from the rest.
+"""Two calibrations in a common frame: the similarity between them, and the remaining difference.
 
-With w = u + i v, mean over the area of the detector,
+With w = u + i v, as a mean over the area of the detector,
 
-    w_A = shift + turn w_B + d        (or the conjugate of w_B, where one of them is mirrored)
+    w_A = shift + turn w_B + d        (or the conjugate of w_B if one of them is mirrored)
 
-is solved for shift and turn by least squares over the whole detector.  d is what no shift, rotation
-or scale explains.  It is stated along the axes of the detector, in pixels of A without distortion:
-divided by the linear part of A.
+is solved for shift and turn by least squares over the whole detector. The residual d is the part
+that no shift, rotation or scale explains. It is given along the axes of the detector in undistorted
+pixels of A, that is, divided by the linear part of A.
 """
 
 from __future__ import annotations
@@ -24,46 +24,46 @@ from bayesdist.infer.compare.frame_fields import term_squares
 from bayesdist.model import PolynomialBasis
 from bayesdist.utils.arrays import Complex, Float
 
-NEAR = 0.1  # radians, or of the scale: axes that lie alike
+NEAR = 0.1  # radians, or relative scale: largest difference of axes that count as parallel
 
 
 @dataclass(frozen=True)
 class Similarity:
-    """Shift, rotation and scale by which A lies off B: w_A = shift + turn w_B."""
+    """Shift, rotation and scale between A and B: w_A = shift + turn w_B."""
 
-    # mean over the detector of A minus B, along x and y, pixels; None unless the axes of both lie
-    # alike and their units agree
+    # mean over the detector of A minus B, along x and y, pixels; None unless the axes of A and B
+    # are nearly parallel and their units agree
     shift: tuple[float, float] | None
     rotation: float  # radians, from u towards v
-    scale: float  # of A against B; without meaning where one is in pixels and the other in angles
+    scale: float  # of A relative to B; meaningless if one is in pixels and the other in angles
     mirrored: bool
     same_unit: bool  # True if both are in pixels or both in angles
     sigma_shift: tuple[float, float] | None
-    # standard errors; None where neither side has a covariance, or one has no correlations
+    # standard errors; None if neither side has a covariance, or one has no correlations
     sigma_rotation: float | None
     sigma_scale: float | None
 
     @property
     def alike(self) -> bool:
-        """True if the axes of both lie alike, so that shift and scale are a difference."""
+        """True if the axes of A and B are nearly parallel, so that shift and scale can differ."""
         turned = np.hypot(self.rotation, self.scale - 1.0)
         return self.same_unit and not self.mirrored and bool(turned < NEAR)
 
 
 @dataclass(frozen=True, eq=False)
 class CommonFrame:
-    """The difference A - B in pixels of A, and what was taken out of it."""
+    """The difference A - B in pixels of A, and what was removed from it."""
 
-    basis: PolynomialBasis  # of the higher of both orders, with the reference pixel of A
+    basis: PolynomialBasis  # with the higher of the two orders and the reference pixel of A
     difference: Float  # (2, K), Legendre coefficients
-    cov: Float | None  # (2 K, 2 K), of the difference, u before v
-    raw_cov: Float | None  # (2 K, 2 K), the same before anything was taken out
-    # (2 K, q), fields that were taken out: of the shift, the scale and the rotation; none where
-    # they are kept
+    cov: Float | None  # (2 K, 2 K), covariance of the difference, u before v
+    raw_cov: Float | None  # (2 K, 2 K), covariance before anything was removed
+    # (2 K, q), fields of the shift, the scale and the rotation that were removed; q = 0 if they are
+    # kept
     taken: Float
-    shares: tuple[float, float]  # fractions of A and of B in the variances
+    shares: tuple[float, float]  # fractions that A and B contribute to the variances
     similarity: Similarity
-    pixel_mas: float | None  # size of a pixel of A, where one side states it
+    pixel_mas: float | None  # size of a pixel of A, if either side states it
 
     @property
     def norm(self) -> Float:
@@ -72,12 +72,12 @@ class CommonFrame:
 
 
 def common_frame(a: ChipMap, b: ChipMap, *, keep: bool) -> CommonFrame:
-    """Bring two calibrations to one frame.
+    """Transform two calibrations to a common frame.
 
-    `a`, `b`: of one detector; of any order, reference pixel, orientation, parity and unit.  Their
-    errors are taken as independent. `keep`: leave shift, rotation and scale in the difference.
-    InputError for detectors of different size, a calibration without linear part, or where shift,
-    rotation and scale are to be kept between frames that do not lie alike.
+    `a`, `b`: calibrations of one detector, with any order, reference pixel, orientation, parity and
+    unit. Their errors are treated as independent. `keep`: True to keep shift, rotation and scale in
+    the difference. Raises InputError if the detectors differ in size, a calibration has no linear
+    part, or shift, rotation and scale should be kept although the axes are not nearly parallel.
     """
     if a.basis.size != b.basis.size:
         sizes = " and ".join(f"{c.basis.size[0]:g} x {c.basis.size[1]:g}" for c in (a, b))
@@ -117,8 +117,8 @@ def common_frame(a: ChipMap, b: ChipMap, *, keep: bool) -> CommonFrame:
     cov = sum(parts[1:], parts[0]) if parts else None
     shares = (float(cov_a is not None), float(cov_b is not None))
     if cov is not None and len(parts) == 2:
-        known = np.diag(cov) > 0
-        of_a = float(np.mean(np.diag(parts[0])[known] / np.diag(cov)[known]))
+        positive = np.diag(cov) > 0
+        of_a = float(np.mean(np.diag(parts[0])[positive] / np.diag(cov)[positive]))
         shares = (of_a, 1.0 - of_a)
 
     fields = similarity_fields(moved)
@@ -127,7 +127,7 @@ def common_frame(a: ChipMap, b: ChipMap, *, keep: bool) -> CommonFrame:
     errors = None
     if cov is not None and a.correlated and b.correlated:
         errors = estimate @ cov @ estimate.T
-    taken = fields[:, :0] if keep else fields
+    removed = fields[:, :0] if keep else fields
     projector = np.eye(len(raw)) - (0.0 if keep else fields @ estimate)
     out = to_pixels @ projector
     return CommonFrame(
@@ -135,7 +135,7 @@ def common_frame(a: ChipMap, b: ChipMap, *, keep: bool) -> CommonFrame:
         difference=(out @ raw).reshape(2, -1),
         cov=None if cov is None else _symmetric(out @ cov @ out.T),
         raw_cov=None if cov is None else _symmetric(to_pixels @ cov @ to_pixels.T),
-        taken=to_pixels @ taken,
+        taken=to_pixels @ removed,
         shares=shares,
         similarity=_similarity(turn, mirrored, same_unit, lies_alike, linear, za, zb, errors),
         pixel_mas=_pixel_mas(a, b, linear, turn),
@@ -143,35 +143,35 @@ def common_frame(a: ChipMap, b: ChipMap, *, keep: bool) -> CommonFrame:
 
 
 def with_errors(a: Float | None, b: Float | None) -> str:
-    """Sides with a covariance: 'both', 'A', 'B' or 'none'."""
+    """Calibrations with a covariance: 'both', 'A', 'B' or 'none'."""
     if a is not None:
         return "A" if b is None else "both"
     return "none" if b is None else "B"
 
 
 def draws_of_sum(parts: Iterable[tuple[float, ChipMap]]) -> float:
-    """Draws that a sum of estimated covariances is worth, as Welch and Satterthwaite count them.
+    """Effective number of draws of a sum of estimated covariances (Welch-Satterthwaite formula).
 
-    `parts` are the fraction of each estimate in the sum, and the map that states its draws.
+    `parts`: for each estimate its fraction of the sum, and the map that states its number of draws.
     """
-    lost = sum(share**2 / one.draws for share, one in parts)
+    lost = sum(share**2 / chip_map.draws for share, chip_map in parts)
     return 1.0 / lost if lost > 0 else np.inf
 
 
 def turn_matrix(turn: complex, *, mirrored: bool) -> Float:
-    """Matrix (2, 2) of a scale and rotation, behind a mirror where there is one."""
+    """Matrix (2, 2) of a scale and rotation, applied after a reflection if mirrored."""
     matrix = np.array([[turn.real, -turn.imag], [turn.imag, turn.real]])
     return matrix * np.array([1.0, -1.0]) if mirrored else matrix
 
 
 def least_squares(fields: Float, basis: PolynomialBasis) -> Float:
-    """Matrix (q, 2 K) from a difference to what fields (2 K, q) explain of it over the chip."""
+    """Matrix (q, 2 K) that fits fields (2 K, q) to a difference by least squares over the chip."""
     weighted = fields * term_squares(basis)[:, None]
     return np.asarray(np.linalg.solve(fields.T @ weighted, weighted.T))
 
 
 def linear_part(basis: PolynomialBasis, coefficients: Float, a: ChipMap) -> Float:
-    """Derivatives (2, 2) of A's positions by the pixel, at its reference pixel."""
+    """Derivatives (2, 2) of A's positions with respect to the pixel, at its reference pixel."""
     linear = basis.to_monomials(coefficients)[:, 1:3]
     if abs(np.linalg.det(linear)) <= 1e-9 * np.abs(linear).max() ** 2:
         raise InputError("has a singular linear part", where=a.name, do="check its coefficients")
@@ -198,8 +198,8 @@ def _similarity(
     sigma_shift: tuple[float, float] | None = None
     if errors is not None:
         sigma = np.sqrt(np.maximum(np.diag(errors), 0.0))
-        own = inverse @ errors[:2, :2] @ inverse.T
-        along_u, along_v = np.sqrt(np.maximum(np.diag(own), 0.0)).tolist()
+        shift_cov = inverse @ errors[:2, :2] @ inverse.T
+        along_u, along_v = np.sqrt(np.maximum(np.diag(shift_cov), 0.0)).tolist()
         sigma_shift = along_u, along_v
     return Similarity(
         shift=(float(shift[0]), float(shift[1])) if lies_alike else None,

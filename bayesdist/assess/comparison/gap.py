@@ -1,13 +1,13 @@
-"""The gap between chips: does one lie elsewhere against another in A than in B?
+"""Gap between chips: compare the relative position of two chips in A and in B.
 
-Chips are compared one by one, each after its own best shift, rotation and scale.  What these do to
-one chip they have to do to all of them: with the similarity of the reference chip taken out of the
-whole detector, w = u + i v of another chip is
+Chips are compared one by one, each after removing its best-fitting shift, rotation and scale. These
+apply to all chips in the same way. After the similarity of the reference chip has been removed from
+the whole detector, w = u + i v of another chip is
 
     w_A = shift + (1 + scale + i rotation) (turn w_B - its mean) + d
 
-in which shift, rotation and scale are those of the chip against the reference chip.  They are
-linear in the coefficients of both chips, and so are their errors.
+with shift, rotation and scale of the chip relative to the reference chip. They are linear in the
+coefficients of both chips, and so are their errors.
 """
 
 from __future__ import annotations
@@ -33,28 +33,28 @@ from bayesdist.utils.arrays import Float
 
 @dataclass(frozen=True, eq=False)
 class ChipPair:
-    """Two chips of one calibration in one plane."""
+    """Two chips of one calibration in a common plane."""
 
-    chips: tuple[int, int]  # numbers of the reference chip and of the other one
-    reference: ChipMap  # of one order, in one system of u, v
+    chips: tuple[int, int]  # numbers of the reference chip and of the other chip
+    reference: ChipMap  # both maps have the same order and the same system of u, v
     other: ChipMap
-    # (4 K, 4 K), joint covariance of their coefficients: u and v of the reference chip, then of the
-    # other
+    # (4 K, 4 K), joint covariance of their coefficients: u and v of the reference chip, followed by
+    # u and v of the other chip
     cov: Float | None
 
 
 @dataclass(frozen=True, eq=False)
 class GapDifference:
-    """Offset of another chip, A minus B, where the reference chips lie on each other."""
+    """Offset of a chip, A minus B, after aligning the reference chips."""
 
     chip: int  # chip numbers
     reference: int
-    # (4,), mean shift over the chip along its x and y, in pixels of A without distortion; scale;
-    # rotation from u towards v, radians
+    # (4,), mean shift over the chip along its x and y, in undistorted pixels of A; scale; rotation
+    # from u towards v, radians
     values: Float
     cov: Float | None  # (4, 4)
-    test: FieldTest | None  # of all four at once; None without errors on either side
-    errors_of: str  # 'both', 'A', 'B' or 'none': as of `with_errors`
+    test: FieldTest | None  # of all four values combined; None without errors on either side
+    errors_of: str  # 'both', 'A', 'B' or 'none'; see `with_errors`
 
     @property
     def sigma(self) -> Float | None:
@@ -67,8 +67,8 @@ def pair_of_chips(
 ) -> ChipPair:
     """Two chips of a calibration.
 
-    `reference`, `other`: chip numbers. `epoch`: decimal years, for what depends on time. The result
-    comes with a covariance where the calibration has one.
+    `reference`, `other`: chip numbers. `epoch`: decimal years, if the calibration depends on time.
+    The result has a covariance if the calibration has one.
     """
     maps = calibration.at(epoch, origin="stated")
     cov = calibration.joint_covariance((reference, other), epoch, origin="stated")
@@ -76,33 +76,33 @@ def pair_of_chips(
 
 
 def gap_difference(a: ChipPair, b: ChipPair) -> GapDifference:
-    """Compare where two calibrations have a chip against another one.
+    """Compare the position of a chip relative to another one in two calibrations.
 
-    `a`, `b`: of the same chips, which `compare` has compared; of any order, reference pixel,
-    orientation, parity and unit.  Their errors are taken as independent. InputError for chips
-    without linear part.
+    `a`, `b`: pairs of the same chips, already compared by `compare`, with any order, reference
+    pixel, orientation, parity and unit. Their errors are treated as independent. Raises InputError
+    if a chip has no linear part.
     """
     bases = []
     for of_a, of_b in ((a.reference, b.reference), (a.other, b.other)):
         order = max(of_a.basis.order, of_b.basis.order)
         bases.append(PolynomialBasis(order, of_a.basis.size, of_a.basis.reference_pixel))
     K = bases[0].n_terms
-    both = [[c.padded(K)[0] for c in (pair.reference, pair.other)] for pair in (a, b)]
-    za, zb = ([c[0] + 1j * c[1] for c in one] for one in both)
+    coefficients = [[c.padded(K)[0] for c in (pair.reference, pair.other)] for pair in (a, b)]
+    za, zb = ([c[0] + 1j * c[1] for c in pair_coefficients] for pair_coefficients in coefficients)
     turn, mirrored = turn_between(za[0], zb[0], bases[0], b.reference.name)
     moved = [turn * (z.conj() if mirrored else z) for z in zb]
     raw = [as_real(x - y) for x, y in zip(za, moved, strict=True)]
     fits = [
         least_squares(similarity_fields(z), basis) for z, basis in zip(moved, bases, strict=True)
     ]
-    # what the similarity of the reference chip does to the other one
+    # effect on the other chip of the similarity fitted to the reference chip
     about = moved[1].copy()
     about[0] -= moved[0][0]
-    one = np.zeros_like(about)
-    one[0] = 1.0
-    carried = np.stack([as_real(f) for f in (one, 1j * one, about, 1j * about)], axis=1)
+    constant = np.zeros_like(about)
+    constant[0] = 1.0
+    carried = np.stack([as_real(f) for f in (constant, 1j * constant, about, 1j * about)], axis=1)
     linear = np.eye(4)
-    linear[:2, :2] = np.linalg.inv(linear_part(bases[1], both[0][1], a.other))
+    linear[:2, :2] = np.linalg.inv(linear_part(bases[1], coefficients[0][1], a.other))
     estimate = linear @ np.hstack([-fits[1] @ carried @ fits[0], fits[1]])
     values = estimate @ np.concatenate(raw)
 
@@ -113,10 +113,10 @@ def gap_difference(a: ChipPair, b: ChipPair) -> GapDifference:
         for pair, by in ((a, estimate), (b, estimate @ change))
         if pair.cov is not None
     ]
-    reference, other = a.chips
+    reference, other_chip = a.chips
     cov = sum(errors[1:], errors[0]) if errors else None
     return GapDifference(
-        other,
+        other_chip,
         reference,
         values,
         cov,
@@ -132,17 +132,17 @@ def _test(
     pairs: tuple[ChipPair, ChipPair],
     basis: PolynomialBasis,
 ) -> FieldTest:
-    """Chi-square of all four, each as what it does to a star at the edge of the chip."""
+    """Chi-square of all four values, each weighted by its effect at the edge of the chip."""
     lever = float(np.hypot(*basis.half_size))
     norm = np.array([1.0, 1.0, lever, lever]) ** 2
-    known = [pair.other for pair in pairs if pair.cov is not None]
+    maps = [pair.other for pair in pairs if pair.cov is not None]
     shares = [float(np.mean(np.diag(e) / np.diag(cov))) for e in errors]
-    draws = draws_of_sum(zip(shares, known, strict=True))
+    draws = draws_of_sum(zip(shares, maps, strict=True))
     return chi_square(values, cov, norm=norm, draws=draws)
 
 
 def _padded(cov: Float, K: int, n_terms: int) -> Float:
-    """Joint covariance of K terms of two chips, with zeros for terms that are not there."""
+    """Joint covariance of K terms of two chips, padded with zeros to `n_terms`."""
     out = np.zeros((4, n_terms, 4, n_terms))
     out[:, :K, :, :K] = cov.reshape(4, K, 4, K)
     return out.reshape(4 * n_terms, -1)

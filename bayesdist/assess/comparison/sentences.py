@@ -1,4 +1,4 @@
-"""A comparison in words: the verdict, what was taken out, and on whose errors it rests."""
+"""A comparison in sentences: the verdict, what was removed, and which errors were used."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ from bayesdist.utils.distributions import norm_sf
 from bayesdist.utils.limits import DIFFERENCE
 from bayesdist.utils.numbers import p_words
 
-IDENTICAL = 1e-9  # pixels
+IDENTICAL = 1e-9  # pixels: smaller differences are rounding
 
 
 def verdict(found: Comparison, pixel_mas: float | None = None) -> str:
-    """One sentence: whether the calibrations differ, by how much, and how sure that is.
+    """Verdict in one sentence: if the calibrations differ, by how much, and how significantly.
 
-    `pixel_mas`: size of a pixel, where neither side states it.
+    `pixel_mas`: size of a pixel in mas, if neither side states it.
     """
     size = (
         f"{_length(found.rms, found, pixel_mas)} rms, at most "
@@ -40,8 +40,8 @@ def verdict(found: Comparison, pixel_mas: float | None = None) -> str:
 
 
 def comparison_lines(found: Comparison) -> list[str]:
-    """Lines below the verdict."""
-    kept = not found.frame.taken.shape[1]
+    """Lines of text below the verdict."""
+    keeps_similarity = not found.frame.taken.shape[1]
     lines = [
         f"{letter}  {c.name}: order {c.basis.order}, in {c.unit}"
         + (f", chip {c.chip}" if c.chip is not None else "")
@@ -50,11 +50,13 @@ def comparison_lines(found: Comparison) -> list[str]:
         + "".join(f"; {note}" for note in c.notes)
         for letter, c in (("A", found.a), ("B", found.b))
     ]
-    lines.append("kept in the difference:" if kept else "taken out of the difference:")
+    lines.append("kept in the difference:" if keeps_similarity else "taken out of the difference:")
     lines += [f"  {line}" for line in _similarity(found)]
     if found.errors_of in ("A", "B"):
-        other = "B" if found.errors_of == "A" else "A"
-        lines.append(f"only {found.errors_of} has errors: the significance takes {other} for exact")
+        exact_side = "B" if found.errors_of == "A" else "A"
+        lines.append(
+            f"only {found.errors_of} has errors: the significance takes {exact_side} for exact"
+        )
     if found.noise_rms is not None:
         lines.append(f"the errors alone would make {found.noise_rms:.2g} pix rms")
     p_z, p_chi2 = found.p_largest_z, found.p_largest_chi2
@@ -75,7 +77,7 @@ def comparison_lines(found: Comparison) -> list[str]:
 
 
 def _singly(found: Comparison) -> str:
-    """The most significant coefficient, where each can only be tested by itself."""
+    """Most significant coefficient, if coefficients can only be tested one by one."""
     table = comparison_table(found)
     z = np.abs(np.asarray(table["z"], float))
     tested = int(np.isfinite(z).sum())
@@ -83,7 +85,7 @@ def _singly(found: Comparison) -> str:
         return "no coefficient can be tested"
     k = int(np.nanargmax(z))
     row = table[k]
-    p = min(1.0, tested * 2 * float(norm_sf(z[k])))  # Bonferroni: correlations are not known
+    p = min(1.0, tested * 2 * float(norm_sf(z[k])))  # Bonferroni: correlations are unknown
     return (
         f"most significant of {tested} coefficients: x^{row['i']} y^{row['j']} of {row['axis']}, "
         f"{z[k]:.3g} sigma, {_share(p)} for the largest of so many"
@@ -124,7 +126,7 @@ def _measured(value: float, sigma: float | None) -> str:
 
 
 def gap_verdict(gap: GapDifference) -> str:
-    """One sentence: whether a chip lies elsewhere against the reference chip."""
+    """Verdict in one sentence: if the position of a chip relative to the reference chip differs."""
     chips, d = f"against chip {gap.reference}", float(np.hypot(*gap.values[:2]))
     if np.abs(gap.values).max() < IDENTICAL:
         return f"Chip {gap.chip} lies alike {chips}, to rounding."
@@ -143,7 +145,7 @@ def gap_verdict(gap: GapDifference) -> str:
 
 
 def gap_lines(gap: GapDifference) -> list[str]:
-    """Lines below this verdict: A minus B, the reference chips laid on each other."""
+    """Lines of text below the verdict on a gap: A minus B, with aligned reference chips."""
     sigma = [None] * 4 if gap.sigma is None else gap.sigma.tolist()
     shift_x, shift_y, scale, (turn, error) = zip(gap.values.tolist(), sigma, strict=True)
     in_degrees = None if error is None else float(np.degrees(error))

@@ -1,4 +1,4 @@
-"""Area that a pixel covers in (u, v), relative to that at the reference pixel."""
+"""Area of a pixel in (u, v), relative to that of the reference pixel."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ class AreaMap:
     y : ndarray, shape (ny,)
         FITS 1-based pixels.
     area : ndarray, shape (ny, nx)
-        ``|det d(u, v) / d(x, y)|`` over its value at the reference pixel.
+        ``|det d(u, v) / d(x, y)|`` divided by its value at the reference pixel.
     sigma : ndarray, shape (ny, nx)
         Standard deviation of `area`; 0 at the reference pixel by definition.
     reference_area : float
@@ -33,7 +33,9 @@ class AreaMap:
     unit : str
         Unit of u and v.
     chip : int
+        Chip number.
     epoch : float or None
+        Decimal years.
     """
 
     x: Float
@@ -53,18 +55,18 @@ def area_map(
     epoch: float | None = None,
     chip: int | None = None,
 ) -> AreaMap:
-    """Relative pixel area, with its uncertainty by the delta method.
+    """Relative pixel area, with its uncertainty by linear error propagation.
 
-    The map to multiply flat-fielded photometry with, as in Figure 4.5 of section 4.1 of the ACS
-    handbook.  The frame of an exposure is linear and cancels, so it is the same for all exposures.
+    Multiply flat-fielded photometry by this map, as in Figure 4.5 of section 4.1 of the ACS
+    handbook. The frame of an exposure is linear and cancels, so the map is valid for all exposures.
 
     Parameters
     ----------
     solution : LinearFit or Posterior
     grid : tuple of int
-        Points on x and y.
+        Number of points along x and y.
     epoch : float, optional
-        Decimal years; needed by a model with time dependence.
+        Decimal years; required if the model depends on time.
     chip : int, optional
         Chip number; the first chip by default.
 
@@ -75,23 +77,25 @@ def area_map(
     Raises
     ------
     InputError
-        When the mapping is singular at the reference pixel, for an unknown chip, a missing epoch,
-        or a bad grid.
+        If the mapping is singular at the reference pixel, the chip is unknown, the epoch is
+        missing, or the grid is invalid.
     """
-    one = calibration_of(solution).chip(chip, epoch, origin="stated")
-    basis, covariance = one.basis, required(one.cov, "the solution has no covariance")
-    det_ref, d_ref = determinant(basis, one.coefficients, *np.array(basis.reference_pixel)[:, None])
+    chip_map = calibration_of(solution).chip(chip, epoch, origin="stated")
+    basis, covariance = chip_map.basis, required(chip_map.cov, "the solution has no covariance")
+    det_ref, d_ref = determinant(
+        basis, chip_map.coefficients, *np.array(basis.reference_pixel)[:, None]
+    )
     if det_ref[0] == 0.0:
         raise InputError(
             "the pixel area is zero at the reference pixel",
-            where=f"chip {one.chip}",
+            where=f"chip {chip_map.chip}",
             do="check the linear terms of the solution and model.reference_pixel",
         )
     x, y = grid_pixels(basis.size, grid)
     X, Y = mesh(x, y)
     area, sigma = np.empty(X.size), np.empty(X.size)
     for rows in point_blocks(X.size):
-        det, d = determinant(basis, one.coefficients, X[rows], Y[rows])
+        det, d = determinant(basis, chip_map.coefficients, X[rows], Y[rows])
         ratio = det / det_ref
         slope = d / det_ref - (ratio / det_ref)[:, None] * d_ref
         area[rows] = np.abs(ratio)
@@ -102,7 +106,7 @@ def area_map(
         area=area.reshape(y.size, x.size),
         sigma=sigma.reshape(y.size, x.size),
         reference_area=abs(float(det_ref[0])),
-        unit=one.unit,
-        chip=one.chip or 1,
-        epoch=one.epoch,
+        unit=chip_map.unit,
+        chip=chip_map.chip or 1,
+        epoch=chip_map.epoch,
     )

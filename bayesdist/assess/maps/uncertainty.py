@@ -1,4 +1,4 @@
-"""Maps of the uncertainty of a solution's positions, and circles that hold a given probability."""
+"""Maps of the uncertainty of positions, and circular errors for a given probability."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ from bayesdist.utils.arrays import Float
 from bayesdist.utils.quantities import Epoch, year_of
 
 RELATIVE = "relative positions"
-NODES = 33  # ratios of the axes between which radii are interpolated: to 1e-4
-ANGLES = 256
+NODES = 33  # number of axis ratios between which radii are interpolated, accurate to 1e-4
+ANGLES = 256  # number of angles of the integral over the error ellipse
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,15 +33,17 @@ class UncertaintyMap:
     y : ndarray, shape (ny,)
         FITS 1-based pixels.
     sigma_u, sigma_v : ndarray, shape (ny, nx)
-        In `unit`; NaN at positions that see no sky, where a field of the detector is given.
+        Standard deviations in `unit`; NaN at positions outside the field that sees the sky.
     correlation : ndarray, shape (ny, nx)
-        Between u and v; 0 where one of them is known exactly.
+        Correlation between u and v; 0 where one of them is known exactly.
     unit : str
     chip : int
+        Chip number.
     epoch : float or None
         Decimal years.
     kind : str
-        'least squares', 'posterior', or `RELATIVE`: the posterior without what the gauge decides.
+        'least squares', 'posterior', or `RELATIVE` for a posterior without the directions that the
+        gauge determines.
 
     Examples
     --------
@@ -82,16 +84,20 @@ class UncertaintyMap:
 
     @property
     def per_axis(self) -> Float:
-        """Rms of sigma_u and sigma_v, (ny, nx): 1 sigma of one axis."""
+        """Rms of sigma_u and sigma_v, (ny, nx): the standard deviation per axis."""
         return per_axis(self.sigma_u, self.sigma_v)
 
     def circular_error(self, probability: float) -> Float:
-        """Radius (ny, nx) of the circle that holds the true position with a probability.
+        """Radius (ny, nx) of the circle that contains the true position with a given probability.
 
         Parameters
         ----------
         probability : float
             Between 0 and 1.
+
+        Returns
+        -------
+        ndarray, shape (ny, nx)
         """
         return circular_error(self.sigma_u, self.sigma_v, self.correlation, probability)
 
@@ -117,7 +123,7 @@ class UncertaintyMap:
 
 
 def sigmas_of(uu: Float, vv: Float, uv: Float) -> tuple[Float, Float, Float]:
-    """Standard deviations (N,) of u and v, and their correlation; 0 where one is known exactly."""
+    """Standard deviations (N,) of u and v, and their correlation; 0 if one is known exactly."""
     sigma_u, sigma_v = np.sqrt(uu), np.sqrt(vv)
     product = sigma_u * sigma_v
     correlation = np.divide(uv, product, out=np.zeros_like(uv), where=product > 0)
@@ -125,9 +131,9 @@ def sigmas_of(uu: Float, vv: Float, uv: Float) -> tuple[Float, Float, Float]:
 
 
 def with_local(found: UncertaintyMap, sigma: Float | None) -> UncertaintyMap:
-    """A map with what the model leaves out at each position; itself where that is not known.
+    """Add the structure that the model omits to a map; unchanged if `sigma` is None.
 
-    `sigma`: (ny nx, 2), of u and v at the points of the map.
+    `sigma`: standard deviations of u and v at the points of the map, shape (ny nx, 2).
     """
     if sigma is None:
         return found
@@ -156,13 +162,14 @@ def uncertainty_map(
     ----------
     solution : LinearFit or Posterior
     grid : tuple of int
-        Points on x and y.
+        Number of points along x and y.
     epoch : float, str, Time, date or Quantity, optional
-        Needed by a model with time dependence.
+        Required if the model depends on time.
     chip : int, optional
         Chip number; the first chip by default.
     exposure : int or str, optional
-        Code or name of the exposure in whose frame the position is predicted; the gauge by default.
+        Code or name of the exposure that defines the frame of the positions; by default the frame
+        of the gauge.
 
     Returns
     -------
@@ -171,7 +178,7 @@ def uncertainty_map(
     Raises
     ------
     InputError
-        For an unknown chip or exposure, a missing epoch, or a bad grid.
+        If the chip or exposure is unknown, the epoch is missing, or the grid is invalid.
 
     Examples
     --------
@@ -189,7 +196,7 @@ def uncertainty_map(
     x, y = grid_pixels(place.chip.size, grid)
     uu, vv, uv = position_moments(place.covariance(solution), place.basis, *mesh(x, y))
     shape = (y.size, x.size)
-    sigma_u, sigma_v, correlation = (one.reshape(shape) for one in sigmas_of(uu, vv, uv))
+    sigma_u, sigma_v, correlation = (values.reshape(shape) for values in sigmas_of(uu, vv, uv))
     return UncertaintyMap(
         x=x,
         y=y,
@@ -204,9 +211,9 @@ def uncertainty_map(
 
 
 def per_axis(sigma_u: ArrayLike, sigma_v: ArrayLike) -> Float:
-    """Rms of the standard deviations of both axes: 1 sigma of one axis, whatever its direction.
+    """Rms of the standard deviations of both axes, independent of their orientation.
 
-    `sigma_u`, `sigma_v`: in one unit, which is that of the result.
+    `sigma_u`, `sigma_v`: in the same unit, which is also that of the result.
     """
     return np.asarray(np.hypot(sigma_u, sigma_v) / np.sqrt(2.0))
 
@@ -214,16 +221,20 @@ def per_axis(sigma_u: ArrayLike, sigma_v: ArrayLike) -> Float:
 def circular_error(
     sigma_u: ArrayLike, sigma_v: ArrayLike, correlation: ArrayLike, probability: float
 ) -> Float:
-    """Radius of the circle about the true position that holds a probability: CE68, CE95.
+    """Radius of the circle about the true position that has a given probability: CE68, CE95.
 
     Parameters
     ----------
     sigma_u, sigma_v : array_like
-        Standard deviations, in one unit, which is that of the result.
+        Standard deviations in the same unit, which is also that of the result.
     correlation : array_like
-        Between u and v.
+        Correlation between u and v.
     probability : float
         Between 0 and 1.
+
+    Returns
+    -------
+    ndarray
 
     Examples
     --------
@@ -240,7 +251,7 @@ def circular_error(
 
 @cache
 def _radii(probability: float) -> CubicSpline:
-    """Radius over the major axis, as a function of minor over major axis."""
+    """Radius in units of the major axis, as a function of the axis ratio minor / major."""
     ratios = np.linspace(0.0, 1.0, NODES)
     angle = (np.arange(ANGLES) + 0.5) * np.pi / (2 * ANGLES)
 

@@ -1,6 +1,7 @@
-"""Dither patterns compared by the covariance that a self-calibration would have; what they lack.
+"""Compare dither patterns by the covariance that a self-calibration would have.
 
-Nothing is detected and no noise is drawn: only where stars fall, by the density of a field.
+No detections are simulated and no noise is drawn: the density of the field determines where stars
+fall on the detector.
 """
 
 from __future__ import annotations
@@ -38,26 +39,26 @@ from bayesdist.simulate.patterns import DitherPattern
 from bayesdist.utils.arrays import Float, Int
 
 KINDS = ("gauge-free", "shape", "absolute")
-LEAST_SHARED = 3  # stars that two exposures share at least, if they overlap at all
-MOST_STARS = 2_000_000  # of the sky that all patterns see together
-MOST_LOOKED_FOR = 5e8  # stars of that sky times exposures of all patterns
-SHORT = 0.25  # of the detector's side: the scales above it are not sampled
+LEAST_SHARED = 3  # least number of common stars of two exposures that overlap
+MOST_STARS = 2_000_000  # stars in the part of the sky covered by all patterns
+MOST_LOOKED_FOR = 5e8  # these stars times the exposures of all patterns
+SHORT = 0.25  # of the detector's side: shorter offsets do not constrain large scales
 SKEWS = ("skew_plus", "skew_cross")
-MOST = 4  # parameters that are named
-MOST_FURTHER = 64  # exposures whose information is computed: a power of 2
-MOST_DETECTIONS = 15_000  # of all of these
-WAYS = 5  # in which they may be dithered
-SMOOTHING = 0.5  # of the scatter of offsets, by which further ones differ from those at hand
+MOST = 4  # largest number of parameters that are named
+MOST_FURTHER = 64  # exposures for which information is computed: a power of 2
+MOST_DETECTIONS = 15_000  # in all of these exposures
+WAYS = 5  # number of dither patterns for these exposures
+SMOOTHING = 0.5  # of the scatter of offsets: smoothing of new offsets relative to existing ones
 
 
 @dataclass(frozen=True, eq=False)
 class Camera:
-    """A detector as it is planned for."""
+    """A detector for which exposures are planned."""
 
     chips: tuple[Chip, ...]
-    # (chips, 2, K), Legendre coefficients of its distortion, in pixels: how chips lie matters most
+    # (chips, 2, K), Legendre coefficients of the distortion in pixels, mainly to place the chips
     coefficients: Float
-    frames: str = "shift_rotation"  # what is free in each exposure
+    frames: str = "shift_rotation"  # free parameters of each exposure
 
     @property
     def pixels(self) -> float:
@@ -66,9 +67,9 @@ class Camera:
 
     @cached_property
     def side(self) -> float:
-        """The smaller side of what all chips cover, pixels."""
-        one = np.zeros((1, 2)), np.zeros(1)
-        model, theta = dithered_model(self.chips, self.coefficients, *one)
+        """The smaller side of the area covered by all chips, in pixels."""
+        pose = np.zeros((1, 2)), np.zeros(1)
+        model, theta = dithered_model(self.chips, self.coefficients, *pose)
         points = np.concatenate(
             [model.predict(theta, *outline_pixels(c.size), chip=c.number) for c in self.chips]
         )
@@ -77,29 +78,29 @@ class Camera:
 
 @dataclass(frozen=True)
 class PlannedStars:
-    """A field of stars, and how well they are detected."""
+    """A field of stars, and the quality of its detections."""
 
-    per_detector: float  # detections of one exposure, on average
-    sigma: float  # error of a detection on one axis, pixels
-    false: float = 0.0  # fraction of the detections that are false: they say nothing
-    least: int = 2  # fewest detections of a star that is used
+    per_detector: float  # mean number of detections in one exposure
+    sigma: float  # error of a detection per axis, pixels
+    false: float = 0.0  # fraction of false detections, which carry no information
+    least: int = 2  # least number of detections of a star that is used
     seed: int = 1
 
 
 @dataclass(frozen=True)
 class PriorInformation:
-    """Knowledge beside the detections; None for what is not known."""
+    """Prior knowledge in addition to the detections; None for unknown quantities."""
 
-    offset_sigma: float | None = None  # error of a commanded offset on one axis, pixels
-    roll_sigma: float | None = None  # of a commanded roll, radians
-    exposure_scale_sigma: float | None = None  # scatter of the exposures' scales
-    scale_sigma: float | None = None  # relative error of the size of a pixel
+    offset_sigma: float | None = None  # error of a commanded offset per axis, pixels
+    roll_sigma: float | None = None  # error of a commanded roll, radians
+    exposure_scale_sigma: float | None = None  # standard deviation of the exposures' scales
+    scale_sigma: float | None = None  # relative error of the pixel scale
 
     def prior(self, model: DistortionModel, theta: Float, pattern: DitherPattern) -> Prior:
-        """All of it, at a truth."""
+        """Prior that combines all of this knowledge, linearised at true parameters."""
         out, n = Prior.none(theta), len(pattern)
         if self.offset_sigma is not None:
-            # rolls are about the middle of all chips: a pixel elsewhere moves with the roll
+            # rolls are about the centre of all chips, so pixels elsewhere move with the roll
             middles = [(c.number, (c.size[0] + 1) / 2, (c.size[1] + 1) / 2) for c in model.chips]
             sigma = np.full(n, self.offset_sigma)
             out = out + pointing_prior(model, theta, pattern.offsets, sigma, pixels=middles)
@@ -116,45 +117,45 @@ class PriorInformation:
 
 @dataclass(frozen=True, eq=False)
 class PlannedPattern:
-    """Errors that a pattern would leave."""
+    """Errors that a dither pattern would leave."""
 
     pattern: DitherPattern
     camera: Camera
     solution: ExpectedSolution
-    # of each chip, by kind: 'gauge-free'   without whatever the detections of this pattern leave
-    # free; 'shape'        without shift, rotation and scale of the sky: the same for all patterns;
-    # 'absolute'     without the zero point alone. None where nothing bounds the errors
+    # map of each chip, by kind. 'gauge-free': without directions that the detections of this
+    # pattern leave free; 'shape': without shift, rotation and scale on the sky, the same for all
+    # patterns; 'absolute': without the zero point only. None if the errors are unbounded
     maps: dict[str, tuple[UncertaintyMap, ...] | None]
 
     def per_axis(self, kind: str) -> Float:
-        """Errors per axis (1 sigma) at all points of the grid, pixels; infinite if unbounded."""
+        """Standard deviations per axis at all grid points, pixels; infinite if unbounded."""
         maps = self.maps[kind]
         if maps is None:
             return np.array([np.inf])
         return np.concatenate([m.per_axis.ravel() for m in maps])
 
     def rms(self, kind: str) -> float:
-        """Root mean square of these."""
+        """Rms of the standard deviations per axis over the grid, pixels."""
         return float(np.sqrt(np.mean(self.per_axis(kind) ** 2)))
 
     def largest(self, kind: str) -> float:
-        """The largest of these."""
+        """Largest standard deviation per axis on the grid, pixels."""
         return float(self.per_axis(kind).max())
 
     @property
     def n_free(self) -> int:
-        """Directions that detections leave free."""
+        """Number of directions that the detections leave free."""
         return self.solution.gauge.null.shape[1]
 
     @property
     def rank(self) -> tuple[bool, float, int, float]:
-        """By which patterns are sorted: shape, where it is bounded, then what is free."""
+        """Sort key of patterns: rms of the shape if bounded, then the number of free directions."""
         shape = self.rms("shape")
         return (not np.isfinite(shape), shape, self.n_free, self.rms("gauge-free"))
 
     @cached_property
     def by_degree(self) -> dict[int, float]:
-        """Gauge-free rms over detector and axes of the polynomials of each degree, pixels."""
+        """Gauge-free rms over the detector and both axes, by polynomial degree, pixels."""
         solution = self.solution
         model, gauge = solution.model, solution.gauge
         square = mean_squares(model) * np.diag(solution.up_to(gauge.null))[: model.n_polynomial]
@@ -167,7 +168,7 @@ class PlannedPattern:
 
     @cached_property
     def chips_share_stars(self) -> bool:
-        """True if some star is seen on two chips."""
+        """True if at least one star is detected on two chips."""
         p = self.solution.problem
         chip = p.groups.chip[p.groups.index]
         low, high = (f.reduceat(chip, p.starts[:-1]) for f in (np.minimum, np.maximum))
@@ -180,9 +181,9 @@ def compare_patterns(
     stars: PlannedStars,
     known: PriorInformation,
 ) -> tuple[PlannedPattern, ...]:
-    """Outcomes of several patterns on one sky, the best one first.
+    """Compare dither patterns on the same sky; the best one comes first.
 
-    InputError for a pattern whose exposures do not overlap, and for too many stars.
+    Raises InputError if the exposures of a pattern do not overlap, or if there are too many stars.
     """
     truths = [
         dithered_model(camera.chips, camera.coefficients, p.offsets, p.rolls, frames=camera.frames)
@@ -196,15 +197,15 @@ def compare_patterns(
             where="pattern",
             do=f"give fewer exposures or stars ({MOST_LOOKED_FOR:.0g} pairs of them at most)",
         )
-    found = [
+    plans = [
         _planned(pattern, camera, *truth, sky, stars, known)
         for pattern, truth in zip(patterns, truths, strict=True)
     ]
-    return tuple(sorted(found, key=lambda one: one.rank))
+    return tuple(sorted(plans, key=lambda plan: plan.rank))
 
 
 def _sky(corners: Sequence[tuple[Float, Float]], stars: PlannedStars, camera: Camera) -> Float:
-    """Positions (S, 2) over the rectangle that all patterns together see."""
+    """Random positions (S, 2) in the rectangle covered by all patterns."""
     low = np.min([c[0] for c in corners], axis=0)
     high = np.max([c[1] for c in corners], axis=0)
     mean = stars.per_detector * float(np.prod(high - low)) / camera.pixels
@@ -228,7 +229,7 @@ def _planned(
     known: PriorInformation,
 ) -> PlannedPattern:
     x, y, exposure, chip, star = stars_on_detector(model, truth, sky)
-    # a false detection says nothing, as if it were not there
+    # false detections carry no information and are omitted
     true = np.random.default_rng([stars.seed, 1]).uniform(size=len(x)) >= stars.false
     x, y = x[true], y[true]
     exposure, chip, star = exposure[true], chip[true], star[true]
@@ -256,17 +257,17 @@ def _columns(move: dict[str, Float], *names: str) -> Float:
 def _maps(solution: ExpectedSolution, directions: Float) -> tuple[UncertaintyMap, ...] | None:
     if not solution.bounded_by(directions):
         return None
-    seen = replace(solution, cov=solution.up_to(directions))
-    return tuple(uncertainty_map(seen, chip=chip.number) for chip in solution.model.chips)
+    reduced = replace(solution, cov=solution.up_to(directions))
+    return tuple(uncertainty_map(reduced, chip=chip.number) for chip in solution.model.chips)
 
 
 def _require_overlap(pattern: DitherPattern, exposure: Int, star: Int) -> None:
-    """Refuse exposures that no stars tie to the others."""
+    """Raise InputError if exposures form groups without common stars."""
     E = len(pattern)
-    seen = coo_array(
+    detected = coo_array(
         (np.ones(len(star)), (exposure, star)), shape=(E, int(star.max(initial=0)) + 1)
     ).tocsr()
-    shared = (seen @ seen.T).tocoo()
+    shared = (detected @ detected.T).tocoo()
     tied = shared.data >= LEAST_SHARED
     graph = coo_array((tied[tied], (shared.row[tied], shared.col[tied])), shape=(E, E))
     n, group = connected_components(graph, directed=False)
@@ -287,9 +288,9 @@ def _numbers(values: Int, most: int = 6) -> str:
 
 
 def lacking(found: PlannedPattern) -> tuple[str, ...]:
-    """Sentences on offsets and rolls that a pattern lacks, and what that costs.
+    """Sentences on offsets and rolls that a pattern lacks, and the consequences.
 
-    The result is empty for a pattern of large offsets in both directions and with rolls.
+    The result is empty for a pattern with rolls and with large offsets in both directions.
     """
     pattern, gauge = found.pattern, found.solution.gauge
     no_rolls = gauge.spread < SAME_ROLL
@@ -303,8 +304,8 @@ def lacking(found: PlannedPattern) -> tuple[str, ...]:
             else "no offsets: what a roll brings back onto itself, as radial distortion, is free"
         )
     elif pattern.along_one_line:
-        what = "is free" if no_rolls else "rests on the rolls alone"
-        out.append(f"offsets lie along one line: what changes only across it {what}")
+        consequence = "is free" if no_rolls else "rests on the rolls alone"
+        out.append(f"offsets lie along one line: what changes only across it {consequence}")
     if 0 < pattern.reach < SHORT * found.camera.side:
         worst = max(found.by_degree, key=found.by_degree.__getitem__)
         out.append(
@@ -320,47 +321,47 @@ def lacking(found: PlannedPattern) -> tuple[str, ...]:
 def _without_rolls(found: PlannedPattern) -> str:
     skews = [d for d in found.solution.gauge.directions if d.name in SKEWS]
     sigma = max(d.sigma_fixed for d in skews)
-    what = "no rolls but half turns" if np.ptp(found.pattern.rolls) > SAME_ROLL else "no rolls"
+    missing = "no rolls but half turns" if np.ptp(found.pattern.rolls) > SAME_ROLL else "no rolls"
     if not np.isfinite(sigma):
-        return f"{what}: a linear skew of the distortion cannot be told from one of the sky"
+        return f"{missing}: a linear skew of the distortion cannot be told from one of the sky"
     return (
-        f"{what}: linear skew rests on the commanded offsets, "
+        f"{missing}: linear skew rests on the commanded offsets, "
         f"sigma {sigma:.2g} ({sigma * skews[0].edge_pix:.2g} pix at the edge)"
     )
 
 
 def nearly_free(found: PlannedPattern) -> str:
-    """Combinations that are nearly free, by the parameters that lead them; empty for none."""
+    """Nearly free combinations, described by their leading parameters; empty if there are none."""
     weakest = found.solution.gauge.weakest
     if not len(weakest):
         return ""
     names = found.solution.model.names
     led = dict.fromkeys(names[int(k)] for _, k in weakest)
-    more = f" and {len(led) - MOST} more" if len(led) > MOST else ""
+    remainder = f" and {len(led) - MOST} more" if len(led) > MOST else ""
     return (
-        f"nearly free: combinations led by {', '.join(list(led)[:MOST])}{more}, up to "
+        f"nearly free: combinations led by {', '.join(list(led)[:MOST])}{remainder}, up to "
         f"{weakest[:, 0].max():.2g} pix at the edge"
     )
 
 
 @dataclass(frozen=True, eq=False)
 class FurtherDithers:
-    """Information of further exposures about the parameters of a self-calibration.
+    """Fisher information of further exposures on the parameters of a self-calibration.
 
-    It is more than the number of exposures times that of one of those at hand: stars that were seen
-    before lie where they lie, others are seen for a second time, and pointings that lie farther
-    apart tell what small offsets leave nearly free.  By stars that are better known the frames of
-    the exposures at hand are, too.  So it is computed, for further exposures with
-    offsets and rolls as those at hand have, over a field of stars that is as dense.
+    It is more than the number of exposures times the information of an existing one. Positions of
+    known stars are already constrained, other stars get a second detection, and larger offsets
+    constrain combinations that small offsets leave nearly free. Better star positions also improve
+    the frames of the existing exposures. The information is therefore computed for a field of the
+    same density, with offsets and rolls like those of the existing exposures.
     """
 
     mode: SelfCalibrationMode
-    offsets: Float  # (E + MOST_FURTHER, 2) of all exposures, in the unit of u and v
+    offsets: Float  # (E + MOST_FURTHER, 2), offsets of all exposures, in the unit of u and v
     rolls: Float  # (E + MOST_FURTHER,) in radians
     seed: int
 
     def information(self, n: int) -> Float:
-        """Information (D, D) of n further exposures; beyond `MOST_FURTHER` it is linear in n."""
+        """Information (D, D) of n further exposures; linear in n beyond `MOST_FURTHER`."""
         number, values = self._known
         above = min(max(int(np.searchsorted(number, n)), 1), len(number) - 1)
         low, high = number[above - 1], number[above]
@@ -368,16 +369,16 @@ class FurtherDithers:
 
     @cached_property
     def _known(self) -> tuple[Int, list[Float]]:
-        """Numbers of further exposures, 0 and powers of 2, and their information."""
+        """Numbers of further exposures (0 and powers of 2), and their information."""
         mode, E = self.mode, len(self.mode.problem.model.exposures)
         number = np.concatenate([[0], 2 ** np.arange(MOST_FURTHER.bit_length())])
         model, theta, sky = self._field
-        seen = stars_on_detector(model, theta, sky)
-        expected = [self._expected(seen, E + int(n)) for n in number]
-        # of as many detections as there are, with their errors
+        star_detections = stars_on_detector(model, theta, sky)
+        expected = [self._expected(star_detections, E + int(n)) for n in number]
+        # scaled to the actual number of detections and their errors
         D = mode.problem.model.n_params
         scale = np.trace(of_first(mode.expansion.curvature, mode.free, D)) / np.trace(expected[0])
-        return number, [scale * (one - expected[0]) for one in expected]
+        return number, [scale * (information - expected[0]) for information in expected]
 
     @cached_property
     def _field(self) -> tuple[DistortionModel, Float, Float]:
@@ -400,9 +401,9 @@ class FurtherDithers:
         return model, theta, low + rng.uniform(size=(count, 2)) * (high - low)
 
     def _expected(self, seen: tuple[Float, Float, Int, Int, Int], n: int) -> Float:
-        """Information (D, D) of the first n exposures by the stars that they have seen."""
-        whole, theta, _ = self._field
-        model = replace(whole, exposures=whole.exposures[:n])
+        """Information (D, D) of the first n exposures, from the stars detected in them."""
+        full_model, theta, _ = self._field
+        model = replace(full_model, exposures=full_model.exposures[:n])
         x, y, exposure, chip, star = seen
         rows = exposure < n
         detections = Detections(
@@ -415,17 +416,17 @@ class FurtherDithers:
             star=star[rows],
         )
         curvature = expected_curvature(model, theta[: model.n_params], detections)
-        # the gauge holds what it holds at present
+        # the gauge constrains the same directions as at present
         D = self.mode.problem.model.n_params
         return of_first(curvature, np.append(self.mode.free, np.arange(D, model.n_params)), D)
 
 
 def further_dithers(mode: SelfCalibrationMode, seed: int) -> list[FurtherDithers]:
-    """Several ways in which further exposures of a self-calibration may be dithered.
+    """Possible dither patterns of further exposures of a self-calibration.
 
-    Offsets are those at hand at random, smoothed without a change of their variance, and rolls are
-    those at hand in turn.  The list is empty for fewer than three exposures, for stars that move or
-    are known beforehand, and for distortions that depend on time.
+    Offsets are drawn from the existing ones and smoothed without changing their variance; rolls are
+    the existing ones in random order. The list is empty if there are fewer than three exposures,
+    stars move or have prior positions, or the distortion depends on time.
     """
     problem = mode.problem
     model, E = problem.model, len(problem.model.exposures)
@@ -434,18 +435,18 @@ def further_dithers(mode: SelfCalibrationMode, seed: int) -> list[FurtherDithers
     frames = np.zeros((E, 3))
     for e in range(1, E):
         of_exposure = mode.theta[model.frame_slice(e)]
-        known = dict(zip(model.free_frame_names(e), of_exposure, strict=True))
-        frames[e] = [known.get(name, 0.0) for name in ("shift_u", "shift_v", "rotation")]
+        frame = dict(zip(model.free_frame_names(e), of_exposure, strict=True))
+        frames[e] = [frame.get(name, 0.0) for name in ("shift_u", "shift_v", "rotation")]
     offsets, rolls = frames[:, :2], frames[:, 2]
     middle, scatter = offsets.mean(axis=0), np.cov(offsets.T)
-    # rolls alone, or dithers along a line, have no scatter in some direction
+    # rolls only, or dithers along a line, have no scatter in some direction
     root = np.linalg.cholesky(scatter + 1e-9 * (np.trace(scatter) + 1e-300) * np.eye(2))
     rng, out = np.random.default_rng([seed, 6]), []
     for k in range(WAYS):
-        more = np.sqrt(E / (E - 1)) * (offsets[rng.integers(E, size=MOST_FURTHER)] - middle)
-        more += SMOOTHING * rng.standard_normal((MOST_FURTHER, 2)) @ root.T
-        more = middle + more / np.sqrt(1 + SMOOTHING**2)
+        further = np.sqrt(E / (E - 1)) * (offsets[rng.integers(E, size=MOST_FURTHER)] - middle)
+        further += SMOOTHING * rng.standard_normal((MOST_FURTHER, 2)) @ root.T
+        further = middle + further / np.sqrt(1 + SMOOTHING**2)
         turned = np.resize(rng.permutation(rolls), MOST_FURTHER)
-        every = np.concatenate([offsets, more]), np.concatenate([rolls, turned])
-        out.append(FurtherDithers(mode, *every, seed + k))
+        extended = np.concatenate([offsets, further]), np.concatenate([rolls, turned])
+        out.append(FurtherDithers(mode, *extended, seed + k))
     return out

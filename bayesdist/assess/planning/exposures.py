@@ -8,49 +8,50 @@ from dataclasses import dataclass, field
 
 from bayesdist.utils.arrays import Float
 
-MOST = 4096  # exposures beyond which more are no plan
-# The range of the answer is that of the numbers whose probability differs by no more. Of exposures
-# that were simulated as asked for fewer met their limits than was stated, by 0.27 +- 0.07
+MOST = 4096  # largest number of exposures that is considered
+# The range of the answer contains the numbers with a probability that differs by at most this. With
+# simulated exposures the limits were met less often than predicted, by 0.27 +- 0.07
 # (docs/validation.md).
 PROBABILITY_ERROR = 0.25
-SMALL = 0.05  # probability of meeting a limit, below which errors are said to be too large for it
+SMALL = 0.05  # probability of meeting a limit, below which errors are called too large for it
 
 
 @dataclass(frozen=True, eq=False)
 class Schedule:
-    """Dates at which exposures would be taken."""
+    """Dates of planned exposures."""
 
     name: str
-    # (d, d), of one exposure about polynomials and drift, on average over the dates of the schedule
+    # (d, d), information of one exposure on polynomials and drift, averaged over the dates
     information: Float
-    single_date: bool = False  # True if all further exposures have one date
-    # possible information (d, d) of a number of exposures, where it is not their number times that
-    # of one
+    single_date: bool = False  # True if all further exposures have the same date
+    # functions that return possible information (d, d) of a number of exposures, if it is not
+    # proportional to that number
     together: Sequence[Callable[[int], Float]] = ()
 
     def of(self, n: int) -> list[Float]:
-        """Information (d, d) of n exposures: values that are equally probable."""
-        return [one(n) for one in self.together] or [n * self.information]
+        """Information (d, d) of n exposures: equally probable values."""
+        return [information_of(n) for information_of in self.together] or [n * self.information]
 
 
 @dataclass(frozen=True)
 class Need:
-    """Number of exposures that a schedule takes.
+    """Number of exposures needed with a schedule.
 
     Parameters
     ----------
     schedule : str
-        Its name.
+        Name of the schedule.
     exposures : int or None
-        Fewest with which the requirement is met with the probability asked for; None where `MOST`
-        are not enough.
+        Smallest number with which the requirement is met with the required probability; None if
+        `MOST` are not enough.
     probability : float
-        That the requirement is met with so many; with `MOST` where they are not enough.
+        Probability that the requirement is met with this number, or with `MOST` if these are not
+        enough.
     interval : tuple of (int or None)
-        Fewest exposures for a probability lower and higher by `PROBABILITY_ERROR`; half way to 1
-        where it would be nearer to it.  None where `MOST` are not enough.
+        Smallest numbers for a probability that is lower and higher by `PROBABILITY_ERROR`; the
+        higher one is at most halfway to 1. None if `MOST` are not enough.
     by_number : mapping of int to float
-        Probability that the requirement is met, by the number of exposures, ascending.
+        Probability that the requirement is met, by number of exposures, ascending.
     """
 
     schedule: str
@@ -61,7 +62,7 @@ class Need:
 
     @property
     def sentence(self) -> str:
-        """The need in words."""
+        """The need in one sentence."""
         if self.exposures == 0:
             return f"{self.schedule}: met as it is (probability {self.probability:.3g})"
         if self.exposures is None:
@@ -80,7 +81,7 @@ class Need:
 
     @property
     def table(self) -> str:
-        """Probabilities of the numbers that were tried, in words; empty where it is met now."""
+        """Probabilities of the numbers that were evaluated, as text; empty if already met."""
         return ", ".join(f"{n}: {p:.2f}" for n, p in self.by_number.items())
 
 
@@ -91,35 +92,40 @@ def exposures_needed(
     *,
     now: float,
 ) -> tuple[Need, ...]:
-    """The fewest exposures of each schedule with which a requirement is met.
+    """Smallest number of exposures of each schedule with which a requirement is met.
 
     Parameters
     ----------
     schedules : sequence of Schedule
     probability_of : callable
-        From a schedule to the probability that the requirement is met with so many more exposures
-        of it; with the same random numbers each time, so that it rises with their number.
+        Function of a schedule that returns a function of the number of exposures, which returns the
+        probability that the requirement is met. It must use the same random numbers in each call,
+        so that the probability increases with the number of exposures.
     asked : float
-        Probability to be reached.
+        Required probability.
     now : float
-        Probability that the limit is met as it is.
+        Probability that the limit is met without further exposures.
+
+    Returns
+    -------
+    tuple of Need
     """
     if now >= asked:
-        return tuple(Need(one.name, 0, now) for one in schedules)
-    return tuple(_need(one.name, probability_of(one), asked) for one in schedules)
+        return tuple(Need(schedule.name, 0, now) for schedule in schedules)
+    return tuple(_need(schedule.name, probability_of(schedule), asked) for schedule in schedules)
 
 
 def _need(name: str, probability_met: Callable[[int], float], asked: float) -> Need:
-    known = dict[int, float]()
+    probabilities = dict[int, float]()
 
     def reached(n: int) -> float:
-        if n not in known:
-            known[n] = probability_met(n)
-        return known[n]
+        if n not in probabilities:
+            probabilities[n] = probability_met(n)
+        return probabilities[n]
 
     def fewest(probability: float) -> int | None:
         enough = 1
-        while reached(enough) < probability:  # doubling: most needs are small
+        while reached(enough) < probability:  # doubling, because most needs are small
             if enough == MOST:
                 return None
             enough *= 2
@@ -129,4 +135,6 @@ def _need(name: str, probability_met: Callable[[int], float], asked: float) -> N
     n = fewest(asked)
     high = min(asked + PROBABILITY_ERROR, (1 + asked) / 2)
     interval = fewest(asked - PROBABILITY_ERROR), None if n is None else fewest(high)
-    return Need(name, n, reached(MOST if n is None else n), interval, dict(sorted(known.items())))
+    return Need(
+        name, n, reached(MOST if n is None else n), interval, dict(sorted(probabilities.items()))
+    )

@@ -1,23 +1,25 @@
-"""Preposterior analysis: whether a requirement would be met with more exposures.
+"""Preposterior analysis: probability that a requirement would be met with more exposures.
 
-What more data would show is not known, but today's posterior says how probable it is.  Truths are
-drawn from it; for each of them the error model is predicted that a run with the exposures at hand
-and further ones would have, and the requirement is judged by it:
+The outcome of further exposures is unknown, but today's posterior gives its probability. True
+parameters ("truths") are drawn from it. For each of them, the error model of a run with the
+existing and the further exposures is predicted, and the requirement is judged with it:
 
-- coefficients: their information is that of all exposures.  In a self-calibration each star takes
-  up one of its detections: further exposures of the same stars say more than those at hand.
-- structure and curvature of the drift, posterior draws z about a mean m: with rho times today's
-  data, the draws are m + rho / (1 + rho) (t - m) + sqrt(rho) / (1 + rho) (e - m) + (z - m) /
-  sqrt(1 + rho), where the truth t and the noise e are themselves draws.  This is the posterior of a
-  linear Gaussian model, and it keeps the law of total variance for any other.  Where nothing is
-  seen, the prior of the size is nearly flat in its logarithm, and all sizes shrink alike.  Several
-  exposures of one date do not show how a drift bends, and leave its curvature as it is.
-- scatter of exposures: its draws are weighted by the likelihood of deviations that are drawn with
-  the scatter of the truth.  Their effect on the mean of the exposures falls as the root of the
-  number of exposures (in a self-calibration, as the variance of the solution times that root).
-  The deviation of a single exposure stays as large as it is: it only becomes better known, so that
-  a limit that is too small for it is never met, and of few exposures nobody knows whether it is.
-- everything else, as what is stated of a catalogue, stays as it is.
+- Coefficients: the information of all exposures is used. In a self-calibration each star uses up
+  one of its detections, so further exposures of the same stars add more than the existing ones.
+- Structure and curvature of the drift, posterior draws z with mean m: with rho times today's data,
+  the draws become m + rho / (1 + rho) (t - m) + sqrt(rho) / (1 + rho) (e - m) + (z - m) /
+  sqrt(1 + rho), with the truth t and the noise e drawn from the same draws. This is the posterior
+  of a linear Gaussian model, and it preserves the law of total variance for any other model. If no
+  structure is detected, the prior of its size is nearly flat in its logarithm, and all sizes shrink
+  alike. Several exposures of the same date do not constrain the curvature of a drift, which is then
+  left unchanged.
+- Scatter of exposures: its draws are weighted by the likelihood of deviations drawn with the
+  scatter of the truth. The effect of deviations on the mean of the exposures decreases with the
+  square root of the number of exposures (in a self-calibration, with the variance of the solution
+  times that root). The deviation of a single exposure does not decrease, but its size becomes
+  better known. A limit that is smaller than it is therefore never met, and with few exposures this
+  cannot be told.
+- Everything else, such as the stated error of a catalogue, is unchanged.
 """
 
 from __future__ import annotations
@@ -49,28 +51,30 @@ from bayesdist.infer.equations.scaled import one_thread
 from bayesdist.infer.solution.solution import Solution
 from bayesdist.utils.arrays import Bool, Float, Int
 
-TRUTHS = 60
-DRAWS = 250  # of the error model that each truth leads to
-MOST_POSITIONS = 60  # that stand for all: the statistic is scaled by what it is over all of them
-MOST_PAIRS = 300
+TRUTHS = 60  # number of truths
+DRAWS = 250  # number of draws of the error model for each truth
+MOST_POSITIONS = 60  # sampled positions; the statistic is scaled to its value over all positions
+MOST_PAIRS = 300  # sampled pairs of positions
 CHANGING = (StructureErrors, Deviations, FieldsOfExposures, ExposureVariation)  # with more data
 
 
 @dataclass(frozen=True)
 class Data:
-    """Size of the data at hand, of which further exposures bring more.
+    """Size of the existing data, to which further exposures add.
 
     Parameters
     ----------
     n_exposures : int
+        Number of exposures.
     weight : float
-        Sum over the stars of an average exposure of the inverse variance of an axis, in the unit of
-        u and v.
+        Sum of the inverse variances per axis over the stars of an average exposure, with variances
+        in the unit of u and v squared.
     n_stars : float
-        Stars in an average exposure.
+        Number of stars in an average exposure.
     gain : float
-        Information of a further exposure about the distortion, relative to the average one at hand:
-        of the same stars in a self-calibration it is larger, as these take up detections once.
+        Information of a further exposure on the distortion, relative to the average existing one.
+        It is larger than 1 for the same stars in a self-calibration, because each star uses up a
+        detection only once.
     """
 
     n_exposures: int
@@ -80,10 +84,10 @@ class Data:
 
 
 def with_more_data(z: Float, rho: float, truth: int, noise: int) -> Float:
-    """Posterior draws (n, ...) with 1 + rho times today's data, from those of today.
+    """Posterior draws (n, ...) with 1 + rho times today's data, from today's draws `z`.
 
-    `truth` and `noise` are the numbers of the draws that are taken for the truth, and for the error
-    of the further data.
+    `truth` and `noise` are the numbers of the draws that are used as the true value, and as the
+    error of the further data.
     """
     m = z.mean(axis=0)
     moved = (rho * (z[truth] - m) + np.sqrt(rho) * (z[noise] - m)) / (1 + rho)
@@ -92,56 +96,59 @@ def with_more_data(z: Float, rho: float, truth: int, noise: int) -> Float:
 
 @dataclass(frozen=True, eq=False)
 class Scattering:
-    """A term that scatters from exposure to exposure."""
+    """A term that varies between exposures."""
 
-    in_mean: ErrorDraws | None  # effect on the mean of the exposures, by draws
-    # with the deviation of a single exposure; None if only the mean of exposures is assessed
+    in_mean: ErrorDraws | None  # effect on the mean of the exposures
+    # including the deviation of a single exposure; None if only the mean of exposures is assessed
     whole: ErrorDraws | None
-    # (DRAWS, d), variances of the deviations of an exposure: mean squares of displacements
+    # (DRAWS, d), variances of the deviations of an exposure, as mean squares of displacements
     variances: Float
-    bends: bool = False  # True if the term has the curvature of the drift, too
+    bends: bool = False  # True if the term includes the curvature of the drift
 
     def chosen(self, n: int, data: Data, truth: int, rng: np.random.Generator) -> Int:
-        """Draws (DRAWS,) that n more exposures make probable if one of them is the truth.
+        """Draws (DRAWS,) that are probable after n more exposures if draw `truth` is true.
 
-        Deviations are measured as well as the stars of an exposure allow.  What they say of all
-        scatters together counts, with as many degrees of freedom as large deviations have.
+        Deviations are measured with the precision that the stars of an exposure allow. The
+        likelihood uses the sum of all scatters, with as many degrees of freedom as there are large
+        deviations.
         """
         noise = 1.0 / data.weight
-        known = self.variances + noise
-        true = known[truth]
+        measured_variances = self.variances + noise
+        true = measured_variances[truth]
         effective = float(true.sum() ** 2 / np.sum(true**2))
         dof = n * effective
-        size, (uniform, quantile) = known.mean(axis=1), rng.uniform(size=2)
-        # by its quantile, which belongs to a truth whatever the number of exposures
+        size, (uniform, quantile) = measured_variances.mean(axis=1), rng.uniform(size=2)
+        # the quantile belongs to a truth and does not change with the number of exposures
         square = size[truth] * chdtri(dof, quantile)
         log = -0.5 * (dof * np.log(size) + square / size)
         weight = np.cumsum(np.exp(log - log.max()))
-        # evenly spaced, so that the choice changes little with the weights
+        # systematic resampling, so that the choice changes little with the weights
         even = (np.arange(len(size)) + uniform) / len(size) * weight[-1]
         return np.minimum(np.searchsorted(weight, even), len(size) - 1)
 
 
 @dataclass(frozen=True, eq=False)
 class Futures:
-    """Runs with more exposures that are probable by an error model, judged by a requirement.
+    """Possible runs with more exposures according to an error model, judged by a requirement.
 
     Parameters
     ----------
     errors : ErrorModel
-        As it is now; with the errors of centroids, where the requirement is of a magnitude.
+        Present error model; it includes the errors of centroids if the requirement has a magnitude.
     requirement : Requirement
     data : Data
-        What the error model rests on.
+        Data that were used for the error model.
     solution : callable
-        Solution that has the additional information (d, d) about polynomials and drift.
+        Function of additional information (d, d) on polynomials and drift that returns the solution
+        with this information.
     grid : tuple of int
-        Points on x and y of each chip.
+        Number of points along x and y of each chip.
     epoch : float or None
         Decimal years, for a requirement that names none.
     pixel_scale : float or None
         Size of one pixel in mas.
     seed : int
+        Seed of all random numbers.
     """
 
     errors: ErrorModel
@@ -156,8 +163,8 @@ class Futures:
     def probability(self, schedule: Schedule) -> Callable[[int], float]:
         """Probability that the requirement is met with n more exposures, as a function of n.
 
-        Truths are the same for any n, and one that leads to a requirement that is met is not looked
-        at again with more exposures, nor one that leads to a missed requirement with fewer.
+        Truths are the same for any n. A truth that meets the requirement is not evaluated again
+        with more exposures, and one that misses it is not evaluated again with fewer.
         """
         met_with, missed_with = np.full(TRUTHS, np.inf), np.zeros(TRUTHS)
 
@@ -172,9 +179,9 @@ class Futures:
 
     @one_thread
     def met(self, schedule: Schedule, n: int, truths: Int) -> Bool:
-        """Boolean mask (t,) of the truths that lead to a requirement met with n more exposures.
+        """Boolean mask (t,) of the truths that lead to a met requirement with n more exposures.
 
-        `truths` (t,) are numbers below `TRUTHS`.
+        `truths`: numbers below `TRUTHS`, shape (t,).
         """
         rho = n / self.data.n_exposures
         several = [self._of_solution(information) for information in schedule.of(n)]
@@ -182,7 +189,7 @@ class Futures:
         means = [1 / np.sqrt(1 + rho)] * len(several)
         if schedule.together:
             now = self._of_solution(0 * schedule.of(n)[0]).variance
-            means = [np.sqrt(1 + rho) * one.variance / now for one in several]
+            means = [np.sqrt(1 + rho) * errors.variance / now for errors in several]
         of_bends = 0.0 if schedule.single_date else rho
         reached = [
             self._probability(several[k % len(several)], means[k % len(several)], n, of_bends, k)
@@ -191,11 +198,11 @@ class Futures:
         return np.array(reached) >= self.requirement.probability
 
     def _of_solution(self, information: Float) -> _SolutionErrors:
-        """Errors of the parameters with additional information about them."""
-        more = self.solution(information)
-        solution = replace(self.errors.solution, solution=more, without=None, catalogue=())
+        """Errors of the parameters, given additional information on them."""
+        informed = self.solution(information)
+        solution = replace(self.errors.solution, solution=informed, without=None, catalogue=())
         drawn = solution.draw(DRAWS, np.random.default_rng([self.seed, 1]))
-        square = mean_squares(more.model) * np.diag(more.cov)[: more.model.n_polynomial]
+        square = mean_squares(informed.model) * np.diag(informed.cov)[: informed.model.n_polynomial]
         errors = [self._evaluated(drawn, place.positions) for place in self._places]
         return _SolutionErrors(errors, float(square.sum()))
 
@@ -204,32 +211,32 @@ class Futures:
     ) -> float:
         """Probability of meeting the limit that a run would state for a truth.
 
-        `mean` is the size of what the mean of the exposures' deviations does, relative to today,
-        and `of_bends` the amount of further data on the curvature of a drift.
+        `mean`: effect of exposure deviations on the mean of the exposures, relative to today.
+        `of_bends`: amount of further data on the curvature of a drift, relative to today.
         """
         rho = n / self.data.n_exposures
         rhos = [of_bends if bends else self.data.gain * rho for bends in self._bends]
         rng = np.random.default_rng([self.seed, 2, truth])
         true, noise = rng.integers(DRAWS, size=2)
-        # the scatter of the stars is known as well as they are many
+        # relative uncertainty of the scatter of the stars, from their number
         stars = self.data.n_stars * np.array([self.data.n_exposures, n])
         width = np.exp(rng.standard_normal() * np.sqrt(np.sum(0.5 / stars)))
-        chosen = [one.chosen(n, self.data, true, rng) for one in self._scattering]
+        chosen = [term.chosen(n, self.data, true, rng) for term in self._scattering]
         values = []
         for place, of_solution in zip(self._places, solution.errors, strict=True):
             error = width * of_solution
-            for z, more in zip(place.resolved, rhos, strict=True):
-                error += with_more_data(z, more, true, noise)
-            for one, (in_mean, own), rows in zip(
+            for z, term_rho in zip(place.resolved, rhos, strict=True):
+                error += with_more_data(z, term_rho, true, noise)
+            for term, (in_mean, deviation), rows in zip(
                 self._scattering, place.scattering, chosen, strict=True
             ):
-                size = 1 / np.sqrt(1 + of_bends) if one.bends else mean
-                error += size * in_mean[rows] + own[rows]
+                size = 1 / np.sqrt(1 + of_bends) if term.bends else mean
+                error += size * in_mean[rows] + deviation[rows]
             values.append([place.values(error + r) / place.limit for r in place.unchanged])
-        worst = np.max(values, axis=0)  # (ways, DRAWS), over the epochs
+        worst = np.max(values, axis=0)  # (ways, DRAWS), largest over the epochs
         return float(np.mean(worst <= 1.0, axis=1).min())
 
-    # -- what does not depend on the number of exposures ------------------------------------------
+    # -- quantities that do not depend on the number of exposures ----------------------------------
 
     @cached_property
     def _drawn(self) -> DrawnErrors:
@@ -237,7 +244,7 @@ class Futures:
 
     @cached_property
     def _resolved(self) -> list[ErrorDraws]:
-        """Terms that data determine as they do coefficients: structure and curvature."""
+        """Draws of terms that data constrain like coefficients: structure and curvature."""
         return [
             draws
             for term, draws in zip(self._drawn.terms, self._drawn.draws, strict=True)
@@ -246,7 +253,7 @@ class Futures:
 
     @cached_property
     def _bends(self) -> list[bool]:
-        """True for each of the resolved terms that is the curvature of the drift."""
+        """True for each resolved term that is the curvature of the drift."""
         return [isinstance(t, Deviations) for t in self._drawn.terms if _is_resolved(t)]
 
     @cached_property
@@ -270,9 +277,9 @@ class Futures:
                 limit,
                 [self._summed(way, positions) for way in ways],
                 [self._evaluated(draws, positions) for draws in self._resolved],
-                [self._scattered(one, positions) for one in self._scattering],
+                [self._scattered(term, positions) for term in self._scattering],
             )
-            # of all positions the statistic is another one than of those that stand for them
+            # the statistic over the sampled positions differs from that over all positions
             [over_all] = drawn.statistics(domain, [r.statistic]).values()
             over_some = place.values(self._summed(drawn, positions))
             ratio = float(np.median(over_all) / max(np.median(over_some), 1e-300))
@@ -280,19 +287,19 @@ class Futures:
         return out
 
     def _scattered(self, one: Scattering, positions: EvaluationDomain) -> tuple[Float, Float]:
-        """Effect on the mean of the exposures, and deviation of a single one (DRAWS, N, 2)."""
+        """Effect on the exposures' mean, and deviation of a single one, (DRAWS, N, 2) each."""
         nothing = np.zeros((DRAWS, positions.size, 2))
         in_mean = nothing if one.in_mean is None else self._evaluated(one.in_mean, positions)
-        whole = in_mean if one.whole is None else self._evaluated(one.whole, positions)
-        return in_mean, whole - in_mean
+        combined = in_mean if one.whole is None else self._evaluated(one.whole, positions)
+        return in_mean, combined - in_mean
 
     def _evaluated(self, draws: ErrorDraws, positions: EvaluationDomain) -> Float:
-        """Errors (DRAWS, N, 2) of one term."""
+        """Errors (DRAWS, N, 2) of a single term."""
         alone = replace(self._drawn, terms=(), draws=(draws,), further=None, _cache={})
         return self._summed(alone, positions)
 
     def _summed(self, drawn: DrawnErrors, positions: EvaluationDomain) -> Float:
-        """Errors (DRAWS, N, 2) of all terms that were drawn."""
+        """Errors (DRAWS, N, 2) of all drawn terms."""
         shape = DRAWS, positions.size, 2
         normal = np.random.default_rng([self.seed, 4]).standard_normal(shape)
         return drawn.errors(positions)(slice(0, DRAWS), normal)
@@ -303,7 +310,7 @@ class _SolutionErrors:
     """Errors of the parameters of a solution."""
 
     errors: Sequence[Float]  # (DRAWS, N, 2) at each place
-    variance: float  # mean square over the detector, of the polynomials
+    variance: float  # mean variance of the polynomials over the detector
 
 
 @dataclass(frozen=True, eq=False)
@@ -312,17 +319,18 @@ class _Place:
 
     positions: EvaluationDomain
     statistic: str
-    pairs: Int | None  # (2, P), whose differences count
+    pairs: Int | None  # (2, P), pairs of positions that are compared
     limit: float  # in the unit of the errors
-    # (DRAWS, N, 2) of all that more data do not change, for each way in which it varies over the
-    # field
+    # (DRAWS, N, 2) of all terms that more data do not change, for each way in which they may vary
+    # over the field
     unchanged: Sequence[Float]
-    resolved: Sequence[Float]  # (DRAWS, N, 2) of each term that data determine
-    # (DRAWS, N, 2) of each term that scatters: its effect on the mean, and on a single exposure
+    resolved: Sequence[Float]  # (DRAWS, N, 2) of each term that data constrain like coefficients
+    # (DRAWS, N, 2) of each term that varies between exposures: effects on the mean and on a single
+    # exposure
     scattering: Sequence[tuple[Float, Float]]
 
     def values(self, error: Float) -> Float:
-        """The statistic of errors (n, N, 2) for each draw."""
+        """Statistic of errors (n, N, 2) for each draw."""
         axis, _, base = self.statistic.rpartition("_")
         if self.pairs is None:
             return of_sizes(base, sizes(axis, error))
@@ -332,11 +340,11 @@ class _Place:
 
 
 def _some(domain: EvaluationDomain, seed: int) -> tuple[EvaluationDomain, Int | None]:
-    """Positions that stand for all of a domain, and pairs of them that stand for all pairs."""
+    """Sample of the positions of a domain, and a sample of the pairs of these positions."""
     rng, pairs = np.random.default_rng([seed, 5]), domain.pairs()
     if pairs is None:
         n = min(domain.size, MOST_POSITIONS)
-        # evenly over the list of positions, in which neighbours follow each other
+        # evenly spaced in the list of positions, which is ordered by position
         rows = ((np.arange(n) + rng.uniform()) * domain.size / n).astype(int)
     else:
         n = min(pairs.shape[1], MOST_PAIRS)
@@ -349,45 +357,45 @@ def _some(domain: EvaluationDomain, seed: int) -> tuple[EvaluationDomain, Int | 
 
 
 def _is_resolved(term: ErrorTerm) -> bool:
-    """True for a term that data determine as they do coefficients: structure and curvature."""
+    """True for a term that data constrain like coefficients: structure and curvature."""
     return isinstance(term, CHANGING) and not _scatters(term)
 
 
 def _scatters(term: ErrorTerm) -> bool:
-    """True for a term whose size is that of a scatter of exposures."""
+    """True for a term with a size that is given by the scatter of exposures."""
     if isinstance(term, Deviations):
         return bool(_linear(term).kinds)
     return isinstance(term, FieldsOfExposures | ExposureVariation)
 
 
 def _scattering(term: ErrorTerm, rng: np.random.Generator) -> Scattering:
-    """Draws of a term that scatters, in the order of the draws of its scatter."""
+    """Draws of a term that varies between exposures, in the order of the draws of its scatter."""
     in_mean: ErrorDraws | None = None
-    whole: ErrorDraws | None = None
+    in_exposure: ErrorDraws | None = None
     if isinstance(term, Deviations):
         linear = _linear(term)
         rows = np.arange(DRAWS) % len(linear.theta)
         in_mean = term.of_rows(rows, None)
-        whole = term.of_rows(rows, int(rng.integers(2**63))) if term.single else None
+        in_exposure = term.of_rows(rows, int(rng.integers(2**63))) if term.single else None
         variances = [
-            # of a position in half sizes: its square is 2 / 3 on average
+            # position in units of the half size of the chip: its mean square is 2 / 3
             (1.0 if kind == "shift" else 2 / 3)
             * (linear.size * linear.scatter[SCATTERS[kind]]) ** 2
             for kind, name in ((kind, SCATTERS[kind]) for kind in linear.kinds)
             for _ in LINEAR.get(kind, "uv")
         ]
-        # what the mean of the exposures leaves of their scatter is not told from a bend here
+        # the scatter of the exposures' mean cannot be distinguished from curvature of the drift
         return Scattering(
-            in_mean, whole, np.stack(variances, axis=1)[rows], bool(np.isfinite(linear.epoch))
+            in_mean, in_exposure, np.stack(variances, axis=1)[rows], bool(np.isfinite(linear.epoch))
         )
     if isinstance(term, FieldsOfExposures):
         fields = required(term.discrepancy.fields, "no fields of exposures were estimated")
         rows = np.arange(DRAWS) % len(fields.theta)
         in_mean = replace(term, single=False).of_rows(rows, rng)
-        whole = term.of_rows(rows, rng) if term.single else None
+        in_exposure = term.of_rows(rows, rng) if term.single else None
         n_terms = len(QUADRATIC)
         variance = fields.second_order**2 + fields.amplitude**2 / n_terms
-        return Scattering(in_mean, whole, np.tile(variance[rows, None], (1, 2 * n_terms)))
+        return Scattering(in_mean, in_exposure, np.tile(variance[rows, None], (1, 2 * n_terms)))
     if isinstance(term, ExposureVariation):
         rows = np.arange(DRAWS) % len(term.tau)
         half = term.model.pixel_size(term.mean) * max(max(c.size) for c in term.model.chips) / 2
@@ -402,8 +410,8 @@ def _linear(term: Deviations) -> LinearDeviations:
 def _without(drawn: DrawnErrors) -> DrawnErrors:
     """Draws of the terms that more data do not change."""
     draws = [
-        one
-        for term, one in zip(drawn.terms, drawn.draws, strict=True)
+        term_draws
+        for term, term_draws in zip(drawn.terms, drawn.draws, strict=True)
         if not isinstance(term, (SolutionErrors, *CHANGING))
     ]
     return replace(drawn, terms=(), draws=tuple(draws), further=None, _cache={})

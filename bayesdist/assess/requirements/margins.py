@@ -1,4 +1,4 @@
-"""Requirements on the position error, and by what margin a solution meets them."""
+"""Requirements on the position error, and the margins by which a solution meets them."""
 
 from __future__ import annotations
 
@@ -30,14 +30,14 @@ from bayesdist.utils.arrays import Float
 from bayesdist.utils.checks import LARGER, Check, doubts_of
 from bayesdist.utils.numbers import counted, probability_words, rounded
 
-EPOCHS = 9  # of a range that are judged, its ends and what lies evenly between
-MOST_DRAWS = 512_000  # 99.9 % of verdicts are right 0.001 from the probability 0.95 asked for
-DRAWS_AT_ONCE = 32_000  # that are added, for memory
+EPOCHS = 9  # number of evenly spaced epochs, with both ends, at which a range is judged
+MOST_DRAWS = 512_000  # 99.9 % of verdicts are right 0.001 from the required probability 0.95
+DRAWS_AT_ONCE = 32_000  # number of draws added at a time, to limit memory
 
 
 @dataclass(frozen=True, eq=False)
 class Margin:
-    """Margin of a solution against a requirement.  All lengths are in `unit`.
+    """Margin of a solution relative to a requirement. All lengths are in `unit`.
 
     Parameters
     ----------
@@ -45,37 +45,37 @@ class Margin:
     value : float
         Median of the statistic over the draws.
     interval : tuple of float
-        Central 95 % of the statistic over the draws.
+        Central 95 % interval of the statistic over the draws.
     margin : float
-        The limit minus the value that the statistic stays at or under with the probability asked
-        for: not negative if and only if `probability_met` is at least that probability.
+        The limit minus the quantile of the statistic at the required probability. It is
+        non-negative if and only if `probability_met` is at least the required probability.
     probability_met : float
-        Probability that the limit is met by the known errors: the fraction of draws at or under it.
-        It may be 1 where the verdict is 'undecided', because the residuals were not examined, for
-        example, or an error of the catalogue is not stated: other errors are in no draw.
+        Probability that the known errors meet the limit: the fraction of draws that do not exceed
+        it. It may be 1 for an 'undecided' verdict, for example if the residuals were not examined
+        or no catalogue error is stated, because such errors are not in the draws.
     mc_error : float
         Monte-Carlo standard error of `probability_met`.
     verdict : str
-        'met' if the limit is met with the probability asked for; 'missed' if it is exceeded with
-        a probability of at least 0.95; 'not shown' if neither; 'undecided' if something is in doubt
-        that the probability does not include.
+        'met' if the limit is met with the required probability; 'missed' if it is exceeded with a
+        probability of at least 0.95; 'not shown' if neither; 'undecided' if there are doubts that
+        the probability does not include.
     reason : str
-        Why, in words.
+        Reason for the verdict.
     unit : str
-        The requirement's.
+        Unit of the requirement.
     epoch : float or None
-        At which it was judged; of a range of epochs the worst one.
+        Decimal year for which the requirement was judged; the worst one of a range of epochs.
     n_effective : float
-        Independent draws that all draws are worth.
+        Effective number of independent draws.
     draws : ndarray, shape (n,)
-        The statistic of each of the draws that were asked for; over a range of epochs the largest.
-        Near the probability asked for the other numbers rest on more draws.
+        Statistic of each of the requested draws; over a range of epochs the largest one. Close to
+        the required probability, the other results use more draws than these.
     worst : WorstPosition
-        Where the error is largest, at that epoch; its size in `unit`.
+        Position with the largest error at that epoch; its rms is in `unit`.
     rests_on : tuple of str
-        What the verdict takes for granted or has measured, as clauses.
+        Assumptions and measurements that the verdict depends on.
     remedy : RequiredReduction or None
-        The term that must be reduced, and to what level, for the requirement to be met; None if it
+        The term that must be reduced, and to what size, for the requirement to be met; None if it
         is met or undecided.
 
     Examples
@@ -121,13 +121,13 @@ class Margin:
     def sentence(self) -> str:
         """Requirement, verdict, value, limit, probability and reason in one line."""
         r = self.requirement
-        where = "" if self.epoch is None else f" in {self.epoch:.2f}"
+        when = "" if self.epoch is None else f" in {self.epoch:.2f}"
         scope = f" {r.scope}" if r.scope else ""
-        known = " by the known errors alone" if self.verdict == "undecided" else ""
+        qualifier = " by the known errors alone" if self.verdict == "undecided" else ""
         value = rounded(self.value, (self.interval[1] - self.interval[0]) / 4)
         return (
-            f"{r.name}: {self.verdict}: {r.statistic}{scope}{where} {value} {r.unit}, "
-            f"limit {r.limit:g} {r.unit}, {self.probability_words}{known}, "
+            f"{r.name}: {self.verdict}: {r.statistic}{scope}{when} {value} {r.unit}, "
+            f"limit {r.limit:g} {r.unit}, {self.probability_words}{qualifier}, "
             f"{r.probability:g} asked for: "
             f"{self.reason}"
         )
@@ -139,7 +139,7 @@ class Margin:
 
     @property
     def percent(self) -> float:
-        """The margin in percent of the limit."""
+        """The margin as a percentage of the limit."""
         return 100.0 * self.margin / self.requirement.limit
 
 
@@ -154,29 +154,36 @@ def judge(
     checks: Sequence[Check] = (),
     adaptive: bool = True,
 ) -> tuple[Margin, ...]:
-    """Margins of requirements on drawn errors, in the order of the requirements.
+    """Judge requirements on drawn errors.
 
     Parameters
     ----------
     errors : DrawnErrors
     requirements : sequence of Requirement
     grid : tuple of int
-        Points on x and y of each chip.
+        Number of points along x and y of each chip.
     epoch, chip : float and int, optional
-        For requirements that name none: decimal years; the chip number, by default all chips.
+        Epoch in decimal years and chip number, for requirements that name none; all chips by
+        default.
     pixel_scale : float, optional
         Size of one pixel in mas.
     checks : sequence of Check
-        Their doubts leave requirements undecided; that of convergence is among them.
+        Checks, including that of convergence; doubts that they raise make verdicts undecided.
     adaptive : bool
-        Whether draws are added near the probability asked for, and near that of a missed limit: as
-        many as there are, again and again, until the verdict no longer depends on Monte-Carlo error
-        or there are `MOST_DRAWS`.  The additional draws follow from the seed of the first ones.
+        True to add draws if the probability of meeting the limit is close to the required one, or
+        to that of a missed limit. The number of draws is doubled until the verdict does not depend
+        on Monte-Carlo error, or reaches `MOST_DRAWS`. The added draws are determined by the seed of
+        the first ones.
+
+    Returns
+    -------
+    tuple of Margin
+        In the order of the requirements.
 
     Raises
     ------
     InputError
-        As `check_requirements`.
+        See `check_requirements`.
     """
     if not requirements:
         return ()
@@ -217,10 +224,10 @@ def _tallied(
     *,
     adaptive: bool,
 ) -> list[tuple[list[list[Float]], list[Tally]]]:
-    """Statistics of each requirement, with more draws where Monte-Carlo error would decide.
+    """Statistics of each requirement, with more draws if Monte-Carlo error would decide a verdict.
 
-    For each requirement, and in it for each way in which errors may vary over the field: the
-    statistic (n,) of the first draws at each epoch, and the tally of all draws.
+    For each requirement returns two lists with one item per way in which errors may vary over the
+    field: the statistic (n,) of the first draws at each epoch, and the tally of all draws.
     """
     batch, total, out = errors, 0, list[tuple[list[list[Float]], list[Tally]]]()
     undecided = list(range(len(requirements)))
@@ -233,7 +240,7 @@ def _tallied(
         statistics = {}
         for domain, names in wanted.items():
             owner = next(i for i in undecided if domain in cases[i])
-            with _named(requirements[owner]):  # its separation or magnitude may be wrong
+            with _named(requirements[owner]):  # its separation or magnitude may be invalid
                 statistics[domain] = [way.statistics(domain, sorted(names)) for way in ways]
         for i in undecided:
             r = requirements[i]
@@ -253,19 +260,19 @@ def _tallied(
         ]
         if not (adaptive and undecided and errors.further and total < MOST_DRAWS):
             return out
-        more = min(total, max(errors.n_draws, DRAWS_AT_ONCE), MOST_DRAWS - total)
-        batch = errors.further(more, number)
+        n_more = min(total, max(errors.n_draws, DRAWS_AT_ONCE), MOST_DRAWS - total)
+        batch = errors.further(n_more, number)
     raise AssertionError("the loop returns")
 
 
 def _more_draws_decide(
     tallies: Sequence[Tally], asked: float, n_first: int, doubts: Sequence[Check]
 ) -> bool:
-    """Whether a verdict is open because of too few draws, and more of them could settle it.
+    """True if a verdict is open because there are too few draws, and more could settle it.
 
-    `tallies`: of each way in which errors may vary. `asked`: probability asked for. `n_first`:
-    number of draws that were asked for. `doubts`: with those that may make errors smaller nothing
-    is decided, with others only that a requirement is missed.
+    `tallies`: tallies for each way in which errors may vary. `asked`: required probability.
+    `n_first`: requested number of draws. `doubts`: if these may make errors smaller, no verdict can
+    be settled; if they only make errors larger, only a missed requirement can.
     """
     if any(check.doubt != LARGER for check in doubts):
         return False
@@ -274,11 +281,11 @@ def _more_draws_decide(
     if not doubts:
         bounds.append((int(np.argmin(fractions)), asked))  # met in every way
     for k, bound in bounds:
-        now, most = tallies[k].effective()
+        now, n_limit = tallies[k].effective()
         if not undecided_by_draws(fractions[k], now, [bound]):
             continue
-        # how much draws of the same sets have in common is known from a few draws of each
-        if tallies[k].n < 4 * n_first or not undecided_by_draws(fractions[k], most, [bound]):
+        # the covariance of draws from the same sets is estimated well from a few draws of each
+        if tallies[k].n < 4 * n_first or not undecided_by_draws(fractions[k], n_limit, [bound]):
             return True
     return False
 
@@ -291,12 +298,12 @@ def domains_of(
     epoch: float | None = None,
     chip: int | None = None,
 ) -> tuple[EvaluationDomain, ...]:
-    """Domains in which a requirement is judged: one for each epoch.
+    """Domains in which a requirement is judged, one for each epoch.
 
-    `grid`: points on x and y of a chip. `epoch`, `chip`: for a requirement that names none.
-    InputError for an unknown chip, a missing epoch, a range of epochs where nothing depends on
-    time, a polygon that is not said to lie on one of several chips, and a region that holds fewer
-    than four points of the grid.
+    `grid`: number of points along x and y of a chip. `epoch`, `chip`: for a requirement that names
+    none. Raises InputError if the chip is unknown, the epoch is missing, a range of epochs is given
+    although nothing depends on time, a polygon does not name its chip among several, or a region
+    contains fewer than four grid points.
     """
     r = requirement
     epochs: list[float | None] = [r.epoch if r.epoch is not None else epoch]
@@ -309,7 +316,7 @@ def domains_of(
             )
         start, stop = r.epochs
         inner = [b for b in model.time.breaks if start < b < stop]
-        # a break belongs to what follows it: just before it the earlier drift has run longest
+        # at a break the later drift applies; just before it the earlier drift has run longest
         before = [float(np.nextafter(b, start)) for b in inner]
         epochs = [*sorted({*np.linspace(start, stop, EPOCHS).tolist(), *inner, *before})]
     elif epochs[0] is None and model.time is not None:
@@ -325,7 +332,7 @@ def domains_of(
             where=r.where,
             do=f"name its chip, one of {', '.join(str(c.number) for c in chips)}",
         )
-    with _named(r):  # its region may be wrong
+    with _named(r):  # its region may be invalid
         first = EvaluationDomain.of_chips(
             model,
             grid,
@@ -341,18 +348,18 @@ def domains_of(
 
 @contextmanager
 def _named(requirement: Requirement) -> Iterator[None]:
-    """Context whose errors name the requirement."""
+    """Context manager that adds the requirement's name to an InputError."""
     try:
         yield
     except InputError as error:
-        where = f"{requirement.where}, {error.where}"
-        raise InputError(error.cause, where=where, do=error.do) from None
+        location = f"{requirement.where}, {error.where}"
+        raise InputError(error.cause, where=location, do=error.do) from None
 
 
 def _chips_of(
     requirement: Requirement, model: DistortionModel, chip: int | None, epoch: float | None
 ) -> tuple[Chip, ...]:
-    """The chips whose field is judged."""
+    """The chips on which a requirement is judged."""
     number = chip if requirement.chip is None else requirement.chip
     if requirement.chip is not None and number not in [c.number for c in model.chips]:
         raise InputError(
@@ -369,7 +376,7 @@ def _chips_of(
 def _of_extremes(
     margins: Sequence[Margin], worse: Margin, names: Sequence[str], doubts: Sequence[Check]
 ) -> Margin:
-    """The least favourable margin, `worse`, with a verdict that holds for all of them."""
+    """The least favourable margin, `worse`, with a verdict that is valid for all margins."""
     better = max(margins, key=lambda m: m.probability_met)
     if all(m.verdict == worse.verdict for m in margins) or worse.verdict == "undecided":
         return worse
@@ -404,7 +411,7 @@ def _margin(
     worst_epoch = case[int(np.argmax([np.quantile(d, asked) for d in by_epoch]))]
     met, (n_effective, _) = tally.fraction, tally.effective()
     low, median, high = np.quantile(draws, [0.025, 0.5, 0.975])
-    # the empirical quantile without interpolation, so that its side of the limit agrees with `met`
+    # empirical quantile without interpolation, so that it is consistent with `met`
     reached = np.quantile(draws, asked, method="inverted_cdf")
     verdict, reason = verdict_of(met, n_effective, asked, doubts)
     axis = requirement.statistic[0] if requirement.statistic[:2] in ("u_", "v_") else ""

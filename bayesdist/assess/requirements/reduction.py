@@ -10,25 +10,25 @@ from bayesdist.assess.domain import EvaluationDomain
 from bayesdist.assess.drawn import DrawnErrors
 from bayesdist.assess.requirements.requirement import Requirement
 
-DRAWS = 1000  # a factor is wanted to a percent or two
-STEPS = 9  # halvings of the interval in which the factor lies
+DRAWS = 1000  # number of draws, sufficient for a factor accurate to one or two percent
+STEPS = 9  # number of bisections of the interval that contains the factor
 
 
 @dataclass(frozen=True)
 class RequiredReduction:
-    """Error term that must be reduced."""
+    """The error term that must be reduced to meet a requirement."""
 
-    # where one term can do it alone, that which has to shrink least; else the largest one
+    # the term that needs the smallest reduction if one term is sufficient; else the largest term
     term: str
-    factor: float  # by which its error must be multiplied; 0 where it cannot do it alone
-    now: float  # its radial rms over the positions judged, in the requirement's unit
-    needed: float
-    enough: bool  # True if the requirement is met then, the other terms being as they are
+    factor: float  # factor by which its error must be multiplied; 0 if it is not sufficient
+    now: float  # its radial rms over the positions judged, in the unit of the requirement
+    needed: float  # radial rms that it may have
+    enough: bool  # True if the requirement is then met with the other terms unchanged
     unit: str
 
     @property
     def sentence(self) -> str:
-        """The reduction in words."""
+        """The reduction in one sentence."""
         if not self.enough:
             return (
                 f"no term can do it alone: the largest, {self.term} ({self.now:.3g} {self.unit} "
@@ -43,37 +43,37 @@ class RequiredReduction:
 def required_reduction(
     errors: DrawnErrors, requirement: Requirement, domain: EvaluationDomain, factor: float
 ) -> RequiredReduction | None:
-    """The term that has to shrink least for a requirement to be met; None if it is nearly met.
+    """Find the term that needs the smallest reduction for a requirement to be met.
 
-    Each term by itself is multiplied by a number between 0 and 1, with the same draws throughout.
+    Each term in turn is multiplied by a number between 0 and 1, with the same draws throughout.
 
-    `domain`: where, and at the worst epoch. `factor`: unit of the solution, in the unit of the
-    requirement.
+    `domain`: positions at the worst epoch. `factor`: size of the solution's unit in the unit of the
+    requirement. Returns None if the requirement is met with the draws used here.
     """
     n = min(DRAWS, errors.n_draws)
     statistic = requirement.statistic
 
     def met(term: str, size: float) -> bool:
-        found = errors.statistics(domain, [statistic], scale={term: size}, n_draws=n)
+        statistics = errors.statistics(domain, [statistic], scale={term: size}, n_draws=n)
         return bool(
-            np.mean(factor * found[statistic] <= requirement.limit) >= requirement.probability
+            np.mean(factor * statistics[statistic] <= requirement.limit) >= requirement.probability
         )
 
-    if met("", 1.0):  # on these draws: no term has to shrink by a size that could be stated
+    if met("", 1.0):  # met with these draws, so that no reduction can be stated
         return None
     sizes = {name: factor * size for name, size in errors.sizes(domain).items()}
     largest = max(sizes, key=lambda name: sizes[name])
-    best, most = "", 0.0
+    best, best_factor = "", 0.0
     for name in sizes:
-        # a term that must shrink more than another one is not bisected
-        if sizes[name] > 0 and met(name, most):
+        # terms that need a larger reduction than the best one so far are skipped
+        if sizes[name] > 0 and met(name, best_factor):
             low, high = 0.0, 1.0
             for _ in range(STEPS):
                 middle = (low + high) / 2
                 low, high = (middle, high) if met(name, middle) else (low, middle)
-            if not best or low > most:
-                best, most = name, low
+            if not best or low > best_factor:
+                best, best_factor = name, low
     if not best:
         return RequiredReduction(largest, 0.0, sizes[largest], 0.0, False, requirement.unit)
     now = sizes[best]
-    return RequiredReduction(best, most, now, most * now, True, requirement.unit)
+    return RequiredReduction(best, best_factor, now, best_factor * now, True, requirement.unit)

@@ -1,4 +1,4 @@
-"""A requirement on the position error: which statistic, where, when, and how surely."""
+"""A requirement on the position error: statistic, limit, region, epoch and probability."""
 
 from __future__ import annotations
 
@@ -26,40 +26,42 @@ from bayesdist.utils.quantities import unit_name, value_in, year_of
 
 @dataclass(frozen=True)
 class Requirement:
-    """A limit on a statistic of the position error over the detector, which is all of its chips.
+    """A limit on a statistic of the position error over the detector, which includes all chips.
 
     Parameters
     ----------
     name : str
+        Name of the requirement.
     statistic : str
         One of `STATISTICS`.
     limit : float or Quantity
         Positive; stored as a number in `unit`.
     unit : str, optional
-        'pix', 'arcsec', 'mas' or 'deg'; of a Quantity it is its own.  It may be left out (empty)
-        for models whose u and v are in pixels: see `in_unit_of`.
+        'pix', 'arcsec', 'mas' or 'deg'; ignored if the limit is a Quantity. It may be omitted
+        (empty) for models with u and v in pixels; see `in_unit_of`.
     probability : float
-        With which the statistic must be at or under the limit, between 0 and 1.
+        Probability with which the statistic must not exceed the limit, between 0 and 1.
     epoch : float, str, Time, date or Quantity, optional
         Stored in decimal years.
     chip : int, optional
-        Number of the one chip that is judged; all chips together by default.
+        Number of the only chip that is judged; all chips together by default.
     region : str or sequence of (x, y)
-        The part of each chip that counts: see `check_region`.
+        The part of each chip that is judged; see `check_region`.
     epochs : tuple of float, optional
-        First and last epoch of a range, in place of `epoch`: the limit must hold throughout.
+        First and last epoch of a range, instead of `epoch`: the limit must be met throughout.
     relative : bool
-        Whether the error is that of the difference of two positions in one image, over all pairs of
-        positions, in place of that of one position.
+        True for the error of the difference between two positions in one image, over all pairs of
+        positions, instead of the error of a position.
     separation : float or Quantity, optional
-        Pairs on one chip that are not farther apart than so many pixels; for relative errors.
+        Largest separation of the pairs in pixels, on the same chip; only for relative errors.
     magnitude : float or Quantity, optional
-        Of the star whose error is meant: its centroid's error counts in.
+        Magnitude of a star, for which the error of its centroid is included.
 
     Raises
     ------
     InputError
-        For an unknown statistic, unit or region, and for numbers out of range or at odds.
+        If the statistic, unit or region is unknown, a number is out of range, or parameters
+        contradict each other.
 
     Examples
     --------
@@ -86,7 +88,7 @@ class Requirement:
         if self.unit:
             require_known(self.unit, UNITS, "unit", where=self.where)
         unit = unit_name(self.limit, "limit", where=self.where) or self.unit or ""
-        # a plain number is the same in any unit
+        # the unit has no effect on a plain number
         limit = value_in(self.limit, unit or "pix", "limit", where=self.where)
         object.__setattr__(self, "limit", limit)
         object.__setattr__(self, "unit", unit)
@@ -100,7 +102,7 @@ class Requirement:
         if self.epoch is not None:
             object.__setattr__(self, "epoch", year_of(self.epoch, where=self.where))
         if self.epochs is not None:
-            years = tuple(year_of(one, "epochs", where=self.where) for one in self.epochs)
+            years = tuple(year_of(epoch, "epochs", where=self.where) for epoch in self.epochs)
             object.__setattr__(self, "epochs", years)
         for wrong, cause, do in (
             (
@@ -139,12 +141,12 @@ class Requirement:
                 raise InputError(cause, where=self.where, do=do)
 
     def in_unit_of(self, unit: str) -> Requirement:
-        """Requirement with a unit: its own, or pixels if those are the unit of u and v.
+        """Requirement with a unit: its stated unit, or pixels if u and v are in pixels.
 
         Parameters
         ----------
         unit : str
-            Of u and v.
+            Unit of u and v.
 
         Returns
         -------
@@ -153,18 +155,18 @@ class Requirement:
         Raises
         ------
         InputError
-            If it has no unit, and u and v are in angles.
+            If it has no unit, and u and v are angles.
         """
         return self if self.unit else replace(self, unit=stated_unit(self.unit, unit, self.where))
 
     @property
     def where(self) -> str:
-        """Name in messages."""
+        """Name of the requirement in error messages."""
         return f"requirement {self.name!r}"
 
     @property
     def scope(self) -> str:
-        """Words on the scope of the statistic beside chip and epoch; may be empty."""
+        """Scope of the statistic as text, without chip and epoch; may be empty."""
         words = region_words(self.region)
         if self.relative:
             apart = "" if self.separation is None else f" up to {self.separation:g} px apart"
@@ -174,19 +176,19 @@ class Requirement:
         return words.strip()
 
     def reaches_beyond(self, covered: Coverage, grid: tuple[int, int]) -> bool:
-        """True if the requirement is judged on a chip where there are no stars.
+        """True if the requirement is judged on parts of a chip that no stars cover.
 
         Parameters
         ----------
         covered : Coverage
-            Of the chip.
+            Coverage of a chip by stars.
         grid : tuple of int
-            Points on x and y.
+            Number of points along x and y.
 
         Returns
         -------
         bool
-            Only where what is not covered is significant.
+            Always False if the uncovered part is not significant.
         """
         chip = covered.chip
         if not covered.significant or self.chip not in (None, chip.number):
@@ -198,12 +200,12 @@ class Requirement:
 
 
 def as_requirements(requirements: Requirement | Sequence[Requirement]) -> list[Requirement]:
-    """Requirements as a list; one requirement alone becomes a list of one.
+    """Requirements as a list; a single requirement becomes a list of one.
 
     Raises
     ------
     InputError
-        If one of them is something else.
+        If one of them is not a `Requirement`.
     """
     several: list[Any] = [requirements]
     if isinstance(requirements, list | tuple):

@@ -1,4 +1,4 @@
-"""A probability counted in draws, and the number of independent draws that it is worth."""
+"""A probability estimated by counting draws, and its effective number of independent draws."""
 
 from __future__ import annotations
 
@@ -12,17 +12,17 @@ from bayesdist.utils.arrays import Bool, Float, Int
 
 @dataclass(eq=False)
 class Tally:
-    """Draws of a statistic against its limit, one set of draws after the other.
+    """Draws of a statistic compared with its limit, in one or several sets of draws.
 
     Parameters
     ----------
     limit : float
-        In the unit of the values.
+        Limit in the unit of the values.
     values : list of ndarray
-        The statistic of each draw, of each set.
+        The statistic of each draw, for each set of draws.
     pools : list of tuple of Pool
-        Finite sets that the draws of the errors were taken from, of each set of draws; the same
-        terms in the same order.
+        Finite sets from which the draws of the errors were taken, for each set of draws; with the
+        same terms in the same order.
     """
 
     limit: float
@@ -30,7 +30,7 @@ class Tally:
     pools: list[tuple[Pool, ...]] = field(default_factory=list)
 
     def add(self, values: Float, pools: tuple[Pool, ...]) -> None:
-        """Count further draws."""
+        """Add further draws."""
         self.values.append(values)
         self.pools.append(pools)
 
@@ -46,34 +46,38 @@ class Tally:
 
     @property
     def fraction(self) -> float:
-        """Fraction of draws at or under the limit."""
+        """Fraction of draws that do not exceed the limit."""
         return float(np.mean(self.all_values <= self.limit))
 
     def effective(self) -> tuple[float, float]:
-        """Independent draws that the draws are worth, and that any number of them would be worth.
+        """Effective number of independent draws, and its limit for an infinite number of draws.
 
-        The variance of the fraction p of n draws, some of whose terms are taken from finite sets of
-        m independent draws each, is at most
+        Let n draws contain terms that are taken from finite sets of m independent draws each. The
+        variance of the fraction p of the draws that meet the limit is at most
 
             p (1 - p) / n + sum(s / m)
 
-        where s is the covariance of two draws that have the same draw of the set in common
-        (Hoeffding's decomposition; the sum of s is at most p (1 - p)).  It is estimated from such
-        pairs, with two standard errors added; without pairs it is p (1 - p).
+        where s is the covariance of two draws that use the same draw of the set (Hoeffding's
+        decomposition; the sum of s is at most p (1 - p)). It is estimated from such pairs, and two
+        standard errors are added; without pairs it is p (1 - p).
 
         Returns
         -------
         now, limit : float
-            At least 1; the second is infinite without such sets.
+            At least 1; the second is infinite without finite sets.
         """
         met = self.all_values <= self.limit
         n, p = len(met), float(np.mean(met))
         variance = p * (1.0 - p)
         sizes, shares = [], []
         for k in range(len(self.pools[0])):
-            same = [pools[k] for pools in self.pools]
-            sizes.append(sum(pool.size for pool in same) if same[0].renewed else same[0].size)
-            shares.append(_share(met, p, same) if variance > 0 else 1.0)
+            term_pools = [pools[k] for pools in self.pools]
+            sizes.append(
+                sum(pool.size for pool in term_pools)
+                if term_pools[0].renewed
+                else term_pools[0].size
+            )
+            shares.append(_share(met, p, term_pools) if variance > 0 else 1.0)
         if not sizes:
             return float(n), np.inf
         worst = 1.0 / min(sizes)
@@ -84,8 +88,8 @@ class Tally:
 def _share(met: Bool, p: float, pools: list[Pool]) -> float:
     """Covariance of two draws with the same draw of a set, relative to their variance.
 
-    `met`: (n,), True for a draw that meets the limit. `p`: mean of them. `pools`: of each set of
-    draws.
+    `met`: True for each draw that meets the limit, shape (n,). `p`: mean of `met`. `pools`: the set
+    for each set of draws.
     """
     rows: list[Int] = []
     first = 0
@@ -103,5 +107,5 @@ def _share(met: Bool, p: float, pools: list[Pool]) -> float:
         return 1.0
     products = (n_met - p * n_draws) ** 2 - (n_met * (1.0 - 2.0 * p) + p**2 * n_draws)
     share = float(products.sum()) / n_pairs / (p * (1.0 - p))
-    # each of the n_pairs / 2 different pairs has a product of variance (p (1 - p))^2
+    # each of the n_pairs / 2 distinct pairs has a product with variance (p (1 - p))^2
     return float(np.clip(share + 2.0 * np.sqrt(2.0 / n_pairs), 0.0, 1.0))

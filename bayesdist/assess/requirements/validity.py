@@ -1,4 +1,4 @@
-"""Until when a requirement is met: the probability as the drift is extrapolated."""
+"""Validity period of a calibration: until when a requirement is met by the extrapolated drift."""
 
 from __future__ import annotations
 
@@ -15,41 +15,41 @@ from bayesdist.diagnose.significance import clopper_pearson
 from bayesdist.model.grid import DEFAULT_GRID
 from bayesdist.utils.arrays import Float
 
-BAND = 0.95
+BAND = 0.95  # level of the interval of a probability
 
 
 @dataclass(frozen=True, eq=False)
 class ValidityPeriod:
-    """The probability of meeting a requirement, epoch by epoch."""
+    """Probability of meeting a requirement as a function of epoch."""
 
     requirement: Requirement
-    epoch: Float  # (n,), decimal years, rising
+    epoch: Float  # (n,), decimal years, ascending
     probability: Float  # (n,), fraction of draws that meet the limit
-    low: Float  # (n,), its central 95 % interval from the number of draws (Clopper-Pearson)
+    low: Float  # (n,), central 95 % interval for the number of draws (Clopper-Pearson)
     high: Float  # (n,)
     value: Float  # (n,), median of the statistic, in the unit of the requirement
 
     @property
     def date(self) -> float | None:
-        """Date at which the probability falls below what is asked; None if it does not."""
+        """Date at which the probability falls below the required one; None if it does not."""
         return self._fall(self.probability)
 
     @property
     def interval(self) -> tuple[float | None, float | None]:
-        """Such dates for both ends of the probability's interval, the earlier one first."""
+        """Such dates for both ends of the interval of the probability, the earlier one first."""
         return self._fall(self.low), self._fall(self.high)
 
     @property
     def sentence(self) -> str:
-        """The date in words."""
+        """The date in one sentence."""
         name, asked = self.requirement.name, self.requirement.probability
         first, last = float(self.epoch[0]), float(self.epoch[-1])
         if self.date is None:
             return f"{name}: the probability stays at {asked:g} or more until {last:.1f}"
         if self.date == first:
-            found = float(self.probability[0])
+            p_first = float(self.probability[0])
             return (
-                f"{name}: the probability is below {asked:g} already at {first:.1f} ({found:.2g})"
+                f"{name}: the probability is below {asked:g} already at {first:.1f} ({p_first:.2g})"
             )
         early, late = self.interval
         until = f"{late:.1f}" if late is not None else f"after {last:.1f}"
@@ -66,7 +66,7 @@ class ValidityPeriod:
         ends = slice(k - 1, k + 1)
         return float(
             np.interp(
-                -self.requirement.probability,  # `interp` wants rising values
+                -self.requirement.probability,  # `interp` needs ascending values
                 -probability[ends],
                 self.epoch[ends],
             )
@@ -83,23 +83,22 @@ def validity_period(
 ) -> ValidityPeriod:
     """Follow a requirement through time.
 
-    The error at each epoch is that of the drift as the model has it, extrapolated with its
-    covariance, and with the curvature that the data and its prior leave open, where the errors hold
-    it.
+    The error at each epoch is that of the drift in the model, extrapolated with its covariance. It
+    includes the curvature of the drift that data and prior allow, if the errors contain it.
 
-    `errors`: of a model that depends on time; one set of draws for all epochs: the curve has no
-    noise of its own between them. `requirement`: its own epoch is not used. `epochs`: (n,), decimal
-    years, rising, two or more. `grid`: points on x and y of a chip. `pixel_scale`: as
-    `check_requirements`.
+    `errors`: draws for a model that depends on time; the same draws are used at all epochs, so the
+    curve has no Monte-Carlo noise between epochs. `requirement`: its epoch is ignored. `epochs`:
+    decimal years, ascending, shape (n,), at least two. `grid`: number of points along x and y of a
+    chip. `pixel_scale`: see `check_requirements`.
     """
     at = np.asarray(epochs, float)
     requirement = requirement.in_unit_of(errors.unit)
     factor = convert(1.0, errors.unit, requirement.unit, pixel_scale, where=requirement.where)
     n = errors.n_effective
-    here = replace(requirement, epoch=float(at[0]), epochs=None)
-    (domain,) = domains_of(here, errors.solution.model, grid)
-    found = errors.over_epochs(domain, [float(epoch) for epoch in at], [requirement.statistic])
-    draws = factor * np.array([one[requirement.statistic] for one in found])
+    single_epoch = replace(requirement, epoch=float(at[0]), epochs=None)
+    (domain,) = domains_of(single_epoch, errors.solution.model, grid)
+    statistics = errors.over_epochs(domain, [float(epoch) for epoch in at], [requirement.statistic])
+    draws = factor * np.array([by_name[requirement.statistic] for by_name in statistics])
     met, value = np.mean(draws <= requirement.limit, axis=1), np.median(draws, axis=1)
     low, high = np.array([clopper_pearson(p, n, BAND) for p in met]).T
     return ValidityPeriod(requirement, at, met, low, high, value)

@@ -1,4 +1,4 @@
-"""The verdict on a requirement: a probability counted from draws, and what it rests on."""
+"""Verdict on a requirement from a probability counted in draws, and its assumptions."""
 
 from __future__ import annotations
 
@@ -17,21 +17,21 @@ from bayesdist.utils.distributions import beta_std
 from bayesdist.utils.limits import CONFIDENCE, COUNTING_ERROR, EXCEEDS
 from bayesdist.utils.numbers import count, probability_words
 
-# level of a check by the word of a verdict, from good to bad
+# level of a check for each verdict, from best to worst
 VERDICT_LEVELS = {"met": "pass", "not shown": "warn", "undecided": "warn", "missed": "fail"}
-MISSED_BELOW = round(1.0 - EXCEEDS.value, 12)  # probability of meeting a limit that is missed
+MISSED_BELOW = round(1.0 - EXCEEDS.value, 12)  # largest probability of meeting a missed limit
 
 
 def counting_error(fraction: float, n: float) -> float:
-    """Standard deviation of a probability counted in n draws, under Jeffreys' prior: never zero."""
+    """Standard deviation of a probability counted in n draws, with Jeffreys' prior; never zero."""
     k = fraction * n
     return beta_std(k + 0.5, n - k + 0.5)
 
 
 def undecided_by_draws(fraction: float, n: float, bounds: Sequence[float]) -> bool:
-    """Whether the 99 % Clopper-Pearson interval of a probability has a bound within it.
+    """True if the 99 % Clopper-Pearson interval of a probability contains one of the bounds.
 
-    `fraction`: of draws that meet the limit. `n`: effective number of draws.
+    `fraction`: fraction of draws that meet the limit. `n`: effective number of draws.
     """
     low, high = clopper_pearson(fraction, n, CONFIDENCE.value)
     return any(low < bound <= high for bound in bounds)
@@ -45,41 +45,41 @@ def verdict_of(
     Parameters
     ----------
     fraction : float
-        Of draws that meet the limit.
+        Fraction of draws that meet the limit.
     n : float
         Effective number of draws.
     asked : float
-        Probability asked for.
+        Required probability.
     checks : sequence of Check
-        Their doubts leave a requirement undecided.
+        Checks; doubts that they raise make the verdict undecided.
 
     Returns
     -------
     verdict : str
-        'met' if the probability of meeting the limit is at least the one asked for; 'missed' if
-        the limit is exceeded with a probability of at least 0.95; else 'not shown'.  The estimate
-        decides if its 99 % Clopper-Pearson interval lies on one side, or if its standard error is
-        at most 0.005; else nothing is shown.  With doubts 'undecided'; but 'missed' stays if all
-        of them can only make errors larger.
+        'met' if the probability of meeting the limit is at least the required one; 'missed' if the
+        limit is exceeded with a probability of at least 0.95; else 'not shown'. The estimate is
+        decisive if its 99 % Clopper-Pearson interval is on one side of the bound, or if its
+        standard error is at most 0.005; otherwise the verdict is 'not shown'. With doubts it is
+        'undecided', but 'missed' remains if all doubts can only make errors larger.
     reason : str
-        What decided, and with doubts what the draws alone point to.
+        Reason for the verdict; with doubts also the verdict of the draws alone.
     """
     error = counting_error(fraction, n)
     exact = COUNTING_ERROR.met_by(error)
     near = f"{probability_words(fraction, error, n)}, within its Monte-Carlo error of"
-    more = f"{count(n)} effective draws"
+    n_draws = f"{count(n)} effective draws"
     on_asked, on_missed = (
         undecided_by_draws(fraction, n, [bound]) for bound in (asked, MISSED_BELOW)
     )
     if fraction >= asked and (exact or not on_asked):
         verdict, reason = "met", f"the probability is at least the {asked:g} asked for"
         if on_asked:
-            reason = f"{near} the {asked:g} asked for ({more})"
+            reason = f"{near} the {asked:g} asked for ({n_draws})"
     elif fraction <= MISSED_BELOW and (exact or not on_missed):
         verdict = "missed"
         reason = f"the limit is exceeded with a probability of at least {EXCEEDS.value:g}"
         if on_missed:
-            reason = f"{near} {MISSED_BELOW:g} ({more})"
+            reason = f"{near} {MISSED_BELOW:g} ({n_draws})"
     else:
         verdict = "not shown"
         reason = (
@@ -89,12 +89,12 @@ def verdict_of(
         )
         if on_asked or on_missed:
             bound = asked if on_asked else MISSED_BELOW
-            reason = f"{near} {bound:g} ({more}): "
+            reason = f"{near} {bound:g} ({n_draws}): "
             reason += "more draws (sampler.target_ess, assess.draws) decide it"
     doubts = doubts_of(checks)
-    if not doubts or (verdict == "missed" and all(one.doubt == LARGER for one in doubts)):
+    if not doubts or (verdict == "missed" and all(doubt.doubt == LARGER for doubt in doubts)):
         return verdict, reason
-    texts = "; ".join(one.sentence for one in doubts)
+    texts = "; ".join(doubt.sentence for doubt in doubts)
     alone = {
         "met": f"the stated errors alone would meet it ({reason})",
         "missed": f"the stated errors alone would miss it ({reason})",
@@ -113,10 +113,10 @@ def rests_on(
     single: bool,
     dates: Float,
 ) -> tuple[str, ...]:
-    """Clauses on what a verdict at an epoch assumes, or has measured.
+    """Clauses on what a verdict at an epoch assumes or is based on.
 
-    `epoch`: decimal years. `given`: names of the errors that the user gives. `aligned`, `single`:
-    as of `error_model`. `dates`: of the matches, decimal years.
+    `epoch`: decimal years. `given`: names of the errors that the user states. `aligned`, `single`:
+    see `error_model`. `dates`: dates of the matches, decimal years.
     """
     out, correlated = [f"a polynomial of order {model.order}"], diagnostics.correlated
     if correlated is not None:
@@ -137,10 +137,10 @@ def rests_on(
     passed = [t for t in tests if not t.significant]
     if tests:
         sizes = (t.smallest for t in passed if np.isfinite(t.smallest) and t.unit == model.unit)
-        least = max(sizes, default=None)
+        detectable = max(sizes, default=None)
         text = f"{len(passed)} of {len(tests)} tests of the residuals found nothing"
-        if least is not None:
-            text += f"; each would have found {least:.2g} {model.unit} rms"
+        if detectable is not None:
+            text += f"; each would have found {detectable:.2g} {model.unit} rms"
         out.append(text)
     held = diagnostics.holdout
     out.append("no held-out stars" if held is None else held.verdict)
@@ -148,15 +148,15 @@ def rests_on(
 
 
 def _structure(correlated: Discrepancy, unit: str) -> str:
-    """Clause on the structure beyond the polynomial that counts."""
+    """Clause on the structure beyond the polynomial that is included."""
     rows = correlated.facts.get("structure", [])
     if not rows:
         return "look-up tables, with their errors"
-    median, most = (
+    median, upper = (
         float(np.sqrt(np.mean([row[key] ** 2 for row in rows]))) for key in ("median", "most")
     )
     return (
-        f"structure beyond it of {median:.2g} {unit} rms on an axis, at most {most:.2g} with 95 % "
+        f"structure beyond it of {median:.2g} {unit} rms on an axis, at most {upper:.2g} with 95 % "
         "probability, from residuals and prior"
     )
 
@@ -164,7 +164,7 @@ def _structure(correlated: Discrepancy, unit: str) -> str:
 def _exposures(
     model: DistortionModel, correlated: Discrepancy | None, *, aligned: bool, single: bool
 ) -> str:
-    """Of which exposures the position is one."""
+    """Clause on the exposures for which the position is valid."""
     n = len(model.exposures)
     if aligned:
         return f"a position in a new exposure, which deviates as {n} exposures do"
@@ -172,8 +172,8 @@ def _exposures(
     if linear is None or "shape" not in linear.scatter:
         return f"{n} exposures" if n > 1 else "one exposure, or the mean of several"
     size = float(np.median(linear.scatter["shape"]))
-    what = f"whose {'scale and shears' if 'scale' in linear.kinds else 'shears'}"
-    what += f" scatter by {size:.1g}"
+    variation = f"whose {'scale and shears' if 'scale' in linear.kinds else 'shears'}"
+    variation += f" scatter by {size:.1g}"
     if single:
-        return f"a position in a single exposure, as {linear.n_exposures} exposures, {what}"
-    return f"a position in the mean of {linear.n_exposures} exposures, {what}"
+        return f"a position in a single exposure, as {linear.n_exposures} exposures, {variation}"
+    return f"a position in the mean of {linear.n_exposures} exposures, {variation}"

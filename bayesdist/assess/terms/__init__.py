@@ -1,1 +1,1 @@
-"""Error terms: whatever moves a position."""
+"""Error terms: contributions to the error of a position."""

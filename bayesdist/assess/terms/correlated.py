@@ -1,4 +1,4 @@
-"""Correlated errors that a calibration leaves, as terms of the error model."""
+"""Error terms for correlated errors that remain after a calibration."""
 
 from __future__ import annotations
 
@@ -35,48 +35,53 @@ SOURCE = f"{MEASURED}, with a prior on its size"
 
 @dataclass(frozen=True, eq=False)
 class StructureErrors:
-    """Structure that the model leaves out, and the error of the parameters that followed it.
+    """Structure that the model omits, and the error of the parameters that were biased by it.
 
-    The fit was drawn towards the structure, so that the two errors are correlated: row k of both is
-    draw k of the posterior.  What is left counts as much as both together have beyond the error of
-    the parameters.
+    The fit was drawn towards the structure, so the two errors are correlated: row k of both is draw
+    k of the posterior. The row of the omitted structure is the excess of their joint error over the
+    error of the parameters.
     """
 
     discrepancy: Discrepancy
-    frames: bool = False  # True if errors of the exposures' frames count
-    # True if what is left at a position counts; False where errors of look-up tables stand for it
+    frames: bool = False  # True to include errors of the exposure frames
+    # True to include structure omitted at a position; False if look-up table errors represent it
     left: bool = True
 
     @property
     def rows(self) -> tuple[Row, ...]:
-        """The part in the parameters, and what is left."""
+        """Rows of the part in the parameters and, with `left`, of the omitted structure."""
         in_fit = Row(STRUCTURE_IN_FIT, source=SOURCE)
         return (in_fit, Row(STRUCTURE, LOCAL, SOURCE)) if self.left else (in_fit,)
 
     def draw(self, n: int, rng: np.random.Generator) -> ErrorDraws:
-        """The first n draws, over and over."""
-        found, shift = self.discrepancy, self.discrepancy.structure_theta
+        """First n draws of the posterior, repeated if n is larger."""
+        discrepancy, shift = self.discrepancy, self.discrepancy.structure_theta
         rows = np.arange(n) % len(shift)
-        theta, pool = _moved(found, shift[rows], self.frames), Pool(rows, len(shift))
+        theta, pool = _moved(discrepancy, shift[rows], self.frames), Pool(rows, len(shift))
         fit = Polynomials(
-            self.rows[0], found.model, found.mean, theta, frames=self.frames, pools=(pool,)
+            self.rows[0],
+            discrepancy.model,
+            discrepancy.mean,
+            theta,
+            frames=self.frames,
+            pools=(pool,),
         )
         if not self.left:
             return fit
         coefficients: dict[int | None, NDArray[np.floating]] = {
-            chip: one.coefficients for chip, one in found.structure.items()
+            chip: structure.coefficients for chip, structure in discrepancy.structure.items()
         }
-        left = Functions(self.rows[1], coefficients, partial(_functions, found), n)
-        return Together((fit, left), remainder=True)
+        omitted = Functions(self.rows[1], coefficients, partial(_functions, discrepancy), n)
+        return Together((fit, omitted), remainder=True)
 
     def sigma(self, domain: EvaluationDomain) -> Float:
-        """Standard deviations (N, 2) of what is left, over all draws."""
+        """Standard deviations (N, 2) of the omitted structure, over all draws."""
         draws = self.draw(self.discrepancy.n_draws, np.random.default_rng(0))
         exposure = None
         if self.frames:
             fitted = [e for e, _ in enumerate(domain.model.exposures)]
             fitted = [e for e in fitted if domain.model.free_frame_names(e)]
-            # draws are in random order: their number chooses the exposure
+            # draws are in random order, so an exposure can be assigned by the draw number
             if fitted:
                 exposure = np.array(fitted)[np.arange(self.discrepancy.n_draws) % len(fitted)]
         return np.sqrt(draws.on(domain, Image(exposure)).squares()[STRUCTURE])
@@ -84,94 +89,98 @@ class StructureErrors:
 
 @dataclass(frozen=True, eq=False)
 class Deviations:
-    """Error by deviations of single exposures, and by a curvature of the drift."""
+    """Error due to deviations of single exposures and to curvature of the drift."""
 
-    discrepancy: Discrepancy  # with `linear`
-    # True if the position is one in a single exposure that is yet to come, whose own deviation is
-    # in the error; else one in the mean of the exposures
+    discrepancy: Discrepancy  # must have `linear`
+    # True for a position in a single future exposure, with the deviation of that exposure; False
+    # for a position in the mean of the exposures
     single: bool = False
-    frames: bool = False  # as of `StructureErrors`
+    frames: bool = False  # see `StructureErrors`
 
     @property
     def rows(self) -> tuple[Row, ...]:
-        """One row."""
+        """A single row."""
         return (Row(DEVIATIONS, source=SOURCE),)
 
     def draw(self, n: int, rng: np.random.Generator) -> Polynomials:
-        """Draws in random order, as they have nothing to do with other terms."""
+        """Draws in random order, because they are independent of other terms."""
         linear = required(self.discrepancy.linear, "no deviations of exposures were estimated")
         rows = rng.integers(len(linear.theta), size=n)
         return self.of_rows(rows, int(rng.integers(2**63)) if self.single else None)
 
     def of_rows(self, rows: Int, seed: int | None) -> Polynomials:
-        """Draws (n,) of the posterior by their numbers, with new deviations of single exposures.
+        """Draws of the posterior with the given numbers, shape (n,), and new exposure deviations.
 
-        `seed` is that of these deviations; None for none of them.
+        `seed`: seed of the deviations of single exposures; None to omit them.
         """
-        found = self.discrepancy
-        linear = required(found.linear, "no deviations of exposures were estimated")
-        theta = _moved(found, linear.theta[rows], self.frames)
-        more = partial(_bending, linear, np.asarray(found.mean, float), rows, seed)
+        discrepancy = self.discrepancy
+        linear = required(discrepancy.linear, "no deviations of exposures were estimated")
+        theta = _moved(discrepancy, linear.theta[rows], self.frames)
+        bending = partial(_bending, linear, np.asarray(discrepancy.mean, float), rows, seed)
         pools = [Pool(rows, len(linear.theta))]
-        if seed is not None:  # their deviations are new in each set of draws
+        if seed is not None:  # the deviations are new in each set of draws
             pools.append(Pool(rows, len(linear.theta), renewed=True))
         return Polynomials(
             self.rows[0],
-            found.model,
-            found.mean,
+            discrepancy.model,
+            discrepancy.mean,
             theta,
             frames=self.frames,
-            more=more,
+            more=bending,
             pools=tuple(pools),
         )
 
 
 @dataclass(frozen=True, eq=False)
 class FieldsOfExposures:
-    """Error by second-order terms and smooth fields that differ from exposure to exposure.
+    """Error due to second-order terms and smooth fields that vary between exposures.
 
-    The parameters follow their mean over the exposures.  A position in a single exposure that is
-    yet to come has the field of that exposure besides.
+    The parameters follow the mean of these fields over the exposures. A position in a single
+    future exposure has the error of the field of that exposure in addition.
     """
 
-    discrepancy: Discrepancy  # with `fields`
-    single: bool = False  # as of `Deviations`
-    frames: bool = False  # as of `StructureErrors`
+    discrepancy: Discrepancy  # must have `fields`
+    single: bool = False  # see `Deviations`
+    frames: bool = False  # see `StructureErrors`
 
     @property
     def rows(self) -> tuple[Row, ...]:
-        """The part in the parameters, and with `single` that of the exposure."""
+        """Rows of the part in the parameters and, with `single`, of the field of the exposure."""
         in_fit = Row(FIELDS_IN_FIT, source=SOURCE)
         return (in_fit, Row(FIELDS, source=SOURCE)) if self.single else (in_fit,)
 
     def draw(self, n: int, rng: np.random.Generator) -> ErrorDraws:
-        """Draws in random order, as they have nothing to do with other terms."""
+        """Draws in random order, because they are independent of other terms."""
         fields = required(self.discrepancy.fields, "no fields of exposures were estimated")
         return self.of_rows(rng.integers(len(fields.theta), size=n), rng)
 
     def of_rows(self, rows: Int, rng: np.random.Generator) -> ErrorDraws:
-        """Effect on the parameters of draws (n,) by their numbers.
+        """Effect on the parameters, for the posterior draws with the given numbers, shape (n,).
 
-        With `single`, fields of single exposures beside, of the posterior's draws in their order.
+        With `single`, fields of single exposures are added, for the posterior draws in order.
         """
-        found, n = self.discrepancy, len(rows)
-        fields = required(found.fields, "no fields of exposures were estimated")
-        theta = _moved(found, fields.theta[rows], self.frames)
-        fit = Polynomials(self.rows[0], found.model, found.mean, theta, frames=self.frames)
+        discrepancy, n = self.discrepancy, len(rows)
+        fields = required(discrepancy.fields, "no fields of exposures were estimated")
+        theta = _moved(discrepancy, fields.theta[rows], self.frames)
+        fit = Polynomials(
+            self.rows[0], discrepancy.model, discrepancy.mean, theta, frames=self.frames
+        )
         if not self.single:
             return fit
         coefficients: dict[int | None, NDArray[np.floating]] = {
-            chip.number: fields.coefficients(chip, rng) for chip in found.model.chips
+            chip.number: fields.coefficients(chip, rng) for chip in discrepancy.model.chips
         }
-        waves = {chip.number: fields.functions(chip).finer_waves(rng) for chip in found.model.chips}
-        own = Functions(self.rows[1], coefficients, partial(_of_exposure, found, waves), n)
-        return Together((fit, own))
+        waves = {
+            chip.number: fields.functions(chip).finer_waves(rng) for chip in discrepancy.model.chips
+        }
+        field = Functions(self.rows[1], coefficients, partial(_of_exposure, discrepancy, waves), n)
+        return Together((fit, field))
 
 
 def _of_exposure(
     discrepancy: Discrepancy, waves: dict[int, Float], number: int, x: Float, y: Float
 ) -> NDArray[np.floating]:
-    """Functions (N, m) of the field of an exposure on a chip."""
+    """Values (N, m) of the functions of the field of an exposure on a chip."""
     model = discrepancy.model
     fields = required(discrepancy.fields, "no fields of exposures were estimated")
     chip = model.chips[model.chip_code(number)]
@@ -186,23 +195,23 @@ def _bending(
     epoch: float | None,
     chip: int,
 ) -> Float:
-    """Curvature of the drift (n, 2, K), and with a seed the deviation of a new exposure."""
+    """Curvature of the drift (n, 2, K); with a seed, plus the deviation of a new exposure."""
     out = linear.polynomials(epoch, chip)[rows]
     if seed is None:
         return out
-    # one exposure has the same deviation on all chips, at all epochs
+    # an exposure has the same deviation on all chips and at all epochs
     return out + linear.of_single_exposures(mean, chip, np.random.default_rng(seed))[rows]
 
 
 def _moved(discrepancy: Discrepancy, shift: Float, frames: bool) -> Float:
-    """Parameters moved by shifts: all (n, D), or without frames of polynomials and drift alone."""
+    """Mean parameters plus shifts: all (n, D), or without frames only polynomials and drift."""
     mean, model = discrepancy.mean, discrepancy.model
-    D, known = (len(mean), len(mean)) if frames else (model.n_distortion, model.n_global)
-    theta = np.tile(mean[:known], (len(shift), 1))
+    D, n_moved = (len(mean), len(mean)) if frames else (model.n_distortion, model.n_global)
+    theta = np.tile(mean[:n_moved], (len(shift), 1))
     theta[:, :D] += shift[:, :D]
     return theta
 
 
 def _functions(discrepancy: Discrepancy, chip: int, x: Float, y: Float) -> NDArray[np.floating]:
-    """Functions (N, m) of the structure on a chip."""
+    """Values (N, m) of the functions of the structure on a chip."""
     return discrepancy.structure[chip].evaluate(*discrepancy.model.basis(chip).scaled(x, y))

@@ -1,4 +1,4 @@
-"""Error terms that the user gives, and errors of a star's own centroid."""
+"""Error terms stated by the user, and errors of the centroid of a star."""
 
 from __future__ import annotations
 
@@ -35,21 +35,22 @@ if TYPE_CHECKING:
 TERM_KINDS = ("random", "systematic")
 CENTROID = "centroid"
 
-# words by which the name of a row says that it is the error of the reference catalogue
+# words in the name of a row that identify it as the error of the reference catalogue
 CATALOGUE_WORDS = (
     *("catalog", "reference", "gaia", "2mass", "hipparcos", "tycho", "ucac", "urat", "usno"),
     *("pan-starrs", "panstarrs", "ps1", "sdss", "skymapper", "hsc", "des dr"),
 )
 
-SMOOTH_ORDER = 3  # of fields that stand for what may vary over the detector
+SMOOTH_ORDER = 3  # polynomial order of smooth fields that represent errors varying over a detector
 SMOOTH_DRAWS = 1000
-BEYOND = 0.5  # magnitudes by which the outermost bins may be left
+BEYOND = 0.5  # magnitudes by which the range of the outermost bins may be exceeded
 
 
 def said_by_user(source: str) -> str:
-    """Source of a budget's row, as a user gives it.
+    """Source of a row of the budget, from the text of the user.
 
-    It begins with one of the three kinds of source: a publication that is named so stays one.
+    The result begins with one of the three kinds of source; text that already begins with 'given by
+    the user' or 'published' keeps its kind.
     """
     text = source.strip()
     if text.lower().startswith((GIVEN, PUBLISHED)):
@@ -58,25 +59,25 @@ def said_by_user(source: str) -> str:
 
 
 def names_motions(name: str) -> bool:
-    """True if a row of this name is the error of proper motions."""
+    """True if the name of a row indicates the error of proper motions."""
     return "motion" in name.lower()
 
 
 def names_catalogue(name: str) -> bool:
-    """True if a row of this name is the error of the reference catalogue's positions."""
+    """True if the name of a row indicates the error of the reference catalogue's positions."""
     return any(word in name.lower() for word in CATALOGUE_WORDS) and not names_motions(name)
 
 
 def is_stated(sizes: Sequence[float | None], source: str) -> bool:
-    """True if a row states an error: one of size 0 does so with its source only."""
+    """True if a row states an error; a size of 0 counts only if its source is given."""
     return any(sizes) or said_by_user(source) != GIVEN
 
 
 def stated_names(terms: Sequence[ErrorTerm]) -> tuple[str, ...]:
-    """Names of the terms that state an error, in their order."""
+    """Names of the terms that state an error, in order."""
     names = []
     for term in terms:
-        sizes = [getattr(term, "sigma", 1.0)]  # terms of one size, or of a size of their own
+        sizes = [getattr(term, "sigma", 1.0)]  # other terms have one size, or compute their size
         if isinstance(term, UserTerm):
             sizes = [term.sigma_u, term.sigma_v]
         row = term.rows[0]
@@ -88,7 +89,7 @@ def stated_names(terms: Sequence[ErrorTerm]) -> tuple[str, ...]:
 def _sizes(
     sizes: Sequence[Number], unit: str, what: str, where: str
 ) -> tuple[tuple[float, ...], str]:
-    """Standard deviations with their unit: `unit` of plain numbers, else that of the Quantities."""
+    """Standard deviations and their unit: `unit` for plain numbers, else that of the Quantities."""
     units = [unit_name(size, what, where=where) for size in sizes]
     if None in units and any(units):
         raise InputError(
@@ -97,38 +98,40 @@ def _sizes(
             do="give Quantities for both, or numbers in `unit`",
         )
     named = unit if units[0] is None else units[0]
-    # a plain number is the same in any unit
+    # the unit has no effect on a plain number
     return tuple(value_in(size, named or "pix", what, where=where) for size in sizes), named
 
 
 @dataclass(frozen=True)
 class UserTerm:
-    """A Gaussian error given by the user, the same at every position of the detector.
+    """A Gaussian error stated by the user, equally large at every position of the detector.
 
     Parameters
     ----------
     name : str
+        Name of the row of the budget.
     kind : str
         'random': independent at every position; 'systematic': one offset shared by the whole field.
     sigma_u, sigma_v : float or Quantity
         Standard deviation of each axis; stored as numbers.
     unit : str, optional
-        'pix', 'arcsec', 'mas' or 'deg'; that of the model by default, and of Quantities their own.
+        'pix', 'arcsec', 'mas' or 'deg'; by default the unit of the Quantities, or that of the
+        model.
     source : str
-        Where the number comes from: 'given by the user', or a publication.
+        Origin of the number: 'given by the user', or a publication.
     varies : bool, optional
-        For a systematic term: True if it may differ from position to position in a way that is not
-        known, as the errors of a catalogue do.  Requirements are then judged for one offset of the
-        whole field, for a smooth field, and for independent errors at every position.  By default
-        it is True if the name is that of a reference catalogue, such as 'Gaia DR3'.
+        For a systematic term: True if the error may vary over the field in an unknown way, as the
+        errors of a catalogue do. Requirements are then judged for one offset of the whole field,
+        for a smooth field, and for independent errors at every position. The default is True if
+        the name is that of a reference catalogue, such as 'Gaia DR3'.
     included_in_scatter : bool
         For a random term: True if the residuals contain it in addition to the errors of centroids.
 
     Raises
     ------
     InputError
-        For an unknown kind or unit, a sigma that is negative or not finite, and a systematic term
-        that is included in the scatter.
+        If the kind or unit is unknown, a sigma is negative or not finite, or a systematic term is
+        declared as included in the scatter.
 
     Examples
     --------
@@ -147,12 +150,12 @@ class UserTerm:
     included_in_scatter: bool = False
 
     def __post_init__(self) -> None:
-        where = f"budget term {self.name!r}"
-        require_known(self.kind, TERM_KINDS, "kind", where=where)
+        location = f"budget term {self.name!r}"
+        require_known(self.kind, TERM_KINDS, "kind", where=location)
         if self.unit is not None:
-            require_known(self.unit, UNITS, "unit", where=where)
+            require_known(self.unit, UNITS, "unit", where=location)
         (sigma_u, sigma_v), unit = _sizes(
-            (self.sigma_u, self.sigma_v), self.unit or "", "sigma", where
+            (self.sigma_u, self.sigma_v), self.unit or "", "sigma", location
         )
         varies = names_catalogue(self.name) if self.varies is None else self.varies
         for name, value in (
@@ -165,44 +168,50 @@ class UserTerm:
         if self.included_in_scatter and self.kind != "random":
             raise InputError(
                 "included_in_scatter is of a random budget term, which scatters from star to star",
-                where=where,
+                where=location,
                 do="leave it out",
             )
         for axis, sigma in (("u", self.sigma_u), ("v", self.sigma_v)):
             if not (math.isfinite(sigma) and sigma >= 0):
                 raise InputError(
-                    f"sigma_{axis} is {sigma}", where=where, do="give a number that is not negative"
+                    f"sigma_{axis} is {sigma}",
+                    where=location,
+                    do="give a number that is not negative",
                 )
 
     def sigma(self, unit: str, pixel_scale: float | None = None) -> tuple[float, float]:
-        """(sigma_u, sigma_v) in the unit of a model; `pixel_scale` in mas as in `units.convert`."""
-        where = f"budget term {self.name!r}"
+        """(sigma_u, sigma_v) in the unit of a model; `pixel_scale` in mas, see `units.convert`."""
+        location = f"budget term {self.name!r}"
         su, sv = (
-            convert(s, self.unit or unit, unit, pixel_scale, where=where)
+            convert(s, self.unit or unit, unit, pixel_scale, where=location)
             for s in (self.sigma_u, self.sigma_v)
         )
         return float(su), float(sv)
 
     def in_unit(self, unit: str, pixel_scale: float | None = None) -> UserTerm:
-        """Term with its standard deviations in the unit of a model.
+        """Term with its standard deviations converted to the unit of a model.
 
         Parameters
         ----------
         unit : str
-            pix, arcsec, mas or deg.
+            'pix', 'arcsec', 'mas' or 'deg'.
         pixel_scale : float, optional
-            Size of a pixel in mas, needed to or from pixels.
+            Size of a pixel in mas, needed for conversions from or to pixels.
+
+        Returns
+        -------
+        UserTerm
         """
         su, sv = self.sigma(unit, pixel_scale)
         return replace(self, sigma_u=su, sigma_v=sv, unit=unit)
 
     @property
     def rows(self) -> tuple[Row, ...]:
-        """One row."""
+        """A single row."""
         return (Row(self.name, self.kind, self.source),)
 
     def draw(self, n: int, rng: np.random.Generator) -> ErrorDraws:
-        """One offset for the whole field, or independent errors; in the unit of the term."""
+        """Draw one offset for the whole field or independent errors, in the unit of the term."""
         size = np.array([self.sigma_u, self.sigma_v])
         if self.kind == "random":
             return Independent(self.rows[0], partial(_everywhere, size))
@@ -214,13 +223,18 @@ class UserTerm:
     def treatments(
         self, model: DistortionModel, grid: tuple[int, int] | None
     ) -> tuple[ErrorTerm, ...]:
-        """The error as a smooth field and as independent errors, where it may vary; else nothing.
+        """The error as a smooth field and as independent errors; empty if it cannot vary.
 
         Parameters
         ----------
         model : DistortionModel
         grid : tuple of int or None
-            Points of each chip over which the smooth field has its size.
+            Number of points along x and y of each chip, over which the smooth field has its stated
+            rms; None for the default grid.
+
+        Returns
+        -------
+        tuple of ErrorTerm
         """
         if not (self.varies and self.kind == "systematic" and (self.sigma_u or self.sigma_v)):
             return ()
@@ -239,29 +253,30 @@ def require_catalogue(catalogue: object) -> None:
 
 @dataclass(frozen=True, init=False)
 class Catalogue:
-    """The systematic error of the positions of the reference catalogue, as the user states it.
+    """The systematic error of the positions in the reference catalogue, as the user states it.
 
-    It is the ``[[budget]]`` row of a configuration with the same name, sizes and source.  A verdict
-    needs it: matched stars cannot show an error that the catalogue has in common for all of them.
+    It corresponds to the ``[[budget]]`` row of a configuration with the same name, sizes and
+    source. A verdict needs it, because matched stars cannot reveal an error that is common to all
+    stars of the catalogue.
 
     Parameters
     ----------
     name : str
         Name of the catalogue, such as 'Gaia DR3'.
     sigma : float or Quantity, or a pair of them
-        Standard deviation of the positions, of both axes or along u and v; stored as a pair.
+        Standard deviation of the positions, for both axes or along u and v; stored as a pair.
     unit : str
-        'pix', 'arcsec', 'mas' or 'deg'; of a Quantity it is its own.
+        'pix', 'arcsec', 'mas' or 'deg'; ignored for Quantities.
     source : str
-        Where the number comes from.  A size of 0 needs a source.
+        Origin of the number. A size of 0 needs a source.
     sigma_mas : float, optional
-        In place of `sigma`: the size in milliarcseconds.
+        Size in milliarcseconds, instead of `sigma`.
 
     Raises
     ------
     InputError
-        For an empty name or that of proper motions, no size or two, a size that is negative or not
-        finite, a size of 0 without a source, and an unknown unit.
+        If the name is empty or that of proper motions, the size is missing or given twice, a size
+        is negative or not finite, a size of 0 has no source, or the unit is unknown.
 
     Examples
     --------
@@ -292,38 +307,40 @@ class Catalogue:
                 where="catalogue",
                 do="give its name, as in bd.Catalogue('Gaia DR3', sigma_mas=0.3)",
             )
-        where = f"catalogue {name!r}"
+        location = f"catalogue {name!r}"
         if names_motions(name):
             raise InputError(
                 "the name is that of proper motions, and the error is that of positions",
-                where=where,
+                where=location,
                 do="name the catalogue, and give errors of its motions as a UserTerm",
             )
-        require_known(unit, UNITS, "unit", where=where)
+        require_known(unit, UNITS, "unit", where=location)
         if (sigma is None) == (sigma_mas is None):
             problem = "missing" if sigma is None else "given twice"
             raise InputError(
                 f"the size of its error is {problem}",
-                where=where,
+                where=location,
                 do="give sigma_mas, or sigma with its unit; 0 with its source where it has none",
             )
-        given: Any = sigma if sigma_mas is None else sigma_mas
-        several = isinstance(given, tuple | list) or getattr(given, "ndim", 0) > 0
-        pair = tuple(given) if several else (given, given)
+        size_argument: Any = sigma if sigma_mas is None else sigma_mas
+        several = isinstance(size_argument, tuple | list) or getattr(size_argument, "ndim", 0) > 0
+        pair = tuple(size_argument) if several else (size_argument, size_argument)
         if len(pair) != 2:
             raise InputError(
-                f"its error has {len(pair)} sizes", where=where, do="give one, or those of u and v"
+                f"its error has {len(pair)} sizes",
+                where=location,
+                do="give one, or those of u and v",
             )
-        sizes, unit = _sizes(pair, unit if sigma_mas is None else "mas", "sigma", where)
+        sizes, unit = _sizes(pair, unit if sigma_mas is None else "mas", "sigma", location)
         for size in sizes:
             if not (math.isfinite(size) and size >= 0):
                 raise InputError(
-                    f"its error is {size} {unit}", where=where, do="give a number of 0 or more"
+                    f"its error is {size} {unit}", where=location, do="give a number of 0 or more"
                 )
         if not is_stated(sizes, source):
             raise InputError(
                 "its error is 0, and no source is given for that",
-                where=where,
+                where=location,
                 do="give the source, or the size of its error",
             )
         for field, value in (("name", name), ("sigma", sizes), ("unit", unit), ("source", source)):
@@ -331,16 +348,16 @@ class Catalogue:
 
     @property
     def row_name(self) -> str:
-        """Name of its row of the budget, which says that it is a catalogue's."""
+        """Name of its row of the budget, which always identifies it as a catalogue."""
         return self.name if names_catalogue(self.name) else f"reference catalogue {self.name}"
 
     def term(self) -> UserTerm:
-        """Term of the error budget, as the command line makes it of the row."""
+        """Term of the error budget, equal to the one that a configuration row produces."""
         source = said_by_user(self.source)
         return UserTerm(self.row_name, "systematic", *self.sigma, self.unit, source, varies=True)
 
     def budget_row(self) -> dict[str, str | float]:
-        """Keys and values of its ``[[budget]]`` row in a configuration."""
+        """Keys and values of the ``[[budget]]`` row in a configuration."""
         sigma_u, sigma_v = self.sigma
         row: dict[str, str | float] = {"name": self.row_name, "kind": "systematic"}
         row |= {"sigma_u": sigma_u, "sigma_v": sigma_v, "unit": self.unit}
@@ -348,33 +365,33 @@ class Catalogue:
 
 
 def _everywhere(size: Float, domain: EvaluationDomain) -> Float:
-    """A standard deviation (N, 2) that is the same at all positions."""
+    """Standard deviation (N, 2), equal at all positions."""
     return np.tile(size, (domain.size, 1))
 
 
 def _one(chip: int, x: Float, y: Float) -> Float:
-    """The function that is 1."""
+    """Constant function 1, shape (N, 1)."""
     return np.ones((len(x), 1))
 
 
 @dataclass(frozen=True)
 class SmoothTerm:
-    """A user's error as a smooth field over each chip, larger at the edges than inside.
+    """A user's error as a smooth random field over each chip, larger at the edges than inside.
 
-    As the distortion of a catalogue, or of another camera, would be.
+    It resembles the distortion of a catalogue or of another camera.
     """
 
     term: UserTerm  # in the unit of the model
     model: DistortionModel
-    grid: tuple[int, int]  # points of each chip over which the mean square is that of the term
+    grid: tuple[int, int]  # points of each chip over which the rms equals that of the term
 
     @property
     def rows(self) -> tuple[Row, ...]:
-        """The row of the term."""
+        """Row of the term."""
         return self.term.rows
 
     def draw(self, n: int, rng: np.random.Generator) -> Functions:
-        """Coefficients of polynomials, of each chip by itself."""
+        """Draw coefficients of polynomials, independently for each chip."""
         n_own, coefficients = min(n, SMOOTH_DRAWS), dict[int | None, Float]()
         covariance: dict[int | None, Float] = {}
         size = np.array([self.term.sigma_u, self.term.sigma_v])[:, None]
@@ -388,36 +405,38 @@ class SmoothTerm:
         return Functions(self.rows[0], coefficients, self, n, covariance=covariance, pools=(pool,))
 
     def __call__(self, chip: int, x: Float, y: Float) -> Float:
-        """Polynomials (N, m) on a chip."""
-        one = self.model.chips[self.model.chip_code(chip)]
-        return PolynomialBasis(SMOOTH_ORDER, one.size, one.reference_pixel).evaluate(x, y)
+        """Values (N, m) of the polynomials on a chip."""
+        chip_of_model = self.model.chips[self.model.chip_code(chip)]
+        return PolynomialBasis(
+            SMOOTH_ORDER, chip_of_model.size, chip_of_model.reference_pixel
+        ).evaluate(x, y)
 
 
 @dataclass(frozen=True, eq=False)
 class Centroids:
-    """Errors of the centroids of stars of a stated magnitude."""
+    """Errors of the centroids of stars with a given magnitude."""
 
-    errors: MagnitudeErrors | None  # in the unit of the solution; None where none are known
+    errors: MagnitudeErrors | None  # in the unit of the solution; None if they are unknown
 
     @property
     def rows(self) -> tuple[Row, ...]:
-        """One row."""
+        """A single row."""
         return (Row(CENTROID, "random"),)
 
     def draw(self, n: int, rng: np.random.Generator) -> Independent:
-        """Independent errors of the stars that a domain names."""
+        """Independent errors for stars with the magnitude of a domain."""
         return Independent(self.rows[0], self.sigma)
 
     def sigma(self, domain: EvaluationDomain) -> Float | None:
-        """Standard deviations (N, 2); None where the domain names no magnitude."""
+        """Standard deviations (N, 2); None if the domain has no magnitude."""
         if domain.magnitude is None:
             return None
         return np.tile(self.at(domain.magnitude), (domain.size, 1))
 
     def at(self, magnitude: float) -> Float:
-        """Errors (2,) of the centroid of a star.
+        """Standard deviations (2,) of the centroid of a star.
 
-        InputError where no errors by magnitude are known, or none near this one.
+        Raises InputError if errors by magnitude are unknown, or were not measured near this one.
         """
         if self.errors is None:
             raise InputError(
@@ -439,40 +458,41 @@ class Centroids:
 def centroid_errors(
     scatter: MagnitudeErrors, contained: Sequence[tuple[str, float, float]]
 ) -> MagnitudeErrors:
-    """Scatter of residuals by magnitude, less other errors that are in it.
+    """Scatter of residuals by magnitude, after subtracting other errors that it contains.
 
-    A budget that lists the reference catalogue and the residual scatter beside each other counts
-    the catalogue twice: what is known to be in the residuals is taken off first.
+    A budget that lists both the reference catalogue and the residual scatter would count the
+    catalogue twice. Errors that the residuals are known to contain are therefore subtracted in
+    quadrature.
 
-    `contained`: errors that the residuals hold beside those of the centroids, in their unit.
-    InputError where an error that is said to be in the residuals is larger than these.
+    `contained`: errors that the residuals contain in addition to those of the centroids, in the
+    same unit. Raises InputError if such an error is larger than the residuals.
     """
     squares = np.sum([(u**2, v**2) for _, u, v in contained] or [(0.0, 0.0)], axis=0)
-    left = np.sqrt(squares)
-    for sigma, known in zip((scatter.sigma_u, scatter.sigma_v), left, strict=True):
-        # the median of n absolute residuals is known to 1.17 / sqrt(n)
-        too_small = sigma * (1.0 + 3.0 * 1.17 / np.sqrt(scatter.n)) < known
+    subtracted = np.sqrt(squares)
+    for sigma, contained_sigma in zip((scatter.sigma_u, scatter.sigma_v), subtracted, strict=True):
+        # the relative standard error of the median of n absolute residuals is 1.17 / sqrt(n)
+        too_small = sigma * (1.0 + 3.0 * 1.17 / np.sqrt(scatter.n)) < contained_sigma
         if too_small.any():
             k = int(np.argmax(too_small))
             raise InputError(
-                f"errors of {known:.3g} are declared part of residuals that scatter by "
+                f"errors of {contained_sigma:.3g} are declared part of residuals that scatter by "
                 f"{sigma[k]:.3g} at magnitude {scatter.mag[k]:.2f}",
                 where=f"budget term {contained[0][0]!r}",
                 do="correct them, or set included_in_scatter = false",
             )
-    return scatter.less(*left)
+    return scatter.less(*subtracted)
 
 
 def centroids_of(
     diagnostics: Diagnostics, contained: Sequence[tuple[str, float, float]]
 ) -> MagnitudeErrors | None:
-    """Errors of centroids by magnitude: the scatter of residuals less what has a term of its own.
+    """Errors of centroids by magnitude: the scatter of residuals without errors of other terms.
 
-    Of structure that is among the residuals the median of its size is taken off: a prior's tail is
-    in no residual.
+    For structure that the residuals contain, the median of its size is subtracted, because the
+    residuals contain nothing of the tail of its prior.
 
-    `contained`: as `centroid_errors`. Returns None where the stars have no magnitudes. InputError
-    as `centroid_errors`.
+    `contained`: see `centroid_errors`. Returns None if the stars have no magnitudes. Raises
+    InputError like `centroid_errors`.
     """
     if diagnostics.centroid is None:
         return None

@@ -1,4 +1,4 @@
-"""Errors that all stars near a position share, and that differ from place to place."""
+"""Errors that are shared by all stars near a position and vary over the detector."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ SOURCE = f"{MEASURED}: neighbours in different exposures"
 
 
 def table_of(chip: int, size: tuple[float, float], values: Float) -> LookupTable:
-    """A table of values (ny, nx, 2) on the grid of a chip."""
+    """Look-up table of values (ny, nx, 2) on the grid of a chip."""
     ny, nx = values.shape[:2]
     x, y = grid_pixels(size, (nx, ny))
     step = (float(x[1] - x[0]), float(y[1] - y[0]))
@@ -31,19 +31,21 @@ def table_of(chip: int, size: tuple[float, float], values: Float) -> LookupTable
 
 @dataclass(frozen=True, eq=False)
 class LocalErrors:
-    """A Gaussian error that all stars at a position have in common.
+    """A Gaussian error that is common to all stars at a position.
 
-    Such is the error of a look-up table: its nodes are closer than positions at which errors are
-    evaluated, and there the errors count as independent.
+    An example is the error of a look-up table. Its nodes are closer than the positions at which
+    errors are evaluated, so the errors at these positions are treated as independent.
 
     Parameters
     ----------
     name : str
+        Name of the row of the budget.
     tables : mapping of int to LookupTable
-        By chip number: standard deviations of u and v, in the unit of the solution.
+        Standard deviations of u and v by chip number, in the unit of the solution.
     source : str
+        Origin of the numbers.
     squares : mapping of int to MeanSquare
-        By chip number: how well their mean squares are known themselves, where that is known.
+        Mean squares with their uncertainties by chip number, for chips where these are known.
     """
 
     name: str
@@ -60,24 +62,24 @@ class LocalErrors:
         source: str = MEASURED,
         squares: Mapping[int, MeanSquare] | None = None,
     ) -> LocalErrors:
-        """Standard deviations (ny, nx, 2) on a grid of each chip, by its number."""
+        """Term from standard deviations (ny, nx, 2) on a grid of each chip, by chip number."""
         sizes = {chip.number: chip.size for chip in model.chips}
         tables = {chip: table_of(chip, sizes[chip], np.asarray(s)) for chip, s in sigma.items()}
         return cls(name, tables, source, squares or {})
 
     @property
     def rows(self) -> tuple[Row, ...]:
-        """One row."""
+        """A single row."""
         return (Row(self.name, LOCAL, self.source),)
 
     def draw(self, n: int, rng: np.random.Generator) -> Independent:
-        """Independent errors, each chip and axis as large as it may be.
+        """Draw independent errors and their sizes.
 
-        What is known of one chip or axis says nothing of the others.
+        Sizes are drawn independently for each chip and axis.
         """
-        known = {chip: one.relative_error for chip, one in self.squares.items()}
-        sizes = {chip: one.relative_draws(n, rng) for chip, one in self.squares.items()}
-        return Independent(self.rows[0], self.sigma, sizes, known)
+        relative_errors = {chip: square.relative_error for chip, square in self.squares.items()}
+        sizes = {chip: square.relative_draws(n, rng) for chip, square in self.squares.items()}
+        return Independent(self.rows[0], self.sigma, sizes, relative_errors)
 
     def sigma(self, domain: EvaluationDomain) -> Float:
         """Standard deviations (N, 2), interpolated between the nodes of the tables.
@@ -85,7 +87,7 @@ class LocalErrors:
         Raises
         ------
         InputError
-            For a chip without values.
+            If a chip has no table.
         """
         parts = []
         for chip, rows in domain.by_chip():
@@ -106,10 +108,11 @@ def interpolation_term(
     grid: tuple[int, int],
     epoch: float | None,
 ) -> tuple[LocalErrors, ...]:
-    """The term of the budget; nothing where a chip has not been measured.
+    """Budget term of interpolation between nodes; empty unless all chips have been measured.
 
-    `between`: by chip number. `solution`: its derivatives bring pixels to u and v, along the axes
-    of the polynomials. `grid`: points on x and y of each chip. `epoch`: decimal years.
+    `between`: interpolation errors by chip number. `solution`: its derivatives convert pixels to u
+    and v, along the axes of the polynomials. `grid`: number of points along x and y of each chip.
+    `epoch`: decimal years.
     """
     chips = solution.model.chips
     if not between or any(chip.number not in between for chip in chips):
@@ -120,9 +123,9 @@ def interpolation_term(
         P = place.polynomial(solution.mean)
         by_x, by_y = place.basis.gradient(*mesh(*grid_pixels(chip.size, grid)))
         J = np.stack([by_x @ P.T, by_y @ P.T], axis=-1)
-        found, into = between[chip.number], np.mean(J**2, axis=0)
-        variance = J**2 @ found.left.mean
+        interpolation, squared_gradients = between[chip.number], np.mean(J**2, axis=0)
+        variance = J**2 @ interpolation.left.mean
         sigma[chip.number] = np.sqrt(variance).reshape(grid[1], grid[0], 2)
-        error = np.sqrt(into**2 @ found.error**2)
-        squares[chip.number] = MeanSquare(into @ found.square, error)
+        error = np.sqrt(squared_gradients**2 @ interpolation.error**2)
+        squares[chip.number] = MeanSquare(squared_gradients @ interpolation.square, error)
     return (LocalErrors.on_grid(INTERPOLATION, sigma, solution.model, SOURCE, squares),)

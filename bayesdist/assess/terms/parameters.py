@@ -36,35 +36,35 @@ ABERRATION = "velocity aberration"
 class CatalogueErrors:
     """Effect of the errors of the reference catalogue on polynomials and drift.
 
-    A star has one error in however many exposures it is matched.  The solution that is assessed
-    has this error; the one without it took the catalogue's errors for independent from match to
-    match, and shows the rows of the budget beside this one.  So what independent errors of the
-    catalogue would do stands in those rows, and all of what the true ones do in this row: the
-    squares of the rows add up to more than the total, which is drawn from the solution.
+    A star has the same catalogue error in all exposures in which it is matched. The assessed
+    solution includes these correlated errors. The rows of the budget are those of a solution that
+    takes catalogue errors as independent between matches. Those rows thus contain the effect of
+    independent errors and this row the full effect of correlated errors. The sum of squares of all
+    rows therefore exceeds the total, which is drawn from the assessed solution.
     """
 
     model: DistortionModel
-    mean: Float  # (D,), of its parameters
-    # (D, D), of the error of its parameters that the catalogue causes: `total` of a
-    # `StarCovariance`, or its part for the positions, and the one for the motions in a term of its
-    # own
+    mean: Float  # mean parameters, (D,)
+    # covariance (D, D) that the catalogue errors contribute to the parameters: `total` of a
+    # `StarCovariance`, or separate terms for its part from positions and its part from proper
+    # motions
     covariance: Float
     name: str = CATALOGUE
-    source: str = GIVEN  # where the errors of the catalogue come from
+    source: str = GIVEN  # origin of the errors of the catalogue
 
     @property
     def rows(self) -> tuple[Row, ...]:
-        """A row that the solution holds already."""
+        """A row that is not in the total, because the solution already includes it."""
         return (Row(self.name, source=self.source, in_total=False),)
 
     def draw(self, n: int, rng: np.random.Generator) -> Polynomials:
         """Draws of the error from N(0, covariance)."""
         mean, D = np.asarray(self.mean, float), self.model.n_distortion
-        # scales of units and sizes apart, a sum of squares: eigenvalues below 0 are rounding
+        # the covariance is positive semidefinite; after scaling, negative eigenvalues are rounding
         scale = np.sqrt(np.diag(self.covariance)[:D])
         scale = np.where(scale > 0, scale, 1.0)
         values, vectors = np.linalg.eigh(self.covariance[:D, :D] / np.outer(scale, scale))
-        # the symmetric root: signs and order of eigenvectors do not change the draws
+        # symmetric square root: draws do not depend on signs and order of eigenvectors
         root = (vectors * np.sqrt(np.maximum(values, 0.0))) @ vectors.T
         theta = np.tile(mean[: self.model.n_global], (n, 1))
         theta[:, :D] += scale * (rng.standard_normal((n, D)) @ root)
@@ -74,10 +74,10 @@ class CatalogueErrors:
 def catalogue_terms(
     solution: Solution, stars: StarCovariance, catalogue: str
 ) -> tuple[CatalogueErrors, ...]:
-    """Terms of the errors of a catalogue: of its positions, and of its motions where it has some.
+    """Terms for the errors of catalogue positions and, if any, of proper motions.
 
-    `solution`: that takes them for independent. `catalogue`: name of the file that states the
-    errors.
+    `solution`: solution that takes these errors as independent. `catalogue`: name of the file that
+    states the errors.
     """
     source = f"{GIVEN}: errors of {{}} in {catalogue}"
     model, mean = solution.model, np.asarray(solution.mean, float)
@@ -94,34 +94,34 @@ def catalogue_terms(
 class ScaleError:
     """A Gaussian error of scale or orientation about the reference pixel of the first chip.
 
-    Velocity aberration that is left out, or known only as far as the header knows the spacecraft's
-    velocity, is an error of the scale: VAFACTOR differs from 1 by up to 1e-4.
+    An example is velocity aberration that was not corrected, or that was corrected with an
+    inaccurate spacecraft velocity. It changes the scale: VAFACTOR differs from 1 by up to 1e-4.
 
-    InputError for an unknown kind, or a sigma that is negative or not finite.
+    Raises InputError if the kind is unknown, or if sigma is negative or not finite.
     """
 
     name: str
     kind: str  # 'scale' or 'rotation'
-    sigma: float  # standard deviation: relative, or in radians
-    solution: Solution  # whose positions it moves
+    sigma: float  # standard deviation, relative for a scale and in radians for a rotation
+    solution: Solution  # solution with the positions that the error moves
     source: str = GIVEN
-    in_total: bool = True  # False where another row holds this error
+    in_total: bool = True  # False if another row includes this error
 
     def __post_init__(self) -> None:
-        where = f"budget term {self.name!r}"
-        require_known(self.kind, ("scale", "rotation"), "kind", where=where)
+        location = f"budget term {self.name!r}"
+        require_known(self.kind, ("scale", "rotation"), "kind", where=location)
         if not (math.isfinite(self.sigma) and self.sigma >= 0):
             raise InputError(
-                f"sigma is {self.sigma}", where=where, do="give a number that is not negative"
+                f"sigma is {self.sigma}", where=location, do="give a number that is not negative"
             )
 
     @property
     def rows(self) -> tuple[Row, ...]:
-        """One row."""
+        """A single row."""
         return (Row(self.name, source=self.source, in_total=self.in_total),)
 
     def draw(self, n: int, rng: np.random.Generator) -> Polynomials:
-        """Draws of the error: one number for the whole image."""
+        """Draws of the error, one number per draw for the whole image."""
         model, mean = self.solution.model, np.asarray(self.solution.mean, float)
         epoch = None if model.time is None else model.time.epoch0[0]
         first = place_of(model, epoch=epoch)
@@ -136,68 +136,71 @@ class ScaleError:
                 position = np.stack([-position[1], position[0]])
             for s, change in zip(slices, position, strict=True):
                 moved[s] = change
-        sizes, known = self.sigma * rng.standard_normal((n, 1)), slice(model.n_global)
-        return Polynomials(self.rows[0], model, mean, mean[known] + sizes * moved[known])
+        sizes, moving = self.sigma * rng.standard_normal((n, 1)), slice(model.n_global)
+        return Polynomials(self.rows[0], model, mean, mean[moving] + sizes * moved[moving])
 
 
-# terms that a row of the configuration with one sigma makes, by its kind
+# error terms that a configuration row with a single sigma can create, by kind
 ONE_SIZE: dict[str, Callable[..., ErrorTerm]] = {"scale": ScaleError, "rotation": ScaleError}
 
 
 def one_size_kinds() -> tuple[str, ...]:
-    """Kinds of error terms that have one size, those that missions add among them."""
-    return (*ONE_SIZE, *(kind for one in missions().values() for kind in one.error_terms))
+    """Kinds of error terms with a single size, including those that missions add."""
+    return (*ONE_SIZE, *(kind for mission in missions().values() for kind in mission.error_terms))
 
 
 def one_size_term(name: str, kind: str, sigma: float, solution: Solution, source: str) -> ErrorTerm:
-    """Error term of a kind; parameters as of `ScaleError`."""
-    added = {kind: path for one in missions().values() for kind, path in one.error_terms.items()}
+    """Error term of a kind; for the parameters see `ScaleError`."""
+    added = {
+        kind: path for mission in missions().values() for kind, path in mission.error_terms.items()
+    }
     make = ONE_SIZE[kind] if kind in ONE_SIZE else load_object(added[kind])
     return make(name, kind, sigma, solution, source)
 
 
 @dataclass(frozen=True, eq=False)
 class ExposureVariation:
-    """Deviation of a new exposure from the polynomials that all exposures have in common."""
+    """Deviation of a new exposure from the polynomials that are common to all exposures."""
 
-    # with frames in gauge 'held', in which exposures deviate from the polynomials
+    # frames must have gauge 'held', in which exposures deviate from the polynomials
     model: DistortionModel
-    mean: Float  # (D,), of its parameters
-    # (k,), deviations that scatter, named as an exposure's parameters: 'scale', 'shear_plus', ...
+    mean: Float  # mean parameters, (D,)
+    # (k,), kinds of deviation, named like parameters of an exposure: 'scale', 'shear_plus', ...
     kinds: tuple[str, ...]
-    tau: Float  # (m, k), draws of the scatter of each kind
-    # what of it is known to be velocity aberration: shown beside, as this scatter holds it
+    tau: Float  # (m, k), draws of the standard deviation of each kind over the exposures
+    # part of the variation that is known to be velocity aberration; shown but not added, because
+    # the variation already includes it
     aberration: ScaleError | None = None
     name: str = EXPOSURE_SCATTER
     source: str = MEASURED
 
     @property
     def _exposure(self) -> int:
-        """The exposure whose place a new one takes: any, as its own deviations are put to zero."""
+        """The exposure that represents a new one: any, since its deviations are set to zero."""
         return len(self.model.exposures) - 1
 
     @property
     def rows(self) -> tuple[Row, ...]:
-        """The scatter, and what of it is aberration."""
-        own = Row(self.name, source=self.source)
-        return (own,) if self.aberration is None else (own, *self.aberration.rows)
+        """Rows of the variation and, if known, of its part that is velocity aberration."""
+        row = Row(self.name, source=self.source)
+        return (row,) if self.aberration is None else (row, *self.aberration.rows)
 
     def draw(self, n: int, rng: np.random.Generator) -> ErrorDraws:
-        """Draws of deviations, each from a normal distribution with a scatter of its own."""
+        """Draws of deviations from normal distributions; each uses a draw of the scatter."""
         return self.of_rows(rng.integers(len(self.tau), size=n), rng)
 
     def of_rows(self, rows: Int, rng: np.random.Generator) -> ErrorDraws:
-        """Draws (n,) of deviations, whose scatters are draws by their numbers."""
-        known = self.model.free_frame_names(self._exposure)
+        """Draws of deviations with the given draws of the scatter, numbers `rows` of shape (n,)."""
+        names = self.model.free_frame_names(self._exposure)
         first = self.model.frame_slice(self._exposure).start
-        at = [first + known.index(kind) for kind in self.kinds]
+        at = [first + names.index(kind) for kind in self.kinds]
         mean = np.array(self.mean, float)
         mean[at] = 0.0
         theta = np.tile(mean, (len(rows), 1))
         tau = self.tau[rows]
         theta[:, at] = tau * rng.standard_normal(tau.shape)
         pools = (Pool(rows, len(self.tau)),)
-        own = Polynomials(self.rows[0], self.model, mean, theta, self._exposure, pools=pools)
+        variation = Polynomials(self.rows[0], self.model, mean, theta, self._exposure, pools=pools)
         if self.aberration is None:
-            return own
-        return Together((own, self.aberration.draw(len(rows), rng)))
+            return variation
+        return Together((variation, self.aberration.draw(len(rows), rng)))

@@ -1,4 +1,4 @@
-"""Errors of the parameters of a solution, part by part."""
+"""Errors of the parameters of a solution, split into parts."""
 
 from __future__ import annotations
 
@@ -30,27 +30,27 @@ EXPOSURE_FRAME = "exposure frame"
 
 @dataclass(frozen=True, eq=False)
 class SolutionErrors:
-    """Draws of a solution less its mean: of its coefficients, its drift, and a frame.
+    """Draws of a solution minus its mean, split into coefficients, drift and exposure frame.
 
-    The parts add up to the joint error (to first order) along the axes of the polynomials, however
-    the field turned between exposures.  They are correlated.
+    The parts are correlated. To first order, they sum to the joint error along the axes of the
+    polynomials, even if the field was rotated between exposures.
     """
 
     solution: Solution
-    # the solution that lacks the errors of the catalogue, and shows the rows of the parts
+    # solution without the errors of the catalogue, from which the rows of the parts are computed
     without: Solution | None = None
-    # what the errors of the catalogue do, which the solution's draws hold: shown beside
+    # effects of the catalogue errors: shown but not added, because the draws already include them
     catalogue: tuple[CatalogueErrors, ...] = ()
 
     @property
     def fitted_exposures(self) -> list[int]:
-        """Codes of the exposures whose frame was fitted."""
+        """Codes of the exposures with a fitted frame."""
         model = self.solution.model
         return [e for e in range(len(model.exposures)) if model.free_frame_names(e)]
 
     @property
     def rows(self) -> tuple[Row, ...]:
-        """Coefficients, drift and frame as far as the model has them, and the catalogue's."""
+        """Rows of the coefficients, of drift and frame if the model has them, and the catalogue."""
         names = [COEFFICIENTS]
         if self.solution.model.time is not None:
             names.append(TIME_DEPENDENCE)
@@ -59,17 +59,17 @@ class SolutionErrors:
         return (*(Row(name) for name in names), *(r for c in self.catalogue for r in c.rows))
 
     def draw(self, n: int, rng: np.random.Generator) -> SolutionDraws:
-        """Draws of the solution, and of what is shown beside them."""
+        """Draws of the solution, and of the rows that are only shown."""
         joint = shown = self.solution.drawn_rows(n, rng)
-        (own,) = rng.spawn(1)  # what is shown beside changes nothing of what follows
+        (spawned,) = rng.spawn(1)  # rows that are only shown must not change later random numbers
         if self.without is not None:
-            shown = self.without.drawn_rows(n, own)
-        return SolutionDraws(self, joint, shown, tuple(c.draw(n, own) for c in self.catalogue))
+            shown = self.without.drawn_rows(n, spawned)
+        return SolutionDraws(self, joint, shown, tuple(c.draw(n, spawned) for c in self.catalogue))
 
 
 @dataclass(frozen=True, eq=False)
 class SolutionDraws:
-    """Draws of the parameters, as of `drawn_rows`: of the joint error, and of its parts shown."""
+    """Draws of the parameters from `drawn_rows`: for the joint error, and for the rows shown."""
 
     of: SolutionErrors
     joint: tuple[Float, Int]
@@ -78,10 +78,10 @@ class SolutionDraws:
 
     @property
     def pools(self) -> tuple[Pool, ...]:
-        """The stored draws of a sampler; nothing for a fit, each draw of which is a new one.
+        """The stored draws of a sampler; empty for a linear fit, which has independent draws.
 
-        They are worth the smaller of the bulk and tail effective sample sizes, as a probability far
-        from a half is a matter of the tails.
+        The effective number of draws is the smaller of the bulk and tail effective sample sizes,
+        because a probability far from one half depends on the tails.
         """
         convergence = self.of.solution.convergence
         if convergence is None:
@@ -89,16 +89,16 @@ class SolutionDraws:
         sizes = [convergence.ess_bulk_min, convergence.ess_tail_min]
         ess = 1.0 if any(math.isnan(size) for size in sizes) else max(min(sizes), 1.0)
         theta, rows = self.joint
-        # draws that were transformed one by one do not say which of the sampler's they are
+        # draws that were transformed individually do not tell which draw of the sampler they are
         anonymous = len(theta) == len(rows) and np.array_equal(rows, np.arange(len(rows)))
         return (Pool(None if anonymous else rows, ess),)
 
     def on(self, domain: EvaluationDomain, image: Image) -> TogetherField:
-        """The errors at the positions of a domain."""
+        """Errors at the positions of a domain."""
         exact, shown = self.of.without is None, self.of.without or self.of.solution
         parts = _parts(shown, *self.shown, domain.epoch, image.exposure)
         fields = [
-            # rows of another solution cannot be taken off the draws of this one
+            # rows computed from another solution are not part of the draws of this one
             PolynomialField.of((Row(name, in_total=exact),), domain, image, of)
             for name, of in parts.items()
             if name
@@ -110,15 +110,15 @@ class SolutionDraws:
             at, e = domain.epoch, image.exposure
             return polynomial_errors(model, mean, theta, epoch=at, chip=chip, exposure=e, rows=rows)
 
-        whole = PolynomialField.of((), domain, image, joint)
+        joint_field = PolynomialField.of((), domain, image, joint)
         fields += [c.on(domain, image) for c in self.catalogue]
-        return TogetherField.of(domain, tuple(fields), whole)
+        return TogetherField.of(domain, tuple(fields), joint_field)
 
 
 def _parts(
     solution: Solution, theta: Float, rows: Int, epoch: float | None, exposure: Int | None
 ) -> dict[str, Callable[[int], Float]]:
-    """By name of the part, its Legendre coefficients (n, 2, K) by chip number."""
+    """Functions of the chip number that return Legendre coefficients (n, 2, K), by part name."""
     model, mean = solution.model, np.asarray(solution.mean, float)
 
     def static(chip: int) -> Float:
@@ -126,16 +126,18 @@ def _parts(
         return np.stack([theta[rows, s] - mean[s] for s in slices], axis=1)
 
     def drift(chip: int) -> Float:
-        whole = polynomial_errors(model, mean, theta, epoch=epoch, chip=chip, rows=rows)
-        return whole - static(chip)
+        with_drift = polynomial_errors(model, mean, theta, epoch=epoch, chip=chip, rows=rows)
+        return with_drift - static(chip)
 
     def frame(exposure: Int, chip: int) -> Float:
         out = np.empty((len(rows), 2, model.n_terms))
         for e in np.unique(exposure):
-            own, block = np.flatnonzero(exposure == e), model.frame_slice(int(e))
-            only = np.tile(mean, (len(own), 1))
-            only[:, block] = theta[rows[own], block]
-            out[own] = polynomial_errors(model, mean, only, epoch=epoch, chip=chip, exposure=int(e))
+            draws, block = np.flatnonzero(exposure == e), model.frame_slice(int(e))
+            only = np.tile(mean, (len(draws), 1))
+            only[:, block] = theta[rows[draws], block]
+            out[draws] = polynomial_errors(
+                model, mean, only, epoch=epoch, chip=chip, exposure=int(e)
+            )
         return out
 
     out: dict[str, Callable[[int], Float]] = {COEFFICIENTS: static}

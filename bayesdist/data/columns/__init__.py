@@ -1,1 +1,1 @@
-"""Columns and labels that matches are made of: completed, checked, and joined."""
+"""Columns and labels of matches: default values, checks, and concatenation."""

@@ -1,4 +1,4 @@
-"""Columns of matches as plain arrays of one length and unit, and the checks of their values."""
+"""Columns of matches as plain arrays of equal length in one unit, and checks of their values."""
 
 from __future__ import annotations
 
@@ -36,12 +36,12 @@ COLUMNS = (*_NUMBERS, *_INTEGERS)
 
 Columns = Mapping[str, NDArray[Any]]
 
-_LABELS = tuple(one.name for one in fields(Labels))
+_LABELS = tuple(label_field.name for label_field in fields(Labels))
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class MatchColumns:
-    """Columns and labels of matches, which `Matches` describes: completed, and checked."""
+    """Columns and labels of matches with defaults and checks; `Matches` documents them."""
 
     x: Float
     y: Float
@@ -77,9 +77,9 @@ class MatchColumns:
     match_radius: float | None = None
 
     def _complete(self) -> None:
-        """Fill in the defaults, give every array its type, and check the values."""
-        where = ", ".join(self.sources)
-        columns, n, rejected = _completed(self._columns, unit=self.unit, where=where)
+        """Fill in the defaults, convert every array to its type, and check the values."""
+        location = ", ".join(self.sources)
+        columns, n, rejected = _completed(self._columns, unit=self.unit, where=location)
         self.__dict__.update(columns)
         counts = merged_counts([self.rejected, rejected]) if rejected else dict(self.rejected)
         object.__setattr__(self, "n_rows", n if self.n_rows is None else int(self.n_rows))
@@ -89,13 +89,13 @@ class MatchColumns:
             columns,
             {name: getattr(self, labels) for name, labels in names.items()},
             unit=self.unit,
-            where=where,
+            where=location,
             place=self.place,
         )
 
     @property
     def _columns(self) -> dict[str, Any]:
-        """Columns that the stars have."""
+        """Columns that are not None."""
         return columns_of(self, COLUMNS)
 
     @property
@@ -105,27 +105,37 @@ class MatchColumns:
 
     @property
     def chip_number(self) -> Int:
-        """Number of the chip of each star (N,)."""
+        """Chip number of each star (N,)."""
         return np.asarray(self.chip_numbers, np.int64)[self.chip]
 
     def grouped(self, by: str) -> tuple[tuple[str, ...], Int]:
-        """Labels of groups of stars, and the code (N,) of each star's group among them.
+        """Labels of groups of stars, and the code of each star's group.
 
-        `by`: 'chip', 'exposure' or 'filter'; empty for one group of all stars, whose label is
-        empty. Result: `labels`; `codes` (N,).
+        Parameters
+        ----------
+        by : str
+            'chip', 'exposure' or 'filter'; empty for a single group of all stars with an empty
+            label.
+
+        Returns
+        -------
+        labels : tuple of str
+            Labels of the groups.
+        codes : ndarray of int, shape (N,)
+            Index of each star's group in `labels`.
         """
         if not by:
             return ("",), np.zeros(len(self.x), np.int64)
         return tuple(map(str, getattr(self, LABELS_OF_CODES[by]))), getattr(self, by)
 
     def place(self, row: int, column: str = "") -> str:
-        """Name of a star for a message: file, row (from 1) and column."""
+        """Location of a star for a message: file, row (counted from 1) and column."""
         head = f"{self.sources[self.source[row]]}, row {self.row[row] + 1}"
         return f"{head}, column {column!r}" if column else head
 
 
 class _Column:
-    """Column of matches in memory; an error where the stars are on disk."""
+    """Descriptor of a column of matches; raises InputError if the stars are on disk."""
 
     def __init__(self, name: str) -> None:
         self._name = name
@@ -151,7 +161,7 @@ for _name in COLUMNS:
 
 
 def column_unit(name: str, unit: str) -> str | None:
-    """Unit of a column where u and v are in `unit`; None for whole numbers."""
+    """Unit of a column if u and v are in `unit`; None for integer columns."""
     if name not in _NUMBERS:
         return None
     if name in _MOTIONS:
@@ -163,21 +173,21 @@ def column_unit(name: str, unit: str) -> str | None:
 def _completed(
     given: Mapping[str, Any], *, unit: str, where: str
 ) -> tuple[dict[str, NDArray[Any]], int, dict[str, int]]:
-    """Columns with their defaults, the number of rows given, and counts of those left out.
+    """Columns with their defaults, the number of rows given, and counts of rejected rows.
 
-    Quantities become numbers in `unit`, and rows with a masked value are left out and counted by
-    reason.
+    Quantities are converted to numbers in `unit`. Rows with a masked value are left out and counted
+    by reason.
     """
     columns = _without_units(given, unit, where)
     n = np.size(columns["x"])
     columns, rejected = _without_masked(columns, n)
-    left = np.size(columns["x"])
-    if left == 0:
+    n_valid = np.size(columns["x"])
+    if n_valid == 0:
         raise InputError("holds no rows", where=where, do="give a table with matched stars")
     absent_codes = {"source", *LABELS_OF_CODES} - columns.keys()
-    columns = columns | {name: np.zeros(left, np.int64) for name in absent_codes}
+    columns = columns | {name: np.zeros(n_valid, np.int64) for name in absent_codes}
     if "row" not in columns:
-        columns = columns | {"row": np.arange(left)}
+        columns = columns | {"row": np.arange(n_valid)}
     ordered = {name: columns[name] for name in COLUMNS if name in columns}
     return one_length(ordered, integers=_INTEGERS, where=where), n, rejected
 
@@ -186,19 +196,19 @@ def _without_units(given: Mapping[str, Any], unit: str, where: str) -> dict[str,
     """Columns with quantities replaced by numbers in `unit`."""
     out = dict(given)
     for name in _NUMBERS:
-        own = unit_of(out.get(name), where=f"column {name!r}")
+        stated_unit = unit_of(out.get(name), where=f"column {name!r}")
         to = column_unit(name, unit)
-        if own is not None and to is not None:
-            factor = conversion(own, to, where=f"{where}, column {name!r}")
+        if stated_unit is not None and to is not None:
+            factor = conversion(stated_unit, to, where=f"{where}, column {name!r}")
             out[name] = factor * without_unit(out[name])
     return out
 
 
 def _without_masked(columns: dict[str, Any], n: int) -> tuple[dict[str, Any], dict[str, int]]:
-    """Columns without the rows that have a masked value, and counts of these by reason."""
+    """Columns without the rows that have a masked value, and counts of these rows by reason."""
     masked = [name for name in COLUMNS if hasattr(columns.get(name), "mask")]
     if not masked or {np.shape(values) for values in columns.values()} != {(n,)}:
-        return columns, {}  # unequal lengths are refused where they are compared
+        return columns, {}  # unequal lengths are reported by `one_length`
     gone = {name: absent(columns[name], not_finite=False) for name in masked}
     reasons = [(f"no value in column {name!r}", rows) for name, rows in gone.items()]
     stay, rejected = counted(reasons, n)
@@ -217,12 +227,12 @@ def _check(
     where: str,
     place: Callable[[int, str], str],
 ) -> None:
-    """Refuse an unknown unit, half a pair, codes without a label, and values that cannot be."""
+    """Raise InputError for an unknown unit, half a pair, codes without labels, or bad values."""
     check_unit(unit, where=where)
     refuse_half(SIGMAS, columns, where=where, what="errors")
     refuse_half(_NOMINAL, columns, where=where, what="nominal positions")
     for name, names in labels.items():
-        if name != "source":  # names of files may be any
+        if name != "source":  # file names may contain any character
             refuse_control_characters((n for n in names if isinstance(n, str)), where)
         if columns[name].min() < 0 or columns[name].max() >= len(names):
             label = {**LABELS_OF_CODES, "source": "sources"}[name]
@@ -244,7 +254,7 @@ def _check(
 
 
 def refuse_repeated(columns: Columns, *, place: Callable[[int], str]) -> None:
-    """Refuse the same measurement of the same star twice."""
+    """Raise InputError if the same measurement of a star occurs twice."""
     names = (*POSITIONS, *LABELS_OF_CODES, "epoch")
     pair = first_duplicate([columns[name] for name in names if name in columns])
     if pair is not None:

@@ -1,4 +1,4 @@
-"""Several tables of matches become one: codes renumbered, counts added, columns in agreement."""
+"""Concatenation of tables of matches: codes are renumbered, counts added, and columns checked."""
 
 from __future__ import annotations
 
@@ -15,18 +15,18 @@ from bayesdist.utils.arrays import Float, Int
 
 
 def joined_arguments(tables: Sequence[MatchColumns]) -> dict[str, Any]:
-    """Arguments of `Matches` for the rows of several tables, in their order.
+    """Arguments of `Matches` for the rows of several tables in their order.
 
-    InputError for different units or tangent points, or an optional column that only some have.
+    InputError if units or tangent points differ, or if only some tables have an optional column.
     """
     first = tables[0]
-    for other in tables[1:]:
+    for table in tables[1:]:
         for name, label in (("unit", "unit"), ("tangent_point", "tangent point")):
-            if getattr(other, name) != getattr(first, name):
+            if getattr(table, name) != getattr(first, name):
                 raise InputError(
-                    f"{label} is {getattr(other, name)}, but {getattr(first, name)} in "
+                    f"{label} is {getattr(table, name)}, but {getattr(first, name)} in "
                     f"{', '.join(first.sources)}",
-                    where=", ".join(other.sources),
+                    where=", ".join(table.sources),
                     do="bring all files to one",
                 )
     joined: dict[str, Any] = {
@@ -66,7 +66,7 @@ def joined_arguments(tables: Sequence[MatchColumns]) -> dict[str, Any]:
 
 
 def joined_columns(parts: Sequence[Mapping[str, NDArray[Any]]]) -> dict[str, NDArray[Any]]:
-    """Columns that all parts have, joined in their order."""
+    """Columns that all parts have, concatenated in their order."""
     names = [name for name in parts[0] if all(name in part for part in parts)]
     if len(parts) == 1:
         return dict(parts[0])
@@ -76,23 +76,25 @@ def joined_columns(parts: Sequence[Mapping[str, NDArray[Any]]]) -> dict[str, NDA
 def merged_codes(
     codes: Sequence[Int], labels: Sequence[tuple[Any, ...]], *, ordered: bool = False
 ) -> tuple[Int, tuple[Any, ...]]:
-    """One numbering for codes with labels of their own: the joined codes, and the labels.
+    """Concatenate codes with different labels: returns the new codes and the labels.
 
-    Labels stand in the order of their first appearance, or sorted.
+    Labels are in the order of their first appearance, or sorted if `ordered`.
     """
-    every: list[Any] = list(dict.fromkeys(label for own in labels for label in own))
+    all_labels: list[Any] = list(
+        dict.fromkeys(label for part_labels in labels for label in part_labels)
+    )
     if ordered:
-        every.sort()
-    number = {label: k for k, label in enumerate(every)}
+        all_labels.sort()
+    number = {label: k for k, label in enumerate(all_labels)}
     renumbered = [
-        np.array([number[label] for label in own], np.int64)[code]
-        for code, own in zip(codes, labels, strict=True)
+        np.array([number[label] for label in part_labels], np.int64)[code]
+        for code, part_labels in zip(codes, labels, strict=True)
     ]
-    return np.concatenate(renumbered), tuple(every)
+    return np.concatenate(renumbered), tuple(all_labels)
 
 
 def common_radius(radii: Sequence[float | None], sources: Sequence[str]) -> float | None:
-    """Match radius of all tables; None if one has none.  InputError if they differ."""
+    """Match radius of all tables; None if any has none. InputError if they differ."""
     stated = {radius for radius in radii if radius is not None}
     if len(stated) == 0 or None in radii:
         return None
@@ -108,7 +110,7 @@ def common_radius(radii: Sequence[float | None], sources: Sequence[str]) -> floa
 def merged_optional(
     name: str, arrays: Sequence[Float | None], sources: Sequence[str]
 ) -> Float | None:
-    """Joined column that all tables have; None where none has it; refused where only some have."""
+    """Concatenated column; None if no table has it. InputError if only some have it."""
     present = [a for a in arrays if a is not None]
     if not present:
         return None

@@ -22,7 +22,7 @@ DEFAULT_LABELS: dict[str, Any] = {"exposure": "1", "chip": 1, "filter": ""}
 
 @dataclass(frozen=True, eq=False)
 class Labels:
-    """Attributes that all batches of matches share; the fields are those of `Matches`."""
+    """Attributes shared by all batches of matches; the fields are those of `Matches`."""
 
     unit: str
     exposure_names: tuple[str, ...]
@@ -38,21 +38,21 @@ class Labels:
 
     def arguments(self) -> dict[str, Any]:
         """Arguments of `Matches` by name."""
-        return {one.name: getattr(self, one.name) for one in fields(self)}
+        return {label_field.name: getattr(self, label_field.name) for label_field in fields(self)}
 
     def of_batch(self, n: int) -> Labels:
-        """Labels of a batch of n rows: those of all, with counts of its own."""
+        """Labels of a batch of n rows, without the counts of rejected rows."""
         return replace(self, n_rows=n, rejected={})
 
     def codes(self, key: str, block: Mapping[str, Any], *, source: str) -> Int:
-        """Codes of a block's exposures, chips or filters among those of the whole.
+        """Codes of a block's exposures, chips or filters, converted to the labels of all files.
 
-        InputError for a label that was not there when the files were scanned.
+        InputError for a label that did not exist when the files were scanned.
         """
-        known = self._numbers[key]
+        code_by_label = self._numbers[key]
         labels = block[LABELS_OF_CODES[key]]
         try:
-            code_of_label = np.array([known[label] for label in labels], np.int64)
+            code_of_label = np.array([code_by_label[label] for label in labels], np.int64)
         except KeyError:
             raise InputError(
                 "has changed since it was opened", where=source, do="start again"
@@ -61,7 +61,7 @@ class Labels:
 
     @cached_property
     def _numbers(self) -> dict[str, dict[Any, int]]:
-        """Code of each label."""
+        """Code of each label, by the kind of label."""
         return {
             key: {label: k for k, label in enumerate(getattr(self, names))}
             for key, names in LABELS_OF_CODES.items()
@@ -69,7 +69,7 @@ class Labels:
 
 
 def recoded(key: str, block: Mapping[str, Any], code_of_label: Int) -> Int:
-    """Codes (N,) of a block, with the code that each of its labels has elsewhere."""
+    """Codes (N,) of a block, converted with the new code of each of its labels."""
     codes = block.get(key)
     if codes is None:
         codes = np.zeros(len(block["x"]), np.int64)
@@ -77,9 +77,9 @@ def recoded(key: str, block: Mapping[str, Any], code_of_label: Int) -> Int:
 
 
 def merged_counts(counts: Sequence[Mapping[str, int]]) -> dict[str, int]:
-    """Sums by key."""
+    """Sums of counts by key."""
     total: dict[str, int] = {}
-    for one in counts:
-        for key, number in one.items():
+    for count_by_key in counts:
+        for key, number in count_by_key.items():
             total[key] = total.get(key, 0) + number
     return total

@@ -1,4 +1,4 @@
-"""Matches as objects of other packages: an astropy QTable, an Arrow stream, HTML."""
+"""Matches as objects of other packages: astropy QTable, Arrow stream, and HTML."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ if TYPE_CHECKING:
     import pyarrow
     from astropy.table import QTable
 
-_LEFT_OUT = frozenset(("source",))  # the header names the files
+_LEFT_OUT = frozenset(("source",))  # the header lists the files
 
 
 def table_of(matches: MatchColumns) -> QTable:
-    """QTable of matches in memory, with units and with names in place of codes.
+    """QTable of matches in memory, with units and with names instead of codes.
 
-    Columns that the matches do not have are omitted; so is a filter without a name.  The tangent
-    point, the match radius, counts and notes are in ``meta["bayesdist"]``.
+    Columns that the matches do not have are omitted, and so is a filter column without names. The
+    tangent point, match radius, counts and notes are in ``meta["bayesdist"]``.
     """
     from astropy import units as apu
     from astropy.table import QTable
@@ -47,7 +47,7 @@ def table_of(matches: MatchColumns) -> QTable:
 
 
 def geometry_header(matches: MatchColumns) -> dict[str, Any]:
-    """Tangent point and match radius of matches, with the unit of the radius, if they have any."""
+    """Tangent point and match radius (with its unit) of matches, if they have them."""
     header: dict[str, Any] = {}
     if matches.tangent_point is not None:
         header["tangent_point"] = list(matches.tangent_point)
@@ -57,10 +57,10 @@ def geometry_header(matches: MatchColumns) -> dict[str, Any]:
 
 
 def header_arguments(header: Mapping[str, Any], unit: str, *, source: str) -> dict[str, Any]:
-    """Arguments of `Matches` in the header of a table that holds a `geometry_header`.
+    """Arguments of `Matches` from the header of a table that has a `geometry_header`.
 
-    `unit` is that of u and v, to which the match radius is converted.  A table of other programs
-    has no such header: the result is then empty.
+    `unit` is that of u and v, to which the match radius is converted. Empty for a table written by
+    another program.
     """
     stated = header.get(HEADER)
     if not isinstance(stated, Mapping):
@@ -84,17 +84,17 @@ def arrow_stream(
     Parameters
     ----------
     matches : MatchColumns
-        Whose labels are those of all batches.
+        Matches with the labels of all batches.
     batches : iterable of MatchColumns
-        In memory; read one after another.
+        Batches in memory, which are read one after another.
     columns : iterable of str
         Columns that all batches have.
 
     Returns
     -------
     pyarrow.RecordBatchReader
-        Columns as in `table_of`, with their units as metadata of the fields; names of exposures,
-        filters and chips are dictionaries.
+        Columns as in `table_of`, with units as metadata of the fields. Names of exposures, filters
+        and chips are dictionary-encoded.
     """
     import pyarrow
 
@@ -134,7 +134,7 @@ def _arrow_column(matches: MatchColumns, name: str) -> pyarrow.Array:
 
 
 def html_of(n: int, facts: Iterable[tuple[str, str]]) -> str:
-    """Short HTML table with the number of matches and facts about them."""
+    """Short HTML table with the number of matches and further facts."""
     rows = "".join(
         f"<tr><th style='text-align:left'>{escape(key)}</th>"
         f"<td style='text-align:left'>{escape(value)}</td></tr>"
@@ -144,7 +144,7 @@ def html_of(n: int, facts: Iterable[tuple[str, str]]) -> str:
 
 
 def _plain_columns(matches: MatchColumns) -> dict[str, NDArray[Any]]:
-    """Columns that the matches have and that a reader of a table is told."""
+    """Columns that the matches have and that are included in tables."""
     return {
         name: np.asarray(values)
         for name in COLUMNS
@@ -153,14 +153,14 @@ def _plain_columns(matches: MatchColumns) -> dict[str, NDArray[Any]]:
 
 
 def _is_told(matches: MatchColumns, name: str) -> bool:
-    """False for columns that say nothing: codes of files, and a filter without a name."""
+    """False for columns without information: codes of files, and a filter without a name."""
     if name in _LEFT_OUT:
         return False
     return name != "filter" or matches.filter_names != ("",)
 
 
 def _labels(matches: MatchColumns, name: str) -> NDArray[Any] | None:
-    """Names or numbers of the codes of a column; None for a column that holds no codes."""
+    """Names or numbers of the codes of a column; None for a column without codes."""
     if name == "exposure":
         return np.array(matches.exposure_names)
     if name == "filter":

@@ -1,1 +1,1 @@
-"""Which files a path names and which format they have; formats of other programs."""
+"""Input files: resolution of paths, recognition of formats, and formats of other programs."""

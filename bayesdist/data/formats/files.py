@@ -1,4 +1,4 @@
-"""Files that a path names, their formats, and the exposures they stand for."""
+"""Files named by a path, their formats, and the exposures that they represent."""
 
 from __future__ import annotations
 
@@ -20,22 +20,22 @@ from bayesdist.mission import load_object, missions
 
 PathLike = str | os.PathLike[str]
 
-# of the correspondences of astrometry.net (`corr.fits`): detections with their index stars
+# columns of astrometry.net correspondences (`corr.fits`): detections and their index stars
 CORR_COLUMNS = {"x": "field_x", "y": "field_y", "ra": "index_ra", "dec": "index_dec"}
 FORMATS = ("auto", "table", "bayesdist", "hst1pass", "matchup", "astrometry.net")
 
 
 @dataclass(frozen=True)
 class MatchFormat:
-    """A format of files of matches that a mission names in `match_formats`.
+    """Format of files of matches that a mission registers in `match_formats`.
 
     Parameters
     ----------
     recognizes : callable
-        Given the path of a file: whether it is of this format.
+        ``recognizes(path)`` is True if the file is of this format.
     read : callable
-        Given the path: its matches as a table whose columns have the names and units that
-        `read_matches` knows.
+        ``read(path)`` returns the matches as a table with column names and units that
+        `read_matches` recognises.
     """
 
     recognizes: Callable[[Path], bool]
@@ -43,36 +43,37 @@ class MatchFormat:
 
 
 def mission_formats() -> dict[str, MatchFormat]:
-    """Formats of all missions that are installed, by name."""
+    """Formats of all installed missions, by name."""
     return {
-        name: load_object(where)
+        name: load_object(target)
         for mission in missions().values()
-        for name, where in mission.match_formats.items()
+        for name, target in mission.match_formats.items()
     }
 
 
 def input_files(path: PathLike | Sequence[PathLike]) -> list[Path]:
-    """Files that a path, pattern, folder or list of them names.
+    """Files named by a path, a pattern, a folder, or a list of these.
 
     Parameters
     ----------
     path : path-like or sequence of path-like
-        A pattern (``*``, ``?``, ``[``) stands for the files that fit it, a folder for the Parquet
-        files in it and below, both in the order of their names.
+        A pattern (``*``, ``?``, ``[``) stands for all files that match it, and a folder for the
+        Parquet files in it and its subfolders, both sorted by name.
 
     Returns
     -------
     list of pathlib.Path
+        Names of the files.
 
     Raises
     ------
     InputError
-        When there are none, or a file is repeated.
+        If there are no files, or if a file is repeated.
     """
-    given = [path] if isinstance(path, str | os.PathLike) else list(path)
-    if not given:
+    paths = [path] if isinstance(path, str | os.PathLike) else list(path)
+    if not paths:
         raise InputError("no file is named", where="data.matches", do="name at least one")
-    files = [file for one in given for file in _expanded(Path(one))]
+    files = [file for item in paths for file in _expanded(Path(item))]
     for file in files:
         if files.count(file) > 1:
             raise InputError("is named twice", where=str(file), do="name each file once")
@@ -81,28 +82,28 @@ def input_files(path: PathLike | Sequence[PathLike]) -> list[Path]:
 
 def _expanded(path: Path) -> list[Path]:
     if path.is_dir():
-        found = sorted(
+        matching_files = sorted(
             file for file in path.rglob("*.parquet") if not file.name.startswith((".", "_"))
         )
-        if not found:
+        if not matching_files:
             raise InputError(
                 "is a folder without Parquet files", where=str(path), do="name the files"
             )
-        return found
+        return matching_files
     if path.exists() or not glob.has_magic(str(path)):
         return [path]
-    found = sorted(Path(file) for file in glob.glob(str(path), recursive=True))  # noqa: PTH207  from any root
-    if not found:
+    matching_files = sorted(Path(file) for file in glob.glob(str(path), recursive=True))  # noqa: PTH207  from any root
+    if not matching_files:
         raise InputError("no file fits the pattern", where=str(path), do="check the pattern")
-    return found
+    return matching_files
 
 
 def kind_of(file: Path, columns: Mapping[str, str] | None) -> str:
-    """Format of a file: one that a mission adds, else by its name and then by its content."""
+    """Format of a file: one registered by a mission, or else by its name and then its content."""
     if columns is None and file.is_file():
-        for own, one in mission_formats().items():
-            if one.recognizes(file):
-                return own
+        for key, format_ in mission_formats().items():
+            if format_.recognizes(file):
+                return key
     name = without_codec(file.name)
     if name.endswith(tuple(TABLE_SUFFIXES)):
         if columns is None and name.endswith((".fits", ".fit")):
@@ -115,7 +116,7 @@ def kind_of(file: Path, columns: Mapping[str, str] | None) -> str:
     if is_matchup(lines):
         return "matchup"
     if is_hst1pass(file, lines):
-        return "hst1pass"  # its reader finds what is wrong
+        return "hst1pass"  # the reader reports what is wrong
     if is_text_table(lines) or is_fits(file):
         return "table"
     raise FormatError(
@@ -127,13 +128,13 @@ def kind_of(file: Path, columns: Mapping[str, str] | None) -> str:
 
 
 def exposure_names(files: Sequence[Path]) -> list[str]:
-    """Names of files as exposures: the stem, with as many folders before it as tell all apart."""
+    """Exposure names of files: the stem, preceded by as many folders as make the names unique."""
     stems = [file.name.split(".")[0] or file.name for file in files]
     parents = [file.parent for file in files]
     while len(set(stems)) < len(stems):
-        again = {stem for stem in stems if stems.count(stem) > 1}
+        repeated = {stem for stem in stems if stems.count(stem) > 1}
         named = [
-            f"{parent.name}/{stem}" if stem in again and parent.name else stem
+            f"{parent.name}/{stem}" if stem in repeated and parent.name else stem
             for stem, parent in zip(stems, parents, strict=True)
         ]
         if named == stems:  # only the extensions differ

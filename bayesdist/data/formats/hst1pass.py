@@ -1,8 +1,9 @@
 """Star lists of hst1pass (`*.uvwXYMpq`, `*.xymq`) and the MATCHUP masters made from them.
 
-hst1pass is J. Anderson's one-pass photometry of HST exposures (WFC3 ISR 2022-05), jwst1pass that of
-JWST.  A list names its columns in the block under FILEOUT near the end of its header; lists without
-one, of the older programs or by other hands, have a letter of their suffix for each column.
+hst1pass is J. Anderson's one-pass photometry of HST exposures (WFC3 ISR 2022-05); jwst1pass is the
+equivalent for JWST. A list names its columns in the block after FILEOUT near the end of its header.
+In lists without such a block, from older or other programs, each letter of the file suffix denotes
+a column.
 """
 
 from __future__ import annotations
@@ -25,34 +26,35 @@ from bayesdist.utils.text import number_of
 _COLUMN = re.compile(r"#\s*\((\d+)\)\s+(\S+)\s+--\s")
 _KEYWORD = re.compile(r"#\s*(\w+)\s*:\s*(.*?)\s*$")
 _SUFFIX = re.compile(r"\w*(xym|XYM|XYm)\w*")
-_LABELS = "IJN"  # row, column and number of a star for grepping: I0042, J0817, N00007
-_CHIP = "kK"  # chip: as a number, or a label such as K1
-_ROWS = 2048  # of the lower chip, in the frame that holds both
+_LABELS = "IJN"  # row, column and number of a star as text labels: I0042, J0817, N00007
+_CHIP = "kK"  # chip, as a number or a label such as K1
+_ROWS = 2048  # rows of the lower chip in a frame that contains both chips
 _DAMAGED = "fetch or write the file again"
 
 
 @dataclass(frozen=True, eq=False)
 class Hst1passList:
-    """One list.
+    """One hst1pass list.
 
     Parameters
     ----------
     name : str
-        File name up to its first point: the exposure.
+        Name of the exposure: the file name up to its first point.
     source : str
-        File.
+        Name of the file.
     columns : dict of str to ndarray, shape (N,)
-        By the letters of hst1pass: u, v position corrected by the observatory's solution; x, y raw
-        pixels, FITS 1-based, and X, Y those corrected for charge transfer; m, M, w instrumental
-        magnitudes, raw, corrected likewise, and of undistorted pixels; p peak; q quality of fit.
+        Columns by the letters of hst1pass: u, v positions corrected with the observatory's
+        solution; x, y raw pixels, FITS 1-based, and X, Y those corrected for charge transfer; m, M,
+        w instrumental magnitudes: raw, corrected for charge transfer, and of undistorted pixels; p
+        peak; q quality of fit.
     filter : str
-        Empty where the header has none.
+        Filter; empty if the header has none.
     epoch : float or None
-        Decimal years, from rDAT.
+        Decimal year, from rDAT.
     exptime : float or None
-        Seconds, from EXPTI.
+        Exposure time in seconds, from EXPTI.
     two_chips : bool
-        True of a detector with two chips in one frame of 4096 x 4096 pixels, as the header says.
+        True if the header describes a detector with two chips in one frame of 4096 x 4096 pixels.
     """
 
     name: str
@@ -66,7 +68,7 @@ class Hst1passList:
     def matches(self, *, name: str | None = None) -> Matches:
         """Matches of raw pixels with the observatory's corrected positions.
 
-        Pixels are X, Y, or x, y where a list has no X, Y.  The block under FILEOUT calls X, Y
+        Pixels are X, Y, or x, y if the list has no X, Y. The block after FILEOUT calls X, Y
         "dist-cor", but they are raw: the header's BDRY_xy and BDRY_uv rows give the corners of the
         chip in both systems.
 
@@ -78,12 +80,12 @@ class Hst1passList:
         Returns
         -------
         Matches
-            In pixels, without errors; magnitudes are M.
+            Matches in pixels without errors, with magnitudes M, or m if the list has no M.
 
         Raises
         ------
         FormatError
-            When the list lacks pixels, u or v.
+            If the list lacks pixels, u or v.
         """
         x, y = self._pair(("X", "Y"), ("x", "y"))
         u, v = self._pair(("u", "v"))
@@ -106,7 +108,7 @@ class Hst1passList:
     def detections(self, *, name: str | None = None) -> Detections:
         """Raw pixels, instrumental magnitudes and qualities q of the detections.
 
-        Pixels are X, Y with the magnitudes M, or x, y and m where a list has none.
+        Pixels are X, Y, or x, y if the list has no X, Y. Magnitudes are M, or m if it has no M.
 
         Parameters
         ----------
@@ -116,11 +118,12 @@ class Hst1passList:
         Returns
         -------
         Detections
+            Detections without errors.
 
         Raises
         ------
         FormatError
-            When the list lacks pixels.
+            If the list lacks pixels.
         """
         x, y = self._pair(("X", "Y"), ("x", "y"))
         chip, y = self._on_chips(y)
@@ -135,11 +138,11 @@ class Hst1passList:
         )
 
     def _on_chips(self, y: Float) -> tuple[Int, Float]:
-        """Chip of each star, (N,), and its row on that chip.
+        """Chip of each star (N,), and the row coordinate on that chip.
 
-        hst1pass lays the two chips of ACS/WFC and WFC3/UVIS into one frame, k = 1 below k = 2; of
-        these it is CCDCHIP, 2 below 1, as in HST's other files.  Rows count on the chip, unless the
-        list has them so.  Where a list has no k, it has one chip, 1.
+        hst1pass places the two chips of ACS/WFC and WFC3/UVIS in one frame, k = 1 below k = 2.
+        Chips are converted to CCDCHIP, with 2 below 1, as in other HST files. Rows are converted to
+        rows of the chip, unless they already are. A list without k has a single chip, number 1.
         """
         k = next((self.columns[name] for name in _CHIP if name in self.columns), None)
         if k is None:
@@ -168,21 +171,22 @@ class Hst1passList:
 
 
 def is_hst1pass(path: Path, lines: list[str]) -> bool:
-    """True for an hst1pass list, by its lines or its suffix."""
+    """True for an hst1pass list, recognised by its lines or its suffix."""
     return any(line.startswith("#") and "FILEOUT:" in line for line in lines) or bool(
         _suffix_letters(path)
     )
 
 
 def _suffix_letters(path: Path) -> list[str]:
-    """Letters of a suffix such as `.xymq`, which names the columns; none of other suffixes."""
+    """Letters of a suffix such as `.xymq`, which name the columns; empty for other suffixes."""
     letters = path.name.removesuffix(".gz").partition(".")[2].rpartition(".")[2]
-    named = _SUFFIX.fullmatch(letters) and len(set(letters)) == len(letters)  # no MATCHUP.XYMEEE
+    # excludes MATCHUP.XYMEEE
+    named = _SUFFIX.fullmatch(letters) and len(set(letters)) == len(letters)
     return list(letters) if named else []
 
 
 def is_matchup(lines: list[str]) -> bool:
-    """True for lines that begin as a MATCHUP master or one of its calibrated forms does."""
+    """True if the lines begin like a MATCHUP master or a calibrated form of it."""
     head = lines[:5]
     return any(line.startswith("#") and "xbar" in line and "ysig" in line for line in head) or (
         bool(head) and {"x", "y", "m", "xe", "ye", "N_fnd"} <= set(head[0].split())
@@ -190,21 +194,23 @@ def is_matchup(lines: list[str]) -> bool:
 
 
 def read_hst1pass(path: str | Path) -> Hst1passList:
-    r"""Read one list.
+    r"""Read an hst1pass list.
 
     Parameters
     ----------
     path : path-like
+        Text file, optionally compressed.
 
     Returns
     -------
     Hst1passList
+        Columns and header values of the list.
 
     Raises
     ------
     InputError
-        For a missing file, columns that neither a FILEOUT block nor the suffix names, no rows, or
-        rows that do not have these columns (a truncated file).
+        If the file is missing, if neither a FILEOUT block nor the suffix names the columns, if
+        there are no rows, or if rows lack columns (a truncated file).
 
     Examples
     --------
@@ -223,22 +229,22 @@ def read_hst1pass(path: str | Path) -> Hst1passList:
     if start is None:
         names = _suffix_letters(path)
     else:
-        names = [found[2] for line in header[start:] if (found := _COLUMN.match(line))]
+        names = [match[2] for line in header[start:] if (match := _COLUMN.match(line))]
     if not names:
-        what = "the FILEOUT block names no columns"
+        problem = "the FILEOUT block names no columns"
         if start is None:
-            what = (
+            problem = (
                 "is no hst1pass list, or its header is cut off: no FILEOUT block names the "
                 "columns, and no suffix such as .xymq"
             )
-        raise FormatError(what, where=str(path), do=_DAMAGED)
-    kept = [k for k, name in enumerate(names) if name not in _LABELS]
-    values = _numbers(path, lines, len(names), kept)
-    keywords = {found[1]: found[2] for line in header if (found := _KEYWORD.match(line))}
+        raise FormatError(problem, where=str(path), do=_DAMAGED)
+    numeric = [k for k, name in enumerate(names) if name not in _LABELS]
+    values = _numbers(path, lines, len(names), numeric)
+    keywords = {match[1]: match[2] for line in header if (match := _KEYWORD.match(line))}
     return Hst1passList(
         name=path.name.split(".")[0],
         source=str(path),
-        columns={names[k]: values[:, m].copy() for m, k in enumerate(kept)},
+        columns={names[k]: values[:, m].copy() for m, k in enumerate(numeric)},
         filter=keywords.get("FILT", "").strip("' "),
         epoch=_float(keywords.get("rDAT")),
         exptime=_float(keywords.get("EXPTI")),
@@ -255,7 +261,7 @@ def _float(text: str | None) -> float | None:
 
 
 def _numbers(path: Path, lines: list[str], n_columns: int, kept: Sequence[int]) -> Float:
-    """Some of the leading `n_columns` fields of the rows that are no comments."""
+    """Fields with indices `kept`, out of `n_columns` leading ones, of all rows except comments."""
     rows = [line for line in lines if line.strip() and not line.startswith("#")]
     if not rows:
         raise FormatError("holds no stars", where=str(path), do="give a list with stars")
@@ -267,7 +273,7 @@ def _numbers(path: Path, lines: list[str], n_columns: int, kept: Sequence[int]) 
         try:
             if len(fields) < n_columns:
                 raise ValueError(f"has {len(fields)} of {n_columns} columns")
-            if "_" in line or not line.isascii():  # which Python takes for parts of numbers
+            if "_" in line or not line.isascii():  # Python would accept these as parts of numbers
                 raise ValueError(f"{line.strip()[:40]!r} holds other characters than numbers do")
             out[k] = [fields[m].removeprefix("K") for m in kept]
         except ValueError as error:
@@ -280,28 +286,30 @@ def read_matchup(
 ) -> ReferenceCatalog:
     r"""Read a MATCHUP master as a reference catalogue.
 
-    Two forms are known: the original (xbar ybar mbar xsig ysig msig qbar Nf ...) and the calibrated
-    one with a header line (x y m xe ye me std N_fnd ... name t).  In known files of the second
-    form, t is the same for years of observations: it is no epoch of the positions, and it is not
-    used.
+    Two forms are supported: the original one (xbar ybar mbar xsig ysig msig qbar Nf ...) and the
+    calibrated one with a header line (x y m xe ye me std N_fnd ... name t). In existing files of
+    the second form, t is the same for years of observations, so it is not an epoch of the positions
+    and is not used.
 
     Parameters
     ----------
     path : path-like
+        Text file, optionally compressed.
     epoch : float, optional
-        Decimal year of the positions; the file does not hold it.
+        Decimal year of the positions, which the file does not state.
     unit : str, optional
         Unit of the positions.
 
     Returns
     -------
     ReferenceCatalog
-        sigma_u, sigma_v are xsig, ysig: the scatter over the exposures, not the error of the mean.
+        Catalogue in which sigma_u, sigma_v are xsig, ysig: the scatter over the exposures, not the
+        error of the mean.
 
     Raises
     ------
     InputError
-        For a missing file, one that is no MATCHUP master, or rows cut off.
+        If the file is missing, is not a MATCHUP master, or is truncated.
 
     Examples
     --------

@@ -1,4 +1,4 @@
-"""Interpretation of the columns of a table, to be shown and written down before it is read."""
+"""Interpretation of the columns of a table, which can be shown and saved before it is read."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ PathLike = str | os.PathLike[str]
 
 MAX_ROWS_READ = 200_000  # rows of a large table that are read to interpret its columns
 MAX_CHIPS = 200
-MIN_ROWS_ON_CHIP = 20  # rows: flags and qualities have values that are rare
+MIN_ROWS_ON_CHIP = 20  # rows; flags and qualities often have rarer values
 
 
 @dataclass(frozen=True)
@@ -31,15 +31,15 @@ class TableLayout:
 
     names: tuple[str, ...]  # all columns
     taken: dict[str, str]  # column of each quantity that is read
-    origin: int  # of the pixels, by names and header
-    why: str  # reason for the origin; empty where there is none
-    like_chips: dict[str, int]  # number of values of unused columns that may be chips
-    dated: bool  # True where the header has the date of the exposure
-    spans: dict[str, tuple[float, float]]  # least and largest value of unused columns of numbers
+    origin: int  # coordinate of the first pixel, from column names and header
+    why: str  # reason for the origin; empty if there is none
+    like_chips: dict[str, int]  # number of distinct values in unused columns that may hold chips
+    dated: bool  # True if the header has the date of the exposure
+    spans: dict[str, tuple[float, float]]  # smallest and largest value of unused numeric columns
 
     @property
     def lacking(self) -> list[str]:
-        """Quantities that matches need, and of which no column is known."""
+        """Quantities that matches need and that have no recognised column."""
         return lacking_columns(self.taken)
 
 
@@ -49,10 +49,10 @@ def table_layout(
     *,
     read_sigma: bool = True,
 ) -> TableLayout | None:
-    """Layout of a file of matches, or of the first of several; None of files with fixed columns.
+    """Layout of a file of matches, or of the first of several; None for files with fixed columns.
 
-    Arguments and errors are as for `read_matches`, but that columns may be lacking; `read_sigma` is
-    True where columns of errors are read.
+    Arguments and errors are as for `read_matches`, except that columns may be missing. `read_sigma`
+    is True if columns of errors are read.
     """
     file = input_files(path)[0]
     if kind_of(file, columns) != "table":
@@ -64,8 +64,8 @@ def table_layout(
         table: Columns = next(part.blocks(part.colnames, size=MAX_ROWS_READ))
         header: Mapping[str, Any] = {}
     else:
-        whole = with_sky_columns(read_table(file))
-        table, header = whole, whole.meta
+        full_table = with_sky_columns(read_table(file))
+        table, header = full_table, full_table.meta
     names = tuple(table.colnames)
     taken = present_columns(names, columns, source=str(file), read_sigma=read_sigma)
     origin, why = origin_of(taken.get("x", ""), names, header)
@@ -75,14 +75,14 @@ def table_layout(
         taken,
         origin,
         why,
-        {name: n for name, one in unused.items() if (n := _values_like_chips(one))},
+        {name: n for name, column in unused.items() if (n := _values_like_chips(column))},
         own_epoch(header) is not None,
-        {name: span for name, one in unused.items() if (span := _span(one)) is not None},
+        {name: span for name, column in unused.items() if (span := _span(column)) is not None},
     )
 
 
 def _span(column: Any) -> tuple[float, float] | None:
-    """Least and largest value of a column of numbers."""
+    """Smallest and largest value of a numeric column; None for other columns."""
     values = np.ma.compressed(np.ma.asarray(getattr(column, "value", column)))
     if values.dtype.kind not in "iuf":
         return None
@@ -91,7 +91,7 @@ def _span(column: Any) -> tuple[float, float] | None:
 
 
 def _values_like_chips(column: Any) -> int:
-    """Number of chips if these values are chips; 0 where they cannot be."""
+    """Number of distinct values if they may be chips, otherwise 0."""
     values = np.asarray(getattr(column, "unmasked", column))
     if values.ndim != 1 or values.dtype.kind not in "iuSU" or getattr(column, "unit", None):
         return 0

@@ -1,4 +1,4 @@
-"""Matches in one HDF5 file that keeps every column and label to the last bit."""
+"""Matches in an HDF5 file that stores every column and label exactly."""
 
 from __future__ import annotations
 
@@ -11,13 +11,14 @@ SUFFIX = ".h5"
 
 
 def write_matches(path: Path, matches: Matches) -> None:
-    """Write matches in memory to a file that `read_matches` reads.
+    """Write matches in memory to a file that `read_matches` can read.
 
     Parameters
     ----------
     path : pathlib.Path
-        Name of the file, which ends in ``.h5``.
+        Output file, with a name that ends in ``.h5``.
     matches : Matches
+        Matches in memory.
 
     Raises
     ------
@@ -28,7 +29,17 @@ def write_matches(path: Path, matches: Matches) -> None:
 
 
 def read_written_matches(path: Path) -> Matches:
-    """Matches of a file of `write_matches`.
+    """Read matches from a file written by `write_matches`.
+
+    Parameters
+    ----------
+    path : pathlib.Path
+        HDF5 file.
+
+    Returns
+    -------
+    Matches
+        Matches in memory.
 
     Raises
     ------

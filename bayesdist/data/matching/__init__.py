@@ -1,1 +1,1 @@
-"""Star lists matched with a catalogue: patterns, linear maps, nearest neighbours, and chance."""
+"""Matching of star lists with a catalogue: patterns, linear maps, neighbours, and chance."""

@@ -1,9 +1,9 @@
-"""Star lists of the exposures of a campaign matched with one catalogue, without trusting a WCS.
+"""Match the star lists of a campaign's exposures with one catalogue, without relying on a WCS.
 
-Known distortion brings the raw positions to a plane; triangles of bright stars find rotation and
-shift; a linear map is iterated while the search radius shrinks; a cubic for each chip fits what the
-known distortion has left.  Matches are mutual nearest neighbours within a radius that follows from
-their own distances.  Transformations serve the matching alone: the results are raw pixels with
+The known distortion projects raw positions to a plane. Triangles of bright stars give rotation and
+shift. A linear map is iterated while the search radius shrinks, and a cubic per chip fits the
+remaining distortion. Matches are mutual nearest neighbours within a radius that is derived from
+their distances. The transformations are used only for the matching: the results are raw pixels with
 catalogue positions (ACS ISR 2015-06, Section 4.1).
 """
 
@@ -54,14 +54,14 @@ class CampaignMatches:
     Parameters
     ----------
     table : Matches
-        Raw pixels with catalogue positions at the epoch of each exposure; `sigma_u`, `sigma_v`
-        are those of the catalogue there, without the centroid's error.
+        Raw pixels with catalogue positions at the epoch of each exposure. `sigma_u` and `sigma_v`
+        are the errors of these positions, without centroid errors.
     reports : tuple of ExposureReport
-        In the order of the lists.
+        Reports in the order of the lists.
     left_out : dict of str to str
-        Exposures that did not match, and why.
+        Exposures that did not match, and the reason for each.
     mirrored : bool
-        True where u has the sign that is opposite to the catalogue's.
+        True if u has the opposite sign to that in the catalogue.
     """
 
     table: Matches
@@ -70,31 +70,33 @@ class CampaignMatches:
     mirrored: bool = False
 
     def warnings(self, log: ExposureLog) -> list[str]:
-        """Warnings of `match_warnings` on the matching."""
+        """Warnings about the matching, see `match_warnings`."""
         return match_warnings(self.reports, self.left_out, log)
 
     def summary(self) -> Table:
-        """Reports as a table, a row for each exposure; chips and reasons are columns."""
-        chips = sorted({chip for one in self.reports for chip in one.per_chip})
-        reasons = list(dict.fromkeys(reason for one in self.reports for reason in one.rejected))
+        """Reports as a table with one row per exposure, and columns for chips and reasons."""
+        chips = sorted({chip for report in self.reports for chip in report.per_chip})
+        reasons = list(
+            dict.fromkeys(reason for report in self.reports for reason in report.rejected)
+        )
         rows: dict[str, list[Any]] = {}
         simple = ("exposure", "filter", "epoch", "detected")
         for name in simple:
-            rows[name] = [getattr(one, name) for one in self.reports]
+            rows[name] = [getattr(report, name) for report in self.reports]
         for reason in reasons:
-            rows[reason] = [one.rejected.get(reason, 0) for one in self.reports]
+            rows[reason] = [report.rejected.get(reason, 0) for report in self.reports]
         for name in ("matched", "expected", "completeness", "false_rate", "false_fraction"):
-            rows[name] = [getattr(one, name) for one in self.reports]
+            rows[name] = [getattr(report, name) for report in self.reports]
         for chip in chips:
-            rows[f"chip {chip}"] = [one.per_chip.get(chip, 0) for one in self.reports]
+            rows[f"chip {chip}"] = [report.per_chip.get(chip, 0) for report in self.reports]
         for name in ("rotation", "scale", "rms", "coincidences"):
-            rows[name] = [getattr(one, name) for one in self.reports]
+            rows[name] = [getattr(report, name) for report in self.reports]
         for k, name in enumerate(("offset_u", "offset_v")):
-            rows[name] = [one.offset[k] for one in self.reports]
+            rows[name] = [report.offset[k] for report in self.reports]
         for k, name in enumerate(("radius_min", "radius_max")):
-            rows[name] = [one.radius[k] for one in self.reports]
+            rows[name] = [report.radius[k] for report in self.reports]
         rows["zero_point"] = [
-            np.nan if one.zero_point is None else one.zero_point for one in self.reports
+            np.nan if report.zero_point is None else report.zero_point for report in self.reports
         ]
         return Table(rows)
 
@@ -111,51 +113,53 @@ def match_campaign(
 ) -> CampaignMatches:
     """Match the star lists of many exposures with a catalogue.
 
-    Exposures that do not match or lose all their detections to the cuts are left out, and counted.
+    Exposures that do not match, or that have no detections after the cuts, are left out and
+    counted.
 
     Parameters
     ----------
     lists : sequence of Detections
-        One for each exposure.
+        Star lists, one per exposure.
     log : ExposureLog
-        With their epochs and filters.
+        Log with the epochs and filters of the exposures.
     catalog : ReferenceCatalog
-        Brought to the epoch of each exposure, where its parallaxes displace it, too.  Its positions
-        stay relative to its own origin.
+        Reference stars. They are moved to the epoch of each exposure and displaced by their
+        parallaxes. Positions remain relative to the origin of the catalogue.
     start : callable
-        Known distortion: ``start(x, y, chip, epoch) -> (N, 2)`` from raw pixels and chip numbers to
-        a plane in the catalogue's unit, any rotation and origin; all chips on one plane.  It is
-        called by several threads at a time.
+        Known distortion: ``start(x, y, chip, epoch)`` returns positions (N, 2) for raw pixels and
+        chip numbers, on one plane for all chips, in the catalogue's unit, with any rotation and
+        origin. It is called by several threads at the same time.
     cuts : StarCuts, optional
-        Cuts on detections to be matched; by default none.  Those that the cuts leave out still help
-        to recognise the field.
+        Cuts on the detections to be matched; none by default. Detections that fail the cuts are
+        still used to recognise the field.
     radius : float, optional
-        Search radius; by default it is taken from the scatter of the pairs, ring by ring around the
-        middle of the detector (`search_radius`), below that where chance takes over.
+        Search radius. By default it is derived from the scatter of the pairs in rings around the
+        middle of the detector (`search_radius`), and is limited to radii with few chance matches.
     mirrored : sequence of bool, optional
-        True to take the catalogue with the sign of u changed; of several, those that follow are
-        tried where the first matches no exposure.  East of a sky with north up is to the left: a
-        detector that is read out as the sky is seen has the parity that is opposite to (u, v) of a
+        True uses the catalogue with the sign of u reversed. If several values are given, they are
+        tried in turn until an exposure matches. On the sky with north up, east is to the left: a
+        detector that shows the sky in this orientation has the opposite parity to (u, v) on a
         tangent plane.
 
     Returns
     -------
     CampaignMatches
+        Matches of all exposures that match, with reports.
 
     Raises
     ------
     InputError
-        When an exposure is not in the log or stands in two lists.  When more than a fifth of them
-        are left out, the first two, or one that would match by another scale or as a mirror image:
-        with the best number of coincidences.  When in most exposures one chip does not match where
-        another does.
+        If an exposure is not in the log or occurs in two lists. If more than a fifth of the
+        exposures fail, if the first two fail, or if the first one would match with another scale or
+        as a mirror image: the message gives the best number of coincidences. If in most exposures
+        one chip does not match although another one does.
     """
     check_campaign(lists, log, catalog)
     cuts = StarCuts() if cuts is None else cuts
-    passed = [cuts.passed(one) for one in lists]
-    chips = sorted({chip for one in lists for chip in one.chips})
-    mean_epoch = float(np.mean([log[one.name].epoch for one in lists]))
-    views = [_View(catalog, one, mean_epoch) for one in mirrored]
+    passed = [cuts.passed(stars) for stars in lists]
+    chips = sorted({chip for stars in lists for chip in stars.chips})
+    mean_epoch = float(np.mean([log[stars.name].epoch for stars in lists]))
+    views = [_View(catalog, is_mirrored, mean_epoch) for is_mirrored in mirrored]
 
     def attempt(one: Detections, cut: tuple[Bool, dict[str, int]], views: list[_View]) -> _Outcome:
         good, rejected = cut
@@ -179,30 +183,30 @@ def match_campaign(
         except InputError as error:
             return error
 
-    found: list[ExposureMatch] = []
+    exposure_matches: list[ExposureMatch] = []
     failed: dict[str, InputError] = {}
     outcomes = _in_turn(attempt, zip(lists, passed, strict=True), views)
     for one, (good, _), outcome in zip(lists, passed, outcomes, strict=True):
         if not isinstance(outcome, InputError):
             pairs, views = outcome[0], [outcome[1]]
-            found.append(pairs)
+            exposure_matches.append(pairs)
             continue
         reason = ""
-        if good.any() and not found and not failed:
+        if good.any() and not exposure_matches and not failed:
             plane = _started(start, one, log[one.name].epoch)
             reason = mismatch_reason(plane, one.mag, views[0].index)
         failed[one.name] = outcome
-        if reason or too_many(len(failed), len(found), len(lists)):
+        if reason or too_many(len(failed), len(exposure_matches), len(lists)):
             raise failure(failed, reason, len(lists), mirrored) from outcome
-    refuse_astray([one.report for one in found], catalog)
-    matched = [one for one in lists if one.name not in failed]
+    refuse_astray([match.report for match in exposure_matches], catalog)
+    matched = [stars for stars in lists if stars.name not in failed]
     shown = catalog.mirrored() if views[0].mirrored else catalog
-    table = _table(matched, log, shown, found)
+    table = _table(matched, log, shown, exposure_matches)
     if failed:
-        n = sum(len(one) for one in lists) - table.n_rows
+        n = sum(len(stars) for stars in lists) - table.n_rows
         table = table.with_counts(table.n_rows + n, {**table.rejected, _LEFT_OUT: n})
     left_out = {k: e.cause for k, e in failed.items()}
-    reports = tuple(one.report for one in found)
+    reports = tuple(match.report for match in exposure_matches)
     return CampaignMatches(table, reports, left_out, views[0].mirrored)
 
 
@@ -214,20 +218,20 @@ def _in_turn(
     lists: Iterable[tuple[Detections, Any]],
     views: list[_View],
 ) -> Iterator[_Outcome]:
-    """Outcomes for the lists: one by one until one matches in a parity, the others on all cores."""
-    rest = iter(lists)
-    for one in rest:
-        outcome = attempt(*one, views)
+    """Outcomes for the lists: one at a time until one matches, the remaining ones on all cores."""
+    remaining = iter(lists)
+    for stars in remaining:
+        outcome = attempt(*stars, views)
         yield outcome
         if not isinstance(outcome, InputError):
             views = [outcome[1]]
             break
     with ThreadPoolExecutor(os.cpu_count()) as pool:
-        yield from pool.map(lambda one: attempt(*one, views), rest)
+        yield from pool.map(lambda one: attempt(*one, views), remaining)
 
 
 class _View:
-    """Catalogue in one of its parities, at any epoch."""
+    """Catalogue in one parity, at any epoch."""
 
     def __init__(self, catalog: ReferenceCatalog, mirrored: bool, mean_epoch: float) -> None:
         self.mirrored = mirrored
@@ -240,7 +244,7 @@ class _View:
 
     @cached_property
     def index(self) -> PatternIndex:
-        """Patterns at the mean epoch: motions of some years do not change shapes of triangles."""
+        """Patterns at the mean epoch; motions of some years do not change shapes of triangles."""
         mean = self.at(self._mean_epoch)
         return pattern_index(np.column_stack([mean.u, mean.v]), mean.mag)
 
@@ -250,7 +254,7 @@ def _matched(
     views: Sequence[_View],
     epoch: float,
 ) -> tuple[ExposureMatch, _View]:
-    """Match with the first of these views that gives one; else the error of the first view."""
+    """Match with the first view that succeeds; otherwise raise the error of the first view."""
     errors = []
     for view in views:
         try:
@@ -282,20 +286,22 @@ def _table(
     catalog: ReferenceCatalog,
     found: Sequence[ExposureMatch],
 ) -> Matches:
-    """Table of all matches, with the columns that every list has."""
-    reports = [one.report for one in found]
+    """Table of all matches, with the optional columns that every list has."""
+    reports = [exposure_match.report for exposure_match in found]
     sizes = [len(match.index) for match in found]
 
     def joined(values: Sequence[NDArray[Any]]) -> NDArray[Any]:
-        return np.concatenate([one[m.index] for one, m in zip(values, found, strict=True)])
+        return np.concatenate([column[m.index] for column, m in zip(values, found, strict=True)])
 
     each = np.repeat(np.arange(len(lists)), sizes)
-    filters, filter_names = encoded(np.array([log[one.name].filter for one in lists]))
-    files, sources = encoded(np.array([one.source for one in lists]))
-    chip, chip_numbers = encoded(joined([one.chip for one in lists]), ordered=True)
-    mags = [one.mag for one in lists if one.mag is not None]
-    unmatched = sum(one.detected - sum(one.rejected.values()) - one.matched for one in reports)
-    rejected = merged_counts([one.rejected for one in reports])
+    filters, filter_names = encoded(np.array([log[entry.name].filter for entry in lists]))
+    files, sources = encoded(np.array([entry.source for entry in lists]))
+    chip, chip_numbers = encoded(joined([entry.chip for entry in lists]), ordered=True)
+    mags = [entry.mag for entry in lists if entry.mag is not None]
+    unmatched = sum(
+        entry.detected - sum(entry.rejected.values()) - entry.matched for entry in reports
+    )
+    rejected = merged_counts([entry.rejected for entry in reports])
     if unmatched:
         rejected[_UNMATCHED] = unmatched
     star = np.concatenate([match.catalog_index for match in found])
@@ -305,25 +311,25 @@ def _table(
         sigmas["sigma_u"] = np.concatenate([pair[0] for pair in pairs])
         sigmas["sigma_v"] = np.concatenate([pair[1] for pair in pairs])
     return Matches(
-        x=joined([one.x for one in lists]),
-        y=joined([one.y for one in lists]),
+        x=joined([entry.x for entry in lists]),
+        y=joined([entry.y for entry in lists]),
         u=np.concatenate([match.u for match in found]),
         v=np.concatenate([match.v for match in found]),
         **sigmas,
         unit=catalog.unit,
-        epoch=np.array([log[one.name].epoch for one in lists])[each],
+        epoch=np.array([log[entry.name].epoch for entry in lists])[each],
         mag=joined(mags) if len(mags) == len(lists) else None,
         exposure=each,
-        exposure_names=tuple(one.name for one in lists),
+        exposure_names=tuple(entry.name for entry in lists),
         chip=chip,
         chip_numbers=chip_numbers,
         filter=filters[each],
         filter_names=filter_names,
         star=catalog.star[star],
-        row=joined([one.row for one in lists]),
+        row=joined([entry.row for entry in lists]),
         source=files[each],
         sources=sources,
-        n_rows=sum(len(one) for one in lists),
+        n_rows=sum(len(entry) for entry in lists),
         rejected=rejected,
         tangent_point=catalog.tangent_point,
     )

@@ -1,4 +1,4 @@
-"""One exposure of a campaign matched with the catalogue at its epoch."""
+"""Match one exposure of a campaign with the catalogue at its epoch."""
 
 from __future__ import annotations
 
@@ -39,29 +39,30 @@ from bayesdist.data.matching.similarity import (
 from bayesdist.errors import InputError
 from bayesdist.utils.arrays import Bool, Float, Int
 
-_ASTRAY_FRACTION = 0.2  # of the matched fraction of the best chip: a chip below lies elsewhere
-_MIN_DETECTIONS_ON_CHIP = 20  # detections of a chip for that comparison
-_CHANCE_RATE = 0.1  # chance matches of a detection within the largest radius that is looked at
-_DISPLACEMENT = 10.0  # radii by which detections are displaced to count chance matches
-_MAX_CHECKED = 2000  # detections of the last check
-_MARGIN = 0.1  # of the field, around it
-_MAX_ROUNDS = 12  # of a cubic for each chip, and then the radius that follows
-_MIN_UNPAIRED = 100  # unpaired detections that sample where such detections lie
-_MAX_FALSE_FRACTION = 0.1  # of the pairs by chance: more, and the field is not understood
-_GROWTH_FACTOR = 1.01  # of the pairs, while the cubic is still reaching out
-_MAG_PERCENTILES = (1.0, 99.0)  # percentiles of magnitude that count as the range of a list
+_ASTRAY_FRACTION = 0.2  # of the matched fraction of the best chip; a chip below this is misplaced
+_MIN_DETECTIONS_ON_CHIP = 20  # smallest number of detections on a chip for that comparison
+_CHANCE_RATE = 0.1  # chance matches per detection within the largest radius that is considered
+_DISPLACEMENT = 10.0  # search radii by which detections are displaced to count chance matches
+_MAX_CHECKED = 2000  # largest number of detections in the final check
+_MARGIN = 0.1  # margin around the field, as a fraction of its size
+_MAX_ROUNDS = 12  # largest number of rounds in which the cubics and the radius are updated
+_MIN_UNPAIRED = 100  # smallest number of unpaired detections that represent their distribution
+_MAX_FALSE_FRACTION = 0.1  # largest fraction of chance pairs; with more, the match is rejected
+# increase of the number of pairs per round above which the cubics are still improving
+_GROWTH_FACTOR = 1.01
+_MAG_PERCENTILES = (1.0, 99.0)  # percentiles that define the range of magnitudes of a list
 
 
 @dataclass(frozen=True, eq=False)
 class ExposureMatch:
-    """Matches of an exposure: rows of list and catalogue, and catalogue positions (n,)."""
+    """Matches of an exposure: row indices in list and catalogue, and catalogue positions (n,)."""
 
     report: ExposureReport
     index: Int
     catalog_index: Int
     u: Float
     v: Float
-    sigma: tuple[Float, Float] | None  # errors of the catalogue positions (n,)
+    sigma: tuple[Float, Float] | None  # errors (n,) of the catalogue positions in u and v
 
 
 def match_exposure(
@@ -77,12 +78,40 @@ def match_exposure(
     radius: float | None,
     source: str,
 ) -> ExposureMatch:
-    """Matches of the detections of an exposure with the catalogue at its epoch.
+    """Match the detections of an exposure with the catalogue at its epoch.
 
-    `good` (N,) masks the detections that may be matched, `plane` (N, 2) holds their positions after
-    the known distortion, `patterns` those of the catalogue at an epoch not far from this, `chips`
-    those of the campaign, `rejected` the detections that are not good, by reason; `radius` is as
-    for `match_campaign`.  InputError when the field is not that of the catalogue.
+    Parameters
+    ----------
+    stars : Detections
+        Detections of the exposure.
+    good : ndarray of bool, shape (N,)
+        Mask of the detections that may be matched.
+    plane : ndarray, shape (N, 2)
+        Positions of the detections after the known distortion.
+    catalog : ReferenceCatalog
+        Catalogue at the epoch of the exposure.
+    patterns : PatternIndex
+        Patterns of the catalogue at a similar epoch.
+    exposure : Exposure
+        Entry of the exposure log.
+    chips : sequence of int
+        Chips of the campaign.
+    rejected : mapping of str to int
+        Number of detections that are not good, by reason.
+    radius : float or None
+        Search radius, as for `match_campaign`.
+    source : str
+        Name of the list, for error messages.
+
+    Returns
+    -------
+    ExposureMatch
+        Pairs with their report.
+
+    Raises
+    ------
+    InputError
+        If the field is not that of the catalogue.
     """
     rows = np.flatnonzero(good)
     points, chip = plane[rows], stars.chip[rows]
@@ -110,7 +139,7 @@ def match_exposure(
         raise failure
     moved, allowed, index, partner = pairs.moved, pairs.allowed, pairs.index, pairs.partner
     false_rate = _false_rate(pairs, rho, reference, _DISPLACEMENT * largest)
-    # matched = true + rate (all - true)
+    # matched = true + false_rate (all - true)
     true = max((len(index) - false_rate * len(points)) / (1.0 - min(false_rate, 0.99)), 0.0)
     false_fraction = float(np.clip(1.0 - true / len(index), 0.0, 1.0))
     if radius is None and false_fraction > _MAX_FALSE_FRACTION:
@@ -132,8 +161,8 @@ def match_exposure(
     sigma = None
     if catalog.sigma_u is not None and catalog.sigma_v is not None:
         sigma = (catalog.sigma_u[partner], catalog.sigma_v[partner])
-    asked = {one: int((chip == one).sum()) for one in chips}
-    per_chip = {one: int((chip[index] == one).sum()) for one in chips}
+    asked = {chip_number: int((chip == chip_number).sum()) for chip_number in chips}
+    per_chip = {chip_number: int((chip[index] == chip_number).sum()) for chip_number in chips}
     report = ExposureReport(
         exposure=exposure.name,
         filter=exposure.filter,
@@ -142,7 +171,7 @@ def match_exposure(
         rejected=dict(rejected),
         matched=len(index),
         per_chip=per_chip,
-        missing_chips=tuple(one for one, n in asked.items() if not n),
+        missing_chips=tuple(chip_number for chip_number, n in asked.items() if not n),
         astray=_astray(asked, per_chip),
         expected=int(expected.sum()),
         completeness=matched / max(int(expected.sum()), 1),
@@ -162,7 +191,7 @@ def match_exposure(
 
 
 def _astray(asked: Mapping[int, int], matched: Mapping[int, int]) -> tuple[int, ...]:
-    """Chips whose detections hardly match, where those of another chip do."""
+    """Chips with few matched detections although another chip has many."""
     share = {chip: matched[chip] / n for chip, n in asked.items() if n >= _MIN_DETECTIONS_ON_CHIP}
     best = max(share.values(), default=0.0)
     return tuple(chip for chip, part in share.items() if part < _ASTRAY_FRACTION * best)
@@ -170,7 +199,7 @@ def _astray(asked: Mapping[int, int], matched: Mapping[int, int]) -> tuple[int, 
 
 @dataclass(frozen=True, eq=False)
 class Pairs:
-    """Pairs, the positions of all detections after the maps, and the largest distance of a pair."""
+    """Pairs, positions of all detections after the maps, and largest distance of a pair."""
 
     moved: Float
     allowed: SearchRadius
@@ -189,19 +218,20 @@ def iterated_pairs(
     *,
     fixed: bool,
 ) -> Pairs | None:
-    """Pairs of positions `start` (N, 2) with `reference` (M, 2), after a cubic for each chip.
+    """Pairs of positions `start` (N, 2) with `reference` (M, 2), after fitting a cubic per chip.
 
-    `rho` (N,) are distances from the middle of the detections, `tree` is of `reference`, `largest`
-    is the largest distance of a pair.  None if there are no pairs but by chance.
+    `rho` (N,) are distances from the middle of the detections, `tree` is the k-d tree of
+    `reference`, and `largest` is the largest distance of a pair. None if there are no more pairs
+    than by chance.
 
-    While the cubic brings in more pairs the radius stays at its largest; then it shrinks to that
-    which the pairs need, unless it is fixed, and the cubic is fitted once more.
+    While the cubics bring in more pairs, the radius stays at its largest value. It then shrinks to
+    the radius that the pairs need, unless it is fixed, and the cubics are fitted once more.
     """
     allowed = SearchRadius(np.zeros(1), np.array([largest]))
     chance = min(chance_rate(start, tree, largest, _DISPLACEMENT * largest), 0.99)
     moved = start
     index, partner, distance = mutual_pairs(moved, reference, largest, tree=tree)
-    for left in reversed(range(_MAX_ROUNDS)):
+    for rounds_left in reversed(range(_MAX_ROUNDS)):
         if len(index) < MIN_PAIRS:
             return None
         before = len(index)
@@ -210,11 +240,12 @@ def iterated_pairs(
         )
         widest = float(allowed.radius.max())
         index, partner, distance = mutual_pairs(moved, reference, widest, tree=tree)
-        growing = len(index) > _GROWTH_FACTOR * before and left > 1
+        growing = len(index) > _GROWTH_FACTOR * before and rounds_left > 1
         if not fixed and not growing and len(index):
             unpaired = np.ones(len(moved), bool)
             unpaired[index] = False
-            # without counterpart a neighbour within r has the probability 1 - exp(-density pi r^2)
+            # a detection without counterpart has a neighbour within r with probability 1 -
+            # exp(-density pi r^2)
             within = float(-np.expm1(np.log1p(-chance) * (widest / largest) ** 2))
             allowed = search_radius(
                 rho[index], distance, rho[unpaired], largest=widest, chance=within
@@ -230,9 +261,10 @@ def iterated_pairs(
 
 
 def _false_rate(pairs: Pairs, rho: Float, reference: Float, step: float) -> float:
-    """Probability that a detection without counterpart finds a star that is still free.
+    """Probability that a detection without counterpart is paired with an unmatched star.
 
-    Unpaired detections show where such detections lie; where they are few, all detections are used.
+    It is evaluated at the positions of unpaired detections, or of all detections if there are few
+    unpaired ones.
     """
     free = np.ones(len(reference), bool)
     free[pairs.partner] = False
@@ -254,10 +286,10 @@ def _by_patterns(
     patterns: PatternIndex,
     source: str,
 ) -> tuple[LinearMap, int]:
-    """First linear map, and how many stars agreed on it.
+    """First linear map, and the number of stars that agreed on it.
 
-    The good detections are tried first; where they are not recognised, all are, for the catalogue
-    may hold stars that are saturated in the exposure.
+    Good detections are tried first. If they are not recognised, all detections are tried, because
+    the catalogue may hold stars that are saturated in the exposure.
     """
 
     def recognised(which: Bool) -> Similarity:
@@ -270,19 +302,19 @@ def _by_patterns(
         )
 
     try:
-        found = recognised(good)
+        similarity = recognised(good)
     except InputError:
         if good.all():
             raise
-        found = recognised(np.ones(len(stars), bool))
-    # a similarity is good in the middle: the map grows outwards from there with the bright stars
+        similarity = recognised(np.ones(len(stars), bool))
+    # a similarity is accurate in the middle: extend the map outwards using the bright stars
     mag = None if stars.mag is None else stars.mag[good]
-    rough = grown_map(brightest(plane[good], mag), found, patterns, narrow=0.15)
-    return rough, found.coincidences
+    rough = grown_map(brightest(plane[good], mag), similarity, patterns, narrow=0.15)
+    return rough, similarity.coincidences
 
 
 def _around(points: Float, catalog: ReferenceCatalog) -> Int:
-    """Catalogue stars in the box of the points, with a margin for displaced detections."""
+    """Indices of catalogue stars in the box of the points plus a margin."""
     low, high = points.min(axis=0), points.max(axis=0)
     margin = _MARGIN * float((high - low).max())
     inside = (catalog.u >= low[0] - margin) & (catalog.u <= high[0] + margin)
@@ -293,7 +325,7 @@ def _around(points: Float, catalog: ReferenceCatalog) -> Int:
 def _range(
     stars: Detections, rows: Int, index: Int, catalog: ReferenceCatalog, partner: Int
 ) -> tuple[float | None, Bool]:
-    """Zero point, and a mask of the catalogue stars within the magnitudes of the detections."""
+    """Magnitude zero point, and a mask of catalogue stars in the range of the detections."""
     if stars.mag is None or catalog.mag is None:
         return None, np.ones(len(catalog), bool)
     zero_point = float(np.median(catalog.mag[partner] - stars.mag[rows][index]))
@@ -302,7 +334,7 @@ def _range(
 
 
 def _footprint(moved: Float, chip: Int, reference: Float) -> Bool:
-    """Boolean mask of the reference stars inside the hull of any chip's detections."""
+    """Boolean mask of the reference stars inside the hull of the detections of any chip."""
     covered = np.zeros(len(reference), bool)
     for number in np.unique(chip):
         covered |= inside_hull(reference, hull_of(moved[chip == number])[0])

@@ -1,8 +1,8 @@
-"""Detections grouped into stars: friends of friends on positions that exposures have in common.
+"""Grouping of detections into stars by friends of friends, on positions common to all exposures.
 
-The sky is cut into cells, and each is grouped by itself, with what lies about it.  A group belongs
-to the cell of its first detection and reaches no farther than `MAX_EXTENT`, so that the cell has
-all of it: groups do not depend on where the sky is cut.
+The sky is divided into cells that are grouped separately, each with a margin around it. A group
+belongs to the cell of its first detection and extends no farther than `MAX_EXTENT`, so that it is
+complete in that cell: groups do not depend on the division of the sky.
 """
 
 from __future__ import annotations
@@ -18,69 +18,71 @@ from scipy.spatial import cKDTree
 from bayesdist.data.detections import NO_STAR
 from bayesdist.utils.arrays import Bool, Float, Int
 
-FINE = 16  # grid squares in a linking length: detections in one are friends without a comparison
-MAX_EXTENT = 3.0  # linking lengths that a group may span: a longer one is a chain of stars
-MARGIN = 5  # linking lengths about a cell: a group that begins in it, and whoever is linked to that
-MIN_SIDE = 16 * MARGIN  # linking lengths: smaller cells would be margin for the most part
-EQUAL = 6  # digits of a linking length to which distances are compared
-CELL = 2**16  # detections, on average: their columns fit into the cache of a core
+FINE = 16  # grid squares per linking length; detections in one square are always friends
+MAX_EXTENT = 3.0  # linking lengths; a longer group is a chain of several stars
+MARGIN = 5  # linking lengths around a cell, enough for groups that begin in it and their neighbours
+MIN_SIDE = 16 * MARGIN  # linking lengths; the margin would dominate smaller cells
+EQUAL = 6  # digits after the decimal point to which distances in linking lengths are compared
+CELL = 2**16  # average number of detections; their columns fit into the cache of a core
 
-# function of each source, in their order: `map`, or the same on a cluster
+# applies a function to all cells in order: `map`, or its equivalent on a cluster
 Each = Callable[[Callable[..., "Grouped"], Iterable["Cell"]], Iterable["Grouped"]]
 
 
 @dataclass(frozen=True, eq=False)
 class Friends:
-    """Stars that were found among detections (N,)."""
+    """Stars found among detections (N,)."""
 
-    star: Int  # (N,) codes from 0; `NO_STAR` for detections that were dropped
+    star: Int  # (N,) star codes from 0; `NO_STAR` for dropped detections
     n_stars: int
-    n_doubled: int  # groups with several detections of one exposure: the nearest to the mean stays
-    n_dropped: int  # detections that were dropped for that
-    n_chains: int  # groups that were given up, as they span several stars
+    # groups with several detections in one exposure; the one nearest to the mean is kept
+    n_doubled: int
+    n_dropped: int  # detections dropped for that reason
+    n_chains: int  # groups that were dropped because they span several stars
 
     @property
     def n_ambiguous(self) -> int:
-        """Groups that may not be one star."""
+        """Number of groups that may not be single stars."""
         return self.n_doubled + self.n_chains
 
 
 @dataclass(frozen=True, eq=False)
 class Cell:
-    """Detections of a cell of the sky and of its margin."""
+    """Detections in a cell of the sky and in its margin."""
 
     rows: Int  # (n,) ascending
     places: Float  # (n, 2)
     exposure: Int  # (n,)
-    inside: Bool  # (n,) without the margin
+    inside: Bool  # (n,) True for detections in the cell itself
     length: float  # linking length
 
 
 @dataclass(frozen=True, eq=False)
 class Grouped:
-    """Groups whose first detection lies in a cell."""
+    """Groups with their first detection in a cell."""
 
-    rows: Int  # (m,) detections of stars
-    first: Int  # (m,) first row of the star of each
+    rows: Int  # (m,) rows of detections that belong to stars
+    first: Int  # (m,) first row of the star of each detection
     n_doubled: int
     n_dropped: int
-    chained: Int  # (k,) rows of chains that reach into the cell, with those in its margin
-    chain: Int  # (k,) number, in the cell, of the chain of each
+    chained: Int  # (k,) rows of chains that reach into the cell, including those in its margin
+    chain: Int  # (k,) number of the chain, counted within the cell
 
 
 def friends_of_friends(places: Float, exposure: Int, length: float, *, each: Each = map) -> Friends:
-    """Groups of detections (N, 2) that are connected by steps no longer than a linking length.
+    """Groups of detections (N, 2) that are connected by steps of at most one linking length.
 
-    Distances are exact to a sixteenth of the length: positions are rounded to squares of a grid, so
-    that the many detections of one star are a few points.  Codes rise with the first detection of
-    the star.  `each` is where the cells are grouped: one after another in this process by default.
+    Distances are exact to a sixteenth of the linking length: positions are rounded to a grid, which
+    reduces the many detections of a star to a few points. Star codes are in the order of the first
+    detections. `each` applies a function to the cells, by default one after another in this
+    process.
     """
     first = np.full(len(places), NO_STAR)
     n_doubled, n_dropped, chains = 0, 0, list[tuple[Int, Int]]()
-    for found in each(grouped, cells(places, exposure, length, CELL)):
-        first[found.rows] = found.first
-        n_doubled, n_dropped = n_doubled + found.n_doubled, n_dropped + found.n_dropped
-        chains.append((found.chained, found.chain))
+    for cell_groups in each(grouped, cells(places, exposure, length, CELL)):
+        first[cell_groups.rows] = cell_groups.first
+        n_doubled, n_dropped = n_doubled + cell_groups.n_doubled, n_dropped + cell_groups.n_dropped
+        chains.append((cell_groups.chained, cell_groups.chain))
     good = np.flatnonzero(first != NO_STAR)
     code = np.cumsum(first == np.arange(len(first))) - 1
     star = np.full(len(first), NO_STAR)
@@ -89,19 +91,19 @@ def friends_of_friends(places: Float, exposure: Int, length: float, *, each: Eac
 
 
 def cells(places: Float, exposure: Int, length: float, detections: int) -> Iterator[Cell]:
-    """Cells of the sky with about so many detections, and with any."""
+    """Sky cells with roughly `detections` detections each; empty cells are omitted."""
     square = _squares(places, length)
     extent = square.max(axis=1) + 1.0
     side = int(np.sqrt(detections / len(places) * extent[0] * extent[1])) + 1
     side, margin = max(side, MIN_SIDE * FINE), MARGIN * FINE
-    n_lines = int(square[1].max()) // side + 3  # none in the first and the last
+    n_lines = int(square[1].max()) // side + 3  # the first and the last line are empty
     cell = (square[0] // side + np.int64(1)) * n_lines + square[1] // side + 1
     order = np.argsort(cell, kind="stable")
     cell, square = cell[order], square[:, order]
     for number in np.unique(cell):
         low = side * (np.array(divmod(int(number), n_lines)) - 1)
         high = low + side
-        # the cell and those about it: three in a column follow one another
+        # a cell and its eight neighbours; the three in a column have consecutive numbers
         middles = number + n_lines * np.array([-1, 0, 1])
         ends = np.searchsorted(cell, [middles - 1, middles + 2]).T
         at = np.concatenate(
@@ -116,7 +118,7 @@ def cells(places: Float, exposure: Int, length: float, detections: int) -> Itera
 
 
 def _squares(places: Float, length: float) -> Int:
-    """Squares (2, N) from the lowest, of a grid that is the same for all cells."""
+    """Grid squares (2, N), counted from the lowest one; the grid is common to all cells."""
     lowest, highest = (np.floor(end / (length / FINE)) for end in (places.min(0), places.max(0)))
     narrow = (highest - lowest).max() < np.iinfo(np.int32).max
     square = np.empty((2, len(places)), np.int32 if narrow else np.int64)
@@ -126,7 +128,7 @@ def _squares(places: Float, length: float) -> Int:
 
 
 def _within(square: Int, low: Int, high: Int) -> Bool:
-    """Boolean mask (n,) of squares (2, n) from low (2,) up to high (2,)."""
+    """Boolean mask (n,) of squares (2, n) from low (2,) up to, but not including, high (2,)."""
     (i, j), (a, b), (c, d) = square, low, high
     return np.asarray((i >= a) & (i < c) & (j >= b) & (j < d))
 
@@ -136,31 +138,34 @@ def grouped(cell: Cell) -> Grouped:
     places, rows = cell.places, cell.rows
     column, line = _squares(places, cell.length)
     key = column * (line.max() + np.int64(1)) + line
-    _, some, of_square = np.unique(key, return_index=True, return_inverse=True)
-    pairs = cKDTree(places[some]).query_pairs(cell.length, output_type="ndarray")
-    links = coo_array((np.ones(len(pairs), bool), tuple(pairs.T)), shape=(len(some),) * 2)
+    _, representatives, of_square = np.unique(key, return_index=True, return_inverse=True)
+    pairs = cKDTree(places[representatives]).query_pairs(cell.length, output_type="ndarray")
+    links = coo_array(
+        (np.ones(len(pairs), bool), tuple(pairs.T)), shape=(len(representatives),) * 2
+    )
     n, group_of_square = connected_components(links, directed=False)
-    group = group_of_square[of_square].astype(np.int64)  # codes of groups and exposures multiply
+    # int64, because codes of groups and exposures are multiplied
+    group = group_of_square[of_square].astype(np.int64)
     chain = _spans(places, group, n) > MAX_EXTENT * cell.length
     reaches = np.zeros(n, bool)
-    reaches[group[cell.inside]] = True  # the first detection of a chain may be far off
+    reaches[group[cell.inside]] = True  # the first detection of a chain may be outside of the cell
     chained = (chain & reaches)[group]
     heads = np.full(n, len(rows))
     np.minimum.at(heads, group, np.arange(len(rows)))
-    own = cell.inside[heads] & ~chain
-    second = _seconds(places / cell.length, cell.exposure, group, own)
-    kept = own[group]
-    kept[second] = False
-    stars, which = group[kept], rows[kept]
-    # the first that is left
+    belongs = cell.inside[heads] & ~chain
+    second = _seconds(places / cell.length, cell.exposure, group, belongs)
+    selected = belongs[group]
+    selected[second] = False
+    stars, star_rows = group[selected], rows[selected]
+    # first remaining detection of each group
     first = np.full(n, NO_STAR)
-    first[stars[::-1]] = which[::-1]
+    first[stars[::-1]] = star_rows[::-1]
     doubled = len(np.unique(group[second]))
-    return Grouped(which, first[stars], doubled, len(second), rows[chained], group[chained])
+    return Grouped(star_rows, first[stars], doubled, len(second), rows[chained], group[chained])
 
 
 def _spans(places: Float, group: Int, n: int) -> Float:
-    """Larger one of the sides (n,) of the rectangle that holds a group."""
+    """Longer side (n,) of the box around each group."""
     span = np.zeros(n)
     for axis in range(2):
         low, high = np.full(n, np.inf), np.full(n, -np.inf)
@@ -171,16 +176,17 @@ def _spans(places: Float, group: Int, n: int) -> Float:
 
 
 def _seconds(places: Float, exposure: Int, group: Int, own: Bool) -> Int:
-    """Indices of detections of groups (n,) that are not their exposure's nearest to the mean.
+    """Indices of detections that are not the nearest to the group's mean in their exposure.
 
-    `places` are in linking lengths.  The mean of two detections is as far from one as from the
-    other: rounding does not choose, and the first is taken.
+    Only groups with `own` (n,) True are considered. `places` are in linking lengths. The mean of
+    two detections has the same distance from both; distances are rounded so that the first one is
+    kept.
     """
     key = group * (int(exposure.max()) + 1) + exposure
     order = np.argsort(key, kind="stable")
-    same = key[order][1:] == key[order][:-1]
+    is_repeat = key[order][1:] == key[order][:-1]
     several = np.zeros(len(key), bool)
-    several[order[1:][same]] = several[order[:-1][same]] = True
+    several[order[1:][is_repeat]] = several[order[:-1][is_repeat]] = True
     several &= own[group]
     at = np.flatnonzero(several)
     counts = np.bincount(group)
@@ -191,7 +197,7 @@ def _seconds(places: Float, exposure: Int, group: Int, own: Bool) -> Int:
 
 
 def _joined(chains: list[tuple[Int, Int]]) -> int:
-    """Number of chains, of which cells see parts that have rows in common."""
+    """Number of chains, after joining the parts that different cells see and that share rows."""
     rows = np.unique(np.concatenate([rows for rows, _ in chains]), return_inverse=True)[1]
     sizes = [int(chain.max(initial=-1)) + 1 for _, chain in chains]
     begins = np.cumsum([0, *sizes[:-1]])

@@ -1,4 +1,4 @@
-"""Reports on the matching of exposures, and warnings on all of them."""
+"""Reports on the matching of exposures, and warnings on their comparison."""
 
 from __future__ import annotations
 
@@ -15,56 +15,64 @@ from bayesdist.data.matching.similarity import MIRRORED
 from bayesdist.errors import InputError
 from bayesdist.utils.arrays import Float
 
-_MAX_FRACTION_LEFT_OUT = 0.2  # of the exposures: beyond, the campaign itself is wrong
-_MAX_FAILURES_AT_FIRST = 2  # exposures that fail before any has matched
-_MIN_EXPOSURES = 5  # exposures among which one can be called odd
-_ODD_SIGMAS = 5.0  # of the other exposures
-_MIN_COMPLETENESS_STEP = 0.15  # of completeness, at least
-_MIN_FALSE_STEP = 0.05  # of the matches, at least
-_MIN_SCALE_STEP = 2e-5  # at least: telescopes breathe less
-_MAX_NAMED = 5  # exposures in a sentence
+# largest fraction of exposures that may fail; with more, the campaign is misconfigured
+_MAX_FRACTION_LEFT_OUT = 0.2
+_MAX_FAILURES_AT_FIRST = 2  # largest number of exposures that may fail before any has matched
+_MIN_EXPOSURES = 5  # smallest number of exposures among which outliers are identified
+_ODD_SIGMAS = 5.0  # robust standard deviations of all exposures
+_MIN_COMPLETENESS_STEP = 0.15  # smallest deviation of the completeness that is reported
+_MIN_FALSE_STEP = 0.05  # smallest deviation of the false fraction that is reported
+# smallest deviation of the scale that is reported; the breathing of telescopes is below
+_MIN_SCALE_STEP = 2e-5
+_MAX_NAMED = 5  # largest number of exposures named in a sentence
 
 
 @dataclass(frozen=True)
 class ExposureReport:
-    """Report of the matching of an exposure.
+    """Report on the matching of an exposure.
 
     Parameters
     ----------
     exposure, filter : str
+        Name of the exposure and its filter.
     epoch : float
+        Decimal year.
     detected : int
-        Detections in the list.
+        Number of detections in the list.
     rejected : dict of str to int
-        Those that the cuts left out, by reason.
+        Number of detections that failed the cuts, by reason.
     matched : int
+        Number of matches.
     per_chip : dict of int to int
-        Matched on each chip of the campaign.
+        Number of matches on each chip of the campaign.
     missing_chips : tuple of int
         Chips of the campaign without a detection that passed the cuts.
     astray : tuple of int
-        Chips whose detections hardly match, where those of another chip do.
+        Chips with few matched detections although another chip has many.
     expected : int
-        Catalogue stars in the footprint of the detections and within their range of magnitudes.
+        Number of catalogue stars in the footprint of the detections and within their magnitude
+        range.
     completeness : float
-        Part of `expected` that is matched.
+        Fraction of `expected` that is matched.
     false_rate : float
         Probability that a detection without counterpart in the catalogue is matched by chance.
     false_fraction : float
-        Part of the matches that are expected to be false for that reason.
+        Expected fraction of such chance matches among all matches.
     rotation : float
-        From the start's positions to the catalogue, degrees anticlockwise, in [0, 360).
+        Rotation from the positions after the known distortion to the catalogue, degrees
+        anticlockwise, in [0, 360).
     scale : float
+        Scale of that transformation.
     offset : tuple of float
-        Position of the middle of the detections, in the catalogue's unit.
+        Catalogue position of the middle of the detections, in the catalogue's unit.
     radius : tuple of float
         Smallest and largest search radius over the detector.
     rms : float
-        Of the distances of the pairs, after the linear transformation and a cubic for each chip.
+        Rms distance of the pairs after the linear transformation and a cubic per chip.
     zero_point : float or None
-        Median of the catalogue's magnitudes less those of the list.
+        Median difference between the magnitudes of the catalogue and of the list.
     coincidences : int
-        Stars that agreed on rotation and shift.
+        Number of stars that agreed on rotation and shift.
     """
 
     exposure: str
@@ -92,25 +100,25 @@ class ExposureReport:
 def check_campaign(
     lists: Sequence[Detections], log: ExposureLog, catalog: ReferenceCatalog
 ) -> None:
-    """Refuse lists, log and catalogue that do not fit together; nothing is matched.
+    """Raise InputError if lists, log and catalogue do not fit together.
 
-    InputError for no lists, an exposure that is not in the log or stands in two lists, errors of 0,
-    and proper motions without an epoch.
+    InputError if there are no lists, if an exposure is not in the log or occurs in two lists, if
+    errors are 0, or if there are proper motions without an epoch.
     """
     if not lists:
         raise InputError("there are no star lists to match", do="give at least one")
-    names = [one.name for one in lists]
-    for k, one in enumerate(lists):
-        if one.name not in log:
+    names = [stars.name for stars in lists]
+    for k, stars in enumerate(lists):
+        if stars.name not in log:
             raise InputError(
-                f"exposure {one.name} is not in {log.source}",
-                where=one.source,
+                f"exposure {stars.name} is not in {log.source}",
+                where=stars.source,
                 do="add it to the log, or leave the list out",
             )
-        if one.name in names[:k]:
+        if stars.name in names[:k]:
             raise InputError(
-                f"exposure {one.name} has a list in {lists[names.index(one.name)].source}, too",
-                where=one.source,
+                f"exposure {stars.name} has a list in {lists[names.index(stars.name)].source}, too",
+                where=stars.source,
                 do="give one list for each exposure",
             )
     for name in ("sigma_u", "sigma_v"):
@@ -127,7 +135,7 @@ def check_campaign(
 
 
 def all_cut(stars: Detections, rejected: Mapping[str, int]) -> InputError:
-    """Error of a list of which the cuts leave nothing, with the counts of each cut."""
+    """Error for a list without detections after the cuts, with the count of each cut."""
     counts = ", ".join(f"{count} {reason}" for reason, count in rejected.items())
     return InputError(
         f"the cuts leave none of {len(stars)} detections ({counts})",
@@ -137,17 +145,17 @@ def all_cut(stars: Detections, rejected: Mapping[str, int]) -> InputError:
 
 
 def too_many(failed: int, matched: int, n: int) -> bool:
-    """True where so many exposures failed that the campaign itself is wrong."""
+    """True if the number of failures shows that the campaign is misconfigured."""
     return failed > _MAX_FRACTION_LEFT_OUT * n or (not matched and failed >= _MAX_FAILURES_AT_FIRST)
 
 
 def failure(
     failed: Mapping[str, InputError], reason: str, n: int, tried: Sequence[bool] = (False,)
 ) -> InputError:
-    """First failure as an error, with what is known of the others.
+    """First failure as an error, with a summary of the others.
 
-    `failed` is by exposure, `reason` that of `mismatch_reason`; `tried` has True for each parity in
-    which the catalogue was taken mirrored.
+    `failed` holds the errors by exposure and `reason` is that of `mismatch_reason`. `tried` has an
+    entry for each parity that was tried, True for a mirrored catalogue.
     """
     first = next(iter(failed.values()))
     cause, do = first.cause, first.do
@@ -162,8 +170,8 @@ def failure(
 
 
 def refuse_astray(reports: Sequence[ExposureReport], catalog: ReferenceCatalog) -> None:
-    """Refuse a known distortion, or chip numbers, that put a chip elsewhere."""
-    astray = [one for one in reports if one.astray]
+    """Raise InputError if distortion or chip numbers misplace a chip in most exposures."""
+    astray = [report for report in reports if report.astray]
     if 2 * len(astray) <= len(reports):
         return
     first = astray[0]
@@ -182,10 +190,10 @@ def match_warnings(
 ) -> list[str]:
     """Clauses on exposures that were left out, that lack a chip, or that are outliers.
 
-    An exposure is an outlier when its completeness is far below that of the others, when far more
-    of its matches are expected to be false, or when its scale, free of aberration (where the log
-    has VAFACTOR), differs: by five robust standard deviations of all exposures, and no less than
-    0.15, 0.05 and 2e-5.
+    An exposure is an outlier if its completeness is far below that of the others, if far more of
+    its matches are expected to be false, or if its scale differs. The scale is corrected for
+    velocity aberration if the log has VAFACTOR. The thresholds are five robust standard deviations
+    of all exposures, and at least 0.15, 0.05 and 2e-5.
     """
     out = []
     if left_out:
@@ -193,50 +201,50 @@ def match_warnings(
         texts = [f"{name} ({cause})" for name, cause in left_out.items()]
         verb = "were" if len(texts) > 1 else "was"
         out.append(f"{len(texts)} of {n} exposures {verb} left out: {_listed(texts)}")
-    for chip in sorted({chip for one in reports for chip in one.missing_chips}):
-        names = [one.exposure for one in reports if chip in one.missing_chips]
+    for chip in sorted({chip for report in reports for chip in report.missing_chips}):
+        names = [report.exposure for report in reports if chip in report.missing_chips]
         out.append(f"no detection on chip {chip} passes the cuts in exposure {_listed(names)}")
-    for chip in sorted({chip for one in reports for chip in one.astray}):
-        names = [one.exposure for one in reports if chip in one.astray]
+    for chip in sorted({chip for report in reports for chip in report.astray}):
+        names = [report.exposure for report in reports if chip in report.astray]
         out.append(f"the detections of chip {chip} hardly match in exposure {_listed(names)}")
     if len(reports) < _MIN_EXPOSURES:
         return out
-    completeness = np.array([one.completeness for one in reports])
-    false = np.array([one.false_fraction for one in reports])
-    factor = log.select(names=[one.exposure for one in reports])
-    whole = np.array([not one.missing_chips and not one.astray for one in reports])
+    completeness = np.array([report.completeness for report in reports])
+    false = np.array([report.false_fraction for report in reports])
+    factor = log.select(names=[report.exposure for report in reports])
+    has_all_chips = np.array([not report.missing_chips and not report.astray for report in reports])
     scale = np.array(
-        [one.scale / (factor[one.exposure].vafactor or np.nan) if full else np.nan
-         for one, full in zip(reports, whole, strict=True)]
+        [report.scale / (factor[report.exposure].vafactor or np.nan) if full else np.nan
+         for report, full in zip(reports, has_all_chips, strict=True)]
     )  # fmt: skip
-    for what, values, odd, form in (
+    for quantity, values, odd, form in (
         ("completeness", completeness, _away(-completeness, _MIN_COMPLETENESS_STEP) > 0, ".2f"),
         ("fraction of false matches", false, _away(false, _MIN_FALSE_STEP) > 0, ".2f"),
         ("scale", scale - _median(scale), np.abs(_away(scale, _MIN_SCALE_STEP)) > 0, "+.1e"),
     ):
         named = [
-            f"{one.exposure} ({value:{form}})"
-            for one, value, is_odd in zip(reports, values, odd, strict=True)
+            f"{report.exposure} ({value:{form}})"
+            for report, value, is_odd in zip(reports, values, odd, strict=True)
             if is_odd
         ]
         if named:
-            usual = "of the others" if what == "scale" else f"of {_median(values):.2f}"
-            out.append(f"the {what} is unlike that {usual} in exposure {_listed(named)}")
+            usual = "of the others" if quantity == "scale" else f"of {_median(values):.2f}"
+            out.append(f"the {quantity} is unlike that {usual} in exposure {_listed(named)}")
     return out
 
 
 def _median(values: Float) -> float:
-    known = values[np.isfinite(values)]
-    return float(np.median(known)) if len(known) else 0.0
+    finite = values[np.isfinite(values)]
+    return float(np.median(finite)) if len(finite) else 0.0
 
 
 def _away(values: Float, least: float) -> Float:
-    """Distances from the median where they are large in both ways; else 0."""
+    """Deviations from the median where they exceed both thresholds; zero elsewhere."""
     d = np.nan_to_num(values - _median(values))
     limit = max(_ODD_SIGMAS * MAD_TO_SIGMA * _median(np.abs(values - _median(values))), least)
     return np.where(np.abs(d) > limit, d, 0.0)
 
 
 def _listed(texts: Sequence[str]) -> str:
-    more = f" and {len(texts) - _MAX_NAMED} more" if len(texts) > _MAX_NAMED else ""
-    return ", ".join(texts[:_MAX_NAMED]) + more
+    remainder = f" and {len(texts) - _MAX_NAMED} more" if len(texts) > _MAX_NAMED else ""
+    return ", ".join(texts[:_MAX_NAMED]) + remainder

@@ -1,8 +1,9 @@
-"""Matches of a table of detections with a catalogue on the sky, by way of a rough WCS.
+"""Match a table of detections with a catalogue on the sky, using a rough WCS.
 
 The rough positions of the detections are brought onto the catalogue by a shift, rotation and scale
-(found by the patterns of the stars where the WCS is too far off) and, with enough pairs, a cubic.
-Pairs are mutual nearest neighbours within the match radius after that.
+and, with enough pairs, a cubic. If the WCS is too inaccurate, the shift, rotation and scale are
+found from the patterns of the stars. Pairs are then mutual nearest neighbours within the match
+radius.
 """
 
 from __future__ import annotations
@@ -60,8 +61,8 @@ _FROM_DETECTIONS = (
     *("exposure", "chip", "filter", "epoch", "mag", "flux", "colour", "sigma_u", "sigma_v"),
 )
 _FROM_CATALOGUE = ("ra", "dec", *SKY_QUANTITIES, "mag", "flux", "colour", "star")
-_MARGIN = 0.5  # field radii around the detections in which catalogue stars are looked for
-_DISPLACEMENT = 10.0  # radii by which detections are displaced to count chance pairs
+_MARGIN = 0.5  # field radii around the detections in which catalogue stars are used
+_DISPLACEMENT = 10.0  # match radii by which detections are displaced to count chance pairs
 
 
 def match(
@@ -82,44 +83,45 @@ def match(
 ) -> Matches:
     """Match detections with a catalogue on the sky.
 
-    The rough positions of the detections come from a WCS or from their own columns of ra and dec.
-    They may be off by a shift, a rotation and a few per cent of the scale, which are fitted first;
-    with at least 200 pairs a cubic is fitted as well, so that a distortion which the rough WCS does
-    not include does not lose stars in the corners.  Each chip of each exposure is matched by
-    itself.
+    The rough positions of the detections come from a WCS or from columns of ra and dec. They may be
+    off by a shift, a rotation and a few per cent of the scale, which are fitted first. With at
+    least 200 pairs a cubic is fitted as well, so that a distortion that the rough WCS does not
+    include does not lose stars in the corners. Each chip of each exposure is matched separately.
 
     Parameters
     ----------
     detections : table or path
-        With detector positions in pixels: whatever `Matches.from_table` takes, or a file.
+        Detections with detector positions in pixels: any table that `Matches.from_table` accepts,
+        or a file.
     catalogue : table, SkyCoord, ReferenceCatalog or path
-        Reference positions on the sky.  With proper motions they are moved to the epoch of the
-        detections.
+        Reference positions on the sky. If they have proper motions they are moved to the epoch of
+        the detections.
     radius : Quantity or float
-        Match radius, largest distance of a pair; a plain number is in arcsec.
+        Match radius: largest distance of a pair; a plain number is in arcsec.
     wcs : WCS, or mapping of WCS, optional
-        Any WCS of the common Python interface (APE 14): `astropy.wcs.WCS`, a gwcs, that of a run.
-        A mapping gives one for each exposure or each chip number.  By default `detections` has
-        columns of ra and dec.
+        Any WCS with the common Python interface (APE 14): `astropy.wcs.WCS`, a gwcs, or that of a
+        run. A mapping gives one for each exposure or each chip number. By default `detections` must
+        have columns of ra and dec.
     columns, catalogue_columns : mapping of str to str, optional
         Column of each quantity in the two tables, as for `ReadOptions`.
     sigma, epoch, catalogue_epoch, pixel_origin, tangent_point, chips, not_finite
-        As for `ReadOptions`.  The tangent point is the mean direction of the detections by default.
+        As for `ReadOptions`. The default tangent point is the mean direction of the detections.
 
     Returns
     -------
     Matches
-        Magnitudes, fluxes and errors of the match come from the detections if they have them, and
-        otherwise from the catalogue.  `star` is the column of that name of the catalogue, or else
-        its row from 0.  `u_nominal` and `v_nominal` are the positions by the refined WCS, and
-        `match_radius` is the radius in arcsec.  `notes` say how many were matched and how the WCS
-        was refined; `rejected` counts the others.
+        Magnitudes, fluxes and errors come from the detections if they have them, and otherwise from
+        the catalogue. `star` is the column of that name in the catalogue, or else its row counted
+        from 0. `u_nominal` and `v_nominal` are the positions by the refined WCS, and `match_radius`
+        is the radius in arcsec. `notes` state how many detections were matched and how the WCS was
+        refined; `rejected` counts the others.
 
     Raises
     ------
     InputError
-        For a radius that is not positive, an empty table, proper motions without an epoch, and
-        detections that do not match the catalogue, with the separation of the two fields.
+        If the radius is not positive, if a table is empty, if there are proper motions without an
+        epoch, or if the detections do not match the catalogue; the message then gives the
+        separation of the two fields.
 
     Examples
     --------
@@ -142,12 +144,12 @@ def match(
         None, None, sigma, pixel_origin, tangent_point, epoch, catalogue_epoch, chips, not_finite
     )
     stars = _reference(catalogue, catalogue_columns, options)
-    seen = _detections(detections, columns, wcs, options)
-    point = options.tangent_point or mean_direction(seen.ra, seen.dec)
-    found = _Found(seen, stars)
-    for group in seen.groups():
-        found.add(group, point, reach)
-    return found.matches(point, reach, options)
+    rough_detections = _detections(detections, columns, wcs, options)
+    point = options.tangent_point or mean_direction(rough_detections.ra, rough_detections.dec)
+    collected = _Found(rough_detections, stars)
+    for group in rough_detections.groups():
+        collected.add(group, point, reach)
+    return collected.matches(point, reach, options)
 
 
 # -- the two tables -------------------------------------------------------------------------------
@@ -155,17 +157,17 @@ def match(
 
 @dataclass(frozen=True, eq=False)
 class _Stars:
-    """Catalogue stars that have a position, and a motion if the catalogue has motions."""
+    """Catalogue stars with a position, and with a motion if the catalogue has motions."""
 
     columns: Quantities
-    rows: Int  # (M,), in the catalogue
+    rows: Int  # (M,), rows in the catalogue
     moving: bool
-    epoch: float | None  # of the positions, if it is no column
-    mag: Float | None  # (M,), infinite where it is not known
+    epoch: float | None  # epoch of the positions, if it is not a column
+    mag: Float | None  # (M,), infinite if unknown
     notes: tuple[str, ...]
 
     def at(self, epoch: float | None) -> tuple[Float, Float]:
-        """Right ascension and declination (M,) at an epoch, degrees."""
+        """Right ascension and declination (M,) in degrees at an epoch."""
         if not self.moving:
             return sky_columns(self.columns)
         if epoch is None:
@@ -182,7 +184,7 @@ class _Stars:
 
 @dataclass(frozen=True, eq=False)
 class _Group:
-    """Detections of one chip of one exposure."""
+    """Detections on one chip of one exposure."""
 
     rows: Int
     name: str
@@ -194,21 +196,22 @@ class _Seen:
     """Detections with a rough position on the sky."""
 
     columns: Quantities
-    rows: Int  # (N,), in the table
+    rows: Int  # (N,), rows in the table
     n_rows: int
     rejected: dict[str, int]
-    ra: Float  # (N,), degrees, by the rough WCS
+    ra: Float  # (N,), degrees, from the rough WCS
     dec: Float
     mag: Float | None
     epoch: Float | None  # (N,), decimal years
     exposure: Int  # (N,), codes
     chip: Int
-    names: tuple[tuple[str, ...], tuple[str, ...]]  # of exposures and chips; empty without columns
+    # names of exposures and chips; empty without such columns
+    names: tuple[tuple[str, ...], tuple[str, ...]]
     origin: int
     notes: tuple[str, ...]
 
     def groups(self) -> Iterator[_Group]:
-        """Detections of each chip of each exposure."""
+        """Groups of detections, one for each chip of each exposure."""
         for exposure in np.unique(self.exposure):
             for chip in np.unique(self.chip[self.exposure == exposure]):
                 rows = np.flatnonzero((self.exposure == exposure) & (self.chip == chip))
@@ -224,7 +227,7 @@ class _Seen:
 
 
 def _table_of(data: Any, source: str) -> Table:
-    """Table with at least one row of an object or a file."""
+    """Table with at least one row, from an object or a file."""
     if isinstance(data, str | os.PathLike):
         data = read_table(Path(data))
     if isinstance(data, Matches):
@@ -246,7 +249,7 @@ def _catalogue_table(catalogue: Any) -> Table:
 
 
 def _sky_table_of(catalogue: ReferenceCatalog) -> QTable:
-    """Table on the sky of a catalogue on a tangent plane."""
+    """Table with sky coordinates of a catalogue on a tangent plane."""
     from astropy import units as apu
 
     if catalogue.tangent_point is None or catalogue.unit == "pix":
@@ -273,24 +276,24 @@ def _sky_table_of(catalogue: ReferenceCatalog) -> QTable:
 
 
 def _reference(catalogue: Any, columns: Mapping[str, str] | None, options: ReadOptions) -> _Stars:
-    """Catalogue stars with the quantities that are read."""
+    """Catalogue stars with the quantities that are used."""
     table = _catalogue_table(catalogue)
-    found = find_columns(
+    column_names = find_columns(
         table.colnames, columns, ALIASES, source=CATALOGUE, pairs=PAIRS, needed=("ra", "dec")
     )
-    if "epoch" in found:
-        found.setdefault("catalogue_epoch", found["epoch"])
-    found = {key: name for key, name in found.items() if key in _FROM_CATALOGUE}
-    epoch = options.catalogue_epoch if "catalogue_epoch" not in found else None
-    moving = "pm_ra" in found
-    if moving and "catalogue_epoch" not in found and epoch is None:
+    if "epoch" in column_names:
+        column_names.setdefault("catalogue_epoch", column_names["epoch"])
+    column_names = {key: name for key, name in column_names.items() if key in _FROM_CATALOGUE}
+    epoch = options.catalogue_epoch if "catalogue_epoch" not in column_names else None
+    moving = "pm_ra" in column_names
+    if moving and "catalogue_epoch" not in column_names and epoch is None:
         raise InputError(
             "has proper motions, and the epoch of its positions is not given",
             where=CATALOGUE,
             do="give catalogue_epoch, or leave the motions out: "
             'catalogue_columns={"pm_ra": "", "pm_dec": ""}',
         )
-    read = {key: name for key, name in found.items() if key in ("ra", "dec", *MOTIONS)}
+    read = {key: name for key, name in column_names.items() if key in ("ra", "dec", *MOTIONS)}
     stay, counts = without_missing(
         table,
         read,
@@ -301,9 +304,9 @@ def _reference(catalogue: Any, columns: Mapping[str, str] | None, options: ReadO
     )
     rows = np.flatnonzero(stay)
     notes = tuple(f"{n} catalogue stars are left out: {reason}" for reason, n in counts.items())
-    quantities = Quantities(table[rows], found, CATALOGUE, names=table.colnames)
+    quantities = Quantities(table[rows], column_names, CATALOGUE, names=table.colnames)
     mag = None
-    if "mag" in found:
+    if "mag" in column_names:
         mag = np.nan_to_num(quantities["mag"].known_numbers(), nan=np.inf)
     return _Stars(quantities, rows, moving, epoch, mag, notes)
 
@@ -311,24 +314,26 @@ def _reference(catalogue: Any, columns: Mapping[str, str] | None, options: ReadO
 def _detections(
     detections: Any, columns: Mapping[str, str] | None, wcs: Any, options: ReadOptions
 ) -> _Seen:
-    """Detections with rough positions by the WCS, or by columns of ra and dec."""
+    """Detections with rough positions from the WCS, or from columns of ra and dec."""
     table = _table_of(detections, DETECTIONS)
     if isinstance(detections, Matches) and detections.tangent_point is not None:
         _add_sky(table, detections)
-    found = find_columns(
+    column_names = find_columns(
         table.colnames, columns, ALIASES, source=DETECTIONS, pairs=PAIRS, needed=("x", "y")
     )
-    if wcs is None and not {"ra", "dec"} <= found.keys():
+    if wcs is None and not {"ra", "dec"} <= column_names.keys():
         raise InputError(
             "has no columns of ra and dec, and no WCS is given",
             where=DETECTIONS,
             do="give wcs, for example astropy.wcs.WCS(header)",
         )
     rough = () if wcs is not None else ("ra", "dec")
-    found = {k: name for k, name in found.items() if k in ("x", "y", *rough, *_FROM_DETECTIONS)}
+    column_names = {
+        k: name for k, name in column_names.items() if k in ("x", "y", *rough, *_FROM_DETECTIONS)
+    }
     stay, rejected = without_missing(
         table,
-        found,
+        column_names,
         source=DETECTIONS,
         reject=options.not_finite == "reject",
         spared=frozenset(("colour", "flux")),
@@ -338,11 +343,13 @@ def _detections(
     origin = options.pixel_origin
     notes: tuple[str, ...] = ()
     if origin is None:
-        origin, why = origin_of(found["x"], table.colnames, table.meta)
+        origin, why = origin_of(column_names["x"], table.colnames, table.meta)
         notes = (f"the first pixel is taken as {origin}: {why}",) if why else ()
-    quantities = Quantities(table[rows], found, DETECTIONS, names=table.colnames)
+    quantities = Quantities(table[rows], column_names, DETECTIONS, names=table.colnames)
     codes = {
-        key: quantities[key].labels() if key in found else (np.zeros(len(rows), np.int64), ())
+        key: quantities[key].labels()
+        if key in column_names
+        else (np.zeros(len(rows), np.int64), ())
         for key in ("exposure", "chip")
     }
     if wcs is None:
@@ -359,11 +366,11 @@ def _detections(
         )
     if not inside.all():
         rejected = rejected | {OUTSIDE: int((~inside).sum())}
-        quantities = Quantities(table[rows[inside]], found, DETECTIONS, names=table.colnames)
+        quantities = Quantities(table[rows[inside]], column_names, DETECTIONS, names=table.colnames)
     mag = None
-    if "mag" in found:
+    if "mag" in column_names:
         mag = quantities["mag"].numbers()
-    elif "flux" in found:
+    elif "flux" in column_names:
         mag = quantities["flux"].magnitudes_of_fluxes()
     return _Seen(
         columns=quantities,
@@ -385,7 +392,7 @@ def _detections(
 def _epochs(
     quantities: Quantities, header: Mapping[str, Any], options: ReadOptions
 ) -> Float | None:
-    """Epochs (N,) of the detections: of the option, of their column, or of the header."""
+    """Epochs (N,) of the detections: from the option, the column, or the header."""
     if options.epoch is not None and "epoch" in quantities:
         raise InputError(
             "an epoch of the exposures is given, and the table has a column of it",
@@ -416,8 +423,8 @@ def _add_sky(table: Table, matches: Matches) -> None:
 def _by_wcs(
     wcs: Any, x: Float, y: Float, codes: Mapping[str, tuple[Int, tuple[str, ...]]]
 ) -> tuple[Float, Float]:
-    """Rough positions (N,) in degrees of 0-based pixels (N,)."""
-    if not isinstance(wcs, Mapping) or hasattr(wcs, "cards"):  # a FITS header is a mapping, too
+    """Rough positions (N,) in degrees at 0-based pixels (N,)."""
+    if not isinstance(wcs, Mapping) or hasattr(wcs, "cards"):  # a FITS header is a mapping as well
         if len(codes["chip"][1]) > 1:
             raise InputError(
                 f"has {len(codes['chip'][1])} chips, and one WCS is given",
@@ -448,9 +455,9 @@ def _by_wcs(
 
 
 def sky_of_pixels(wcs: Any, x: Float, y: Float) -> tuple[Float, Float]:
-    """Right ascension and declination (ICRS, degrees) of 0-based pixels by any APE 14 WCS.
+    """Right ascension and declination (ICRS, degrees) at 0-based pixels, by any APE 14 WCS.
 
-    NaN where the WCS gives no position.  InputError for other objects, and for a WCS that does not
+    NaN where the WCS gives no position. InputError for other objects, and for a WCS that does not
     map two pixel axes to the sky.
     """
     low = getattr(wcs, "low_level_wcs", wcs)
@@ -472,14 +479,14 @@ def sky_of_pixels(wcs: Any, x: Float, y: Float) -> tuple[Float, Float]:
     high = wcs if hasattr(wcs, "pixel_to_world") else HighLevelWCSWrapper(low)
     try:
         world = high.pixel_to_world(x, y)
-    except Exception as error:  # each kind of WCS has exceptions of its own
+    except Exception as error:  # every WCS class raises different exceptions
         raise InputError(
             f"gives no positions of the detections ({error})",
             where="wcs",
             do="check that it is the WCS of this image",
         ) from error
     world = world if isinstance(world, list | tuple) else [world]
-    sky = next((one for one in world if isinstance(one, SkyCoord)), None)
+    sky = next((coordinate for coordinate in world if isinstance(coordinate, SkyCoord)), None)
     if sky is None:
         raise InputError(
             "has no celestial axes", where="wcs", do="give a WCS that maps pixels to the sky"
@@ -492,7 +499,7 @@ def sky_of_pixels(wcs: Any, x: Float, y: Float) -> tuple[Float, Float]:
 
 
 class _Found:
-    """Pairs of all groups of detections, collected one after another."""
+    """Pairs of all groups of detections, collected group by group."""
 
     def __init__(self, seen: _Seen, stars: _Stars) -> None:
         self.seen, self.stars = seen, stars
@@ -503,18 +510,22 @@ class _Found:
 
     def add(self, group: _Group, point: tuple[float, float], radius: float) -> None:
         """Find the pairs of one group."""
-        seen = self.seen
+        rough_detections = self.seen
         ra, dec = self.stars.at(group.epoch)
-        nearby, place = _nearby(seen.ra[group.rows], seen.dec[group.rows], ra, dec)
+        nearby, place = _nearby(
+            rough_detections.ra[group.rows], rough_detections.dec[group.rows], ra, dec
+        )
         if len(nearby) < MIN_PAIRS:
             raise InputError(
                 f"{len(nearby)} catalogue stars lie in the field of the detections: {place}",
                 where=group.name,
                 do="give the WCS of this image, or a catalogue of its field",
             )
-        points = np.column_stack(tangent_plane(seen.ra[group.rows], seen.dec[group.rows], point))
+        points = np.column_stack(
+            tangent_plane(rough_detections.ra[group.rows], rough_detections.dec[group.rows], point)
+        )
         reference = np.column_stack(tangent_plane(ra[nearby], dec[nearby], point))
-        mag = None if seen.mag is None else seen.mag[group.rows]
+        mag = None if rough_detections.mag is None else rough_detections.mag[group.rows]
         mags = None if mag is None or self.stars.mag is None else (mag, self.stars.mag[nearby])
         pairs = _aligned_pairs(points, reference, mags, radius, group.name, place)
         self.index.append(group.rows[pairs.index])
@@ -524,55 +535,66 @@ class _Found:
 
     def matches(self, point: tuple[float, float], radius: float, options: ReadOptions) -> Matches:
         """Matches of all pairs, in the order of the detections."""
-        seen, stars = self.seen, self.stars
+        rough_detections, stars = self.seen, self.stars
         index, partner = np.concatenate(self.index), np.concatenate(self.partner)
         nominal = np.concatenate(self.nominal)
         order = np.argsort(index, kind="stable")
         index, partner, nominal = index[order], partner[order], nominal[order]
         table = Table()
-        taken = {key: seen.columns for key in ("x", "y", *_FROM_DETECTIONS) if key in seen.columns}
+        sources = {
+            key: rough_detections.columns
+            for key in ("x", "y", *_FROM_DETECTIONS)
+            if key in rough_detections.columns
+        }
         for key in _FROM_CATALOGUE:
-            if key in stars.columns and not ({key} | _INSTEAD.get(key, set())) & taken.keys():
-                taken[key] = stars.columns
-        for key, columns in taken.items():
-            table[key] = _column(columns, key, index if columns is seen.columns else partner)
+            if key in stars.columns and not ({key} | _INSTEAD.get(key, set())) & sources.keys():
+                sources[key] = stars.columns
+        for key, columns in sources.items():
+            table[key] = _column(
+                columns, key, index if columns is rough_detections.columns else partner
+            )
         notes = list(self.notes)
-        if options.sigma == "columns" and "sigma_ra" in taken and "sigma_u" not in taken:
+        if options.sigma == "columns" and "sigma_ra" in sources and "sigma_u" not in sources:
             notes.append(CATALOGUE_ERRORS_ALONE)
         if "star" not in table.colnames:
             table["star"] = stars.rows[partner]
         table["u_nominal"], table["v_nominal"] = nominal.T
-        if seen.epoch is not None and "epoch" not in table.colnames:
-            table["epoch"] = seen.epoch[index]
-        every = dict.fromkeys(ALIASES, "")
+        if rough_detections.epoch is not None and "epoch" not in table.colnames:
+            table["epoch"] = rough_detections.epoch[index]
+        unused = dict.fromkeys(ALIASES, "")
         settings = ReadOptions(
-            columns=every | {name: name for name in table.colnames},
+            columns=unused | {name: name for name in table.colnames},
             sigma=options.sigma,
-            pixel_origin=seen.origin,
+            pixel_origin=rough_detections.origin,
             tangent_point=point,
             catalogue_epoch=stars.epoch,
             chips=options.chips,
             not_finite=options.not_finite,
         )
         arguments = match_arguments(table, settings, source=DETECTIONS)
-        lost = {UNMATCHED: len(seen.rows) - len(index)} if len(seen.rows) > len(index) else {}
+        lost = (
+            {UNMATCHED: len(rough_detections.rows) - len(index)}
+            if len(rough_detections.rows) > len(index)
+            else {}
+        )
         arguments |= {
-            "row": seen.rows[index][arguments["row"]],
-            "n_rows": seen.n_rows,
-            "rejected": {**seen.rejected, **lost, **arguments["rejected"]},
+            "row": rough_detections.rows[index][arguments["row"]],
+            "n_rows": rough_detections.n_rows,
+            "rejected": {**rough_detections.rejected, **lost, **arguments["rejected"]},
             "match_radius": radius,
-            "notes": (*seen.notes, *stars.notes, *notes, *arguments["notes"]),
+            "notes": (*rough_detections.notes, *stars.notes, *notes, *arguments["notes"]),
         }
         matches = Matches.of_distinct_rows(**arguments).as_read(options.sigma)
         u, v = (matches.column(name) for name in ("u_nominal", "v_nominal"))
         away = np.hypot(matches.u - u, matches.v - v)
-        # the dates of single detections and the rounding of the plane may move a star
+        # the dates of individual detections and rounding on the plane may move a star out of the
+        # circle
         return (
             matches if (away <= radius).all() else matches.select(away <= radius, reason=UNMATCHED)
         )
 
 
-# quantities of the catalogue that are not read beside others of the detections
+# quantities of the catalogue that are not used if the detections have these others
 _INSTEAD = {"mag": {"flux"}, "flux": {"mag"}}
 
 
@@ -587,21 +609,21 @@ def _column(columns: Quantities, key: str, rows: Int) -> Any:
 
 
 def _nearby(ra: Float, dec: Float, star_ra: Float, star_dec: Float) -> tuple[Int, str]:
-    """Catalogue stars in and around the field, and words on where the two fields are."""
+    """Indices of catalogue stars in and around the field, and text on both positions."""
     centre = mean_direction(ra, dec)
     size = float(separation(centre, ra, dec).max())
     away = separation(centre, star_ra, star_dec)
-    there = mean_direction(star_ra, star_dec)
-    apart = float(separation(centre, np.array([there[0]]), np.array([there[1]]))[0])
+    centroid = mean_direction(star_ra, star_dec)
+    apart = float(separation(centre, np.array([centroid[0]]), np.array([centroid[1]]))[0])
     place = (
         f"the detections lie around RA {centre[0]:.4f}, Dec {centre[1]:+.4f} by the rough WCS and "
-        f"the catalogue around RA {there[0]:.4f}, Dec {there[1]:+.4f}, {_angle(apart)} away"
+        f"the catalogue around RA {centroid[0]:.4f}, Dec {centroid[1]:+.4f}, {_angle(apart)} away"
     )
     return np.flatnonzero(away <= (1.0 + _MARGIN) * size), place
 
 
 def _angle(degrees: float) -> str:
-    """Angle in words."""
+    """Angle as text."""
     if degrees >= 1.0:
         return f"{degrees:.3g} degrees"
     return f"{60 * degrees:.3g} arcmin" if degrees >= 1 / 60 else f"{3600 * degrees:.3g} arcsec"
@@ -615,9 +637,9 @@ def _aligned_pairs(
     name: str,
     place: str,
 ) -> Pairs:
-    """Pairs after the rough positions (N, 2) were brought onto the reference positions (M, 2).
+    """Pairs after the rough positions (N, 2) are brought onto the reference positions (M, 2).
 
-    `mags` are the magnitudes of both, if both have some: the bright stars are then tried first.
+    If `mags`, the magnitudes of both, are given, bright stars are tried first.
     """
     failure = InputError(
         f"does not match the catalogue: {place}",
@@ -633,10 +655,10 @@ def _aligned_pairs(
         mag, star_mag = mags or (None, None)
         patterns = pattern_index(reference, star_mag)
         try:
-            found = find_similarity(points, patterns, mag=mag, source=name)
+            similarity = find_similarity(points, patterns, mag=mag, source=name)
         except InputError:
             raise failure from None
-        start = grown_map(brightest(points, mag), found, patterns, narrow=NARROW)
+        start = grown_map(brightest(points, mag), similarity, patterns, narrow=NARROW)
         reach = max(NARROW * patterns.spacing, radius)
     linear = iterated_map(points, reference, tree, start, reach, radius)
     if linear is None:
@@ -650,7 +672,7 @@ def _aligned_pairs(
 
 
 def _agrees(points: Float, reference: Float, tree: cKDTree, radius: float) -> bool:
-    """True if the rough positions alone give more pairs than chance does."""
+    """True if the rough positions alone give more pairs than chance."""
     index, _, distance = mutual_pairs(points, reference, radius, tree=tree)
     return _enough(len(index), points, reference) and beats_chance(
         points, reference, tree, distance
@@ -658,7 +680,7 @@ def _agrees(points: Float, reference: Float, tree: cKDTree, radius: float) -> bo
 
 
 def _enough(n: int, points: Float, reference: Float) -> bool:
-    """True if n pairs are enough to convince, of the reference stars where the points are."""
+    """True if n pairs are convincing, given the reference stars in the area of the points."""
     return are_enough(n, len(points), overlap(points, reference)[0])
 
 

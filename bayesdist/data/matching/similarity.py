@@ -1,9 +1,9 @@
-"""Similarity between two lists of stars, found without a start value by the shapes of triangles.
+"""Similarity between two lists of stars, found from the shapes of triangles without a start value.
 
-Triangles of bright neighbours are looked up in a k-d tree of those of the reference list.  Each two
-of equal shape vote for one rotation, scale and shift; true ones agree, chance spreads its votes
-over the whole space.  The winner is believed when it brings far more stars together than the stars
-find when they are displaced.
+Triangles of neighbouring bright stars are looked up in a k-d tree of the triangles of the reference
+list. Every two triangles of equal shape vote for a rotation, scale and shift. Votes of true pairs
+agree, while those of chance pairs are scattered over the parameter space. The best candidate is
+accepted if it brings far more stars together than a displaced list does.
 """
 
 from __future__ import annotations
@@ -22,24 +22,28 @@ from bayesdist.data.matching.triangles import Candidate, Level, candidates
 from bayesdist.errors import InputError
 from bayesdist.utils.arrays import Complex, Float
 
-_MIN_STARS_TRIED = 60  # stars of the shallowest try
-_STARS_OF_FIRST_LEVEL = 400  # each further one has three times as many
+_MIN_STARS_TRIED = 60  # smallest number of stars in a trial
+# reference stars in the first level; each further level has three times as many
+_STARS_OF_FIRST_LEVEL = 400
 _LEVEL_FACTOR = 3
-_TOLERANCES = (0.004, 0.012)  # of the logarithms of side ratios: remainder of a distortion
-_DEPTHS = (1.0, 0.5, 2.0)  # stars of the list, in units of the number by the mean density
-_WIDE = 0.3  # mean distances between reference stars: reach of the first pairs
-_BRIGHT_STARS = 2000  # stars of the first linear map
-_STARS_CHECKED = 1000  # stars that a candidate is checked with
-_CHANCE_SIGMAS = 8.0  # by which its coincidences must beat chance
-_MIN_AGREEING = 6  # stars that agree
+# tolerances of the logarithms of side ratios, which allow for residual distortion
+_TOLERANCES = (0.004, 0.012)
+# stars of the list, relative to the number expected from the mean density
+_DEPTHS = (1.0, 0.5, 2.0)
+_WIDE = 0.3  # mean spacings of reference stars; search radius of the first pairs
+_BRIGHT_STARS = 2000  # stars in the first linear map
+_STARS_CHECKED = 1000  # largest number of stars with which a candidate is checked
+_CHANCE_SIGMAS = 8.0  # standard deviations by which its coincidences must exceed those by chance
+_MIN_AGREEING = 6  # smallest number of stars that must agree
 
 # ratios of arcsec, mas, degrees and pixels of 0.05 arcsec
 _RATIOS = (20.0, 50.0, 1000.0, 3600.0, 72_000.0, 3.6e6)
-_RATIO_TOLERANCE = 1.1  # of such a ratio; pixels have other sizes, too
-_WIDE_SCALE = 1.4  # a scale that is only badly known
-_SCALE_TOLERANCE = 0.03  # that the matching allows
-_STARS_FOR_EACH_AGREEING = 5.0  # stars that have a neighbour, for each whose triangles agree
-_CLEAR_SIGMAS = 16.0  # standard deviations of chance: of many tries one may well reach half of it
+_RATIO_TOLERANCE = 1.1  # relative tolerance of such a ratio, because pixel sizes differ
+_WIDE_SCALE = 1.4  # relative tolerance for a scale that is poorly known
+_SCALE_TOLERANCE = 0.03  # relative tolerance of the scale that the matching allows
+# largest number of stars with a neighbour per star with agreeing triangles
+_STARS_FOR_EACH_AGREEING = 5.0
+_CLEAR_SIGMAS = 16.0  # standard deviations; half of this may occur by chance in many trials
 MIRRORED = "its mirror image"
 
 
@@ -52,16 +56,16 @@ class Similarity:
 
     rotation: float  # degrees anticlockwise, in [0, 360)
     scale: float
-    mirrored: bool  # True where the y axis is reversed first
+    mirrored: bool  # True if the y axis is reversed first
     origin: Float  # (2,), a point in the middle of the list
-    target: Float  # (2,), its position on the other list
-    coincidences: int  # stars whose triangles agree
+    target: Float  # (2,), position of the origin in the other list
+    coincidences: int  # stars with agreeing triangles
     found: int  # bright stars with a neighbour after the transformation
-    expected: float  # as many by chance
+    expected: float  # expected number of such stars by chance
 
     @property
     def map(self) -> LinearMap:
-        """Linear map that is equal to this."""
+        """Equivalent linear map."""
         a = np.radians(self.rotation)
         matrix = self.scale * np.array([[np.cos(a), -np.sin(a)], [np.sin(a), np.cos(a)]])
         if self.mirrored:
@@ -75,11 +79,11 @@ class Similarity:
 
 @dataclass(frozen=True, eq=False)
 class PatternIndex:
-    """Reference list (M, 2), ready to be searched any number of times; made by `pattern_index`."""
+    """Reference list (M, 2) prepared for repeated searches; made by `pattern_index`."""
 
     positions: Float
-    levels: tuple[Level, ...]  # the brightest stars in growing number, with triangles
-    area: float  # of the hull of all
+    levels: tuple[Level, ...]  # increasing numbers of the brightest stars, with their triangles
+    area: float  # area of the hull of all positions
 
     @cached_property
     def tree(self) -> cKDTree:
@@ -88,27 +92,29 @@ class PatternIndex:
 
     @cached_property
     def spacing(self) -> float:
-        """Mean distance between neighbours."""
+        """Mean spacing of neighbours."""
         return mean_spacing(self.positions)
 
 
 def pattern_index(positions: ArrayLike, mag: ArrayLike | None = None) -> PatternIndex:
-    """Reference list prepared for `find_similarity`.
+    """Prepare a reference list for `find_similarity`.
 
     Parameters
     ----------
     positions : array_like, shape (M, 2)
+        Positions of the reference stars.
     mag : array_like, shape (M,), optional
-        Magnitudes; without them all stars take part at once.
+        Magnitudes. Without them all stars are used at once.
 
     Returns
     -------
     PatternIndex
+        Prepared reference list.
 
     Raises
     ------
     InputError
-        For fewer than three stars, or positions that are not finite.
+        If there are fewer than three stars, or if positions are not finite.
     """
     points = np.ascontiguousarray(positions, np.float64)
     if len(points) < 3 or not np.isfinite(points).all():
@@ -140,32 +146,34 @@ def find_similarity(
     source: str = "detections",
     reference_name: str = "reference list",
 ) -> Similarity:
-    """Similarity that brings a list of stars onto a reference list.
+    """Find the similarity that maps a list of stars onto a reference list.
 
     Parameters
     ----------
     points : array_like, shape (N, 2)
-        Positions; the remainder of a distortion may displace them by several pixels, as long as it
-        changes local scales by less than about a per cent.
+        Positions. Residual distortion may displace them by several pixels, as long as it changes
+        local scales by less than about one per cent.
     reference : PatternIndex
+        Prepared reference list.
     mag : array_like, shape (N,), optional
-        Magnitudes, any zero point; with them the bright stars are tried first.
+        Magnitudes with any zero point. With them, bright stars are tried first.
     scale : tuple of float, optional
         Smallest and largest scale.
     mirrored : bool, optional
         True to search for the mirror image.
     source, reference_name : str, optional
-        For the error.
+        Names of the two lists, for the error message.
 
     Returns
     -------
     Similarity
+        First candidate that is convincing.
 
     Raises
     ------
     InputError
-        When no similarity brings together more stars than chance does, with the best number of
-        coincidences.
+        If no similarity brings together more stars than chance does; the message gives the best
+        number of coincidences.
     """
     xy = np.ascontiguousarray(points, np.float64)
     if len(xy) < 3 or not np.isfinite(xy).all():
@@ -189,13 +197,13 @@ def find_similarity(
     for tolerance, level, size in _tries(len(stars), mag is not None, reference, area):
         bright = stars[:size]
         for candidate in candidates(bright, level, tolerance, scale):
-            found, expected = _support(candidate, bright, reference)
-            best = max(best, (found, expected))
+            n_found, expected = _support(candidate, bright, reference)
+            best = max(best, (n_found, expected))
             if (
                 candidate.agreeing >= _MIN_AGREEING
-                and found - expected > _CHANCE_SIGMAS * np.sqrt(expected)
-                and found > 2.0 * expected
-                and found >= _MIN_AGREEING
+                and n_found - expected > _CHANCE_SIGMAS * np.sqrt(expected)
+                and n_found > 2.0 * expected
+                and n_found >= _MIN_AGREEING
             ):
                 return Similarity(
                     rotation=float(np.degrees(np.angle(candidate.turn)) % 360.0),
@@ -204,7 +212,7 @@ def find_similarity(
                     origin=origin,
                     target=np.array([candidate.target.real, candidate.target.imag]),
                     coincidences=candidate.agreeing,
-                    found=found,
+                    found=n_found,
                     expected=expected,
                 )
     raise InputError(
@@ -216,27 +224,27 @@ def find_similarity(
 
 
 def brightest(points: Float, mag: Float | None) -> Float:
-    """Points (n, 2) enough for a linear map: the brightest, or the first of points without mag."""
+    """Points (n, 2) sufficient for a linear map: the brightest, or the first without magnitudes."""
     return (points if mag is None else points[np.argsort(mag, kind="stable")])[:_BRIGHT_STARS]
 
 
 def grown_map(
     points: Float, found: Similarity, reference: PatternIndex, *, narrow: float
 ) -> LinearMap:
-    """Linear map of points (N, 2), fitted outwards from the middle, where a similarity is good.
+    """Linear map of points (N, 2), fitted outwards from the middle, where a similarity is accurate.
 
-    The reach of its pairs shrinks from 0.3 to `narrow` mean distances between reference stars.  It
-    is the similarity itself where too few points have one.
+    The search radius shrinks from 0.3 to `narrow` mean spacings of the reference stars. If too few
+    points have a pair, the similarity itself is returned.
     """
-    wide, least = _WIDE * reference.spacing, narrow * reference.spacing
-    grown = iterated_map(points, reference.positions, reference.tree, found.map, wide, least)
+    wide, final_reach = _WIDE * reference.spacing, narrow * reference.spacing
+    grown = iterated_map(points, reference.positions, reference.tree, found.map, wide, final_reach)
     return found.map if grown is None else grown
 
 
 def _tries(
     n: int, ranked: bool, reference: PatternIndex, area: float
 ) -> Iterator[tuple[float, Level, int]]:
-    """Tolerance, reference stars and number of stars of the list, the most promising first."""
+    """Tolerance, reference level and number of stars for each trial, the most promising first."""
     for tolerance in _TOLERANCES:
         for level in reference.levels:
             even = len(level.stars) * area / reference.area
@@ -253,7 +261,7 @@ def _tries(
 
 
 def _support(candidate: Candidate, stars: Complex, reference: PatternIndex) -> tuple[int, float]:
-    """Numbers of stars that have a reference star near them, and that have one by chance."""
+    """Number of stars with a reference star nearby, and the number expected by chance."""
     sample = stars[:: -(-len(stars) // _STARS_CHECKED)]
     moved = candidate.turn * sample + candidate.target
     points = np.stack([moved.real, moved.imag], axis=-1)
@@ -264,18 +272,18 @@ def _support(candidate: Candidate, stars: Complex, reference: PatternIndex) -> t
 
 
 def mismatch_reason(plane: Float, mag: Float | None, reference: PatternIndex) -> str:
-    """Clause on the scale or mirror image by which a list (N, 2) would match; else empty."""
-    ratios = [factor for one in _RATIOS for factor in (one, 1.0 / one)]
+    """Clause on the scale or mirror image with which a list (N, 2) would match; empty if none."""
+    ratios = [factor for unit_ratio in _RATIOS for factor in (unit_ratio, 1.0 / unit_ratio)]
     tries = [
         (1.0, _WIDE_SCALE, False),
-        *((one, _RATIO_TOLERANCE, False) for one in ratios),
+        *((unit_ratio, _RATIO_TOLERANCE, False) for unit_ratio in ratios),
         (1.0, _WIDE_SCALE, True),
     ]
     best, reason = 0.0, ""
-    # a wrong unit is found or dismissed in no time, a mirror image is not: it comes last
+    # a wrong unit is found or excluded quickly, but a mirror image is not, so it comes last
     for ratio, within, mirrored in tries:
         try:
-            found = find_similarity(
+            similarity = find_similarity(
                 ratio * plane,
                 reference,
                 mag=mag,
@@ -284,21 +292,22 @@ def mismatch_reason(plane: Float, mag: Float | None, reference: PatternIndex) ->
             )
         except InputError:
             continue
-        # shrunk onto a crowded region any list finds neighbours; but few of its triangles agree
-        if _STARS_FOR_EACH_AGREEING * found.coincidences < found.found:
+        # if shrunk onto a crowded region, any list finds neighbours, but few of its triangles agree
+        if _STARS_FOR_EACH_AGREEING * similarity.coincidences < similarity.found:
             continue
-        scale = ratio * found.scale
+        scale = ratio * similarity.scale
         as_it_is = abs(scale - 1.0) < _SCALE_TOLERANCE
-        if as_it_is and not mirrored:  # then neither scale nor image is wrong
+        if as_it_is and not mirrored:  # neither scale nor parity is wrong
             continue
-        sigmas = (found.found - found.expected) / np.sqrt(found.expected)
+        sigmas = (similarity.found - similarity.expected) / np.sqrt(similarity.expected)
         if sigmas <= best:
             continue
         image = MIRRORED if mirrored else "it"
         at = "" if as_it_is else f" at {scale:.4g} times the scale"
         best = sigmas
         reason = (
-            f"{image} does match{at}: {found.found} stars, where chance gives {found.expected:.1f}"
+            f"{image} does match{at}: {similarity.found} stars, where chance gives "
+            f"{similarity.expected:.1f}"
         )
         if best > _CLEAR_SIGMAS:
             break

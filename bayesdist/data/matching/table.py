@@ -29,7 +29,7 @@ from bayesdist.utils.arguments import takes
 from bayesdist.utils.arrays import Int
 from bayesdist.utils.quantities import Number, value_in
 
-_FALSE_RATE = 0.02  # chance matches of a detection that the default radius allows
+_FALSE_RATE = 0.02  # probability of a chance match of a detection that the default radius allows
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,14 +41,14 @@ class Matching:
     index, catalog_index : ndarray of int, shape (n_pairs,)
         Rows of the detections and of the catalogue; no row is repeated.
     transformation : LinearMap
-        From the given positions to the catalogue's.
+        Map from the given positions to those of the catalogue.
     radius : float
         Largest distance of a pair, in the catalogue's unit.
     coincidences : int
-        Stars that agreed on rotation and shift.
+        Number of stars that agreed on rotation and shift.
     false_rate : float
         Probability that a detection without counterpart is paired by chance: 1 - exp(-density pi
-        radius^2), with the mean density over the detections of reference stars that are still free.
+        radius^2), with the mean density of unpaired reference stars over the detections.
     """
 
     index: Int
@@ -72,10 +72,10 @@ def match_to_catalog(
     max_offset: Number | None = None,
     source: str = "detections",
 ) -> Matching:
-    """Matches of detections with reference stars, one to one.
+    """Match detections with reference stars, one to one.
 
-    A rotation, scale and shift is found by the patterns of the stars; a linear transformation is
-    then iterated while the radius shrinks; the pairs are mutual nearest neighbours inside the final
+    Rotation, scale and shift are found from the patterns of the stars. A linear transformation is
+    then iterated while the radius shrinks. The pairs are mutual nearest neighbours within the final
     radius.
 
     Parameters
@@ -83,27 +83,28 @@ def match_to_catalog(
     x, y : array_like, shape (N,)
         *Corrected* positions, in the catalogue's unit and parity.
     catalog : ReferenceCatalog
-        At the epoch of the detections.
+        Catalogue at the epoch of the detections.
     mag : array_like, shape (N,), optional
-        Magnitudes of the detections, any zero point: with those of the catalogue they let the
-        bright stars be tried first.
+        Magnitudes of the detections with any zero point. If the catalogue has magnitudes too,
+        bright stars are tried first.
     radius : float or Quantity, optional
-        Final radius, a plain number in the catalogue's unit; by default the one in which a
-        detection without counterpart finds a neighbour by chance with probability 0.02.
+        Final radius; a plain number is in the catalogue's unit. The default is the radius within
+        which a detection without counterpart finds a neighbour by chance with probability 0.02.
     max_offset : float or Quantity, optional
-        Largest offset of the middle of the detections on either axis; by default any.
+        Largest offset of the middle of the detections on either axis; unlimited by default.
     source : str, optional
-        File, for errors.
+        Name of the file, for error messages.
 
     Returns
     -------
     Matching
+        Pairs with the transformation and the false-match rate.
 
     Raises
     ------
     InputError
-        When no rotation and shift brings together more stars than chance does (another field), with
-        the best number of coincidences.
+        If no rotation and shift brings together more stars than chance does, as for a different
+        field; the message gives the best number of coincidences.
     """
     if radius is not None:
         radius = value_in(radius, catalog.unit, "radius", where=source)
@@ -120,17 +121,17 @@ def match_to_catalog(
     ranked = mag is not None and catalog.mag is not None
     magnitudes = np.asarray(mag, float) if ranked else None
     patterns = pattern_index(reference, catalog.mag if ranked else None)
-    found = find_similarity(
+    similarity = find_similarity(
         points, patterns, mag=magnitudes, source=source, reference_name=catalog.source
     )
     failure = InputError(
-        f"does not match {catalog.source}: {found.coincidences} stars agree on a rotation and "
+        f"does not match {catalog.source}: {similarity.coincidences} stars agree on a rotation and "
         "shift, but the others do not follow",
         where=source,
         do="check the field, the scale and the distortion that is taken as known",
     )
     middle = np.median(points, axis=0)
-    offset = found(middle[None])[0] - middle
+    offset = similarity(middle[None])[0] - middle
     if max_offset is not None and np.abs(offset).max() > max_offset:
         raise InputError(
             f"matches {catalog.source} at an offset of ({offset[0]:.6g}, {offset[1]:.6g}), beyond "
@@ -138,7 +139,7 @@ def match_to_catalog(
             where=source,
             do="check the field, or allow a larger offset",
         )
-    rough = grown_map(brightest(points, magnitudes), found, patterns, narrow=NARROW)
+    rough = grown_map(brightest(points, magnitudes), similarity, patterns, narrow=NARROW)
     n_over, area = overlap(rough(points), reference)
     if radius is None:
         radius = chance_radius(_FALSE_RATE, n_over, area)
@@ -156,7 +157,7 @@ def match_to_catalog(
         catalog_index=catalog_index,
         transformation=transformation,
         radius=radius,
-        coincidences=found.coincidences,
+        coincidences=similarity.coincidences,
         false_rate=float(-np.expm1(-max(n_over - len(index), 0) / area * np.pi * radius**2)),
     )
 
@@ -169,29 +170,29 @@ def match_table(
     radius: Number | None = None,
     max_offset: Number | None = None,
 ) -> Matches:
-    """Matches with a catalogue's positions in place of approximate ones, exposure by exposure.
+    """Replace approximate positions by those of a catalogue, exposure by exposure.
 
     Parameters
     ----------
     table : Matches
-        u, v are approximate corrected positions in the catalogue's unit, as hst1pass gives them.
+        Matches with u, v as approximate corrected positions in the catalogue's unit, as given by
+        hst1pass.
     catalog : ReferenceCatalog
-        Brought to the mean epoch of each exposure, where it has proper motions.
+        Catalogue, which is moved to the mean epoch of each exposure if it has proper motions.
     radius, max_offset
-        As `match_to_catalog`.
+        As for `match_to_catalog`.
 
     Returns
     -------
     Matches
-        The matched stars, with u, v and star codes of the catalogue; the others are counted as
-        rejected.  Errors stay as they are: those of a catalogue are only a part of the error of a
-        match.
+        Matched stars with u, v and star codes of the catalogue; the others are counted as rejected.
+        Errors are unchanged, because those of a catalogue are only a part of the error of a match.
 
     Raises
     ------
     InputError
-        When the units differ, an exposure does not match, or proper motions meet a table without
-        epoch.
+        If the units differ, if an exposure does not match, or if there are proper motions but the
+        table has no epoch.
 
     Examples
     --------
@@ -203,17 +204,17 @@ def match_table(
     >>> len(found)
     60
     """
-    where = ", ".join(table.sources)
+    location = ", ".join(table.sources)
     if table.unit != catalog.unit:
         raise InputError(
             f"positions are in {table.unit}, those of {catalog.source} in {catalog.unit}",
-            where=where,
+            where=location,
             do="bring both to one unit",
         )
     if catalog.pm_u is not None and table.epoch is None:
         raise InputError(
             f"has no epoch, and {catalog.source} has proper motions",
-            where=where,
+            where=location,
             do="give the epoch of the exposures",
         )
     u, v = table.u.copy(), table.v.copy()
@@ -224,7 +225,7 @@ def match_table(
         then = catalog
         if catalog.pm_u is not None and table.epoch is not None:
             then = catalog.at(float(table.epoch[rows].mean()))
-        found = match_to_catalog(
+        matching = match_to_catalog(
             table.u[rows],
             table.v[rows],
             then,
@@ -233,9 +234,9 @@ def match_table(
             max_offset=max_offset,
             source=f"{table.sources[table.source[rows[0]]]}, exposure {table.exposure_names[code]}",
         )
-        pairs = rows[found.index]
-        u[pairs], v[pairs] = then.u[found.catalog_index], then.v[found.catalog_index]
-        star[pairs] = then.star[found.catalog_index]
+        pairs = rows[matching.index]
+        u[pairs], v[pairs] = then.u[matching.catalog_index], then.v[matching.catalog_index]
+        star[pairs] = then.star[matching.catalog_index]
         matched[pairs] = True
     selected = table.select(matched, reason="no counterpart in the catalogue")
     return selected.with_columns(

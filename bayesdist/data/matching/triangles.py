@@ -13,31 +13,32 @@ from scipy.spatial import cKDTree
 from bayesdist.data.matching.linear_map import robust_fit
 from bayesdist.utils.arrays import Bool, Complex, Float, Int
 
-_MIN_SIDE_RATIO = 0.15  # shortest to longest side: below, a small error turns the shape around
-_MAX_SIDE_RATIO = 0.985  # sides nearer to each other than this may change places
-_MAX_ANCHORS = 500  # stars of the list that triangles are made around
-_NEIGHBOURS = (5, 6)  # of each, in the list and in the reference
-_MAX_CANDIDATES = 3  # peaks of a vote that are looked at
+# shortest to longest side; in flatter triangles, small errors change the shape
+_MIN_SIDE_RATIO = 0.15
+_MAX_SIDE_RATIO = 0.985  # ratio of two sides; more similar sides may change their order
+_MAX_ANCHORS = 500  # largest number of stars of the list around which triangles are made
+_NEIGHBOURS = (5, 6)  # neighbours of each star, in the list and in the reference
+_MAX_CANDIDATES = 3  # number of peaks of the votes that are examined
 _MAX_VOTES = 400_000  # at most
 
 
 @dataclass(frozen=True, eq=False)
 class Triangles:
-    """Triangles, their corners in the order of the opposite sides, longest first."""
+    """Triangles with corners in the order of the opposite sides, longest first."""
 
     corners: Int  # (T, 3), indices of stars
-    shape: Float  # (T, 2), logarithms of middle and shortest side over the longest
-    log_size: Float  # (T,), of the longest side
-    left: Bool  # (T,), anticlockwise; a mirror changes it
+    shape: Float  # (T, 2), logarithms of the ratios of middle and shortest side to the longest
+    log_size: Float  # (T,), logarithm of the longest side
+    left: Bool  # (T,), True if anticlockwise, which a mirror reverses
 
     def __len__(self) -> int:
         return len(self.corners)
 
 
 def triangles_of(stars: Complex, anchors: Int, neighbours: int) -> Triangles:
-    """Triangles of each anchor with two of its nearest `neighbours`, of stars x + i y (N,).
+    """Triangles of each anchor with two of its nearest `neighbours`, for stars x + i y (N,).
 
-    Each stands once; nearly flat and nearly isosceles ones are left out.
+    Each triangle occurs once. Nearly flat and nearly isosceles triangles are left out.
     """
     points = np.stack([stars.real, stars.imag], axis=-1)
     neighbours = min(neighbours, len(stars) - 1)
@@ -49,8 +50,10 @@ def triangles_of(stars: Complex, anchors: Int, neighbours: int) -> Triangles:
     corners = np.concatenate([first, near[:, pairs]], axis=2).reshape(-1, 3)
     corners = np.sort(corners.astype(np.int64), axis=1)
     n = len(stars)
-    _, once = np.unique((corners[:, 0] * n + corners[:, 1]) * n + corners[:, 2], return_index=True)
-    return _described(stars, corners[once])
+    _, distinct = np.unique(
+        (corners[:, 0] * n + corners[:, 1]) * n + corners[:, 2], return_index=True
+    )
+    return _described(stars, corners[distinct])
 
 
 def _described(stars: Complex, corners: Int) -> Triangles:
@@ -91,25 +94,26 @@ class Candidate:
 
     turn: complex
     target: complex
-    agreeing: int  # stars of these triangles that it brings together
-    slack: float  # median of their distances: how far the map may be off
+    agreeing: int  # number of stars in these triangles that it brings together
+    slack: float  # median distance of these stars, a measure of the error of the map
 
 
 def candidates(
     stars: Complex, level: Level, tolerance: float, scale: tuple[float, float]
 ) -> Iterator[Candidate]:
-    """Peaks of the vote of all pairs of triangles of equal shape, the best supported first.
+    """Peaks of the votes from all pairs of triangles of equal shape, the best supported first.
 
-    `stars` (N,) are positions x + i y from the middle of the list, brightest first where magnitudes
-    are known; `tolerance` is that of the logarithms of side ratios.
+    `stars` (N,) are positions x + i y from the middle of the list, brightest first if magnitudes
+    are known. `tolerance` applies to the logarithms of side ratios.
     """
-    # evenly over the ranks, so that a clump of false bright detections is not all
+    # anchors are spread over the ranks, so that a clump of false bright detections does not
+    # dominate
     anchors = np.unique(np.linspace(0, len(stars) - 1, min(_MAX_ANCHORS, len(stars))).astype(int))
-    own = triangles_of(stars, anchors, _NEIGHBOURS[0])
-    i, j = _alike(own, level.triangles, tolerance, scale)
+    list_triangles = triangles_of(stars, anchors, _NEIGHBOURS[0])
+    i, j = _alike(list_triangles, level.triangles, tolerance, scale)
     if not len(i):
         return
-    z, w = stars[own.corners[i]], level.stars[level.triangles.corners[j]]
+    z, w = stars[list_triangles.corners[i]], level.stars[level.triangles.corners[j]]
     middle_z, middle_w = z.mean(axis=1, keepdims=True), w.mean(axis=1, keepdims=True)
     dz, dw = z - middle_z, w - middle_w
     turn = (np.conj(dz) * dw).sum(axis=1) / (np.abs(dz) ** 2).sum(axis=1)
@@ -130,7 +134,11 @@ def candidates(
         members = np.array(near.query_ball_point(votes[peak], 2.0 * reach))
         support[members] = 0
         pairs = np.stack(
-            [own.corners[i[members]].ravel(), level.triangles.corners[j[members]].ravel()], axis=-1
+            [
+                list_triangles.corners[i[members]].ravel(),
+                level.triangles.corners[j[members]].ravel(),
+            ],
+            axis=-1,
         )
         fitted = _fitted(stars, level.stars, np.unique(pairs, axis=0), reach)
         if fitted is not None:
@@ -140,11 +148,11 @@ def candidates(
 def _alike(
     own: Triangles, theirs: Triangles, tolerance: float, scale: tuple[float, float]
 ) -> tuple[Int, Int]:
-    """Pairs of triangles of one shape, handedness and, within the range of scales, size."""
+    """Pairs of triangles with equal shape and handedness, and sizes within the range of scales."""
     low, high = np.log(scale[0]), np.log(scale[1])
-    # the size counts in units that make its range as wide as the tolerance
+    # sizes are in units in which their range is as wide as the tolerance
     unit = tolerance / (0.5 * (high - low) + tolerance)
-    found: list[tuple[Int, Int]] = []
+    pair_lists: list[tuple[Int, Int]] = []
     for hand in (False, True):
         a, b = np.flatnonzero(own.left == hand), np.flatnonzero(theirs.left == hand)
         if not (len(a) and len(b)):
@@ -154,16 +162,16 @@ def _alike(
         pairs = cKDTree(first).sparse_distance_matrix(
             cKDTree(second), tolerance * np.sqrt(2.0), output_type="ndarray"
         )
-        found.append((a[pairs["i"]], b[pairs["j"]]))
-    if not found:
+        pair_lists.append((a[pairs["i"]], b[pairs["j"]]))
+    if not pair_lists:
         return np.zeros(0, np.int64), np.zeros(0, np.int64)
-    i, j = (np.concatenate(one) for one in zip(*found, strict=True))
-    every = -(-len(i) // _MAX_VOTES) or 1
-    return i[::every], j[::every]
+    i, j = (np.concatenate(indices) for indices in zip(*pair_lists, strict=True))
+    stride = -(-len(i) // _MAX_VOTES) or 1
+    return i[::stride], j[::stride]
 
 
 def _fitted(stars: Complex, others: Complex, pairs: Int, reach: float) -> Candidate | None:
-    """Least-squares similarity of pairs of stars that belong together."""
+    """Least-squares similarity of corresponding stars; None if fewer than three agree."""
     z, w = stars[pairs[:, 0]], others[pairs[:, 1]]
 
     def fit(use: Bool) -> tuple[tuple[complex, complex], Float]:
@@ -174,8 +182,8 @@ def _fitted(stars: Complex, others: Complex, pairs: Int, reach: float) -> Candid
         return (turn, target), np.abs(w - turn * z - target)
 
     slack = 1e-9 * float(np.abs(w).max(initial=0.0))
-    found = robust_fit(fit, len(z), least=3, slack=slack, reach=reach)
-    if found is None or found.use.sum() < 3:
+    robust = robust_fit(fit, len(z), least=3, slack=slack, reach=reach)
+    if robust is None or robust.use.sum() < 3:
         return None
-    agreeing = min(len(np.unique(pairs[found.use, axis])) for axis in (0, 1))
-    return Candidate(*found.solution, agreeing, float(np.median(found.away[found.use])))
+    agreeing = min(len(np.unique(pairs[robust.use, axis])) for axis in (0, 1))
+    return Candidate(*robust.solution, agreeing, float(np.median(robust.away[robust.use])))

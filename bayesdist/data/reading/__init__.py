@@ -1,1 +1,1 @@
-"""Columns of any file to matches: the user's options, known names of columns, and valid rows."""
+"""Conversion of table columns to matches: reading options, column names, and valid rows."""

@@ -1,4 +1,4 @@
-"""Columns of a table to the arrays of a Matches; chips that it knows by name get numbers."""
+"""Conversion of table columns to the arrays of `Matches`; chip names are replaced by numbers."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from bayesdist.data.tables.units import check_unit
 from bayesdist.errors import InputError
 from bayesdist.utils.arrays import Float, Int
 
-# errors of x and y in pixels, as photutils and others call them
+# names that photutils and other programs use for errors of x and y in pixels
 CENTROID_ERRORS = (
     *(("x_err", "y_err"), ("xerr", "yerr"), ("x_error", "y_error"), ("sigma_x", "sigma_y")),
     *(("e_x", "e_y"), ("xcentroid_err", "ycentroid_err"), ("x_fit_err", "y_fit_err")),
@@ -27,16 +27,18 @@ CENTROID_ERRORS = (
 
 
 def position_unit(pair: tuple[SourceColumn, SourceColumn], unit: str | None) -> str:
-    """Unit ('pix', 'arcsec', 'mas', 'deg') of a pair of columns, from the file or else the option.
+    """Unit ('pix', 'arcsec', 'mas', 'deg') of a pair of columns, from the file or the option.
 
-    Refused where both are missing, where they contradict each other, or where the columns do.
+    InputError if both are missing, or if the file, the option or the two columns disagree.
     """
     if unit is not None:
         check_unit(unit, where="unit")
     stated: list[str | None] = []
     for column in pair:
-        own = column.unit
-        stated.append(None if own is None else check_unit(str(own), where=column.where))
+        column_unit = column.unit
+        stated.append(
+            None if column_unit is None else check_unit(str(column_unit), where=column.where)
+        )
     first, second = stated
     if first is not None and second is not None and first != second:
         raise InputError(
@@ -66,9 +68,10 @@ def is_on_sky(
     columns: Mapping[str, str] | None,
     source: str,
 ) -> bool:
-    """True where ra, dec are the reference positions, not u, v; refused when the user names both.
+    """True if ra, dec are the reference positions rather than u, v.
 
-    `found` is the column of each quantity, `columns` those that the user names.
+    `found` is the column of each quantity, and `columns` are those named by the user. InputError if
+    the user names both ra, dec and u, v.
     """
     named = {key for key, column in (columns or {}).items() if column}
     plane, sky = named & {"u", "v"}, named & {"ra", "dec"}
@@ -79,7 +82,7 @@ def is_on_sky(
     on_sky, on_plane = {"ra", "dec"} <= set(found), {"u", "v"} <= set(found)
     if plane or not on_sky:
         return False
-    # with a magnitude B, the U and V of a table are magnitudes, too
+    # if there is a magnitude B, columns U and V are magnitudes as well
     return bool(sky) or not on_plane or "b" in {name.lower() for name in names}
 
 
@@ -90,22 +93,22 @@ def present_columns(
     source: str,
     read_sigma: bool = True,
 ) -> dict[str, str]:
-    """Column of each quantity that is there: x, y, either u, v or ra, dec, and others."""
+    """Column of each quantity that exists: x, y, either u, v or ra, dec, and optional ones."""
     names = list(names)
-    found = find_columns(names, columns, ALIASES, source=source, pairs=PAIRS)
-    on_sky = is_on_sky(names, found, columns, source)
+    present = find_columns(names, columns, ALIASES, source=source, pairs=PAIRS)
+    on_sky = is_on_sky(names, present, columns, source)
     unread = {"u", "v"} if on_sky else {"ra", "dec", *SKY_QUANTITIES}
     if not read_sigma:
         unread |= {"sigma_u", "sigma_v"}
-    if not read_sigma or "sigma_u" in found:  # the errors of the match hold those of the catalogue
+    if not read_sigma or "sigma_u" in present:  # errors of the match include those of the catalogue
         unread |= {"sigma_ra", "sigma_dec"}
-    if "mag" in found:
+    if "mag" in present:
         unread.add("flux")
-    return {key: name for key, name in found.items() if key not in unread}
+    return {key: name for key, name in present.items() if key not in unread}
 
 
 def lacking_columns(found: Container[str]) -> list[str]:
-    """Quantities that matches need, and `present_columns` has not found."""
+    """Quantities that matches need and that `present_columns` has not found."""
     return [key for key in ("x", "y") if key not in found] + [
         key for key in ("u", "v") if key not in found and "ra" not in found
     ]
@@ -118,10 +121,10 @@ def needed_columns(
     source: str,
     read_sigma: bool = True,
 ) -> dict[str, str]:
-    """Column of each quantity that is read, as of `present_columns`; refused where one lacks."""
+    """Column of each quantity as in `present_columns`; InputError if a needed one is missing."""
     names = list(names)
-    found = present_columns(names, columns, source=source, read_sigma=read_sigma)
-    lacking = lacking_columns(found)
+    present = present_columns(names, columns, source=source, read_sigma=read_sigma)
+    lacking = lacking_columns(present)
     if lacking:
         do = (
             f"name {'it' if len(lacking) == 1 else 'them'} in the option 'columns' "
@@ -129,29 +132,29 @@ def needed_columns(
         )
         if {"u", "v"} <= set(lacking):
             do += ", or positions on the sky as ra and dec"
-        if "x" in found and "y" in found:
+        if "x" in present and "y" in present:
             do += ", or make the file one of the lists of a [campaign] or [selfcal]"
         raise InputError(
             f"no column for {', '.join(map(repr, lacking))} among {', '.join(names) or 'none'}",
             where=source,
             do=do,
         )
-    return found
+    return present
 
 
 def columns_read(
     names: Sequence[str], header: Mapping[str, Any], options: ReadOptions, *, source: str
 ) -> tuple[dict[str, str], ReadOptions, tuple[str, ...]]:
-    """Column of each quantity, the options with the origin of the pixels, and notes about it."""
-    found = needed_columns(names, options.columns, source=source, read_sigma=options.read_sigma)
-    _refuse_unused(options, found, source)
-    notes = _unused_centroid_errors(names, found) if options.read_sigma else ()
+    """Column of each quantity, options with the pixel origin, and notes on both."""
+    needed = needed_columns(names, options.columns, source=source, read_sigma=options.read_sigma)
+    _refuse_unused(options, needed, source)
+    notes = _unused_centroid_errors(names, needed) if options.read_sigma else ()
     if options.pixel_origin is not None:
-        return found, options, notes
-    origin, why = origin_of(found["x"], names, header)
+        return needed, options, notes
+    origin, why = origin_of(needed["x"], names, header)
     if why:
         notes = (f"the first pixel is taken as {origin}: {why}", *notes)
-    return found, replace(options, pixel_origin=origin), notes
+    return needed, replace(options, pixel_origin=origin), notes
 
 
 def _unused_centroid_errors(names: Sequence[str], found: Mapping[str, str]) -> tuple[str, ...]:
@@ -168,7 +171,7 @@ def _unused_centroid_errors(names: Sequence[str], found: Mapping[str, str]) -> t
 
 
 def _refuse_unused(options: ReadOptions, found: Mapping[str, str], source: str) -> None:
-    """Refuse options for which a table has no columns, or which its own columns replace."""
+    """Raise InputError for options that need missing columns or that existing columns replace."""
     if "catalogue_epoch" in found:
         options.refuse(
             source,
@@ -193,11 +196,11 @@ def _refuse_unused(options: ReadOptions, found: Mapping[str, str], source: str) 
 
 
 def match_columns(quantities: Quantities, options: ReadOptions) -> dict[str, Any]:
-    """Arguments of `Matches` from rows of a table, with columns as `needed_columns`."""
-    found, column = quantities.found, quantities.__getitem__
+    """Arguments of `Matches` from rows of a table, with columns as from `needed_columns`."""
+    present, column = quantities.found, quantities.__getitem__
     out: dict[str, Any] = {}
     out["x"], out["y"] = (_pixels(column(key), options.pixel_origin) for key in ("x", "y"))
-    if "epoch" in found:
+    if "epoch" in present:
         if options.epoch is not None:
             raise InputError(
                 "an epoch of the exposures is given, and the table has a column of it",
@@ -207,7 +210,7 @@ def match_columns(quantities: Quantities, options: ReadOptions) -> dict[str, Any
         out["epoch"] = column("epoch").years()
     elif options.epoch is not None:
         out["epoch"] = np.full(len(quantities), options.epoch)
-    if "ra" in found:
+    if "ra" in present:
         out |= _projected(quantities, options, out.get("epoch"))
     else:
         if options.tangent_point is not None:
@@ -219,26 +222,26 @@ def match_columns(quantities: Quantities, options: ReadOptions) -> dict[str, Any
         out["u"], out["v"] = (column(key).numbers() for key in ("u", "v"))
         out["unit"] = position_unit((column("u"), column("v")), options.unit)
     for key in ("sigma_u", "sigma_v"):
-        if key in found:
+        if key in present:
             out[key] = _sigma(column(key), out["unit"])
     at = options.tangent_point
-    for key in nominal_columns(found, source=quantities.source, tangent_point=at):
+    for key in nominal_columns(present, source=quantities.source, tangent_point=at):
         out[key] = column(key).numbers() * column(key).factor(out["unit"])
-    if "mag" in found:
+    if "mag" in present:
         out["mag"] = column("mag").numbers()
-    elif "flux" in found:
+    elif "flux" in present:
         mag = column("flux").magnitudes_of_fluxes()
         out |= {} if mag is None else {"mag": mag}
-    if "colour" in found:  # it serves a test alone
+    if "colour" in present:  # it is used only by a diagnostic, so it may be unreadable
         colour = column("colour").numbers_if_readable("a colour")
         out |= {} if colour is None else {"colour": colour}
-    if "exposure" in found:
+    if "exposure" in present:
         out["exposure"], out["exposure_names"] = column("exposure").labels()
-    if "filter" in found:
+    if "filter" in present:
         out["filter"], out["filter_names"] = column("filter").labels()
-    if "star" in found:
+    if "star" in present:
         out["star"] = column("star").integers()
-    if "chip" in found:
+    if "chip" in present:
         out["chip"], out["chip_numbers"], out["chip_names"] = numbered_chips(
             column("chip"), options.chips
         )
@@ -246,7 +249,7 @@ def match_columns(quantities: Quantities, options: ReadOptions) -> dict[str, Any
 
 
 def _pixels(column: SourceColumn, pixel_origin: int | None) -> Float:
-    """FITS 1-based pixels."""
+    """Pixels converted to FITS 1-based coordinates."""
     pixel_origin = 1 if pixel_origin is None else pixel_origin
     if pixel_origin not in (0, 1):
         raise InputError(
@@ -262,9 +265,9 @@ def _pixels(column: SourceColumn, pixel_origin: int | None) -> Float:
 
 
 def _projected(quantities: Quantities, options: ReadOptions, epoch: Float | None) -> dict[str, Any]:
-    """Positions on the tangent plane, their errors and motions."""
-    where = quantities.source
-    unit = plane_unit(options.unit, source=where)
+    """Positions on the tangent plane, with their errors and motions."""
+    source = quantities.source
+    unit = plane_unit(options.unit, source=source)
     sky = reference_sky(quantities, epoch=epoch, catalogue_epoch=options.catalogue_epoch)
     if sky.sigma is not None and not (sky.sigma > 0).all():
         bad = int(np.argmin((sky.sigma > 0).all(axis=0)))
@@ -276,13 +279,13 @@ def _projected(quantities: Quantities, options: ReadOptions, epoch: Float | None
         sigma=sky.sigma,
         motion=sky.motion,
         sigma_motion=sky.sigma_motion,
-        where=where,
+        where=source,
         place=quantities.place,
     )
 
 
 def plane_unit(unit: str | None, *, source: str) -> str:
-    """Unit of u and v that come from the sky; another one by option is refused."""
+    """Unit of u and v that are computed from sky positions; InputError for any other unit."""
     if unit not in (None, "arcsec"):
         raise InputError(
             f"unit is {unit}, but sky positions come to the tangent plane in arcsec",
@@ -295,10 +298,10 @@ def plane_unit(unit: str | None, *, source: str) -> str:
 def nominal_columns(
     found: Mapping[str, str], *, source: str, tangent_point: tuple[float, float] | None
 ) -> tuple[str, ...]:
-    """'u_nominal' and 'v_nominal' where a table has them, else nothing.
+    """'u_nominal' and 'v_nominal' if the table has them, otherwise empty.
 
-    Refused is one without the other; and both with sky positions where no tangent point is given:
-    the plane on which they lie is not to depend on which stars were matched.
+    InputError if only one is present, or if both are present with sky positions but without a
+    tangent point: their plane must not depend on which stars were matched.
     """
     pair = ("u_nominal", "v_nominal")
     refuse_half(pair, found, where=source, what="nominal positions")
@@ -332,7 +335,7 @@ def _sigma(column: SourceColumn, unit: str) -> Float:
 
 
 def text_labels(column: SourceColumn) -> tuple[str, ...]:
-    """Names of the chips in a column; none where they are numbers."""
+    """Names of the chips in a column; empty if they are numbers."""
     values = column.values
     plain = values.labels if isinstance(values, EncodedColumn) else np.asarray(values)
     if plain.dtype.kind not in "SUO":
@@ -342,11 +345,11 @@ def text_labels(column: SourceColumn) -> tuple[str, ...]:
 
 
 def numbered(names: Iterable[str]) -> dict[str, int]:
-    """Numbers from 1 for names in their order, digits by their value: S2 before S10."""
+    """Numbers from 1 for names in natural order, which places S2 before S10."""
 
     def key(name: str) -> list[tuple[int, int, str]]:
         parts = re.findall(r"\d+|\D+", name)
-        return [(0, int(one), "") if one.isdigit() else (1, 0, one) for one in parts]
+        return [(0, int(part), "") if part.isdigit() else (1, 0, part) for part in parts]
 
     return {name: k for k, name in enumerate(sorted(set(names), key=key), 1)}
 
@@ -354,10 +357,10 @@ def numbered(names: Iterable[str]) -> dict[str, int]:
 def numbered_chips(
     column: SourceColumn, chips: Mapping[str, int] | None
 ) -> tuple[Int, tuple[int, ...], tuple[str, ...]]:
-    """Codes (N,) of the chips, their numbers in rising order, and their names where they have such.
+    """Codes (N,) of the chips, their numbers in ascending order, and their names, if any.
 
-    `chips` gives the number of each name; by default from 1 in the order of the names.  Numbers
-    that are not whole and names without a number are refused.
+    `chips` gives the number of each name; the default is from 1 in the order of the names.
+    InputError for numbers that are not integers, and for names without a number.
     """
     names = text_labels(column)
     if not names:
@@ -370,7 +373,7 @@ def numbered_chips(
             where=column.where,
             do="give [[chip]] blocks of these names, or write numbers",
         )
-    own, labels = column.labels()
+    label_codes, labels = column.labels()
     for name in labels:
         if name not in number_of:
             raise InputError(
@@ -378,7 +381,7 @@ def numbered_chips(
                 where=column.where,
                 do="add a [[chip]] block of this name, or leave these rows out",
             )
-    every = np.array([number_of[name] for name in labels], np.int64)
-    numbers, codes = np.unique(every[own], return_inverse=True)
+    numbers_of_labels = np.array([number_of[name] for name in labels], np.int64)
+    numbers, codes = np.unique(numbers_of_labels[label_codes], return_inverse=True)
     name_of = {number_of[name]: name for name in labels}
     return codes, tuple(numbers.tolist()), tuple(name_of[number] for number in numbers.tolist())

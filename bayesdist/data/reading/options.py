@@ -1,4 +1,4 @@
-"""Options for the columns of a table, checked once."""
+"""Options for reading the columns of a table, validated once."""
 
 from __future__ import annotations
 
@@ -20,59 +20,61 @@ from bayesdist.utils.quantities import Number, direction_in, year_of
 
 @dataclass(frozen=True)
 class ReadOptions:
-    """Options of reading matches.
+    """Options for reading matches.
 
     Parameters
     ----------
     columns : mapping of str to str, optional
         Column of each quantity: x y u v ra dec sigma_u sigma_v epoch exposure chip filter mag flux
         colour star u_nominal v_nominal, and with ra and dec sigma_ra sigma_dec pm_ra pm_dec
-        sigma_pm_ra sigma_pm_dec corr_ra corr_dec parallax sigma_parallax catalogue_epoch.  What is
-        not named is looked for under its usual names (`ALIASES`), in any case of letters; an empty
-        name leaves a quantity out.  With ra and dec, u and v are the tangent plane in arcsec.
+        sigma_pm_ra sigma_pm_dec corr_ra corr_dec parallax sigma_parallax catalogue_epoch. Other
+        quantities are searched for under their usual names (`ALIASES`), ignoring case; an empty
+        name omits a quantity. With ra and dec, u and v are on the tangent plane in arcsec.
     unit : {'pix', 'arcsec', 'mas', 'deg'}, optional
-        Unit of u and v, where the file states none.
+        Unit of u and v if the file states none.
     sigma : {'columns', 'by_magnitude'}, float or Quantity, optional
-        Source of errors: columns; left to be estimated from residuals by magnitude (they
-        are then None); or one number, in the unit of u and v or with a unit of its own.
+        Source of the errors: columns; estimates from residuals by magnitude, which are made later
+        (errors are then None); or one number, in the unit of u and v or as a Quantity.
     pixel_origin : {0, 1}, optional
-        Coordinate of the centre of the first pixel; by default 1, or 0 where names or header are
-        those of a program that counts from 0.
+        Coordinate of the centre of the first pixel. The default is 1, or 0 if column names or the
+        header are those of a program that counts from 0.
     tangent_point : SkyCoord, or pair of float or Quantity, optional
-        Point where the plane for sky positions touches the sky (numbers: ICRS degrees); by default
-        the mean direction of all stars.
+        Tangent point for sky positions (numbers: ICRS degrees). The default is the mean direction
+        of all stars.
     epoch : float, str, Time, date or Quantity, optional
-        Decimal year, ISO date or time of all exposures, where the table has no column of it.
-        Reference positions with proper motions are brought to it.
+        Decimal year, ISO date or time of all exposures, if the table has no such column. Reference
+        positions with proper motions are moved to it.
     catalogue_epoch : float, str, Time, date or Quantity, optional
-        The same of the reference positions, where the table has no column of it.
+        Epoch of the reference positions, if the table has no such column.
     chips : mapping of str to int, optional
-        Numbers of the chips, where the table has their names; by default from 1 in the order of the
+        Numbers of the chips, if the table has chip names. The default is from 1 in the order of the
         names.
     not_finite : {'refuse', 'reject'}, optional
-        Rows with NaN or infinity are an error, or left out and counted.  Rows with missing (masked)
-        values are always left out and counted, in `rejected`.
+        Rows with NaN or infinity are an error, or are left out and counted. Rows with missing
+        (masked) values are always left out and counted in `rejected`.
     same_position : {'one_star', 'separate_stars'}, optional
-        Meaning of rows with the same reference position, where the table has no column `star`: they
-        are measurements of one star, which share the error of its position, or of separate stars
-        with independent errors.  Catalogue positions are compared before proper motions.
+        Meaning of rows with the same reference position, if the table has no column `star`:
+        measurements of one star, which share the error of its position, or of separate stars with
+        independent errors. Catalogue positions are compared before proper motions are applied.
     plate_scale : float, optional
-        Arcsec in a millimetre, for u and v in a length (of a focal plane, a mask or a metrology),
-        which is their unit in the file or `unit`.  They become arcsec, and so do their errors.
+        Arcsec per millimetre, for u and v in a length unit (of a focal plane, a mask or a
+        metrology), which is stated in the file or by `unit`. Positions and errors are converted to
+        arcsec.
 
     Raises
     ------
     InputError
-        For `sigma`, `not_finite` or `same_position` that are none of these.
+        If `sigma`, `not_finite` or `same_position` is none of these values, or if `plate_scale`,
+        the tangent point or an epoch is invalid.
     """
 
     columns: Mapping[str, str] | None = None
     unit: str | None = None
     sigma: str | Number = "columns"
     pixel_origin: int | None = None
-    tangent_point: Any = None  # (ra, dec) in degrees once it is made
-    epoch: Any = None  # decimal year once it is made
-    catalogue_epoch: Any = None  # the same
+    tangent_point: Any = None  # converted to (ra, dec) in degrees
+    epoch: Any = None  # converted to a decimal year
+    catalogue_epoch: Any = None  # converted to a decimal year
     chips: Mapping[str, int] | None = None
     not_finite: str = "refuse"
     same_position: str = "one_star"
@@ -98,17 +100,17 @@ class ReadOptions:
 
     @property
     def read_sigma(self) -> bool:
-        """True where errors come from columns."""
+        """True if errors are read from columns."""
         return self.sigma == "columns"
 
     @property
     def plane_sigma(self) -> str | Number:
-        """Option `sigma` in the unit to which u and v come: lengths become arcsec.
+        """Option `sigma` in the unit of u and v after reading: lengths are converted to arcsec.
 
         Raises
         ------
         InputError
-            For a number without unit beside u and v whose unit the file states.
+            If `sigma` is a plain number but the unit of u and v is stated only in the file.
         """
         if self.plate_scale is None or isinstance(self.sigma, str):
             return self.sigma
@@ -126,18 +128,18 @@ class ReadOptions:
         return self.sigma * factor * self.plate_scale
 
     def refuse(self, source: str, why: str, *names: str, do: str = "leave {} out") -> None:
-        """Refuse options that are set and would not be used.
+        """Raise InputError for options that are set but would not be used.
 
         Parameters
         ----------
         source : str
-            File or table, for the error.
+            File or table, for the error message.
         why : str
-            Reason why they are not used.
+            Reason why the options are not used.
         *names : str
-            The options.
+            Names of the options.
         do : str, optional
-            What to do, in which {} stands for the option.
+            Advice, in which {} stands for the name of the option.
 
         Raises
         ------
@@ -151,14 +153,14 @@ class ReadOptions:
                 )
 
     def refuse_fixed(self, source: str, kind: str, *names: str) -> None:
-        """Refuse options that the format `kind` leaves no room for."""
+        """Raise InputError for options that are fixed by the format `kind`."""
         why = f"the format {kind} fixes it"
         self.refuse(source, why, *names, do="leave {} out or set the format to 'table'")
 
 
 @contextmanager
 def option_names() -> Iterator[None]:
-    """Context in which errors name options without the section [data] of a configuration."""
+    """Remove the configuration section [data] from option names in error messages."""
     key = re.compile(rf"\bdata\.({'|'.join(field.name for field in fields(ReadOptions))})\b")
     try:
         yield
@@ -171,7 +173,7 @@ def option_names() -> Iterator[None]:
 
 
 def check_sigma(sigma: str | Number) -> None:
-    """Refuse an invalid option `sigma`."""
+    """Raise InputError if the option `sigma` is invalid."""
     if isinstance(sigma, str):
         good = sigma in ("columns", "by_magnitude")
     elif hasattr(sigma, "value"):  # its unit is compared with that of u and v later
@@ -189,7 +191,7 @@ def check_sigma(sigma: str | Number) -> None:
 def refuse_missing_errors(
     sigma: str | Number, has_sigma: bool, has_mag: bool, *, where: str
 ) -> None:
-    """Refuse matches that lack the columns which the option `sigma` asks for."""
+    """Raise InputError if matches lack the columns that the option `sigma` requires."""
     if sigma == "columns" and not has_sigma:
         raise InputError(
             "holds no errors of the positions",

@@ -1,4 +1,4 @@
-"""Table of detector positions with sky coordinates, by the names that readers recognise."""
+"""Table of detector positions with sky coordinates, under names that the readers recognise."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ SKY_COLUMN = "skycoord"
 
 
 def sky_table(x: Any, y: Any, sky: SkyCoord, *, sigma: Any, epoch: Any, **columns: Any) -> QTable:
-    """Table of pixels (N,) and sky coordinates (N,), whose other columns are those given.
+    """Table of pixels (N,) and sky coordinates (N,), with the other columns given by keyword.
 
-    `sigma` is one error, one of each star, or a pair of these, plain numbers being arcsec; `epoch`
-    becomes a column if it has one value for each star.
+    `sigma` is one error, one per star, or a pair of these; plain numbers are in arcsec. `epoch`
+    becomes a column if it has one value per star.
     """
     table = QTable({"x": _column(x, "x", None)})
     n = len(table)
@@ -38,7 +38,7 @@ def sky_table(x: Any, y: Any, sky: SkyCoord, *, sigma: Any, epoch: Any, **column
 
 
 def icrs_of(sky: Any, n: int | None, *, where: str = "sky") -> SkyCoord:
-    """Sky coordinates (N,) in ICRS, with the proper motions and the obstime that they have."""
+    """Sky coordinates (N,) in ICRS, with proper motions and obstime if they have them."""
     from astropy.coordinates import ConvertError, SkyCoord
 
     if not isinstance(sky, SkyCoord):
@@ -68,7 +68,7 @@ def icrs_of(sky: Any, n: int | None, *, where: str = "sky") -> SkyCoord:
 
 
 def _column(values: Any, name: str, n: int | None, *, broadcast: bool = False) -> Any:
-    """Column of n values; of any number where n is None."""
+    """Column of n values, or of any number of values if n is None."""
     if not hasattr(values, "shape"):
         values = np.asarray(values)
     if broadcast and n is not None and values.shape == ():

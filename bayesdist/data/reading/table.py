@@ -1,4 +1,4 @@
-"""Columns of Matches from any object with columns: astropy, pandas, Arrow, mappings, records."""
+"""Columns of Matches from any table-like object: astropy, pandas, Arrow, mappings, records."""
 
 from __future__ import annotations
 
@@ -24,10 +24,11 @@ from bayesdist.errors import InputError
 from bayesdist.files.parquet import arrow_table
 from bayesdist.utils.arrays import Float
 
-# how messages about values that `not_finite` leaves out begin
+# beginnings of error messages about values that `not_finite` can leave out
 NOT_FINITE_CAUSES = ("value is nan", "value is inf", "value is -inf")
 _MOTION = "mas / yr"
-_SPARED = frozenset((*SPARED, "colour", "flux"))  # optional: a star may lack them
+# optional quantities, which may have missing values
+_SPARED = frozenset((*SPARED, "colour", "flux"))
 _KINDS = (
     "an astropy Table or QTable, a pandas or polars DataFrame, an Arrow table, a mapping of arrays "
     "or a structured array"
@@ -35,7 +36,7 @@ _KINDS = (
 
 
 def is_table(data: Any) -> bool:
-    """True for objects that `as_table` takes."""
+    """True for objects that `as_table` accepts."""
     return (
         isinstance(data, Table | Mapping)
         or _is_pandas(data)
@@ -49,26 +50,27 @@ def _is_pandas(data: Any) -> bool:
 
 
 def as_table(data: Any, source: str) -> Table:
-    """Astropy Table of any object with columns.
+    """Convert any object with columns to an astropy Table.
 
     Parameters
     ----------
     data : table
-        An astropy Table or QTable; a pandas DataFrame, whose NaN are missing values; any object
-        with an Arrow stream (polars, pyarrow, DuckDB), whose nulls are missing values; a mapping of
-        arrays or lists, in which None is a missing value; or a structured array of numpy.
+        An astropy Table or QTable; a pandas DataFrame, in which NaN is a missing value; any object
+        with an Arrow stream (polars, pyarrow, DuckDB), in which nulls are missing values; a mapping
+        of arrays or lists, in which None is a missing value; or a structured numpy array.
     source : str
-        Name of the table, for errors.
+        Name of the table, for error messages.
 
     Returns
     -------
     Table
-        An astropy Table as it is; others as views of their columns where possible.
+        The object itself if it is an astropy Table; otherwise a table of views of its columns where
+        possible.
 
     Raises
     ------
     InputError
-        If it is no such object, or its columns have different lengths.
+        If it is not such an object, or if its columns have different lengths.
     """
     if isinstance(data, Table):
         return data
@@ -94,7 +96,7 @@ def as_table(data: Any, source: str) -> Table:
 
 
 def _without_none(column: Any) -> Any:
-    """Column of a mapping; lists that hold None become masked columns."""
+    """Column of a mapping; lists that contain None become masked columns."""
     if not isinstance(column, list | tuple) or not any(value is None for value in column):
         return column
     mask = [value is None for value in column]
@@ -106,7 +108,7 @@ def _without_none(column: Any) -> Any:
 def _through_plate_scale(
     table: Table, found: Mapping[str, str], options: ReadOptions, source: str
 ) -> tuple[Table, str]:
-    """Table whose positions and errors in a length are in arcsec, and a note on that."""
+    """Table with positions and errors converted from lengths to arcsec, and a note about it."""
     if "u" not in found:
         raise InputError(
             "a plate scale is given, and the reference positions are on the sky",
@@ -123,7 +125,7 @@ def _through_plate_scale(
         unit = unit_of(column, where=f"{source}, column {found[key]!r}")
         factor = stated if unit is None else length_in_mm(unit)
         if factor is None and key not in ("u", "v") and unit is not None:
-            continue  # an angle, as it is
+            continue  # an angle, which needs no conversion
         if factor is None or (stated is not None and factor != stated):
             raise InputError(
                 f"a plate scale is given, and the unit is {unit or options.unit or 'not stated'}",
@@ -143,48 +145,51 @@ def _through_plate_scale(
 def sky_positions(
     table: Table, columns: Mapping[str, str] | None, *, source: str
 ) -> tuple[Float, Float] | None:
-    """Degrees (n,) of ra and of dec in the rows that have both; None for positions u, v."""
+    """RA and Dec (n,) in degrees of the rows that have both; None if positions are u, v."""
     sky = catalogue_positions(table, columns, source=source)
     if sky is None:
         return None
-    there = np.isfinite(sky[0])
-    return sky[0][there], sky[1][there]
+    finite = np.isfinite(sky[0])
+    return sky[0][finite], sky[1][finite]
 
 
 def catalogue_positions(
     table: Table, columns: Mapping[str, str] | None, *, source: str
 ) -> tuple[Float, Float] | None:
-    """Degrees (N,) of ra and of dec as they stand in a table, NaN where a row lacks one.
+    """RA and Dec (N,) in degrees as stored in a table, NaN if a row lacks one.
 
     None if the reference positions are u, v.
     """
     table = with_sky_columns(table)
-    found = find_columns(table.colnames, columns, ALIASES, source=source, pairs=PAIRS)
-    if not is_on_sky(table.colnames, found, columns, source):
+    column_names = find_columns(table.colnames, columns, ALIASES, source=source, pairs=PAIRS)
+    if not is_on_sky(table.colnames, column_names, columns, source):
         return None
     stay = ~(
-        absent(table[found["ra"]], not_finite=True) | absent(table[found["dec"]], not_finite=True)
+        absent(table[column_names["ra"]], not_finite=True)
+        | absent(table[column_names["dec"]], not_finite=True)
     )
     out = np.full((2, len(table)), np.nan)
     if stay.any():
-        out[:, stay] = sky_columns(Quantities(table if stay.all() else table[stay], found, source))
+        out[:, stay] = sky_columns(
+            Quantities(table if stay.all() else table[stay], column_names, source)
+        )
     return out[0], out[1]
 
 
 def with_sky_columns(table: Table) -> Table:
-    """Table whose SkyCoord columns are columns of ra and dec, in degrees.
+    """Table with SkyCoord columns replaced by columns of ra and dec in degrees.
 
-    `skycoord` becomes `skycoord.ra`, `skycoord.dec` (ICRS), and its motions and the time of its
-    positions `pmra`, `pmdec` and `ref_epoch`.  A single SkyCoord column of any other name is also
-    available as `skycoord`.  Distances are not used.  A table without such columns is returned as
-    it is.
+    `skycoord` becomes `skycoord.ra`, `skycoord.dec` (ICRS); its motions and the time of its
+    positions become `pmra`, `pmdec` and `ref_epoch`. A single SkyCoord column of any other name is
+    also available as `skycoord`. Distances are not used. A table without such columns is returned
+    unchanged.
     """
-    others = [name for name in table.colnames if not isinstance(table[name], Column)]
-    if not others:
+    mixin_names = [name for name in table.colnames if not isinstance(table[name], Column)]
+    if not mixin_names:
         return table
     from astropy.coordinates import SkyCoord
 
-    coordinates = [name for name in others if isinstance(table[name], SkyCoord)]
+    coordinates = [name for name in mixin_names if isinstance(table[name], SkyCoord)]
     if not coordinates:
         return table
     out = table.copy(copy_data=False)
@@ -210,48 +215,51 @@ def match_arguments(
     exposure_name: str | None = None,
     identify: bool = True,
 ) -> dict[str, Any]:
-    """Arguments of `Matches` from a table's columns.
+    """Arguments of `Matches` from the columns of a table.
 
     Parameters
     ----------
     data : table
         As for `as_table`.
     options : ReadOptions, optional
+        Reading options.
     source : str, optional
-        File, for errors.
+        Name of the file, for error messages.
     exposure_name : str, optional
-        Name of the one exposure, where the table has no column of them.
+        Name of the single exposure, if the table has no column of exposures.
     identify : bool, optional
-        Whether stars are recognised by equal reference positions if there is no column of them;
-        False for a part of the data, whose stars may be in the other parts too.
+        True to recognise stars by equal reference positions if there is no column of stars. False
+        for a part of the data, because the same stars may also be in other parts.
 
     Returns
     -------
     dict
-        Without errors of the matches if these do not come from columns.
+        Arguments, without errors of the matches if these do not come from columns.
 
     Raises
     ------
     InputError
-        For a missing column, text among numbers, values that are not finite, units that are missing
-        or contradict each other, and no rows.
+        If a column is missing, if a column of numbers contains text, if values are not finite, if
+        units are missing or contradictory, or if there are no rows.
     """
     options = options or ReadOptions()
     table = with_sky_columns(as_table(data, source))
-    found, options, notes = columns_read(table.colnames, table.meta, options, source=source)
+    column_names, options, notes = columns_read(table.colnames, table.meta, options, source=source)
     if len(table) == 0:
         raise InputError("holds no rows", where=source, do="give a table with matched stars")
     if options.plate_scale is not None:
-        table, scaled = _through_plate_scale(table, found, options, source)
+        table, scaled = _through_plate_scale(table, column_names, options, source)
         options, notes = replace(options, unit="arcsec", plate_scale=None), (*notes, scaled)
-    if options.epoch is None and "pm_ra" in found and "epoch" not in found:
+    if options.epoch is None and "pm_ra" in column_names and "epoch" not in column_names:
         options = replace(options, epoch=own_epoch(table.meta))
-    dated = "catalogue_epoch" in found or options.catalogue_epoch is not None
-    moves = "pm_ra" in found and dated and ("epoch" in found or options.epoch is not None)
+    dated = "catalogue_epoch" in column_names or options.catalogue_epoch is not None
+    moves = (
+        "pm_ra" in column_names and dated and ("epoch" in column_names or options.epoch is not None)
+    )
     rows_with_values = partial(
         without_missing,
         table,
-        found,
+        column_names,
         source=source,
         spared=_SPARED | (frozenset() if moves else frozenset(MOTIONS)),
         motions=frozenset(MOTIONS),
@@ -264,7 +272,7 @@ def match_arguments(
         def place(index: int) -> str:
             return row_number(int(rows[index]))
 
-    quantities = Quantities(table, found, source, place)
+    quantities = Quantities(table, column_names, source, place)
     try:
         out = match_columns(quantities, options)
     except InputError as error:
@@ -277,12 +285,12 @@ def match_arguments(
             do=f'correct such rows, or leave out {n_lost} of {n} with data.not_finite = "reject"',
         ) from error
     if identify and "star" not in out:
-        # as in the catalogue: motions bring one star to another place in each exposure
-        first, second = sky_columns(quantities) if "ra" in found else (out["u"], out["v"])
+        # compare catalogue positions: proper motion moves a star differently in each exposure
+        first, second = sky_columns(quantities) if "ra" in column_names else (out["u"], out["v"])
         star, note = star_codes(first, second, options.same_position)
         if star is not None:
             out |= {"star": star, "notes": (*out.get("notes", ()), note)}
-    if "ra" not in found:
+    if "ra" not in column_names:
         out |= header_arguments(table.meta, out["unit"], source=source)
     if exposure_name is not None:
         out.setdefault("exposure_names", (exposure_name,))
@@ -291,7 +299,7 @@ def match_arguments(
 
 
 def own_epoch(header: Mapping[str, Any]) -> float | str | None:
-    """Date of the exposure by its header: MJD-OBS as a decimal year, DATE-OBS as it stands."""
+    """Date of the exposure from its header: MJD-OBS as a decimal year, or DATE-OBS unchanged."""
     upper = {str(key).upper(): value for key, value in header.items()}
     day = upper.get("MJD-OBS")
     if isinstance(day, int | float) and not isinstance(day, bool):

@@ -1,1 +1,1 @@
-"""Positions on the sky: at the epoch of an exposure, as the Earth sees them, on a tangent plane."""
+"""Sky positions: epoch propagation, effects of the Earth's motion, and tangent planes."""

@@ -2,9 +2,9 @@
 
     VAFACTOR = sqrt(1 - b^2) / (1 - n . b),    b = velocity / c
 
-Towards the apex of the motion the stars crowd together: a true offset on the sky is VAFACTOR times
-the offset by a scale free of aberration for the pixels (Cox & Gilliland 2002, HST Calibration
-Workshop).  Aberration is conformal, so the factor is the same in all directions.
+Stars are displaced towards the apex of the motion: a true offset on the sky is VAFACTOR times the
+offset computed with an aberration-free pixel scale (Cox & Gilliland 2002, HST Calibration
+Workshop). Aberration is conformal, so the factor is the same in all directions.
 """
 
 from __future__ import annotations
@@ -30,46 +30,51 @@ def velocity_aberration(
     *,
     velocity_km_s: ArrayLike = (0.0, 0.0, 0.0),
 ) -> float:
-    """Scale factor of velocity aberration for a target, at an epoch.
+    """Scale factor of velocity aberration for a target at an epoch.
 
-    The barycentric velocity of the Earth comes from astropy's built-in ephemeris, without network.
-    Over a year the factor varies by up to 1e-4; the orbit of HST (7.5 km/s) adds 2.5e-5.
+    The barycentric velocity of the Earth is taken from astropy's built-in ephemeris, without
+    network access. Over a year the factor varies by up to 1e-4; the orbit of HST (7.5 km/s) adds
+    2.5e-5.
 
     Parameters
     ----------
     epoch : float or astropy Time
         Decimal year, or a time.
     ra, dec : float
-        Target in degrees.  Strictly the formula takes the apparent direction; the true one changes
-        the factor by b^2, 1e-8.
+        Position of the target in degrees. Strictly, the formula requires the apparent direction;
+        the true direction changes the factor by b^2, 1e-8.
     velocity_km_s : array_like, shape (3,), optional
         Velocity of the telescope relative to the Earth, along the axes of the ICRS.
 
     Returns
     -------
     float
-        VAFACTOR; above 1 when the telescope moves towards the target.
+        VAFACTOR; larger than 1 if the telescope moves towards the target.
 
     Raises
     ------
     InputError
-        For an epoch, direction or velocity that is none.
+        If the epoch, direction or velocity is invalid.
     """
     import astropy.units as apu
     from astropy.coordinates import get_body_barycentric_posvel
     from astropy.time import Time
 
-    own = np.asarray(velocity_km_s, float)
-    given = (0.0 if isinstance(epoch, Time) else float(epoch), float(ra), float(dec))
-    if own.shape != (3,) or not np.isfinite([*own, *given]).all() or abs(given[2]) > 90.0:
+    relative = np.asarray(velocity_km_s, float)
+    numbers = (0.0 if isinstance(epoch, Time) else float(epoch), float(ra), float(dec))
+    if (
+        relative.shape != (3,)
+        or not np.isfinite([*relative, *numbers]).all()
+        or abs(numbers[2]) > 90.0
+    ):
         raise InputError(
-            f"no aberration for epoch {epoch}, direction ({ra}, {dec}) and velocity {own}",
+            f"no aberration for epoch {epoch}, direction ({ra}, {dec}) and velocity {relative}",
             do="give a decimal year, ra and dec in degrees, and three components in km/s",
         )
-    # as TT: it needs no table of leap seconds, and a minute changes the factor by 1e-9
+    # TT needs no table of leap seconds, and an error of a minute changes the factor by only 1e-9
     time = epoch if isinstance(epoch, Time) else Time(epoch, format="decimalyear", scale="tt")
     _, earth = get_body_barycentric_posvel("earth", time, ephemeris="builtin")
-    b = (earth.xyz.to_value(apu.km / apu.s) + own) / _LIGHT
+    b = (earth.xyz.to_value(apu.km / apu.s) + relative) / _LIGHT
     speed2 = float(b @ b)
     if not speed2 < 1.0:
         raise InputError("the telescope is faster than light", do="give the velocity in km/s")
@@ -79,11 +84,11 @@ def velocity_aberration(
 
 
 def parallax_factors(epoch: ArrayLike, ra: float, dec: float) -> Float:
-    """Displacements (E, 2) to east and north per unit of parallax, at decimal (Julian) years (E,).
+    """Displacements (E, 2) to east and north per unit of parallax, at Julian years (E,).
 
-    As seen from the Earth, for ICRS degrees; a satellite in low orbit is within 5e-5 au of its
-    centre.  Green, Spherical Astronomy (1985), section 8; the Earth's position by astropy's own
-    ephemeris (ERFA's epv00), which needs no file.
+    `ra` and `dec` are ICRS degrees. The observer is at the centre of the Earth; a satellite in low
+    orbit is within 5e-5 au of it. See Green, Spherical Astronomy (1985), section 8. The position of
+    the Earth is from astropy's built-in ephemeris (ERFA's epv00), which needs no file.
     """
     from astropy.coordinates import get_body_barycentric
     from astropy.time import Time

@@ -1,7 +1,7 @@
 """Reference positions on the sky, with the errors and motions of a catalogue.
 
-Positions are brought to the epoch of the exposures: space motion by astropy, the parallax as seen
-from the Earth, errors with those of the motion and the parallax.
+Positions are moved to the epoch of the exposures: space motion by astropy, and the parallax as seen
+from the Earth. Their errors include those of motion and parallax.
 """
 
 from __future__ import annotations
@@ -19,28 +19,29 @@ from bayesdist.errors import InputError
 from bayesdist.utils.arrays import Float
 
 MOTIONS = ("pm_ra", "pm_dec", "sigma_pm_ra", "sigma_pm_dec")
-# that a star may lack: it then has none that counts
+# quantities that may be missing for a star, which then count as zero
 SPARED = ("parallax", "sigma_parallax", "corr_ra", "corr_dec")
 SKY_QUANTITIES = ("sigma_ra", "sigma_dec", *MOTIONS, *SPARED, "catalogue_epoch")
 
-_NO_MATTER = 100  # parsecs: without a radial velocity the path on the sky has no distance in it
-_STANDS = 1e-3  # years, over which nothing moves
+# parsecs; without a radial velocity, the path on the sky does not depend on the distance
+_NO_MATTER = 100
+_STANDS = 1e-3  # years; over a shorter time motions are negligible
 
 
 @dataclass(frozen=True, eq=False)
 class ReferenceSky:
-    """Reference positions as they are compared with the detections."""
+    """Reference positions at the epoch at which they are compared with the detections."""
 
     ra: Float  # (N,), degrees
     dec: Float  # (N,), degrees
-    sigma: Float | None  # (2, N), per axis along east and north, arcsec
+    sigma: Float | None  # (2, N), along east and north, arcsec
     motion: Float | None  # (2, N), to east (with cos(dec)) and north, arcsec/yr
     sigma_motion: Float | None  # (2, N), errors of the motions
-    notes: tuple[str, ...]  # treatment of the positions, as clauses
+    notes: tuple[str, ...]  # clauses on how the positions were treated
 
 
 def sky_columns(quantities: Quantities) -> tuple[Float, Float]:
-    """Right ascension and declination (N,) in degrees, as they stand in some rows of a table."""
+    """Right ascension and declination (N,) in degrees, as stored in the rows of a table."""
     ra, dec = (_degrees(quantities[key], key) for key in ("ra", "dec"))
     beyond = np.abs(dec) > 90.0
     if beyond.any():
@@ -57,7 +58,7 @@ def _degrees(column: SourceColumn, key: str) -> Float:
 
 
 def _sexagesimal(column: SourceColumn, texts: NDArray[np.str_], key: str) -> Float:
-    """Degrees of texts such as 10:00:24.1 (hours, of ra) and +02:12:00 (degrees)."""
+    """Degrees from strings such as 10:00:24.1 (hours, for ra) and +02:12:00 (degrees)."""
     import astropy.units as apu
     from astropy.coordinates import Angle
 
@@ -79,12 +80,12 @@ def reference_sky(
     epoch: Float | None = None,
     catalogue_epoch: float | None = None,
 ) -> ReferenceSky:
-    """Reference positions at `epoch`, with errors and motions where the table has them.
+    """Reference positions at `epoch`, with errors and motions if the table has them.
 
-    `epoch` (N,) is that of the exposures, `catalogue_epoch` that of the positions where there is no
-    column of it.  Used with ra and dec, where they are there: sigma_ra, sigma_dec, pm_ra, pm_dec
-    and their errors, corr_ra and corr_dec (of position and motion on one axis), parallax and its
-    error.  Refused are half a pair, and units that are missing or wrong.
+    `epoch` (N,) is that of the exposures, `catalogue_epoch` that of the positions if there is no
+    such column. Besides ra and dec, these columns are used if they exist: sigma_ra, sigma_dec,
+    pm_ra, pm_dec and their errors, corr_ra and corr_dec (correlation of position and motion on one
+    axis), parallax and its error. InputError for half a pair, and for missing or invalid units.
     """
     ra, dec = sky_columns(quantities)
     sigma = _pair(quantities, ("sigma_ra", "sigma_dec"), "arcsec")
@@ -105,7 +106,7 @@ def reference_sky(
         note = f"proper motions are not used: {lacks} is not given ({key})"
         return ReferenceSky(ra, dec, sigma, motion, sigma_motion, (note,))
     zero = zero_motions(quantities["pm_ra"].values, quantities["pm_dec"].values)
-    if zero.any():  # tables on disk, of which no row is left out in reading
+    if zero.any():  # tables on disk: rows are not left out in reading
         raise quantities["pm_ra"].fail(
             int(np.argmax(zero)),
             f"proper motion is exactly 0 on both axes in {np.count_nonzero(zero)} rows, as where "
@@ -138,12 +139,12 @@ def reference_sky(
 def _pair(
     quantities: Quantities, keys: tuple[str, str], unit: str, *, missing: bool = False
 ) -> Float | None:
-    """Columns of a pair (2, N) in a unit; None where neither is there."""
+    """Columns of a pair (2, N) in a unit; None if neither exists."""
     have = [key for key in keys if key in quantities]
     if len(have) == 1:
-        other = keys[1 - keys.index(have[0])]
+        partner = keys[1 - keys.index(have[0])]
         raise InputError(
-            f"column {other!r} is missing beside {quantities[have[0]].name!r}",
+            f"column {partner!r} is missing beside {quantities[have[0]].name!r}",
             where=quantities.source,
             do="name it in the option 'columns', or leave the other out by an empty name",
         )
@@ -153,7 +154,7 @@ def _pair(
 
 
 def _optional(quantities: Quantities, key: str, unit: str) -> Float | None:
-    """Column of which stars may lack a value: it is 0 then."""
+    """Column in a unit, with 0 for missing values; None if it does not exist."""
     if key not in quantities:
         return None
     return _in_unit(quantities[key], key, unit, missing=True)
@@ -161,7 +162,7 @@ def _optional(quantities: Quantities, key: str, unit: str) -> Float | None:
 
 def _in_unit(column: SourceColumn, key: str, unit: str, *, missing: bool) -> Float:
     if column.unit is None and unit:
-        # catalogues write degrees for positions and mas for the rest: no guess is safe
+        # catalogues use degrees for positions and mas for other columns, so no default is safe
         raise InputError(
             "has no unit, and its name is that of no known catalogue",
             where=column.where,
@@ -173,7 +174,7 @@ def _in_unit(column: SourceColumn, key: str, unit: str, *, missing: bool) -> Flo
 
 
 def _moved(ra: Float, dec: Float, motion: Float, start: Float, end: Float) -> tuple[Float, Float]:
-    """Positions at the end by space motion without a radial velocity."""
+    """Positions at the end of a space motion without radial velocity."""
     if np.max(np.abs(end - start), initial=0.0) < _STANDS:
         return ra, dec
     import astropy.units as apu
@@ -194,7 +195,7 @@ def _moved(ra: Float, dec: Float, motion: Float, start: Float, end: Float) -> tu
 
 
 def _factors(epoch: Float, direction: tuple[float, float]) -> Float:
-    """Parallax factors (2, N); those of the middle of the field stand for all of it."""
+    """Parallax factors (2, N), computed for the middle of the field."""
     dates, of = np.unique(epoch, return_inverse=True)
     return np.asarray(parallax_factors(dates, *direction)[of].T, float)
 
@@ -202,7 +203,7 @@ def _factors(epoch: Float, direction: tuple[float, float]) -> Float:
 def _sigma_at(
     quantities: Quantities, sigma: Float, sigma_pm: Float | None, dt: Float, factors: Float
 ) -> Float:
-    """Errors (2, N) at the new epoch: those of position, motion and parallax."""
+    """Errors (2, N) at the new epoch, including those of motion and parallax."""
     variance = sigma**2
     if sigma_pm is not None:
         for axis, key in enumerate(("corr_ra", "corr_dec")):

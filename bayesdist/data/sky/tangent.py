@@ -1,4 +1,4 @@
-"""The tangent plane: gnomonic projection of the sky, in seconds of arc.
+"""Tangent plane: gnomonic projection of the sky, in seconds of arc.
 
     D   = sin d sin d0 + cos d cos d0 cos(a - a0)
     xi  = cos d sin(a - a0) / D                                  east
@@ -22,17 +22,17 @@ ARCSEC = np.degrees(1.0) * 3600.0  # seconds of arc in a radian
 
 
 def mean_direction(ra: ArrayLike, dec: ArrayLike) -> tuple[float, float]:
-    """Direction of the sum of unit vectors.
+    """Mean direction: that of the sum of the unit vectors.
 
     Parameters
     ----------
     ra, dec : array_like, shape (N,)
-        Degrees.
+        Right ascension and declination in degrees.
 
     Returns
     -------
     ra0, dec0 : float
-        Degrees, ra0 in [0, 360).
+        Mean direction in degrees, with ra0 in [0, 360).
     """
     return direction_of(direction_sum(ra, dec))
 
@@ -40,7 +40,7 @@ def mean_direction(ra: ArrayLike, dec: ArrayLike) -> tuple[float, float]:
 def direction_sum(ra: ArrayLike, dec: ArrayLike) -> tuple[int, int, int]:
     """Sum of unit vectors in units of 2^-62, from ra and dec (N,) in degrees.
 
-    It is exact to the last digit: sums of parts add up to that of the whole.
+    The sum is exact to the last digit, so that sums of parts add up to the total.
     """
     a, d = np.radians(np.asarray(ra, float)), np.radians(np.asarray(dec, float))
     x, y, z = (_exact_sum(c) for c in (np.cos(d) * np.cos(a), np.cos(d) * np.sin(a), np.sin(d)))
@@ -48,14 +48,14 @@ def direction_sum(ra: ArrayLike, dec: ArrayLike) -> tuple[int, int, int]:
 
 
 def _exact_sum(values: Float) -> int:
-    """Sum of numbers within [-1, 1] in units of 2^-62: two halves of 31 bits cannot overflow."""
+    """Sum of numbers in [-1, 1] in units of 2^-62; two parts of 31 bits cannot overflow."""
     upper = np.rint(values * 2.0**31)
     lower = np.rint((values * 2.0**31 - upper) * 2.0**31)
     return (int(upper.astype(np.int64).sum()) << 31) + int(lower.astype(np.int64).sum())
 
 
 def direction_of(vector: tuple[int, int, int]) -> tuple[float, float]:
-    """Direction of a vector of any length, as `mean_direction` gives it."""
+    """Direction of a vector of any length, in the form returned by `mean_direction`."""
     x, y, z = (float(component) for component in vector)
     ra0 = float(np.degrees(np.arctan2(y, x)) % 360.0)
     return ra0, float(np.degrees(np.arctan2(z, np.hypot(x, y))))
@@ -64,7 +64,7 @@ def direction_of(vector: tuple[int, int, int]) -> tuple[float, float]:
 def _angles(
     ra: ArrayLike, dec: ArrayLike, point: tuple[float, float], where: str, place: Place
 ) -> tuple[Float, Float, float, Float]:
-    """Hour angle from the point, declination, the point's declination, and D; radians."""
+    """Hour angle from the tangent point, declination, its declination, and D; in radians."""
     delta, d, d0, D = _distances(ra, dec, point)
     if np.any(D <= 0):
         row = place(int(np.argmax(D <= 0)))
@@ -98,28 +98,28 @@ def tangent_plane(
     where: str = "",
     place: Place = row_number,
 ) -> tuple[Float, Float]:
-    """Positions of the sky on the plane that touches it at a point.
+    """Project sky positions onto a tangent plane.
 
     Parameters
     ----------
     ra, dec : array_like, shape (N,)
-        Degrees.
+        Right ascension and declination in degrees.
     point : tuple of float
         Tangent point (ra0, dec0), degrees.
     where : str, optional
-        File, for the error.
+        Name of the file, for the error message.
     place : callable, optional
-        Name of a row in it, by its index in the arrays.
+        ``place(index)`` is the name of a row of that file, given its index in the arrays.
 
     Returns
     -------
     xi, eta : ndarray, shape (N,)
-        Seconds of arc; xi grows to the east, eta to the north.
+        Coordinates in seconds of arc; xi increases to the east, eta to the north.
 
     Raises
     ------
     InputError
-        When a position is 90 degrees or more from the point.
+        If a position is 90 degrees or more from the tangent point.
     """
     delta, d, d0, D = _angles(ra, dec, point, where, place)
     xi = np.cos(d) * np.sin(delta) / D
@@ -130,9 +130,9 @@ def tangent_plane(
 def tangent_jacobian(
     ra: ArrayLike, dec: ArrayLike, point: tuple[float, float], *, where: str = ""
 ) -> Float:
-    """Derivatives (N, 2, 2) of (xi, eta) by small steps to the east and to the north.
+    """Derivatives (N, 2, 2) of (xi, eta) with respect to displacements to the east and north.
 
-    ``J[:, 0, 1]`` is d xi / d dec; a step to the east counts as d ra cos(dec).
+    ``J[:, 0, 1]`` is d xi / d dec; a displacement to the east is d ra cos(dec).
     """
     delta, d, d0, D = _angles(ra, dec, point, where, row_number)
     out = np.empty((*np.shape(D), 2, 2))
@@ -154,11 +154,11 @@ def onto_plane(
     where: str = "",
     place: Place = row_number,
 ) -> dict[str, Any]:
-    """Columns u, v, tangent_point of stars in arcsec; sigma_u, pm_u, sigma_pm_u where given.
+    """Columns u, v, tangent_point of stars in arcsec, and sigma_u, pm_u, sigma_pm_u if given.
 
-    `ra`, `dec` (N,) and `point` are in degrees, None being the mean direction; errors, motions and
-    their errors (2, N) are to the east (with the factor cos(dec)) and to the north, in arcsec (per
-    year).
+    `ra`, `dec` (N,) and `point` are in degrees; the default point is the mean direction. Errors,
+    motions and their errors (2, N) are to the east (with the factor cos(dec)) and to the north, in
+    arcsec (per year).
     """
     point = mean_direction(ra, dec) if point is None else point
     u, v = tangent_plane(ra, dec, point, where=where, place=place)
@@ -176,9 +176,9 @@ def onto_plane(
 
 
 def plane_axes(point: tuple[float, float]) -> Float:
-    """Unit vectors to east, north and tangent point (degrees), as the rows (3, 3) of a matrix.
+    """Unit vectors to east, north and tangent point (degrees), as rows (3, 3) of a matrix.
 
-    A position of the plane lies in the direction (xi, eta, 1) @ rows, xi and eta in radians.
+    A point on the plane is in the direction (xi, eta, 1) @ rows, with xi and eta in radians.
     """
     a, d = np.radians(point)
     return np.array(
@@ -191,9 +191,10 @@ def plane_axes(point: tuple[float, float]) -> Float:
 
 
 def separation(point: tuple[ArrayLike, ArrayLike], ra: ArrayLike, dec: ArrayLike) -> Float:
-    """Angles (N,) between positions, all in degrees (Vincenty's formula).
+    """Angular separations (N,) between positions, all in degrees (Vincenty's formula).
 
-    `point` is one position, or the longitudes and latitudes (N,) of as many as `ra` and `dec`.
+    `point` is one position, or the longitudes and latitudes (N,) of as many positions as `ra` and
+    `dec`.
     """
     a0, d0, a, d = (np.radians(angle) for angle in (*point, ra, dec))
     cos_a, sin_a = np.cos(a - a0), np.sin(a - a0)
@@ -203,7 +204,7 @@ def separation(point: tuple[ArrayLike, ArrayLike], ra: ArrayLike, dec: ArrayLike
 
 
 def sky_of_plane(xi: ArrayLike, eta: ArrayLike, point: tuple[float, float]) -> tuple[Float, Float]:
-    """Right ascension in [0, 360) and declination, degrees, of points (arcsec) of a plane."""
+    """Right ascension in [0, 360) and declination, degrees, of points (arcsec) on a plane."""
     xi, eta = np.asarray(xi, float) / ARCSEC, np.asarray(eta, float) / ARCSEC
     x, y, z = np.moveaxis(np.stack([xi, eta, np.ones_like(xi)], axis=-1) @ plane_axes(point), -1, 0)
     return np.degrees(np.arctan2(y, x)) % 360.0, np.degrees(np.arctan2(z, np.hypot(x, y)))

@@ -1,1 +1,1 @@
-"""Matches in Parquet files: written, scanned, and left on disk."""
+"""Matches in Parquet files: writing, scanning, and reading from disk in batches."""

@@ -1,7 +1,8 @@
 """Matches that stay on disk: Parquet files, read batch by batch.
 
-A scan in the memory of one block finds what must be known of all rows: the names of exposures,
-chips and filters, the tangent point, and that no row is wrong or repeated.
+A scan with one block in memory at a time collects what must be known about all rows: the names of
+exposures, chips and filters, and the tangent point. It also checks that no row is invalid or
+repeated.
 """
 
 from __future__ import annotations
@@ -27,7 +28,7 @@ from bayesdist.data.tables.parquet import describe_part
 from bayesdist.errors import FormatError, InputError
 
 PathLike = str | os.PathLike[str]
-Segment = tuple[int, int, int]  # file, first row, row after the last
+Segment = tuple[int, int, int]  # file, first row, and row after the last
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,16 +36,17 @@ class StoredRows:
     """Consecutive rows of Parquet files."""
 
     labels: Labels
-    files: tuple[StoredFile, ...]  # of the rows
-    segments: tuple[Segment, ...]  # for each file its code, the first row, the row after the last
+    files: tuple[StoredFile, ...]  # files of the rows
+    # for each file: its code, the first row, and the row after the last
+    segments: tuple[Segment, ...]
 
     def __len__(self) -> int:
         return sum(stop - start for _, start, stop in self.segments)
 
     def load(self) -> Matches:
-        """Rows, with codes and sources by the labels.
+        """Read the rows, with codes and sources that refer to the labels.
 
-        InputError when a file is damaged, gone, or not what it was when it was opened.
+        InputError if a file is damaged, missing, or has changed since it was opened.
         """
         columns: dict[str, NDArray[Any]] = {}
         names, end = set(COLUMNS), 0
@@ -73,25 +75,25 @@ class StoredRows:
 
 
 def open_matches(path: PathLike | Sequence[PathLike], **options: Any) -> Matches:
-    """Matched star positions that stay on disk.
+    """Open matched star positions without reading them into memory.
 
     Parameters
     ----------
     path : path-like or sequence of path-like
         Parquet: a file, a list of files, a pattern, or a folder of parts of one table.
     **options
-        As `ReadOptions`; a row with a missing value, or one that is not finite, is refused.
+        As for `ReadOptions`; rows with missing values or values that are not finite are an error.
 
     Returns
     -------
     Matches
-        Its batches are equal to `read_matches` of these rows.
+        Matches on disk; the batches are equal to `read_matches` of their rows.
 
     Raises
     ------
     InputError
-        For all that is wrong with a file or an option, in one sentence.  All files must have the
-        same quantities; one of them may be empty.
+        If a file or an option is invalid; the message says what to change. All files must have the
+        same quantities, and some of them may be empty.
 
     Examples
     --------
@@ -103,14 +105,14 @@ def open_matches(path: PathLike | Sequence[PathLike], **options: Any) -> Matches
     >>> sum(len(batch) for batch in stars.batches())
     500
     """
-    given = ReadOptions(**options)
-    if given.not_finite == "reject":
+    reading = ReadOptions(**options)
+    if reading.not_finite == "reject":
         raise InputError(
             "rows of tables on disk cannot be left out in reading",
             where="data.not_finite",
             do="write the table without them",
         )
-    if given.plate_scale is not None:
+    if reading.plate_scale is not None:
         raise InputError(
             "tables on disk are not brought to another unit",
             where="data.plate_scale",
@@ -129,16 +131,18 @@ def open_matches(path: PathLike | Sequence[PathLike], **options: Any) -> Matches
     if not in_parts and len(files) > 1:
         names = exposure_names(files)
     stored = [
-        stored_file(describe_part(file), given, exposure_name=name)
+        stored_file(describe_part(file), reading, exposure_name=name)
         for file, name in zip(files, names, strict=True)
     ]
     _refuse_differences(stored)
     first = stored[0]
-    sigma = given.sigma
+    sigma = reading.sigma
     refuse_missing_errors(sigma, _has_errors(first), "mag" in first.found, where=first.source)
-    if first.on_sky and given.tangent_point is None:
+    if first.on_sky and reading.tangent_point is None:
         point = tangent_point_of(stored)
-        stored = [replace(one, options=replace(one.options, tangent_point=point)) for one in stored]
+        stored = [
+            replace(part, options=replace(part.options, tangent_point=point)) for part in stored
+        ]
     labels = scan(stored)
     matches = Matches.from_readers(_readers(labels, stored), labels, _columns_of(first))
     return matches if isinstance(sigma, str) else matches.with_errors(sigma)
@@ -147,7 +151,7 @@ def open_matches(path: PathLike | Sequence[PathLike], **options: Any) -> Matches
 def _readers(labels: Labels, files: Sequence[StoredFile]) -> list[StoredRows]:
     """Consecutive rows of all files.
 
-    Row groups, and files, are joined up to `BATCH` rows; larger ones are split evenly.
+    Row groups and files are combined up to `BATCH` rows; larger ones are split evenly.
     """
     out: list[list[Segment]] = [[]]
     size = 0
@@ -169,7 +173,7 @@ def _readers(labels: Labels, files: Sequence[StoredFile]) -> list[StoredRows]:
 
 
 def _spans(group_rows: Sequence[int]) -> list[tuple[int, int]]:
-    """First row and row after the last of each row group, large ones split evenly."""
+    """First row and row after the last of each row group; large groups are split evenly."""
     out = []
     first = 0
     for rows in group_rows:
@@ -180,23 +184,23 @@ def _spans(group_rows: Sequence[int]) -> list[tuple[int, int]]:
 
 
 def _columns_of(file: StoredFile) -> set[str]:
-    """Columns of matches that a file gives."""
-    found = set(file.found) & set(COLUMNS) | {*POSITIONS, *LABELS_OF_CODES, "row", "source"}
+    """Columns of matches that a file provides."""
+    available = set(file.found) & set(COLUMNS) | {*POSITIONS, *LABELS_OF_CODES, "row", "source"}
     if file.options.epoch is not None:
-        found.add("epoch")
+        available.add("epoch")
     if _has_errors(file):
-        found |= set(SIGMAS)
+        available |= set(SIGMAS)
     for on_sky, on_plane in (("pm_ra", "pm"), ("sigma_pm_ra", "sigma_pm")):
         if on_sky in file.found:
-            found |= {f"{on_plane}_u", f"{on_plane}_v"}
-    return found
+            available |= {f"{on_plane}_u", f"{on_plane}_v"}
+    return available
 
 
 def _refuse_differences(parts: Sequence[StoredFile]) -> None:
-    """Refuse parts that do not make one table."""
+    """Raise InputError for parts that do not form one table."""
     first = parts[0]
-    for other in parts[1:]:
-        for lacking, having in ((other, first), (first, other)):
+    for part in parts[1:]:
+        for lacking, having in ((part, first), (first, part)):
             missing = [key for key in having.found if key not in lacking.found]
             if missing:
                 raise InputError(
@@ -205,14 +209,14 @@ def _refuse_differences(parts: Sequence[StoredFile]) -> None:
                     where=lacking.source,
                     do="give all parts the same columns",
                 )
-        if other.unit != first.unit:
+        if part.unit != first.unit:
             raise InputError(
-                f"unit is {other.unit}, but {first.unit} in {first.source}",
-                where=other.source,
+                f"unit is {part.unit}, but {first.unit} in {first.source}",
+                where=part.source,
                 do="bring all files to one",
             )
 
 
 def _has_errors(file: StoredFile) -> bool:
-    """True where a file has errors of the matches, or of the reference positions."""
+    """True if a file has errors of the matches, or of the reference positions."""
     return bool({"sigma_u", "sigma_ra"} & set(file.found))

@@ -1,4 +1,4 @@
-"""Parquet files of matches: how each is read, and the labels that a scan of all of them finds."""
+"""Parquet files of matches: how each file is read, and the labels found by scanning all of them."""
 
 from __future__ import annotations
 
@@ -34,14 +34,14 @@ BLOCK = 2**16  # rows read together
 
 @dataclass(frozen=True, eq=False)
 class StoredFile:
-    """Parquet file of matches, and how it is read."""
+    """Parquet file of matches, and how to read it."""
 
     part: ParquetPart
     found: Mapping[str, str]  # column of each quantity
-    unit: str  # of u and v
-    exposure_name: str | None  # of the one exposure, where there is no column
-    options: ReadOptions  # with pixel origin, and tangent point once known
-    notes: tuple[str, ...] = ()  # findings on the file, as clauses
+    unit: str  # unit of u and v
+    exposure_name: str | None  # name of the single exposure, if there is no column of exposures
+    options: ReadOptions  # with pixel origin, and with the tangent point once it is known
+    notes: tuple[str, ...] = ()  # clauses on the file
 
     @property
     def source(self) -> str:
@@ -50,7 +50,7 @@ class StoredFile:
 
     @property
     def on_sky(self) -> bool:
-        """True where the reference positions are ra and dec."""
+        """True if the reference positions are ra and dec."""
         return "ra" in self.found
 
     def blocks(
@@ -62,25 +62,27 @@ class StoredFile:
     ) -> Iterator[dict[str, Any]]:
         """Arguments of Matches for rows `start` to `stop`, at most `size` rows at a time.
 
-        As `match_columns`, with codes into labels of the block's own.  InputError names the row
-        group of a wrong row.
+        As from `match_columns`, with codes that refer to labels of the block. InputError for an
+        invalid row names its row group.
         """
-        found = self.found
-        encoded = {found[key] for key in LABELS_OF_CODES if key in found}
-        encoded |= {found["epoch"]} & self.part.texts if "epoch" in found else set()
-        columns = list(dict.fromkeys(found.values()))
-        # names of chips get numbers once all are known
+        column_names = self.found
+        encoded = {column_names[key] for key in LABELS_OF_CODES if key in column_names}
+        encoded |= {column_names["epoch"]} & self.part.texts if "epoch" in column_names else set()
+        columns = list(dict.fromkeys(column_names.values()))
+        # chip names get their numbers once all names are known
         options = replace(self.options, unit=self.unit, chips=self.options.chips or {})
         for block in self.part.blocks(columns, encoded=encoded, start=start, stop=stop, size=size):
-            out = match_columns(self._quantities(block, found), options)
+            out = match_columns(self._quantities(block, column_names), options)
             for key, labels in LABELS_OF_CODES.items():
-                if key not in found:
-                    own = self.exposure_name if key == "exposure" else None
-                    out[labels] = (DEFAULT_LABELS[key] if own is None else own,)
+                if key not in column_names:
+                    exposure_label = self.exposure_name if key == "exposure" else None
+                    out[labels] = (
+                        DEFAULT_LABELS[key] if exposure_label is None else exposure_label,
+                    )
             yield out
 
     def direction(self) -> tuple[int, int, int]:
-        """Sum of the directions of all its reference positions."""
+        """Sum of the direction vectors of all reference positions."""
         total = np.zeros(3, object)
         columns = [self.found["ra"], self.found["dec"]]
         for block in self.part.blocks(columns, size=BLOCK):
@@ -99,37 +101,39 @@ def stored_file(
     *,
     exposure_name: str | None,
 ) -> StoredFile:
-    """Layout of a file, by the names and units of its columns alone; missing ones are refused."""
+    """Layout of a file from the names and units of its columns; InputError if one is missing."""
     source = part.name
-    found, options, notes = columns_read(part.colnames, {}, options, source=source)
-    found.pop("flux", None)  # magnitudes of all rows or of none: that takes all of them
-    refuse_half(("sigma_u", "sigma_v"), found, where=source, what="errors")
-    nominal_columns(found, source=source, tangent_point=options.tangent_point)
-    if "ra" in found:
-        own = plane_unit(options.unit, source=source)
+    column_names, options, notes = columns_read(part.colnames, {}, options, source=source)
+    column_names.pop("flux", None)  # magnitudes would require the fluxes of all rows to be positive
+    refuse_half(("sigma_u", "sigma_v"), column_names, where=source, what="errors")
+    nominal_columns(column_names, source=source, tangent_point=options.tangent_point)
+    if "ra" in column_names:
+        plane_unit_ = plane_unit(options.unit, source=source)
     else:
         u, v = (
-            SourceColumn(Column([], unit=part.units.get(found[key])), source, found[key])
+            SourceColumn(
+                Column([], unit=part.units.get(column_names[key])), source, column_names[key]
+            )
             for key in ("u", "v")
         )
-        own = position_unit((u, v), options.unit)
-    return StoredFile(part, found, own, exposure_name, options, notes)
+        plane_unit_ = position_unit((u, v), options.unit)
+    return StoredFile(part, column_names, plane_unit_, exposure_name, options, notes)
 
 
 def tangent_point_of(parts: Sequence[StoredFile]) -> tuple[float, float]:
     """Mean direction of all reference positions."""
     total = np.zeros(3, object)
-    for one in parts:
-        total += one.direction()
+    for part in parts:
+        total += part.direction()
     x, y, z = total.tolist()
     return direction_of((x, y, z))
 
 
 @dataclass(eq=False)
 class _Scan:
-    """Parts batch by batch, as `first_repetition` takes them.
+    """Iterates over all parts batch by batch, as `first_repetition` requires.
 
-    All columns are read, so that any wrong row is found, and labels are numbered as they appear.
+    All columns are read, so that any invalid row is found, and labels are numbered as they appear.
     """
 
     parts: Sequence[StoredFile]
@@ -138,17 +142,17 @@ class _Scan:
     )
 
     def __call__(self) -> Iterator[list[NDArray[Any]]]:
-        for one in self.parts:
-            for block in one.blocks(size=BLOCK):
+        for part in self.parts:
+            for block in part.blocks(size=BLOCK):
                 keys = [block[name] for name in ("x", "y", "u", "v")]
-                for key, known in self.numbers.items():
+                for key, code_by_label in self.numbers.items():
                     code_of_label = np.array(
                         [
-                            known.setdefault(label, len(known))
+                            code_by_label.setdefault(label, len(code_by_label))
                             for label in block[LABELS_OF_CODES[key]]
                         ]
                     )
-                    if key in block or one.exposure_name is not None:
+                    if key in block or part.exposure_name is not None:
                         keys.append(recoded(key, block, code_of_label))
                 if "epoch" in block:
                     keys.append(block["epoch"])
@@ -156,15 +160,15 @@ class _Scan:
 
 
 def scan(parts: Sequence[StoredFile]) -> Labels:
-    """Names common to all parts, from a scan of all rows; any wrong or repeated row is refused.
+    """Labels common to all parts, from a scan of all rows; InputError for invalid or repeated rows.
 
-    The parts have the same quantities and unit, and a tangent point if they need one.
+    The parts must have the same quantities and unit, and a tangent point if they need one.
     """
-    n_rows = sum(one.part.n_rows for one in parts)
+    n_rows = sum(part.part.n_rows for part in parts)
     if n_rows == 0:
-        more = f" and {len(parts) - 1} more" if len(parts) > 1 else ""
+        remainder = f" and {len(parts) - 1} more" if len(parts) > 1 else ""
         raise InputError(
-            "holds no rows", where=parts[0].source + more, do="give a table with matched stars"
+            "holds no rows", where=parts[0].source + remainder, do="give a table with matched stars"
         )
     rows = _Scan(parts)
     pair = first_repetition(rows, buckets_for(n_rows))
@@ -180,41 +184,41 @@ def scan(parts: Sequence[StoredFile]) -> Labels:
         exposure_names=tuple(rows.numbers["exposure"]),
         chip_numbers=tuple(sorted(rows.numbers["chip"])),
         filter_names=tuple(rows.numbers["filter"]),
-        sources=tuple(one.source for one in parts),
+        sources=tuple(part.source for part in parts),
         n_rows=n_rows,
         **_geometry(parts),
-        notes=tuple(dict.fromkeys(note for one in parts for note in one.notes)),
+        notes=tuple(dict.fromkeys(note for part in parts for note in part.notes)),
     )
 
 
 def _geometry(parts: Sequence[StoredFile]) -> dict[str, Any]:
     """Tangent point and match radius of all parts, as arguments of `Labels`.
 
-    InputError if parts state different ones.
+    InputError if parts state different values.
     """
     first = parts[0]
     if first.on_sky:
         return {"tangent_point": first.options.tangent_point}
-    stated = [header_arguments(one.part.header, one.unit, source=one.source) for one in parts]
+    stated = [header_arguments(part.part.header, part.unit, source=part.source) for part in parts]
     points = [header.get("tangent_point") for header in stated]
-    for point, one in zip(points, parts, strict=True):
+    for point, part in zip(points, parts, strict=True):
         if point != points[0]:
             raise InputError(
                 f"tangent point is {point}, but {points[0]} in {first.source}",
-                where=one.source,
+                where=part.source,
                 do="bring all parts to one",
             )
     radii = [header.get("match_radius") for header in stated]
     return {
         "tangent_point": points[0],
-        "match_radius": common_radius(radii, [one.source for one in parts]),
+        "match_radius": common_radius(radii, [part.source for part in parts]),
     }
 
 
 def _named(parts: Sequence[StoredFile], row: int) -> str:
-    """File, row group and row of a row counted over all parts."""
-    for one in parts:
-        if row < one.part.n_rows:
+    """File, row group and row of a row number counted over all parts."""
+    for part in parts:
+        if row < part.part.n_rows:
             break
-        row -= one.part.n_rows
-    return f"{one.source}, {one.part.place(0)(row)}"
+        row -= part.part.n_rows
+    return f"{part.source}, {part.part.place(0)(row)}"

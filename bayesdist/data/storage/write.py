@@ -1,4 +1,4 @@
-"""Columns, and matches table by table as they come, to Parquet."""
+"""Write columns, or matches table by table, to Parquet."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     import pyarrow
 
 Labelled = tuple[Int, tuple[str, ...]]
-# columns, their units, and what no column holds
+# columns, their units, and header values that no column holds
 Part = tuple[Mapping[str, NDArray[Any] | Labelled], Mapping[str, str], Mapping[str, Any]]
 
 _NUMBERS = (
@@ -41,32 +41,32 @@ def write_partitioned(
     *,
     rows_per_group: int = BATCH,
 ) -> list[Path]:
-    """Write tables of matches as a folder of Parquet files, parts of one table.
+    """Write tables of matches as a folder of Parquet files, which are parts of one table.
 
-    Only one of the tables need be in memory at a time.  Reading the folder gives the same numbers
-    bit for bit, with the tangent point and the match radius.  Not written are the rows and files
-    that the stars come from, and what was rejected; labels that no star has; and exposures, chips
-    and filters where the first table has none but the default.
+    Only one of the tables needs to be in memory at a time. Reading the folder gives bit-identical
+    numbers, with the tangent point and the match radius. Not written are the rows and files of
+    origin, counts of rejected rows, labels without stars, and exposures, chips and filters if the
+    first table has only the default label.
 
     Parameters
     ----------
     tables : iterable of Matches
-        Of one unit and with the same columns.
+        Tables in one unit, with the same columns.
     folder : path-like
-        It is made if need be, and must not hold Parquet files.
+        Output folder, which is created if necessary and must not contain Parquet files.
     rows_per_group : int, optional
-        Rows of a row group at most.
+        Largest number of rows in a row group.
 
     Returns
     -------
     list of pathlib.Path
-        ``part-00000.parquet`` and so on, one for each table.  When one of them cannot be written,
-        or the tables end in an error, those before it are removed.
+        ``part-00000.parquet`` and so on, one per table. If a file cannot be written, or if the
+        iterable raises an error, the files written so far are removed.
 
     Raises
     ------
     InputError
-        For no tables, tables that differ in their columns or unit, and a folder that cannot be
+        If there are no tables, if tables differ in columns or unit, or if the folder cannot be
         written to or is in use.
 
     Examples
@@ -88,7 +88,7 @@ def write_partitioned(
 
 
 def _parts(tables: Iterable[Matches], folder: Path) -> Iterator[Part]:
-    """Columns and units of tables, which must have those of the first."""
+    """Columns and units of tables, which must be those of the first table."""
     names: list[str] = []
     unit = ""
     for number, table in enumerate(tables, 1):
@@ -108,7 +108,7 @@ def _parts(tables: Iterable[Matches], folder: Path) -> Iterator[Part]:
 def write_parts(
     folder: Path, parts: Iterable[Part], *, rows_per_group: int | None = None
 ) -> list[Path]:
-    """Files part-00000.parquet and so on of columns and units; none is left if one fails."""
+    """Write columns and units to part-00000.parquet and so on; remove all files if one fails."""
     written: list[Path] = []
     try:
         for columns, units, header in parts:
@@ -131,7 +131,7 @@ def _make_empty(folder: Path) -> None:
 
 
 def _columns(table: Matches, names: Collection[str]) -> dict[str, NDArray[Any] | Labelled]:
-    """Columns of a table; labels where there are other than the default, or `names` has them."""
+    """Columns of a table; labels only if they are not the default or if `names` contains them."""
     columns: dict[str, Any] = columns_of(table, (*_NUMBERS, "star"))
     for name, key in LABELS_OF_CODES.items():
         labels = getattr(table, key)
@@ -148,9 +148,9 @@ def write_columns(
     header: Mapping[str, Any] | None = None,
     rows_per_group: int | None = None,
 ) -> None:
-    """Write a Parquet file, with units in the metadata of its fields; replaced atomically.
+    """Write a Parquet file atomically, with units in the metadata of its fields.
 
-    `columns` are arrays (N,), or codes and the labels that they stand for, stored as a dictionary.
+    `columns` are arrays (N,), or codes with their labels, which are stored as a dictionary.
     `header` is stored as JSON in the metadata of the file.
     """
     import pyarrow.parquet
@@ -168,17 +168,17 @@ def write_columns(
             table,
             temporary,
             row_group_size=rows_per_group,
-            # measured numbers do not compress; labels are run-length encoded all the same
+            # measurements do not compress well; labels are run-length encoded in any case
             compression="none",
             use_dictionary=[name for name, v in columns.items() if isinstance(v, tuple)],
             write_statistics=False,
-            write_page_checksum=True,  # so that damage is seen
+            write_page_checksum=True,  # to detect damage
         )
     pyarrow.default_memory_pool().release_unused()
 
 
 def _labelled(codes: Int, labels: Sequence[str | int]) -> pyarrow.DictionaryArray:
-    """A column of labels, by codes into them."""
+    """Column of labels from codes that refer to them."""
     import pyarrow
 
     return pyarrow.DictionaryArray.from_arrays(

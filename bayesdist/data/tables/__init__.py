@@ -1,1 +1,1 @@
-"""Files with columns: read whole or block by block, columns found by name and brought to arrays."""
+"""Table files: reading whole files or blocks, finding columns by name, and conversion to arrays."""

@@ -1,4 +1,4 @@
-"""Columns of one length with finite values; rows that lack one are counted by reason or refused."""
+"""Checks of columns for equal lengths and finite values; incomplete rows are counted or refused."""
 
 from __future__ import annotations
 
@@ -14,13 +14,14 @@ from bayesdist.utils.arrays import Bool
 
 log = logging.getLogger("bayesdist")
 
-MOTION_KEYS = ("pm_ra", "pm_dec", "pm_u", "pm_v")  # of tables of matches, and of catalogues
+MOTION_KEYS = ("pm_ra", "pm_dec", "pm_u", "pm_v")  # in tables of matches, and in catalogues
 ZERO_MOTION = "proper motion of exactly 0"
 NOT_FINITE = ("refuse", "reject")
-# of a value, and of an error: the square of one over that of the other is still a number
+# limits for a value and for an error, so that the ratio of their squares can be represented
 LARGEST, SMALLEST = 1e30, 1e-100
-Place = Callable[[int], str]  # name of a row in an error, by its index in the arrays
-COMPLETED: Any = None  # default of what a table of columns fills in itself: then it is there
+Place = Callable[[int], str]  # name of a row in error messages, given its index in the arrays
+# default of columns that a class fills in itself, so that they are never None afterwards
+COMPLETED: Any = None
 
 
 def row_number(index: int) -> str:
@@ -31,9 +32,9 @@ def row_number(index: int) -> str:
 def one_length(
     columns: Mapping[str, Any], *, integers: Collection[str] = (), where: str
 ) -> dict[str, NDArray[Any]]:
-    """Contiguous float64 arrays, those of `integers` int64, as long as the first of them.
+    """Contiguous float64 arrays (int64 for `integers`) with the length of the first column.
 
-    They are in the machine's byte order, which columns of FITS tables are not.
+    Arrays are converted to native byte order, which columns of FITS tables do not have.
     """
     arrays = {
         name: np.ascontiguousarray(values, np.int64 if name in integers else np.float64)
@@ -52,7 +53,7 @@ def one_length(
 
 
 def columns_of(table: Any, names: Sequence[str]) -> dict[str, Any]:
-    """Columns of a table, by name, that are not None."""
+    """Columns of a table that are not None, by name."""
     values = {name: getattr(table, name) for name in names}
     return {name: value for name, value in values.items() if value is not None}
 
@@ -67,9 +68,9 @@ def check_columns(
     positive: Collection[str] = (),
     not_negative: Collection[str] = (),
 ) -> None:
-    """Give the columns of a frozen table one length and their types, and check their values.
+    """Convert the columns of a frozen dataclass to equal lengths and types, and check their values.
 
-    As `one_length` and `check_values`; a row is named by its number where it has no `place`.
+    See `one_length` and `check_values`. Without `place`, rows are named by their number.
     """
     columns = one_length(columns_of(table, names), integers=integers, where=where)
     for name, values in columns.items():
@@ -89,9 +90,9 @@ def check_values(
     positive: Collection[str] = (),
     not_negative: Collection[str] = (),
 ) -> None:
-    """Refuse columns with values that are not finite, or not positive where they must be.
+    """Raise InputError for columns with values that are not finite, or not positive if required.
 
-    The row is named by its `place`.
+    `place` names the row in the message.
     """
     for name, values in columns.items():
         good, must = np.abs(values) < LARGEST, "finite"
@@ -113,7 +114,7 @@ def check_values(
 
 
 def refuse_half(pair: tuple[str, str], present: Container[str], *, where: str, what: str) -> None:
-    """Refuse one column of a pair without the other."""
+    """Raise InputError if only one column of a pair is present."""
     for name, partner in (pair, pair[::-1]):
         if partner in present and name not in present:
             raise InputError(
@@ -124,7 +125,7 @@ def refuse_half(pair: tuple[str, str], present: Container[str], *, where: str, w
 
 
 def check_not_finite(value: str) -> None:
-    """Refuse an invalid option `not_finite`."""
+    """Raise InputError if the option `not_finite` is invalid."""
     if value not in NOT_FINITE:
         raise InputError(
             f"not_finite is {value!r}",
@@ -134,9 +135,9 @@ def check_not_finite(value: str) -> None:
 
 
 def absent(column: Any, *, not_finite: bool) -> Bool:
-    """Boolean mask (N,) of the rows without a value: masked or, if asked for, not finite."""
+    """Boolean mask (N,) of rows without a value: masked or, if requested, not finite."""
     mask = np.array(np.broadcast_to(getattr(column, "mask", False), np.shape(column)), bool)
-    if mask.ndim > 1:  # a column of arrays, which is refused elsewhere
+    if mask.ndim > 1:  # a column of arrays, which is rejected elsewhere
         return np.zeros(len(mask), bool)
     if not_finite:
         plain = getattr(column, "unmasked", column)
@@ -147,23 +148,23 @@ def absent(column: Any, *, not_finite: bool) -> Bool:
 
 
 def zero_motions(first: Any, second: Any) -> Bool:
-    """Boolean mask (N,) of the stars whose proper motion is exactly 0 on both axes.
+    """Boolean mask (N,) of stars with a proper motion of exactly 0 on both axes.
 
-    No measured motion is 0 to all digits on both axes; tables in which missing values were filled
-    have such rows.
+    A measured motion is never exactly 0 on both axes; such rows come from tables in which missing
+    values were filled with 0.
     """
     zero = np.ones(len(first), bool)
     for column in (first, second):
         plain = getattr(column, "unmasked", column)
         values = np.asarray(getattr(plain, "value", plain))
         if values.ndim != 1 or values.dtype.kind not in "iuf":
-            return np.zeros(len(first), bool)  # texts are refused elsewhere
+            return np.zeros(len(first), bool)  # strings are rejected elsewhere
         zero &= (values == 0) & ~absent(column, not_finite=False)
     return zero
 
 
 def counted(reasons: Sequence[tuple[str, Bool]], n: int) -> tuple[Bool, dict[str, int]]:
-    """Boolean mask of the n rows that stay, and how many others go, by their first reason."""
+    """Boolean mask of the n rows that remain, and counts of the others by their first reason."""
     stay, counts = np.ones(n, bool), dict[str, int]()
     for reason, gone in reasons:
         new = int((stay & gone).sum())
@@ -182,12 +183,12 @@ def without_missing(
     spared: frozenset[str],
     motions: frozenset[str],
 ) -> tuple[Bool, dict[str, int]]:
-    """Boolean mask (N,) of the rows with a value in every column that is read.
+    """Boolean mask (N,) of rows with a value in every column that is read.
 
-    The others are counted by reason.  `reject` leaves out what is not finite, too; missing values
-    of `spared` quantities do no harm; in `motions` NaN means that a star has none, as catalogues
-    write it, and so do proper motions of exactly 0 on both axes, with a warning.  No row left is an
-    error.
+    The other rows are counted by reason. With `reject`, values that are not finite count as
+    missing. Missing values of `spared` quantities are allowed. For `motions`, NaN means that a star
+    has no measured motion, as in catalogues; so do proper motions of exactly 0 on both axes, with a
+    warning. InputError if no row remains.
     """
     reasons = []
     motion_names = [found[key] for key in MOTION_KEYS if key in found and key not in spared]

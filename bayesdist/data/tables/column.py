@@ -1,4 +1,4 @@
-"""Columns of a table, by quantity, to one array each, or an error of file, row and column."""
+"""Conversion of table columns to arrays; errors name the file, row and column."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ Array = TypeVar("Array", Float, Int)
 
 
 def encoded(values: NDArray[Any], *, ordered: bool = False) -> tuple[Int, tuple[Any, ...]]:
-    """Codes (N,) of values, and the values themselves: sorted, or in the order of appearance."""
+    """Codes (N,) of values, and the distinct values: sorted, or in the order of appearance."""
     unique, first, codes = np.unique(values, return_index=True, return_inverse=True)
     codes = codes.astype(np.int64)
     if not ordered:
@@ -40,10 +40,10 @@ def encoded(values: NDArray[Any], *, ordered: bool = False) -> tuple[Int, tuple[
 
 @dataclass(frozen=True, eq=False)
 class EncodedColumn:
-    """Column of few different values, each of which is read only once."""
+    """Column with few distinct values; each value is parsed only once."""
 
-    codes: Int  # (N,), into `labels`
-    labels: NDArray[Any]  # (L,), in the order of their first appearance
+    codes: Int  # (N,), indices into `labels`
+    labels: NDArray[Any]  # (L,), distinct values in the order of their first appearance
     unit: str | None = None
 
     @property
@@ -54,13 +54,13 @@ class EncodedColumn:
 
 @dataclass(frozen=True, eq=False)
 class SourceColumn:
-    """Column with the names that an error needs."""
+    """Column together with the names that error messages need."""
 
     values: Any  # (N,): astropy Column, Quantity, Time, `EncodedColumn` or array
-    source: str  # file
-    name: str  # column
-    place: Place = row_number  # name of a row, by its index
-    usual_unit: str | None = None  # of columns of this name, where the file gives none
+    source: str  # name of the file
+    name: str  # name of the column
+    place: Place = row_number  # name of a row, given its index
+    usual_unit: str | None = None  # unit implied by the column name, used if the file states none
 
     @property
     def where(self) -> str:
@@ -69,22 +69,22 @@ class SourceColumn:
 
     @property
     def unit(self) -> apu.UnitBase | None:
-        """Unit that the file gives, else the usual one, or None."""
-        own = unit_of(self.values, where=self.where)
-        return apu.Unit(self.usual_unit) if own is None and self.usual_unit else own
+        """Unit stated in the file, or else the usual unit, or None."""
+        stated_unit = unit_of(self.values, where=self.where)
+        return apu.Unit(self.usual_unit) if stated_unit is None and self.usual_unit else stated_unit
 
     def factor(self, unit: str) -> float:
-        """Factor from the column's numbers to a unit; 1 where the column has none of its own."""
-        own = self.unit
-        return 1.0 if own is None else conversion(own, unit, where=self.where)
+        """Factor from the column's numbers to a unit; 1 if the column has no unit."""
+        column_unit = self.unit
+        return 1.0 if column_unit is None else conversion(column_unit, unit, where=self.where)
 
     def fail(self, index: int, cause: str, do: str = "correct the row or drop it") -> InputError:
         """Error about one value."""
-        where = f"{self.source}, {self.place(index)}, column {self.name!r}"
-        return InputError(cause, where=where, do=do)
+        location = f"{self.source}, {self.place(index)}, column {self.name!r}"
+        return InputError(cause, where=location, do=do)
 
     def _plain(self) -> NDArray[Any]:
-        """Values as a one-dimensional array without masked ones."""
+        """Values as a one-dimensional array; InputError for masked values."""
         mask = np.broadcast_to(getattr(self.values, "mask", False), np.shape(self.values))
         if np.ndim(self.values) != 1:
             raise InputError(
@@ -102,15 +102,15 @@ class SourceColumn:
         return np.asarray(getattr(plain, "value", plain))
 
     def _by_label(self, read: Callable[[SourceColumn], Array]) -> Array:
-        """Values that are parsed label by label, for each row."""
+        """Parse the values label by label, and expand them to rows."""
         column = self.values
         try:
             return read(replace(self, values=Column(column.labels, unit=column.unit)))[column.codes]
-        except InputError:  # again row by row, for an error that names the row
+        except InputError:  # parse row by row, for an error that names the row
             return read(replace(self, values=Column(column.plain, unit=column.unit)))
 
     def numbers(self) -> Float:
-        """Numbers (N,) in the file's unit; text, a missing value, NaN or infinity is refused."""
+        """Numbers (N,) in the file's unit; InputError for text, missing values, NaN or infinity."""
         if isinstance(self.values, EncodedColumn):
             return self._by_label(SourceColumn.numbers)
         values = self._plain()
@@ -131,7 +131,7 @@ class SourceColumn:
         return out
 
     def numbers_or(self, value: float) -> Float:
-        """Numbers (N,), with `value` where missing or not finite; text is refused."""
+        """Numbers (N,), with `value` where missing or not finite; InputError for text."""
         if isinstance(self.values, EncodedColumn):
             return replace(self, values=self.values.plain).numbers_or(value)
         mask = absent(self.values, not_finite=True)
@@ -142,7 +142,7 @@ class SourceColumn:
         return replace(self, values=filled).numbers()
 
     def numbers_if_readable(self, what: str) -> Float | None:
-        """Numbers (N,); None and a warning that no star has `what`, where they cannot be read."""
+        """Numbers (N,); if they cannot be read, None and a warning that no star has `what`."""
         try:
             return self.numbers()
         except InputError as error:
@@ -150,7 +150,7 @@ class SourceColumn:
             return None
 
     def magnitudes_of_fluxes(self) -> Float | None:
-        """Magnitudes (N,), or None and a warning where not all fluxes are positive numbers."""
+        """Magnitudes (N,); None and a warning unless all fluxes are positive numbers."""
         flux = self.numbers_if_readable("a magnitude")
         if flux is None:
             return None
@@ -160,7 +160,7 @@ class SourceColumn:
         return None
 
     def known(self) -> tuple[Int, SourceColumn]:
-        """Rows (n,) that have a value, neither masked nor NaN, and the column of these alone."""
+        """Indices (n,) of rows with a value (not masked or NaN), and the column of these rows."""
         plain = getattr(self.values, "unmasked", self.values)
         missing = np.array(np.broadcast_to(getattr(self.values, "mask", False), len(plain)))
         if plain.dtype.kind == "f":
@@ -170,17 +170,17 @@ class SourceColumn:
         return rows, named
 
     def known_numbers(self) -> Float:
-        """Numbers (N,), with NaN where they are missing; text and infinity are refused."""
+        """Numbers (N,), with NaN where missing; InputError for text and infinity."""
         rows, named = self.known()
         out = np.full(len(self.values), np.nan)
-        if len(rows):  # a column of nulls alone has no type
+        if len(rows):  # a column that holds only nulls has no type
             out[rows] = named.numbers()
         return out
 
     def _parsed(
         self, texts: NDArray[Any], parse: Callable[[str], Any], wanted: str
     ) -> NDArray[Any]:
-        """Parsed texts; the first one that cannot be parsed is refused."""
+        """Parsed strings; InputError for the first one that cannot be parsed."""
         out = []
         for index, text in enumerate(texts):
             try:
@@ -192,45 +192,48 @@ class SourceColumn:
         return np.array(out)
 
     def integers(self) -> Int:
-        """Whole numbers (N,); anything else is refused."""
+        """Integers (N,); InputError for any other value."""
         if isinstance(self.values, EncodedColumn):
             return self._by_label(SourceColumn.integers)
         if np.asarray(getattr(self.values, "unmasked", self.values)).dtype.kind == "i":
-            return self._plain().astype(np.int64)  # not by way of float64: names may have 19 digits
+            # not converted through float64, because identifiers may have 19 digits
+            return self._plain().astype(np.int64)
         values = self.numbers()
-        whole = values == np.rint(values)
-        if not whole.all():
-            bad = int(np.argmin(whole))
+        is_integer = values == np.rint(values)
+        if not is_integer.all():
+            bad = int(np.argmin(is_integer))
             raise self.fail(bad, f"value is {values[bad]:g}, and must be a whole number")
         return values.astype(np.int64)
 
     def labels(self) -> tuple[Int, tuple[str, ...]]:
-        """Codes (N,), and their names in the order of their first appearance."""
+        """Codes (N,), and their labels in the order of first appearance."""
         if isinstance(self.values, EncodedColumn):
-            own, unique = replace(self, values=self.values.labels).labels()
-            return own[self.values.codes], unique
+            label_codes, unique = replace(self, values=self.values.labels).labels()
+            return label_codes[self.values.codes], unique
         values = self._plain()
-        if values.dtype.kind == "O":  # each object once: most are the same few
-            known: dict[tuple[type, Any], int] = {}  # by their types, too: 1 is not True
+        if values.dtype.kind == "O":  # parse each distinct object only once
+            code_of_value: dict[tuple[type, Any], int] = {}  # types distinguish 1 from True
             try:
-                numbers = [known.setdefault((type(v), v), len(known)) for v in values]
+                numbers = [
+                    code_of_value.setdefault((type(v), v), len(code_of_value)) for v in values
+                ]
             except TypeError:  # Parquet has lists and structures
                 index = [isinstance(v, Hashable) for v in values].index(False)
                 raise self.fail(index, "several values stand where a name must be") from None
             codes = np.array(numbers, np.int64)
-            found: Iterable[Any] = [v for _, v in known]
+            distinct: Iterable[Any] = [v for _, v in code_of_value]
         else:
-            codes, found = encoded(values)
-        names = [_text(v) for v in found]
+            codes, distinct = encoded(values)
+        names = [_text(v) for v in distinct]
         refuse_control_characters(names, self.where)
-        again, unique = encoded(np.array(names))  # 'a' and 'a ' are one name
-        return again[codes], unique
+        merged, unique = encoded(np.array(names))  # 'a' and 'a ' are the same label
+        return merged[codes], unique
 
     def years(self) -> Float:
-        """Epochs (N,) as decimal years; no date, or one outside 1800 to 2200, is refused.
+        """Epochs (N,) as decimal years; InputError for other values and years outside 1800 to 2200.
 
-        Numbers are years, or Modified Julian Dates where the column's unit is the day; texts are
-        such numbers or ISO dates.
+        Numbers are years, or Modified Julian Dates if the unit of the column is the day. Strings
+        are such numbers or ISO dates.
         """
         if isinstance(self.values, EncodedColumn):
             return self._by_label(SourceColumn.years)
@@ -240,9 +243,10 @@ class SourceColumn:
         else:
             values = self._plain()
             if values.dtype.kind == "M":
-                # a time scale without leap seconds: dates stay as written; few dates, many stars
-                found, codes = np.unique(values.astype("datetime64[ns]"), return_inverse=True)
-                out = np.asarray(Time(found, scale="tt").decimalyear, float)[codes]
+                # a time scale without leap seconds keeps dates as written; convert each distinct
+                # date once
+                distinct, codes = np.unique(values.astype("datetime64[ns]"), return_inverse=True)
+                out = np.asarray(Time(distinct, scale="tt").decimalyear, float)[codes]
             elif values.dtype.kind in "SUO" and not _all_numbers(values):
                 out = self._dates(values)
             else:
@@ -272,16 +276,17 @@ class SourceColumn:
             if not inside.all():
                 bad = int(np.argmin(inside))
                 raise self.fail(bad, f"{values[bad]:g} is no Modified Julian Date")
-            found, codes = np.unique(values, return_inverse=True)
-            return np.asarray(Time(found, format="mjd", scale="tt").decimalyear, float)[codes]
+            distinct, codes = np.unique(values, return_inverse=True)
+            return np.asarray(Time(distinct, format="mjd", scale="tt").decimalyear, float)[codes]
         raise InputError(
             f"unit {unit} is not one of dates", where=self.where, do="give 'yr', or 'd' for MJD"
         )
 
     def _dates(self, texts: NDArray[Any]) -> Float:
-        codes, found = encoded(np.array([_text(t) for t in texts]))  # few dates, many stars
+        # convert each distinct date once
+        codes, distinct = encoded(np.array([_text(t) for t in texts]))
         years = []
-        for k, text in enumerate(found):
+        for k, text in enumerate(distinct):
             try:
                 years.append(self._year(text))
             except (ValueError, TypeError, InputError):
@@ -292,7 +297,7 @@ class SourceColumn:
         return np.array(years)[codes]
 
     def _year(self, text: str) -> float:
-        """Decimal year of a date, or of a number that stands among dates."""
+        """Decimal year of a date, or of a number in a column of dates."""
         if _all_numbers([text]):
             number = Column([number_of(text)], unit=getattr(self.values, "unit", None))
             return float(replace(self, values=number)._numeric_years()[0])
@@ -300,7 +305,7 @@ class SourceColumn:
 
 
 def _text(value: Any) -> str:
-    """A label as people write it."""
+    """Label as a string without decimals or blanks."""
     if isinstance(value, bytes):
         return value.decode("utf-8", "replace").strip()
     if isinstance(value, float) and value.is_integer():
@@ -318,28 +323,28 @@ def _all_numbers(texts: Iterable[Any]) -> bool:
 
 
 class Columns(Protocol):
-    """Named columns of one length, as an astropy Table has them."""
+    """Named columns of equal length, as in an astropy Table."""
 
     @property
     def colnames(self) -> Sequence[str]:
-        """Names."""
+        """Names of the columns."""
 
     def __len__(self) -> int:
-        """Rows."""
+        """Number of rows."""
 
     def __getitem__(self, name: str) -> Any:
-        """Values as `SourceColumn` takes them."""
+        """Values in a form that `SourceColumn` accepts."""
 
 
 @dataclass(frozen=True, eq=False)
 class Quantities:
-    """Columns of a table by quantity."""
+    """Columns of a table, accessible by quantity."""
 
     table: Columns
     found: Mapping[str, str]  # column of each quantity
-    source: str  # file, for errors
-    place: Place = row_number  # name of a row, by its index
-    names: Sequence[str] = ()  # all columns of the file: they tell which catalogue it is
+    source: str  # file, for error messages
+    place: Place = row_number  # name of a row, given its index
+    names: Sequence[str] = ()  # all columns of the file, from which its catalogue is recognised
 
     def __contains__(self, key: str) -> bool:
         return key in self.found

@@ -1,4 +1,4 @@
-"""Quantities of columns: by the user, or by the names, units and origins that programs give."""
+"""Columns of quantities, found by the user's names or by the names and units of known programs."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Any
 
 from bayesdist.errors import InputError
 
-# lower case; the first that the file has is taken, and of a pair the first of which it has both
+# lower case; the first name that the file has is used, and for a pair the first that both have
 BASIC: dict[str, tuple[str, ...]] = {
     "x": ("x", "x_pix", "xpix", "x_raw", "xraw", "xwin_image", "xpsf_image", "x_image"),
     "y": ("y", "y_pix", "ypix", "y_raw", "yraw", "ywin_image", "ypsf_image", "y_image"),
@@ -90,7 +90,7 @@ PAIRS = (
 )
 
 _MAS, _MOTION = "mas", "mas / yr"
-# of columns that a catalogue documents; two of its other names with them show that it is this one
+# units documented by catalogues; a catalogue is recognised by two further column names
 _CATALOGUES: tuple[tuple[dict[str, str], frozenset[str]], ...] = (
     (  # Gaia archive
         {
@@ -119,14 +119,14 @@ _CATALOGUES: tuple[tuple[dict[str, str], frozenset[str]], ...] = (
 _COMPANY = 2
 _DAYS = frozenset(("mjd", "mjd_obs", "mjd-obs", "obs_mjd"))
 
-# names that only programs which count from 0 give
+# names used only by programs that count pixels from 0
 _FROM_ZERO = {
     **dict.fromkeys(("xcentroid", "x_centroid", "x_fit", "x_init"), "photutils"),
     **dict.fromkeys(("xcentroid_win", "xcentroid_quad"), "photutils"),
     **dict.fromkeys(("x_centroid_win", "x_centroid_quad"), "photutils"),
     **dict.fromkeys(("slot_centroid_x", "base_sdsscentroid_x"), "the LSST pipelines"),
 }
-# program, and columns that it writes with its x, y
+# program, and columns that it writes together with x, y
 _COUNTS_FROM_ZERO: tuple[tuple[str, frozenset[str]], ...] = (
     ("sep", frozenset(("tnpix", "xcpeak"))),
     ("photutils", frozenset(("aperture_sum",))),
@@ -147,13 +147,34 @@ def find_columns(
 ) -> dict[str, str]:
     """Column of each quantity that a file has.
 
-    `mapping` gives what the user names (an empty name leaves a quantity out), `aliases` the usual
-    names, in lower case, for the rest; of `pairs` the names go together: those of which the file
-    has both come first.  An unknown quantity, or a column that is not in the file, is refused with
-    the nearest name, and a file without one of the `needed` quantities.
+    Parameters
+    ----------
+    names : iterable of str
+        Columns of the file.
+    mapping : mapping of str to str or None
+        Columns named by the user; an empty name omits the quantity.
+    aliases : mapping of str to tuple of str
+        Usual column names of each quantity, in lower case.
+    source : str
+        Name of the file, for error messages.
+    pairs : iterable of tuple of str
+        Quantities with corresponding aliases; names are preferred for which the file has both.
+    needed : iterable of str
+        Quantities that the file must have.
+
+    Returns
+    -------
+    dict of str to str
+        Column by quantity.
+
+    Raises
+    ------
+    InputError
+        If a quantity is unknown, if a column is not in the file (the message suggests the nearest
+        name), or if a needed quantity is missing.
     """
     names = list(names)
-    found: dict[str, str] = {}
+    column_names: dict[str, str] = {}
     for key, column in (mapping or {}).items():
         if key not in aliases:
             raise InputError(
@@ -165,33 +186,33 @@ def find_columns(
             raise InputError(
                 f"column {column!r} is missing", where=source, do=f"name {_nearest(column, names)}"
             )
-        found[key] = column
+        column_names[key] = column
     lower: dict[str, str] = {}
     for name in names:
-        # where only case tells two columns apart, the lower-case one is the usual one
+        # if two columns differ only in case, the one in lower case is used
         if name.lower() not in lower or name == name.lower():
             lower[name.lower()] = name
-    for one, other in pairs:
-        if one not in found and other not in found:
-            both = zip(aliases[one], aliases[other], strict=True)
-            first = next((two for two in both if lower.keys() >= set(two)), None)
+    for first_key, second_key in pairs:
+        if first_key not in column_names and second_key not in column_names:
+            alias_pairs = zip(aliases[first_key], aliases[second_key], strict=True)
+            first = next((two for two in alias_pairs if lower.keys() >= set(two)), None)
             if first is not None:
-                found[one], found[other] = lower[first[0]], lower[first[1]]
+                column_names[first_key], column_names[second_key] = lower[first[0]], lower[first[1]]
     for key, usual in aliases.items():
-        if key not in found:
-            found[key] = next((lower[a] for a in usual if a in lower), "")
+        if key not in column_names:
+            column_names[key] = next((lower[a] for a in usual if a in lower), "")
     for key in needed:
-        if not found[key]:
+        if not column_names[key]:
             raise InputError(
                 f"no column for {key!r} among {', '.join(names) or 'none'}",
                 where=source,
                 do="rename the column, or name it in the option 'columns'",
             )
-    return {key: column for key, column in found.items() if column}
+    return {key: column for key, column in column_names.items() if column}
 
 
 def _nearest(name: str, choices: Iterable[str]) -> str:
-    """The nearest choice, or all of them where none is near."""
+    """The nearest choice, or a list of all choices if none is near."""
     choices = list(choices)
     lower = {c.lower(): c for c in choices}
     near = difflib.get_close_matches(name.lower(), lower, n=1, cutoff=0.5)
@@ -201,15 +222,15 @@ def _nearest(name: str, choices: Iterable[str]) -> str:
 
 
 def known_unit(name: str, names: Iterable[str]) -> str | None:
-    """Unit that a column has by its name, where its file gives none, or None.
+    """Unit implied by the name of a column if its file states none; None if unknown.
 
-    A catalogue is recognised by two of its `names` apart from this one.
+    A catalogue is recognised by two of its column names in addition to this one.
     """
-    name, others = name.lower(), {other.lower() for other in names}
+    name, lower_names = name.lower(), {label.lower() for label in names}
     if name in _DAYS:
         return "d"
     for units, company in _CATALOGUES:
-        if name in units and len((company & others) - {name}) >= _COMPANY:
+        if name in units and len((company & lower_names) - {name}) >= _COMPANY:
             return units[name]
     return None
 
@@ -217,7 +238,8 @@ def known_unit(name: str, names: Iterable[str]) -> str | None:
 def origin_of(column: str, names: Iterable[str], header: Mapping[str, Any]) -> tuple[int, str]:
     """Coordinate (0 or 1) of the centre of the first pixel, and the reason.
 
-    `column` is that of x; where the reason is empty nothing is known, and 1 is FITS's own.
+    `column` is the column of x. An empty reason means that nothing is known; 1 is then the FITS
+    convention.
     """
     for key, value in header.items():
         if str(key).lower() in _ORIGIN_KEYS and str(value).strip() in ("0", "1"):
@@ -229,7 +251,7 @@ def origin_of(column: str, names: Iterable[str], header: Mapping[str, Any]) -> t
     if column.lower() in _FROM_ZERO:
         return 0, f"{column} is a name of {_FROM_ZERO[column.lower()]}, which counts from 0"
     if column in ("x", "xcenter"):
-        for program, others in _COUNTS_FROM_ZERO:
-            if others <= lower:
-                return 0, f"{', '.join(sorted(others))} are of {program}, which counts from 0"
+        for program, companions in _COUNTS_FROM_ZERO:
+            if companions <= lower:
+                return 0, f"{', '.join(sorted(companions))} are of {program}, which counts from 0"
     return 1, ""

@@ -1,7 +1,7 @@
-"""Parquet files, block by block: memory is that of a block, however large file and row groups are.
+"""Parquet files, read block by block with the memory of one block, whatever their size.
 
-Damage is named with its row group.  Checksums of pages are verified where a file has them; without
-them a flipped bit among numbers is just another number.
+Errors about damage name the row group. Page checksums are verified if the file has them; without
+them, a flipped bit in a number cannot be detected.
 """
 
 from __future__ import annotations
@@ -43,10 +43,10 @@ _BATCH = 65_536  # rows decoded at a time
 class RowBlock:
     """Consecutive rows of a file, with the columns that an astropy Table would have."""
 
-    first: int  # row in the file of the first one, from 0
+    first: int  # index in the file of the first row, counted from 0
     columns: Mapping[str, pyarrow.ChunkedArray]
     units: Mapping[str, str]
-    encoded: Collection[str]  # columns to be given as `EncodedColumn`
+    encoded: Collection[str]  # columns that are returned as `EncodedColumn`
 
     @property
     def colnames(self) -> list[str]:
@@ -69,17 +69,17 @@ class RowBlock:
 class ParquetPart:
     """Description of a Parquet file without its rows."""
 
-    path: Path  # absolute, so that it is found from any folder
-    name: str  # path as it was given, for messages
+    path: Path  # absolute, so that it is valid in any working folder
+    name: str  # path as given, for messages
     group_rows: tuple[int, ...]  # rows of each row group
     colnames: tuple[str, ...]
     units: Mapping[str, str]
-    texts: frozenset[str]  # columns of strings, or of dictionaries
-    header: Mapping[str, Any]  # of the table
+    texts: frozenset[str]  # columns of strings or dictionaries
+    header: Mapping[str, Any]  # header values stored with the table
 
     @property
     def n_rows(self) -> int:
-        """Rows of the file."""
+        """Number of rows in the file."""
         return int(self._edges[-1])
 
     @cached_property
@@ -87,14 +87,14 @@ class ParquetPart:
         return np.cumsum([0, *self.group_rows])
 
     def _group_of(self, row: int) -> int:
-        """Row group of a row, both from 0."""
+        """Row group of a row, both counted from 0."""
         return int(np.searchsorted(self._edges, row, side="right")) - 1
 
     def _group_name(self, group: int) -> str:
         return f"row group {group + 1} of {len(self.group_rows)}"
 
     def place(self, first: int) -> Place:
-        """Names of rows, by their distance from the row `first`: row group and row, both from 1."""
+        """Names of rows (row group and row, from 1), given their offsets from the row `first`."""
 
         def name(index: int) -> str:
             row = first + index
@@ -111,10 +111,10 @@ class ParquetPart:
         stop: int | None = None,
         size: int,
     ) -> Iterator[RowBlock]:
-        """Blocks of rows `start` to `stop` (from 0), of at most `size` rows each.
+        """Blocks of rows `start` to `stop` (counted from 0), of at most `size` rows each.
 
-        Columns of `encoded` are given as `EncodedColumn`.  InputError when the file is damaged,
-        gone, or not what it was when it was described.
+        Columns in `encoded` are returned as `EncodedColumn`. InputError if the file is damaged,
+        missing, or has changed since it was described.
         """
         import pyarrow
 
@@ -140,14 +140,14 @@ class ParquetPart:
     def _batches(
         self, columns: Sequence[str], start: int, stop: int
     ) -> Iterator[pyarrow.RecordBatch]:
-        """Rows as they are decoded."""
+        """Record batches as they are decoded."""
         import pyarrow
 
         if start >= stop:
             return
         groups = list(range(self._group_of(start), self._group_of(stop - 1) + 1))
         at = int(self._edges[groups[0]])
-        # a text that is stored once may stand in all rows: it is decoded once, too
+        # a string that is stored once may occur in all rows, so it is decoded only once
         with _opened(self.path, self.name, self.texts) as stored:
             budget = Budget(self.name, self.path.stat().st_size)
             if _group_rows(stored) != self.group_rows or _names(stored) != self.colnames:
@@ -158,7 +158,8 @@ class ParquetPart:
                     where=f"{self.name}, column {column!r}",
                     do="give a column with one value in each row",
                 )
-            # only next() is guarded: exceptions of the consumer are not the file's fault
+            # only next() is guarded, because errors in the code that uses the rows are not the
+            # file's fault
             decoded = stored.iter_batches(_BATCH, row_groups=groups, columns=list(columns))
             while True:
                 try:
@@ -187,7 +188,7 @@ class ParquetPart:
         error: Exception,
     ) -> InputError:
         """Error about the first row group that cannot be read."""
-        where = self.name
+        location = self.name
         for group in groups:
             if self._edges[group + 1] <= reached:
                 continue
@@ -197,16 +198,16 @@ class ParquetPart:
             except Exception as found:
                 error = found
                 first, last = self._edges[group] + 1, self._edges[group + 1]
-                where = f"{self.name}, {self._group_name(group)} (rows {first} to {last})"
+                location = f"{self.name}, {self._group_name(group)} (rows {first} to {last})"
                 break
-        return _as_input_error(Path(self.name), where, error)
+        return _as_input_error(Path(self.name), location, error)
 
     def _changed(self) -> InputError:
         return InputError("has changed since it was opened", where=self.name, do="start again")
 
 
 def describe_part(path: Path) -> ParquetPart:
-    """Description of a Parquet file from its footer; one that is missing or damaged is refused."""
+    """Description of a Parquet file from its footer; InputError if it is missing or damaged."""
     with _opened(path, str(path)) as stored, naming_faults(path):
         schema = stored.schema_arrow
         return ParquetPart(
@@ -224,7 +225,7 @@ def describe_part(path: Path) -> ParquetPart:
 def _opened(
     path: Path, name: str, as_codes: Collection[str] = ()
 ) -> Iterator[pyarrow.parquet.ParquetFile]:
-    """Open file of which only the part being decoded is held in memory."""
+    """Open a file so that only the part being decoded is in memory."""
     with naming_faults(Path(name)):
         stored = open_parquet(path, as_codes)
     with stored:
@@ -249,7 +250,7 @@ def _as_input_error(path: Path, where: str, error: Exception) -> InputError:
 
 
 def _encoded(values: pyarrow.ChunkedArray, unit: str | None) -> EncodedColumn | None:
-    """Codes and labels of a column, or None where it has nulls or a type that has no equals."""
+    """Codes and labels of a column; None if it has nulls or a type without equality."""
     import pyarrow
 
     try:
@@ -262,7 +263,7 @@ def _encoded(values: pyarrow.ChunkedArray, unit: str | None) -> EncodedColumn | 
         return None
     labels = numpy_array(array.dictionary)
     codes = numpy_array(array.indices).astype(np.int64)
-    # the dictionary of a file may have another order, and labels that no row has
+    # a dictionary in the file may be in another order, and may have unused labels
     n = len(codes)
     first = np.full(len(labels), n)
     first[codes[::-1]] = np.arange(n - 1, -1, -1)

@@ -1,9 +1,9 @@
-"""Repeated rows of a table that is held in memory or streamed.
+"""Search for repeated rows in a table that is in memory or streamed.
 
-Rows are hashed to one integer each, so that ten million of them need one sort, not one for each
-key; only rows whose hashes meet are compared in full.  Of a table that streams by, the hashes are
-sorted into buckets of about `HELD` in a scratch file, and then looked at bucket by bucket: the cost
-grows linearly with the rows and the memory not at all.
+Each row is hashed to one integer, so that ten million rows need one sort instead of one per key.
+Only rows with equal hashes are compared in full. For a streamed table, hashes are sorted into
+buckets of about `HELD` in a scratch file, which are then processed one by one: the cost grows
+linearly with the number of rows, and the memory does not grow.
 """
 
 from __future__ import annotations
@@ -22,30 +22,30 @@ UInt = NDArray[np.uint64]
 Keys = Sequence[NDArray[Any]]
 Batches = Callable[[], Iterable[Keys]]
 
-HELD = 8_000_000  # hashes in memory at a time
-_COMPARED = 100_000  # hashes that rows are compared in full for at a time
-_BLOCK = 16_384  # rows hashed together: their keys stay in the cache
+HELD = 8_000_000  # number of hashes in memory at a time
+_COMPARED = 100_000  # number of hashes for which rows are compared in full at a time
+_BLOCK = 16_384  # number of rows hashed together, so that their keys stay in the cache
 _MULTIPLIER = np.uint64(0x9E3779B97F4A7C15)
 _SHIFT = np.uint64(29)
 
 
 def first_duplicate(keys: Keys) -> tuple[int, int] | None:
-    """Indices of a row and of its first repetition in all keys (N,); None where no row repeats."""
+    """Indices of a row and of its first repetition in all keys (N,); None if no row repeats."""
     return first_repetition(lambda: (keys,), 1)
 
 
 def buckets_for(n_rows: int) -> int:
-    """Number of buckets into which the hashes of `n_rows` rows are to be sorted."""
+    """Number of buckets for the hashes of `n_rows` rows."""
     return max(1, -(-n_rows // HELD))
 
 
 def first_repetition(batches: Batches, buckets: int) -> tuple[int, int] | None:
-    """Row numbers of a row and of its first repetition in all keys; None where no row repeats.
+    """Row numbers of a row and of its first repetition in all keys; None if no row repeats.
 
-    `batches` gives the table anew at each call: an iterable of batches of rows, each a sequence of
-    keys as `first_duplicate` takes them; 1 / `buckets` of the hashes are held at a time.  The pair
-    is the earliest one, unless more than 100 000 different rows repeat: then it is the earliest of
-    the first of them that are found.  InputError when the scratch folder is full.
+    `batches` returns, at each call, an iterable over the batches of the table from its beginning.
+    Each batch is a sequence of keys as for `first_duplicate`. A fraction 1 / `buckets` of the
+    hashes is in memory at a time. The pair is the earliest one; if more than 100 000 different rows
+    repeat, it is the earliest among the first of them. InputError if the scratch folder is full.
     """
     waiting: list[UInt] = []
     for k, hashes in enumerate(_bucketed(batches, buckets)):
@@ -61,7 +61,7 @@ def first_repetition(batches: Batches, buckets: int) -> tuple[int, int] | None:
 
 
 def _bits(keys: Keys) -> list[UInt]:
-    """Keys as integers that are equal where the keys are."""
+    """Keys as integers that are equal if the keys are equal."""
     out = []
     for key in keys:
         key = key + 0.0 if key.dtype.kind == "f" else key  # -0.0 equals 0.0
@@ -70,7 +70,7 @@ def _bits(keys: Keys) -> list[UInt]:
 
 
 def _hashed(keys: Keys) -> UInt:
-    """One integer for each row."""
+    """One integer hash per row."""
     n = len(keys[0])
     out = np.zeros(n, np.uint64)
     for a in range(0, n, _BLOCK):
@@ -85,14 +85,15 @@ def _hashed(keys: Keys) -> UInt:
 def _bucketed(batches: Batches, buckets: int) -> Iterator[UInt]:
     """Hashes of each bucket; the table is read once."""
     if buckets == 1:
-        found = [_hashed(keys) for keys in batches()]
-        yield np.concatenate(found) if found else np.zeros(0, np.uint64)
+        hashes_of_batches = [_hashed(keys) for keys in batches()]
+        yield np.concatenate(hashes_of_batches) if hashes_of_batches else np.zeros(0, np.uint64)
         return
-    edges: list[Int] = []  # of the buckets of each batch, in the file
+    edges: list[Int] = []  # positions in the file of the buckets of each batch
     with tempfile.TemporaryFile(prefix="bayesdist-") as file:
         try:
             for hashed in _joined(_hashed(keys) for keys in batches()):
-                # by the upper half: the lower bits of a product see those of its factors only
+                # use the upper half: the lower bits of a product depend only on the lower bits of
+                # its factors
                 bucket = (hashed >> np.uint64(32)) % np.uint64(buckets)
                 counts = np.bincount(bucket.astype(np.int64), minlength=buckets)
                 edges.append(file.tell() + 8 * np.concatenate([[0], np.cumsum(counts)]))
@@ -114,7 +115,7 @@ def _bucketed(batches: Batches, buckets: int) -> Iterator[UInt]:
 
 
 def _joined(parts: Iterable[UInt]) -> Iterator[UInt]:
-    """Hashes in larger parts, so that the list of their positions in the file stays short."""
+    """Hashes combined into larger parts, which keeps the list of file positions short."""
     waiting: list[UInt] = []
     for part in parts:
         waiting.append(part)
@@ -128,21 +129,21 @@ def _joined(parts: Iterable[UInt]) -> Iterator[UInt]:
 def _repeated(hashed: UInt) -> UInt:
     """Hashes that occur more than once; the array is sorted in place."""
     hashed.sort()
-    twice = hashed[1:][hashed[1:] == hashed[:-1]]
-    return np.unique(twice)
+    duplicates = hashed[1:][hashed[1:] == hashed[:-1]]
+    return np.unique(duplicates)
 
 
 def _first_of(batches: Batches, repeated: UInt) -> tuple[int, int] | None:
-    """Earliest pair of equal rows among those with certain hashes, in rising order."""
-    seen: dict[bytes, int] = {}
+    """Earliest pair of equal rows among those with the hashes `repeated`, which are ascending."""
+    row_of_bytes: dict[bytes, int] = {}
     start = 0
     for keys in batches():
         hashed = _hashed(keys)
         slot = np.minimum(np.searchsorted(repeated, hashed), len(repeated) - 1)
         for index in np.flatnonzero(repeated[slot] == hashed).tolist():
             row = b"".join(b.tobytes() for b in _bits([k[index : index + 1] for k in keys]))
-            if row in seen:
-                return seen[row], start + index
-            seen[row] = start + index
+            if row in row_of_bytes:
+                return row_of_bytes[row], start + index
+            row_of_bytes[row] = start + index
         start += len(hashed)
     return None

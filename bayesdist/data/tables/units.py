@@ -1,4 +1,4 @@
-"""Units are resolved on reading: every unit in a file becomes one of four words, or an error."""
+"""Resolution of units on reading: every unit of u and v becomes one of `UNITS`, or an error."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 UNITS = ("pix", "arcsec", "mas", "deg")
 
-# names that other programs write where astropy expects 'pix' or 'deg'
+# spellings of other programs that astropy does not recognise
 _SPELLINGS = {
     "pixels": "pix",
     "pixel": "pix",
@@ -29,7 +29,7 @@ _SPELLINGS = {
 
 
 def check_unit(unit: str, *, where: str = "unit") -> str:
-    """The unit itself, when it is one of `UNITS`; any other is refused."""
+    """The unit itself if it is one of `UNITS`; otherwise raise InputError."""
     if unit not in UNITS:
         do = length_advice(unit) or f"choose one of {', '.join(UNITS)}"
         raise InputError(f"unit is {unit!r}", where=where, do=do)
@@ -37,8 +37,8 @@ def check_unit(unit: str, *, where: str = "unit") -> str:
 
 
 def length_advice(unit: str) -> str:
-    """Advice on positions in a length, as millimetres of a focal plane; empty for other units."""
-    import astropy.units as apu  # a tenth of a second, as wherever it is used here
+    """Advice on positions in a length unit, such as millimetres; empty for other units."""
+    import astropy.units as apu  # takes a tenth of a second to import
 
     parsed = apu.Unit(unit.strip(), parse_strict="silent")
     if parsed.physical_type != "length":
@@ -50,7 +50,7 @@ def length_advice(unit: str) -> str:
 
 
 def length_in_mm(unit: apu.UnitBase | str | None) -> float | None:
-    """Millimetres in a unit of length; None for other units, and for none."""
+    """Millimetres per unit of length; None for other units, and for None."""
     import astropy.units as apu
 
     if unit is None:
@@ -60,7 +60,7 @@ def length_in_mm(unit: apu.UnitBase | str | None) -> float | None:
 
 
 def unit_of(column: Any, *, where: str) -> apu.UnitBase | None:
-    """Unit of a table's column, None where it has none; an unknown one is refused."""
+    """Unit of a table column; None if it has none. InputError for an unknown unit."""
     unit = getattr(column, "unit", None)
     if unit is None:
         return None
@@ -78,7 +78,7 @@ def unit_of(column: Any, *, where: str) -> apu.UnitBase | None:
 
 
 def conversion(unit: apu.UnitBase | str, to: str, *, where: str) -> float:
-    """Factor from values of `unit` to those of `to`; units of different quantities are refused."""
+    """Factor from values in `unit` to values in `to`; InputError for incompatible units."""
     import astropy.units as apu
 
     try:
@@ -94,8 +94,8 @@ def conversion(unit: apu.UnitBase | str, to: str, *, where: str) -> float:
 
 
 def without_unit(column: Any) -> Any:
-    """Numbers of a column with a unit, masked where it is."""
-    if hasattr(column, "to_value"):  # a Quantity, plain or Masked
+    """Numbers of a column without its unit; the mask is kept."""
+    if hasattr(column, "to_value"):  # a Quantity, plain or masked
         return column.value
     if isinstance(column, np.ma.MaskedArray):
         return np.ma.MaskedArray(column.data, mask=column.mask)

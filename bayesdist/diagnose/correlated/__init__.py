@@ -1,4 +1,4 @@
-"""Discrepancy: structure outside the fitted model, with priors and posteriors of its own."""
+"""Discrepancy: structure that the fitted model lacks, with separate priors and posteriors."""
 
 from bayesdist.diagnose.correlated.estimate import estimate_discrepancy
 from bayesdist.diagnose.correlated.priors import DiscrepancyPriors

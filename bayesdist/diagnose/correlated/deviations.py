@@ -1,8 +1,8 @@
-"""Linear deviations of exposures from one another, and the curvature of drifts.
+"""Linear deviations of exposures from their common mean, and the curvature of drifts.
 
-Both are seen in differences between exposures only, and few of these determine little: two
-exposures do not determine a curvature, and hardly a scatter when a drift is fitted to them.  Then
-the prior decides, as it must in any extrapolation.
+Both appear only in differences between exposures, and few exposures determine little: two exposures
+do not determine a curvature, and hardly a scatter if a drift is fitted to them.  In that case the
+prior determines the result, as in any extrapolation.
 """
 
 from __future__ import annotations
@@ -32,14 +32,14 @@ from bayesdist.model import DistortionModel, Groups
 from bayesdist.model.frames import LINEAR_MATRICES
 from bayesdist.utils.arrays import Bool, Float, Int
 
-# deviations of an exposure that scatter together, and the frames that fit them already
+# deviations of an exposure with a common scatter, and the frames that include them
 KINDS = {
     "shift": ("shift", "shift_rotation", "shift_rotation_scale", "affine"),
     "rotation": ("shift_rotation", "shift_rotation_scale", "affine"),
     "scale": ("shift_rotation_scale", "affine"),
     "shear": ("affine",),
 }
-# and their parameters, but for shifts
+# parameters of these deviations, except for shifts
 LINEAR = {
     "rotation": ("rotation",),
     "scale": ("scale",),
@@ -47,18 +47,20 @@ LINEAR = {
 }
 SCATTERS = {"shift": "shift", "rotation": "rotation", "scale": "shape", "shear": "shape"}
 CURVATURE = "curvature"
-MAX_EXPOSURES = 40  # whose deviations are estimated; of more, so many stand for all
-# steps in each amplitude, by the number of scatters: first to find where the density is, then only
-# there
+# largest number with estimated deviations; if there are more, a subset represents all
+MAX_EXPOSURES = 40
+# number of steps in each amplitude, by the number of scatters: first on a coarse grid over the
+# whole range, then on a finer grid where the density is not negligible
 COARSE, REFINED = (12, 8, 6, 5), (30, 18, 11, 6)
-WIDE = 100.0  # times the amplitudes that are expected: as good as free
-MIN_OF_OTHERS = 5  # exposures: of fewer, none can be told from the others
-# amplitudes range from this fraction of the prior's median or of what the data resolve, the smaller
+WIDE = 100.0  # multiple of the expected amplitudes that is practically a flat prior
+MIN_OF_OTHERS = 5  # exposures; with fewer, outliers cannot be identified
+# lower limit of amplitudes, as a fraction of the prior median or of the resolution of the data, the
+# smaller of both
 LEAST = 1 / 3
-# up to multiples of the median and of what the data resolve, the larger
+# upper limits, in units of the median and of the resolution of the data; the larger applies
 MOST, MOST_RESOLVED = 100.0, 10.0
-MOST_CURVATURE = 10.0  # of the median: few dates say nothing of it
-NEGLIGIBLE = 1e-3  # of the density, below the largest of an amplitude
+MOST_CURVATURE = 10.0  # in units of the median: a few dates hardly constrain the curvature
+NEGLIGIBLE = 1e-3  # density relative to the maximum
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,23 +68,24 @@ class LinearDeviations:
     """Draws of the deviations of exposures, and of the curvature of the drift."""
 
     model: DistortionModel
-    # effect (n, D) of the deviations on the parameters of the fit, with the sign of its error
+    # (n, D) effect of the deviations on the parameters, with the sign of the parameters' error
     theta: Float
-    # chip (by code), axis and basis function that is curved in time
+    # chip (by code), axis and index of each basis function with a curvature in time
     terms: tuple[tuple[int, int, int], ...]
-    # (n, terms) in the unit of u, v per squared year; half of it multiplies the squared time
+    # (n, terms) second derivative with respect to time, in the unit of u and v per squared year
     curvature: Float
-    epoch: float  # zero of time, decimal years; NaN without curvature
+    epoch: float  # zero point of time, decimal years; NaN without curvature
     scatter: dict[str, Float]  # draws (n,) of each scatter
     n_exposures: int
-    # deviations of each exposure: of 'shift', 'rotation', 'scale' and 'shear'
+    # kinds of deviations: 'shift', 'rotation', 'scale' and 'shear'
     kinds: tuple[str, ...] = ()
-    size: float = 1.0  # half the longer side of a chip, in the unit of u, v: that of a shift of 1
-    # codes of the exposures that went wrong, which are no part of the scatter
+    # half the longer side of a chip, in the unit of u and v: the size of a shift by 1
+    size: float = 1.0
+    # codes of exposures with outlying deviations, which are excluded from the scatter
     outlying: tuple[int, ...] = ()
     # median correlation time of the deviations in years; 0 if they are independent
     correlation_time: float = 0.0
-    # rms of the curvature over the detector and the dates beyond lines in time, both axes together
+    # rms of the curvature over detector and dates, minus lines in time, both axes together
     bend: float = 0.0
 
     @property
@@ -95,7 +98,7 @@ class LinearDeviations:
         return out
 
     def polynomials(self, epoch: float | None, chip: int) -> Float:
-        """Coefficients (n, 2, K) on a chip of the curvature alone, at an epoch."""
+        """Coefficients (n, 2, K) on a chip of the curvature alone, at the date `epoch`."""
         out = np.zeros((len(self.curvature), 2, self.model.n_terms))
         code = self.model.chip_code(chip)
         for k, (c, axis, term) in enumerate(self.terms):
@@ -106,7 +109,7 @@ class LinearDeviations:
     def of_single_exposures(self, mean: Float, chip: int, rng: np.random.Generator) -> Float:
         """Coefficients (n, 2, K) on a chip (by number) of the deviation of a future exposure.
 
-        The polynomials of the parameters `mean` (D,) are deformed.
+        The deviations deform the polynomials of the parameters `mean` (D,).
         """
         code, n = self.model.chip_code(chip), len(self.theta)
         at = np.array([self.model.time.epoch0[0] if self.model.time else 0.0])
@@ -125,20 +128,20 @@ class LinearDeviations:
 
 @dataclass(frozen=True, eq=False)
 class DeviationColumns:
-    """Functions whose coefficients scatter: displacements of the stars of some groups."""
+    """Displacements of the stars of some groups by functions with random coefficients."""
 
     model: DistortionModel
     theta: Float
-    kinds: tuple[str, ...]  # deviations of each exposure
-    # chip (by code), axis and basis function that is curved in time
+    kinds: tuple[str, ...]  # kinds of deviations of each exposure
+    # chip (by code), axis and index of each basis function with a curvature in time
     terms: tuple[tuple[int, int, int], ...]
-    scatter: NDArray[np.str_]  # name (n,) of the scatter that each coefficient has
-    # exposure (G,) of each group of stars, from 0; -1 for those whose deviations are not estimated
+    scatter: NDArray[np.str_]  # (n,) name of the scatter of each coefficient
+    # (G,) exposure of each group of stars, from 0; -1 if its deviations are not estimated
     of_group: Int
-    n_exposures: int  # whose deviations are estimated
-    n_all: int  # exposures with those among them that others stand for
-    middle: float  # zero of time; NaN without terms
-    size: float  # half the longer side of a chip, in the unit of u, v
+    n_exposures: int  # number of exposures with estimated deviations
+    n_all: int  # number of all exposures
+    middle: float  # zero point of time; NaN without curvature terms
+    size: float  # half the longer side of a chip, in the unit of u and v
     # code, epoch (n_exposures,): of each exposure, and its date in decimal years
     code: Int
     epoch: Float
@@ -148,11 +151,11 @@ class DeviationColumns:
 
     @property
     def n_of_exposures(self) -> int:
-        """Number of coefficients that are deviations of exposures; they come first."""
+        """Number of coefficients that are deviations of exposures; they precede the curvatures."""
         return len(self) - len(self.terms)
 
     def positions(self, chip: int, epoch: float, phi: Float) -> Float:
-        """Positions (C, 2) along the axes of the polynomials, given the basis (C, K)."""
+        """Positions (C, 2) along the axes of the polynomials, for the basis (C, K)."""
         poly = self.model.polynomials(self.theta, np.array([chip]), np.array([epoch]))
         return np.asarray(phi @ poly[..., 0, :, :].T)
 
@@ -161,17 +164,19 @@ class DeviationColumns:
 
         Exposures deviate about `centre` (2,); `phi` (C, K) is the model's basis at the stars.
         """
-        own = _deviations(self.positions(chip, epoch, phi) - centre, self.kinds, self.size)
+        displacements = _deviations(
+            self.positions(chip, epoch, phi) - centre, self.kinds, self.size
+        )
         if self.of_group[g] < 0:
-            own = own[:, :, :0]
-        columns = int(self.of_group[g]) * own.shape[2] + np.arange(own.shape[2])
-        here = [k for k, term in enumerate(self.terms) if term[0] == chip]
-        out = np.zeros((len(phi), 2, len(here)))
-        for k, number in enumerate(here):
+            displacements = displacements[:, :, :0]
+        columns = int(self.of_group[g]) * displacements.shape[2] + np.arange(displacements.shape[2])
+        curved = [k for k, term in enumerate(self.terms) if term[0] == chip]
+        out = np.zeros((len(phi), 2, len(curved)))
+        for k, number in enumerate(curved):
             _, axis, term = self.terms[number]
             out[:, axis, k] = 0.5 * (epoch - self.middle) ** 2 * self.size * phi[:, term]
-        columns = np.concatenate([columns, self.n_of_exposures + np.array(here, np.int64)])
-        return columns, np.concatenate([own, out], axis=2)
+        columns = np.concatenate([columns, self.n_of_exposures + np.array(curved, np.int64)])
+        return columns, np.concatenate([displacements, out], axis=2)
 
 
 def deviation_columns(
@@ -183,15 +188,16 @@ def deviation_columns(
     exposures: bool = True,
     most: int = MAX_EXPOSURES,
 ) -> DeviationColumns | None:
-    """Deviations that the frames of a model do not fit, and curvatures of its drift.
+    """Deviations that the frames of a model do not include, and curvatures of its drift.
 
-    `counts` (G,) is the number of stars of each group.  Single exposures deviate only if
-    `exposures`; not where a hierarchy of them has been fitted.  None where nothing can deviate:
-    without a drift for a single exposure.
+    `counts` (G,) is the number of stars of each group.  Without `exposures`, single exposures do
+    not deviate; this is the case if a hierarchy of them was fitted.  Returns None if nothing can
+    deviate, for example for a single exposure without a drift.
 
-    The deviations of at most `most` exposures are estimated.  Where there are more, these stand for
-    all, and are at most half of them: the polynomials follow the mean of all exposures, those
-    chosen among them, and the others are not told from it.
+    The deviations of at most `most` exposures are estimated.  If there are more exposures, the
+    selected ones represent all and are at most half of them: the polynomials follow the mean of all
+    exposures, including the selected ones, and the deviations of the others cannot be separated
+    from that mean.
     """
     keys = np.column_stack([groups.exposure, groups.epoch])
     distinct, of_group = np.unique(keys, axis=0, return_inverse=True)
@@ -202,7 +208,7 @@ def deviation_columns(
     chosen = np.arange(n_all)
     if kinds and n_all > most:
         n_exposures = min(most, n_all // 2)
-        # at random in intervals of one length, so that all dates are among them
+        # one random exposure per interval of equal length, so that all dates are represented
         uniform = np.random.default_rng(n_all).uniform(size=n_exposures)
         chosen = ((np.arange(n_exposures) + uniform) * n_all / n_exposures).astype(int)
     number = np.full(n_all, -1)
@@ -239,8 +245,8 @@ def linear_deviations(
 ) -> LinearDeviations | None:
     """Posterior draws of the deviations of exposures and of the curvature of drifts.
 
-    `information` has the excess of the scores, `working` is that of the likelihood of the solution.
-    None where nothing can deviate.
+    `information` includes the excess variance of the scores, `working` is that of the likelihood of
+    the solution.  Returns None if nothing can deviate.
     """
     model = working.model
     counts = np.array([c.count.sum() for c in working.groups()])
@@ -255,23 +261,25 @@ def linear_deviations(
 
     def displacement(cells: GroupCells, g: int) -> Float:
         out = np.zeros((len(cells.X), 2, total))
-        which, values = columns.at(g, cells.chip, cells.epoch, cells.phi, centre)
-        out[:, :, which] = values
+        indices, values = columns.at(g, cells.chip, cells.epoch, cells.phi, centre)
+        out[:, :, indices] = values
         return np.asarray(np.einsum("ab,cbq->caq", cells.frame, out))
 
     S, score = np.zeros((total, total)), np.zeros(total)
     crossed = [np.zeros((model.n_params, total)) for _ in range(2)]
-    for which, source in enumerate((information, working)):
+    for source_index, source in enumerate((information, working)):
         for g, cells in enumerate(source.groups()):
             moved = displacement(cells, g)
             pulled = np.einsum("cab,cbq->caq", cells.curvature, moved, optimize=True)
-            crossed[which][cells.columns] += cells.onto_parameters(pulled)
-            if which == 0:
+            crossed[source_index][cells.columns] += cells.onto_parameters(pulled)
+            if source_index == 0:
                 S += np.einsum("caq,car->qr", moved, pulled, optimize=True)
                 score += np.einsum("caq,ca->q", moved, cells.score, optimize=True)
-    left = EfficientScore.of(information.covariance, information.score, crossed[0], S, score)
-    taken = working.covariance @ crossed[1]
-    return deviation_draws(columns, left.information, left.score, taken, priors, n, rng)
+    efficient = EfficientScore.of(information.covariance, information.score, crossed[0], S, score)
+    response = working.covariance @ crossed[1]
+    return deviation_draws(
+        columns, efficient.information, efficient.score, response, priors, n, rng
+    )
 
 
 def deviation_draws(
@@ -283,10 +291,11 @@ def deviation_draws(
     n: int,
     rng: np.random.Generator,
 ) -> LinearDeviations:
-    """Posterior draws of deviations, the sizes of their scatters marginalised.
+    """Posterior draws of deviations, with the sizes of their scatters marginalised.
 
-    S (q, q) and `score` (q,) are information and score of the coefficients, with what the fit
-    absorbs eliminated; `taken` (D, q) is the effect of a unit of each on the fit.
+    S (q, q) and `score` (q,) are information and score of the coefficients, with the part that the
+    fit absorbs eliminated.  `taken` (D, q) is the change of the fit due to a unit of each
+    coefficient.
     """
     total, scatter = len(columns), columns.scatter
     medians = {
@@ -299,9 +308,9 @@ def deviation_draws(
     index = np.array([names.index(s) for s in scatter])
     grids = []
     for k, name in enumerate(names):
-        known = np.diag(S)[index == k]
-        known = known[known > 1e-8 * max(float(known.max()), 1e-300)]
-        resolved = 1 / np.sqrt(np.median(known)) if known.size else medians[name]
+        diagonal = np.diag(S)[index == k]
+        diagonal = diagonal[diagonal > 1e-8 * max(float(diagonal.max()), 1e-300)]
+        resolved = 1 / np.sqrt(np.median(diagonal)) if diagonal.size else medians[name]
         low = LEAST * min(medians[name], resolved)
         high = (MOST_CURVATURE if name == CURVATURE else MOST) * medians[name]
         high = max(high, MOST_RESOLVED * resolved if resolved < 1e-2 else 0.0)
@@ -358,7 +367,7 @@ def deviation_draws(
     wrong = loose[: columns.n_of_exposures].reshape(columns.n_exposures, -1).any(axis=1)
     return LinearDeviations(
         model=columns.model,
-        # the fit absorbs a deviation; the truth lies on the other side
+        # the fit absorbs a deviation, so that its error has the opposite sign
         theta=-of_fit @ taken.T,
         terms=columns.terms,
         curvature=(curvature := coefficients[:, columns.n_of_exposures :] * columns.size),
@@ -381,18 +390,19 @@ def _of_all_exposures(
     drawn: Float,
     rng: np.random.Generator,
 ) -> Float:
-    """What turns draws (m, n) of coefficients into those that the parameters follow.
+    """Difference between the coefficients that the parameters follow and the `drawn` ones (m, n).
 
-    It is 0 where the deviations of all exposures were estimated.  Where some exposures stand for
-    all, these say nothing of the mean of all, and the parameters follow deviations that are drawn
-    anew, as many times larger as the mean of all exposures varies more than the sum of a part of
-    it.  Exposures that went wrong are not typical, and stay as they were drawn.
+    It is zero if the deviations of all exposures were estimated.  If a subset represents all
+    exposures, it does not determine their mean.  The parameters then follow deviations that are
+    drawn from the prior and multiplied by the ratio of the variation of the mean of all exposures
+    to that of the sum over the subset.  Outlying exposures are not typical, and their draws are not
+    changed.
     """
     out, n = np.zeros_like(drawn), columns.n_of_exposures
     if columns.n_all == columns.n_exposures or not n:
         return out
     times = columns.n_all / columns.n_exposures
-    if root.time == 0:  # independent deviations add in squares
+    if root.time == 0:  # independent deviations add in quadrature
         times = np.sqrt(times)
     anew = root.matrix[:n, :n] @ (spread[:n, None] * rng.standard_normal((n, len(drawn))))
     out[:, :n] = np.where(loose[:n] > 0, 0.0, times * anew.T - drawn[:, :n])
@@ -400,7 +410,7 @@ def _of_all_exposures(
 
 
 def _bend(columns: DeviationColumns, curvature: Float) -> float:
-    """Rms of curvatures (n, terms) over the detector and the dates, beyond lines in time."""
+    """Rms of curvatures (n, terms) over the detector and the dates, minus lines in time."""
     if not columns.terms:
         return 0.0
     years = columns.epoch - columns.middle
@@ -415,11 +425,11 @@ def _bend(columns: DeviationColumns, curvature: Float) -> float:
 
 @dataclass(frozen=True, eq=False)
 class _Root:
-    """Coefficients as combinations of independent ones, for one correlation time."""
+    """Linear combinations of independent coefficients that have one correlation time."""
 
     time: float  # in years; 0 for independent exposures
-    prior: float  # probability
-    matrix: Float  # (n, n), but for the scales of what is not loose
+    prior: float  # prior probability
+    matrix: Float  # (n, n) without the scales of coefficients of typical exposures
 
     def started(self, S: Float, score: Float) -> tuple[Float, Float]:
         """Information and score of the independent coefficients."""
@@ -429,13 +439,13 @@ class _Root:
 def _roots(
     columns: DeviationColumns, S: Float, score: Float, index: Int, loose: Float, scale: Float
 ) -> list[_Root]:
-    """Correlation times of the deviations; of independent ones alone if nothing speaks for more.
+    """Correlation times of the deviations, or independence alone.
 
-    Only a drift depends on them.
+    Correlation times are considered only if there is a drift and the data suggest a correlation.
     """
     n, E = columns.n_of_exposures, columns.n_exposures
-    own = np.where(loose > 0, loose, 1.0)
-    independent = _Root(0.0, 1.0, np.diag(own))
+    scales = np.where(loose > 0, loose, 1.0)
+    independent = _Root(0.0, 1.0, np.diag(scales))
     if not n or columns.model.time is None:
         return [independent]
     mean, _ = _given(S, score, np.where(loose > 0, loose, WIDE * scale[index]))
@@ -447,54 +457,55 @@ def _roots(
     out = [replace(independent, prior=UNCORRELATED)]
     for fraction in CORRELATION_TIMES:
         time = float(fraction * np.ptp(columns.epoch))
-        matrix = np.diag(own)
+        matrix = np.diag(scales)
         root = correlation_root(columns.epoch, time, np.logical_not(wrong))
-        matrix[:n, :n] = own[:n, None] * np.kron(root, np.eye(n // E))
+        matrix[:n, :n] = scales[:n, None] * np.kron(root, np.eye(n // E))
         out.append(_Root(time, (1 - UNCORRELATED) / len(CORRELATION_TIMES), matrix))
     return out
 
 
 def _given(S: Float, score: Float, spread: Float) -> tuple[Float, Float]:
-    """Mean (n,) and covariance (n, n) of coefficients with these prior standard deviations."""
+    """Mean (n,) and covariance (n, n) of coefficients with prior standard deviations `spread`."""
     scaled = S * np.outer(spread, spread) + np.eye(len(S))
     inverse = scipy.linalg.inv(scaled) * np.outer(spread, spread)
     return inverse @ score, inverse
 
 
 def _outlying(columns: DeviationColumns, S: Float, score: Float, index: Int, scale: Float) -> Float:
-    """Prior standard deviations (n,) of exposures that went wrong; 0 for all others.
+    """Prior standard deviations (n,) of the coefficients of outlying exposures; 0 for all others.
 
-    They are set aside one by one, the worst first, by the odds of ten times the scatter of the
-    others (`infer.exposures.scatter`); none are where they would be more than a fifth.
+    The most outlying exposures are removed one by one, according to the odds of a scatter that is
+    ten times as large as that of the others (`infer.exposures.scatter`).  If more than a fifth
+    would be removed, none are.
     """
     total, E = len(S), columns.n_exposures
     out = np.zeros(total)
     per = columns.n_of_exposures // max(E, 1)
     if E < MIN_OF_OTHERS or not per:
         return out
-    kind, which = index[:per], np.arange(E * per).reshape(E, per)
-    while (out[which].any(axis=1)).sum() <= MOST_OUTLYING * E:
-        tight: Bool = np.logical_not(out[which].any(axis=1))
+    kind, coefficient_index = index[:per], np.arange(E * per).reshape(E, per)
+    while (out[coefficient_index].any(axis=1)).sum() <= MOST_OUTLYING * E:
+        tight: Bool = np.logical_not(out[coefficient_index].any(axis=1))
         spread = np.where(out > 0, out, WIDE * scale[index])
         mean, _ = _given(S, score, spread)
-        b = mean[which] - np.median(mean[which][tight], axis=0)
-        # an exposure that went wrong would raise a scatter that is not robust, and excuse itself
+        b = mean[coefficient_index] - np.median(mean[coefficient_index][tight], axis=0)
+        # an outlier would increase a non-robust scatter and thereby go unnoticed
         robust = (1.4826 * np.median(np.abs(b[tight]), axis=0)) ** 2
         sizes = np.sqrt([np.mean(robust[kind == k]) for k in kind])
-        spread[which[tight]] = np.maximum(sizes, 1e-2 * scale[kind])
+        spread[coefficient_index[tight]] = np.maximum(sizes, 1e-2 * scale[kind])
         mean, cov = _given(S, score, spread)
-        squares = (mean**2 + np.diag(cov))[which]
+        squares = (mean**2 + np.diag(cov))[coefficient_index]
         odds = np.full(E, -np.inf)
         for e in np.flatnonzero(tight):
-            rows = which[e]
+            rows = coefficient_index[e]
             inverse = np.linalg.inv(cov[np.ix_(rows, rows)])
             information = inverse - np.diag(spread[rows] ** -2.0)
             pull = inverse @ mean[rows]
-            others = np.logical_and(tight, np.arange(E) != e)
-            rest = np.array([np.mean(squares[others][:, kind == k]) for k in kind])
+            is_other = np.logical_and(tight, np.arange(E) != e)
+            other_variance = np.array([np.mean(squares[is_other][:, kind == k]) for k in kind])
             evidence = []
             for times in (1.0, OUTLYING):
-                precision = 1 / (times**2 * rest)
+                precision = 1 / (times**2 * other_variance)
                 values = np.linalg.eigvalsh(information / np.sqrt(np.outer(precision, precision)))
                 fit = pull @ np.linalg.solve(information + np.diag(precision), pull)
                 evidence.append(0.5 * (fit - np.log1p(np.maximum(values, 0.0)).sum()))
@@ -504,12 +515,14 @@ def _outlying(columns: DeviationColumns, S: Float, score: Float, index: Int, sca
         if odds[worst] <= 0:
             return out
         size = np.array([np.sqrt(np.mean(b[worst, kind == k] ** 2)) for k in kind])
-        out[which[worst]] = np.maximum(size, OUTLYING * spread[which[worst]])
+        out[coefficient_index[worst]] = np.maximum(
+            size, OUTLYING * spread[coefficient_index[worst]]
+        )
     return np.zeros(total)
 
 
 def _where_it_counts(grids: Sequence[Float], weight: Float) -> list[Float]:
-    """Finer grids over the amplitudes that are not negligible, and the next ones on both sides."""
+    """Finer grids over the range of amplitudes with a density that is not negligible."""
     out = []
     for k, grid in enumerate(grids):
         best = weight.max(axis=tuple(a for a in range(weight.ndim) if a != k))
@@ -520,7 +533,7 @@ def _where_it_counts(grids: Sequence[Float], weight: Float) -> list[Float]:
 
 
 def _bending(model: DistortionModel) -> tuple[tuple[int, int, int], ...]:
-    """Functions that may be curved in time: those that drift in the model, on each chip."""
+    """Basis functions that may be curved in time: those that drift in the model, on each chip."""
     if model.time is None:
         return ()
     out = []
@@ -532,7 +545,7 @@ def _bending(model: DistortionModel) -> tuple[tuple[int, int, int], ...]:
 
 
 def _deviations(position: Float, kinds: Sequence[str], size: float) -> Float:
-    """Displacements (C, 2, q) by unit deviations of each kind; shifts in half sizes."""
+    """Displacements (C, 2, q) due to unit deviations of each kind; shifts are in half sides."""
     chosen = [np.zeros((len(position), 0, 2))]
     for kind in kinds:
         if kind == "shift":

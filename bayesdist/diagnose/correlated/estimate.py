@@ -1,4 +1,4 @@
-"""Discrepancy of a solution from the truth, estimated from its residuals in one pass."""
+"""Estimate the discrepancy between a solution and the truth from its residuals in one pass."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ from bayesdist.model.grid import cell_index
 from bayesdist.utils.arrays import Float
 
 DRAWS = 2000
-RESOLVED = 50  # draws of what the functions resolve, before neighbouring stars are compared
+RESOLVED = 50  # draws of the resolved structure, for the comparison of neighbouring stars
 
 
 @one_thread
@@ -66,32 +66,37 @@ def estimate_discrepancy(
     settling: Settling | None = None,
     n_draws: int = DRAWS,
 ) -> Discrepancy:
-    """Estimate the structure that a solution leaves out, with priors on its size.
+    """Estimate the structure that a solution lacks, with priors on its size.
 
-    There is never a decision that it is absent.
+    The structure is never assumed to be absent.
 
     Parameters
     ----------
     matches : Matches or Shards
         Data of the solution.
     solution : Posterior or LinearFit
-        Without extra weight in the corners.
+        Solution as sampled or fitted, without transformations.
     rng : numpy.random.Generator
+        Source of random numbers.
     priors : DiscrepancyPriors, optional
+        Prior medians of the sizes; see `DiscrepancyPriors` for the defaults.
     parameter_priors : GaussianPriors, optional
-        Priors of the solution's parameters.
+        Priors of the solution's parameters; flat by default.
     sample : Matches, optional
-        Some of the matches, or all: structure finer than the functions shows in neighbouring stars.
+        The matches or a part of them, in memory, to estimate structure finer than the functions
+        from neighbouring stars.  If None, that structure is not constrained.
     stars : Matches, optional
-        The matches in memory.  Errors common to the matches of a star, or of a tight group of
-        stars, are estimated, and exposures without frames of their own are separated.
+        All matches, in memory.  If given, errors that are common to the matches of a star, or of a
+        tight group of stars, are estimated, and exposures without separate frames are
+        distinguished.
     structure : bool
-        False for no structure beyond the model, where look-up tables were fitted to it.
+        False to omit structure beyond the model, if look-up tables were fitted to it.
     exposures : bool
-        False for no deviations of single exposures, where a hierarchy of them was fitted.
+        False to omit linear deviations of single exposures, if a hierarchy of them was fitted.
     settling : Settling, optional
-        Transformation of the single chips' shifts that was made after sampling.
+        Transformation of the shifts of single chips that was applied after sampling.
     n_draws : int
+        Number n of draws.
 
     Returns
     -------
@@ -100,7 +105,7 @@ def estimate_discrepancy(
     Raises
     ------
     InputError
-        For a view of a solution.
+        If the solution is a transformed view of another solution.
     """
     model, likelihood = solution.model, likelihood_of(solution)
     priors = priors or DiscrepancyPriors()
@@ -129,7 +134,7 @@ def estimate_discrepancy(
         information = replace(information, sums=by_star)
     chips = range(len(model.chips)) if structure else ()
     near = {} if sample is None or not structure else neighbour_scores(sample, likelihood, model)
-    found, theta, facts = _structures(
+    structures, theta, facts = _structures(
         information, working, chips, near, priors, pixel, n_draws, rng
     )
     linear = linear_deviations(information, working, priors, n_draws, rng, exposures=exposures)
@@ -165,7 +170,7 @@ def estimate_discrepancy(
         if fields is not None:
             fields = replace(fields, theta=settling.mean(fields.theta))
     facts |= {"unit": model.unit, "noise_ratio": ratio}
-    facts["structure_correlation"] = structure_correlation(model, found, theta)
+    facts["structure_correlation"] = structure_correlation(model, structures, theta)
     if linear is not None:
         facts |= linear.facts
         if linear.outlying:
@@ -175,11 +180,11 @@ def estimate_discrepancy(
             facts["exposures_outlying"] = [names[code] for code in linear.outlying]
     if fields is not None:
         facts["exposure_fields"] = fields.facts(model.chips[0].size)
-    return Discrepancy(model, mean, formal, noise, found, theta, linear, facts, fields)
+    return Discrepancy(model, mean, formal, noise, structures, theta, linear, facts, fields)
 
 
 def _dates_of_exposures(information: Information) -> Float:
-    """Dates (E,) of the exposures of a model, decimal years; NaN for one without stars."""
+    """Dates (E,) of the exposures of a model, decimal years; NaN for exposures without stars."""
     groups = information.sums.groups
     out = np.full(len(information.model.exposures), np.nan)
     out[groups.exposure] = groups.epoch
@@ -189,9 +194,9 @@ def _dates_of_exposures(information: Information) -> Float:
 def _by_exposure(
     stars: Matches, likelihood: Likelihood, model: DistortionModel, excess: Float | None = None
 ) -> CellSums:
-    """Sums with separate groups for exposures that have no frames of their own.
+    """Sums with separate groups for exposures that have no separate frames.
 
-    `excess` (N,) is as of `cell_sums`, in the order of the matches.
+    For `excess` (N,), in the order of the matches, see `cell_sums`.
     """
     side = cells_per_side(len(stars.exposure_names) * len(model.chips))
     parts = []
@@ -199,8 +204,8 @@ def _by_exposure(
         rows = np.flatnonzero(stars.exposure == code)
         if rows.size:
             prepared, order = prepare(model, stars.select(rows))
-            own = None if excess is None else excess[rows][order]
-            part = cell_sums(prepared, likelihood, side, own)
+            exposure_excess = None if excess is None else excess[rows][order]
+            part = cell_sums(prepared, likelihood, side, exposure_excess)
             of = np.full(len(part.groups), code)
             parts.append(replace(part, groups=replace(part.groups, exposure=of)))
     return reduce(add, parts)
@@ -224,29 +229,29 @@ def _structures(
         chip = model.chips[code]
         functions = StructureFunctions.for_stars(model.order, chip.size, int(stars[code]))
         chip_waves = ChipStructure(functions, functions.finer_waves(rng), np.empty(0))
-        S, crossed, taken, score = _along_axes(information, working, chip_waves, code)
-        left = [
+        S, crossed, responses, score = _along_axes(information, working, chip_waves, code)
+        efficient = [
             EfficientScore.of(information.covariance, information.score, *axis)
             for axis in zip(crossed, S, score, strict=True)
         ]
         posterior = structure_posterior(
             [[functions]] * 2,
-            [one.information for one in left],
-            [one.score for one in left],
+            [axis_score.information for axis_score in efficient],
+            [axis_score.score for axis_score in efficient],
             noise=_star_error(information, code),
             higher_order=priors.higher_order * pixel,
             structure=priors.structure * pixel,
             pairs=(None, None)
             if code not in neighbours
-            else partial(_finer_evidence, neighbours[code], working, taken, code, rng),
+            else partial(_finer_evidence, neighbours[code], working, responses, code, rng),
         )
         coefficients = posterior.draws(n, rng, [[chip_waves.waves]] * 2)
-        found = replace(chip_waves, coefficients=np.stack(coefficients, axis=1))
+        chip_structure = replace(chip_waves, coefficients=np.stack(coefficients, axis=1))
         for a in (0, 1):
-            # the fit absorbs structure into polynomials; the truth lies on the other side
-            theta -= found.coefficients[:, a] @ (working.covariance @ taken[a]).T
-        rows += found.sizes(chip, posterior.length)
-        out[chip.number] = found
+            # the fit absorbs structure into polynomials, so that its error has the opposite sign
+            theta -= chip_structure.coefficients[:, a] @ (working.covariance @ responses[a]).T
+        rows += chip_structure.sizes(chip, posterior.length)
+        out[chip.number] = chip_structure
     return out, theta, {"structure": rows}
 
 
@@ -260,17 +265,18 @@ def _finer_evidence(
 ) -> tuple[SharedVariance | None, SharedVariance | None]:
     """Evidence of neighbouring stars for structure finer than the functions of a chip.
 
-    `structure` is the posterior of what these resolve, and `taken` (D, functions) for each axis the
-    products of the functions with the parameters of the fit, which has absorbed a part.
+    `structure` is the posterior of the resolved structure.  `taken` (D, functions), for each axis,
+    is the information between the functions and the parameters of the fit, which has absorbed a
+    part.
     """
     model, (functions,) = working.model, structure.functions[0]
     phi = model.basis(model.chips[code].number).evaluate_scaled(near.X, near.Y)
     values = functions.evaluate(near.X, near.Y)
     drawn = structure.draws(RESOLVED, rng)
-    known = functions.n_known
+    n_resolved = functions.n_known
     absorbed = np.zeros((RESOLVED, model.n_params))
     for z, t in zip(drawn, taken, strict=True):
-        absorbed += z @ (working.covariance @ t[:, :known]).T
+        absorbed += z @ (working.covariance @ t[:, :n_resolved]).T
     resolved = np.empty((RESOLVED, len(phi), 2))
     for a in (0, 1):
         columns = model.coefficient_slice(model.chips[code].number, a)
@@ -279,7 +285,7 @@ def _finer_evidence(
 
 
 def _star_error(information: Information, chip: int) -> float:
-    """Error of a typical star on an axis."""
+    """Typical error of a star per axis."""
     rows = information.sums.groups.chip == chip
     n, uu, vv = information.sums.sums[rows][:, :, [0, 3, 5]].sum(axis=(0, 1))
     return float(np.sqrt(2 * n / (uu + vv))) if uu + vv > 0 else 1.0
@@ -288,33 +294,35 @@ def _star_error(information: Information, chip: int) -> float:
 def _along_axes(
     information: Information, working: Information, structure: ChipStructure, chip: int
 ) -> tuple[list[Float], list[Float], list[Float], list[Float]]:
-    """Information and score of the functions on u and v, and their products with the parameters.
+    """Information and score of the functions on u and v, and their information with the parameters.
 
-    The products are those of the flattened likelihood and of the working one, the latter with the
-    finer waves too.
+    The latter is returned for the flattened likelihood and for the working one, for which it
+    includes the finer waves.
     """
     model, side = working.model, working.sums.side
     m, D = structure.functions.n_known, model.n_params
     weight, score = np.zeros((2, side * side)), np.zeros((2, side * side))
     used, X, Y = working.sums.centres(chip)
-    every = structure.evaluate(X, Y)
-    B = every[:, :m]
-    crossed, taken = ([np.zeros((D, n)) for _ in "uv"] for n in (m, every.shape[1]))
+    all_values = structure.evaluate(X, Y)
+    B = all_values[:, :m]
+    crossed, by_working = ([np.zeros((D, n)) for _ in "uv"] for n in (m, all_values.shape[1]))
     row = np.full(side * side, -1)
     row[used] = np.arange(len(used))
-    for source, into, values in ((information, crossed, B), (working, taken, every)):
+    for source, into, values in ((information, crossed, B), (working, by_working, all_values)):
         for cells in source.groups():
             if cells.chip != chip:
                 continue
             at = row[cell_index(cells.X, cells.Y, (side, side))]
-            here, M = values[at], cells.frame
+            values_at, M = values[at], cells.frame
             turned = np.einsum("cab,bd->cad", cells.curvature, M)
             for a in (0, 1):
-                block = np.stack([(cells.phi * turned[:, b, a, None]).T @ here for b in (0, 1)])
+                block = np.stack(
+                    [(cells.phi * turned[:, b, a, None]).T @ values_at for b in (0, 1)]
+                )
                 into[a][cells.columns] += np.einsum("akm,akq->mq", cells.derivative, block)
                 if source is information:
                     weight[a, at] += np.einsum("b,cb->c", M[:, a], turned[:, :, a])
                     score[a, at] += cells.score @ M[:, a]
     n = len(used)
     S = [B.T @ (weight[a, :n, None] * B) for a in (0, 1)]
-    return S, crossed, taken, [B.T @ score[a, :n] for a in (0, 1)]
+    return S, crossed, by_working, [B.T @ score[a, :n] for a in (0, 1)]

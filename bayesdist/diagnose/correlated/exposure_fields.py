@@ -1,13 +1,13 @@
 """Deviations of single exposures beyond linear terms: second order, and smooth fields.
 
-Terms of the second order of each exposure scatter with one size tau, as those of shift, rotation
-and scale do.  With the linear terms of the exposure free, and all higher terms of the polynomials
-in common, its information and score are small matrices, and the likelihood of tau is a sum over
-exposures.  What is smooth and of no low order has an amplitude and a correlation length, known from
-products of neighbouring stars within exposures (`exposure_products`).
+The second-order terms of the exposures scatter with one size tau, similar to shift, rotation and
+scale.  With free linear terms of the exposure, and all higher polynomial terms in common, its
+information and score are small matrices, and the log-likelihood of tau is a sum over exposures.
+Smooth deviations without low-order terms have an amplitude and a correlation length, which are
+estimated from products of neighbouring stars within exposures (`exposure_products`).
 
-The fit follows the mean of both over the exposures.  Their size there is what counts in the mean
-calibration; a single exposure has its own in full.
+The fit follows the mean of both over the exposures.  The error of the mean calibration depends on
+the size of this mean, whereas a single exposure has its full deviation.
 """
 
 from __future__ import annotations
@@ -46,49 +46,50 @@ from bayesdist.model import Chip, DistortionModel
 from bayesdist.model.basis import polynomial_terms
 from bayesdist.utils.arrays import Float, Int
 
-STEPS = 40  # of an amplitude
-ITERATIONS = 12  # of the scatter, to find the exposures that went wrong
-WIDE = 30.0  # times what the data resolve: as good as free
-RANGE = 10.0  # range of amplitudes about the prior's median and what the data resolve
-SHAPE = 0.3  # by which the correlation at a separation may differ from that of a Matern field
-SINES = 10  # along each side of a chip: finer ones move no polynomial
+STEPS = 40  # number of grid points in amplitude
+ITERATIONS = 12  # of the scatter, to identify outlying exposures
+WIDE = 30.0  # multiple of the resolution of the data that is practically a flat prior
+# factor by which amplitudes extend beyond the prior median and the resolution of the data
+RANGE = 10.0
+SHAPE = 0.3  # relative tolerance of the correlation at a separation, compared with a Matern field
+SINES = 10  # along each side of a chip; finer sines do not change the polynomials
 QUADRATIC = polynomial_terms(SECOND_ORDER)[len(polynomial_terms(SECOND_ORDER - 1)) :]
-STARS_PER_TERM = 2  # of an exposure on a chip; with fewer its second order is not looked at
+STARS_PER_TERM = 2  # per exposure and chip; with fewer, its second-order terms are not estimated
 
 
 @dataclass(frozen=True, eq=False)
 class ExposureFields:
     """Draws of the size of deviations of single exposures, and of their effect on the fit."""
 
-    theta: Float  # error (n, D) of the parameters, which follow the mean of the exposures
-    # (n,) in the unit of u, v: scatter of each second-order term of unit mean square
+    theta: Float  # (n, D) error of the parameters, which follow the mean of the exposures
+    # (n,) scatter of each second-order term of unit mean square, in the unit of u and v
     second_order: Float
-    amplitude: Float  # (n,) rms of the smooth field on an axis
+    amplitude: Float  # (n,) rms of the smooth field per axis
     length: Float  # (n,) its correlation length in longer half sides of a chip
     n_exposures: int
 
     def facts(self, size: tuple[float, float]) -> dict[str, Any]:
         """Median rms of both kinds over a chip, both axes together, for summaries.
 
-        `size` are the columns and rows of the chip. The field is without its terms up to second
-        order.
+        `size` contains the numbers of columns and rows of the chip.  Terms up to second order are
+        excluded from the field.
         """
         second = float(np.sqrt(2 * len(QUADRATIC)) * np.median(self.second_order))
         by_length = np.array([modes(size, float(length)).left for length in LENGTHS])
-        left = by_length[np.searchsorted(LENGTHS, self.length)]
-        field = float(np.median(self.amplitude * np.sqrt(2 * left)))
-        # without a field, as of very few stars, its length is that of the prior
+        remaining = by_length[np.searchsorted(LENGTHS, self.length)]
+        field = float(np.median(self.amplitude * np.sqrt(2 * remaining)))
+        # without a field, for example for very few stars, its length is that of the prior
         weights = self.amplitude**2 if self.amplitude.any() else None
         length = float(np.average(self.length, weights=weights))
         length_pix = length * max(size) / 2
         return {"second_order": second, "field": field, "length_pix": length_pix}
 
     def functions(self, chip: Chip) -> StructureFunctions:
-        """Sines of the field on a chip, without their part in terms up to second order."""
+        """Sines of the field on a chip, with terms up to second order subtracted."""
         return StructureFunctions(SECOND_ORDER, chip.size, SINES)
 
     def coefficients(self, chip: Chip, rng: np.random.Generator) -> Float:
-        """Coefficients (n, 2, m) of the functions of an exposure that is yet to come."""
+        """Draw coefficients (n, 2, m) of the functions for a future exposure."""
         functions, n = self.functions(chip), len(self.amplitude)
         low = rng.standard_normal((n, 2, len(QUADRATIC))) * self.second_order[:, None, None]
         lengths, of = np.unique(self.length, return_inverse=True)
@@ -102,9 +103,9 @@ class ExposureFields:
     def evaluate(self, chip: Chip, waves: Float, X: Float, Y: Float) -> Float:
         """Values (N, m) of these functions at scaled positions."""
         functions = self.functions(chip)
-        known = functions.evaluate(X, Y)[:, functions.n_terms :]
+        sines = functions.evaluate(X, Y)[:, functions.n_terms :]
         finer = functions.evaluate_finer(waves, X, Y)
-        return np.concatenate([legendre_products(X, Y, QUADRATIC), known, finer], axis=1)
+        return np.concatenate([legendre_products(X, Y, QUADRATIC), sines, finer], axis=1)
 
 
 def exposure_fields(
@@ -117,9 +118,9 @@ def exposure_fields(
 ) -> ExposureFields | None:
     """Posterior draws of deviations of single exposures beyond linear terms.
 
-    `information` has the excess of the scores, `working` is that of the likelihood of the solution,
-    and `stars` are all detections or some, with the exposure of each; None for no field.  None for
-    a single exposure.
+    `information` includes the excess variance of the scores, `working` is that of the likelihood of
+    the solution.  `stars` are all detections or a part of them, with the exposure of each; if it is
+    None, no field is estimated.  Returns None for a single exposure.
     """
     model = working.model
     groups = working.sums.groups
@@ -155,43 +156,47 @@ def detection_scores(
 
 @dataclass(frozen=True, eq=False)
 class _Terms:
-    """Terms of all exposures on one chip from the second order on, along both axes.
+    """Second-order and higher terms of all exposures on one chip, along both axes.
 
-    The first six are those of the second order, which deviate; all are free in common.
+    The first six are the second-order terms, which deviate in each exposure.  The mean of each term
+    is free.
     """
 
     information: Float  # (E, t, t) with the linear terms of each exposure eliminated
     score: Float  # (E, t)
-    # values (E, 6) and vectors (E, 6, 6): eigenvectors of the information of the second order
+    # values (E, 6) and vectors (E, 6, 6): eigen-decomposition of the second-order information
     values: Float
     vectors: Float
-    taken: Float  # (E, 6, D) information of a unit of each second-order term and the parameters
-    loose: Float  # (E,) variance of the terms of an exposure that went wrong, else 0
+    taken: Float  # (E, 6, D) information between each second-order term and the parameters
+    loose: Float  # (E,) prior variance of the terms of an outlying exposure, otherwise 0
 
     @classmethod
     def of(cls, information: Information, working: Information, chip: int) -> _Terms | None:
-        """Terms on a chip (by code) of the exposures with enough stars; None if these are few."""
+        """Terms on a chip (by code) of the exposures with enough stars.
+
+        None if these are fewer than two.
+        """
         model, q = working.model, len(QUADRATIC)
-        every = polynomial_terms(max(model.order, SECOND_ORDER))
-        K = len(every)
-        degree = np.array([sum(powers) for powers in every])
+        powers_of_terms = polynomial_terms(max(model.order, SECOND_ORDER))
+        K = len(powers_of_terms)
+        degree = np.array([sum(powers) for powers in powers_of_terms])
         linear, high = np.flatnonzero(degree < SECOND_ORDER), np.flatnonzero(degree >= SECOND_ORDER)
-        second, higher = high[:q], high[q:]  # terms are in the order of their degree
+        second, higher = high[:q], high[q:]  # terms are sorted by degree
         chosen = np.concatenate([second, K + second, higher, K + higher])
         free = np.concatenate([linear, K + linear])
-        S, s, taken = [], [], []
+        S, s, responses = [], [], []
         for cells, plain in zip(information.groups(), working.groups(), strict=True):
             if cells.chip != chip or cells.count.sum() < STARS_PER_TERM * (len(free) + 2 * q):
                 continue
-            phi = legendre_products(cells.X, cells.Y, every)
+            phi = legendre_products(cells.X, cells.Y, powers_of_terms)
             H = np.einsum("ba,cbd,de->cae", cells.frame, cells.curvature, cells.frame)
             N = np.block([[phi.T @ (H[:, a, b, None] * phi) for b in (0, 1)] for a in (0, 1)])
             r = (phi.T @ (cells.score @ cells.frame)).T.ravel()
             gain = np.linalg.lstsq(N[np.ix_(free, free)], N[np.ix_(free, chosen)])[0]
-            left = N[np.ix_(chosen, chosen)] - N[np.ix_(chosen, free)] @ gain
-            S.append((left + left.T) / 2)
+            projected = N[np.ix_(chosen, chosen)] - N[np.ix_(chosen, free)] @ gain
+            S.append((projected + projected.T) / 2)
             s.append(r[chosen] - gain.T @ r[free])
-            taken.append(_onto_parameters(plain, phi[:, second], model.n_params).T)
+            responses.append(_onto_parameters(plain, phi[:, second], model.n_params).T)
         if len(S) < 2:
             return None
         every_S = np.stack(S)
@@ -201,12 +206,12 @@ class _Terms:
             np.stack(s),
             np.maximum(values, 0.0),
             vectors,
-            np.stack(taken),
+            np.stack(responses),
             np.zeros(len(S)),
         )
 
     def given(self, tau: float) -> _GivenScatter:
-        """Posterior of all terms for a scatter."""
+        """Posterior of all terms for a scatter `tau`."""
         variance = np.where(self.loose > 0, self.loose, tau**2)[:, None]
         width, q = variance / (1 + self.values * variance), self.values.shape[1]
         inverse = (self.vectors * width[:, None]) @ self.vectors.mT
@@ -228,11 +233,11 @@ class _GivenScatter:
 
     of: _Terms
     log_evidence: float
-    width: Float  # variances (E, 6) along the eigenvectors, given the common terms
-    mean: Float  # (E, 6) if the common terms are 0
-    follow: Float  # (E, 6, t) by which the mean falls with the common terms
-    factor: Float  # Cholesky factor (t, t) of the precision of the common terms
-    half: Float  # (t,) their score in its units
+    width: Float  # (E, 6) variances along the eigenvectors, given the common terms
+    mean: Float  # (E, 6) mean for common terms equal to 0
+    follow: Float  # (E, 6, t) decrease of the mean with the common terms
+    factor: Float  # (t, t) Cholesky factor of the precision of the common terms
+    half: Float  # (t,) their score, multiplied by the inverse of that factor
 
     def squares(self) -> Float:
         """Expected squares (E, 6) of the terms."""
@@ -241,11 +246,11 @@ class _GivenScatter:
             self.factor, self.follow.reshape(-1, len(self.factor)).T, lower=True
         )
         mean = self.mean - self.follow @ common
-        own = np.einsum("eak,ek,eak->ea", self.of.vectors, self.width, self.of.vectors)
-        return np.asarray(mean**2 + own + (spread**2).sum(axis=0).reshape(mean.shape))
+        conditional = np.einsum("eak,ek,eak->ea", self.of.vectors, self.width, self.of.vectors)
+        return np.asarray(mean**2 + conditional + (spread**2).sum(axis=0).reshape(mean.shape))
 
     def draws(self, n: int, rng: np.random.Generator) -> Float:
-        """Draws (n, E, 6) of the terms."""
+        """Draw the terms, shape (n, E, 6)."""
         common = scipy.linalg.solve_triangular(
             self.factor,
             self.half[:, None] + rng.standard_normal((len(self.half), n)),
@@ -258,7 +263,7 @@ class _GivenScatter:
 
 
 def _onto_parameters(cells: GroupCells, values: Float, n_params: int) -> Float:
-    """Information (D, 2 m) of functions with values (C, m) along both axes of the polynomials."""
+    """Information (D, 2 m) between the parameters and functions with values (C, m) on both axes."""
     out = np.zeros((n_params, 2 * values.shape[1]))
     turned = cells.curvature @ cells.frame
     for axis in (0, 1):
@@ -273,37 +278,42 @@ def _second_order_draws(
 ) -> tuple[Float, Float]:
     """Pull (n, D) of the second-order terms on the fit, and draws (n,) of their scatter.
 
-    The fit absorbs the terms: the truth lies on the other side.
+    The sign is reversed because the fit absorbs the terms.
     """
     pull, drawn = np.zeros((n, n_params)), np.zeros(n)
     if not chips:
         return pull, drawn
-    known = np.concatenate([terms.values.ravel() for terms in chips])
-    known = known[known > 1e-8 * known.max()]
-    resolved = float(np.median(known)) ** -0.5
+    eigenvalues = np.concatenate([terms.values.ravel() for terms in chips])
+    eigenvalues = eigenvalues[eigenvalues > 1e-8 * eigenvalues.max()]
+    resolved = float(np.median(eigenvalues)) ** -0.5
     chips = [_with_loose(terms, WIDE * resolved) for terms in chips]
     largest = max(
         float(np.sqrt(np.mean(terms.given(WIDE * resolved).squares()[terms.loose == 0])))
         for terms in chips
     )
     grid, log_prior = _amplitudes(median, resolved, largest)
-    given = [[terms.given(tau) for terms in chips] for tau in grid]
-    log = log_prior + np.array([sum(one.log_evidence for one in chip) for chip in given])
+    posteriors = [[terms.given(tau) for terms in chips] for tau in grid]
+    log = log_prior + np.array(
+        [sum(chip_posterior.log_evidence for chip_posterior in chip) for chip in posteriors]
+    )
     weight = np.exp(log - log.max())
-    which = rng.permutation(np.repeat(np.arange(STEPS), rng.multinomial(n, weight / weight.sum())))
-    for k in np.unique(which):
-        rows = np.flatnonzero(which == k)
+    grid_index = rng.permutation(
+        np.repeat(np.arange(STEPS), rng.multinomial(n, weight / weight.sum()))
+    )
+    for k in np.unique(grid_index):
+        rows = np.flatnonzero(grid_index == k)
         drawn[rows] = grid[k]
-        for posterior in given[k]:
+        for posterior in posteriors[k]:
             coefficients = posterior.draws(len(rows), rng)
             pull[rows] -= np.tensordot(coefficients, posterior.of.taken, axes=2)
     return pull, drawn
 
 
 def _amplitudes(median: float, resolved: float, largest: float) -> tuple[Float, Float]:
-    """Amplitudes (STEPS,), and the logarithm of their prior weights in a sum over them.
+    """Grid of amplitudes (STEPS,), and log prior weights for a sum over them.
 
-    They reach beyond the prior's median, what the data resolve, and the largest that these suggest.
+    The grid extends beyond the prior median, the resolution of the data, and the largest size that
+    the data suggest.
     """
     grid = np.geomspace(
         min(median, resolved) / RANGE, RANGE * max(median, resolved, largest), STEPS
@@ -312,28 +322,30 @@ def _amplitudes(median: float, resolved: float, largest: float) -> tuple[Float, 
 
 
 def _with_loose(terms: _Terms, start: float) -> _Terms:
-    """Terms with the exposures that went wrong set aside, the worst first.
+    """Terms with outlying exposures marked, the most outlying first.
 
-    The odds are those of ten times the scatter of the others (`infer.exposures.scatter`). None
-    are set aside where they would be more than a fifth: then they are the rule.
+    The odds are those of a scatter ten times as large as that of the others
+    (`infer.exposures.scatter`).  If more than a fifth would be outlying, none are marked.
     """
     E, q = terms.values.shape
     loose = np.zeros(E)
     while (loose > 0).sum() <= MOST_OUTLYING * E:
         tight, tau = loose == 0, start
-        for _ in range(ITERATIONS):  # to the most probable scatter of the others
-            given = replace(terms, loose=loose).given(tau)
-            squares = given.squares()
+        for _ in range(ITERATIONS):  # iterate to the most probable scatter of the others
+            posterior = replace(terms, loose=loose).given(tau)
+            squares = posterior.squares()
             tau = float(np.sqrt(np.mean(squares[tight])))
         total, count = squares[tight].sum(), q * (tight.sum() - tight)
-        rest = (total - np.where(tight, squares.sum(axis=1), 0.0)) / np.maximum(count, 1)
-        common = scipy.linalg.solve_triangular(given.factor, given.half, trans=1, lower=True)
+        other_variance = (total - np.where(tight, squares.sum(axis=1), 0.0)) / np.maximum(count, 1)
+        common = scipy.linalg.solve_triangular(
+            posterior.factor, posterior.half, trans=1, lower=True
+        )
         cross = terms.information[:, :, :q]
         score = terms.score[:, :q] - np.einsum("etq,t->eq", cross, common)
         along = np.einsum("eqk,eq->ek", terms.vectors, score) ** 2
         evidence = []
         for times in (1.0, OUTLYING):
-            variance = times**2 * rest[:, None]
+            variance = times**2 * other_variance[:, None]
             fit = along * variance / (1 + terms.values * variance)
             evidence.append(0.5 * (fit - np.log1p(terms.values * variance)).sum(axis=1))
         odds = evidence[1] - evidence[0] + np.log(OUTLYING_FRACTION / (1 - OUTLYING_FRACTION))
@@ -341,18 +353,18 @@ def _with_loose(terms: _Terms, start: float) -> _Terms:
         worst = int(np.argmax(odds))
         if odds[worst] <= 0:
             return replace(terms, loose=loose)
-        loose[worst] = OUTLYING**2 * float(rest[worst])
-        own = along[worst] / np.maximum(terms.values[worst], 1e-300) ** 2
-        loose[worst] = max(loose[worst], float(np.mean(own[terms.values[worst] > 0])))
+        loose[worst] = OUTLYING**2 * float(other_variance[worst])
+        squared_terms = along[worst] / np.maximum(terms.values[worst], 1e-300) ** 2
+        loose[worst] = max(loose[worst], float(np.mean(squared_terms[terms.values[worst] > 0])))
     return terms
 
 
 def _field_draws(
     chips: Sequence[ExposureProducts], median: float, n: int, rng: np.random.Generator
 ) -> tuple[Float, Float]:
-    """Draws (n,) of amplitude and correlation length of the field, by the products of neighbours.
+    """Draws (n,) of amplitude and correlation length of the field, from products of neighbours.
 
-    A field of few patches differs by chance from its mean square, in all bins alike.
+    The mean square of a field with few independent patches scatters in all bins together.
     """
     fits = np.array([[chip.amplitude(length) for chip in chips] for length in LENGTHS])
     resolved = float(np.sqrt(fits[..., 1].min()))
@@ -364,29 +376,29 @@ def _field_draws(
     log += log_prior
     weight = np.exp(log - log.max()).ravel()
     counts = rng.multinomial(n, weight / weight.sum())
-    which = rng.permutation(np.repeat(np.arange(len(counts)), counts))
-    return grid[which % STEPS], LENGTHS[which // STEPS]
+    grid_index = rng.permutation(np.repeat(np.arange(len(counts)), counts))
+    return grid[grid_index % STEPS], LENGTHS[grid_index // STEPS]
 
 
 def _log_likelihood(chip: ExposureProducts, amplitude: Float, length: float) -> Float:
-    """Log likelihood of amplitudes (n,) of a field of a correlation length."""
+    """Log-likelihood of amplitudes (n,) of a field with a correlation length."""
     expected = amplitude[:, None] ** 2 * chip.expected(length)
-    left = chip.covariance - expected
+    deviation = chip.covariance - expected
     variance = chip.variance + (SHAPE * expected) ** 2
     by_chance = 2.0 / (chip.n_fields * modes(chip.size, length).patches)
-    # a matrix of rank 1 beside the diagonal
+    # a diagonal matrix plus a matrix of rank 1
     common = 1 + by_chance * (expected**2 / variance).sum(axis=1)
-    along = (left * expected / variance).sum(axis=1)
-    chi2 = (left**2 / variance).sum(axis=1) - by_chance * along**2 / common
+    along = (deviation * expected / variance).sum(axis=1)
+    chi2 = (deviation**2 / variance).sum(axis=1) - by_chance * along**2 / common
     return np.asarray(-0.5 * (chi2 + np.log(variance).sum(axis=1) + np.log(common)))
 
 
 def _followed(
     working: Information, amplitude: Float, length: Float, rng: np.random.Generator
 ) -> Float:
-    """Pull (n, D) of a field of each exposure on the parameters, drawn at random.
+    """Random pull (n, D) of fields of single exposures on the parameters.
 
-    What the data say of the field of one exposure says nothing of the mean of all.
+    The data on the field of one exposure do not constrain the mean of all fields.
     """
     out = np.zeros((len(amplitude), working.model.n_params))
     lengths, of = np.unique(length, return_inverse=True)

@@ -1,16 +1,16 @@
-"""Products of neighbouring stars within the same exposure, against those across exposures.
+"""Products of neighbouring stars' scores within an exposure, compared with those across exposures.
 
-A field that is new in each exposure (the atmosphere, a focus that wanders) displaces the neighbours
-of one exposure together, and those of different exposures independently. A pattern of the detector
-does the same to both. With scores g and curvatures h of stars whose own errors are independent, a
-displacement with covariance C(d) at separation d makes
+A field that differs between exposures (atmosphere, changing focus) displaces neighbours in one
+exposure together, and neighbours in different exposures independently.  A pattern of the detector
+affects both alike.  For stars with independent errors, scores g and curvatures h, a displacement
+with the covariance C(d) at the separation d gives
 
     sum g_i g_j = C(d) sum h_i h_j
 
-on the mean over pairs, and the difference of the ratios within and across exposures is that of a
-field of single exposures. Terms up to the second order of each exposure are taken out before: they
-have tests and error terms of their own. Products are summed over the cells of a grid by Fourier
-transforms, so that time grows with the number of stars, not of pairs.
+on average over pairs.  The difference of the ratios within and across exposures is the covariance
+of a field of single exposures.  Terms up to second order of each exposure are subtracted first,
+because they have separate tests and error terms.  Products are summed over the cells of a grid by
+Fourier transforms, so that the time grows with the number of stars rather than of pairs.
 """
 
 from __future__ import annotations
@@ -30,12 +30,12 @@ from bayesdist.utils.arrays import Float, Int
 from bayesdist.utils.matern import matern
 
 SIDE = 32  # cells along the longer side of a chip
-SECOND_ORDER = 2  # highest total order of the terms that are taken out of each exposure
+SECOND_ORDER = 2  # highest total order of the terms that are subtracted from each exposure
 # of separations, in longer half sides of a chip
 EDGES = np.array([0.0, 0.05, 0.1, 0.15, 0.2, 0.3, 0.4, 0.5, 0.65, 0.8])
-LENGTHS = np.geomspace(0.06, 0.6, 6)  # correlation lengths that are looked at, in half sides
-MIN_STARS = 24  # of an exposure on a chip
-MIN_PAIRS = 50  # of a bin; the variance of fewer cannot be estimated
+LENGTHS = np.geomspace(0.06, 0.6, 6)  # correlation lengths that are tried, in longer half sides
+MIN_STARS = 24  # per exposure and chip
+MIN_PAIRS = 50  # per bin; with fewer, the variance cannot be estimated
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,20 +55,23 @@ class DetectionScores:
 
 @dataclass(frozen=True, eq=False)
 class ExposureProducts:
-    """Covariance of displacements within exposures on a chip, in excess of that across them."""
+    """Covariance of displacements within exposures on a chip, minus that across exposures."""
 
-    size: tuple[float, float]  # columns and rows of the chip
-    covariance: Float  # (b,) in the squared unit of u, v, both axes together
-    variance: Float  # (b,) by the scatter of the products
-    bins: Int  # (b,) which bins of `EDGES` have pairs enough
-    n_fields: float  # effective number of exposures times two axes
+    size: tuple[float, float]  # numbers of columns and rows of the chip
+    covariance: Float  # (b,) in the squared unit of u and v, both axes together
+    variance: Float  # (b,) variance of the covariance, from the scatter of the products
+    bins: Int  # (b,) indices of the bins of `EDGES` with enough pairs
+    n_fields: float  # effective number of exposures, times two axes
 
     def expected(self, length: float) -> Float:
-        """Covariance (b,) by a field of unit variance and a correlation length in half sides."""
+        """Covariance (b,) of a field of unit variance.
+
+        `length` is its correlation length in half sides.
+        """
         return _expected(self.size, length)[self.bins]
 
     def amplitude(self, length: float) -> tuple[float, float]:
-        """Variance of a field of this length that fits best, and its standard error without one."""
+        """Best-fitting variance of a field of this length, and its error without a field."""
         expected = self.expected(length)
         weight = float(np.sum(expected**2 / self.variance))
         return float(np.sum(expected * self.covariance / self.variance)) / weight, weight**-0.5
@@ -77,9 +80,9 @@ class ExposureProducts:
 def exposure_products(
     scores: DetectionScores, sizes: Iterable[tuple[float, float]]
 ) -> dict[int, ExposureProducts]:
-    """Products of neighbours on each chip, by its code; chips with too few are left out.
+    """Products of neighbours on each chip, by its code; chips with too few pairs are left out.
 
-    `sizes` are columns and rows of all chips.
+    `sizes` are the numbers of columns and rows of all chips.
     """
     good = (scores.curvature > 0).all(axis=1)
     out = {}
@@ -94,7 +97,7 @@ def exposure_products(
 def _of_chip(
     scores: DetectionScores, rows: Int, size: tuple[float, float]
 ) -> ExposureProducts | None:
-    """Products on one chip; None where fewer than two exposures have enough stars."""
+    """Products on one chip; None if fewer than two exposures have enough stars."""
     if not rows.size:
         return None
     rows = rows[np.bincount(scores.exposure[rows])[scores.exposure[rows]] >= MIN_STARS]
@@ -117,7 +120,7 @@ def _of_chip(
         grids = _transformed(columns, of, at, len(exposures), cells)
         power = np.sum(np.abs(grids) ** 2, axis=0)
         pairs = _over_pairs(power, (columns**2).sum(axis=0), cells)
-        # what the terms that were taken out have followed is missing in products of one exposure
+        # products within an exposure lack the part that the subtracted terms have absorbed
         pairs[0] += pairs[4:].sum(axis=0)
         within += pairs[:4]
         total = np.abs(grids[:, :4].sum(axis=0)) ** 2 - power[:4]
@@ -129,16 +132,16 @@ def _of_chip(
 def _excess(
     within: Float, across: Float, size: tuple[float, float], number: Float
 ) -> ExposureProducts | None:
-    """Products from sums (4, bins) over pairs; `number` (E,) of stars of each exposure."""
+    """Products from sums (4, bins) over pairs; `number` (E,) counts the stars per exposure."""
     bins = np.flatnonzero((within[3] >= MIN_PAIRS) & (across[3] >= MIN_PAIRS))
     if not bins.size:
         return None
-    (product, weight, squares, _), (others, other_weight, other_squares, _) = (
+    (product, weight, squares, _), (other_product, other_weight, other_squares, _) = (
         sums[:, bins] for sums in (within, across)
     )
     return ExposureProducts(
         size,
-        product / weight - others / other_weight,
+        product / weight - other_product / other_weight,
         squares / weight**2 + np.maximum(other_squares, 0.0) / other_weight**2,
         bins,
         2.0 * float((number**2).sum() ** 2 / (number**4).sum()),
@@ -146,7 +149,7 @@ def _excess(
 
 
 def _cells(size: tuple[float, float]) -> tuple[int, int]:
-    """Numbers of about square cells along columns and rows."""
+    """Numbers of nearly square cells along columns and rows."""
     nx, ny = (max(1, round(SIDE * side / max(size))) for side in size)
     return nx, ny
 
@@ -154,21 +157,21 @@ def _cells(size: tuple[float, float]) -> tuple[int, int]:
 def _without_low_orders(
     X: Float, Y: Float, g: Float, h: Float, exposure: Int
 ) -> tuple[Float, Float]:
-    """Scores (N,) with terms up to second order of each exposure taken out.
+    """Scores (N,) with terms up to second order of each exposure subtracted.
 
-    The second result (N, 6) has the products of its rows for the covariance of the scores that
-    is lost by it, were errors as quoted.
+    The products of the rows of the second result (N, 6) are the covariance of the scores that is
+    lost by this, if errors are as quoted.
     """
     phi = legendre_products(X, Y, polynomial_terms(SECOND_ORDER))
-    left, followed = np.empty_like(g), np.empty_like(phi)
+    remainder, followed = np.empty_like(g), np.empty_like(phi)
     order = np.argsort(exposure, kind="stable")
     for rows in np.split(order, np.flatnonzero(np.diff(exposure[order])) + 1):
         weighted = h[rows, None] * phi[rows]
         values, vectors = np.linalg.eigh(phi[rows].T @ weighted)
         root = vectors / np.sqrt(np.maximum(values, 1e-9 * values[-1]))
         followed[rows] = weighted @ root
-        left[rows] = g[rows] - followed[rows] @ (root.T @ (phi[rows].T @ g[rows]))
-    return left, followed
+        remainder[rows] = g[rows] - followed[rows] @ (root.T @ (phi[rows].T @ g[rows]))
+    return remainder, followed
 
 
 def _transformed(
@@ -185,9 +188,9 @@ def _transformed(
 
 
 def _over_pairs(power: Float, own: Float, cells: tuple[int, int]) -> Float:
-    """Sums (columns, bins) of products over pairs, by their power spectra (columns, ...).
+    """Sums (columns, bins) of products over pairs, from their power spectra (columns, ...).
 
-    `own` (columns,) are products of detections with themselves, which are no pairs.
+    `own` (columns,) are the products of detections with themselves, which are excluded.
     """
     nx, ny = cells
     lags = scipy.fft.irfft2(power, s=(2 * ny, 2 * nx))
@@ -197,9 +200,10 @@ def _over_pairs(power: Float, own: Float, cells: tuple[int, int]) -> Float:
 
 @lru_cache(maxsize=8)
 def _separations(cells: tuple[int, int]) -> tuple[Float, Int]:
-    """Separations (2 ny, 2 nx) of cells by lag in longer half sides, and their bins.
+    """Separations (2 ny, 2 nx) of cells by lag, in longer half sides, and their bins.
 
-    Two positions in cells of width w are on average sqrt(w^2 / 3) farther apart, in quadrature.
+    Random positions in cells of width w add sqrt(w^2 / 3) in quadrature to the separation of the
+    cells.
     """
     width = 2.0 / max(cells)
     x, y = (np.minimum(np.arange(2 * n), 2 * n - np.arange(2 * n)) * width for n in cells)
@@ -215,7 +219,7 @@ def _binned(lags: Float, cells: tuple[int, int]) -> Float:
 
 
 def _same_stars(scores: DetectionScores, rows: Int, g: Float, size: tuple[float, float]) -> Float:
-    """Sums (4, bins) over pairs of detections of one star: its catalogue position has one error."""
+    """Sums (4, bins) over pairs of detections of one star, which share a catalogue error."""
     out = np.zeros((4, len(EDGES) - 1))
     order = np.argsort(scores.star[rows], kind="stable")
     star, h = scores.star[rows][order], scores.curvature[rows][order]
@@ -254,29 +258,28 @@ def _expected(size: tuple[float, float], length: float) -> Float:
     number = np.abs(scipy.fft.rfft2(np.ones((ny, nx)), s=shape)) ** 2
     number = scipy.fft.irfft2(number, s=shape)
     change = scipy.fft.irfft2((low.conj() * lost).sum(axis=0), s=shape)
-    whole = number * correlation + change
-    covariance, pairs = _binned(np.stack([whole, number]), cells)
+    projected = number * correlation + change
+    covariance, pairs = _binned(np.stack([projected, number]), cells)
     return np.asarray(covariance / np.maximum(pairs, 0.5))
 
 
 @dataclass(frozen=True)
 class Modes:
-    """What is left of a field of unit variance without its terms up to second order.
+    """Properties of a field of unit variance without its terms up to second order.
 
     L are the eigenvalues of its covariance over a chip.
     """
 
-    left: float  # mean square of what is left
+    left: float  # mean square of the remaining field
     patches: float  # (sum L)^2 / sum L^2: degrees of freedom of the mean square
-    dof: (
-        float  # (sum L^2)^3 / (sum L^3)^2: of the chi-square with the skewness of a sum of products
-    )
+    # (sum L^2)^3 / (sum L^3)^2: of the chi-square with the skewness of a sum of products
+    dof: float
 
 
 @lru_cache(maxsize=64)
 def modes(size: tuple[float, float], length: float) -> Modes:
     """Modes of a field over a chip; `length` is the correlation length in longer half sides."""
-    side = 12  # smooth fields: more cells change these little
+    side = 12  # the field is smooth: more cells hardly change the result
     nx, ny = (max(2, round(side * s / max(size))) for s in size)
     half = np.array(size) / max(size)
     X, Y = (Z.ravel() for Z in np.meshgrid(_middles(nx), _middles(ny)))
@@ -291,5 +294,5 @@ def modes(size: tuple[float, float], length: float) -> Modes:
 
 
 def _middles(n: int) -> Float:
-    """Middles of n cells from -1 to 1."""
+    """Centres of n cells from -1 to 1."""
     return (2 * np.arange(n) + 1.0) / n - 1

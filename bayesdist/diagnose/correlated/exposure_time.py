@@ -1,9 +1,9 @@
-"""Correlation in time of the deviations of exposures: is there any, and how long does it last?
+"""Correlation in time of the deviations of exposures: its significance and its time scale.
 
-Exposures that deviate alike over months determine a drift less well than as many independent ones.
-Whether they do is tested by the differences of successive exposures (von Neumann 1941, Annals of
-Mathematical Statistics 12, 367), with all orders of the exposures equally probable by chance.  The
-correlation falls as exp(-|t - t'| / theta), that of an autoregressive process of the first order.
+Exposures with similar deviations over months determine a drift less well than as many independent
+ones.  The test uses the differences of successive exposures (von Neumann 1941, Annals of
+Mathematical Statistics 12, 367); by chance, all orders of the exposures are equally probable.  The
+correlation falls as exp(-|t - t'| / theta), as in an autoregressive process of the first order.
 """
 
 from __future__ import annotations
@@ -17,32 +17,35 @@ from bayesdist.model.frames import DEVIATIONS
 from bayesdist.utils.arrays import Bool, Float, Int
 from bayesdist.utils.distributions import norm_sf
 
-MIN_EXPOSURES = 8  # fewer say nothing of what is left beyond a parabola
+MIN_EXPOSURES = 8  # with fewer, residuals from a parabola are meaningless
 PERMUTATIONS = 4000
-COUNTED = 10  # permutations beyond: of fewer, the probability is that of a normal distribution
-AT_ONCE = 1_000_000  # numbers that are permuted at a time
-FARTHEST = 4.0  # robust standard deviations to which deviations are brought: some exposures fail
-CORRELATION_TIMES = np.array([0.05, 0.15, 0.4, 1.0])  # relative to the time between first and last
+# number of exceeding permutations; with fewer, the p-value is that of a normal distribution
+COUNTED = 10
+AT_ONCE = 1_000_000  # numbers that are permuted together
+# robust standard deviations at which deviations are clipped, because some exposures fail
+FARTHEST = 4.0
+# relative to the time between first and last exposure
+CORRELATION_TIMES = np.array([0.05, 0.15, 0.4, 1.0])
 UNCORRELATED = 0.5  # prior probability that deviations are independent
-SUSPECTED = 0.05  # probability by chance below which correlation times are looked at
+SUSPECTED = 0.05  # p-value below which correlation times are considered
 
 
 def correlation_p(values: Float, epoch: Float, breaks: ArrayLike = ()) -> tuple[float, float]:
-    """Probability of as much correlation in time by chance, and the correlation of neighbours.
+    """P-value of the correlation in time, and the correlation between successive exposures.
 
     Parameters
     ----------
     values : ndarray, shape (E, k)
         Deviations of the exposures, of k kinds.
     epoch : ndarray, shape (E,)
-        Decimal years.
+        Dates of the exposures in decimal years.
     breaks : array_like
-        Dates at which a drift breaks; a step is free at each.
+        Dates at which a drift breaks; a free step is fitted at each.
 
     Returns
     -------
-    tuple of float
-        1 and 0 for fewer than `MIN_EXPOSURES` exposures or dates.
+    p_value, correlation : float
+        (1, 0) for fewer than `MIN_EXPOSURES` dates.
     """
     order = np.argsort(epoch, kind="stable")
     t = epoch[order]
@@ -59,45 +62,46 @@ def correlation_p(values: Float, epoch: Float, breaks: ArrayLike = ()) -> tuple[
         return 1.0, 0.0
 
     def correlation(of: Float) -> Float:
-        """Mean correlation (...) of successive deviations (..., E, k) beyond a parabola."""
-        left = of - basis @ (basis.T @ of)
-        squares = np.maximum((left**2).sum(axis=-2), 1e-300)
+        """Mean correlation (...) of successive deviations (..., E, k) minus a parabola."""
+        residual = of - basis @ (basis.T @ of)
+        squares = np.maximum((residual**2).sum(axis=-2), 1e-300)
         return np.asarray(
-            np.mean(1 - (np.diff(left, axis=-2) ** 2).sum(axis=-2) / (2 * squares), axis=-1)
+            np.mean(1 - (np.diff(residual, axis=-2) ** 2).sum(axis=-2) / (2 * squares), axis=-1)
         )
 
-    seen = float(correlation(values))
+    observed = float(correlation(values))
     rng = np.random.default_rng(len(t))
     chance, step = list[Float](), max(1, AT_ONCE // values.size)
     for start in range(0, PERMUTATIONS, step):
         n = min(step, PERMUTATIONS - start)
         mixed = rng.permuted(np.tile(np.arange(len(t)), (n, 1)), axis=1)
         chance.append(correlation(values[mixed]))
-    others = np.concatenate(chance)
-    beyond = int((others >= seen).sum())
-    p = (beyond + 1) / (len(others) + 1)
+    permuted = np.concatenate(chance)
+    beyond = int((permuted >= observed).sum())
+    p = (beyond + 1) / (len(permuted) + 1)
     if beyond < COUNTED:
-        # correlations are limited: their tails are lighter than those of a normal distribution
-        p = min(p, float(norm_sf((seen - others.mean()) / others.std())))
-    return p, seen
+        # correlations are bounded: their tails are lighter than those of a normal distribution
+        p = min(p, float(norm_sf((observed - permuted.mean()) / permuted.std())))
+    return p, observed
 
 
 def correlation_root(epoch: Float, theta: float, together: Bool) -> Float:
-    """Lower factor (E, E) of the correlation of exposures, those not `together` independent.
+    """Lower Cholesky factor (E, E) of the correlation between exposures.
 
-    `theta` is the correlation time in the unit of the epochs; 0 for independent exposures.
+    Exposures that are not `together` are independent.  `theta` is the correlation time in the unit
+    of the epochs; 0 for independent exposures.
     """
     E = len(epoch)
     if theta <= 0:
         return np.eye(E)
     correlation = np.exp(-np.abs(np.subtract.outer(epoch, epoch)) / theta)
     correlation = np.where(np.logical_and.outer(together, together), correlation, np.eye(E))
-    # exposures of one date are alike but for a little
+    # a small diagonal term, because exposures of one date are perfectly correlated
     return np.asarray(np.linalg.cholesky(correlation + 1e-6 * np.eye(E)))
 
 
 def _fitted(model: DistortionModel, priors: GaussianPriors) -> Int | None:
-    """Indices (k, E) of deviations that are parameters with a prior; None if there are none."""
+    """Indices (k, E) of deviations that are parameters with a prior; None without any."""
     if model.frames == "none":
         return None
     number = {name: k for k, name in enumerate(model.names)}
@@ -110,7 +114,7 @@ def _fitted(model: DistortionModel, priors: GaussianPriors) -> Int | None:
 
 
 def fitted_deviations(model: DistortionModel, theta: Float, priors: GaussianPriors) -> Float | None:
-    """Deviations (E, k) of a hierarchy of exposures; None where none was fitted."""
+    """Deviations (E, k) of a hierarchy of exposures; None if none was fitted."""
     index = _fitted(model, priors)
     return None if index is None else theta[index].T
 
@@ -124,12 +128,12 @@ def correlated_hierarchy(
     n: int,
     rng: np.random.Generator,
 ) -> tuple[Float, float] | None:
-    """Errors (n, D) of a hierarchical fit by correlation in time, and its median time in years.
+    """Errors (n, D) of a hierarchical fit due to correlation in time, and its median time scale.
 
-    The fit takes deviations b for independent, with variances tau^2.  Its error is then
-    cov tau^-2 b, of which b of another covariance makes more: what that has beyond tau^2 is drawn.
-    None without a drift, and where nothing suggests such correlation.  `epoch` (E,) are the dates
-    of the exposures.
+    The fit assumes independent deviations b with variances tau^2.  Its error is cov tau^-2 b, which
+    is larger if b has another covariance; the excess of this covariance over tau^2 is drawn.
+    `epoch` (E,) are the dates of the exposures, and the correlation time is in years.  Returns None
+    without a drift, and if the data do not suggest a correlation.
     """
     index = _fitted(model, priors)
     if index is None or model.time is None:
@@ -152,7 +156,7 @@ def correlated_hierarchy(
         basis, triangle = np.linalg.qr(flat)
         squares = ((white - basis @ (basis.T @ white)) ** 2).sum(axis=0)
         free = len(t) - flat.shape[1]
-        # restricted likelihood of each kind, its variance at the maximum
+        # restricted likelihood of each kind, with its variance at the maximum
         fixed = np.log(np.diag(root)).sum() + np.log(np.abs(np.diag(triangle))).sum()
         log.append(-(fixed + 0.5 * free * np.log(squares)).sum())
         variances.append(squares / free)
@@ -160,15 +164,17 @@ def correlated_hierarchy(
     prior = np.full(len(times), (1 - UNCORRELATED) / len(CORRELATION_TIMES))
     prior[0] = UNCORRELATED
     weight = prior * np.exp(np.array(log) - max(log))
-    which = rng.choice(len(times), size=n, p=weight / weight.sum())
+    time_index = rng.choice(len(times), size=n, p=weight / weight.sum())
     out = np.zeros((n, len(theta)))
-    for k in np.unique(which[which > 0]):
-        rows = np.flatnonzero(which == k)
+    for k in np.unique(time_index[time_index > 0]):
+        rows = np.flatnonzero(time_index == k)
         correlation = roots[k] @ roots[k].T
         for at, variance in zip(index[:, typical], variances[k], strict=True):
-            own = priors.precision[at]
-            beyond = variance * correlation - np.diag(1 / own)
+            kind_precision = priors.precision[at]
+            beyond = variance * correlation - np.diag(1 / kind_precision)
             squares, turn = np.linalg.eigh(beyond)
-            factor = covariance[:, at] @ (own[:, None] * turn * np.sqrt(np.maximum(squares, 0.0)))
+            factor = covariance[:, at] @ (
+                kind_precision[:, None] * turn * np.sqrt(np.maximum(squares, 0.0))
+            )
             out[rows] += rng.standard_normal((len(rows), len(t))) @ factor.T
-    return out, float(np.median(times[which]))
+    return out, float(np.median(times[time_index]))

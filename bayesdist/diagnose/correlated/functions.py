@@ -1,9 +1,9 @@
-"""Functions over a chip that represent structure outside the polynomial.
+"""Functions over a chip that represent structure that the polynomial lacks.
 
-Legendre products above the model's order, and sines on a box that is larger than the chip, whose
-coefficients are independent with the spectrum of a Matern field for their variances (Solin and
-Sarkka 2020, Statistics and Computing 30, 419).  The part of the sines that the model's polynomials
-can represent, over the whole chip, is subtracted.
+They are Legendre products above the model's order, and sines on a box larger than the chip.  The
+coefficients of the sines are independent, and their variances are the spectrum of a Matern field
+(Solin and Sarkka 2020, Statistics and Computing 30, 419).  The projection of the sines on the
+model's polynomials over the whole chip is subtracted.
 """
 
 from __future__ import annotations
@@ -17,25 +17,25 @@ from numpy.polynomial import legendre
 from bayesdist.model.basis import polynomial_terms
 from bayesdist.utils.arrays import Float, Int
 
-ORDERS = 3  # Legendre orders above the model's
-FALL = 0.5  # rms of an order relative to the one below it
-MARGIN = 0.3  # fraction of the longer half side by which the box is larger than the chip
-SMOOTHNESS = 1.5  # of the Matern field: its slope exists
-FINE = 48  # waves that represent structure finer than the sines
+ORDERS = 3  # number of Legendre orders above the model's
+FALL = 0.5  # rms of an order relative to the previous one
+MARGIN = 0.3  # extension of the box beyond the chip, as a fraction of the longer half side
+SMOOTHNESS = 1.5  # of the Matern field, which is therefore differentiable
+FINE = 48  # number of waves that represent structure finer than the sines
 SHORTEST = 0.02  # correlation length, in longer half sides
-HIGHEST = 5.0  # frequency of a wave, in units of the frequency where the spectrum bends
+HIGHEST = 5.0  # largest frequency of a wave, in units of the frequency where the spectrum bends
 GOLDEN = (np.sqrt(5.0) - 1) / 2
-MIN_SIDE, MAX_SIDE = 6, 20  # sines along a square chip
+MIN_SIDE, MAX_SIDE = 6, 20  # limits to the number of sines along a square chip
 STARS_PER_SINE = 4.0
 
 
 @dataclass(frozen=True)
 class StructureFunctions:
-    """Functions over one chip, all of unit mean square before their coefficients' scales."""
+    """Functions over one chip, of unit mean square before their coefficients are scaled."""
 
     order: int  # of the fitted polynomial
-    size: tuple[float, float]  # columns and rows of the chip
-    n_side: int  # sines along the longer side of the box, were it a square
+    size: tuple[float, float]  # numbers of columns and rows of the chip
+    n_side: int  # number of sines along the longer side of the box
 
     @classmethod
     def for_stars(cls, order: int, size: tuple[float, float], n: int) -> StructureFunctions:
@@ -45,7 +45,7 @@ class StructureFunctions:
 
     @cached_property
     def _half(self) -> Float:
-        """Half sides of the chip, the longer one 1."""
+        """Half sides of the chip, in units of the longer one."""
         return np.asarray(self.size) / max(self.size)
 
     @cached_property
@@ -63,8 +63,10 @@ class StructureFunctions:
     def _waves(self) -> Int:
         """Numbers of half waves (m, 2) of each sine along the box."""
         box = self._half + MARGIN
-        most = np.ceil(self.n_side * box / box.max()).astype(int)
-        i, j = (k.ravel() for k in np.meshgrid(*(np.arange(1, n + 1) for n in most), indexing="ij"))
+        limits = np.ceil(self.n_side * box / box.max()).astype(int)
+        i, j = (
+            k.ravel() for k in np.meshgrid(*(np.arange(1, n + 1) for n in limits), indexing="ij")
+        )
         wave = np.column_stack([i, j])
         return wave[np.hypot(*(np.pi * wave / (2 * box)).T) <= self.cut]
 
@@ -94,16 +96,16 @@ class StructureFunctions:
         return np.asarray(FALL ** (degree - self.order - 1) / np.sqrt(degree + 1))
 
     def spectrum(self, length: float) -> Float:
-        """Variances (n_sines,) for a field of unit variance and a correlation length in half sides.
+        """Variances (n_sines,) for a field of unit variance; `length` is in longer half sides.
 
-        The spectral density of the Matern field in two dimensions (Rasmussen and Williams 2006,
-        Equation 4.15).
+        They are the spectral density of the Matern field in two dimensions (Rasmussen and Williams
+        2006, Equation 4.15).
         """
         nu, k2 = SMOOTHNESS, 2 * SMOOTHNESS / length**2
         return np.asarray(4 * np.pi * nu * k2**nu * (k2 + self.frequency**2) ** (-nu - 1))
 
     def finer(self, length: float) -> float:
-        """Fraction of the field's variance at frequencies above the sines'."""
+        """Fraction of the field's variance at frequencies above those of the sines."""
         k2 = 2 * SMOOTHNESS / length**2
         return float((k2 / (k2 + self.cut**2)) ** SMOOTHNESS)
 
@@ -131,18 +133,18 @@ class StructureFunctions:
         """Projections (K, n_sines) of the sines on the model's polynomials."""
         low = polynomial_terms(self.order)
         nodes, weights = legendre.leggauss(2 * self.n_side + self.order + 8)
-        one = [
+        by_axis = [
             (self._along(axis, nodes) * weights[:, None] / 2).T @ _orthonormal(nodes, self.order)
             for axis in (0, 1)
         ]
         i, j = self._waves.T - 1
-        return np.stack([one[0][i, a] * one[1][j, b] for a, b in low])
+        return np.stack([by_axis[0][i, a] * by_axis[1][j, b] for a, b in low])
 
     def finer_waves(self, rng: np.random.Generator) -> Float:
         """Wave vectors (FINE, 2) of structure finer than the sines, in inverse half sides.
 
-        Frequencies are spread evenly in their logarithm over all that a field of any length has,
-        directions evenly over the half circle, each independently of the other.
+        Frequencies are evenly distributed in their logarithm over the range of fields of any
+        length, and directions evenly over the half circle, independently of each other.
         """
         k = np.arange(FINE)
         highest = HIGHEST * max(self.cut, np.sqrt(2 * SMOOTHNESS) / SHORTEST)
@@ -151,27 +153,36 @@ class StructureFunctions:
         return frequency[:, None] * np.column_stack([np.cos(angle), np.sin(angle)])
 
     def finer_spectrum(self, length: float, waves: Float) -> Float:
-        """Variances (FINE,) of the waves of a field of unit variance, by its correlation length.
+        """Variances (FINE,) of the waves of a unit-variance field.
 
-        Their mean is `finer(length)`, as `evaluate_finer` divides by the number of waves.
+        `length` is in longer half sides.
+
+        Their mean is `finer(length)`, because `evaluate_finer` divides by the number of waves.
         """
         k2, square = 2 * SMOOTHNESS / length**2, (waves**2).sum(axis=1)
-        density = square * (k2 + square) ** (-SMOOTHNESS - 1)  # of the logarithm of the frequency
+        # per logarithmic interval of frequency
+        density = square * (k2 + square) ** (-SMOOTHNESS - 1)
         return np.asarray(self.finer(length) * density / density.mean())
 
     def evaluate_finer(self, waves: Float, X: Float, Y: Float) -> Float:
-        """Cosines and sines (N, 2 FINE) of waves at scaled positions; mean squares add to 1."""
+        """Cosines and sines (N, 2 FINE) of waves at scaled positions.
+
+        Their mean squares add to 1.
+        """
         phase = np.outer(self._half[0] * X, waves[:, 0]) + np.outer(self._half[1] * Y, waves[:, 1])
         return np.concatenate([np.cos(phase), np.sin(phase)], axis=1) / np.sqrt(len(waves))
 
 
 def _orthonormal(Z: Float, order: int) -> Float:
-    """Legendre polynomials (N, order + 1) of unit mean square over -1 to 1."""
+    """Legendre polynomials (N, order + 1) with unit mean square over -1 to 1."""
     return np.asarray(legendre.legvander(Z, order) * np.sqrt(2 * np.arange(order + 1) + 1))
 
 
 def legendre_products(X: Float, Y: Float, terms: tuple[tuple[int, int], ...]) -> Float:
-    """Products (N, n) of Legendre polynomials of unit mean square, by their powers (i, j)."""
+    """Products (N, n) of Legendre polynomials with unit mean square.
+
+    `terms` are their powers (i, j).
+    """
     order = max(max(t) for t in terms)
     by_x, by_y = _orthonormal(X, order), _orthonormal(Y, order)
     i, j = np.array(terms).T

@@ -1,8 +1,8 @@
-"""Sums over small cells of the detector, and their information about parameters and functions.
+"""Sums over small cells of the detector, and their information on parameters and functions.
 
-Scores, curvatures and squared scores are summed in one pass.  Cells are so small that all functions
-evaluated on them are smooth within one: later steps then need no star again, however many there
-are.
+Scores, curvatures and squared scores are summed in one pass.  The cells are so small that all
+functions are nearly constant within a cell.  Later steps therefore do not need the stars again,
+however many there are.
 """
 
 from __future__ import annotations
@@ -24,48 +24,48 @@ from bayesdist.model import DistortionModel, Groups
 from bayesdist.model.grid import cell_index
 from bayesdist.utils.arrays import Float, Int
 
-# cells along each side of a chip, by largest number of groups: limits memory and time
+# cells along each side of a chip, by the largest number of groups: limits memory and time
 SIDES = ((8, 64), (32, 48), (10**9, 32))
 COLUMNS = 9  # n, g_u, g_v, h_uu, h_uv, h_vv, g_u^2, g_u g_v, g_v^2
 
 
 @dataclass(frozen=True, eq=False)
 class GroupCells:
-    """One group of stars, cell by cell."""
+    """One group of stars, summed in cells."""
 
-    chip: int  # code
+    chip: int  # index of the chip
     epoch: float
-    X: Float  # scaled positions (C,)
+    X: Float  # (C,) scaled positions
     Y: Float
-    phi: Float  # the model's basis (C, K) there
-    count: Float  # number of stars (C,)
-    score: Float  # gradient (C, 2) of the log-likelihood by the model's u and v
-    curvature: Float  # minus its second derivatives (C, 2, 2)
-    squares: Float  # sums (C, 2, 2) of products of the stars' own gradients
-    columns: Int  # indices (m,) of the parameters that move these positions
-    derivative: Float  # of the effective coefficients by them (2, K, m)
-    frame: Float  # matrix (2, 2) from the axes of the polynomials to those of u and v
+    phi: Float  # (C, K) basis of the model at these
+    count: Float  # (C,) number of stars
+    score: Float  # (C, 2) gradient of the log-likelihood with respect to the model's u and v
+    curvature: Float  # (C, 2, 2) minus its second derivatives
+    squares: Float  # (C, 2, 2) sums of products of the gradients of single stars
+    columns: Int  # (m,) indices of the parameters that change these positions
+    derivative: Float  # (2, K, m) derivatives of the effective coefficients with respect to them
+    frame: Float  # (2, 2) matrix from the axes of the polynomials to those of u and v
 
     def onto_parameters(self, values: Float) -> Float:
-        """Sums (m, q) of J^T values, given values (C, 2, q) along u and v."""
+        """Sums (m, q) of J^T values, for values (C, 2, q) along u and v."""
         block = np.einsum("ck,caq->akq", self.phi, values, optimize=True)
         return np.asarray(np.einsum("akm,akq->mq", self.derivative, block, optimize=True))
 
 
 @dataclass(frozen=True, eq=False)
 class Information:
-    """Likelihood of all cells about a solution, to second order."""
+    """Likelihood of all cells near a solution, to second order."""
 
     model: DistortionModel
     theta: Float
     sums: CellSums
     priors: GaussianPriors
-    # variance (chips, C, 2) of the gradients relative to their curvature, by chip, cell of the
-    # square grid and axis; 1 by default, as where the likelihood is right
+    # (chips, C, 2) variance of the gradients relative to their curvature, by chip, cell of the
+    # square grid and axis; 1 by default, as for a correct likelihood
     excess: Float | None = None
 
     def groups(self) -> Iterator[GroupCells]:
-        """All groups, one after another."""
+        """Iterate over all groups."""
         groups = self.sums.groups
         jacobians = self.model.effective_jacobian(self.theta, groups)
         centres = [self.sums.centres(k) for k in range(len(self.model.chips))]
@@ -77,20 +77,20 @@ class Information:
             chip, exposure = int(groups.chip[g]), int(groups.exposure[g])
             cells, X, Y = centres[chip]
             sums = self.sums.sums[g, cells]
-            here = np.flatnonzero(sums[:, 0])
-            sums = sums[here]
+            filled = np.flatnonzero(sums[:, 0])
+            sums = sums[filled]
             curvature = sums[:, [3, 4, 4, 5]].reshape(-1, 2, 2)
             score, squares = sums[:, 1:3], sums[:, [6, 7, 7, 8]].reshape(-1, 2, 2)
             if self.excess is not None:
-                root = np.sqrt(self.excess[chip, cells[here]])
+                root = np.sqrt(self.excess[chip, cells[filled]])
                 score = score / root**2
                 curvature = curvature / (root[:, :, None] * root[:, None, :])
             yield GroupCells(
                 chip,
                 float(groups.epoch[g]),
-                X[here],
-                Y[here],
-                bases[chip][here],
+                X[filled],
+                Y[filled],
+                bases[chip][filled],
                 sums[:, 0],
                 score,
                 curvature,
@@ -101,7 +101,7 @@ class Information:
             )
 
     def _assembled(self, weights: list[Float]) -> Float:
-        """Sum (D, D) of J^T W J, given the weights (C, 2, 2) of each group."""
+        """Sum (D, D) of J^T W J, for the weights (C, 2, 2) of each group."""
         K = self.model.n_terms
         moments = np.empty((len(weights), 3, K, K))
         for g, (cells, w) in enumerate(zip(self.groups(), weights, strict=True)):
@@ -116,21 +116,21 @@ class Information:
 
     @cached_property
     def precision(self) -> Float:
-        """Information (D, D) of all parameters with their priors."""
+        """Information (D, D) of all parameters, including their priors."""
         matrix = self._assembled([cells.curvature for cells in self.groups()])
         return matrix + self.priors.information(len(self.theta))
 
     @cached_property
     def covariance(self) -> Float:
-        """Inverse (D, D) of `precision`; formal where the likelihood is right."""
+        """Inverse (D, D) of `precision`: the formal covariance, if the likelihood is correct."""
         return scaled_inverse(self.precision)
 
     @cached_property
     def score(self) -> Float:
-        """Gradient (D,) by all parameters, of likelihood and priors.
+        """Gradient (D,) of likelihood and priors with respect to all parameters.
 
-        It is zero at a mode without `excess`.  Priors pull at the deviations of exposures as hard
-        as the stars do.
+        It is zero at a mode without `excess`.  The priors balance the gradient of the stars with
+        respect to the deviations of exposures.
         """
         out = self.priors.pull(self.theta)
         for cells in self.groups():
@@ -138,18 +138,18 @@ class Information:
         return out
 
     def position_covariance(self, cells: GroupCells) -> Float:
-        """Covariance (C, 2, 2) of the model's u and v in each cell by `covariance`."""
+        """Covariance (C, 2, 2) of the model's u and v in each cell, from `covariance`."""
         cov = self.covariance[np.ix_(cells.columns, cells.columns)]
         d = cells.derivative
         within = np.einsum("akm,mn,bln->abkl", d, cov, d, optimize=True)
         return np.asarray(np.einsum("ck,abkl,cl->cab", cells.phi, within, cells.phi, optimize=True))
 
     def leverage(self, cells: GroupCells) -> Float:
-        """Fraction (C, 2) of its own residual that a star of each cell absorbs, on each axis."""
+        """Fraction (C, 2) of its residual that a star in each cell absorbs, on each axis."""
         return _leverage(cells, self.position_covariance(cells))
 
     def squared_scores(self) -> SquaredScores:
-        """Sums over the stars of products of their scores, and what is expected of them."""
+        """Sums over the stars of products of their scores, and the expectation of these sums."""
         unbiased, jackknife, products = [], [], np.zeros(3)
         for cells in self.groups():
             position = self.position_covariance(cells)
@@ -157,8 +157,8 @@ class Information:
             product = free[:, :, None] * free[:, None, :]
             unbiased.append(cells.squares / np.sqrt(product))
             jackknife.append(cells.squares / product)
-            # stars of one cell together: they scatter more than single ones only where they are
-            # many, and the scatter of all is negligible
+            # Stars of one cell are taken together. They scatter more than single stars only if they
+            # are many, and then the scatter of all is negligible.
             X, H = position @ unbiased[-1], position @ cells.curvature
             products += [np.einsum("cab,cba->", *pair) for pair in ((X, X), (X, H), (H, H))]
         prior = self.priors.information(len(self.theta))
@@ -173,7 +173,7 @@ class Information:
 
 
 def _leverage(cells: GroupCells, position: Float) -> Float:
-    """Leverage (C, 2), given the covariance (C, 2, 2) of positions."""
+    """Leverage (C, 2) for a covariance (C, 2, 2) of positions."""
     per_star = np.einsum("caa->ca", cells.curvature) / cells.count[:, None]
     return np.asarray(np.clip(per_star * np.einsum("caa->ca", position), 0.0, 1 - MIN_FREE))
 
@@ -183,9 +183,9 @@ class CellSums(Sums):
     """Sums over the stars of each group and cell."""
 
     groups: Groups
-    side: int  # cells on each side of a chip
-    # (G, C, 9) number of stars, gradient of the log-likelihood by the model's u and v, minus its
-    # second derivatives uu, uv, vv, and products of the gradients uu, uv, vv
+    side: int  # number of cells along each side of a chip
+    # (G, C, 9) number of stars, gradient of the log-likelihood with respect to the model's u and v,
+    # minus its second derivatives uu, uv, vv, and products of the gradients uu, uv, vv
     sums: Float
     position: Float  # (chips, C, 3) number of stars and sums of their scaled positions X and Y
 
@@ -193,7 +193,7 @@ class CellSums(Sums):
     SAME = ("side",)
 
     def centres(self, chip: int) -> tuple[Int, Float, Float]:
-        """Cells of a chip (by code) with stars, and the mean scaled position X, Y in each."""
+        """Indices of a chip's cells with stars (chip by code), and mean scaled X and Y in each."""
         n, x, y = self.position[chip].T
         used = np.flatnonzero(n)
         return used, x[used] / n[used], y[used] / n[used]
@@ -204,7 +204,7 @@ def scores_on_chips(
 ) -> tuple[Float, Float, Int]:
     """Scores (N, 2) and curvatures (N, 2, 2) along the axes of the polynomials, and chips (N,).
 
-    The chip of each detection is a code, and -1 where the likelihood is not concave.
+    The chip of each detection is a code, or -1 if its log-likelihood is not concave.
     """
     g_u, g_v, h_uu, h_uv, h_vv = likelihood.scores(stars)
     g = np.stack([g_u, g_v], axis=1)
@@ -223,24 +223,24 @@ def scores_on_chips(
 
 
 def cells_per_side(n_groups: int) -> int:
-    """Number of cells on each side of a chip for this number of groups."""
-    return next(side for most, side in SIDES if n_groups <= most)
+    """Number of cells along each side of a chip for this number of groups."""
+    return next(side for largest, side in SIDES if n_groups <= largest)
 
 
 def cell_sums(
     stars: Stars, likelihood: Likelihood, side: int, excess: Float | None = None
 ) -> CellSums:
-    """Sums over some stars with `side` cells on each side of a chip, as a task for `Shards.sum`.
+    """Sums over stars with `side` cells along each side of a chip, as a task for `Shards.sum`.
 
-    `excess` (N,) is the variance of the gradient of each star relative to its curvature, 1 by
-    default, by which both are divided.
+    `excess` (N,) is the variance of the gradient of each star relative to its curvature, by which
+    both are divided; 1 by default.
     """
     columns_of_stars = likelihood.scores(stars)
     if excess is not None:
         columns_of_stars = columns_of_stars / excess
     g_u, g_v, h_uu, h_uv, h_vv = columns_of_stars
-    # Where a star may or may not be a false match its curvature is negative.  Such stars are left
-    # out, so that every sum of curvatures is that of a possible likelihood.
+    # The curvature is negative for stars with an uncertain membership. It is set to zero for them,
+    # so that every sum of curvatures is positive.
     good = (h_uu > 0) & (h_vv > 0)
     h_uu, h_uv, h_vv = (np.where(good, h, 0.0) for h in (h_uu, h_uv, h_vv))
     columns = (None, g_u, g_v, h_uu, h_uv, h_vv, g_u**2, g_u * g_v, g_v**2)

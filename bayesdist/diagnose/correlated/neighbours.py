@@ -1,19 +1,18 @@
-"""Structure finer than the functions, from products of neighbouring stars' scores.
+"""Structure finer than the functions, from products of the scores of neighbouring stars.
 
-A pattern of a few tens of pixels is hardly different from white noise for all functions that the
-stars can resolve, and yet stars that lie next to each other share it.  With scores g and curvatures
-h of stars whose own errors are independent, a displacement with covariance C(d) at separation d
-makes
+For the functions that the stars can resolve, a pattern of a few tens of pixels is hardly different
+from white noise, but neighbouring stars share it.  For stars with independent errors, scores g and
+curvatures h, a displacement with the covariance C(d) at the separation d gives
 
     sum g_i g_j = C(d) sum h_i h_j
 
-on the mean over pairs.  What the functions have resolved is taken out of the scores first: for its
-posterior mean f and covariance S at the stars,
+on average over pairs.  The part that the functions resolve is subtracted from the scores first.
+With its posterior mean f and covariance S at the stars,
 
     C(d) sum h_i h_j = sum [(g_i - h_i f_i) (g_j - h_j f_j) + h_i h_j S_ij]
 
-so that C is that of what is finer.  What is left of smoother parts is the same for pairs a little
-farther apart; only the difference to these is used.
+so that C is the covariance of the finer structure.  Remainders of smoother structure are the same
+for pairs at slightly larger separations; only the difference to these is used.
 """
 
 from __future__ import annotations
@@ -33,12 +32,13 @@ from bayesdist.model import DistortionModel
 from bayesdist.utils.arrays import Float, Int
 from bayesdist.utils.matern import matern
 
-# of separations, in pixels; the last bin is of pairs farther apart
+# of separations, in pixels; the last bin contains the pairs used for comparison
 EDGES = np.array([0.0, 6.0, 12.0, 24.0, 48.0, 96.0])
 MAX_PAIRS = 2_000_000
-SHAPE = 0.3  # by which the correlation at a separation may differ: patterns are periodic
-MAX_COMPARED = 20_000  # pairs over which the uncertainty of what is resolved is averaged
-MIN_PAIRS = 50  # of a bin; the variance of fewer cannot be estimated
+SHAPE = 0.3  # relative tolerance of the correlation at a separation, because patterns are periodic
+# number of pairs over which the uncertainty of the resolved structure is averaged
+MAX_COMPARED = 20_000
+MIN_PAIRS = 50  # per bin; with fewer, the variance cannot be estimated
 
 NODES, WEIGHTS = np.polynomial.legendre.leggauss(64)
 
@@ -47,44 +47,46 @@ NODES, WEIGHTS = np.polynomial.legendre.leggauss(64)
 class SharedVariance:
     """Covariance of displacements of neighbouring stars, on one axis of a chip."""
 
-    separation: Float  # mean (b,) of each bin, in longer half sides of the chip
-    apart: float  # mean separation of the pairs farther apart
-    # (b,) in excess of that of the pairs farther apart, in the squared unit of u, v
+    separation: Float  # (b,) mean of each bin, in longer half sides of the chip
+    apart: float  # mean separation of the pairs used for comparison
+    # (b,) in excess of that of the comparison pairs, in the squared unit of u and v
     covariance: Float
-    variance: Float  # (b,) of the covariance, by the scatter of the products
-    bins: Int  # (b,) number of each bin among `EDGES`
+    variance: Float  # (b,) variance of the covariance, from the scatter of the products
+    bins: Int  # (b,) index of each bin in `EDGES`
 
     def raised(self, by: Float) -> SharedVariance:
-        """Evidence with covariances in all bins of `EDGES` added."""
+        """Evidence with the covariances `by` in all bins of `EDGES` added."""
         return replace(self, covariance=self.covariance + by[self.bins] - by[-1])
 
     def of_field(self, length: float, cut: float = 0.0) -> Callable[[float], float]:
-        """Log likelihood of a Matern field's amplitude, by its correlation length in half sides.
+        """Log-likelihood of a Matern field as a function of its amplitude.
 
-        It is that of the field's part at angular frequencies above `cut` (inverse half sides).
+        `length` is the correlation length in half sides.  Only the part of the field at angular
+        frequencies above `cut` (inverse half sides) is considered.
         """
         separation = np.append(self.separation, self.apart)
         at = matern(separation / length) - _below(cut, length, separation)
         at_unit = at[:-1] - at[-1]
-        # A pattern's correlation may differ from the field's by SHAPE of its variance.  Beyond the
-        # most likely size this does not grow: the growth alone would draw to smaller amplitudes.
+        # The correlation of a pattern may differ from that of the field by SHAPE of its variance.
+        # The tolerance does not grow beyond the most likely size: otherwise its growth alone would
+        # favour smaller amplitudes.
         weight = at_unit / self.variance
         likely = max(float(weight @ self.covariance / max(weight @ at_unit, 1e-300)), 0.0)
         finer = float((1 + cut**2 * length**2 / 3) ** -1.5)
 
         def log_likelihood(amplitude: float) -> float:
-            left = self.covariance - at_unit * amplitude**2
+            deviation = self.covariance - at_unit * amplitude**2
             tolerance = SHAPE * finer * min(amplitude**2, likely)
             variance = self.variance + tolerance**2
-            return float(-0.5 * np.sum(left**2 / variance + np.log(variance / self.variance)))
+            return float(-0.5 * np.sum(deviation**2 / variance + np.log(variance / self.variance)))
 
         return log_likelihood
 
 
 def _below(cut: float, length: float, separation: Float) -> Float:
-    """Covariance by separation of the part of a field of unit variance at frequencies below `cut`.
+    """Covariance, at given separations, of a unit-variance field at frequencies below `cut`.
 
-    The integral of J0(k d) over the spectral density of the Matern field in two dimensions.
+    This is the integral of J0(k d) over the spectral density of the Matern field in two dimensions.
     """
     k, weight = (NODES + 1) * cut / 2, WEIGHTS * cut / 2
     k2 = 3 / length**2
@@ -95,12 +97,12 @@ def _below(cut: float, length: float, separation: Float) -> Float:
 def shared_variances(
     table: Matches, likelihood: Likelihood, model: DistortionModel
 ) -> dict[int, tuple[SharedVariance | None, SharedVariance | None]]:
-    """Evidence of neighbouring stars on the two axes of each chip, by its code.
+    """Evidence of neighbouring stars on both axes of each chip, by the code of the chip.
 
-    Nothing is taken out of the scores.  The matches are those of the solution with this likelihood,
-    or some of them.  A star that is matched several times is no neighbour of itself: its catalogue
-    position has one error.  Stars of a tight group are no neighbours of each other either.  None
-    for an axis with too few pairs.
+    Nothing is subtracted from the scores.  The matches are those of the solution with this
+    likelihood, or a part of them.  Pairs of matches of one star, or of stars in a tight group, are
+    excluded because they share an error of the reference position.  The evidence is None for an
+    axis with too few pairs.
     """
     return {
         code: chip.shared_variances()
@@ -112,19 +114,23 @@ def shared_variances(
 class NeighbourScores:
     """Stars of one chip, with their scores along the axes of the polynomials."""
 
-    X: Float  # scaled positions (n,)
+    X: Float  # X, Y (n,): scaled positions
     Y: Float
     score: Float  # (n, 2) gradient of the log-likelihood
     curvature: Float  # (n, 2, 2) minus its second derivatives
-    star: Int  # (n,) what shares an error of the reference, from 0
-    pairs: Int  # (p, 2) rows of neighbours that are different stars
+    # (n,) code of the star, or tight group of stars, that shares an error of the reference, from 0
+    star: Int
+    pairs: Int  # (p, 2) indices of neighbours that are different stars
     separation: Float  # (p,) in pixels
     half: float  # longer half side of the chip, in pixels
 
     def shared_variances(
         self, resolved: Float | None = None
     ) -> tuple[SharedVariance | None, SharedVariance | None]:
-        """Evidence on both axes; `resolved` (draws, n, 2) is what the functions have resolved."""
+        """Evidence on both axes.
+
+        `resolved` (draws, n, 2) are draws of the structure that the functions resolve.
+        """
         single = len(self.star) == self.star.max(initial=-1) + 1
         of_stars = None if single else self.star[self.pairs]
         score, bins = self.score, _bins(self.separation)
@@ -140,43 +146,56 @@ class NeighbourScores:
         return out[0], out[1]
 
     def _uncertain(self, resolved: Float, h: Float, bins: Int) -> Float:
-        """Mean covariance in each bin of what is resolved, by its draws (d, n)."""
-        some = slice(None, None, max(1, len(self.pairs) // MAX_COMPARED))
-        i, j = self.pairs[some].T
-        # divided by the number of draws: the mean that is taken out is that of these draws, too
-        left = (resolved - resolved.mean(axis=0)).T
+        """Mean covariance per bin of the resolved structure's uncertainty, from draws (d, n)."""
+        selected = slice(None, None, max(1, len(self.pairs) // MAX_COMPARED))
+        i, j = self.pairs[selected].T
+        # divided by the number of draws, because the subtracted mean is that of the same draws
+        deviation = (resolved - resolved.mean(axis=0)).T
         weight = h[i] * h[j]
-        product = np.einsum("pd,pd->p", left[i], left[j]) / len(resolved)
+        product = np.einsum("pd,pd->p", deviation[i], deviation[j]) / len(resolved)
         n = len(EDGES) - 1
-        total, sums = (np.bincount(bins[some], w, n) for w in (weight, weight * product))
+        total, sums = (np.bincount(bins[selected], w, n) for w in (weight, weight * product))
         return np.asarray(sums / np.maximum(total, 1e-300))
 
 
 def neighbour_scores(
     table: Matches, likelihood: Likelihood, model: DistortionModel
 ) -> dict[int, NeighbourScores]:
-    """Scores of neighbouring stars of each chip, by its code; arguments as `shared_variances`."""
+    """Scores of neighbouring stars of each chip, by its code.
+
+    For the arguments see `shared_variances`.
+    """
     stars, order = prepare(model, table)
     code = np.arange(len(order)) if table.error_codes is None else table.error_codes[order]
     g, h, chip = scores_on_chips(model, stars, likelihood)
     out = {}
-    for c, one in enumerate(model.chips):
-        here = np.flatnonzero(chip == c)
-        expected = len(here) ** 2 * np.pi * EDGES[-1] ** 2 / (2 * one.size[0] * one.size[1])
-        here = here[:: max(1, round(float(np.sqrt(expected / MAX_PAIRS))))]
-        at = np.column_stack([stars.X[here] * one.size[0], stars.Y[here] * one.size[1]]) / 2
+    for c, model_chip in enumerate(model.chips):
+        members = np.flatnonzero(chip == c)
+        expected = (
+            len(members) ** 2
+            * np.pi
+            * EDGES[-1] ** 2
+            / (2 * model_chip.size[0] * model_chip.size[1])
+        )
+        members = members[:: max(1, round(float(np.sqrt(expected / MAX_PAIRS))))]
+        at = (
+            np.column_stack(
+                [stars.X[members] * model_chip.size[0], stars.Y[members] * model_chip.size[1]]
+            )
+            / 2
+        )
         pairs = cKDTree(at).query_pairs(EDGES[-1], output_type="ndarray")
-        star = np.unique(code[here], return_inverse=True)[1]
+        star = np.unique(code[members], return_inverse=True)[1]
         pairs = pairs[star[pairs[:, 0]] != star[pairs[:, 1]]]
         separation = np.linalg.norm(at[pairs[:, 0]] - at[pairs[:, 1]], axis=1)
-        half = max(one.size) / 2
-        X, Y = stars.X[here], stars.Y[here]
-        out[c] = NeighbourScores(X, Y, g[here], h[here], star, pairs, separation, half)
+        half = max(model_chip.size) / 2
+        X, Y = stars.X[members], stars.Y[members]
+        out[c] = NeighbourScores(X, Y, g[members], h[members], star, pairs, separation, half)
     return out
 
 
 def _bins(separation: Float) -> Int:
-    """Bin of each separation among `EDGES`."""
+    """Index of the bin of each separation."""
     return np.clip(np.searchsorted(EDGES, separation, side="right") - 1, 0, len(EDGES) - 2)
 
 
@@ -189,10 +208,10 @@ def _shared(
     stars: Int | None,
     bins: Int,
 ) -> SharedVariance | None:
-    """Excess covariance by pairs (p, 2) of detections in bins (p,) of their separations.
+    """Excess covariance from pairs (p, 2) of detections, in bins (p,) of their separations.
 
-    `stars` (p, 2) are those of the detections, None if each star has one: pairs of detections of
-    the same two stars repeat one product of their errors.
+    `stars` (p, 2) are the stars of the detections, or None if each star has one detection: several
+    pairs of detections of the same two stars repeat one product of their errors.
     """
     i, j = pairs.T
     product, weight = g[i] * g[j], h[i] * h[j]
@@ -207,20 +226,20 @@ def _shared(
         np.bincount(bins, w, minlength=len(EDGES) - 1).astype(float)
         for w in (None, weight, product, separation)
     )
-    # without informative pairs there is no comparison
+    # without informative pairs no comparison is possible
     if count[-1] < MIN_PAIRS or not (total > 0).all():
         return None
     mean = together / np.maximum(total, 1e-300)
     scatter = np.bincount(bins, (product - mean[bins] * weight) ** 2, minlength=len(count))
     variance = scatter / np.maximum(total, 1e-300) ** 2
-    some = np.flatnonzero(count[:-1] >= MIN_PAIRS)
-    if not some.size:
+    filled = np.flatnonzero(count[:-1] >= MIN_PAIRS)
+    if not filled.size:
         return None
     distance = distance / np.maximum(count, 1) / half
     return SharedVariance(
-        distance[some],
+        distance[filled],
         float(distance[-1]),
-        mean[some] - mean[-1],
-        variance[some] + variance[-1],
-        some,
+        mean[filled] - mean[-1],
+        variance[filled] + variance[-1],
+        filled,
     )

@@ -18,9 +18,9 @@ MIN_RATIO, MAX_RATIO = 0.25, 100.0
 def score_excess(information: Information) -> Float:
     """Ratio (chips, C, 2) of the variance of the scores to their curvature, by chip, cell and axis.
 
-    Where the likelihood is right the two agree.  Ratios of blocks of the detector are shrunk to
-    their mean as their own errors and their scatter about it require (a normal model of their
-    logarithms, by moments: DerSimonian and Laird 1986, Controlled Clinical Trials 7, 177).
+    It is 1 for a correct likelihood.  Ratios of blocks of the detector are shrunk to their mean
+    according to their errors and their scatter (a normal model of their logarithms, by moments:
+    DerSimonian and Laird 1986, Controlled Clinical Trials 7, 177).
     """
     side, n_chips = information.sums.side, len(information.model.chips)
     stars = information.sums.position[:, :, 0].sum(axis=1)
@@ -29,7 +29,9 @@ def score_excess(information: Information) -> Float:
     sums = np.zeros((n_chips, side * side, 5))
     for cells in information.groups():
         free = 1 - information.leverage(cells)
-        squares, curvature = (np.einsum("caa->ca", one) for one in (cells.squares, cells.curvature))
+        squares, curvature = (
+            np.einsum("caa->ca", matrix) for matrix in (cells.squares, cells.curvature)
+        )
         values = np.column_stack([squares / free, curvature, cells.count])
         sums[cells.chip] += sums_over(
             cell_index(cells.X, cells.Y, (side, side)), values, side * side
@@ -47,7 +49,7 @@ def score_excess(information: Information) -> Float:
 def block_ratios(block: Int, values: Float, n: int) -> Float:
     """Ratios (N,) of the sums over n blocks of squares and curvatures, shrunk to their mean.
 
-    `block` (N,) is that of each of the values (N, 3): squares, curvatures, numbers.
+    `block` (N,) is the block of each row of `values` (N, 3): square, curvature, number.
     """
     top, bottom, number = sums_over(block, values, n).T
     mean = top.sum() / bottom.sum()
@@ -55,22 +57,22 @@ def block_ratios(block: Int, values: Float, n: int) -> Float:
     out = np.full(n, mean)
     if good.sum() > 1:
         ratio = np.log(top[good] / bottom[good] / mean)
-        own = 2.5 / number[good]  # a normal star's square has variance 2; mixtures have some more
-        w = 1 / own
+        # the square of a normal variable has variance 2; mixtures have a larger one
+        variance = 2.5 / number[good]
+        w = 1 / variance
         q = (w * (ratio - np.average(ratio, weights=w)) ** 2).sum()
         scatter = max(0.0, (q - (len(w) - 1)) / (w.sum() - (w**2).sum() / w.sum()))
-        out[good] = mean * np.exp(ratio * scatter / (scatter + own))
+        out[good] = mean * np.exp(ratio * scatter / (scatter + variance))
     return np.asarray(np.clip(out, MIN_RATIO, MAX_RATIO)[block])
 
 
 def not_narrower(noise: Float, formal: Float) -> tuple[Float, float]:
-    """Covariance by the stars' scatter, on the whole not below the formal one, and their ratio.
+    """Covariance from the stars' scatter, at least as large as the formal one, and their ratio.
 
-    Both are (D, D), and zero for parameters that are fixed.
-    Quoted errors that are too large are the user's statement: residuals cannot distinguish them
-    from matches that were cut.
+    Both are (D, D), with zeros for fixed parameters.  The formal covariance is the lower limit
+    because residuals cannot distinguish quoted errors that are too large from truncated matches.
     """
-    # a small part of the formal one, so that no direction is without variance
+    # a small part of the formal covariance, so that no direction has zero variance
     noise = 0.99 * noise + 0.01 * formal
     free = np.flatnonzero(np.diag(formal) > 0)
     inner = np.ix_(free, free)

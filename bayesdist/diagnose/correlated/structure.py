@@ -1,15 +1,15 @@
-"""Posterior of the structure outside a polynomial, amplitudes marginalised.
+"""Posterior of the structure that a polynomial lacks, with its amplitudes marginalised.
 
 With the part that the fit absorbs eliminated, the data determine the coefficients z of the
-structure's functions through a score s and an information S, so that for amplitudes eta
+structure's functions through a score s and an information matrix S.  For amplitudes eta,
 
     z | eta   ~ N((S + P)^-1 s, (S + P)^-1)             P = P(eta), the prior precision
     log p(eta | data) = log p(eta) + (s^T (S + P)^-1 s - log|S + P| + log|P|) / 2
 
 The amplitude and the correlation length of the Matern field and the amplitude of the higher orders
-are integrated on a grid that is refined where the density is.  Structure too fine for the functions
-shows in neighbouring stars (`SharedVariance`), whose likelihood is a factor: that of the field's
-part finer than the functions, once what these resolve is taken out of the stars' scores.
+are integrated over a grid that is refined where the density is large.  Structure too fine for the
+functions appears in neighbouring stars (`SharedVariance`).  Their likelihood is a factor: that of
+the part of the field finer than the functions, with the resolved part subtracted from the scores.
 """
 
 from __future__ import annotations
@@ -35,38 +35,40 @@ from bayesdist.utils.arrays import Float, Int
 Shared = TypeVar("Shared")
 Evidence = Sequence[SharedVariance | None]
 
-# of the field, in longer half sides; all equally probable beforehand
+# of the field, in longer half sides; equal prior probabilities
 LENGTHS = np.geomspace(SHORTEST, 0.6, 7)
-STEPS = 8  # of the amplitude, before the grid is refined
-HALVINGS = 6  # at most: neighbouring stars may determine an amplitude to some percent
-CHANGE = 0.7  # of the log density between two points, below which none is inserted between them,
-WIDEST = 0.4  # or width of their interval in the logarithm, where most of the density is
-NEGLIGIBLE = 10.0  # in log density, below the largest
-NEAR_TOP = 2.0  # likewise, for most of the density
-UNLIKE = 0.2  # prior probability that the field differs on the two axes, by about a factor e
+STEPS = 8  # in amplitude, before the grid is refined
+# limit to the refinements: neighbouring stars may determine an amplitude to a few per cent
+HALVINGS = 6
+CHANGE = 0.7  # largest change of the log density between two points without a point between them,
+WIDEST = 0.4  # and largest interval in log(amplitude), where most of the density is
+NEGLIGIBLE = 10.0  # difference in log density from the maximum
+NEAR_TOP = 2.0  # likewise, for the region with most of the density
+UNLIKE = 0.2  # prior probability that the amplitude differs between both axes, by about a factor e
 
 
 @dataclass(frozen=True, eq=False)
 class Field:
-    """What the data say of a field of one length, along one axis or more, before its amplitude.
+    """Likelihood of a field with one correlation length, on one or more axes, for any amplitude.
 
-    The sines are seen along the eigenvectors of the information of coefficients that have unit
-    variance where the field has: these serve every amplitude.
+    The coefficients of the sines are scaled to the variance that they have in a field of unit
+    variance, and expressed in the eigenvectors of their information.  These serve for every
+    amplitude.
     """
 
     root: Float  # (n_sines,) standard deviations of the coefficients in a field of unit variance
-    values: Float  # eigenvalues of the sines' information
-    vectors: Float  # eigenvectors of the same
-    score: Float  # of the sines, along these
-    tied: Float  # (n_sines, T), likewise the coupling of the sines to the terms
-    terms: Float  # information (T, T) of the terms
+    values: Float  # (n_sines,) eigenvalues of the sines' information
+    vectors: Float  # (n_sines, n_sines) its eigenvectors
+    score: Float  # (n_sines,) score of the sines along these
+    tied: Float  # (n_sines, T) information between the sines, along these, and the terms
+    terms: Float  # (T, T) information of the terms
     terms_score: Float
 
     @classmethod
     def of(cls, blocks: Sequence[StructureFunctions], length: float, S: Float, s: Float) -> Field:
-        """From information and score of the terms of all blocks, then of their sines."""
-        scale = np.concatenate([one.decline() for one in blocks])
-        root = np.sqrt(np.concatenate([one.spectrum(length) for one in blocks]))
+        """Build from information and score of all terms of all blocks, followed by their sines."""
+        scale = np.concatenate([block.decline() for block in blocks])
+        root = np.sqrt(np.concatenate([block.spectrum(length) for block in blocks]))
         T = len(scale)
         values, vectors = np.linalg.eigh(S[T:, T:] * np.outer(root, root))
         along = vectors.T * root
@@ -81,7 +83,7 @@ class Field:
         )
 
     def at(self, amplitude: float) -> SizedField:
-        """The likelihood for an amplitude."""
+        """Likelihood for the given amplitude."""
         variance = 1 / (self.values + amplitude**-2)
         weighted = self.tied.T * variance
         values, vectors = np.linalg.eigh(self.terms - weighted @ self.tied)
@@ -89,7 +91,7 @@ class Field:
         return SizedField(self, amplitude, variance, np.maximum(values, 0.0), vectors, along)
 
     def draws(self, terms: Float, variance: Float, rng: np.random.Generator) -> Float:
-        """Sines (m, n_sines), given terms (m, T) and variances (m, n_sines) of `SizedField`."""
+        """Draw sines (m, n_sines) for given terms (m, T) and variances (m, n_sines)."""
         along = variance * (self.score - terms @ self.tied.T)
         along += np.sqrt(variance) * (rng.standard_normal(variance.shape) @ self.vectors)
         return np.asarray((along @ self.vectors.T) * self.root)
@@ -97,33 +99,33 @@ class Field:
 
 @dataclass(frozen=True, eq=False)
 class SizedField:
-    """Likelihood of the terms, given length and amplitude of the field."""
+    """Likelihood of the terms, given the correlation length and amplitude of the field."""
 
     field: Field
     amplitude: float
-    variance: Float  # of the sines along their eigenvectors, given the terms
-    values: Float  # eigenvalues of the terms' information without the sines
-    vectors: Float  # eigenvectors of the same
-    score: Float  # of the terms, along these
+    variance: Float  # (n_sines,) of the sines along their eigenvectors, given the terms
+    values: Float  # (T,) eigenvalues of the terms' information with the sines marginalised
+    vectors: Float  # (T, T) its eigenvectors
+    score: Float  # (T,) score of the terms along these
 
     def log_evidence(self, amplitudes: Float) -> Float:
-        """Log evidence by the amplitude of the terms."""
+        """Log evidence as a function of the amplitudes of the terms."""
         out = 0.5 * self.variance @ self.field.score**2
         out -= 0.5 * np.log1p(self.field.values * self.amplitude**2).sum()
         out += 0.5 * (self.score**2 / (self.values + amplitudes[:, None] ** -2)).sum(axis=1)
         return np.asarray(out - 0.5 * np.log1p(self.values * amplitudes[:, None] ** 2).sum(axis=1))
 
     def draws(self, amplitude: Float, rng: np.random.Generator) -> Float:
-        """Terms (m, T), given their amplitudes (m,)."""
+        """Draw terms (m, T), given their amplitudes (m,)."""
         precision = self.values + amplitude[:, None] ** -2
-        # noise through symmetric roots, which signs and order of eigenvectors do not change
+        # multiply noise by symmetric roots, which do not depend on signs and order of eigenvectors
         noise = rng.standard_normal((len(precision), len(self.values))) @ self.vectors
         return np.asarray((self.score / precision + noise / np.sqrt(precision)) @ self.vectors.T)
 
 
 @dataclass(frozen=True, eq=False)
 class _Point:
-    """A correlation length, and an amplitude of the field in each part."""
+    """A correlation length, and the amplitude of the field in each part."""
 
     length: float
     amplitudes: tuple[float, ...]
@@ -134,51 +136,55 @@ class _Point:
 class Structure:
     """Posterior of the structure."""
 
-    # functions of each part: of one axis of a chip, or of all axes of all chips that are coupled
+    # functions of each part: of one axis of a chip, or of all axes of all chips if these are
+    # coupled
     functions: tuple[tuple[StructureFunctions, ...], ...]
-    terms_amplitude: Float  # grid (TERM_STEPS,) of amplitudes of the higher orders
-    points: tuple[_Point, ...]  # lengths and amplitudes of the field
-    weight: Float  # posterior probability (points, TERM_STEPS) of each combination
+    terms_amplitude: Float  # (TERM_STEPS,) grid of amplitudes of the higher orders
+    points: tuple[_Point, ...]  # grid of correlation lengths and amplitudes of the field
+    weight: Float  # (points, TERM_STEPS) posterior probability of each combination
 
     def draws(
         self, n: int, rng: np.random.Generator, waves: Sequence[Sequence[Float]] | None = None
     ) -> list[Float]:
-        """Coefficients (n, n_known + 2 FINE) of terms, sines and finer waves of each function.
+        """Draw coefficients (n, n_known + 2 FINE) of terms, sines and finer waves of each function.
 
-        `waves` are the wave vectors (FINE, 2) of each function of each part; without them finer
-        waves are left out.
+        `waves` contains the wave vectors (FINE, 2) of each function of each part; finer waves are
+        left out if it is None.
         """
         counts = rng.multinomial(n, self.weight.ravel())
         drawn = rng.permutation(np.repeat(np.arange(len(counts)), counts))
         point, by_terms = np.divmod(drawn, self.weight.shape[1])
         amplitude = self.terms_amplitude[by_terms]
         out = []
-        for k, some in enumerate(self.functions):
+        for k, part_functions in enumerate(self.functions):
             terms, sines = self._known(k, point, amplitude, rng)
-            finer = rng.standard_normal((len(some), n, 2 * FINE if waves else 0))
+            finer = rng.standard_normal((len(part_functions), n, 2 * FINE if waves else 0))
             if waves:
                 spread = self._finer(k, waves[k])[:, point]
                 finer *= np.concatenate([spread, spread], axis=2)  # cosines and sines
             first, start = 0, 0
-            for own, wave in zip(some, finer, strict=True):
-                of_terms = terms[:, first : first + own.n_terms] * own.decline()
-                along = sines[:, start : start + own.n_sines]
+            for functions, wave in zip(part_functions, finer, strict=True):
+                of_terms = terms[:, first : first + functions.n_terms] * functions.decline()
+                along = sines[:, start : start + functions.n_sines]
                 out.append(np.concatenate([of_terms, along, wave], axis=1))
-                first, start = first + own.n_terms, start + own.n_sines
+                first, start = first + functions.n_terms, start + functions.n_sines
         return out
 
     def _known(
         self, part: int, point: Int, amplitude: Float, rng: np.random.Generator
     ) -> tuple[Float, Float]:
-        """Terms (n, T) and sines (n, n_sines) of a part at these points, given amplitudes (n,)."""
-        sized = [p.parts[part] for p in self.points]  # many points have the same
+        """Draw terms (n, T) and sines (n, n_sines) of a part at points (n,).
+
+        `amplitude` (n,) are the amplitudes of the terms.
+        """
+        sized = [p.parts[part] for p in self.points]  # many points have the same one
         terms = np.empty((len(point), len(sized[0].values)))
         variance = np.empty((len(point), len(sized[0].variance)))
-        for one, rows in _rows_of(sized, point):
-            terms[rows] = one.draws(amplitude[rows], rng)
-            variance[rows] = one.variance
+        for field_at_size, rows in _rows_of(sized, point):
+            terms[rows] = field_at_size.draws(amplitude[rows], rng)
+            variance[rows] = field_at_size.variance
         sines = np.empty_like(variance)
-        for of_length, rows in _rows_of([one.field for one in sized], point):
+        for of_length, rows in _rows_of([field_at_size.field for field_at_size in sized], point):
             sines[rows] = of_length.draws(terms[rows], variance[rows], rng)
         return terms, sines
 
@@ -199,11 +205,11 @@ class Structure:
 
 
 def _rows_of(of_point: Sequence[Shared], point: Int) -> Iterator[tuple[Shared, Int]]:
-    """Each of what the points have, and which of these draws are at a point that has it."""
-    number = {one: k for k, one in enumerate(dict.fromkeys(of_point))}
-    drawn = np.array([number[one] for one in of_point])[point]
-    for one, k in number.items():
-        yield one, np.flatnonzero(drawn == k)
+    """Iterate over the distinct items of the points, with indices of the draws that have them."""
+    number = {item: k for k, item in enumerate(dict.fromkeys(of_point))}
+    drawn = np.array([number[item] for item in of_point])[point]
+    for item, k in number.items():
+        yield item, np.flatnonzero(drawn == k)
 
 
 def structure_posterior(
@@ -217,35 +223,42 @@ def structure_posterior(
     pairs: Evidence | Callable[[Structure], Evidence] = (None, None),
     lengths: Float | None = None,
 ) -> Structure:
-    """Posterior of the coefficients of structure functions, of one part or two.
+    """Posterior of the coefficients of structure functions, for one part or two.
 
-    The parts of matched stars are the two axes of a chip.  Length and amplitudes are those of both:
-    what bends light or silicon bends it along both, and few data determine little of each.  But the
-    field may differ, as a pattern of columns does.  Stars that are solved for couple all axes of
-    all chips, which are one part then.
+    For matched stars the parts are the two axes of a chip.  Correlation length and amplitudes are
+    common to both axes: light or silicon bends along both, and few data hardly determine each axis
+    alone.  The amplitudes may differ, however, as for a pattern of columns.  Fitted stars couple
+    all axes of all chips, which are then a single part.
 
-    For the `functions` of each part `information` (m, m) is that of their coefficients, and `score`
-    (m,) the gradient of the log-likelihood where they are zero, both with the part that the fit
-    absorbs eliminated; `pairs` is the evidence of neighbouring stars on each part, or a function
-    that finds it once a posterior without it tells what the functions resolve.  `noise` is the
-    typical error of one star, a few times which limits the amplitudes; `higher_order` and
-    `structure` are prior medians of the amplitudes, in the unit of the positions; `lengths` of the
-    field are `LENGTHS` by default.
+    For the `functions` of each part, `information` (m, m) is that of their coefficients, and
+    `score` (m,) is the gradient of the log-likelihood where they are zero, both with the part that
+    the fit absorbs eliminated.  `pairs` is the evidence of neighbouring stars on each part, or a
+    function that computes it from a posterior without that evidence.  `noise` is the typical error
+    of one star, which limits the amplitudes; `higher_order` and `structure` are prior medians of
+    the amplitudes, in the unit of the positions.  `lengths` are the correlation lengths of the
+    field, by default `LENGTHS`.
     """
-    known = [_terms_first(*one) for one in zip(functions, information, score, strict=True)]
+    parts = [_terms_first(*part) for part in zip(functions, information, score, strict=True)]
     amplitudes = AmplitudeGrid.of(
-        max((np.diag(S)[: sum(f.n_terms for f in some)] for some, S, _ in known), key=np.median),
+        max(
+            (
+                np.diag(S)[: sum(f.n_terms for f in part_functions)]
+                for part_functions, S, _ in parts
+            ),
+            key=np.median,
+        ),
         noise=noise,
         higher_order=higher_order,
         structure=structure,
     )
     by_amplitude = {
         float(length): _SizedFields(
-            [Field.of(some, float(length), S, s) for some, S, s in known], amplitudes.terms
+            [Field.of(part_functions, float(length), S, s) for part_functions, S, s in parts],
+            amplitudes.terms,
         )
         for length in (LENGTHS if lengths is None else lengths)
     }
-    cuts = [some[0].cut for some in functions]
+    cuts = [part_functions[0].cut for part_functions in functions]
     if callable(pairs):
         pairs = pairs(_weighed(functions, by_amplitude, amplitudes, structure, (), cuts))
     return _weighed(functions, by_amplitude, amplitudes, structure, pairs, cuts)
@@ -259,9 +272,9 @@ def _weighed(
     pairs: Evidence,
     cuts: Sequence[float],
 ) -> Structure:
-    """Posterior over lengths and amplitudes, with the evidence of neighbouring stars.
+    """Posterior over correlation lengths and amplitudes, with the evidence of neighbouring stars.
 
-    `cuts` are the frequencies of each part above which that evidence is.
+    `cuts` are the frequencies of each part above which that evidence applies.
     """
     by_length = list[tuple[float, list[_Sized], Float]]()
     for length, fields in by_amplitude.items():
@@ -276,13 +289,13 @@ def _weighed(
     for length, sized, density in by_length:
         for at in np.argwhere(density.max(axis=-1) > largest - NEGLIGIBLE):
             chosen = [sized[k] for k in at]
-            sizes = tuple(one.amplitude for one in chosen)
-            parts = tuple(one.parts[k] for k, one in enumerate(chosen))
+            sizes = tuple(sized_field.amplitude for sized_field in chosen)
+            parts = tuple(sized_field.parts[k] for k, sized_field in enumerate(chosen))
             points.append(_Point(length, sizes, parts))
             log_weight.append(density[tuple(at)] - largest)
     weight = np.exp(log_weight)
     return Structure(
-        tuple(tuple(some) for some in functions),
+        tuple(tuple(part_functions) for part_functions in functions),
         amplitudes.terms,
         tuple(points),
         weight / weight.sum(),
@@ -292,18 +305,23 @@ def _weighed(
 def _terms_first(
     functions: Sequence[StructureFunctions], S: Float, s: Float
 ) -> tuple[Sequence[StructureFunctions], Float, Float]:
-    """Functions with the information and score of all terms, then of all sines."""
-    is_sine = np.concatenate([np.arange(one.n_known) >= one.n_terms for one in functions])
+    """Functions, with the information and score of all terms followed by those of all sines."""
+    is_sine = np.concatenate(
+        [
+            np.arange(chip_functions.n_known) >= chip_functions.n_terms
+            for chip_functions in functions
+        ]
+    )
     order = np.argsort(is_sine, kind="stable")
     return functions, S[np.ix_(order, order)], s[order]
 
 
 @dataclass(frozen=True, eq=False)
 class _SizedFields:
-    """Fields of one length in all parts, by their amplitude; each is worked out once."""
+    """Fields of one correlation length in all parts, computed once per amplitude."""
 
     fields: Sequence[Field]
-    of_terms: Float  # amplitudes (TERM_STEPS,) of the terms
+    of_terms: Float  # (TERM_STEPS,) amplitudes of the terms
     _cache: dict[float, tuple[tuple[SizedField, ...], Float]] = field(default_factory=dict)
 
     def at(self, log_amplitude: float) -> tuple[tuple[SizedField, ...], Float]:
@@ -330,32 +348,33 @@ class _Sized:
         shared: Sequence[Callable[[float], float] | None],
         log_amplitude: float,
     ) -> _Sized:
-        """By the fields of all parts, and the evidence of neighbours."""
+        """Build from the fields of all parts, and the evidence of neighbouring stars."""
         amplitude = float(np.exp(log_amplitude))
         parts, evidence = fields.at(float(log_amplitude))
         near = np.zeros(len(parts))
-        for k, known in enumerate(shared):
-            near[k] = 0.0 if known is None else known(amplitude)
+        for k, likelihood in enumerate(shared):
+            near[k] = 0.0 if likelihood is None else likelihood(amplitude)
         return cls(amplitude, parts, evidence + near[:, None])
 
     @property
     def views(self) -> Float:
-        """Evidence (1 + parts, TERM_STEPS) of all parts together, and of each."""
+        """Evidence (1 + parts, TERM_STEPS) of all parts together, and of each part."""
         return np.stack([self.evidence.sum(axis=0), *self.evidence])
 
 
 def _refined(
     at: Callable[[float], _Sized], amplitudes: AmplitudeGrid, median: float
 ) -> list[_Sized]:
-    """Ascending amplitudes of the field, denser where the density changes."""
+    """Ascending amplitudes of the field, spaced more closely where the density changes."""
     prior = amplitudes.log_prior
     grid = list(np.linspace(np.log(amplitudes.low), np.log(amplitudes.high), STEPS))
     sized = [at(a) for a in grid]
     for _ in range(HALVINGS):
-        tops = np.array([(prior + one.views).max(axis=1) for one in sized])
+        tops = np.array([(prior + sized_field.views).max(axis=1) for sized_field in sized])
         tops += log_half_t(np.exp(grid), median, STRUCTURE_DOF)[:, None]
-        best = tops.max(axis=0)  # of this length: a peak may lie between two points
-        # part by part only where they may differ
+        # maximum for this correlation length: a peak may be between two points
+        best = tops.max(axis=0)
+        # refine separately for each part only if the parts may differ
         several = len(best) - 1
         apart = best[1:].sum() > best[0] + (several - 1) * prior.max() + CHANGE
         middles = set[float]()
@@ -371,33 +390,33 @@ def _refined(
 
 
 def _density(sized: Sequence[_Sized], median: float) -> Float:
-    """Log density of amplitudes of the field in each part, and of the terms.
+    """Log density of the amplitudes of the field in each part, and of the terms.
 
-    (n, TERM_STEPS) for one part, (n, n, TERM_STEPS) for two.
+    The shape is (n, TERM_STEPS) for one part and (n, n, TERM_STEPS) for two.
     """
-    amplitude = np.array([one.amplitude for one in sized])
+    amplitude = np.array([sized_field.amplitude for sized_field in sized])
     width = log_widths(amplitude, beyond=0.0)
-    evidence = np.stack([one.evidence for one in sized], axis=1)
+    evidence = np.stack([sized_field.evidence for sized_field in sized], axis=1)
     if len(evidence) == 1:
         return np.asarray(
             (log_half_t(amplitude, median, STRUCTURE_DOF) + width)[:, None] + evidence[0]
         )
     u, v = evidence
-    both = np.add.outer(amplitude**2, amplitude**2) / 2
+    mean_square = np.add.outer(amplitude**2, amplitude**2) / 2
     apart = np.abs(np.subtract.outer(np.log(amplitude), np.log(amplitude)))
     differ = np.log(UNLIKE / 2) - apart + width
     np.fill_diagonal(differ, np.log(1 - UNLIKE))
-    density = log_half_t(np.sqrt(both), median, STRUCTURE_DOF) + width[:, None] + differ
+    density = log_half_t(np.sqrt(mean_square), median, STRUCTURE_DOF) + width[:, None] + differ
     return np.asarray(density[..., None] + u[:, None] + v)
 
 
 def _middles(grid: Sequence[float], tops: Sequence[float], best: float) -> list[float]:
-    """Middles of the intervals that have some of the density, and over which it changes."""
+    """Midpoints of the intervals where the density is not negligible and changes strongly."""
     out = []
     for (a, top_a), (b, top_b) in pairwise(zip(grid, tops, strict=True)):
         top = max(top_a, top_b)
         changes = top > best - NEGLIGIBLE and abs(top_a - top_b) > CHANGE
-        # a peak may lie between two points of the same height
+        # a peak may be between two points of equal height
         if changes or (top > best - NEAR_TOP and b - a > WIDEST):
             out.append(0.5 * (a + b))
     return out

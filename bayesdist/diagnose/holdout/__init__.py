@@ -1,1 +1,1 @@
-"""Stars held out of the fit, against their predictive distribution."""
+"""Comparison of stars held out of the fit with their predictive distribution."""

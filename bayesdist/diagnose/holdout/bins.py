@@ -1,7 +1,7 @@
 """Division of held-out stars by position, magnitude, date and exposure.
 
-An exposure that was held out whole is also divided by place: what bends it alone leaves its mean
-where it was.
+An exposure that was held out entirely is also divided by position: distortions of this exposure
+alone may leave its mean unchanged.
 """
 
 from __future__ import annotations
@@ -22,38 +22,39 @@ ALL = "all"
 STARS_PER_BIN = 60
 MAX_CELLS = 8  # along each side of a chip
 MAX_BINS = 8  # of magnitudes, and of dates
-MAX_PLACES = 4  # along each side of a chip of one exposure
-MAX_CELLS_IN_ALL = 512  # of all such exposures
-MAX_EXPOSURES = 60  # beyond it only those that were held out whole are looked at one by one
+MAX_PLACES = 4  # cells along each side of a chip, per exposure
+MAX_CELLS_IN_ALL = 512  # total number of cells of all such exposures
+# if there are more, only exposures that were held out entirely are tested separately
+MAX_EXPOSURES = 60
 
 
 @dataclass(frozen=True)
 class Bin:
     """One part of the held-out stars."""
 
-    words: str  # where it is, as a clause: 'at x 1 to 512, y 1 to 512'
+    words: str  # description as a clause: 'at x 1 to 512, y 1 to 512'
     chip: Chip | None = None  # of a region
-    # x and y of a region's edges, pixels; lowest and highest magnitude or date
+    # edges of a region in x and y, pixels; lowest and highest magnitude or date
     limits: tuple[float, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
 class Partition:
-    """Bins that hold each star once, or not at all."""
+    """Bins that contain each star at most once."""
 
     kind: str  # 'all', 'region', 'magnitude', 'epoch', 'exposure' or 'place in exposure'
     bins: tuple[Bin, ...]
-    # of a table and some of its rows (n,): bin (n,) of each, negative where there is none
+    # function of a table and of rows (n,) that returns their bins (n,), negative for none
     codes: Callable[[Matches, Int], Int]
 
 
 def partitions_of(
     model: DistortionModel, held: Any, sample: Matches, whole: Sequence[str]
 ) -> tuple[Partition, ...]:
-    """The parts in which held-out stars are judged.
+    """Partitions of the held-out stars that are tested.
 
-    `sample` are some of the held-out stars, evenly spread, which say where bins end; `whole` are
-    the exposures that were held out whole.
+    `sample` is an evenly spread sample of the held-out stars that determines the edges of bins;
+    `whole` are the names of the exposures that were held out entirely.
     """
     n = len(held)
     out = [Partition(ALL, (Bin("over the whole detector"),), lambda _, rows: rows * 0)]
@@ -73,23 +74,23 @@ def partitions_of(
 
 
 def _cells(model: DistortionModel, n: float, most: int) -> int:
-    """Cells along each side of a chip, for so many stars."""
+    """Number of cells along each side of a chip for `n` stars."""
     return int(np.clip(np.sqrt(n / len(model.chips) / STARS_PER_BIN), 1, most))
 
 
 def _places(
     model: DistortionModel, sample: Matches, share: float, whole: Sequence[str]
 ) -> list[Partition]:
-    """Cells of each exposure that was held out whole; none where stars are few."""
+    """Cells of each exposure that was held out entirely; empty if there are too few stars."""
     if len(np.unique(sample.exposure)) < 2:
-        return []  # its places are those of all stars
+        return []  # these cells would be those of all stars
     names = tuple(name for name in sample.exposure_names if name in set(whole))[:MAX_EXPOSURES]
     if not names:
         return []
     codes = [sample.exposure_names.index(name) for name in names]
     n = min(float((sample.exposure == k).sum()) * share for k in codes)
-    few = np.sqrt(MAX_CELLS_IN_ALL / (len(model.chips) * len(names)))
-    side = _cells(model, n, min(MAX_PLACES, int(few)))
+    side_limit = np.sqrt(MAX_CELLS_IN_ALL / (len(model.chips) * len(names)))
+    side = _cells(model, n, min(MAX_PLACES, int(side_limit)))
     if side * len(model.chips) < 2:
         return []
     cells = _regions(model, side)
@@ -115,28 +116,28 @@ def _regions(model: DistortionModel, side: int) -> Partition:
         for j in range(side):
             for i in range(side):
                 limits = (x[i], x[i + 1], y[j], y[j + 1])
-                where = f"{_place(limits, chip, side)}{f' of {chip.name}' if several else ''}"
-                bins.append(Bin(where, chip, limits))
+                words = f"{_place(limits, chip, side)}{f' of {chip.name}' if several else ''}"
+                bins.append(Bin(words, chip, limits))
 
     def code(table: Matches, rows: Int) -> Int:
         out = np.full(len(rows), -1)
         numbers = table.chip_number[rows]
         for c, chip in enumerate(model.chips):
-            here = numbers == chip.number
+            on_chip = numbers == chip.number
             places = []
             for values, size in (
-                (table.x[rows[here]], chip.size[0]),
-                (table.y[rows[here]], chip.size[1]),
+                (table.x[rows[on_chip]], chip.size[0]),
+                (table.y[rows[on_chip]], chip.size[1]),
             ):
                 places.append(np.clip(((values - 0.5) / size * side).astype(np.int64), 0, side - 1))
-            out[here] = (c * side + places[1]) * side + places[0]
+            out[on_chip] = (c * side + places[1]) * side + places[0]
         return out
 
     return Partition("region", tuple(bins), code)
 
 
 def _place(limits: tuple[float, ...], chip: Chip, side: int) -> str:
-    """A cell in words."""
+    """Description of a cell."""
     if side == 1:
         return "over the whole detector"
     a, b, c, d = (round(value) for value in limits)
@@ -147,7 +148,7 @@ def _place(limits: tuple[float, ...], chip: Chip, side: int) -> str:
 
 
 def _quantiles(kind: str, name: str, values: Float, n: int) -> list[Partition]:
-    """Bins of about equally many stars; none where all values are equal."""
+    """Bins with about equal numbers of stars; empty if all values are equal."""
     if n < 2:
         return []
     edges = np.unique(np.quantile(values, np.linspace(0, 1, n + 1)))
@@ -175,7 +176,7 @@ def _exposures(names: Sequence[str], whole: set[str]) -> Partition:
 
 
 def _among(names: Sequence[str], table: Matches, rows: Int) -> Int:
-    """Which of some exposures each of some rows belongs to; negative for others."""
+    """Index into `names` of the exposure of each row; negative for other exposures."""
     number = {name: k for k, name in enumerate(names)}
     of_code = np.array([number.get(name, -1) for name in table.exposure_names], np.int64)
     return np.asarray(of_code[table.exposure[rows]])

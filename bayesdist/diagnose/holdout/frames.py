@@ -1,10 +1,11 @@
-"""Frames of exposures that were held out whole, fitted to their own stars.
+"""Frames of exposures that were held out entirely, fitted to their stars.
 
-What is known of a campaign's exposures beforehand, how they scatter, goes into the fit.  With the
-information F of the stars and the precision P of the scatter, the frame b is then off by a vector
-of covariance (F + P)^-1, and the residuals that it leaves have, in place of Sigma + A P^-1 A^T,
-the covariance Sigma - A (F + P)^-1 A^T; P is zero where nothing is known.  That holds for weights
-that are the inverse of Sigma, the errors of the stars without those of the solution.
+The prior on a campaign's exposures, their scatter, enters the fit.  Let F be the information of the
+stars, P the precision of the scatter, A the derivatives of positions with respect to the frame, and
+Sigma the errors of the stars without those of the solution.  The error of the fitted frame then has
+the covariance (F + P)^-1, and the residuals have the covariance Sigma - A (F + P)^-1 A^T instead of
+Sigma + A P^-1 A^T.  P is zero without a prior.  The result holds if the weights are the inverse of
+Sigma.
 """
 
 from __future__ import annotations
@@ -28,52 +29,53 @@ from bayesdist.model import DistortionModel
 from bayesdist.model.frames import RIGID, frame_names, nearest_frame
 from bayesdist.utils.arrays import Float, Int
 
-SOFT, EXACT = 10, 6  # steps with weights that reach far, and with those of the mixture
-REACH = 4.0  # chi-square at which the former are one half
+SOFT, EXACT = 10, 6  # number of steps with long-tailed weights, and with those of the mixture
+REACH = 4.0  # chi-square at which the long-tailed weight is one half
 STARS_PER_FRAME = 20
 
 
 @dataclass(frozen=True, eq=False)
 class Frame:
-    """Frame of an exposure that was held out whole."""
+    """Frame of an exposure that was held out entirely."""
 
-    names: tuple[str, ...]  # of its parameters, deviations of single chips among them
+    names: tuple[str, ...]  # names of its parameters, including deviations of single chips
     values: Float  # (q,)
-    # (q, q) covariance of their errors: inverse of what its stars and the scatter say of it
+    # (q, q) covariance of their errors: inverse of the information from the stars and the prior
     spent: Float
-    # (q, n) what its stars say of it and of the solution's polynomials and drift together
+    # (q, n) information between the frame and the solution's polynomials and drift
     shared: Float
-    precision: Float  # (q,) what the scatter says of each
-    n: int  # stars
+    precision: Float  # (q,) prior precision of each parameter from the scatter
+    n: int  # number of stars
 
 
 def _alone(model: DistortionModel) -> DistortionModel:
-    """Model of one exposure, behind another one that defines the gauge and has no stars."""
+    """Model of one exposure, after a dummy exposure that defines the gauge and has no stars."""
     return replace(model, exposures=("(release)", "(held out)"))
 
 
 def framed(
     predictive: Predictive, table: Matches, index: Int, values: Float
 ) -> Iterator[tuple[Prediction, Float, Float]]:
-    """Iterator over rows (n,) of one exposure under a frame of its own, by its parameters (q,).
+    """Iterate over rows (n,) of one exposure, predicted with a frame of given parameters (q,).
 
-    With derivatives (n, 2, n_distortion) by polynomials and drift, and (n, 2, q) by the frame.
+    Each item contains the prediction and the derivatives (n, 2, n_distortion) with respect to
+    polynomials and drift, and (n, 2, q) with respect to the frame.
     """
     model, n = _alone(predictive.model), predictive.model.n_distortion
     theta = np.zeros(model.n_params)
     theta[:n] = predictive.mean[:n]
-    own = model.frame_slice(1)
-    theta[own] = values
-    for one in predictions(model, theta, table, index, 1):
-        derivative = np.zeros((len(one.index), 2, model.n_params))
-        derivative[:, :, one.columns] = one.jacobian
-        yield one, derivative[:, :, :n], derivative[:, :, own]
+    frame_columns = model.frame_slice(1)
+    theta[frame_columns] = values
+    for prediction in predictions(model, theta, table, index, 1):
+        derivative = np.zeros((len(prediction.index), 2, model.n_params))
+        derivative[:, :, prediction.columns] = prediction.jacobian
+        yield prediction, derivative[:, :, :n], derivative[:, :, frame_columns]
 
 
 def frames_for(predictive: Predictive, held: Matches, names: Sequence[str]) -> dict[str, Frame]:
-    """Frames of exposures that the solution does not know, fitted to their own stars.
+    """Fit frames to exposures that the solution does not include, using their stars.
 
-    The held-out stars are read once for every step. Exposures with too few stars are left out.
+    The held-out stars are read once per step.  Exposures with too few stars are left out.
     """
     unknown = [name for name in names if name not in set(predictive.model.exposures)]
     if not predictive.model.n_frame or not unknown:
@@ -99,7 +101,7 @@ def frames_for(predictive: Predictive, held: Matches, names: Sequence[str]) -> d
 
 
 def _of_exposures(held: Matches, names: Sequence[str]) -> Iterator[tuple[str, Matches, Int]]:
-    """Name, table and rows of some exposures."""
+    """Iterate over name, table and rows of the given exposures."""
     for table in held.batches():
         for k, name in enumerate(table.exposure_names):
             if name in names:
@@ -111,7 +113,7 @@ def _of_exposures(held: Matches, names: Sequence[str]) -> Iterator[tuple[str, Ma
 def _first_guess(
     predictive: Predictive, held: Matches, names: Sequence[str], precision: Float
 ) -> dict[str, Float]:
-    """Frames nearest to the linear maps that least squares finds."""
+    """Frames nearest to the linear maps from a least-squares fit."""
     model = predictive.model
     kind, o = model.frames, np.asarray(model.origin)
     normal = {name: np.zeros((3, 3)) for name in names}
@@ -130,13 +132,13 @@ def _first_guess(
     for name, N in normal.items():
         if N[0, 0] < STARS_PER_FRAME:
             continue
-        found = np.linalg.lstsq(N, right[name])[0]
-        frame = nearest_frame(kind, found[1:].T, found[0])
+        coefficients = np.linalg.lstsq(N, right[name])[0]
+        frame = nearest_frame(kind, coefficients[1:].T, coefficients[0])
         if kind == "shift":
             frame = (right[name][0] - N[0, 1:]) / N[0, 0]
         values = np.zeros(len(precision))
         for k, part in enumerate(frame_names(kind)):
-            # what scatters begins at its mean; where the telescope pointed is anything
+            # start parameters with a prior at its mean; the pointing has none
             values[k] = frame[k] if part in RIGID or not precision[k] else 0.0
         out[name] = values
     return out
@@ -145,21 +147,24 @@ def _first_guess(
 def _frame_sums(
     predictive: Predictive, held: Matches, values: Mapping[str, Float], *, soft: bool
 ) -> dict[str, tuple[Float, Float, Float, Float, int]]:
-    """Gradient, curvature, information, what is shared with the solution, stars, by exposure."""
+    """Gradient, curvature, information, cross-information with the solution and number of stars.
+
+    Returns them by the name of the exposure.  `soft` selects the long-tailed weights.
+    """
     q, D = _alone(predictive.model).n_frame, predictive.model.n_distortion
     shapes = ((q,), (q, q), (q, q), (q, D))
     out = {name: [np.zeros(shape) for shape in shapes] for name in values}
     count = dict.fromkeys(values, 0)
     for name, table, index in _of_exposures(held, list(values)):
-        for one, by_solution, A in framed(predictive, table, index, values[name]):
-            residual, noise = one.residual, noise_of(predictive, table, one.index)
+        for prediction, by_solution, A in framed(predictive, table, index, values[name]):
+            residual, noise = prediction.residual, noise_of(predictive, table, prediction.index)
             var = noise[:, :2]
             chi2 = (residual**2 / var).sum(axis=1)
             if soft:
                 score = residual / var / (1 + chi2 / REACH)[:, None]
             else:
                 score = scores_of(predictive, residual, noise).place
-            # curvature as of a Gaussian of the same weights: steps never overshoot
+            # curvature of a Gaussian with the same weights, so that steps never overshoot
             share = (score * residual).sum(axis=1) / np.maximum(chi2, 1e-300)
             share = np.clip(share, 0.0, 1.0)
             along = np.einsum("na,nam->nm", score, A)

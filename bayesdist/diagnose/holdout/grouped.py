@@ -1,8 +1,9 @@
-"""Sums over groups of held-out stars, and how they vary through what all predictions share.
+"""Sums over groups of held-out stars, and their covariance through what all predictions share.
 
-Every statistic is a sum of terms, one for each star, whose expectation is zero where the prediction
-is right.  By a parameter of the prediction it changes as the sum of term times score, so that the
-covariances of the solution's parameters, of the mixture's and of fitted frames carry over.
+Every statistic is a sum of terms, one per star, with zero expectation if the prediction is correct.
+Its derivative with respect to a parameter of the prediction is the sum of term times score, so that
+the covariances of the solution's parameters, of the mixture's parameters and of fitted frames can
+be propagated.
 """
 
 from __future__ import annotations
@@ -25,18 +26,20 @@ MIN_SKEW = 1e-4
 
 @dataclass(frozen=True, eq=False)
 class StarScores:
-    """Scores of some stars by all that predictions share."""
+    """Scores of stars with respect to everything that predictions share."""
 
-    columns: Int  # parameters (m,) of the solution
-    solution: Float  # scores (n, m) by these
-    catalogue: Float | None  # covariance (n, m) of the catalogue's errors with these, times score
-    free: Float  # scores (n, h) by what is not known exactly of the mixture
+    columns: Int  # indices (m,) of parameters of the solution
+    solution: Float  # scores (n, m) with respect to these
+    # covariance (n, m) of the catalogue's errors with these, times the score
+    catalogue: Float | None
+    free: Float  # scores (n, h) with respect to the uncertain parameters of the mixture
     exposure: str = ""
-    frame: Float | None = None  # scores (n, q) by the frame that was fitted to the exposure
+    # scores (n, q) with respect to the frame that was fitted to the exposure
+    frame: Float | None = None
 
     @classmethod
     def of(cls, rows: HeldRows, place: Float, free: Float) -> StarScores:
-        """Scores of stars, by those of their positions (n, 2) and of the mixture (n, h)."""
+        """Build from the scores with respect to positions (n, 2) and the mixture (n, h)."""
         shared, frame = rows.with_solution, rows.by_frame
         return cls(
             rows.columns,
@@ -50,22 +53,23 @@ class StarScores:
 
 @dataclass(eq=False)
 class GroupedScores:
-    """Sums of S statistics over stars; sums of batches are added one after the other."""
+    """Sums of S statistics over stars, accumulated over batches."""
 
     sums: Float  # (S,)
-    by: Float  # of terms times scores (S, D) by the solution's parameters
-    common: Float  # covariance (S, D) with these, by way of the catalogue's errors
-    free: Float  # (S, h)
-    lost: dict[str, Float] = field(default_factory=dict)  # (S, q) by frames of these exposures
+    by: Float  # (S, D) sums of terms times scores with respect to the solution's parameters
+    common: Float  # (S, D) covariance with these parameters through the catalogue's errors
+    free: Float  # (S, h) sums of terms times scores with respect to the mixture
+    # (S, q) with respect to the frames of these exposures
+    lost: dict[str, Float] = field(default_factory=dict)
 
     @classmethod
     def empty(cls, n: int, n_params: int, n_free: int) -> GroupedScores:
-        """Sums over nothing."""
+        """Sums of no stars."""
         by = (n, n_params)
         return cls(np.zeros(n), np.zeros(by), np.zeros(by), np.zeros((n, n_free)))
 
     def add(self, terms: csr_matrix, scores: StarScores) -> None:
-        """Add terms (S, n) of some stars."""
+        """Add terms (S, n) of stars."""
         self.sums += np.asarray(terms.sum(axis=1)).ravel()
         self.by[:, scores.columns] += terms @ scores.solution
         if scores.catalogue is not None:
@@ -89,7 +93,10 @@ class GroupedScores:
     def covariance(
         self, predictive: Predictive, frames: Mapping[str, Frame], *, mixture: bool
     ) -> Float:
-        """Covariance (S, S) by what all predictions share, with or without the mixture's errors."""
+        """Covariance (S, S) due to everything that predictions share.
+
+        `mixture` includes the errors of the mixture's parameters.
+        """
         common = self.common @ self.by.T
         out = self.by @ predictive.cov @ self.by.T - common - common.T
         if mixture:
@@ -101,17 +108,17 @@ class GroupedScores:
 
 @dataclass(eq=False)
 class ScaleSums:
-    """Sums of scores by the logarithm of a factor on the errors, in G groups of stars."""
+    """Sums of scores with respect to the log of a factor on the errors, in G groups of stars."""
 
     score: Float  # (G,)
-    second: Float  # their expected moments (G,)
+    second: Float  # (G,) sums of their expected second and third moments
     third: Float
-    by_free: Float  # times the scores (G, h) of the mixture
-    scales: Float  # the same scores (G, SCALES) for other errors
+    by_free: Float  # (G, h) sums of products with the scores of the mixture
+    scales: Float  # (G, SCALES) the same scores for errors multiplied by each factor
 
     @classmethod
     def empty(cls, n: int, n_free: int) -> ScaleSums:
-        """Sums over nothing."""
+        """Sums of no stars."""
         return cls(*(np.zeros((n, *shape)) for shape in ((), (), (), (n_free,), (SCALES.size,))))
 
     def add(
@@ -122,9 +129,10 @@ class ScaleSums:
         free: Float,
         scales: Float,
     ) -> None:
-        """Add stars by their membership (G, n).
+        """Add stars according to their membership (G, n).
 
-        Their scores are (n,), (n, h) and (n, SCALES), second and third moments (2, n).
+        The scores are (n,), those of the mixture (n, h) and those for other errors (n, SCALES);
+        `moments` (2, n) are second and third moments.
         """
         self.score += member @ score
         self.second += member @ moments[0]
@@ -133,11 +141,11 @@ class ScaleSums:
         self.scales += member @ scales
 
     def factor(self, k: int) -> float:
-        """Most likely factor on the errors of one group."""
+        """Maximum-likelihood factor on the errors of group `k`."""
         return scale_of(self.scales[k])
 
     def p_value(self, k: int, free_cov: Float) -> float:
-        """Probability of a factor farther from 1 in one group, by the mixture's covariance."""
+        """Probability of a factor farther from 1, given the covariance of the mixture."""
         g = self.by_free[k]
         variance = float(self.second[k] + g @ free_cov @ g)
         return sum_tails(float(self.score[k]), variance, float(self.third[k]))
@@ -146,7 +154,7 @@ class ScaleSums:
 def membership(codes: Int, n: int, values: Float | None = None) -> csr_matrix:
     """Matrix (n, N) that sums over the stars of each code, or (n k, N) times values (N, k).
 
-    Stars of negative codes are of no group.
+    Stars with negative codes belong to no group.
     """
     rows = np.flatnonzero(codes >= 0)
     if values is None:
@@ -157,12 +165,13 @@ def membership(codes: Int, n: int, values: Float | None = None) -> csr_matrix:
 
 
 class SpreadMoments:
-    """Second and third moments of the score w (q - 2) of one star, and of one axis, w (q_u - 1).
+    """Second and third moments of the spread scores of a star.
 
-    w is the probability of a true match and q its chi-square.  They are integrals over t = q / 2,
-    in which true matches fall as exp(-t) and false ones as k exp(-k t) or not at all, tabulated in
-    k, the ratio of their variances; errors that differ between the axes count as their geometric
-    mean.
+    The scores are w (q - 2) for both axes and w (q_u - 1) for one axis, where w is the probability
+    of a true match and q its chi-square.  The moments are integrals over t = q / 2.  The density of
+    true matches falls as exp(-t), that of false matches as k exp(-k t) or not at all.  The moments
+    are tabulated as functions of k, the ratio of both variances.  Errors that differ between the
+    axes are replaced by their geometric mean.
     """
 
     def __init__(self, predictive: Predictive) -> None:
@@ -180,7 +189,7 @@ class SpreadMoments:
         w = core / np.maximum(core + far, 1e-300)
         score = w * (2 * t - 2)
         density = core + far
-        # q_u = 2 t cos^2 of an angle of which nothing is known: means of its powers
+        # q_u = 2 t cos^2(angle) with a uniformly distributed angle: means of its powers
         square, cube = 1.5 * t**2 - 2 * t + 1, 2.5 * t**3 - 4.5 * t**2 + 3 * t - 1
         self._tables = [
             np.trapezoid(values * density, t, axis=1)
@@ -188,16 +197,16 @@ class SpreadMoments:
         ]
 
     def of(self, cov: Float) -> Float:
-        """Moments (2, 2, n) of stars with covariances uu, vv, uv (n, 3): of both axes, of one."""
+        """Moments (2, 2, n) of stars with covariances (n, 3), for both axes and for one axis."""
         var = np.sqrt(cov[:, 0] * cov[:, 1] - cov[:, 2] ** 2)
         factor = 2.0 if self._predictive.outliers == "uniform" else 1.0
         log_k = np.log(factor * var / self._predictive.scale**2)
-        found = [np.interp(log_k, self._log_k, table) for table in self._tables]
-        return np.array(found).reshape(2, 2, -1)
+        moments = [np.interp(log_k, self._log_k, table) for table in self._tables]
+        return np.array(moments).reshape(2, 2, -1)
 
 
 def sum_tails(value: float, variance: float, third: float) -> float:
-    """Two-sided probability of a sum of mean zero: by a gamma distribution of the same moments.
+    """Two-sided p-value of a sum with zero mean, from a gamma distribution with the same moments.
 
     It is exact for sums of squares of normal variables.
     """
@@ -214,7 +223,7 @@ def sum_tails(value: float, variance: float, third: float) -> float:
 
 
 def scale_of(scores: Float) -> float:
-    """Factor on the errors at which the sum of scores (SCALES,) is zero: the most likely one."""
+    """Maximum-likelihood factor on the errors: the zero of the summed scores (SCALES,)."""
     if not np.any(scores < 0):
         return float(SCALES[-1])
     k = int(np.argmax(scores < 0))
@@ -222,7 +231,7 @@ def scale_of(scores: Float) -> float:
         return float(SCALES[0])
     a, b = scores[k - 1], scores[k]
     steps = np.log(SCALES)
-    # nearly a straight line in the inverse square of the factor
+    # nearly linear in the inverse square of the factor
     x = np.exp(-2 * steps)
     zero = x[k - 1] + (x[k] - x[k - 1]) * a / (a - b)
     return float(1 / np.sqrt(zero))

@@ -1,10 +1,10 @@
-"""Prediction of a star that a solution has not seen: mean, covariance, and false matches.
+"""Prediction of a star that was not fitted: mean, covariance, and false matches.
 
     p(r) = (1 - f) N(r; 0, S) + f p_out(r)      S = diag(s_u^2 + j^2, s_v^2 + j^2) + J C J^T
 
-with the star's quoted errors s, the jitter j, and the solution's own covariance C at its place.
-Of a campaign S has, beside these, what the errors of the look-up tables leave at the place; and
-more is known: how exposures scatter, and which part of s is an error of the star in the catalogue.
+Here s are the star's quoted errors, j is the jitter, and C is the covariance of the solution at the
+star's position.  For a campaign, S also includes the errors of the look-up tables at the position.
+In addition, the scatter of the exposures is known, and the part of s that is due to the catalogue.
 """
 
 from __future__ import annotations
@@ -23,72 +23,72 @@ from bayesdist.model import DistortionModel, Groups, LookupTable
 from bayesdist.utils.arrays import Float, Int
 
 NEVER = 1e-300
-AT_ONCE = 2**14  # stars
-SCALES = np.geomspace(0.5, 4.0, 13)  # of the errors, at which scores are taken
+AT_ONCE = 2**14  # stars evaluated together
+SCALES = np.geomspace(0.5, 4.0, 13)  # factors on the errors at which scores are evaluated
 
 
 @dataclass(frozen=True, eq=False)
 class ExposureDeviations:
-    """Scatter of the exposures of a campaign about what they have in common."""
+    """Scatter of the exposures of a campaign about their common parameters."""
 
-    kinds: tuple[str, ...]  # as an exposure's parameters are named
-    tau: Float  # (m, k) draws of the scatter of each
+    kinds: tuple[str, ...]  # names of the exposure parameters that scatter
+    tau: Float  # (m, k) draws of the scatter of each parameter
 
     def precision(self, names: tuple[str, ...]) -> Float:
-        """Inverse variances (q,) of an exposure's parameters; zero for those that are free."""
+        """Prior inverse variances (q,) of the named exposure parameters; zero for free ones."""
         variance = dict(zip(self.kinds, (self.tau**2).mean(axis=0), strict=True))
         return np.array([1 / variance[name] if name in variance else 0.0 for name in names])
 
 
 @dataclass(frozen=True, eq=False)
 class Predictive:
-    """A solution as it predicts."""
+    """Predictive distribution of a solution."""
 
     model: DistortionModel
-    mean: Float  # (D,)
-    cov: Float  # (D, D)
+    mean: Float  # (D,) parameters
+    cov: Float  # (D, D) their covariance
     outliers: str = "none"  # 'none', 'gaussian' or 'uniform'
-    fraction: float = 0.0  # of false matches
+    fraction: float = 0.0  # fraction of false matches
     jitter2: float = 0.0  # squared jitter
-    # standard deviation of false matches on each axis, or the radius of the match circle
+    # standard deviation of false matches per axis, or the radius of the match circle
     scale: float = 1.0
-    free: tuple[str, ...] = ()  # those of 'j', 'f', 's_out' that are not known exactly
-    # (h, h) their covariance, as squared jitter, fraction and log scale
+    free: tuple[str, ...] = ()  # names of the uncertain mixture parameters, from 'j', 'f', 's_out'
+    # (h, h) their covariance: of the squared jitter, the fraction and the log scale
     free_cov: Float = field(default_factory=lambda: np.zeros((0, 0)))
-    # None where exposures that were held out whole have frames of which nothing is known
+    # None if frames of exposures that were held out entirely have no prior
     deviations: ExposureDeviations | None = None
-    # errors of the catalogue, which the quoted errors contain; None where each match has an error
-    # of its own
+    # catalogue errors, which are part of the quoted errors; None if the errors of all matches are
+    # independent
     stars: StarInfluence | None = None
-    # standard errors of positions that belong to places on the detector, in the unit of u and v: of
-    # look-up tables, or what the model leaves out
+    # standard errors that depend on the position on the detector, in the unit of u and v: those of
+    # look-up tables, or of structure that the model lacks
     local: tuple[LookupTable, ...] = ()
-    # pixels along x and y over which stars share these errors
+    # pixels along x and y within which stars share these errors
     cell: tuple[float, float] | None = None
-    local_in_noise: bool = False  # True where quoted errors and jitter hold them
+    local_in_noise: bool = False  # True if quoted errors and jitter include them
 
     def local_variance(self, x: Float, y: Float, chip: Int) -> Float:
-        """Variance (n,) on each axis of positions by errors that belong to places."""
+        """Variance (n,) per axis due to errors that depend on the position on the detector."""
         out = np.zeros(len(x))
         for table in self.local:
-            here = chip == table.chip
-            # frames turn the axes, and the errors on both are nearly equal
-            out[here] = (table.evaluate(x[here], y[here]) ** 2).mean(axis=1)
+            on_chip = chip == table.chip
+            # rotation by the frame is ignored because the errors on both axes are nearly equal
+            out[on_chip] = (table.evaluate(x[on_chip], y[on_chip]) ** 2).mean(axis=1)
         return out
 
     def outlier_density(self, r2: Float, scale: float) -> Float:
-        """Density of false matches at squared distances."""
+        """Density of false matches at squared distances `r2`, for the scale `scale`."""
         if self.outliers == "gaussian":
             return np.exp(-0.5 * r2 / scale**2) / (2 * np.pi * scale**2)
         if self.outliers == "uniform":
-            # without an edge, as in the likelihood: a pair at the rim, seen from a prediction
-            # that is a little off, is no true match
+            # no edge, as in the likelihood: a pair near the edge of the circle must not become a
+            # true match because the prediction is slightly off
             return np.full_like(r2, 1 / (np.pi * scale**2))
         return np.zeros_like(r2)
 
 
 def predictive_of(posterior: Posterior) -> Predictive:
-    """Prediction by means and covariances of the draws of a posterior."""
+    """Predictive distribution from the means and covariances of the draws of a posterior."""
     mixture, hyper = posterior.mixture, posterior.hyper
     as_sampled: dict[str, Callable[[Float], Float]] = {
         "j": np.square,
@@ -114,22 +114,23 @@ def predictive_of(posterior: Posterior) -> Predictive:
 
 @dataclass(frozen=True, eq=False)
 class Scores:
-    """Derivatives of the log predictive density of some stars."""
+    """Derivatives of the log predictive density of stars."""
 
-    place: Float  # (n, 2) by the predicted position
-    # (n, SCALES) by the logarithm of a factor on the errors of true matches, at each of several
-    # factors
+    place: Float  # (n, 2) with respect to the predicted position
+    # (n, SCALES) with respect to the log of a factor on the errors of true matches, at each factor
+    # of `SCALES`
     spread: Float
-    one: Float  # (n,) at the factor 1
-    axes: Float  # (n, 2) by the logarithm of a factor on the errors along one axis alone
-    axes_spread: Float  # (n, 2, SCALES) at each of several factors
-    free: Float  # (n, h) by what is not known exactly of the mixture
+    one: Float  # (n,) the same at the factor 1
+    axes: Float  # (n, 2) with respect to the log of a factor on the errors along one axis
+    axes_spread: Float  # (n, 2, SCALES) the same at each factor of `SCALES`
+    free: Float  # (n, h) with respect to the uncertain parameters of the mixture
 
 
 def scores_of(predictive: Predictive, residual: Float, cov: Float) -> Scores:
     """Scores of stars.
 
-    `residual` (n, 2) is data minus prediction, `cov` (n, 3) the uu, vv and uv of S.
+    `residual` (n, 2) is data minus prediction, and `cov` (n, 3) contains the elements uu, vv and uv
+    of the predictive covariance S.
     """
     a, b, c = cov.T
     det = a * b - c * c
@@ -168,18 +169,18 @@ def scores_of(predictive: Predictive, residual: Float, cov: Float) -> Scores:
 
 
 def _along_each(log_core: Float, of_axis: Float, far: Float) -> Float:
-    """Scores (n, 2, SCALES) of factors on the errors of true matches along one axis alone."""
+    """Scores (n, 2, SCALES) with respect to factors on the errors of true matches on one axis."""
     q = of_axis[:, :, None] * SCALES**-2.0
-    here = np.exp(log_core[:, None, None] + 0.5 * (of_axis[:, :, None] - q)) / SCALES
+    core = np.exp(log_core[:, None, None] + 0.5 * (of_axis[:, :, None] - q)) / SCALES
     far = far[:, None, None]
-    w = np.where(far > 0, here / np.maximum(here + far, NEVER), 1.0)
+    w = np.where(far > 0, core / np.maximum(core + far, NEVER), 1.0)
     return np.asarray(w * (q - 1))
 
 
 def marginals_of(predictive: Predictive, residual: Float, cov: Float) -> Float:
-    """Predictive probabilities (2, n) of less in u and in v, whatever the other is.
+    """Predictive distribution functions (2, n) of u and of v at the data, each marginal.
 
-    `residual` and `cov` as of `scores_of`.
+    For `residual` and `cov` see `scores_of`.
     """
     f, out = predictive.fraction, []
     for r, var in zip(residual.T, cov[:, :2].T, strict=True):
@@ -188,11 +189,11 @@ def marginals_of(predictive: Predictive, residual: Float, cov: Float) -> Float:
 
 
 def uniforms_of(predictive: Predictive, residual: Float, cov: Float) -> Float:
-    """Predictive probabilities (3, n) of less, uniform where the prediction is right.
+    """Predictive probabilities (3, n) that are uniformly distributed if the prediction is correct.
 
-    Of u; of v where u is what it is (Rosenblatt 1952), which is independent of the first; and of
-    the distance that both make once they are brought to normal variables.  `predictive`, `residual`
-    and `cov` as of `scores_of`.
+    They are the distribution functions of u, of v given u (Rosenblatt 1952), which is independent
+    of the first, and of the distance after both have been transformed to normal variables.  For the
+    arguments see `scores_of`.
     """
     a, b, c = cov.T
     u, v = residual.T
@@ -207,13 +208,13 @@ def uniforms_of(predictive: Predictive, residual: Float, cov: Float) -> Float:
     w = (1 - f) * core
     w = np.where(f * far > 0, w / np.maximum(w + f * far, NEVER), 1.0)
     first = (1 - f) * ndtr(u / np.sqrt(a)) + f * below_u
-    rest = np.sqrt(b - c * c / a)
-    second = w * ndtr((v - c / a * u) / rest) + (1 - w) * below_v
+    conditional_sigma = np.sqrt(b - c * c / a)
+    second = w * ndtr((v - c / a * u) / conditional_sigma) + (1 - w) * below_v
     return np.stack([first, second, _radial(first, second)])
 
 
 def _false_along(predictive: Predictive, x: Float) -> tuple[Float, Float]:
-    """Density (n,) of false matches along one axis, and probability of less."""
+    """Density (n,) and distribution function (n,) of false matches along one axis."""
     s = predictive.scale
     if predictive.outliers == "gaussian":
         return np.exp(-0.5 * (x / s) ** 2) / (np.sqrt(2 * np.pi) * s), ndtr(x / s)
@@ -225,26 +226,26 @@ def _false_along(predictive: Predictive, x: Float) -> tuple[Float, Float]:
 
 
 def _radial(first: Float, second: Float) -> Float:
-    """Probability of a smaller sum of squares of the normal variables of two uniform ones."""
+    """Distribution function of the radius of two normal variables, given those of each."""
     z = ndtri(np.clip(np.stack([first, second]), 1e-300, 1 - 1e-16))
     return np.asarray(-np.expm1(-0.5 * (z**2).sum(axis=0)))
 
 
 @dataclass(frozen=True, eq=False)
 class Prediction:
-    """Stars of one group, or some of them, against a model."""
+    """Data minus prediction for stars of one group, or a part of them."""
 
-    index: Int  # rows (n,) of their table
+    index: Int  # rows (n,) in their table
     residual: Float  # data minus prediction (n, 2)
-    columns: Int  # parameters (m,) that the prediction depends on
-    jacobian: Float  # derivatives (n, 2, m) of the prediction by these
-    frame: Float  # linear part (2, 2) of the exposure's frame
+    columns: Int  # indices (m,) of the parameters that the prediction depends on
+    jacobian: Float  # derivatives (n, 2, m) of the prediction with respect to these
+    frame: Float  # linear part (2, 2) of the frame of the exposure
 
 
 def predictions(
     model: DistortionModel, theta: Float, table: Matches, rows: Int, exposure: Int | int | None
 ) -> Iterator[Prediction]:
-    """Iterator over some rows (n,) of a table, by chip, date and code of the exposure."""
+    """Iterate over rows (n,) of a table, grouped by chip, date and code of the exposure."""
     groups = groups_of(model, table, rows, exposure)
     effective = model.effective(theta, groups)
     jacobians = model.effective_jacobian(theta, groups)
@@ -263,7 +264,7 @@ def predictions(
 def groups_of(
     model: DistortionModel, table: Matches, rows: Int, exposure: Int | int | None
 ) -> Groups:
-    """Groups of some rows (n,) of a table, of exposures with these codes."""
+    """Groups of rows (n,) of a table that belong to exposures with the given codes."""
     return model.groups(
         len(rows),
         epoch=None if table.epoch is None else table.epoch[rows],
@@ -273,7 +274,7 @@ def groups_of(
 
 
 def noise_of(predictive: Predictive, table: Matches, index: Int) -> Float:
-    """uu, vv and uv (n, 3) of the errors of stars without those of the solution's parameters."""
+    """Covariance elements uu, vv, uv (n, 3) of stars, without the solution's errors."""
     var = np.stack(errors_of(table), axis=1)[index] ** 2 + predictive.jitter2
     if predictive.local and not predictive.local_in_noise:
         place = (table.x[index], table.y[index], table.chip_number[index])

@@ -1,4 +1,4 @@
-"""Sums over held-out stars from which they are judged: in bins, in counts, in one pass."""
+"""Sums over held-out stars for all tests, accumulated in one pass."""
 
 from __future__ import annotations
 
@@ -32,25 +32,25 @@ from bayesdist.utils.arrays import Float
 
 PIT_BINS = 20
 TAILS = (3.0, 4.0, 5.0)  # sigma
-LEVELS = (1.0, 2.0)  # sigma, within which stars are counted along each axis
-STEP = 0.5  # of a standard deviation of the mixture's parameters: for derivatives
+LEVELS = (1.0, 2.0)  # in sigma; fractions of stars within these are counted on each axis
+STEP = 0.5  # step of numerical derivatives, in standard deviations of the mixture's parameters
 
 
 @dataclass(eq=False)
 class BinSums:
-    """Sums over the stars of each bin of a partition; B bins."""
+    """Sums over the stars of each of the B bins of a partition."""
 
-    n: Float  # stars (B,)
-    independent: Float  # stars (B,), each once in however many exposures it shares errors
-    place: GroupedScores  # scores of the position (2 B,): u and v of one bin after the other
-    place_2: Float  # their squares (B, 2, 2)
-    place_cov: Float  # covariance (2 B, 2 B) of these sums by what is the matches' own
-    weight: Float  # inverse variances (B, 2), each times the share that its star counts
+    n: Float  # (B,) number of stars
+    independent: Float  # (B,) number of distinct stars
+    place: GroupedScores  # (2 B,) scores of the position: u and v of each bin in turn
+    place_2: Float  # (B, 2, 2) sums of their squares
+    place_cov: Float  # (2 B, 2 B) covariance of these sums due to the errors of the matches
+    weight: Float  # (B, 2) sums of inverse variances, times the weight of each star
     scale: ScaleSums
 
     @classmethod
     def empty(cls, n: int, n_params: int, n_free: int) -> BinSums:
-        """Sums over nothing."""
+        """Sums of no stars."""
         return cls(
             np.zeros(n),
             np.zeros(n),
@@ -67,7 +67,7 @@ class BinSums:
         return self.place.sums.reshape(-1, 2)
 
     def close(self, kind: str, shared: SharedErrors | None) -> None:
-        """Take the sums of matches that share errors for those of single ones."""
+        """Replace variances of independent matches by those of matches with shared errors."""
         n = len(self.n)
         if shared is None:
             self.independent = self.n
@@ -88,18 +88,18 @@ class HeldSums:
 
     bins: dict[str, BinSums]  # by the kind of the partition
     axes: tuple[ScaleSums, ScaleSums]  # of all stars, along u and along v
-    # stars (2, LEVELS) in the middle of their predictive distribution along each axis: in so much
-    # of it as a normal variable has within so many sigma
+    # (2, LEVELS) number of stars within the central part of their predictive distribution on each
+    # axis that corresponds to each level of a normal distribution
     within: Float
     # counts (PIT_BINS,) of the predictive probabilities of u, of v given u, and of the distance
     pit: tuple[GroupedScores, ...]
-    beyond: Float  # stars (TAILS,) beyond so many sigma on either axis
-    # expected ones (TAILS, 1 + 2 h); then with each parameter of the mixture a little lower, higher
+    beyond: Float  # (TAILS,) number of stars beyond each limit on either axis
+    # (TAILS, 1 + 2 h) expected numbers, also with each mixture parameter slightly lower and higher
     expected: Float
     frames: Mapping[str, Frame]
-    shared: SharedErrors | None  # None where each match has an error of its own
-    n: int = 0  # stars that were predicted
-    n_left_out: int = 0  # stars of exposures with too few for a frame
+    shared: SharedErrors | None  # None if the errors of all matches are independent
+    n: int = 0  # number of predicted stars
+    n_left_out: int = 0  # number of stars of exposures with too few stars for a frame
 
 
 def held_sums(
@@ -124,16 +124,16 @@ def held_sums(
     moments = SpreadMoments(predictive)
     around = [predictive, *_around(predictive)]
     for table in held.batches():
-        seen = 0
+        predicted = 0
         for rows in predicted_rows(predictive, table, frames):
-            seen += len(rows.index)
+            predicted += len(rows.index)
             _add(out, predictive, moments, around, partitions, table, rows)
-        out.n += seen
-        out.n_left_out += len(table) - seen
+        out.n += predicted
+        out.n_left_out += len(table) - predicted
     for kind, sums in out.bins.items():
         sums.close(kind, out.shared)
     if out.shared is not None:
-        # what stars scatter together they do alike along both axes
+        # the joint scatter of stars is the same along both axes
         second, third = out.shared.spread_moments(ALL, 1)
         for axis in out.axes:
             axis.second += second / 2
@@ -142,7 +142,7 @@ def held_sums(
 
 
 def _around(predictive: Predictive) -> list[Predictive]:
-    """Predictions with each parameter of the mixture a little lower, and higher."""
+    """Predictive distributions with each mixture parameter slightly lower, and higher."""
     out = []
     sd = np.sqrt(np.diag(predictive.free_cov))
     for key, step in zip(predictive.free, STEP * sd, strict=True):
@@ -166,7 +166,7 @@ def _add(
     table: Matches,
     rows: HeldRows,
 ) -> None:
-    """Add some stars to all sums."""
+    """Add stars to all sums."""
     scores = scores_of(predictive, rows.residual, rows.cov)
     carried = StarScores.of(rows, scores.place, scores.free)
     weight = np.divide(
@@ -175,10 +175,10 @@ def _add(
     )
     place = scores.place
     if rows.frame is not None and rows.by_frame is not None:
-        # as they would scatter if they had lost nothing to the frame
+        # rescale to the scatter that they would have without a fitted frame
         A = rows.by_frame
-        taken = np.einsum("nam,mk,nak->na", A, rows.frame.spent, A)
-        place = place * np.sqrt(1 + taken / rows.cov[:, :2])
+        absorbed = np.einsum("nam,mk,nak->na", A, rows.frame.spent, A)
+        place = place * np.sqrt(1 + absorbed / rows.cov[:, :2])
     squares = (place[:, :, None] * place[:, None, :]).reshape(-1, 4)
     codes = {p.kind: p.codes(table, rows.index) for p in partitions}
     of_spread, of_axis = moments.of(rows.cov)
@@ -191,9 +191,9 @@ def _add(
         sums.place_2 += (member @ squares).reshape(-1, 2, 2)
         sums.weight += member @ weight
         sums.scale.add(member, scores.one, of_spread, scores.free, scores.spread)
-    every = csr_matrix(np.ones((1, len(rows.index))))
+    all_stars = csr_matrix(np.ones((1, len(rows.index))))
     for a, axis in enumerate(out.axes):
-        axis.add(every, scores.axes[:, a], of_axis, scores.free, scores.axes_spread[:, a])
+        axis.add(all_stars, scores.axes[:, a], of_axis, scores.free, scores.axes_spread[:, a])
     aside = np.abs(2 * marginals_of(predictive, rows.residual, rows.cov) - 1)
     for k, level in enumerate(LEVELS):
         out.within[:, k] += (aside < erf(level / np.sqrt(2))).sum(axis=1)
@@ -206,13 +206,15 @@ def _add(
         out.shared.add(table, rows, place, uniforms, size, codes)
     for k, limit in enumerate(TAILS):
         out.beyond[k] += (size > limit).sum()
-        for m, one in enumerate(around):
-            extra = one.jitter2 - predictive.jitter2
-            out.expected[k, m] += _beyond(one, limit * np.sqrt(rows.cov[:, :2]), extra, rows.cov)
+        for m, variant in enumerate(around):
+            extra = variant.jitter2 - predictive.jitter2
+            out.expected[k, m] += _beyond(
+                variant, limit * np.sqrt(rows.cov[:, :2]), extra, rows.cov
+            )
 
 
 def _beyond(one: Predictive, half: Float, extra: float, cov: Float) -> float:
-    """Expected number of stars outside of boxes of half sides (n, 2)."""
+    """Expected number of stars outside of boxes with half sides (n, 2)."""
     sigma = np.sqrt(np.maximum(cov[:, :2] + extra, 1e-300))
     core = erf(half / (np.sqrt(2) * sigma)).prod(axis=1)
     if one.outliers == "gaussian":
@@ -226,12 +228,12 @@ def _beyond(one: Predictive, half: Float, extra: float, cov: Float) -> float:
 
 
 def _in_circle(half: Float) -> Float:
-    """Fraction (n,) of the unit circle inside boxes of half sides (n, 2)."""
+    """Fraction (n,) of the unit circle inside boxes with half sides (n, 2)."""
     a, b = np.minimum(half, 1.0).T
 
     def under(x: Float) -> Float:  # area under the arc from 0 to x
         return 0.5 * (x * np.sqrt(1 - x * x) + np.arcsin(x))
 
-    corner = np.sqrt(np.maximum(1 - b * b, 0.0))  # where the box's top meets the arc
+    corner = np.sqrt(np.maximum(1 - b * b, 0.0))  # intersection of the box's top with the arc
     start = np.minimum(corner, a)
     return np.asarray((start * b + under(a) - under(start)) * 4 / np.pi)

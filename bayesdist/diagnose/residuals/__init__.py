@@ -1,1 +1,1 @@
-"""Residuals in bins and samples: their tables, and whether they are those of noise."""
+"""Residuals in bins and samples: tables, and tests for structure and for wrong errors."""

@@ -21,17 +21,17 @@ _BLOCK = 2**16  # stars
 class BinnedResiduals:
     """Mean residuals on a grid of equal bins that cover the detector."""
 
-    x: Float  # (nx,)
-    y: Float  # (ny,), centres of the bins, FITS 1-based pixels
+    x: Float  # (nx,) centres of the bins, FITS 1-based pixels
+    y: Float  # (ny,) likewise
     # mean_u, mean_v (ny, nx): NaN in an empty bin
     mean_u: Float
     mean_v: Float
-    count: Int  # (ny, nx), stars
-    # sem_u, sem_v (ny, nx): standard errors of the means from the scatter inside the bin; NaN below
-    # two stars
+    count: Int  # (ny, nx) number of stars
+    # sem_u, sem_v (ny, nx): standard errors of the means from the scatter in the bin; NaN for fewer
+    # than two stars
     sem_u: Float
     sem_v: Float
-    # stars that lie on no pixel of the detector and went into no bin
+    # number of stars outside of the detector, which are in no bin
     n_outside: int = 0
 
 
@@ -39,22 +39,22 @@ class BinnedResiduals:
 class BinValues:
     """Means of one quantity in bins."""
 
-    # mean, sem (ny, nx): means and their standard errors; NaN where there are too few stars
+    # mean, sem (ny, nx): means and their standard errors; NaN for too few stars
     mean: Float
     sem: Float
-    dof: Float  # (ny, nx) degrees of freedom of the standard errors: stars less one
+    dof: Float  # (ny, nx) degrees of freedom of the standard errors: number of stars minus one
 
     @property
     def good(self) -> Bool:
-        """Bins whose mean has a standard error."""
+        """Boolean mask of the bins with a standard error."""
         return np.isfinite(self.mean) & np.isfinite(self.sem)
 
     def scaled(self, factor: float) -> BinValues:
-        """Means in another unit."""
+        """Means multiplied by a factor."""
         return BinValues(self.mean * factor, self.sem * abs(factor), self.dof)
 
     def minus(self, other: BinValues) -> BinValues:
-        """Differences bin by bin; errors of the two count as independent."""
+        """Differences between bins, with independent errors."""
         var = self.sem**2, other.sem**2
         total = var[0] + var[1]
         with np.errstate(invalid="ignore", divide="ignore"):
@@ -65,15 +65,17 @@ class BinValues:
 
 @dataclass(frozen=True, eq=False)
 class BinnedSums:
-    """Sums of residuals in equal bins that cover the detector; sums of pieces of the data add."""
+    """Sums of residuals in equal bins that cover the detector.
 
-    size: tuple[float, float]  # columns and rows of the detector
-    count: Int  # (ny, nx), stars
-    # first, second (q, ny, nx): of u, of v and of further quantities: sums of the residuals, and of
-    # their squares
+    Sums over parts of the data can be added.
+    """
+
+    size: tuple[float, float]  # numbers of columns and rows of the detector
+    count: Int  # (ny, nx) number of stars
+    # first, second (q, ny, nx): sums of u, v and further quantities, and of their squares
     first: Float
     second: Float
-    # stars that lie on no pixel of the detector and went into no bin
+    # number of stars outside of the detector, which are in no bin
     n_outside: int = 0
 
     def __add__(self, other: BinnedSums) -> BinnedSums:
@@ -84,17 +86,17 @@ class BinnedSums:
 
     @property
     def n(self) -> int:
-        """Stars in all bins."""
+        """Number of stars in all bins."""
         return int(self.count.sum())
 
     @property
     def means(self) -> tuple[Float, Float]:
-        """Means (q, ny, nx), and their standard errors from the scatter inside the bins."""
+        """Means (q, ny, nx), and their standard errors from the scatter in the bins."""
         count = self.count.astype(np.float64)
         mean = _ratio(self.first, count)
         about = np.nan_to_num(mean)
         spread = self.second - 2 * about * self.first + about**2 * count
-        # rounding may leave a spread of zero slightly below it
+        # rounding may make a zero scatter slightly negative
         variance = _ratio(np.maximum(spread, 0.0), count**2)
         return mean, np.sqrt(variance * _ratio(count, count - 1.0))
 
@@ -115,9 +117,9 @@ class BinnedSums:
         )
 
     def values(self, axis: str) -> BinValues:
-        """Means of the bins along one axis, of `band_bins`.
+        """Means of the bins along one axis, for sums from `band_bins`.
 
-        `axis` is one of `BAND_AXES`; else InputError.
+        `axis` is one of `BAND_AXES`; raises InputError otherwise.
         """
         require_known(axis, BAND_AXES, "axis")
         k = BAND_AXES.index(axis)
@@ -134,7 +136,7 @@ def binned_residuals(
     bins: int | tuple[int, int],
     size: tuple[float, float],
 ) -> BinnedResiduals:
-    """Residuals averaged in bins of the detector; parameters and errors as of `binned_sums`."""
+    """Residuals averaged in bins of the detector; for parameters and errors see `binned_sums`."""
     return binned_sums(x, y, ru, rv, bins=bins, size=size).residuals()
 
 
@@ -149,10 +151,27 @@ def binned_sums(
 ) -> BinnedSums:
     """Sums of residuals in bins of the detector.
 
-    `x`, `y`: (N,), FITS 1-based pixels. `ru`, `rv`: (N,), residuals, data minus model. `more`:
-    (N,), further quantities of each star. `bins`: on x and on y. `size`: columns and rows of the
-    detector; the bins run from 0.5 to size + 0.5. InputError for lengths that differ, values that
-    are not finite, or a bad number of bins.
+    Parameters
+    ----------
+    x, y : array_like, shape (N,)
+        FITS 1-based pixels.
+    ru, rv : array_like, shape (N,)
+        Residuals, data minus model.
+    *more : array_like, shape (N,)
+        Further quantities of each star.
+    bins : int or tuple of int
+        Number of bins in x and y.
+    size : tuple of float
+        Numbers of columns and rows of the detector; the bins extend from 0.5 to size + 0.5.
+
+    Returns
+    -------
+    BinnedSums
+
+    Raises
+    ------
+    InputError
+        If lengths differ, values are not finite, or the number of bins is not positive.
     """
     nx, ny = (bins, bins) if isinstance(bins, int | np.integer) else bins
     if min(nx, ny) < 1 or int(nx) != nx or int(ny) != ny:
@@ -162,7 +181,7 @@ def binned_sums(
         raise InputError("positions and residuals differ in length")
 
     def sums_from(start: int) -> BinnedSums:
-        """Sums of one block: its scratch arrays stay in the cache, however many stars there are."""
+        """Sums of one block, small enough for its temporary arrays to stay in the cache."""
         block = [a[start : start + _BLOCK] for a in columns]
         if not all(np.isfinite(a).all() for a in block):
             raise InputError("a position or residual is not finite", do="leave that star out")
@@ -175,7 +194,7 @@ def binned_sums(
 
 
 def _block_sums(block: Sequence[Float], nx: int, ny: int, size: tuple[float, float]) -> BinnedSums:
-    """Sums over some stars."""
+    """Sums over the stars of a block."""
     x, y, *residuals = block
     edges_x, edges_y = _edges(size[0], nx), _edges(size[1], ny)
     inside = (x >= edges_x[0]) & (x <= edges_x[-1]) & (y >= edges_y[0]) & (y <= edges_y[-1])
@@ -200,34 +219,33 @@ def band_bins(
     bins: int | tuple[int, int],
     size: tuple[float, float],
 ) -> BinnedSums:
-    """Sums of residuals and of their lengths in bins, as section 5 of WSDC D-T033.
+    """Sums of residuals and of their lengths in bins, as in section 5 of WSDC D-T033.
 
-    The mean length of a bin is that of single stars, not the length of the mean residual.
-
-    Parameters as of `binned_sums`; `bins` are 31 in section 5 of WSDC D-T033 and 45 in its
-    Appendix C.
+    The mean length of a bin is that of single stars rather than the length of the mean residual.
+    For the parameters see `binned_sums`; section 5 of WSDC D-T033 uses 31 bins and Appendix C uses
+    45.
     """
     length = np.hypot(np.asarray(ru, float), np.asarray(rv, float))
     return binned_sums(x, y, ru, rv, length, bins=bins, size=size)
 
 
 def _edges(size: float, n: int) -> Float:
-    """Edges (n + 1,) of equal bins over pixels."""
+    """Edges (n + 1,) of n equal bins over `size` pixels."""
     return np.linspace(0.5, size + 0.5, n + 1)
 
 
 def _bin(values: Float, edges: Float) -> Int:
-    """Bin of each value inside the edges; the last edge belongs to the last bin."""
+    """Bin of each value between the edges; the last edge belongs to the last bin."""
     n = edges.size - 1
     guess = (values - edges[0]) * (n / (edges[-1] - edges[0]))
     index = np.clip(guess.astype(np.int64), 0, n - 1)
-    # the edges themselves decide, not the rounding of the guess
+    # compare with the edges, because the first guess is rounded
     index -= values < edges[index]
     index += values >= edges[index + 1]
     return np.minimum(index, n - 1)
 
 
 def _ratio(a: Float, b: Float) -> Float:
-    """Ratios, NaN where the denominator is not positive."""
+    """Ratios; NaN if the denominator is not positive."""
     b = np.broadcast_to(b, a.shape)
     return np.divide(a, b, out=np.full(a.shape, np.nan), where=b > 0)

@@ -1,12 +1,12 @@
-"""Residuals that go with the proper motions of the stars: the epochs are not as they are taken.
+"""Residuals that correlate with the proper motions of the stars, because the epochs are wrong.
 
     r_i = -mu_i dt        mu_i the proper motion of star i, dt the same for all
 
-What the model can take up of both sides is taken from them by a polynomial of the model's order on
-each chip of each exposure.  A scan of dt finds the smallest median residual, whatever false matches
-and fast stars there are; a reweighted fit about it gives dt and, from the scores of single stars,
-its error.  Errors of the motions s_i would draw dt to 0: only stars whose motions are well known
-have a part, and of these
+The part of both sides that the model can absorb, a polynomial of the model's order on each chip of
+each exposure, is subtracted.  A scan of dt finds the smallest median residual, which is robust
+against false matches and fast stars.  A reweighted fit that starts there gives dt and, from the
+scores of single stars, its error.  Errors s_i of the motions would bias dt towards 0.  Only stars
+with well known motions are therefore used, and for these
 
     dt = -sum w r mu / sum w (mu^2 - s^2)
 """
@@ -26,32 +26,33 @@ from bayesdist.infer.solution.solution import Solution
 from bayesdist.utils.arrays import Float, Int
 from bayesdist.utils.limits import EPOCH_SHIFT
 
-SAMPLE = 20_000  # detections that are looked at
+SAMPLE = 20_000  # largest number of detections that are used
 MIN_STARS = 30  # stars with motions
-FARTHEST = 60.0  # years that are scanned
-STEPS = 481  # of the scan, a quarter of a year each
+FARTHEST = 60.0  # largest shift in the scan, years
+STEPS = 481  # number of steps in the scan, a quarter of a year each
 MAX_ITERATIONS = 30
-# error of a motion over the scatter of motions, at most: larger ones are often quoted too small
+# largest error of a motion, relative to the scatter of motions; larger errors are often quoted too
+# small
 WELL_KNOWN = 0.2
-BIWEIGHT = 4.685  # robust standard deviations, beyond which a star has no weight (Tukey)
+BIWEIGHT = 4.685  # robust standard deviations beyond which a star has no weight (Tukey)
 
 
 @dataclass(frozen=True)
 class EpochShift:
     """An error of the epochs that explains residuals."""
 
-    years: float  # from the epoch that the reference positions have to that of the exposures
+    years: float  # from the epoch of the reference positions to that of the exposures
     sigma: float  # its standard error
-    # before, after: robust scatter of the residuals along an axis, as they are and with the shift,
-    # in `unit`; of stars with well known motions
+    # before, after: robust scatter of the residuals per axis without and with the shift, in `unit`,
+    # for stars with well known motions
     before: float
     after: float
     unit: str  # of u and v
-    significant: bool  # more than five standard errors, and the scatter falls
+    significant: bool  # True if it exceeds five standard errors and reduces the scatter
 
     @property
     def sentence(self) -> str:
-        """Meaning of the shift, and remedy."""
+        """Interpretation of the shift, and remedy."""
         when = "after" if self.years > 0 else "before"
         return (
             f"the residuals go with the proper motions of the stars: the exposures were taken "
@@ -63,10 +64,10 @@ class EpochShift:
 
 
 def epoch_shift(table: Matches, solution: Solution) -> EpochShift | None:
-    """The error of the epochs that the residuals show.
+    """Error of the epochs according to the residuals.
 
-    Of a table of more than `SAMPLE` rows every k-th is taken. None without proper motions, or with
-    too few.
+    Every k-th row is used if the table has more than `SAMPLE` rows.  Returns None without proper
+    motions, or with too few.
     """
     if table.pm_u is None or table.pm_v is None:
         return None
@@ -74,26 +75,26 @@ def epoch_shift(table: Matches, solution: Solution) -> EpochShift | None:
     motion = sample.motion
     if motion is None:
         return None
-    moving = np.any(motion != 0, axis=0)  # 0 on both axes is that none was measured
+    moving = np.any(motion != 0, axis=0)  # zero on both axes means that no motion was measured
     if moving.sum() < MIN_STARS:
         return None
     error = np.zeros_like(motion) if sample.motion_sigma is None else sample.motion_sigma
-    known = moving & (error < WELL_KNOWN * _scatter(motion[:, moving])).all(axis=0)
-    if known.sum() < MIN_STARS:
+    well_known = moving & (error < WELL_KNOWN * _scatter(motion[:, moving])).all(axis=0)
+    if well_known.sum() < MIN_STARS:
         return None
-    residual, P = _left_over(sample, known * sample.inlier, sample.residual, motion)
+    residual, P = _left_over(sample, well_known * sample.inlier, sample.residual, motion)
     grid = np.linspace(-FARTHEST, FARTHEST, STEPS)
-    seen, moved = residual[:, known], P[:, known]
-    sizes = [float(np.median(np.abs(seen + dt * moved))) for dt in grid]
+    known_residual, moved = residual[:, well_known], P[:, well_known]
+    sizes = [float(np.median(np.abs(known_residual + dt * moved))) for dt in grid]
     dt = float(grid[int(np.argmin(sizes))])
-    before = _scatter(residual[:, known])
+    before = _scatter(residual[:, well_known])
     weight = information = np.zeros(0)
     for _ in range(MAX_ITERATIONS):
-        scale = np.sqrt(_scatter((residual + dt * P)[:, known]) ** 2 + (dt * error) ** 2)
+        scale = np.sqrt(_scatter((residual + dt * P)[:, well_known]) ** 2 + (dt * error) ** 2)
         if not (scale > 0).all():
             return None
         z2 = (((residual + dt * P) / scale) ** 2).sum(axis=0) / (2 * BIWEIGHT**2)
-        single = np.where(known & (z2 < 1), (1 - np.minimum(z2, 1)) ** 2, 0.0)
+        single = np.where(well_known & (z2 < 1), (1 - np.minimum(z2, 1)) ** 2, 0.0)
         weight = single / scale**2
         residual, P = _left_over(sample, single, sample.residual, motion)
         information = (weight * (P**2 - error**2)).sum()
@@ -103,38 +104,38 @@ def epoch_shift(table: Matches, solution: Solution) -> EpochShift | None:
         if abs(new - dt) < 1e-6:
             break
         dt = new
-    left = residual + dt * P
-    # a star has one motion in all of its detections, and its error is in both factors
+    corrected = residual + dt * P
+    # a star has one motion in all of its detections, and the error of the motion is in both factors
     _, star = np.unique(motion, axis=1, return_inverse=True)
-    score = (weight * (left * P - dt * error**2)).sum(axis=0)
+    score = (weight * (corrected * P - dt * error**2)).sum(axis=0)
     sigma = float(np.sqrt(squares_over(star.ravel(), score)[0]) / information)
-    after = _scatter(left[:, known])
-    found = abs(dt) > EPOCH_SHIFT.value * sigma and after < before
-    return EpochShift(dt, sigma, before, after, sample.model.unit, bool(found))
+    after = _scatter(corrected[:, well_known])
+    is_significant = abs(dt) > EPOCH_SHIFT.value * sigma and after < before
+    return EpochShift(dt, sigma, before, after, sample.model.unit, bool(is_significant))
 
 
 def _scatter(values: Float) -> float:
-    """Robust standard deviation about the median of each axis, both together."""
+    """Robust standard deviation about the median of each axis, both axes together."""
     middle = np.median(values, axis=1, keepdims=True)
     return MAD_TO_SIGMA * float(np.median(np.abs(values - middle)))
 
 
 def _left_over(sample: ScoredSample, weight: Float, *fields: Float) -> Iterator[Float]:
-    """Vectors (2, N) less their polynomials on each chip of each exposure."""
+    """Vectors (2, N) minus polynomials on each chip of each exposure."""
     out = [field.copy() for field in fields]
     for rows in _together(sample):
         basis = sample.model.basis().evaluate_scaled(sample.X[rows], sample.Y[rows])
         w = np.sqrt(weight[rows])
-        if (w > 0).sum() < 2 * basis.shape[1]:  # too few for a polynomial: a shift
+        if (w > 0).sum() < 2 * basis.shape[1]:  # too few for a polynomial: only a shift
             basis = basis[:, :1]
         for field in out:
-            found = np.linalg.lstsq(w[:, None] * basis, (w * field[:, rows]).T)[0]
-            field[:, rows] -= (basis @ found).T
+            coefficients = np.linalg.lstsq(w[:, None] * basis, (w * field[:, rows]).T)[0]
+            field[:, rows] -= (basis @ coefficients).T
     yield from out
 
 
 def _together(sample: ScoredSample) -> list[Int]:
-    """Rows of each chip of each exposure."""
+    """Indices of the rows of each chip and exposure."""
     keys = np.column_stack([sample.chip, sample.exposure])
     code = np.unique(keys, axis=0, return_inverse=True)[1].ravel()
     return np.split(np.argsort(code, kind="stable"), np.cumsum(np.bincount(code))[:-1])

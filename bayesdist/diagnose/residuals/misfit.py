@@ -1,7 +1,7 @@
-"""Does the model describe the stars?  Structure left in the residuals, and errors that do not fit.
+"""Does the model describe the stars?  Structure in the residuals, and inconsistent errors.
 
-The posterior is that of the model: where the model leaves structure behind, its uncertainty says
-nothing of it, and no requirement can be called met.
+The posterior is conditional on the model.  If the model lacks structure, its uncertainty does not
+include that structure, and no requirement can be called met.
 """
 
 from __future__ import annotations
@@ -28,28 +28,28 @@ MAX_BINS = 32  # along each side
 class Misfit:
     """Structure in binned residuals."""
 
-    # probability of as much structure by chance, of the most telling of three partitions: cells,
-    # columns, rows; multiplied by three, and by the number of chips where the worst of several is
-    # named
+    # probability of so much structure by chance, for the most significant of three partitions
+    # (cells, columns, rows), multiplied by three, and by the number of chips for the worst of
+    # several chips
     p_value: float
-    partition: str  # which one that is
-    # rms over that partition of the mean residual, its noise subtracted (both axes together);
-    # weighted by precision where the noisiest cells would hide what is significant
+    partition: str  # name of that partition
+    # rms of the mean residual over that partition, with the noise subtracted (both axes together);
+    # weighted by precision if the noisiest cells would hide significant structure
     structure: float
     unit: str
-    chip: Chip | None = None  # the chip, where the detector has several
-    # share of the patterns over the partitions that would have been seen: below 1 where fitted
-    # stars hide some
+    chip: Chip | None = None  # None if the detector has a single chip
+    # fraction of the patterns over the partitions that can be detected; below 1 if fitted stars
+    # absorb some
     power: float = 1.0
 
     @property
     def significant(self) -> bool:
-        """True where the structure is more than chance."""
+        """True if the structure is significant."""
         return not STRUCTURE.met_by(self.p_value)
 
     @property
     def underpowered(self) -> bool:
-        """True where most structure would not have been seen."""
+        """True if most structure would not have been detected."""
         return not STRUCTURE_SEEN.met_by(self.power)
 
     @property
@@ -69,9 +69,9 @@ class Misfit:
 
 
 def partitions_for(n: int) -> dict[str, tuple[int, int]]:
-    """The partitions of the detector that `misfit_of` looks at.
+    """Partitions of the detector that `misfit_of` tests, for `n` stars.
 
-    `n`: stars. Result: bins on x and on y, by name.
+    Returns the number of bins in x and y by name.
     """
     side = int(np.clip(np.sqrt(n / STARS_PER_BIN), 3, MAX_BINS))
     strips = int(np.clip(n / STARS_PER_BIN, 3, 2 * MAX_BINS))
@@ -81,32 +81,29 @@ def partitions_for(n: int) -> dict[str, tuple[int, int]]:
 def misfit_of(sums: Mapping[str, BinnedSums], *, order: int | None = None, unit: str) -> Misfit:
     """Test residuals for structure over the detector.
 
-    `sums`: of the residuals of the stars that were not rejected, in each of `partitions_for` so
-    many. `order`: of the polynomial that the fit has taken out of the residuals of both axes.
-    `unit`: of the residuals.
+    `sums` are those of the residuals of stars that were not rejected, for each of `partitions_for`.
+    `order` is the order of the polynomial that was fitted to the residuals on both axes; `unit` is
+    the unit of the residuals.
     """
-    found = []
-    for name, one in sums.items():
-        p, structure = _test(one.residuals(), _absorbed(one, order))
-        found.append(Misfit(p, name, structure, unit))
-    return worst_misfit(found)
+    misfits = []
+    for name, partition_sums in sums.items():
+        p, structure = _test(partition_sums.residuals(), _absorbed(partition_sums, order))
+        misfits.append(Misfit(p, name, structure, unit))
+    return worst_misfit(misfits)
 
 
 def worst_misfit(found: Sequence[Misfit]) -> Misfit:
-    """The most telling of several chips or partitions, its probability corrected for their number.
-
-    `found`: one for each.
-    """
-    # many p-values are zero in double precision: then the larger structure is the worse
+    """Most significant of several chips or partitions, corrected for their number."""
+    # many p-values underflow to zero: then the larger structure is the worse one
     worst = min(found, key=lambda m: (m.p_value, -m.structure))
     return replace(worst, p_value=min(1.0, len(found) * worst.p_value))
 
 
 def _absorbed(sums: BinnedSums, order: int | None) -> float:
-    """Degrees of freedom, of both axes, that means over these bins have lost to the polynomial.
+    """Degrees of freedom, on both axes, that the polynomial removes from means over these bins.
 
-    A term takes from the bins what it keeps when it is averaged over them: nothing where it
-    oscillates within a bin, as all that vary along a column do in columns.
+    A term removes from the bins what remains of it after averaging over them: nothing if it
+    oscillates within a bin, like all terms that vary along a column in the partition into columns.
     """
     if order is None:
         return 0.0
@@ -115,13 +112,13 @@ def _absorbed(sums: BinnedSums, order: int | None) -> float:
 
 
 def _passed(n: int, order: int) -> Float:
-    """Mean square of each Legendre polynomial, averaged over n equal bins, over its mean square."""
+    """Mean square of each Legendre polynomial averaged over n equal bins, relative to its own."""
     means = bin_means(n, order)
     return (2 * np.arange(order + 1) + 1) * np.mean(means**2, axis=1)
 
 
 def bin_means(n: int, order: int) -> Float:
-    """Means of each Legendre polynomial over n equal bins, (order + 1, n)."""
+    """Means (order + 1, n) of each Legendre polynomial over n equal bins."""
     edges = np.linspace(-1.0, 1.0, n + 1)
     integrals = [legendre.Legendre.basis(k).integ()(edges) for k in range(order + 1)]
     return np.asarray(np.diff(integrals, axis=1) * n / 2)
@@ -130,7 +127,7 @@ def bin_means(n: int, order: int) -> Float:
 def _test(cells: BinnedResiduals, absorbed: float) -> tuple[float, float]:
     good = cells.count >= 5
     n = cells.count[good]
-    # the square of a t variable is larger than that of a normal one
+    # the square of a t variable is larger than that of a normal variable
     shrink = np.sqrt((n - 3) / (n - 1))
     mean = np.stack([cells.mean_u[good], cells.mean_v[good]])
     sem = np.stack([cells.sem_u[good], cells.sem_v[good]]) / shrink
@@ -139,6 +136,6 @@ def _test(cells: BinnedResiduals, absorbed: float) -> tuple[float, float]:
     dof = max(mean.size - absorbed * n.size / cells.count.size, 1.0)
     p = float(chi2_sf(total, dof))
     excess = (mean**2 - sem**2).sum(axis=0).mean() if n.size else 0.0
-    if excess <= 0 and not STRUCTURE.met_by(p):  # hidden by the noisiest cells: by its precision
+    if excess <= 0 and not STRUCTURE.met_by(p):  # hidden by the noisiest cells: weight by precision
         excess = 2 * (total - dof) / (1 / sem**2).sum()
     return p, float(np.sqrt(max(excess, 0.0)))

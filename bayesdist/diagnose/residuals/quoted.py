@@ -1,7 +1,8 @@
-"""Quoted errors that are far too small, and matches most of which are false, with their sentences.
+"""Quoted errors that are far too small, and matches that are mostly false, with warnings.
 
-Jitter takes up errors that are a few times too small.  Where they are far smaller, what they say of
-single stars would be lost beside it, so all of them are multiplied by what the residuals show.
+Jitter compensates for errors that are a few times too small.  If they are far smaller, the
+differences between stars would be lost in the jitter.  All errors are therefore multiplied by the
+factor that the residuals show.
 """
 
 from __future__ import annotations
@@ -20,29 +21,29 @@ from bayesdist.utils.limits import (
     WIDENED_ERRORS,
 )
 
-LOW_QUANTILE = 0.1  # of the matches
-FALSE_FRACTION = 0.02  # of false matches, beyond which they widen the residuals of least squares
+LOW_QUANTILE = 0.1  # of the chi-squares of the matches
+# fraction of false matches above which they broaden the residuals of least squares
+FALSE_FRACTION = 0.02
 
 
 def error_scale(fit: LinearFit, table: Matches) -> float:
-    """Factor on all errors that makes small residuals what they say; 1 where it is not large.
+    """Factor on all errors that makes small residuals consistent with them; 1 if it is not large.
 
-    A low quantile of chi-square is compared with its expectation: most matches may be false.
-
-    `table` has the matches, or some of them.
+    A low quantile of chi-square is compared with its expectation, because most matches may be
+    false.  `table` contains the matches or a part of them.
     """
     stars, _ = prepare(fit.model, table)
     r = stars.residuals(np.asarray(fit.mean))
-    found = np.quantile(r[:, 0] ** 2 / stars.var_u + r[:, 1] ** 2 / stars.var_v, LOW_QUANTILE)
-    factor = float(np.sqrt(found / chi2_ppf(LOW_QUANTILE, 2)))
+    quantile = np.quantile(r[:, 0] ** 2 / stars.var_u + r[:, 1] ** 2 / stars.var_v, LOW_QUANTILE)
+    factor = float(np.sqrt(quantile / chi2_ppf(LOW_QUANTILE, 2)))
     return 1.0 if QUOTED_ERRORS.met_by(factor) else factor
 
 
 def error_scale_sentence(factor: float, sigma: float, unit: str, *, by_magnitude: bool) -> str:
-    """Warning that errors were multiplied, and what else may help, as a clause.
+    """Warning that errors were multiplied, and what may help instead, as a clause.
 
-    `sigma` is the median error after it; `by_magnitude` says that there are magnitudes to estimate
-    errors by.
+    `sigma` is the median error after the multiplication; `by_magnitude` is True if errors can be
+    estimated as a function of magnitude.
     """
     do = "check their unit and the order of the model"
     if by_magnitude:
@@ -54,9 +55,9 @@ def error_scale_sentence(factor: float, sigma: float, unit: str, *, by_magnitude
 
 
 def explained_by_false_matches(posterior: Posterior | None, quoted: float) -> bool:
-    """True if a posterior finds false matches, and quoted errors of the others that are right.
+    """True if a posterior finds false matches, and correct quoted errors for the true ones.
 
-    `quoted`: usual quoted error of one axis, in the unit of u and v.
+    `quoted` is the typical quoted error per axis, in the unit of u and v.
     """
     if posterior is None or not {"f", "j"} <= set(posterior.hyper) or quoted <= 0:
         return False
@@ -72,15 +73,14 @@ def majority_sentence(
     quoted: float | None = None,
     things: str = "pairs",
 ) -> str:
-    """Warning that most pairs are false, as a clause; empty where they are not.
+    """Warning that most pairs are false, as a clause; empty if they are not.
 
-    Rejection and mixture both take the true matches to be those that lie together.  Where false
-    ones are the rule, a chance alignment, or their own mean, may be what was fitted; the posterior
-    is then that of a wrong mode and says nothing of the others.  A mixture whose outliers have
-    another shape than the false matches may settle where all pairs are true and their errors large:
-    that shows in the jitter.
+    Rejection and mixture both assume that true matches cluster.  If most matches are false, a
+    chance alignment or their mean may have been fitted, and the posterior then belongs to a wrong
+    mode.  If the outliers of a mixture have a different shape than the false matches, the solution
+    may take all pairs as true with large errors; a large jitter indicates that.
 
-    `quoted` is the usual quoted error of one axis, in the unit of u, v; `things` is the word for
+    `quoted` is the typical quoted error per axis, in the unit of u and v; `things` is the word for
     the matches.
     """
     if posterior is not None and "f" in posterior.hyper:

@@ -1,12 +1,12 @@
-"""One row of a residual table: each statistic with its error, and with its noise taken out.
+"""One row of a residual table: each statistic with its error, and corrected for noise.
 
-Means of bins hold the mean errors of their stars beside what the model leaves.  Two questions are
-answered of every statistic.  Its error: how much it would change with other stars in the same
-bins.  Its noise-free value: what it would be with infinitely many of them.
+Means of bins contain the mean errors of their stars in addition to what the model lacks.  For every
+statistic the row therefore has an error, the scatter that other stars in the same bins would cause,
+and a noise-free value, the expectation for infinitely many stars.
 
 Differences between all pairs of bins are never listed: 45 x 45 bins have four million.  Their mean,
-sigma and extremes have closed forms; an order statistic is found by counting: how many differences
-lie below a limit is one search in a sorted list for each value.
+sigma and extremes have closed forms.  An order statistic is found by counting: the number of
+differences below a limit needs one search in a sorted list per value.
 """
 
 from __future__ import annotations
@@ -22,9 +22,9 @@ from bayesdist.errors import DegenerateError, InputError
 from bayesdist.utils.arrays import Float
 
 STATISTICS = ("mean", "sigma", "min", "max", "median", "p01", "p99")
-DRAWS = 300  # of bins with fresh noise: errors to 4 %
+DRAWS = 300  # realisations of the noise of the bins: errors are accurate to 4 %
 _FEWEST_BINS = 3
-# percentiles of pairs in the draws need not be finer than this part of their spread
+# tolerance of percentiles of pairs in the draws, as a fraction of their spread
 _COARSE = 1e-3
 
 
@@ -32,23 +32,24 @@ _COARSE = 1e-3
 class StatisticsRow:
     """Statistics of means of bins, or of differences between them."""
 
-    label: str  # as in the report: 'W1/X', 'W2-W1/Y', 'W1/radial', '25-Day/X'
-    # by the names in `STATISTICS`, of the means as they are: what the report prints
+    label: str  # as printed in the report: 'W1/X', 'W2-W1/Y', 'W1/radial', '25-Day/X'
+    # by the names in `STATISTICS`: statistics of the means without correction, as in the report
     value: Mapping[str, float]
-    error: Mapping[str, float]  # standard deviation of `value` over the noise of the means
-    # `value` less what noise adds on average to a set of this width and shape.  It takes the
-    # widening out; shape finer than the noise, on which a median may hang, does not come back. Min,
-    # percentiles, median and max stay in their order: they meet where only noise is left
+    error: Mapping[str, float]  # standard deviation of `value` due to the noise of the means
+    # `value` minus the average contribution of noise to a set of this width and shape. The
+    # broadening is removed, but detail finer than the noise, which may affect a median, is not
+    # recovered. Min, percentiles, median and max stay in order: they coincide if there is only
+    # noise
     noise_free: Mapping[str, float]
-    variance: float  # what is left of sigma^2 without noise; below zero where chance makes it so
+    variance: float  # sigma^2 with the noise subtracted; may be negative by chance
     variance_error: float  # its standard deviation
-    # n_bins, n_left_out: bins used, and those without a standard error
+    # n_bins, n_left_out: number of bins that were used, and of those without a standard error
     n_bins: int
     n_left_out: int
 
     @property
     def sigma_noise(self) -> float:
-        """The part of sigma that noise makes: sigma^2 is its square plus `variance`."""
+        """Contribution of noise to sigma: sigma^2 is its square plus `variance`."""
         return float(np.sqrt(max(self.value["sigma"] ** 2 - self.variance, 0.0)))
 
 
@@ -57,13 +58,13 @@ def bin_row(
 ) -> StatisticsRow:
     """A row of Tables 5-1, 5-2 and C-1 of WSDC D-T033.
 
-    `absorbed` are the coefficients of this axis that the fit took out of the residuals, at least 1:
-    they carry away that many degrees of freedom of the noise. Raises `DegenerateError` when too few
-    bins hold two stars.
+    `absorbed` is the number of coefficients, on this axis, that were fitted to the residuals, at
+    least 1: the noise loses that many degrees of freedom.  Raises `DegenerateError` if too few bins
+    contain two stars.
     """
-    some = _Bins.of(label, bins, absorbed)
-    drawn, calm = _along_last(some.draws(rng)), _along_last(some.centre)
-    return _row(label, some, some.value, drawn, calm, 1)
+    used_bins = _Bins.of(label, bins, absorbed)
+    drawn, calm = _along_last(used_bins.draws(rng)), _along_last(used_bins.centre)
+    return _row(label, used_bins, used_bins.value, drawn, calm, 1)
 
 
 def pair_row(
@@ -71,19 +72,19 @@ def pair_row(
 ) -> StatisticsRow:
     """A row of Table 5-3 of WSDC D-T033: differences over all pairs of bins.
 
-    Parameters and errors as of `bin_row`.
+    For the parameters and errors see `bin_row`.
     """
-    some = _Bins.of(label, bins, absorbed)
-    coarse = _COARSE * float(np.hypot(some.value["sigma"], some.value["sigma"]))
-    rows = [pair_statistics(one, tolerance=coarse) for one in some.draws(rng)]
+    used_bins = _Bins.of(label, bins, absorbed)
+    coarse = _COARSE * float(np.hypot(used_bins.value["sigma"], used_bins.value["sigma"]))
+    rows = [pair_statistics(draw, tolerance=coarse) for draw in used_bins.draws(rng)]
     drawn = {name: np.array([row[name] for row in rows]) for name in STATISTICS}
-    calm = pair_statistics(some.centre, tolerance=coarse)
-    return _row(label, some, pair_statistics(some.mean), drawn, calm, 2)
+    calm = pair_statistics(used_bins.centre, tolerance=coarse)
+    return _row(label, used_bins, pair_statistics(used_bins.mean), drawn, calm, 2)
 
 
 @dataclass(frozen=True, eq=False)
 class _Bins:
-    """Used bins, their statistics, and where they would lie without noise."""
+    """Bins that are used, their statistics, and their values without noise."""
 
     mean: Float
     sem: Float
@@ -103,7 +104,7 @@ class _Bins:
                 where=label,
                 do="take fewer bins or more stars",
             )
-        # noise that the fit has not taken away, spread over all bins alike
+        # noise that remains after the fit, distributed evenly over the bins
         sem = sem * np.sqrt((n - absorbed) / (n - 1))
         value = {name: float(x) for name, x in _along_last(mean).items()}
         variance = value["sigma"] ** 2 - (1 - 1 / n) * float(np.mean(sem**2))
@@ -112,10 +113,10 @@ class _Bins:
 
     @property
     def centre(self) -> Float:
-        """Values whose distribution is that of the means without their noise.
+        """Values with the distribution of the means without their noise.
 
-        Each is drawn to the mean of all by the root of its share of true variance: with fresh
-        noise added the set is as wide as the one observed, no wider.
+        Each deviation from the mean is multiplied by the root of its fraction of true variance.
+        With new noise added, the set is as wide as the observed one.
         """
         true = max(self.variance, 0.0)
         total = true + self.sem**2
@@ -127,12 +128,12 @@ class _Bins:
 
 
 def _variance_error(mean: Float, sem: Float, dof: Float) -> float:
-    """Standard deviation of the variance of bins less their noise.
+    """Standard deviation of the noise-corrected variance of bins.
 
-    The variance is the quadratic form b^T A b with A = (1 - 1 1^T / n) / n of b = m + e, e normal
-    with variances S: its variance is 2 tr(A S A S) + 4 m^T A S A m.  The second term is estimated
-    from b, less what noise adds to it.  To this comes the error of the noise itself, whose squares
-    are known to 2 / dof.
+    The variance is the quadratic form b^T A b with A = (1 - 1 1^T / n) / n and b = m + e, where e
+    is normal with variances S.  Its variance is 2 tr(A S A S) + 4 m^T A S A m.  The second term is
+    estimated from b, with the contribution of noise subtracted.  The error of the noise itself is
+    added; its squares have a relative variance of 2 / dof.
     """
     n = mean.size
     s2 = sem**2
@@ -145,8 +146,16 @@ def _variance_error(mean: Float, sem: Float, dof: Float) -> float:
 
 def _along_last(values: Float) -> dict[str, Float]:
     p01, median, p99 = np.percentile(values, [1, 50, 99], axis=-1)
-    every = values.mean(-1), values.std(-1), values.min(-1), values.max(-1), median, p01, p99
-    return dict(zip(STATISTICS, every, strict=True))
+    values_of_statistics = (
+        values.mean(-1),
+        values.std(-1),
+        values.min(-1),
+        values.max(-1),
+        median,
+        p01,
+        p99,
+    )
+    return dict(zip(STATISTICS, values_of_statistics, strict=True))
 
 
 def _row(
@@ -157,16 +166,16 @@ def _row(
     calm: Mapping[str, Float | float],
     times: int,
 ) -> StatisticsRow:
-    """A row of statistics whose variance is that of the bins, so many times."""
+    """A row of statistics, with the variance of the bins multiplied by `times`."""
     variance = times * some.variance
     error = {name: float(drawn[name].std()) for name in STATISTICS}
     added = {name: float(drawn[name].mean() - calm[name]) for name in STATISTICS}
-    # noise adds nothing to a mean, and to a variance what is known in closed form
+    # noise does not change a mean, and its effect on a variance has a closed form
     free = {name: value[name] - added[name] for name in STATISTICS} | {
         "mean": value["mean"],
         "sigma": float(np.sqrt(max(variance, 0.0))),
     }
-    # where noise is all there is, what it adds to extremes may carry them past the middle
+    # if there is only noise, the correction may move extremes past the median
     free["p01"] = min(free["p01"], free["median"])
     free["min"] = min(free["min"], free["p01"])
     free["p99"] = max(free["p99"], free["median"])
@@ -184,10 +193,10 @@ def _row(
 
 
 def residual_statistics(values: ArrayLike) -> dict[str, float]:
-    """Statistics of residuals of stars or of means of bins by name, and their number `n`.
+    """Statistics of residuals, of stars or of means of bins, by name, and their number `n`.
 
-    They are the columns of Table 5-1 of WSDC D-T033, sigma about the mean and over n. NaN (empty
-    bins) is left out; InputError when there is no value or one is infinite.
+    They are the columns of Table 5-1 of WSDC D-T033; sigma is about the mean and divides by n.  NaN
+    (empty bins) is ignored.  Raises InputError if there is no value or one is infinite.
     """
     r = np.asarray(values, float).ravel()
     r = r[~np.isnan(r)]
@@ -199,19 +208,18 @@ def residual_statistics(values: ArrayLike) -> dict[str, float]:
 def pair_statistics(values: Float, *, tolerance: float = 0.0) -> dict[str, float]:
     """Statistics of v_i - v_j over all i and j: the columns of Table 5-3 of WSDC D-T033.
 
-    The n^2 differences contain each value against itself, and are as often the one way as the
-    other: mean and median vanish.
-
-    `values` (n,) are finite and not empty, `tolerance` is the allowed error of percentiles, 0 for
-    rounding. By name: mean, sigma (about the mean, over n^2), min, max, median, p01, p99;
-    percentiles interpolate between neighbours as `numpy.percentile` does.
+    The n^2 differences include each value minus itself, and are symmetric: mean and median are
+    zero.  `values` (n,) must be finite and not empty.  `tolerance` is the allowed error of
+    percentiles; 0 means rounding precision.  The result has the keys mean, sigma (about the mean,
+    over n^2), min, max, median, p01 and p99; percentiles interpolate between neighbours like
+    `numpy.percentile`.
     """
     a = np.sort(values)
     extent = float(a[-1] - a[0])
-    whole, part = divmod((a.size**2 - 1) * 99, 100)
-    p99 = _order_statistic(a, whole, tolerance)
+    rank, part = divmod((a.size**2 - 1) * 99, 100)
+    p99 = _order_statistic(a, rank, tolerance)
     if part:
-        p99 += (_order_statistic(a, whole + 1, tolerance) - p99) * part / 100
+        p99 += (_order_statistic(a, rank + 1, tolerance) - p99) * part / 100
     return {
         "mean": 0.0,
         "sigma": float(np.hypot(a.std(), a.std())),
@@ -224,7 +232,7 @@ def pair_statistics(values: Float, *, tolerance: float = 0.0) -> dict[str, float
 
 
 def _order_statistic(a: Float, rank: int, tolerance: float) -> float:
-    """Difference with so many others at or below it, by bisection; a is sorted."""
+    """Difference of the given rank, by bisection; `a` is sorted."""
     low, high = a[0] - a[-1], a[-1] - a[0]
     finest = np.spacing(max(high, abs(a[0]), abs(a[-1])))
     if _count(a, low) > rank:
@@ -239,5 +247,5 @@ def _order_statistic(a: Float, rank: int, tolerance: float) -> float:
 
 
 def _count(a: Float, limit: float) -> int:
-    """Number of differences at or below a limit."""
+    """Number of differences not larger than a limit."""
     return int(a.size**2 - np.searchsorted(a, a - limit, side="left").sum())

@@ -1,4 +1,4 @@
-"""Some of the stars with residuals and probabilities; their scatter by magnitude and exposure."""
+"""A sample of the stars with residuals and probabilities, and their scatter."""
 
 from __future__ import annotations
 
@@ -16,22 +16,22 @@ from bayesdist.infer.stars.stars import in_table_order, prepare
 from bayesdist.utils.arrays import Bool, Float, Int
 from bayesdist.utils.limits import EXPOSURE_CHI2
 
-SAMPLE = 200_000  # stars that show what all of them look like
-MIN_STARS = 50  # stars whose scatter says anything by magnitude
-CERTAIN = 0.5  # probability of a false match from which on a star is left out
+SAMPLE = 200_000  # number of stars that represent all of them
+MIN_STARS = 50  # smallest number for an estimate of the scatter by magnitude
+CERTAIN = 0.5  # probability of being a false match at which a star is excluded
 
 
 @dataclass(frozen=True, eq=False)
 class ExposureScatter:
     """Chi-square per degree of freedom of each exposure, with the errors of the solution.
 
-    Parameters that were fitted to all exposures make all ratios smaller alike: that of one exposure
-    is compared with that of all.
+    Parameters that were fitted to all exposures reduce all ratios alike, so that each exposure is
+    compared with all exposures together.
     """
 
-    names: tuple[str, ...]  # of the E exposures that have stars
-    n: Int  # (E,), probably true stars
-    ratio: Float  # (E,)
+    names: tuple[str, ...]  # of the E exposures with stars
+    n: Int  # (E,) number of probably true stars
+    ratio: Float  # (E,) chi-square per degree of freedom
 
     @property
     def of_all(self) -> float:
@@ -40,17 +40,17 @@ class ExposureScatter:
 
     @property
     def relative(self) -> Float:
-        """Ratios (E,) in units of that of all."""
+        """Ratios (E,) divided by that of all exposures."""
         return self.ratio / self.of_all
 
     @property
     def chance(self) -> Float:
-        """Standard deviations (E,) of `relative` by chance, of Gaussian residuals on two axes."""
+        """Standard deviations (E,) of `relative` for Gaussian residuals on two axes."""
         return np.asarray(1.0 / np.sqrt(self.n))
 
     @property
     def deviating(self) -> Bool:
-        """Boolean mask (E,) of exposures with other errors than all, by more than chance."""
+        """Boolean mask (E,) of exposures whose errors differ significantly from those of all."""
         factor = np.maximum(self.relative, 1.0 / self.relative)
         by_chance = np.abs(self.relative - 1.0) <= 3.0 * self.chance
         return ~by_chance & (factor > EXPOSURE_CHI2.value)
@@ -61,16 +61,16 @@ class StarSample:
     """Evenly spread stars of the data, or all of them."""
 
     table: Matches  # n stars
-    fit_residual: Float  # (N, 2), data minus the least-squares fit, in the unit of u and v
-    used: Bool  # (N,), whether the fit used the star
-    n_total: int  # stars that there are in all
-    # (N, 2), of true matches along u and v: errors as quoted, with the jitter of the posterior
+    fit_residual: Float  # (N, 2) data minus least-squares fit, in the unit of u and v
+    used: Bool  # (N,) True if the fit used the star
+    n_total: int  # number of all stars
+    # (N, 2) of true matches along u and v: quoted errors, with the jitter of the posterior
     variance: Float
-    # (N, 2), data minus the model at the posterior mean; None where nothing was sampled
+    # (N, 2) data minus the model at the posterior mean; None without a posterior
     posterior_residual: Float | None = None
     outlier_probability: Float | None = None  # (N,)
-    # (N,), share of the variance that fitted places of the stars take out of the residuals; None
-    # where places are known
+    # (N,) fraction of the variance of the residuals that fitted positions of the stars absorb; None
+    # if the positions are known
     taken: Float | None = None
 
     def __len__(self) -> int:
@@ -78,49 +78,52 @@ class StarSample:
 
     @property
     def probably_true(self) -> Bool:
-        """Boolean mask (N,) of the stars that are no likely false match, else that were used."""
+        """Boolean mask (N,) of probably true matches; of the stars used without a posterior."""
         p = self.outlier_probability
         return self.used if p is None else p < CERTAIN
 
     @property
     def partial(self) -> bool:
-        """True where there are more stars than these."""
+        """True if the sample does not contain all stars."""
         return len(self.table) < self.n_total
 
     @property
     def residual(self) -> Float:
-        """Residuals at the posterior mean where there is one, else at the fit."""
+        """Residuals at the posterior mean if there is one, otherwise at the fit."""
         return self.fit_residual if self.posterior_residual is None else self.posterior_residual
 
     @property
     def expected_square(self) -> Float:
-        """Mean squares (N, 2) that residuals of true matches have."""
+        """Expected squares (N, 2) of the residuals of true matches."""
         return self.variance if self.taken is None else self.variance * (1 - self.taken[:, None])
 
     @property
     def by_exposure(self) -> ExposureScatter | None:
-        """Chi-square of each exposure; None where there is only one."""
+        """Chi-square of each exposure; None if there is only one."""
         true, table = self.probably_true, self.table
         codes, square = table.exposure[true], (self.residual**2 / self.expected_square)[true]
         n = np.bincount(codes, minlength=len(table.exposure_names))
-        there = np.flatnonzero(n)
-        if there.size < 2:
+        with_stars = np.flatnonzero(n)
+        if with_stars.size < 2:
             return None
         total = np.bincount(codes, square.sum(axis=1), minlength=n.size)
-        names = tuple(table.exposure_names[k] for k in there)
-        return ExposureScatter(names, n[there], total[there] / (2.0 * n[there]))
+        names = tuple(table.exposure_names[k] for k in with_stars)
+        return ExposureScatter(names, n[with_stars], total[with_stars] / (2.0 * n[with_stars]))
 
 
 def star_sample(
     table: Matches, n_total: int, fit: LinearFit, posterior: Posterior | None = None
 ) -> StarSample:
-    """Residuals and probabilities of some stars, by a fit and a posterior.
+    """Residuals and probabilities of stars, from a fit and a posterior.
 
-    `table`: with errors: as of ``matches.sample(SAMPLE)``. `n_total`: stars that there are in all.
+    `table` must contain errors, as from ``matches.sample(SAMPLE)``; `n_total` is the number of all
+    stars.
     """
     stars, order = prepare(fit.model, table)
     solution = likelihood_shown(fit, posterior)
-    said = None if posterior is None else memberships_of(posterior, stars).in_table_order(order)
+    membership = (
+        None if posterior is None else memberships_of(posterior, stars).in_table_order(order)
+    )
 
     def residual(theta: Float) -> Float:
         return in_table_order(stars.residuals(theta), order)
@@ -132,33 +135,34 @@ def star_sample(
         n_total=n_total,
         variance=in_table_order(solution.variances(stars).T, order),
         posterior_residual=None if posterior is None else residual(solution.theta),
-        outlier_probability=None if said is None else said.outlier_probability,
+        outlier_probability=None if membership is None else membership.outlier_probability,
     )
 
 
 def dates_of(table: Matches) -> Float:
-    """Distinct dates of the stars of a table in memory, ascending; empty if they have none."""
+    """Distinct dates of the stars of a table in memory, ascending; empty without dates."""
     return np.zeros(0) if table.epoch is None else np.unique(table.epoch)
 
 
 def likelihood_shown(fit: LinearFit, posterior: Posterior | None) -> Likelihood:
-    """Likelihood at the solution whose residuals are shown: the posterior's, where there is one.
+    """Likelihood at the solution whose residuals are shown: the posterior's if there is one.
 
-    Positions of stars that were fitted belong to the parameters of the fit: at the mean of the
-    draws the residuals would hold its distance from there, which the stars would follow.
+    If the positions of stars were fitted, the parameters of the fit are used, because the positions
+    belong to them.  Residuals at the mean of the draws would include the distance of that mean from
+    the fit, which fitted positions would follow.
     """
     if posterior is None:
         return fit.likelihood
-    found = posterior.likelihood
-    return replace(found, theta=np.asarray(fit.mean)) if posterior.own_places else found
+    likelihood = posterior.likelihood
+    return replace(likelihood, theta=np.asarray(fit.mean)) if posterior.own_places else likelihood
 
 
 def centroid_scatter(stars: StarSample, *, n_params: int = 0) -> MagnitudeErrors | None:
     """Scatter of the residuals by magnitude.
 
-    Of stars with a posterior the likely false matches are left out, else what the fit rejected;
-    `n_params` are the parameters of the fit to all stars. None where the stars have no magnitudes,
-    or too few of them.
+    Likely false matches are excluded, or stars rejected by the fit if there is no posterior.
+    `n_params` is the number of parameters fitted to all stars.  Returns None if there are no
+    magnitudes, or too few stars with them.
     """
     mag = stars.table.mag
     if mag is None:

@@ -1,7 +1,7 @@
 """Sums over all stars at a solution, in one pass over the data.
 
-The functions that go over a shard are those of a module, so that they can be sent to other
-processes; what they return adds.
+The functions that process a shard are module-level functions, so that they can be sent to other
+processes.  Their results are added.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ Bins = tuple[int, int]
 class ExposureSums(Sums):
     """Counts and residuals of each exposure."""
 
-    # n, n_used (E,): stars, and those that the least-squares fit used
+    # n, n_used (E,): number of stars, and of those that the least-squares fit used
     n: Int
     n_used: Int
     # uu, vv (E,): sums of the squared residuals of the stars used
@@ -41,7 +41,7 @@ class ExposureSums(Sums):
 
     @property
     def rms(self) -> tuple[Float, Float]:
-        """Rms residuals in u and in v of the stars used; NaN where there are none."""
+        """Rms residuals in u and v of the stars used; NaN without stars."""
         with np.errstate(invalid="ignore", divide="ignore"):
             return np.sqrt(self.uu / self.n_used), np.sqrt(self.vv / self.n_used)
 
@@ -50,9 +50,9 @@ class ExposureSums(Sums):
 class StarSums(Sums):
     """Sums over stars at a solution."""
 
-    # residuals at the solution of its probably true stars, by the chip's number and the numbers of
-    # bins on x and y. Where exposures have frames that turn, they are along the axes of the
-    # polynomials: what belongs to the detector would cancel along those of the sky
+    # residuals of probably true stars at the solution, by the number of the chip and the numbers of
+    # bins in x and y. If exposures have rotated frames, they are along the axes of the polynomials:
+    # along those of the sky, effects of the detector would cancel
     binned: Mapping[tuple[int, Bins], BinnedSums]
     exposures: ExposureSums  # at the least-squares fit
 
@@ -63,11 +63,12 @@ def star_sums(
     solution: Likelihood,
     partitions: Mapping[int, tuple[Bins, ...]],
 ) -> StarSums:
-    """Sums over some stars: a task for `Shards.sum`.
+    """Sums over stars: a task for `Shards.sum`.
 
-    `fit`: of the least-squares fit. `solution`: of the posterior, or the fit again where nothing
-    was sampled: the clip of a fit lets false matches in that hide what residuals of the true ones
-    show. `partitions`: bins on x and on y, by the number of the chip.
+    `fit` is the likelihood of the least-squares fit, and `solution` that of the posterior, or the
+    fit again without a posterior: the clipping of a fit may accept false matches that hide effects
+    in the residuals of true ones.  `partitions` are the numbers of bins in x and y, by the number
+    of the chip.
     """
     used, residual = fit.inliers(stars) > 0.5, stars.residuals(fit.theta)
     exposures = _exposure_sums(stars, used, residual)
@@ -79,10 +80,10 @@ def star_sums(
     for number, several in partitions.items():
         k = stars.model.chip_code(number)
         good = used & (code == k)
-        here = arrays if good.all() else tuple(a[good] for a in arrays)
+        chip_arrays = arrays if good.all() else tuple(a[good] for a in arrays)
         size = stars.model.chips[k].size
         for bins in several:
-            binned[number, bins] = binned_sums(*here, bins=bins, size=size)
+            binned[number, bins] = binned_sums(*chip_arrays, bins=bins, size=size)
     return StarSums(binned, exposures)
 
 
@@ -95,9 +96,9 @@ def star_bins(
 ) -> dict[tuple[int, Bins], BinnedSums]:
     """Sums over bins in which the detections of one star count as one, at their mean.
 
-    Detections of a star share the error of its reference position: the means of bins scatter by
-    the number of stars.  `code` (N,) is the star of each match, or the tight group of stars; other
-    arguments are as for `star_sums`.
+    Detections of a star share the error of its reference position, so that the means of bins
+    scatter according to the number of stars.  `code` (N,) is the star of each match, or the tight
+    group of stars; for the other arguments see `star_sums`.
     """
     stars, order = prepare(model, table)
     used, residual = solution.inliers(stars) > 0.5, stars.residuals(solution.theta)
@@ -105,20 +106,20 @@ def star_bins(
     chip, code = _of_groups(stars, stars.groups.chip), code[order]
     out = {}
     for number, several in partitions.items():
-        here = used & (chip == model.chip_code(number))
+        on_chip = used & (chip == model.chip_code(number))
         size = model.chips[model.chip_code(number)].size
-        own, star = values[:, here], code[here]
+        chip_values, star = values[:, on_chip], code[on_chip]
         for nx, ny in several:
-            X, Y = (2 * (own[k] - 0.5) / size[k] - 1 for k in (0, 1))
+            X, Y = (2 * (chip_values[k] - 0.5) / size[k] - 1 for k in (0, 1))
             cell = cell_index(X, Y, (nx, ny))
             _, of = joint_clusters(cell, star)
-            means = [np.bincount(of, z) / np.bincount(of) for z in own]
+            means = [np.bincount(of, z) / np.bincount(of) for z in chip_values]
             out[number, (nx, ny)] = binned_sums(*means, bins=(nx, ny), size=size)
     return out
 
 
 def _along_gauge(stars: Stars, theta: Float, residual: Float) -> Float:
-    """Residuals along the axes of the polynomials, before the frames."""
+    """Residuals along the axes of the polynomials, before frames are applied."""
     if not stars.model.n_frame:
         return residual
     out = residual.copy()
@@ -130,9 +131,9 @@ def _along_gauge(stars: Stars, theta: Float, residual: Float) -> Float:
 
 
 def flagged_by_exposure(shards: Shards, posterior: Posterior) -> Int:
-    """Stars (E,) of each exposure that are more likely false matches than not.
+    """Number (E,) of stars in each exposure that are more likely false matches than true.
 
-    `shards`: of all stars; one pass over them is made.
+    `shards` contains all stars; one pass over them is made.
     """
     return shards.sum(_flagged, *averaged_draws(posterior))
 
@@ -144,7 +145,7 @@ def _flagged(stars: Stars, theta: Float, constants: Constants) -> Int:
 
 
 def _of_groups(stars: Stars, codes: Int) -> Int:
-    """Codes (N,) of the groups of all stars."""
+    """Codes (N,) of the groups, repeated for each of their stars."""
     return np.repeat(codes, np.diff(stars.starts))
 
 

@@ -1,4 +1,4 @@
-"""Tables of statistics of binned residuals, each with its error, as WSDC D-T033 has them."""
+"""Tables of statistics of binned residuals with errors, in the layout of WSDC D-T033."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ class StatisticsTable:
     """Rows of statistics."""
 
     title: str
-    first: str  # head of the column of labels
+    first: str  # heading of the column of labels
     unit: str  # 'pix' or 'arcsec'
     rows: tuple[StatisticsRow, ...]
 
@@ -32,11 +32,11 @@ class StatisticsTable:
         raise KeyError(label)
 
     def to_table(self, *, errors: bool = False) -> Table:
-        """The table in the report's layout.
+        """The table in the layout of the report.
 
-        Columns are 'Band/Axis' (or as `first`), Mean, Sigma, Min, Max, Median, 1%-tile and
-        99%-tile; with `errors` also 'Mean error', 'Mean noise-free' and so on, 'Sigma noise',
-        'Bins' and 'Bins left out'.
+        Columns are 'Band/Axis' (or `first`), Mean, Sigma, Min, Max, Median, 1%-tile and 99%-tile;
+        with `errors` also 'Mean error', 'Mean noise-free' and so on, 'Sigma noise', 'Bins' and
+        'Bins left out'.
         """
         out = Table(meta={"title": self.title, "unit": self.unit})
         out[self.first] = [row.label for row in self.rows]
@@ -66,11 +66,11 @@ def period_table(
 ) -> StatisticsTable:
     """Table C-1: residuals of one band in several periods, in arcsec.
 
-    Periods are in the order of the table, the combined one among them, all against the combined
-    model; `rng` is for the errors. `absorbed` are the coefficients of one axis that the fit took
-    out of the residuals, by the name of the period where it differs; 1 where the residuals are of
-    a model that was not fitted to these stars. Raises DegenerateError when too few bins of a
-    period hold two stars.
+    `periods` are in the order of the table and include the combined one; all residuals refer to the
+    combined model.  `rng` is used for the errors.  `absorbed` is the number of coefficients per
+    axis that were fitted to the residuals, or a mapping by period if it differs; 1 if the model was
+    not fitted to these stars.  Raises DegenerateError if too few bins of a period contain two
+    stars.
     """
     rows = tuple(
         bin_row(

@@ -1,1 +1,1 @@
-"""Score tests of what a model may lack, each with its size and its power."""
+"""Score tests for effects that a model may lack, with the size and the power of each test."""

@@ -1,9 +1,9 @@
-"""Which finding overrules which: causes and the symptoms that they make in other tests.
+"""Precedence among findings: causes, and the symptoms that they produce in other tests.
 
-One fault of the data is seen by several tests. The remedy of a symptom does not help as long as the
-cause is there: a higher order does not help where a ghost displaces stars, and errors that depend
-on position do not help where exposures differ. A symptom is therefore reported with the remedy of
-its cause, and tested again in the run after the cause was removed.
+One fault of the data affects several tests.  The remedy of a symptom does not help while the cause
+persists: a higher order does not help if a ghost displaces stars, and errors that depend on
+position do not help if exposures differ.  A symptom is therefore reported with the remedy of its
+cause, and is tested again in the run after the cause has been removed.
 """
 
 from __future__ import annotations
@@ -13,7 +13,8 @@ from dataclasses import dataclass
 
 from bayesdist.utils.distributions import f_sf
 
-LEADING_CHANCE = 0.01  # with which a few of many functions are taken for the cause of all
+# p-value below which a few of many functions are regarded as the common cause
+LEADING_CHANCE = 0.01
 OF_FIELD = ("orders", "edges", "jumps", "rings", "repeating pattern")
 OF_NOISE = ("noise by position", "noise by axis")
 OF_EXPOSURES = ("noise by exposure", *OF_NOISE)
@@ -21,13 +22,14 @@ OF_EXPOSURES = ("noise by exposure", *OF_NOISE)
 
 @dataclass(frozen=True)
 class Cause:
-    """A finding that accounts for others."""
+    """A finding that accounts for other findings."""
 
     words: str  # the cause, as the object of "may come from"
-    symptoms: tuple[str, ...]  # names or groups of the findings that have its remedy
+    symptoms: tuple[str, ...]  # names or groups of the findings that are given its remedy
 
 
-# By the name or the group of the finding. Where several causes are found, the first one leads.
+# By the name or the group of the finding. If there are several causes, the first one has
+# precedence.
 CAUSES: dict[str, Cause] = {
     "matching": Cause("the match radius", ("shape", *OF_FIELD, *OF_NOISE)),
     "shape": Cause("the shape of the residuals", (*OF_FIELD, *OF_NOISE, "noise by magnitude")),
@@ -57,7 +59,7 @@ CAUSES: dict[str, Cause] = {
 
 
 def cause_of(names: Collection[str], found: Collection[str]) -> str:
-    """Name or group of the finding that accounts for another one; empty if none does.
+    """Name or group of the finding that accounts for another one; empty if there is none.
 
     Parameters
     ----------
@@ -65,6 +67,10 @@ def cause_of(names: Collection[str], found: Collection[str]) -> str:
         Name and group of the symptom.
     found : collection of str
         Names and groups of all significant findings that may be causes.
+
+    Returns
+    -------
+    str
     """
     for name, cause in CAUSES.items():
         if name not in found:
@@ -77,16 +83,20 @@ def cause_of(names: Collection[str], found: Collection[str]) -> str:
 
 
 def explains_more(one: tuple[float, float], other: tuple[float, float]) -> bool:
-    """True if a few functions explain more, for their number, than the many others of a test.
+    """True if a few functions explain more, for their number, than the many of another test.
 
-    Terms that differ from exposure to exposure at random go with the pointing to some extent. A
-    curved sky puts all of the deviations into the few functions of the pointing.  Missing orders
-    rise towards the edges, and what is confined to the edges is spread over many orders.
+    Terms that differ randomly between exposures correlate with the pointing to some extent, whereas
+    a curved sky concentrates all deviations in the few functions of the pointing.  Missing orders
+    rise towards the edges, whereas effects confined to the edges are spread over many orders.
 
     Parameters
     ----------
     one, other : tuple of float
-        Statistic and degrees of freedom of both tests.
+        Statistic and degrees of freedom of the few functions, and of the many.
+
+    Returns
+    -------
+    bool
     """
     ratio = (one[0] / one[1]) / (other[0] / other[1])
     return bool(f_sf(ratio, one[1], other[1]) < LEADING_CHANCE)

@@ -1,8 +1,9 @@
-"""Test of smooth fields that are new in each exposure, by products of neighbouring stars.
+"""Test for smooth fields that differ from exposure to exposure, from products of nearby stars.
 
-The sum of products within exposures, in excess of that across exposures, is weighted as a field of
-a given correlation length would be seen.  It is a quadratic form of independent scores, so that its
-distribution is that of a chi-square with the same skewness.  A few lengths are tried.
+The sum of products within exposures, minus that across exposures, is weighted according to the
+signal of a field with a given correlation length.  It is a quadratic form of independent scores, so
+that its distribution is approximated by a chi-square with the same skewness.  A few correlation
+lengths are tried.
 """
 
 from __future__ import annotations
@@ -32,7 +33,7 @@ LENGTHS = (0.08, 0.2, 0.5)  # correlation lengths that are tried, in longer half
 
 
 def exposure_field_test(sample: ScoredSample) -> Outcome | None:
-    """Test of fields of single exposures; None where fewer than two exposures have enough stars."""
+    """Test for fields of single exposures; None if fewer than two exposures have enough stars."""
     if len({block.exposure for block in sample.blocks}) < 2:
         return None
     scores = DetectionScores(
@@ -43,19 +44,19 @@ def exposure_field_test(sample: ScoredSample) -> Outcome | None:
         return None
     tried = [_tried(list(chips.values()), length) for length in LENGTHS]
     p, statistic, dof, variance, error, length = min(tried)
-    # of both axes, without terms up to second order; what noise makes of it is taken away
-    left = 2 * modes(next(iter(chips.values())).size, length).left
-    size = np.sqrt(left * max(variance, 0.0))
+    # both axes together, without terms up to second order; the contribution of noise is subtracted
+    remaining = 2 * modes(next(iter(chips.values())).size, length).left
+    size = np.sqrt(remaining * max(variance, 0.0))
 
     def smallest(level: float) -> float:
         limit = _deviate(level / len(LENGTHS), dof)
-        return float(np.sqrt(left * error * max(limit - _deviate(POWER, dof), 0.0)))
+        return float(np.sqrt(remaining * error * max(limit - _deviate(POWER, dof), 0.0)))
 
     half = max(max(chip.size) for chip in sample.model.chips) / 2
     family = EXPOSURE_FIELDS
-    found = f"{family.present}, over some {length * half:.2g} pix"
+    present = f"{family.present}, over some {length * half:.2g} pix"
     return outcome(
-        replace(family, present=found),
+        replace(family, present=present),
         statistic,
         dof,
         None,
@@ -71,14 +72,14 @@ def _tried(
     chips: list[ExposureProducts], length: float
 ) -> tuple[float, float, float, float, float, float]:
     """Probability, chi-square, its degrees of freedom, variance of the field, its error, length."""
-    fits = np.array([one.amplitude(length) for one in chips])
+    fits = np.array([chip.amplitude(length) for chip in chips])
     weight = fits[:, 1] ** -2
     variance, error = float(fits[:, 0] @ weight / weight.sum()), float(weight.sum() ** -0.5)
-    dof = sum(one.n_fields * modes(one.size, length).dof for one in chips)
+    dof = sum(chip.n_fields * modes(chip.size, length).dof for chip in chips)
     T = max(dof + variance / error * np.sqrt(2 * dof), 0.0)
     return float(chi2_sf(T, dof)), T, dof, variance, error, length
 
 
 def _deviate(level: float, dof: float) -> float:
-    """Standardised chi-square that is exceeded with a probability."""
+    """Standardised chi-square that is exceeded with the probability `level`."""
     return float((chi2_isf(level, dof) - dof) / np.sqrt(2 * dof))

@@ -1,4 +1,4 @@
-"""Test of deviations of exposures for correlation in time, beyond the drift and a parabola."""
+"""Test whether deviations of exposures are correlated in time, beyond the drift and a parabola."""
 
 from __future__ import annotations
 
@@ -29,8 +29,9 @@ def exposure_time_test(
 ) -> Outcome | None:
     """Test of the deviations of exposures; None without a drift, and for too few dates.
 
-    `estimates` are the linear deviations of exposures (by code) that are no parameters. Those that
-    are, with `priors` on their size, are taken from the solution `theta`.
+    `estimates` are the linear deviations of exposures that are not parameters, by exposure code.
+    Deviations that are parameters, with `priors` on their size, are taken from the solution
+    `theta`.
     """
     sample = projection.sample
     model, time = sample.model, sample.model.time
@@ -53,19 +54,19 @@ def exposure_time_test(
         values = np.stack(list(estimates.values()))
     else:
         return None
-    p, seen = correlation_p(values, dates, time.breaks)
-    if seen == 0.0:
+    p, correlation = correlation_p(values, dates, time.breaks)
+    if correlation == 0.0:
         return None
     rms = float(np.sqrt(np.mean((values - values.mean(axis=0)) ** 2)))
     rms *= model.pixel_size(theta) * max(max(chip.size) for chip in model.chips) / 2
     family = EXPOSURES_IN_TIME
     return outcome(
-        replace(family, present=f"{family.present} ({seen:.2f} between successive ones)"),
-        seen,
+        replace(family, present=f"{family.present} ({correlation:.2f} between successive ones)"),
+        correlation,
         1.0,
         None,
         p,
-        square=max(seen, 0.0) * rms**2,
+        square=max(correlation, 0.0) * rms**2,
         noise=0.0,
         unit=model.unit,
         smallest=partial(_smallest, rms, values.size),
@@ -73,6 +74,6 @@ def exposure_time_test(
 
 
 def _smallest(rms: float, n: int, level: float) -> float:
-    """Rms of the correlated part of n deviations that is found with the power `POWER`."""
+    """Rms of the correlated part of n deviations that is detected with the power `POWER`."""
     needed = (norm_isf(level) - norm_isf(POWER)) / np.sqrt(n)
     return float(rms * np.sqrt(min(needed, 1.0)))

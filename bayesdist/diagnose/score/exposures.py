@@ -1,12 +1,12 @@
-"""Tests of deviations of single exposures: linear terms that frames do not fit, and second order.
+"""Tests for deviations of single exposures: linear terms that frames do not fit, and second order.
 
-Every exposure e has a statistic T_e of its own, of the shift, rotation, scale and shears that are
-no parameters of its frame, or of second-order terms on every chip beside all linear ones: a
-chi-square of the same probability as Hotelling's statistic, with the covariance of the scores from
-its own stars.  Exposures deviate in ways of their own, and the sum of
-the T_e is what is tested: it does not need the covariance of hundreds of scores.  Through the
-polynomials, which all fit together, the T_e are slightly dependent; mean and variance of the sum
-are those of a scaled chi-square (Satterthwaite 1946).
+Every exposure e has a statistic T_e for the shift, rotation, scale and shears that are not
+parameters of its frame, or for second-order terms on every chip, with all linear terms projected
+out.  T_e is a chi-square with the same probability as Hotelling's statistic, using the covariance
+of the scores of the exposure's stars.  Each exposure deviates independently, so that the sum of the
+T_e is tested; this does not need the covariance of hundreds of scores.  The polynomials, which are
+fitted to all exposures, make the T_e slightly dependent.  The mean and variance of the sum are
+therefore those of a scaled chi-square (Satterthwaite 1946).
 """
 
 from __future__ import annotations
@@ -44,43 +44,47 @@ SECOND_ORDER = Family(
     held_by="second order",
     denial="terms of second order in single exposures do not explain it",
 )
-STARS_PER_DIRECTION = 4  # of an exposure that is tested
-MAX_PRODUCTS = 1e10  # of scores: beyond, those of other exposures count by their mean
-INDEPENDENT = 0.02  # as for time: what the frames' curvature leaves is no deviation
+STARS_PER_DIRECTION = 4  # minimum per tested direction of an exposure
+# scores times squared number of global parameters: beyond, an average replaces other exposures'
+# scores
+MAX_PRODUCTS = 1e10
+# smallest remaining fraction of the information: deviations below it are absorbed by the frames
+INDEPENDENT = 0.02
 
 
 @dataclass(frozen=True, eq=False)
 class _Deviations:
-    """One exposure's deviations, all parameters projected out."""
+    """Deviations of one exposure, with all parameters projected out."""
 
     score: Float  # (n,)
     information: Float  # (n, n) with all parameters projected out
-    own: Float  # (n, n) with those of the exposure alone
-    cross: Float  # (n, G) with the global parameters
-    covariance: Float  # (n, n) of the score, from those of single detections
+    own: Float  # (n, n) with only the parameters of the exposure projected out
+    cross: Float  # (n, G) with respect to the global parameters
+    covariance: Float  # (n, n) covariance of the score, from those of single detections
     square: Float  # (n, n) mean square of the deviations over the detector
-    of_own: Float  # (n, n) what its own stars add to this covariance
-    n_own: int  # stars of the exposure, and of all others
+    of_own: Float  # (n, n) contribution of the exposure's stars to this covariance
+    n_own: int  # number of stars of the exposure, and of all other exposures
     n_others: int
 
     @property
     def n_stars(self) -> float:
-        """Stars that the covariance is known from, those of others by what they add to it.
+        """Effective number of stars that determine the covariance.
 
-        What its own stars add is a fraction of each direction's variance: shifts and scales have
-        different units.
+        Stars of other exposures are weighted by their contribution to it.  The contribution of the
+        exposure's stars is measured as a fraction of the variance in each direction, because shifts
+        and scales have different units.
         """
         fraction = float(np.trace(np.linalg.solve(self.covariance, self.of_own))) / len(self.score)
         return 1.0 / (fraction**2 / self.n_own + (1.0 - fraction) ** 2 / self.n_others)
 
     @property
     def statistic(self) -> float:
-        """Chi-square of the same probability as Hotelling's statistic about zero."""
+        """Chi-square with the same probability as Hotelling's statistic about zero."""
         n, t = len(self.score), float(self.score @ np.linalg.solve(self.covariance, self.score))
         return chi_square_of(hotelling_p(t, n, self.n_stars), n)
 
     def along(self, N: Float) -> _Deviations:
-        """Deviations along some directions N (n, q)."""
+        """Deviations along directions N (n, q)."""
         return _Deviations(
             N.T @ self.score,
             N.T @ self.information @ N,
@@ -96,14 +100,14 @@ class _Deviations:
 
 @dataclass(frozen=True, eq=False)
 class _Meat:
-    """Scores of the global parameters, by stars."""
+    """Scores of the global parameters, summed by star."""
 
-    by_star: Float  # (stars, G) sums over the detections of each
-    total: Float  # (G, G) sum of their squares, and what the priors add
+    by_star: Float  # (stars, G) sums over the detections of each star
+    total: Float  # (G, G) sum of their squares, including the contribution of the priors
 
     @classmethod
     def of(cls, projection: Projection) -> _Meat:
-        """Scores of all stars."""
+        """Sum the scores of all stars."""
         sample, G = projection.sample, projection.n_global
         by_star = np.zeros((int(sample.star.max()) + 1, G))
         for block in sample.blocks:
@@ -114,26 +118,26 @@ class _Meat:
         return cls(by_star, by_star.T @ by_star + following.T @ projection.precision @ following)
 
     def covariance(self, nuisance: Float, star: Int, own: Float) -> tuple[Float, Float]:
-        """Covariance (n, n) of an exposure's scores: of its own stars, and of all others.
+        """Covariances (n, n) of an exposure's scores due to its stars, and due to all other stars.
 
-        `nuisance` (G, n) are the parameters that the deviations are taken for, `star` (N,) the
-        stars of the exposure's detections, `own` (N, n) the scores of the detections before the
-        parameters are projected out.
+        `nuisance` (G, n) are the changes of the global parameters that imitate the deviations,
+        `star` (N,) are the stars of the exposure's detections, and `own` (N, n) the scores of these
+        detections before the parameters are projected out.
         """
-        which, of = np.unique(star, return_inverse=True)
-        # a star is one, in this exposure and in all others
-        through = self.by_star[which] @ nuisance
-        left = sums_over(of, own) - through
-        rest = nuisance.T @ self.total @ nuisance - through.T @ through
-        return left.T @ left, rest
+        star_codes, of = np.unique(star, return_inverse=True)
+        # a star counts once, in this exposure and in all others
+        through = self.by_star[star_codes] @ nuisance
+        star_scores = sums_over(of, own) - through
+        other_stars = nuisance.T @ self.total @ nuisance - through.T @ through
+        return star_scores.T @ star_scores, other_stars
 
 
 def exposure_tests(projection: Projection, theta: Float, priors: GaussianPriors) -> list[Outcome]:
-    """Tests of linear and of second-order deviations of exposures, and of their course in time.
+    """Test linear and second-order deviations of exposures, and their time dependence.
 
-    Both are left out for one exposure, and where fewer than two exposures have enough stars. The
-    first is left out where the frames fit all linear terms, the second for polynomials of order 1.
-    `theta` (D,) and `priors` are those of the solution.
+    `theta` (D,) and `priors` are those of the solution.  The tests are left out if there is a
+    single exposure, or if fewer than two exposures have enough stars.  The first test is left out
+    if the frames include all linear terms, the second for polynomials of order 1.
     """
     model = projection.sample.model
     names = [name for name in frame_names("affine") if name not in frame_names(model.frames)]
@@ -161,7 +165,7 @@ def exposure_tests(projection: Projection, theta: Float, priors: GaussianPriors)
 
 
 def _summed(projection: Projection, family: Family, deviations: list[_Deviations]) -> Outcome:
-    """Outcome of the sum of the statistics of all exposures."""
+    """Outcome for the sum of the statistics of all exposures."""
     T = sum(part.statistic for part in deviations)
     n = sum(len(part.score) for part in deviations)
     squares = [
@@ -176,7 +180,7 @@ def _summed(projection: Projection, family: Family, deviations: list[_Deviations
         part.cross.T @ np.linalg.solve(part.information, part.cross) for part in deviations
     )
     together = projection.covariance[:G, :G] @ shared
-    # mean n, variance 2 n (1 + ...), as a multiple of a chi-square
+    # mean n and variance 2 n (1 + ...) of the sum, as a scaled chi-square
     stretch = 1.0 + (float((together * together.T).sum()) - apart) / n
     dof = n / stretch
     T = T / stretch
@@ -196,9 +200,10 @@ def _summed(projection: Projection, family: Family, deviations: list[_Deviations
 def _deviations(
     projection: Projection, names: list[str]
 ) -> Iterator[tuple[int, Float, tuple[_Deviations | None, _Deviations | None]]]:
-    """Linear and second-order deviations of each exposure; None where there are too few stars.
+    """Iterate over exposures: code, estimates (m,) of linear deviations, and a pair of deviations.
 
-    With the code of the exposure, and estimates (m,) of its linear deviations.
+    The pair contains the linear and the second-order deviations; either is None if it is not
+    determined.  Exposures with too few stars are skipped.
     """
     meat, model = None, projection.sample.model
     if len(projection.sample) * projection.n_global**2 < MAX_PRODUCTS:
@@ -218,19 +223,27 @@ def _deviations(
             )
             for block in blocks
         ]
-        whole, every = _of_exposure(projection, blocks, fields, meat)
-        unit, m = np.eye(len(whole)), len(names)
+        unprojected, deviations = _of_exposure(projection, blocks, fields, meat)
+        unit, m = np.eye(len(unprojected)), len(names)
         linear, quadratic = unit[:, :m], unit[:, m:].copy()
-        if m:  # the second order beside all linear terms
-            S = every.information
+        if m:  # second-order terms with all linear terms projected out
+            S = deviations.information
             quadratic[:m] = -np.linalg.lstsq(S[:m, :m], S[:m, m:])[0]
-        estimate = np.asarray(np.linalg.lstsq(every.own[:m, :m], every.score[:m])[0], float)
-        pair = _independent(every, whole, linear), _independent(every, whole, quadratic)
+        estimate = np.asarray(
+            np.linalg.lstsq(deviations.own[:m, :m], deviations.score[:m])[0], float
+        )
+        pair = (
+            _independent(deviations, unprojected, linear),
+            _independent(deviations, unprojected, quadratic),
+        )
         yield blocks[0].exposure, estimate, pair
 
 
 def _independent(every: _Deviations, whole: Float, combinations: Float) -> _Deviations | None:
-    """Deviations along combinations (n, q) that the parameters have left; None without any."""
+    """Deviations along combinations (n, q) that the parameters do not absorb.
+
+    None if there are none.
+    """
     N = independent_directions(
         combinations.T @ whole @ combinations,
         combinations.T @ every.information @ combinations,
@@ -240,7 +253,7 @@ def _independent(every: _Deviations, whole: Float, combinations: Float) -> _Devi
 
 
 def _linear(block: Block, names: list[str], origin: tuple[float, float]) -> Float:
-    """Changes (2, K, n) of the polynomial of a block by unit linear deviations."""
+    """Changes (2, K, n) of the polynomial of a block due to unit linear deviations."""
     out = np.zeros((*block.effective.shape, len(names)))
     about = block.effective.copy()
     about[:, 0] -= origin
@@ -253,7 +266,10 @@ def _linear(block: Block, names: list[str], origin: tuple[float, float]) -> Floa
 
 
 def _second_order(block: Block, columns: list[tuple[int, int, int]]) -> Float:
-    """Changes (2, K, n) of the polynomial of a block by units of terms: chip, axis, number."""
+    """Changes (2, K, n) of the polynomial of a block due to unit second-order terms.
+
+    Each column is a term: index of the chip, axis, and index of the polynomial function.
+    """
     out = np.zeros((*block.effective.shape, len(columns)))
     for n, (chip, axis, k) in enumerate(columns):
         if chip == block.chip:
@@ -264,35 +280,35 @@ def _second_order(block: Block, columns: list[tuple[int, int, int]]) -> Float:
 def _of_exposure(
     projection: Projection, blocks: list[Block], fields: list[Float], meat: _Meat | None
 ) -> tuple[Float, _Deviations]:
-    """Information before anything is projected out, and one exposure's deviations.
+    """Information before anything is projected out, and the deviations of one exposure.
 
-    `fields` are the changes (2, K, n) of the polynomial of each block by unit deviations.
+    `fields` are the changes (2, K, n) of each block's polynomial due to unit deviations.
     """
     sample, model = projection.sample, projection.sample.model
     n, D = fields[0].shape[2], model.n_params
-    whole, cross, score = np.zeros((n, n)), np.zeros((D, n)), np.zeros(n)
+    unprojected, cross, score = np.zeros((n, n)), np.zeros((D, n)), np.zeros(n)
     square = np.zeros((n, n))
     area = model.basis().mean_squares
     for block, Z in zip(blocks, fields, strict=True):
         F = projection.functions.polynomials(block.rows)
         WZ = weighted(F, sample.curvature[:, block.rows], Z)
-        whole += contracted(Z, WZ)
+        unprojected += contracted(Z, WZ)
         cross[block.columns] += contracted(block.derivative, WZ)
         score += contracted(Z, (sample.score[:, block.rows] @ F.T)[..., None])[:, 0]
         square += contracted(Z, area[:, None] * Z) / len(blocks)
     rows = np.unique(np.concatenate([block.columns for block in blocks]))
-    left = EfficientScore.of(
-        projection.covariance, projection.score, cross[rows], whole, score, rows
+    efficient = EfficientScore.of(
+        projection.covariance, projection.score, cross[rows], unprojected, score, rows
     )
     by_global = cross[rows].T @ projection.following[rows]
-    of_own, of_others = _covariances(projection, blocks, fields, left, meat)
+    of_own, of_others = _covariances(projection, blocks, fields, efficient, meat)
     covariance = of_own + of_others
     n_own = sum(int(sample.used[block.rows].sum()) for block in blocks)
     n_others = max(int(sample.used.sum()) - n_own, 1)
-    return whole, _Deviations(
-        left.score,
-        left.information,
-        projection.with_global(left.information, by_global),
+    return unprojected, _Deviations(
+        efficient.score,
+        efficient.information,
+        projection.with_global(efficient.information, by_global),
         by_global,
         (covariance + covariance.T) / 2,
         square,
@@ -309,29 +325,30 @@ def _covariances(
     left: EfficientScore,
     meat: _Meat | None,
 ) -> tuple[Float, Float]:
-    """Covariance (n, n) of an exposure's scores: of its own stars, and of all else.
+    """Covariances (n, n) of an exposure's scores due to its stars, and due to all other data.
 
-    Without the scores of the global parameters, the part of other exposures is taken to be as wrong
-    as errors are on average.
+    Without `meat`, the scores of the global parameters, the covariance due to other exposures is
+    scaled by the average ratio of squared scores to their expectation.
     """
     sample = projection.sample
-    # the global parameters, which other exposures see as well, with those of exposures following
+    # response of the global parameters, which other exposures also constrain, with those of
+    # exposures following
     nuisance = left.gain[: projection.n_global]
     shared = projection.following @ nuisance
-    others, psi = left.information.copy(), []
+    by_others, psi = left.information.copy(), []
     for block, Z in zip(blocks, fields, strict=True):
         F = projection.functions.polynomials(block.rows)
         direct = Z - block.moved(left.gain)
         if meat is None:
-            others -= contracted(direct, weighted(F, sample.curvature[:, block.rows], direct))
+            by_others -= contracted(direct, weighted(F, sample.curvature[:, block.rows], direct))
         else:
             direct += block.moved(shared)
         psi.append(projection.star_scores(F, block, direct))
-    own = np.concatenate(psi)
+    detection_scores = np.concatenate(psi)
     if meat is None:
-        return own.T @ own, projection.score_ratio * others
+        return detection_scores.T @ detection_scores, projection.score_ratio * by_others
     star = np.concatenate([sample.star[block.rows] for block in blocks])
-    of_own, of_others = meat.covariance(nuisance, star, own)
+    of_own, of_others = meat.covariance(nuisance, star, detection_scores)
     rows = np.unique(np.concatenate([block.columns for block in blocks]))
     P = projection.precision[np.ix_(rows, rows)]
     before, after = shared[rows], left.gain[rows]

@@ -1,17 +1,17 @@
-"""Test of the gap: do the chips move against each other with time, in a way that is not fitted?
+"""Test of the gap: do the chips move relative to each other with time, in a way that is not fitted?
 
-Of every exposure the shift of each chip against the first one, and its rotation about its own
-reference pixel, are solved for beside what all chips have in common: shift, rotation, scale and
-shears.  Scale and shears act about each chip's reference pixel, as the terms do that drift in a
-model, so that they leave the gap as it is; those of a frame that the chips share act about its own
-origin.  A line in time through these is compared with their scatter about it,
+For every exposure, the shift of each chip relative to the first chip, and its rotation about its
+own reference pixel, are fitted together with terms common to all chips: shift, rotation, scale and
+shears.  Scale and shears act about each chip's reference pixel, like the drifting terms of a model,
+so that they do not change the gap; those of a frame that all chips share act about the origin of
+the frame.  A linear trend is fitted to these values,
 
     d_e = d_0 + rate (t_e - t_0) + noise        F = rate^2 / var(rate)
 
-with the scatter of whole visits for noise: chips that move to and fro by themselves do not drift.
-What the errors of catalogue stars do, which follow a chip through all exposures where roll angles
-are alike, is added to var(rate).  The largest of all F is tested, corrected for their number
-(Sidak 1967).
+The noise is the scatter of whole visits about the trend, so that chips which move to and fro do not
+count as drifting.  Errors of catalogue stars, which follow a chip through all exposures if the roll
+angles are similar, are added to var(rate).  The largest F is tested, and its p-value is corrected
+for the number of trends (Sidak 1967).
 """
 
 from __future__ import annotations
@@ -31,31 +31,31 @@ from bayesdist.utils.arrays import Float, Int
 from bayesdist.utils.distributions import f_sf
 
 GAP = Family("gap", "", "", "no drift of the gap between the chips is left in the residuals")
-MIN_FREE = 3  # visits beyond those that the line takes
-MIN_STARS = 12  # of an exposure on a chip: six linear terms of both axes, and as many beside
-SHORTEST = 0.1  # years over which a drift is looked for
-VISIT = 1 / 365.25  # years between exposures that deviate together
+MIN_FREE = 3  # number of visits beyond the parameters of the line
+MIN_STARS = 12  # per exposure and chip: six linear terms on both axes, and as many again
+SHORTEST = 0.1  # years; shortest time span in which a drift is tested
+VISIT = 1 / 365.25  # years; exposures closer than this form a visit and may deviate together
 
 _WAYS = ("along x", "along y", "in rotation")
 
 
 @dataclass(frozen=True, eq=False)
 class _Exposure:
-    """Positions of the chips of one exposure against the first one."""
+    """Positions of the chips of one exposure relative to the first chip."""
 
     epoch: float
-    chips: tuple[int, ...]  # codes of all but the first
-    # (len(chips), 3) shifts along the axes of the polynomials, and rotation times half a side: unit
-    # of u, v
+    chips: tuple[int, ...]  # codes of all chips but the first
+    # (len(chips), 3) shifts along the axes of the polynomials, and rotation times half the side of
+    # the chip, in the unit of u and v
     value: Float
     variance: Float  # (len(chips), 3)
     star: Int  # (n,) stars of the detections
-    by_star: Float  # (n, len(chips), 3) what each detection has added to `value`
+    by_star: Float  # (n, len(chips), 3) contribution of each detection to `value`
 
 
 @dataclass(frozen=True)
 class _Line:
-    """The drift of one chip in one way: unit of u, v, per year."""
+    """Drift of one chip in one of the `_WAYS`, in the unit of u and v per year."""
 
     chip: int
     way: int
@@ -65,19 +65,19 @@ class _Line:
 
     @property
     def statistic(self) -> float:
-        """F of one and `free` degrees of freedom."""
+        """F statistic with 1 and `free` degrees of freedom."""
         return self.rate**2 / self.variance
 
     @property
     def p_value(self) -> float:
-        """Probability of a larger statistic, of this line by itself."""
+        """Probability of a larger statistic, for this trend alone."""
         return float(f_sf(self.statistic, 1, self.free))
 
 
 def gap_test(projection: Projection) -> Outcome | None:
-    """Test for chips that drift against each other.
+    """Test for chips that drift relative to each other.
 
-    None for one chip, without dates, and with too few visits for a line.
+    Returns None for a single chip, without dates, and with too few visits for a trend.
     """
     sample = projection.sample
     model = sample.model
@@ -92,7 +92,7 @@ def gap_test(projection: Projection) -> Outcome | None:
     ]
     if not lines:
         return None
-    best = min(lines, key=lambda one: one.p_value)
+    best = min(lines, key=lambda trend: trend.p_value)
     name = model.chips[best.chip].name
     terms = "['u', 0, 0] and ['v', 0, 0]" if best.way < 2 else "['u', 0, 1] and ['v', 1, 0]"
     return outcome(
@@ -114,13 +114,13 @@ def gap_test(projection: Projection) -> Outcome | None:
 
 
 def _smallest(lines: list[_Line], level: float) -> float:
-    """The rate that would be found whichever way the chips drift."""
-    own = -np.expm1(np.log1p(-level) / len(lines))
-    return max(smallest_pattern(float(np.sqrt(a.variance)), 1, a.free, own) for a in lines)
+    """Rate that would be detected for every chip and direction."""
+    line_level = -np.expm1(np.log1p(-level) / len(lines))
+    return max(smallest_pattern(float(np.sqrt(a.variance)), 1, a.free, line_level) for a in lines)
 
 
 def _drifts(projection: Projection, chip: int, way: int) -> bool:
-    """True where the model has this drift: a rate that no prior holds."""
+    """True if the model contains this drift as a rate without a prior."""
     model = projection.sample.model
     if model.time is None or way == 2:
         return False
@@ -133,7 +133,7 @@ def _drifts(projection: Projection, chip: int, way: int) -> bool:
 
 
 def visit_codes(epoch: Float) -> Int:
-    """Code of the visit of each of some exposures, by rising dates."""
+    """Visit number of each exposure, in the order of the dates `epoch` (years)."""
     order = np.argsort(epoch, kind="stable")
     out = np.empty(len(epoch), np.int64)
     out[order] = np.cumsum(np.append(0, np.diff(epoch[order]) > VISIT))
@@ -141,20 +141,20 @@ def visit_codes(epoch: Float) -> Int:
 
 
 def _line(projection: Projection, exposures: list[_Exposure], chip: int, way: int) -> _Line | None:
-    """The drift of one chip in one way; None where there are too few visits."""
-    some = [one for one in exposures if chip in one.chips]
-    if not some:
+    """Drift of one chip in one direction; None if there are too few visits."""
+    with_chip = [exposure for exposure in exposures if chip in exposure.chips]
+    if not with_chip:
         return None
-    epoch = np.array([one.epoch for one in some])
-    at = [(one.chips.index(chip), way) for one in some]
-    value, own = (
-        np.array([getattr(one, name)[k] for one, k in zip(some, at, strict=True)])
+    epoch = np.array([exposure.epoch for exposure in with_chip])
+    at = [(exposure.chips.index(chip), way) for exposure in with_chip]
+    value, variances = (
+        np.array([getattr(exposure, name)[k] for exposure, k in zip(with_chip, at, strict=True)])
         for name in ("value", "variance")
     )
-    # exposures to visits, as weighted means
+    # weighted means of the exposures of each visit
     code = visit_codes(epoch)
-    total = np.asarray(np.bincount(code, 1 / own), float)
-    part = 1 / own / total[code]
+    total = np.asarray(np.bincount(code, 1 / variances), float)
+    part = 1 / variances / total[code]
     t, d = (np.asarray(np.bincount(code, part * z), float) for z in (epoch, value))
     time = projection.sample.model.time
     segment = np.searchsorted(() if time is None else time.breaks, t, side="right")
@@ -165,41 +165,52 @@ def _line(projection: Projection, exposures: list[_Exposure], chip: int, way: in
         return None
     weight = _weights(design, d, 1 / total)
     root = np.sqrt(weight)[:, None]
-    gain = np.linalg.pinv(root * design)[-1] * root[:, 0]  # of the rate
-    left = d - design @ (np.linalg.pinv(root * design) @ (root[:, 0] * d))
-    scale = float(weight @ left**2) / free
+    # derivative of the rate with respect to the values
+    gain = np.linalg.pinv(root * design)[-1] * root[:, 0]
+    residual = d - design @ (np.linalg.pinv(root * design) @ (root[:, 0] * d))
+    scale = float(weight @ residual**2) / free
     variance = scale * float(gain**2 @ (1 / weight))
     pull = gain[code] * part
-    variance += _of_stars(some, at, pull)
+    variance += _of_stars(with_chip, at, pull)
     return _Line(chip, way, float(gain @ d), variance, int(free))
 
 
 def _weights(design: Float, values: Float, own: Float) -> Float:
-    """Inverse variances of visits: their own, and a scatter by moments (DerSimonian and Laird)."""
+    """Inverse variances of visits, including a common scatter estimated by moments.
+
+    The estimator is that of DerSimonian and Laird (1986).  `own` are the variances of the visits
+    without that scatter.
+    """
     w = 1 / own
     root = np.sqrt(w)[:, None]
     hat = root * design @ np.linalg.pinv(root * design)
-    left = values - design @ (np.linalg.pinv(root * design) @ (root[:, 0] * values))
+    residual = values - design @ (np.linalg.pinv(root * design) @ (root[:, 0] * values))
     free = len(values) - np.trace(hat)
     c = float(w.sum() - np.diag(hat) @ w)
-    scatter = max(0.0, (float(w @ left**2) - free) / c)
+    scatter = max(0.0, (float(w @ residual**2) - free) / c)
     return 1 / (own + scatter)
 
 
 def _of_stars(some: list[_Exposure], at: list[tuple[int, int]], pull: Float) -> float:
-    """Variance of a rate by what a star's detections have in common, beyond independent ones."""
-    star = np.concatenate([one.star for one in some])
+    """Variance of a rate from errors that the detections of a star share.
+
+    Only the excess over independent errors is returned.
+    """
+    star = np.concatenate([exposure.star for exposure in some])
     psi = np.concatenate(
-        [p * one.by_star[:, k, way] for p, one, (k, way) in zip(pull, some, at, strict=True)]
+        [
+            p * exposure.by_star[:, k, way]
+            for p, exposure, (k, way) in zip(pull, some, at, strict=True)
+        ]
     )
     return max(float(squares_over(star, psi)[0] - (psi**2).sum()), 0.0)
 
 
 def _exposures(projection: Projection, epoch: Float) -> Iterator[_Exposure]:
-    """Iterator over the exposures with stars enough on the first chip and on another."""
+    """Iterate over the exposures with enough stars on the first chip and on another chip."""
     for blocks in projection.sample.blocks_by("exposure"):
-        if one := _exposure(projection, epoch, blocks):
-            yield one
+        if exposure := _exposure(projection, epoch, blocks):
+            yield exposure
 
 
 def _exposure(projection: Projection, epoch: Float, blocks: list[Block]) -> _Exposure | None:
@@ -226,31 +237,34 @@ def _exposure(projection: Projection, epoch: Float, blocks: list[Block]) -> _Exp
     if not (np.diag(A) > 0).all() or np.linalg.eigvalsh(A).min() < 1e-8:
         return None
     inverse = np.linalg.inv(A) / np.outer(scale, scale)
-    g, own = sample.score[:, at], slice(-3 * len(chips), None)
+    g, tail = sample.score[:, at], slice(-3 * len(chips), None)
     step = inverse @ (F[0].T @ g[0] + F[1].T @ g[1])
-    value = step[own].reshape(len(chips), 3)
+    value = step[tail].reshape(len(chips), 3)
     value = value + _fitted(projection, blocks[0].frame_exposure, chips)
-    # what stars have in common beyond what the exposures have
+    # scores after the fit to the exposure, for the errors that detections of a star share
     psi = sum(F[axis] * (g[axis] - HF[axis] @ step)[:, None] for axis in (0, 1))
-    by_star = (psi @ inverse[:, own]).reshape(len(at), len(chips), 3)
+    by_star = (psi @ inverse[:, tail]).reshape(len(at), len(chips), 3)
     return _Exposure(
         float(epoch[at[0]]),
         tuple(chips),
         value,
-        np.diag(inverse)[own].reshape(len(chips), 3) * projection.score_ratio,
+        np.diag(inverse)[tail].reshape(len(chips), 3) * projection.score_ratio,
         sample.star[at],
         by_star,
     )
 
 
 def _half(projection: Projection, chip: int) -> float:
-    """Half the longest side of a chip, in the unit of u, v."""
+    """Half the longest side of a chip, in the unit of u and v."""
     model = projection.sample.model
     return model.pixel_size(projection.theta) * max(model.chips[chip].size) / 2
 
 
 def _columns(projection: Projection, block: Block, chips: list[int]) -> Float:
-    """Derivatives (2, n, unknowns) of the positions of a block by the unknowns of its exposure."""
+    """Derivatives (2, n, unknowns) of the positions of a block.
+
+    They are with respect to the unknowns of the block's exposure.
+    """
     model = projection.sample.model
     polynomials = projection.functions.polynomials(block.rows)
     at_centre = block.effective @ model.basis(model.chips[block.chip].number).monomial_matrix[0]
@@ -258,20 +272,20 @@ def _columns(projection: Projection, block: Block, chips: list[int]) -> Float:
     n = len(about)
     shared = () if model.chip_deviations else frame_names(model.frames)
     origin = np.zeros(2) + model.origin
-    columns = [np.tile(one, (n, 1)) for one in np.eye(2)]
+    columns = [np.tile(axis_unit, (n, 1)) for axis_unit in np.eye(2)]
     columns.append((about + at_centre - origin) @ LINEAR_MATRICES["rotation"].T)
     for name in DEVIATIONS:
         at = about + at_centre - origin if name in shared else about
         columns.append(at @ LINEAR_MATRICES[name].T)
     for chip in chips:
-        here = float(chip == block.chip)
-        columns += [np.tile(here * block.frame[:, axis], (n, 1)) for axis in (0, 1)]
-        columns.append(here / _half(projection, chip) * about @ LINEAR_MATRICES["rotation"].T)
+        on_chip = float(chip == block.chip)
+        columns += [np.tile(on_chip * block.frame[:, axis], (n, 1)) for axis in (0, 1)]
+        columns.append(on_chip / _half(projection, chip) * about @ LINEAR_MATRICES["rotation"].T)
     return np.moveaxis(np.stack(columns), (0, 1, 2), (2, 1, 0))
 
 
 def _fitted(projection: Projection, exposure: int, chips: list[int]) -> Float:
-    """Shifts and rotation of chips that the model has for an exposure, (chips, 3)."""
+    """Shifts and rotation (chips, 3) of the chips in the model of an exposure."""
     model, out = projection.sample.model, np.zeros((len(chips), 3))
     if not model.chip_deviations:
         return out

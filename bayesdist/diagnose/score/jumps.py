@@ -1,12 +1,13 @@
-"""Test for jumps: residuals that differ on both sides of a column or a row of the detector.
+"""Test for jumps: residuals that differ between both sides of a column or row of the detector.
 
-Amplifiers, stitched masks, strips of the field from another epoch or another list, and plates of a
-catalogue end at a line.  A polynomial bends to follow such a step, and a smooth field rounds it
-off; neither holds what is left of it, over much of the detector.
+The boundaries of amplifiers, stitched masks, strips of the field from another epoch or list, and
+plates of a catalogue are lines.  A polynomial bends to follow such a step, and a smooth field
+rounds it off; neither includes the remaining residuals, which extend over much of the detector.
 
-At each of `EDGES` columns and rows of a chip, the score of a step is tested that is orthogonal to
-polynomials along its axis, up to `HIGHER` orders above the model's, by its sandwich covariance.
-The most significant edge counts, its p-value multiplied by the number of edges (Bonferroni).
+At each of `EDGES` columns and rows of a chip, the score of a step is tested using its sandwich
+covariance.  The step is orthogonal to polynomials along its axis up to `HIGHER` orders above the
+model's.  The p-value of the most significant edge is multiplied by the number of edges
+(Bonferroni).
 """
 
 from __future__ import annotations
@@ -38,8 +39,8 @@ JUMPS = Family(
     explained_by="orders",
     denial="the jump does not explain it",
 )
-EDGES = 31  # columns, and as many rows, of each chip
-HIGHER = 2  # orders above the model's that are no jumps
+EDGES = 31  # number of columns, and also of rows, that are tested on each chip
+HIGHER = 2  # orders above the model's to which the steps are orthogonal
 MIN_STARS_ON_A_SIDE = 60
 LARGEST_LEVERAGE = 0.5
 
@@ -49,15 +50,15 @@ class _Jump:
     """Step at one column or row."""
 
     p_value: float
-    chip: int  # code into the model's chips
-    axis: int  # 0 for a column (an edge at some x), 1 for a row
-    pixel: float  # where it is, in FITS pixels
-    step: Float  # (2,) along u and v as they are on the detector, in the unit of u and v
-    variance: Float  # (2,)
+    chip: int  # index into the model's chips
+    axis: int  # 0 for a column (an edge at constant x), 1 for a row
+    pixel: float  # position of the edge, in FITS pixels
+    step: Float  # (2,) along the detector's directions of u and v, in the unit of u and v
+    variance: Float  # (2,) variance of `step`
 
 
 def jump_test(sample: ScoredSample) -> Outcome | None:
-    """Test for jumps; None if no column or row has stars enough on both sides."""
+    """Test for jumps; None if no column or row has enough stars on both sides."""
     jumps = list(_jumps(sample))
     if not jumps:
         return None
@@ -87,7 +88,7 @@ def jump_test(sample: ScoredSample) -> Outcome | None:
 
 
 def _jumps(sample: ScoredSample) -> Iterator[_Jump]:
-    """Steps at all columns and rows of all chips with stars enough on both sides."""
+    """Iterate over the steps at all columns and rows with enough stars on both sides."""
     leverage = np.broadcast_to(sample.leverage, sample.score.shape)
     usable = sample.used & (leverage.max(axis=0) < LARGEST_LEVERAGE)
     for code, chip in enumerate(sample.model.chips):
@@ -107,18 +108,19 @@ def _jumps(sample: ScoredSample) -> Iterator[_Jump]:
                 if min(n, len(rows) - n) < MIN_STARS_ON_A_SIDE:
                     continue
                 step = beyond - ((beyond * curvature) @ smooth.T) @ inverse @ smooth
-                found = _jump(step, gradient, curvature, star)
-                if found is not None:
+                result = _jump(step, gradient, curvature, star)
+                if result is not None:
                     pixel = 0.5 + (edge + 1) / 2 * chip.size[axis]
-                    yield _Jump(found[0], code, axis, pixel, *found[1:])
+                    yield _Jump(result[0], code, axis, pixel, *result[1:])
 
 
 def _jump(
     step: Float, gradient: Float, curvature: Float, star: Int
 ) -> tuple[float, Float, Float] | None:
-    """P-value of a step (n,), its size (2,) along both axes, and the variances (2,) of these.
+    """P-value of a step (n,), its size (2,) along both axes, and the variances (2,) of the size.
 
-    `gradient` (n, 2) and `curvature` (n,): of the log-likelihood.  None if nothing is known of it.
+    `gradient` (n, 2) and `curvature` (n,) are those of the log-likelihood.  Returns None if the
+    data do not constrain the step.
     """
     by_star = sums_over(star, step[:, None] * gradient)
     total, covariance = by_star.sum(axis=0), by_star.T @ by_star

@@ -1,9 +1,10 @@
 """Tests of the noise: is it described equally well in all parts of the data?
 
-Where a likelihood is right, the squares of its scores have the mean of its curvature (information
-identity).  The ratio of their sums is one over all stars, or whatever the errors are wrong by as a
-whole; tested is that it is the same in all parts.  How much a ratio scatters is taken from the
-squares themselves, whose distribution has longer tails than that of Gaussian noise.
+If a likelihood is correct, the mean square of its scores equals the mean curvature (information
+identity).  Over all stars the ratio of their sums is one, or another constant if all errors are
+wrong by the same factor.  The tests examine whether the ratio is the same in all parts of the data.
+The scatter of a ratio is estimated from the squares themselves, whose distribution has longer tails
+than that of Gaussian noise.
 """
 
 from __future__ import annotations
@@ -51,9 +52,9 @@ BY_AXIS = Family(
     held_by="noise",
 )
 LARGEST_LEVERAGE = 0.5
-STARS_PER_PART = 40  # of a part of the data; smaller ones are joined
+STARS_PER_PART = 40  # minimum per part of the data; smaller parts are merged
 STARS_PER_CELL = 60
-STARS_PER_BIN = 150  # of magnitudes
+STARS_PER_BIN = 150  # per bin of magnitude
 MAX_CELLS = 8  # along each side of a chip
 MAX_MAGNITUDES = 10
 
@@ -67,8 +68,8 @@ class _Squares:
     expected: Float
     star: Int  # (N,)
     sigma: float  # typical standard deviation along an axis
-    # degrees of freedom of the residuals, over their number: what the fit takes from all of them
-    # together makes their squares scatter more than each by itself shows
+    # degrees of freedom of the residuals divided by their number: the fit acts on all residuals
+    # together and makes their squares scatter more than each shows by itself
     free: float
     unit: str
 
@@ -79,9 +80,9 @@ class _Squares:
 
 
 def noise_tests(sample: ScoredSample) -> list[Outcome]:
-    """Outcomes of the tests by position, magnitude, exposure and axis, as far as the data go."""
+    """Outcomes of the tests by position, magnitude, exposure and axis, as far as the data allow."""
     leverage = np.broadcast_to(sample.leverage, sample.score.shape)
-    # what the fit has taken of a residual says nothing of its noise
+    # residuals with a large leverage do not show their noise
     rows = np.flatnonzero(sample.used & (leverage.max(axis=0) < LARGEST_LEVERAGE))
     if len(rows) < STARS_PER_PART:
         return []
@@ -103,33 +104,33 @@ def noise_tests(sample: ScoredSample) -> list[Outcome]:
         parts.append((BY_MAGNITUDE, _magnitudes(sample.mag[rows], n_stars)))
     parts.append((BY_EXPOSURE, sample.exposure[rows]))
     out = [_by_part(squares, family, code) for family, code in parts]
-    return [one for one in (*out, _by_axis(squares)) if one is not None]
+    return [result for result in (*out, _by_axis(squares)) if result is not None]
 
 
 def _cells(sample: ScoredSample, rows: Int) -> Int:
-    """Codes (n,) of coarse cells of each chip."""
+    """Codes (n,) of coarse cells on each chip."""
     chip = sample.chip[rows]
     code = np.zeros(len(rows), np.int64)
     for c in np.unique(chip):
-        here = chip == c
-        n = len(np.unique(sample.star[rows[here]]))
+        on_chip = chip == c
+        n = len(np.unique(sample.star[rows[on_chip]]))
         side = int(np.clip(np.sqrt(n / STARS_PER_CELL), 1, MAX_CELLS))
-        at = rows[here]
+        at = rows[on_chip]
         iy, ix = np.divmod(cell_index(sample.X[at], sample.Y[at], (side, side)), side)
-        # boustrophedon: cells with few stars are joined to neighbours
-        code[here] = c * MAX_CELLS**2 + iy * side + np.where(iy % 2, side - 1 - ix, ix)
+        # boustrophedon order, so that cells with few stars are merged with their neighbours
+        code[on_chip] = c * MAX_CELLS**2 + iy * side + np.where(iy % 2, side - 1 - ix, ix)
     return code
 
 
 def _magnitudes(mag: Float, n_stars: int) -> Int:
-    """Bins with equal numbers of detections."""
+    """Codes (n,) of magnitude bins with equal numbers of detections."""
     n = int(np.clip(n_stars // STARS_PER_BIN, 1, MAX_MAGNITUDES))
     edges = np.quantile(mag, np.linspace(0, 1, n + 1)[1:-1])
     return np.searchsorted(np.unique(edges), mag)
 
 
 def _joined(code: Int, star: Int) -> Int:
-    """Codes from 0 of parts that have stars enough: each takes its successors until it has."""
+    """Codes, from 0, of parts merged with their successors until each has enough stars."""
     values, index = np.unique(code, return_inverse=True)
     pairs = np.unique(index * (int(star.max()) + 1) + star)
     count = np.bincount(pairs // (int(star.max()) + 1))
@@ -139,13 +140,13 @@ def _joined(code: Int, star: Int) -> Int:
         total += n
         if total >= STARS_PER_PART:
             part, total = part + 1, 0
-    if total:  # the last ones go to the part before them
+    if total:  # a remainder is merged with the part before it
         out[out == part] = max(part - 1, 0)
     return out[index]
 
 
 def _by_part(squares: _Squares, family: Family, code: Int) -> Outcome | None:
-    """Test by parts of the data; None where there is but one."""
+    """Test for differences between parts of the data; None if there is only one part."""
     code = _joined(code, squares.star)
     m = int(code.max(initial=0)) + 1
     if m < 2:
@@ -155,21 +156,23 @@ def _by_part(squares: _Squares, family: Family, code: Int) -> Outcome | None:
     if (expected <= 0).any():
         return None
     ratio = np.bincount(code, y) / expected
-    # detections of one star in one part are one
-    left = y - ratio[code] * c
-    own = squares_over(squares.star, left, code, m) / (ratio * expected) ** 2
+    # detections of one star in one part are not independent and count once
+    deviation = y - ratio[code] * c
+    relative_variance = squares_over(squares.star, deviation, code, m) / (ratio * expected) ** 2
     n = np.bincount(code)
-    pooled = float(own @ n**2) / n.sum() / n
-    # of the means of so many squares, the cube root is all but Gaussian (Wilson and Hilferty 1931)
-    shape = squares.free / np.maximum(own, pooled)
+    pooled = float(relative_variance @ n**2) / n.sum() / n
+    # the cube root of a mean of squares is nearly Gaussian (Wilson and Hilferty 1931)
+    shape = squares.free / np.maximum(relative_variance, pooled)
     root = np.cbrt(ratio / squares.ratio) - 1.0 + 1.0 / (9.0 * shape)
     weight = 9.0 * shape
     root = root - np.average(root, weights=weight)
     T = float(weight @ root**2)
-    # a cube root of the variance: half its logarithm's change is that of the standard deviation
+    # a change of the cube root of the variance is 2/3 of that of log(standard deviation)
     step = 1.5 * root * squares.sigma
     noise = float(np.average(0.25 / shape, weights=n)) * squares.sigma**2 * (m - 1) / m
-    low, high = (squares.sigma * np.sqrt(one / squares.ratio) for one in (ratio.min(), ratio.max()))
+    low, high = (
+        squares.sigma * np.sqrt(extreme / squares.ratio) for extreme in (ratio.min(), ratio.max())
+    )
     present = (
         f"{family.present}, from {low:.2g} to {high:.2g} {squares.unit} along an axis where errors "
         "are typical"
@@ -187,17 +190,18 @@ def _by_part(squares: _Squares, family: Family, code: Int) -> Outcome | None:
 
 
 def _by_axis(squares: _Squares) -> Outcome | None:
-    """Test of u against v, star by star."""
+    """Test of the noise along u against that along v, by star."""
     ratio = squares.ratio
-    left = squares.square - ratio * squares.expected
-    d = np.bincount(squares.star, left[0] - left[1])
+    deviation = squares.square - ratio * squares.expected
+    d = np.bincount(squares.star, deviation[0] - deviation[1])
     n = len(d)
     if n < STARS_PER_PART:
         return None
     T = squares.free * float(d.sum() ** 2 / (d**2).sum())
     of_each = squares.square.sum(axis=1) / squares.expected.sum(axis=1)
     scale = np.sqrt(of_each / ratio)
-    # standard deviations differ by half of what variances do, each from its mean by half of that
+    # standard deviations differ by half as much as variances, and each from the mean by half of
+    # that
     noise = (
         squares.sigma
         * float(np.sqrt((d**2).sum() / squares.free))

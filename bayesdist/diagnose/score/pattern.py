@@ -1,4 +1,4 @@
-"""A pattern that repeats over the detector: the largest peak of the spectrum of the scores."""
+"""Test for a pattern that repeats over the detector: a peak in the spectrum of the scores."""
 
 from __future__ import annotations
 
@@ -18,30 +18,30 @@ REPEATING = Family(
     "",
     "no pattern repeats over the detector",
 )
-BINS = 256  # along each side of a chip: periods from a hundredth of it are seen
-PADDED = 2  # finer frequencies than the bins', so that none falls between
-SLOWEST = 1.5  # periods beyond the polynomial's own, below which it takes waves for terms
+BINS = 256  # along each side of a chip: periods down to about 1/100 of the side are detected
+PADDED = 2  # oversampling of the frequencies, so that no wave falls between them
+# multiple of the polynomial's highest frequency below which the polynomial absorbs waves
+SLOWEST = 1.5
 MIN_STARS = 100
-CANDIDATES = 16  # longest walks that are compared where steps differ from wave to wave
+CANDIDATES = 16  # longest walks that are recomputed if steps depend on the wave
 
 
 def pattern_test(sample: ScoredSample) -> Outcome | None:
     """Test for a wave of any period and direction on a chip.
 
-    At each frequency k the length of sum g exp(i k x), over the scores g of one axis, is that of a
-    walk of steps |g| in directions of chance where there is no wave, whatever the errors of single
-    stars.  Detections of one star share the error of its reference position, and are one step
-    |sum g exp(i k x)|.  The longest of all frequencies counts as one of so many walks: at lengths
-    that matter, even neighbours of the finer frequencies hardly ever exceed it together.
-
-    None for less than `MIN_STARS` stars.
+    For each frequency k and the scores g of one axis, the length of sum g exp(i k x) is, without a
+    wave, that of a random walk of steps |g| in random directions, for any errors of single stars.
+    Detections of one star share the error of its reference position and form one step |sum g exp(i
+    k x)|.  The p-value of the longest walk is corrected for the number of frequencies:  at relevant
+    lengths, neighbours among the oversampled frequencies hardly ever exceed it together.  Returns
+    None if there are fewer than `MIN_STARS` stars.
     """
     if len(np.unique(sample.star)) < MIN_STARS:
         return None
     model = sample.model
     allowed = _frequencies(model.order)
     log_tail, power, trials, at = 0.0, 0.0, 0, (0, 0, 0, 0)
-    longer = 1.0  # square of the steps, over that of independent detections
+    longer = 1.0  # mean square of the steps divided by that of independent detections
     for chip, walks in _walks(sample).items():
         for axis in (0, 1):
             if not walks.scores[axis].any():
@@ -63,11 +63,11 @@ def pattern_test(sample: ScoredSample) -> Outcome | None:
     period = PADDED / max(np.hypot(column / size[0], signed / size[1]), 1e-12)
     h = float(np.mean(sample.curvature[[0, 2]]))
     n = len(sample) / len(model.chips)
-    unit = np.sqrt(2 / (n * h))  # rms of a wave whose power is one, on one axis
+    unit = np.sqrt(2 / (n * h))  # rms of a wave with unit power, on one axis
 
     def smallest(level: float) -> float:
         needed = np.log(trials / level)
-        # a noncentral exponential exceeds it with probability 0.9
+        # a noncentral exponential exceeds the limit with probability 0.9
         return float(unit * np.sqrt(longer) * (np.sqrt(needed) + 1.0))
 
     present = (
@@ -88,31 +88,34 @@ def pattern_test(sample: ScoredSample) -> Outcome | None:
 
 
 def _frequencies(order: int) -> Bool:
-    """Boolean mask of the frequencies of `rfft2` that the polynomial does not take up."""
+    """Boolean mask of the frequencies of `rfft2` that the polynomial does not absorb."""
     n = PADDED * BINS
     j, i = np.fft.fftfreq(n, 1 / n)[:, None], np.arange(n // 2 + 1)[None]
-    waves = np.hypot(i, j) / PADDED  # over the chip
+    waves = np.hypot(i, j) / PADDED  # number of waves over the chip
     return (waves > SLOWEST * (order + 1) / 2) & (waves < BINS / 2.5)
 
 
 @dataclass(frozen=True, eq=False)
 class _Walks:
-    """Scores on one chip, whose sums with the phases of a wave are walks in the plane."""
+    """Scores on one chip; their sums with the phases of a wave are random walks in the plane."""
 
-    cell: Int  # (N,) of BINS^2, row by row
+    cell: Int  # (N,) index of one of BINS^2 cells, row by row
     scores: Float  # (2, N) along each axis of the polynomials
-    binned: Float  # (2, BINS, BINS) sums of them
-    star: Int | None  # (N,) star of each, from 0; None if each star has one detection
+    binned: Float  # (2, BINS, BINS) their sums per cell
+    star: Int | None  # (N,) star of each detection, from 0; None if each star has one detection
 
     def candidates(self, lengths: Float) -> list[tuple[int, int]]:
-        """Rows and columns (j, i) of the longest walks, or of the longest if steps are alike."""
+        """Rows and columns (j, i) of the longest walks.
+
+        A single pair if each star has one detection.
+        """
         n = 1 if self.star is None else CANDIDATES
         longest = np.argpartition(lengths.ravel(), -n)[-n:]
         rows, columns = np.unravel_index(longest, lengths.shape)
         return [(int(j), int(i)) for j, i in zip(rows, columns, strict=True)]
 
     def steps(self, axis: int, i: int, j: int) -> Float:
-        """Length of the step of each star at a frequency of i and j waves over the padded chip."""
+        """Step length of each star for a wave with i and j periods over the padded chip."""
         g = self.scores[axis]
         if self.star is None:
             return np.abs(g)
@@ -122,7 +125,7 @@ class _Walks:
 
 
 def _walks(sample: ScoredSample) -> dict[int, _Walks]:
-    """Scores on each chip, by its code."""
+    """Scores of the detections, by the index of the chip."""
     parts = dict[int, list[tuple[Int, Float, Int]]]()
     code = cell_index(sample.X, sample.Y, (BINS, BINS))
     for block in sample.blocks:
@@ -141,10 +144,13 @@ def _walks(sample: ScoredSample) -> dict[int, _Walks]:
 
 
 def log_tail_of_walk(steps: Float, length: float) -> float:
-    """Log probability that a plane walk of steps (N,) in directions of chance gets beyond a length.
+    """Log probability that a random walk in the plane exceeds `length`.
 
-    By the saddle point of its cumulants K(t) = sum log I_0(t steps): exact for many small steps,
-    where it is -length^2 / sum steps^2, and less where a few steps are much of the walk.
+    `steps` (N,) are its step lengths.
+
+    The saddle-point approximation with the cumulants K(t) = sum log I_0(t steps) is exact for many
+    small steps, for which the result is -length^2 / sum steps^2.  It is smaller if a few steps
+    dominate the walk.
     """
     if length >= steps.sum():
         return -np.inf

@@ -1,7 +1,8 @@
-"""Regressors of matched stars with the parameters projected out, and what they do to detections.
+"""Regressors of matched stars with the parameters projected out, and their values at detections.
 
-The regressors of a test are functions of the detections.  Nothing is built that is as long as the
-detections and as wide as parameters or regressors: polynomials have few coefficients in a block.
+The regressors of a test are functions of the detections.  No array has both the length of the
+detections and the width of parameters or regressors, because each block's polynomials have only a
+few coefficients.
 """
 
 from __future__ import annotations
@@ -18,30 +19,30 @@ from bayesdist.diagnose.score.sample import Block, ScoredSample
 from bayesdist.infer.equations.priors import GaussianPriors
 from bayesdist.utils.arrays import Float, Int
 
-RIDGE = 1e-12  # of a scaled information matrix: what the sample does not determine stays finite
-LARGEST_LEVERAGE = 0.95  # of one detection; it has next to no residual of its own there
+RIDGE = 1e-12  # added to a scaled information matrix, so that undetermined directions stay finite
+LARGEST_LEVERAGE = 0.95  # of one detection; with a larger leverage hardly any residual remains
 
 
 @dataclass(frozen=True, eq=False)
 class Projection:
-    """Sums over a sample, from which the tests are made.
+    """Sums over a sample from which the regressor tests are computed.
 
-    D parameters, the first G of them global, q regressors: each of the functions that the tests
-    add, on both axes of every chip.
+    There are D parameters, the first G of them global, and q regressors: each function that the
+    tests add, on both axes of every chip.
     """
 
     functions: Functions
-    theta: Float  # (D,) where the scores were taken
+    theta: Float  # (D,) parameters at which the scores were evaluated
     precision: Float  # (D, D) of the priors
-    parameters: Float  # information (D, D) of the parameters, with the priors
-    covariance: Float  # (D, D) inverse of it
-    score: Float  # (D,) with the pull of the priors
-    cross: Float  # (D, q) of parameters and regressors
+    parameters: Float  # (D, D) information of the parameters, including the priors
+    covariance: Float  # (D, D) its inverse
+    score: Float  # (D,) including the gradient of the priors
+    cross: Float  # (D, q) information between parameters and regressors
     regressors: EfficientScore
 
     @property
     def sample(self) -> ScoredSample:
-        """Detections."""
+        """Sample of detections."""
         return self.functions.sample
 
     @property
@@ -50,33 +51,36 @@ class Projection:
         return self.sample.model.n_global
 
     def columns(self, function: Int, chip: int) -> Int:
-        """Indices of the regressors of some functions on both axes of a chip."""
+        """Indices of the regressors of the given functions on both axes of a chip."""
         start = 2 * self.functions.n_added * chip
         return np.ravel(start + 2 * (function[:, None] - self.sample.model.n_terms) + [0, 1])
 
     @cached_property
     def following(self) -> Float:
-        """Change (D, G) of all parameters with a global one, those of exposures following it."""
+        """Derivatives (D, G) of all parameters with respect to the global ones.
+
+        The parameters of the exposures take the values that fit best for given global parameters.
+        """
         G = self.n_global
         local = -np.linalg.solve(self.parameters[G:, G:], self.parameters[G:, :G])
         return np.concatenate([np.eye(G), local])
 
     def with_global(self, information: Float, cross: Float) -> Float:
-        """Information (n, n) of columns when the exposures' parameters alone are projected out.
+        """Information (n, n) of columns with only the exposures' parameters projected out.
 
-        From that with all of them projected out, and `cross` (n, G) with the global parameters that
-        the others follow.
+        `information` is that with all parameters projected out, and `cross` (n, G) that between the
+        columns and the global parameters, with the exposures' parameters following.
         """
         G = self.n_global
         return np.asarray(information + cross @ self.covariance[:G, :G] @ cross.T)
 
     def beside_exposures(self, which: Int) -> Float:
-        """Information (n, n) of regressors, the exposures' parameters alone projected out."""
-        left = self.regressors.information[np.ix_(which, which)]
-        return self.with_global(left, self.cross[:, which].T @ self.following)
+        """Information (n, n) of regressors with only the exposures' parameters projected out."""
+        projected = self.regressors.information[np.ix_(which, which)]
+        return self.with_global(projected, self.cross[:, which].T @ self.following)
 
     def star_scores(self, F: Float, block: Block, coefficients: Float) -> Float:
-        """Scores (n, q) of detections, by coefficients (2, L, q) of functions F (L, n)."""
+        """Scores (n, q) of detections, from coefficients (2, L, q) of functions F (L, n)."""
         g = self.scored.whole_score[:, block.rows]
         return np.asarray(sum((F * g[axis]).T @ coefficients[axis] for axis in (0, 1)))
 
@@ -96,13 +100,13 @@ class Projection:
 
     @cached_property
     def scored(self) -> ScoredSample:
-        """Sample with its leverage."""
+        """Sample including the leverage of its detections."""
         return replace(self.sample, leverage=self.leverage)
 
     def regressor_map(self, block: Block, which: Int) -> Float:
         """Coefficients (2, L, n) of projected regressors in a block.
 
-        `which` (n,) are from 0 to q - 1.
+        `which` (n,) are regressor indices from 0 to q - 1.
         """
         K = self.sample.model.n_terms
         out = _added(block, self.functions.n_added, K, which)
@@ -110,21 +114,22 @@ class Projection:
         return out
 
     def prior_meat(self, which: Int) -> Float:
-        """Covariance (n, n) that priors give to the scores of regressors, as data of their own."""
+        """Covariance (n, n) of the scores of regressors due to the priors, treated as data."""
         gain = self.regressors.gain[:, which]
         return np.asarray(gain.T @ self.precision @ gain)
 
     @cached_property
     def score_ratio(self) -> float:
-        """Mean square of the scores over what the curvature expects."""
+        """Mean square of the scores divided by its expectation from the curvature."""
         h = self.sample.curvature[[0, 2]]
         return float((self.scored.whole_score**2).sum() / h.sum())
 
 
 def projection_of(functions: Functions, theta: Float, priors: GaussianPriors) -> Projection:
-    """Sums over the detections of a sample.
+    """Sums over the detections of a sample, at the parameters `theta` (D,) of its scores.
 
-    `theta` (D,) is where the scores were taken.
+    If the information matrix is not positive definite, only concave parts of the likelihood are
+    used.
     """
     try:
         return _summed(functions, theta, priors)
@@ -163,22 +168,22 @@ def _summed(functions: Functions, theta: Float, priors: GaussianPriors) -> Proje
 
 
 def _added(block: Block, n_added: int, n_terms: int, which: Int) -> Float:
-    """Coefficients (2, L, n) of some regressors in a block, along the axes of the polynomials."""
+    """Coefficients (2, L, n) of regressors in a block, along the axes of the polynomials."""
     out = np.zeros((2, n_terms + n_added, len(which)))
-    chip, rest = np.divmod(which, 2 * n_added)
-    here = np.flatnonzero(chip == block.chip)
-    function, axis = np.divmod(rest[here], 2)
-    out[:, n_terms + function, here] = block.frame[:, axis]
+    chip, index_in_chip = np.divmod(which, 2 * n_added)
+    on_chip = np.flatnonzero(chip == block.chip)
+    function, axis = np.divmod(index_in_chip[on_chip], 2)
+    out[:, n_terms + function, on_chip] = block.frame[:, axis]
     return out
 
 
 def contracted(A: Float, B: Float) -> Float:
-    """Sums over axes and functions: (2, L, m) and (2, L, n) to (m, n)."""
+    """Sum products over axes and functions: arrays (2, L, m) and (2, L, n) give (m, n)."""
     return A.reshape(-1, A.shape[2]).T @ B.reshape(-1, B.shape[2])
 
 
 def weighted(F: Float, curvature: Float, X: Float) -> Float:
-    """Moments of functions F (L, n) with the curvature (3, n), times X (2, L, m)."""
+    """Moments of functions F (L, n), weighted with the curvature (3, n), applied to X (2, L, m)."""
     uu, uv, vv = curvature
     Wuu = (F * uu) @ F.T
     Wvv = Wuu if uu is vv or np.array_equal(uu, vv) else (F * vv) @ F.T
@@ -189,7 +194,7 @@ def weighted(F: Float, curvature: Float, X: Float) -> Float:
 
 
 def _ridged(matrix: Float) -> Float:
-    """An information matrix in which directions without information have a trace of it."""
+    """Information matrix with a small value on the diagonal, so that it can be inverted."""
     diagonal = np.diag(matrix)
     largest = diagonal.max(initial=0.0)
     return matrix + np.diag(RIDGE * np.where(diagonal > 0, diagonal, largest))

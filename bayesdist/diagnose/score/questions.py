@@ -1,8 +1,8 @@
-"""Questions to the detections: functions that a model may lack, each with its words.
+"""Questions of the score tests: functions that a model may lack, each with its wording.
 
-This is the list for matched stars, campaigns and self-calibrations. How parameters and stars are
-projected out of the functions, the statistic, its p-value and the smallest effect that would have
-been found follow from them.
+The list serves matched stars, campaigns and self-calibrations.  The functions determine everything
+else: how parameters and stars are projected out of them, the statistic, its p-value and the
+smallest effect that would have been detected.
 """
 
 from __future__ import annotations
@@ -23,44 +23,48 @@ Terms = tuple[tuple[int, int], ...]
 
 CONSTANT, LINEAR = polynomial_terms(0), polynomial_terms(1)
 HIGHER = 2  # orders above the model's that are tested
-OUTSIDE = 0.5  # per cent of the values at either end that are moved to the others
-MIN_AT_EDGES = 200  # detections: some in each margin
-MIN_OF_PHASES = 200  # detections: some at each phase of a pixel
-FEWEST_DIGITS = 5  # decimals of a pixel, from which on digits that are missing displace nothing
-WHOLE = 1e-6  # of the last digit, by which a number with few digits differs from its rounded value
-# fractions of the detections: those with few digits, and the others, are at least so many
+OUTSIDE = 0.5  # per cent of the values at either end that are clipped to the remaining range
+MIN_AT_EDGES = 200  # detections, so that each margin contains some
+MIN_OF_PHASES = 200  # detections, so that each pixel phase is covered
+FEWEST_DIGITS = 5  # decimals of a pixel: with so many digits, missing digits displace nothing
+WHOLE = 1e-6  # of the last digit: tolerance for equality of a number and its rounded value
+# smallest fraction of the detections with few digits, and of those with more
 MIN_CUT_OFF = 0.05
-BY_CHANCE = 0.3  # most that end in 0 by chance, of those with one digit more; a tenth on average
-NEAR_EDGE = 0.05  # of half a side, over which what is at an edge falls off
-SHORTEST = 0.1  # years over which a drift is looked for
-# of the information of a direction, left by the parameters: below, it is theirs
+# largest fraction of numbers with one digit more that end in 0 by chance; 0.1 on average
+BY_CHANCE = 0.3
+NEAR_EDGE = 0.05  # of half a side: scale length over which the edge functions decay
+SHORTEST = 0.1  # years; shortest time span in which a drift is tested
+# smallest fraction of a direction's information that must remain after projecting out the
+# parameters
 INDEPENDENT = 1e-6
-OWN_OF_TIME = 0.02  # frames take up drifts but for what the curvature of the polynomial leaves
+# as `INDEPENDENT`, for drifts: frames absorb them except for the curvature of the polynomial
+OWN_OF_TIME = 0.02
 
 
 @dataclass(frozen=True, eq=False)
 class Products:
-    """Functions of the detections: polynomial terms times a number of each detection.
+    """Functions of the detections: polynomial terms multiplied by a value per detection.
 
-    Each moves both axes of each chip freely, or only along a given direction.
+    Each function displaces both axes of each chip independently, or only along a given direction.
     """
 
     terms: Terms  # powers (i, j) of Legendre polynomials over the chip
-    values: Float | None = None  # (N,) that multiply the terms; 1 by default
-    # (2,) or (2, N) displacement along the axes of the detector; those of the sky are turned by
+    values: Float | None = None  # (N,) factors of the terms; 1 by default
+    # (2,) or (2, N) displacement along the detector axes; directions on the sky are converted with
     # `ScoredSample.along_detector`
     direction: Float | None = None
 
 
 @dataclass(frozen=True, eq=False)
 class Question:
-    """What a model may lack: functions of the detections that are tested together."""
+    """Functions of the detections that a model may lack and that are tested together."""
 
     family: Family
     products: tuple[Products, ...]
-    # fraction of its information that a direction must keep when parameters are projected out
+    # fraction of its information that a direction must keep when the parameters are projected out
     least: float = INDEPENDENT
-    # group of families that are fitted as well in a second test, which counts where it sees nothing
+    # group of families that a second test fits as well; if that test is insignificant, its result
+    # is used
     adjusted_for: str = ""
 
 
@@ -124,7 +128,7 @@ CURVATURE = Family(
 
 
 def order_family(total: int, order: int) -> Family:
-    """Words of the test for terms of one total order, of a model that ends at another."""
+    """Wording of the test for terms of the order `total`, for a model of the order `order`."""
     return Family(
         f"order {total}",
         f"raise model.order to {total}" if total <= MAX_ORDER else LOOK_UP_TABLE,
@@ -137,7 +141,7 @@ def order_family(total: int, order: int) -> Family:
 
 
 def questions(sample: ScoredSample) -> Iterator[Question]:
-    """Iterator over what a sample can be asked; values that do not vary are left out later."""
+    """Iterate over the questions that a sample can answer; constant values are removed later."""
     order = sample.model.order
     for total in range(order + 1, order + HIGHER + 1):
         terms = polynomial_terms(total)[len(polynomial_terms(total - 1)) :]
@@ -145,53 +149,59 @@ def questions(sample: ScoredSample) -> Iterator[Question]:
     if sample.mag is not None:
         yield Question(MAGNITUDE, (Products(LINEAR, _standing_out(sample.mag)),))
     if sample.offset is not None and sample.position is not None:
-        # to first order, what a curved sky makes of the tangent planes of exposures
+        # effect, to first order, of a curved sky on the tangent planes of exposures
         p, q = sample.position
         values = [square * along for square in (p * p, p * q, q * q) for along in sample.offset]
-        yield Question(POINTING, tuple(Products(CONSTANT, one) for one in values))
+        yield Question(POINTING, tuple(Products(CONSTANT, value) for value in values))
     if not sample.has_catalogue:
-        return  # how often the others err where stars are solved for is not known
+        return  # without a catalogue the scatter for the remaining questions is unknown
     if sample.colour is not None:
         yield Question(COLOUR, (Products(LINEAR, _standing_out(sample.colour)),))
     if len(sample) >= MIN_AT_EDGES:
         rising = [np.exp((s * Z - 1.0) / NEAR_EDGE) for Z in (sample.X, sample.Y) for s in (-1, 1)]
-        edges = tuple(Products(CONSTANT, one - one.mean()) for one in rising)
-        # a missing order rises towards the edges as well
+        edges = tuple(Products(CONSTANT, value - value.mean()) for value in rising)
+        # missing orders rise towards the edges as well
         yield Question(EDGES, edges, adjusted_for="orders")
     if len(sample) >= MIN_OF_PHASES:
         yield Question(PIXEL_PHASE, tuple(Products(CONSTANT, wave) for wave in _phases(sample)))
-    if cut_off := tuple(Products(CONSTANT, few - few.mean()) for few in _few_digits(sample)):
+    if cut_off := tuple(
+        Products(CONSTANT, indicator - indicator.mean()) for indicator in _few_digits(sample)
+    ):
         yield Question(CUT_OFF, cut_off)
     yield from _of_time(sample)
 
 
 def _from_edge(sample: ScoredSample) -> Float:
-    """Distance (2, N) of each detection from the edge of the first column and row, in pixels."""
+    """Distance (2, N) in pixels of each detection from the edge of the first column and row."""
     size = np.array([chip.size for chip in sample.model.chips])[sample.chip]
     return np.stack([sample.X + 1.0, sample.Y + 1.0]) / 2 * size.T
 
 
 def _few_digits(sample: ScoredSample) -> Iterator[Float]:
-    """Indicators (N,) of the detections whose columns, or rows, have fewer digits than others.
+    """Iterate over indicators (N,) of detections that have fewer digits in x, or in y, than others.
 
-    There is at most one for each axis: none if all have the same number of digits.
+    There is at most one for each axis, and none if all values have the same number of digits.
     """
     for distance in _from_edge(sample):
-        few = []
+        has_digits = []
         for digits in range(FEWEST_DIGITS + 1):
             shifted = (distance + 0.5) * 10.0**digits
-            few.append(np.abs(shifted - np.round(shifted)) < WHOLE)
-        for fewer, more in pairwise(few):
+            has_digits.append(np.abs(shifted - np.round(shifted)) < WHOLE)
+        for fewer, one_digit_more in pairwise(has_digits):
             share = fewer.mean()
-            if MIN_CUT_OFF <= share <= 1 - MIN_CUT_OFF and share > BY_CHANCE * more.mean():
+            if (
+                MIN_CUT_OFF <= share <= 1 - MIN_CUT_OFF
+                and share > BY_CHANCE * one_digit_more.mean()
+            ):
                 yield fewer.astype(float)
                 break
 
 
 def _phases(sample: ScoredSample) -> Iterator[Float]:
-    """Sine and cosine (N,) of the phase of each detection along the columns and rows of pixels.
+    """Iterate over sine and cosine (N,) of the pixel phase of each detection in x and y.
 
-    A wave of one pixel is too short for the test of repeating patterns, and looks like noise.
+    A wave with a period of one pixel is too short for the test of repeating patterns, which would
+    see it as noise.
     """
     for distance in _from_edge(sample):
         phase = 2 * np.pi * distance
@@ -200,11 +210,12 @@ def _phases(sample: ScoredSample) -> Iterator[Float]:
 
 
 def _of_time(sample: ScoredSample) -> Iterator[Question]:
-    """Questions to detections of several dates."""
+    """Iterate over the questions to detections of several dates."""
     time, epoch = sample.model.time, sample.epoch
     if epoch is None or np.ptp(epoch) <= SHORTEST:
         return
-    half = (2 * epoch - epoch.min() - epoch.max()) / np.ptp(epoch)  # from -1 to 1
+    # time scaled to the interval from -1 to 1
+    half = (2 * epoch - epoch.min() - epoch.max()) / np.ptp(epoch)
     if sample.mag is not None:
         values = _standing_out(sample.mag) * half
         yield Question(MAGNITUDE_IN_TIME, (Products(LINEAR, values),))
@@ -216,17 +227,17 @@ def _of_time(sample: ScoredSample) -> Iterator[Question]:
 
 
 def _standing_out(values: Float) -> Float:
-    """Values about their mean; codes for what is missing are brought to the others."""
+    """Values minus their mean, with outliers such as codes for missing data clipped."""
     low, high = np.percentile(values, [OUTSIDE, 100 - OUTSIDE])
     inside = np.clip(values, low, high)
     return np.asarray(inside - inside.mean())
 
 
 def _beyond_lines(half: Float, time: TimeDependence, epoch: Float) -> Float:
-    """Square of time, without what a constant and the segments' own lines say of it."""
+    """Square of the time, minus its fit by a constant and by the linear segments of the model."""
     design = np.column_stack([np.ones(len(half)), time.weights(epoch)])
     dates, of = np.unique(half, return_inverse=True)
     first = np.unique(of, return_index=True)[1]
     weight = np.sqrt(np.bincount(of))
-    found = np.linalg.lstsq(weight[:, None] * design[first], weight * dates**2)[0]
-    return half**2 - design @ found
+    coefficients = np.linalg.lstsq(weight[:, None] * design[first], weight * dates**2)[0]
+    return half**2 - design @ coefficients

@@ -1,4 +1,4 @@
-"""Results of tests for what a model may lack, and which of many are more than chance."""
+"""Results of tests for what a model may lack, and their correction for multiple testing."""
 
 from __future__ import annotations
 
@@ -21,65 +21,68 @@ HeldBy = Literal[
     "", "noise", "structure", "exposures", "curvature", "second order", "exposure fields", "time"
 ]
 
-LOOK_UP_TABLE = "fit a look-up table in a campaign"  # remedy: other runs have none
-POWER = 0.9  # with which the smallest effect that is stated would have been found
+LOOK_UP_TABLE = "fit a look-up table in a campaign"  # remedy that is available to campaigns only
+POWER = 0.9  # probability of detecting an effect of the stated smallest size
 
 
 @dataclass(frozen=True)
 class Family:
-    """One thing that a model may lack, in words, and what else accounts for it."""
+    """Words for one kind of effect that a model may lack, and its relation to other findings."""
 
     name: str
     remedy: str  # what to do about it, as a clause
-    # subject and verb of the finding, where there is something and where there is not; where they
-    # depend on what was found, the test fills them in
+    # clauses for a significant and an insignificant result; the test fills them in if they depend
+    # on the data
     present: str
     absent: str
-    group: str = ""  # of families that others name together
-    # kind of correlated errors that hold what is found, so that the verdict stands
+    group: str = ""  # name of a group of related families
+    # component of the correlated errors that includes the effect, so that the verdict stays valid
     held_by: HeldBy = ""
-    explained_by: str = ""  # name or group of a finding that this one may come from
-    denial: str = ""  # clause that denies it, for findings that it may explain
-    doubt: str = LARGER  # what the finding does to verdicts, as of `Check`
+    explained_by: str = ""  # name or group of a finding that this one may be caused by
+    denial: str = ""  # clause that excludes this family as the cause of another finding
+    doubt: str = LARGER  # effect of the finding on verdicts, see `Check`
 
 
 @dataclass(frozen=True)
 class ScoreTest:
-    """One thing that a model may lack, and what the data say of it.
+    """Result of a test for one kind of effect that the model may lack.
 
     Parameters
     ----------
     name : str
+        Name of the test.
     statistic : float
-        About `dof` on average where the model lacks nothing.
+        Test statistic; about `dof` on average if the model is complete.
     dof : float
-        Directions that are tested.
+        Number of tested directions.
     dof_residual : float or None
-        Stars beyond them that the noise is known from; None where that is of no concern.
+        Number of stars, beyond the tested directions, from which the noise is estimated; None if
+        the statistic has a chi-square distribution.
     p_value : float
-        Probability of as much by chance, of this test by itself.
+        Probability of a larger statistic by chance, for this test alone.
     size : float
-        What was found: rms over the detector, of both axes together, without the part of noise; of
-        tests of the noise, the rms difference of its standard deviation along each axis.  0 or
-        more, in `unit`.
+        Size of the effect, in `unit` and not negative: rms over the detector, both axes together,
+        with the contribution of noise subtracted.  For tests of the noise, the rms difference of
+        its standard deviation per axis.
     smallest : float
-        Size that would have been found with probability `POWER`, in all these tests together.
+        Size that would have been detected with probability `POWER`, given the number of tests.
     unit : str
-        Of u and v.
+        Unit of `size` and `smallest`: that of u and v, or per year.
     remedy : str
-        What to do about it, as a clause.
+        What to do about the effect, as a clause.
     finding : str
-        What it means, as a sentence.
+        Interpretation of the result, as a sentence.
     significant : bool
-        More than chance, corrected for the number of tests (Holm 1979, at `limits.SCORE_TESTS`).
+        True if the result is significant after correction for the number of tests (Holm 1979, at
+        the level `limits.SCORE_TESTS`).
     held_by : str
-        Kind of correlated errors that hold what was found: 'noise', 'structure', 'exposures',
-        'curvature', 'second order' or 'exposure fields' (of single exposures), 'time'
-        (deviations of exposures that are correlated in time); empty where none do.
+        Component of the correlated errors that includes the effect: 'noise', 'structure',
+        'exposures', 'curvature', 'second order' or 'exposure fields' (of single exposures), 'time'
+        (deviations of exposures that are correlated in time); empty if none does.
     group : str
-        Group of related tests, which others name together; empty for a test by itself.
+        Name of the group of related tests; empty if the test belongs to none.
     doubt : str
-        What the finding does to verdicts, as of `Check`.
+        Effect of the finding on verdicts, see `Check`.
     """
 
     name: str
@@ -100,16 +103,16 @@ class ScoreTest:
 
 @dataclass(frozen=True, eq=False)
 class Outcome:
-    """One test by itself, before it is known how many there are."""
+    """Result of one test before the correction for the number of tests."""
 
     family: Family
-    # statistic, dof, dof_residual, p_value, size, unit: as of `ScoreTest`
+    # statistic, dof, dof_residual, p_value, size, unit: see `ScoreTest`
     statistic: float
     dof: float
     dof_residual: float | None
     p_value: float
     size: float
-    # size that is found with probability `POWER`, by the level of the test
+    # size that is detected with probability `POWER`, as a function of the significance level
     smallest: Callable[[float], float]
     unit: str
 
@@ -131,11 +134,11 @@ def outcome(
     unit: str,
     smallest: Callable[[float], float] | None = None,
 ) -> Outcome:
-    """Outcome of a test that has found a pattern of some mean square.
+    """Outcome of a test from the mean square of the pattern that it measured.
 
-    `square` and `noise` are the mean square of the pattern, noise included, and that of the noise;
-    `smallest` is by default that of a pattern that lies in any direction as noise does. Others as
-    of `ScoreTest`.
+    `square` is the mean square of the pattern, noise included, and `noise` that of the noise alone.
+    `smallest` defaults to the detectable rms of a pattern with the same distribution over
+    directions as the noise. For the other arguments see `ScoreTest`.
     """
     if smallest is None:
         smallest = partial(smallest_pattern, float(np.sqrt(max(noise, 0.0))), dof, dof_residual)
@@ -144,46 +147,46 @@ def outcome(
 
 
 def corrected(outcomes: Sequence[Outcome]) -> tuple[ScoreTest, ...]:
-    """Tests with their verdicts, corrected for how many there are (Holm 1979).
+    """Tests with their verdicts, corrected for multiple testing (Holm 1979).
 
-    Findings that others explain as well say so.
+    A finding that another finding may explain mentions it.
     """
-    significant = holm([one.p_value for one in outcomes]) <= SCORE_TESTS.value
-    # of a group the last finding has the remedy of all: a higher order holds the lower ones
+    significant = holm([result.p_value for result in outcomes]) <= SCORE_TESTS.value
+    # the last finding of a group has the remedy for all: a higher order includes the lower ones
     by_name = {
-        name: one.family
-        for one, found in zip(outcomes, significant, strict=True)
-        if found
-        for name in (one.name, one.family.group)
+        name: result.family
+        for result, is_significant in zip(outcomes, significant, strict=True)
+        if is_significant
+        for name in (result.name, result.family.group)
         if name
     }
     causes = _causes(by_name, outcomes)
     out = []
-    for one, found in zip(outcomes, significant, strict=True):
-        family, remedy = one.family, one.family.remedy
-        # what is alone has to pass the first step
-        smallest = one.smallest(SCORE_TESTS.value / len(outcomes))
-        finding = f"{family.absent} ({smallest:.2g} {one.unit} rms would have been found)"
-        if found:
+    for result, is_significant in zip(outcomes, significant, strict=True):
+        family, remedy = result.family, result.family.remedy
+        # a single effect must pass the first step of Holm's procedure
+        smallest = result.smallest(SCORE_TESTS.value / len(outcomes))
+        finding = f"{family.absent} ({smallest:.2g} {result.unit} rms would have been found)"
+        if is_significant:
             cause = cause_of((family.name, family.group), causes)
-            remedy, explanation = _remedy(family, causes), _explanation(one, outcomes)
+            remedy, explanation = _remedy(family, causes), _explanation(result, outcomes)
             if cause:
                 explanation = f", which may come from {CAUSES[cause].words}"
-            size = f"{one.size:.2g} {one.unit} rms, {p_words(one.p_value)}"
+            size = f"{result.size:.2g} {result.unit} rms, {p_words(result.p_value)}"
             finding = f"{family.present}{explanation} ({size})"
         out.append(
             ScoreTest(
-                one.name,
-                one.statistic,
-                one.dof,
-                one.dof_residual,
-                one.p_value,
-                one.size,
+                result.name,
+                result.statistic,
+                result.dof,
+                result.dof_residual,
+                result.p_value,
+                result.size,
                 smallest,
-                one.unit,
+                result.unit,
                 remedy,
                 finding,
-                bool(found),
+                bool(is_significant),
                 family.held_by,
                 family.group,
                 family.doubt,
@@ -193,29 +196,30 @@ def corrected(outcomes: Sequence[Outcome]) -> tuple[ScoreTest, ...]:
 
 
 def _causes(significant: Mapping[str, Family], outcomes: Sequence[Outcome]) -> dict[str, Family]:
-    """Families that have found something and may be causes, by their names and groups.
+    """Significant families that may be causes of others, by their names and groups.
 
-    `significant`: all that have found something.
+    `significant` contains all families with significant results.
     """
-    by_name = {one.name: (one.statistic, one.dof) for one in outcomes}
+    by_name = {result.name: (result.statistic, result.dof) for result in outcomes}
     singles = ("second order of exposures", "exposures")
     single = [by_name[name] for name in singles if name in significant]
-    orders = [by_name[one.name] for one in outcomes if one.family.group == "orders"]
+    orders = [by_name[result.name] for result in outcomes if result.family.group == "orders"]
     total = sum(statistic for statistic, _ in orders), sum(dof for _, dof in orders)
     rivals = {"pointing": single, "edges": [total] if orders else []}
     weaker = {
         name
-        for name, others in rivals.items()
-        if name in significant and not all(explains_more(by_name[name], one) for one in others)
+        for name, competitors in rivals.items()
+        if name in significant
+        and not all(explains_more(by_name[name], result) for result in competitors)
     }
     return {name: family for name, family in significant.items() if name not in weaker}
 
 
 def _remedy(family: Family, causes: Mapping[str, Family]) -> str:
-    """Remedy of a finding: that of its cause if there is one, else that of its group.
+    """Remedy of a finding: that of its cause if there is one, otherwise that of its group.
 
-    `causes`: families of other findings by their names, and the last one of each group by that of
-    the group.
+    `causes` maps the names of significant families, and of their groups, to the families; a group
+    is mapped to its last member.
     """
     cause = cause_of((family.name, family.group), causes)
     if cause:
@@ -224,30 +228,32 @@ def _remedy(family: Family, causes: Mapping[str, Family]) -> str:
 
 
 def _explanation(one: Outcome, outcomes: Sequence[Outcome]) -> str:
-    """Clause that denies the finding of another test that may explain this one; may be empty."""
+    """Clause that excludes another finding as the explanation of this one; may be empty."""
     if one.family.explained_by:
-        for other in outcomes:
-            names = (other.family.name, other.family.group)
-            if one.family.explained_by in names and other.p_value < SCORE_TESTS.value:
-                return f", if {other.family.denial}"
+        for candidate in outcomes:
+            names = (candidate.family.name, candidate.family.group)
+            if one.family.explained_by in names and candidate.p_value < SCORE_TESTS.value:
+                return f", if {candidate.family.denial}"
     return ""
 
 
 def noncentrality(level: float, dof: float, dof_residual: float | None = None) -> float:
     """Noncentrality at which a chi-square or F test has the power `POWER`.
 
-    `dof_residual` is that of an F test.
+    `dof_residual` is the number of denominator degrees of freedom of an F test.
     """
-    if dof_residual is None or dof_residual > 1e5:  # where F and chi-square are alike
+    if (
+        dof_residual is None or dof_residual > 1e5
+    ):  # F and chi-square distributions are practically equal
         return float(special.chndtrinc(chi2_isf(level, dof), dof, 1 - POWER))
     limit = f_isf(level, dof, dof_residual)
     return float(special.ncfdtrinc(dof, dof_residual, 1 - POWER, limit))
 
 
 def smallest_pattern(noise: float, dof: float, dof_residual: float | None, level: float) -> float:
-    """Rms of a pattern that is found with the power `POWER`.
+    """Rms of a pattern that is detected with the power `POWER`.
 
-    `noise` is the rms of the pattern that noise makes; the pattern lies in any direction as noise
-    does.
+    `noise` is the rms of the pattern that noise causes. The pattern is assumed to be distributed
+    over the directions like the noise.
     """
     return float(noise * np.sqrt(noncentrality(level, dof, dof_residual) / dof))

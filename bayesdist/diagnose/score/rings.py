@@ -1,8 +1,8 @@
-"""Rings about a centre inside or outside the detector, as tree rings of thick silicon make them.
+"""Rings about a centre inside or outside the detector, such as the tree rings of thick silicon.
 
-The phase of rings whose distance falls outwards as the inverse of the radius is quadratic in the
-position, kappa |x - c|^2. Multiplied by exp(-i kappa |x|^2) they are plane waves with the
-frequency 2 kappa c: one Fourier transform for each kappa looks at all centres c.
+The spacing of the rings decreases as the inverse of the radius, so that their phase is quadratic in
+the position, kappa |x - c|^2.  Multiplied by exp(-i kappa |x|^2), the rings become plane waves with
+the frequency 2 kappa c: one Fourier transform per kappa examines all centres c.
 """
 
 from __future__ import annotations
@@ -31,88 +31,89 @@ RINGS = Family(
     denial="the rings do not explain it",
 )
 BINS = 128  # along each side of a chip
-PADDED = 2  # finer frequencies than the bins', so that none falls between
-# Curvature of the phase, in radians per square of the longer half side. Rings of smaller ones are
-# wider than the detector; larger ones are closer than 45 pixels in a corner of 2048 x 2048 pixels
-# if the centre is in the middle. Halfway between neighbours the phase is off by 0.5 rad rms.
+PADDED = 2  # oversampling of the frequencies, so that no wave falls between them
+# Curvature of the phase, in radians per square of the longer half side. Rings with a smaller
+# curvature are wider than the detector; those with a larger one are closer than 45 pixels in a
+# corner of 2048 x 2048 pixels if the centre is in the middle. Halfway between neighbouring values
+# the phase error is 0.5 rad rms.
 CURVATURES = np.arange(8.0, 52.0, 2.5)
-FARTHEST = 3.0  # distance of the centre from the middle of the chip, in longer half sides
+FARTHEST = 3.0  # largest distance of the centre from the middle of the chip, in longer half sides
 MIN_STARS = 100
-LEAST_LOG = -1e4  # of a probability
-CANDIDATES = 4  # largest sums that are compared where detections of one star make one step
+LEAST_LOG = -1e4  # smallest log probability, to avoid underflow
+CANDIDATES = 4  # largest sums that are recomputed if the detections of one star form one step
 
 
 @dataclass(frozen=True, eq=False)
 class _Chip:
     """Scores of the detections on one chip."""
 
-    code: int  # into the model's chips
+    code: int  # index into the model's chips
     x: Float  # (2, N) position from the middle of the chip, in longer half sides
     score: Float  # (2, N) along the axes of the polynomials
-    cell: Int  # (N,) of BINS^2, row by row
-    star: Int  # (N,) from 0
-    extent: Float  # (2,) half sides of the chip, in longer ones
+    cell: Int  # (N,) index of one of BINS^2 cells, row by row
+    star: Int  # (N,) star number, from 0
+    extent: Float  # (2,) half sides of the chip, in units of the longer one
 
 
 @dataclass(frozen=True, eq=False)
 class _Rings:
-    """Rings of one chip, centre and curvature, with their probability by themselves."""
+    """Rings on one chip: centre and curvature, with their uncorrected log probability."""
 
     log_p: float
-    power: float  # of both axes together; two on average without rings
+    power: float  # normalised power of both axes together; two on average without rings
     chip: _Chip
     curvature: float
     centre: Float  # (2,) in longer half sides from the middle of the chip
 
 
 def ring_test(sample: ScoredSample) -> Outcome | None:
-    """Test for rings of any centre; None for less than `MIN_STARS` stars.
+    """Test for rings about any centre; None if there are fewer than `MIN_STARS` stars.
 
-    Sums of the scores along both axes are walks in the plane, as in the test of repeating patterns;
-    their probabilities are combined (Fisher). The smallest one counts as one of all centres and
-    curvatures.
+    Sums of the scores along both axes are random walks in the plane, as in the test for repeating
+    patterns, and their probabilities are combined (Fisher).  The smallest is corrected for the
+    number of centres and curvatures.
     """
     if len(np.unique(sample.star)) < MIN_STARS:
         return None
-    found, trials = None, 0
+    best, trials = None, 0
     for chip in _chips(sample):
         for curvature in CURVATURES:
             allowed = _frequencies(curvature, chip.extent)
             trials += int(allowed.sum())
             for rings in _candidates(chip, float(curvature), allowed):
-                if found is None or rings.log_p < found.log_p:
-                    found = rings
-    if found is None:
+                if best is None or rings.log_p < best.log_p:
+                    best = rings
+    if best is None:
         return None
-    p_value = float(min(1.0, trials * np.exp(found.log_p)))
-    chip, size = found.chip, np.array(sample.model.chips[found.chip.code].size)
+    p_value = float(min(1.0, trials * np.exp(best.log_p)))
+    chip, size = best.chip, np.array(sample.model.chips[best.chip.code].size)
     half = size.max() / 2
-    centre = size / 2 + 0.5 + found.centre * half
-    away = np.hypot(*(chip.x - found.centre[:, None])) * half
-    closest, widest = np.pi * half**2 / (found.curvature * np.percentile(away, [95, 5]))
+    centre = size / 2 + 0.5 + best.centre * half
+    away = np.hypot(*(chip.x - best.centre[:, None])) * half
+    closest, widest = np.pi * half**2 / (best.curvature * np.percentile(away, [95, 5]))
     name = f" of {sample.model.chips[chip.code].name}" if len(sample.model.chips) > 1 else ""
     present = (
         f"the residuals form rings about pixel ({centre[0]:.0f}, {centre[1]:.0f}){name}, "
         f"{closest:.0f} to {widest:.0f} pixels apart"
     )
     h = float(np.mean(sample.curvature[[0, 2]]))
-    square = 1.0 / (len(chip.cell) * h)  # rms squared of rings whose power is one, on one axis
+    square = 1.0 / (len(chip.cell) * h)  # mean square of rings with unit power, on one axis
     return outcome(
         replace(RINGS, present=present),
         chi_square_of(p_value, 2),
         2,
         None,
         p_value,
-        square=2 * square * found.power,
+        square=2 * square * best.power,
         noise=4 * square,
         unit=sample.model.unit,
-        # a noncentral variable exceeds it with probability 0.9
+        # a noncentral variable exceeds the limit with probability 0.9
         smallest=lambda level: float(np.sqrt(2 * square) * (np.sqrt(np.log(trials / level)) + 2.0)),
     )
 
 
 def _chips(sample: ScoredSample) -> Iterator[_Chip]:
-    """Scores of each chip."""
+    """Iterate over the chips with enough detections, with their scores."""
     score = sample.on_detector[0].T
     cell = cell_index(sample.X, sample.Y, (BINS, BINS))
     for code, chip in enumerate(sample.model.chips):
@@ -126,19 +127,19 @@ def _chips(sample: ScoredSample) -> Iterator[_Chip]:
 
 
 def _centres(curvature: float, extent: Float) -> tuple[Float, Float]:
-    """Coordinates of the centre (n, 1) and (1, n) that belong to the frequencies of `fft2`."""
+    """Coordinates (n, 1) and (1, n) of the ring centres for the frequencies of `fft2`."""
     n = PADDED * BINS
     wave = -np.pi * np.fft.fftfreq(n, 1 / n) / (2 * curvature * PADDED)
     return (wave / extent[1])[:, None], (wave / extent[0])[None]
 
 
 def _frequencies(curvature: float, extent: Float) -> Bool:
-    """Boolean mask of the frequencies of `fft2` whose centre is not too far away."""
+    """Boolean mask of the frequencies of `fft2` for which the centre is within `FARTHEST`."""
     return np.asarray(np.hypot(*_centres(curvature, extent)) <= FARTHEST)
 
 
 def _candidates(chip: _Chip, curvature: float, allowed: Bool) -> Iterator[_Rings]:
-    """Rings with the largest sums of one curvature."""
+    """Iterate over the rings with the largest sums for one curvature."""
     phase = np.exp(-1j * curvature * (chip.x**2).sum(axis=0))
     power = np.zeros(allowed.shape, np.float32)
     for score in chip.score:
@@ -152,7 +153,7 @@ def _candidates(chip: _Chip, curvature: float, allowed: Bool) -> Iterator[_Rings
         j, i = np.unravel_index(k, power.shape)
         centre = np.array([x[0, i], y[j, 0]])
         wave = phase * np.exp(2j * curvature * (centre @ chip.x))
-        # the product of two probabilities is that of a sum of two exponentials
+        # the probability of the product of two p-values follows from the sum of two exponentials
         log_q, total = 0.0, 0.0
         for score in chip.score:
             steps = _by_star(chip.star, score * wave)
@@ -164,10 +165,10 @@ def _candidates(chip: _Chip, curvature: float, allowed: Bool) -> Iterator[_Rings
 
 
 def _even_length(steps: Complex) -> float:
-    """Length of a walk of steps (N,) whose signs are of chance, if its scatter had no direction.
+    """Length of a walk of steps (N,) with random signs, rescaled as if its scatter were isotropic.
 
-    Few stars have phases that are not spread evenly over the circle, the more so where the best of
-    many centres is taken: the walk then gets farther along one direction than along the other.
+    The phases of a few stars are not spread evenly over the circle, in particular for the best of
+    many centres.  The walk then extends farther along one direction than along the other.
     """
     plane = np.stack([steps.real, steps.imag])
     covariance, total = plane @ plane.T, plane.sum(axis=1)
@@ -177,7 +178,8 @@ def _even_length(steps: Complex) -> float:
 
 def _binned(cell: Int, values: Complex) -> NDArray[np.complex64]:
     """Sums (BINS, BINS) of values (N,) in cells."""
-    sums = np.empty(BINS**2, np.complex64)  # candidates alone: their sums are computed again
+    # single precision suffices to find candidates: their sums are computed again
+    sums = np.empty(BINS**2, np.complex64)
     sums.real, sums.imag = (np.bincount(cell, part, BINS**2) for part in (values.real, values.imag))
     return sums.reshape(BINS, BINS)
 

@@ -15,98 +15,101 @@ from bayesdist.infer.stars.stars import Stars, prepare
 from bayesdist.model import DistortionModel
 from bayesdist.utils.arrays import Bool, Float, Int
 
-SAMPLE = 200_000  # detections that are looked at
-LARGEST_BLOCK = 4096  # detections, whose functions stay in the cache
+SAMPLE = 200_000  # largest number of detections that are tested
+LARGEST_BLOCK = 4096  # detections per block, so that their functions fit into the cache
 
 
 @dataclass(frozen=True, eq=False)
 class Block:
-    """Detections of one chip, exposure and epoch, or some of them, with one polynomial."""
+    """Detections of one chip, exposure and epoch, or a part of them, that share one polynomial."""
 
     rows: slice
-    chip: int  # code into the model's chips
-    exposure: int  # code into the exposures of the data
-    frame_exposure: int  # code of the exposure whose frame they have
+    chip: int  # index into the model's chips
+    exposure: int  # index into the exposures of the data
+    frame_exposure: int  # index of the exposure that defines their frame
     frame: Float  # (2, 2) linear part of that frame
-    effective: Float  # (2, K)
+    effective: Float  # (2, K) coefficients of the polynomial, with frame and drift applied
     columns: Int  # (m,) parameters that the polynomial depends on
-    derivative: Float  # (2, K, m) of the effective coefficients by them
+    # (2, K, m) derivatives of the effective coefficients with respect to these parameters
+    derivative: Float
 
     def moved(self, by: Float) -> Float:
-        """Change (2, K, n) of the polynomial by changes (D, n) of the parameters."""
+        """Change (2, K, n) of the polynomial due to changes `by` (D, n) of the parameters."""
         return np.asarray(self.derivative @ by[self.columns])
 
 
 @dataclass(frozen=True, eq=False)
 class ScoredSample:
-    """Detections in the order of their blocks, with gradient and curvature of their likelihood."""
+    """Detections ordered by block, with gradient and curvature of their log-likelihood."""
 
     model: DistortionModel
-    # X, Y (N,): scaled detector position
+    # X, Y (N,): detector position scaled to the interval from -1 to 1
     X: Float
     Y: Float
-    score: Float  # (2, N) gradient of the log-likelihood by the model's u and v
+    score: Float  # (2, N) gradient of the log-likelihood with respect to the model's u and v
     curvature: Float  # (3, N) minus the second derivatives uu, uv, vv
     residual: Float  # (2, N) data minus model
     variance: Float  # (2, N) squared errors of true matches along u and v, jitter included
-    # (N,) probability of being a true match; of a least-squares fit, whether it uses the detection
+    # (N,) probability of being a true match; for a least-squares fit, 1 if the detection is used
     inlier: Float
     mag: Float | None  # (N,)
     colour: Float | None
     epoch: Float | None
-    # (N,) number of the star, or of the tight group of stars, from 0: its detections share the
+    # (N,) number of the star, or of the tight group of stars, from 0; its detections share the
     # error of the reference position
     star: Int
-    # chip, exposure (N,): codes into the model's chips, and into the exposures of the data
+    # chip, exposure (N,): indices into the model's chips and into the exposures of the data
     chip: Int
     exposure: Int
-    # (N, 2, 2) linear part of the frame of each detection's exposure, from the axes of the detector
-    # to those of u and v
+    # (N, 2, 2) linear part of the frame of each detection's exposure, from the detector axes to
+    # those of u and v
     turn: Float
-    has_catalogue: bool = True  # not where the positions of stars were solved for
-    # position, offset (2, N): ideal position, and where the exposure points beside the others, in
-    # half sides of the detector along its axes; None where pointings are not solved for
+    has_catalogue: bool = True  # False if the positions of the stars were fitted
+    # position, offset (2, N): ideal position, and pointing offset of the exposure relative to the
+    # other exposures, in half sides of the detector along its axes; None unless pointings are
+    # fitted
     position: Float | None = None
     offset: Float | None = None
-    blocks: tuple[Block, ...] = ()  # none where nothing is asked of the model's derivatives
+    blocks: tuple[Block, ...] = ()  # empty if the model's derivatives are not needed
     motion: Float | None = None  # (2, N) proper motions along u and v, in the unit of u, v per year
-    motion_sigma: Float | None = None  # (2, N) their standard errors, where the table has them
-    # (2, N) fraction of the noise of each detection that the fit follows, along u and v; 0 where it
-    # is not known
+    motion_sigma: Float | None = None  # (2, N) their standard errors, if the table has them
+    # (2, N) leverage: fraction of the noise of each detection that the fit follows, along u and v;
+    # 0 if it has not been computed
     leverage: Float | float = 0.0
-    from_nominal: Float | None = (
-        None  # (2, N) data minus nominal positions, where the table has them
-    )
-    match_radius: float | None = None  # within which the stars were matched, as is stated
-    mixture: Constants | None = None  # of the likelihood, where it models false matches
+    from_nominal: Float | None = None  # (2, N) data minus nominal positions, if the table has them
+    match_radius: float | None = None  # stated radius within which the stars were matched
+    mixture: Constants | None = None  # of the likelihood, if it models false matches
 
     def __len__(self) -> int:
         return len(self.X)
 
     @property
     def used(self) -> Bool:
-        """Boolean mask (N,) of the detections that count: all but those that a fit rejects."""
+        """Boolean mask (N,) that is False for detections that the fit rejects."""
         return np.any(self.curvature != 0, axis=0)
 
     def along_detector(self, direction: Float) -> Float:
-        """Displacements (2, N) along the axes of the detector; (2,) or (2, N) along u and v."""
+        """Components (2, N) along the detector axes of a displacement on the sky.
+
+        The displacement (2,) or (2, N) is along u and v.
+        """
         on_sky = np.broadcast_to(np.reshape(direction, (2, -1)), self.score.shape)
         return np.asarray(np.linalg.solve(self.turn, on_sky.T[..., None])[..., 0].T)
 
     @cached_property
     def whole_score(self) -> Float:
-        """Score (2, N), given back what the fit has taken (Bell and McCaffrey 2002)."""
+        """Score (2, N), corrected for the leverage of the fit (Bell and McCaffrey 2002)."""
         return np.asarray(self.score / np.sqrt(1.0 - self.leverage))
 
     @cached_property
     def share(self) -> Float:
-        """Weight (N,) of each used detection by which those of one star count as one."""
+        """Weight (N,) of each used detection: the inverse number of used detections of its star."""
         number = np.bincount(self.star, self.used)
         return np.asarray(1.0 / np.maximum(number, 1.0)[self.star])
 
     @cached_property
     def on_detector(self) -> tuple[Float, Float]:
-        """Score and diagonal of the curvature (N, 2) each, along the axes of the polynomials.
+        """Score and diagonal of the curvature, (N, 2) each, along the axes of the polynomials.
 
         The score is `whole_score`.
         """
@@ -116,17 +119,17 @@ class ScoredSample:
         return score, np.einsum("nba,nbc,nca->na", self.turn, matrix, self.turn)
 
     def blocks_by(self, name: str) -> list[list[Block]]:
-        """Blocks that have a code in common: 'exposure', 'frame_exposure'."""
-        found: dict[int, list[Block]] = {}
+        """Blocks grouped by the attribute `name`: 'exposure' or 'frame_exposure'."""
+        by_code: dict[int, list[Block]] = {}
         for block in self.blocks:
-            found.setdefault(getattr(block, name), []).append(block)
-        return list(found.values())
+            by_code.setdefault(getattr(block, name), []).append(block)
+        return list(by_code.values())
 
     def with_positive_curvature(self) -> ScoredSample:
-        """Sample with what is concave in the likelihood alone.
+        """Sample in which only directions with a concave log-likelihood keep their curvature.
 
-        Detections between true and false curve the wrong way; where there are many of them, their
-        sum is no information matrix.
+        Detections between true and false matches have the opposite curvature; if there are many,
+        the sum of the curvatures is not a valid information matrix.
         """
         uu, uv, vv = self.curvature
         matrix = np.stack([np.stack([uu, uv], -1), np.stack([uv, vv], -1)], -2)
@@ -140,8 +143,9 @@ def scored_sample(
 ) -> ScoredSample:
     """Sample of the detections of a table, with their scores at a solution.
 
-    The table has errors; of more than `SAMPLE` rows, every k-th is taken. `match_radius` is in the
-    unit of u and v. Raises InputError where the table does not go with the solution.
+    The table must contain errors.  Every k-th row is used if it has more than `SAMPLE` rows.
+    `match_radius` is in the unit of u and v.  Raises InputError if the table does not match the
+    solution.
     """
     table = table.sample(SAMPLE)
     by_exposure = np.argsort(table.exposure, kind="stable")
@@ -181,18 +185,21 @@ def scored_sample(
 
 
 def _from_nominal(table: Matches, rows: Int) -> Float | None:
-    """Data minus nominal positions (2, n) of some rows, where the table has them."""
+    """Data minus nominal positions (2, n) of the given rows.
+
+    None if the table has no such positions.
+    """
     nominal = _both(table.u_nominal, table.v_nominal, rows)
     return None if nominal is None else np.stack([table.u[rows], table.v[rows]]) - nominal
 
 
 def _both(u: Float | None, v: Float | None, rows: Int) -> Float | None:
-    """Two columns of a table as one array (2, n), where it has both."""
+    """Two columns of a table as one array (2, n); None if either is missing."""
     return None if u is None or v is None else np.stack([u[rows], v[rows]])
 
 
 def _blocks(stars: Stars, exposure: Int, theta: Float) -> tuple[Block, ...]:
-    """Pieces of the groups that lie in one exposure each and are not too large."""
+    """Divide groups into blocks of one exposure each, of at most `LARGEST_BLOCK` detections."""
     model, groups = stars.model, stars.groups
     effective = model.effective(theta, groups)
     jacobian = model.effective_jacobian(theta, groups)

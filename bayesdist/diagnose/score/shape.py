@@ -1,19 +1,20 @@
-"""Tests of the shape of the residuals: are they as symmetric and as round as the likelihood says?
+"""Tests of the shape of the residuals: are they as symmetric and round as the likelihood assumes?
 
-Errors that are merely larger in some parts of the data scatter the solution, which the sandwich
-covariance holds.  Residuals that are lopsided, correlated along u and v, or that have two cores, in
-ways that differ over the field, displace it: some of the stars are not where the others are.  Two
-visits that were merged without a label, blends, ghosts and charge-transfer tails look so.
+Errors that are merely larger in some parts of the data increase the scatter of the solution, and
+the sandwich covariance includes that. Residuals that are lopsided, correlated between u and v, or
+double-peaked, in ways that vary over the field, displace the solution: some stars are not where the
+others are. Visits that were merged without a label, blends, ghosts and charge-transfer tails cause
+such residuals.
 
-With residuals z in units of their errors, along the axes of the detector, and bounded weights
-w_t = exp(-|z|^2 / (2 t^2)), every sum below is zero on the mean for errors that are mixtures of
-Gaussians about the solution: normal ones, Student's t, errors quoted wrong star by star, false
-matches with a wide scatter of their own.  Nothing else is assumed of the noise; sums over the
-detections of a star are independent, and vary by their own squares.
+With residuals z in units of their errors along the detector axes, and bounded weights w_t =
+exp(-|z|^2 / (2 t^2)), every sum below has zero expectation if the errors are mixtures of Gaussians
+centred on the solution: normal errors, Student's t, errors with a wrong scale for single stars,
+false matches with a wide scatter. No other property of the noise is assumed. Sums over the
+detections of a star are independent, and their variance is estimated from their own squares.
 
-Terms of the polynomials that the model may lack, up to two orders above its own, and low terms of
-each exposure are taken from the residuals before. Where these are larger than the errors, the shape
-is not tested.
+Polynomial terms that the model may lack, up to two orders above its own, and low-order terms of
+each exposure are subtracted from the residuals first. If these exceed the errors, the shape is not
+tested.
 """
 
 from __future__ import annotations
@@ -65,35 +66,43 @@ TWO_CORES = replace(
     absent="the residuals do not have two cores",
 )
 
-# (6,) powers of the Legendre polynomials that the shape may go with: 1, X, Y, XY, X^2, Y^2
+# (6,) powers of the Legendre polynomials with which the shape may vary: 1, X, Y, XY, X^2, Y^2
 TERMS = ((0, 0), (1, 0), (0, 1), (1, 1), (2, 0), (0, 2))
-AREA = np.array([1 / ((2 * i + 1) * (2 * j + 1)) for i, j in TERMS])  # mean squares
-HIGHER = 2  # orders above the model's that are taken from the residuals
-STARS_PER_TERM = 6  # of polynomials that are taken from the residuals
-# How much smaller the residuals may be without these polynomials: where the model lacks more, their
-# shape is that of what it lacks.
+AREA = np.array([1 / ((2 * i + 1) * (2 * j + 1)) for i, j in TERMS])  # mean squares over the field
+HIGHER = 2  # orders above the model's that are subtracted from the residuals
+STARS_PER_TERM = 6  # minimum per subtracted polynomial term
+# Largest ratio of the residuals' scatter before and after the subtraction. If the model lacks more
+# than that, the shape of the residuals is the shape of the missing terms.
 MOST_MISSING = 1.3
-PASSES = 4  # of a robust fit
-RIDGE = 1e-12  # of normal equations, relative
+PASSES = 4  # iterations of a robust fit
+RIDGE = 1e-12  # of normal equations, relative to their mean diagonal
 TINY = 1e-300
 MIN_STARS = 100  # of a chip, for any test
-MIN_STARS_OF_EXPOSURE = 200  # for a test of its own
+MIN_STARS_OF_EXPOSURE = 200  # of an exposure that is tested separately
 LARGEST_LEVERAGE = 0.5
-CORE, REST = 1.3, 4.0  # reach t of the weights of the core and of the rest, in errors
-REACH = 2.5  # of the weights of correlations
-FREE = 3.0  # errors between a star and the edge of its match circle, at least
-CELLS = 16  # along each side of a chip, of which patches consist
+CORE, REST = (
+    1.3,
+    4.0,
+)  # widths t, in errors, of the weights that select the core and the remaining residuals
+REACH = 2.5  # width of the weights in the correlation test
+FREE = 3.0  # smallest distance of a star from the edge of its match circle, in errors
+CELLS = 16  # along each side of a chip; patches consist of cells
 PATCHES = (2, 3, 4, 5, 6, 8, 11, 16)  # cells along the side of a patch
 MIN_STARS_OF_PATCH = 40
-STARS_PER_CELL = 60  # of the test for two cores
+STARS_PER_CELL = 60  # in the test for two cores
 MAX_CELLS = 8
-WAVES = (2.4, 2.8, 3.2, 3.6)  # frequencies, in units of the inverse scatter along the main axis
-WAVE_REACH = 2.0  # of the weights of the test for two cores, in the same unit
+WAVES = (
+    2.4,
+    2.8,
+    3.2,
+    3.6,
+)  # angular frequencies, in units of the inverse scatter along the main axis
+WAVE_REACH = 2.0  # width of the weights of the test for two cores, in units of that scatter
 
 
 @dataclass(frozen=True, eq=False)
 class _Chip:
-    """Residuals of one chip in units of their errors, along the axes of the detector."""
+    """Residuals of one chip in units of their errors, along the detector axes."""
 
     X: Float  # (n,)
     Y: Float
@@ -101,9 +110,9 @@ class _Chip:
     inlier: Float  # (n,)
     star: Int  # (n,) codes from 0
     exposure: Int  # (n,)
-    sigma: float  # usual error along an axis, in the unit of u and v
+    sigma: float  # typical error per axis, in the unit of u and v
     size: tuple[float, float]  # pixels
-    free: float = 1.0  # degrees of freedom of the residuals, over their number
+    free: float = 1.0  # degrees of freedom of the residuals divided by their number
 
     @property
     def n_stars(self) -> int:
@@ -116,7 +125,7 @@ class _Chip:
         return _legendre(self.X, self.Y, TERMS)
 
     def at(self, rows: Int) -> _Chip:
-        """Some of the detections."""
+        """Subset of the detections."""
         return replace(
             self,
             X=self.X[rows],
@@ -128,13 +137,13 @@ class _Chip:
         )
 
     def by_exposure(self) -> Iterator[_Chip]:
-        """Detections of each exposure."""
+        """Iterate over the detections of each exposure."""
         for code in np.unique(self.exposure):
             yield self.at(np.flatnonzero(self.exposure == code))
 
 
 def shape_tests(sample: ScoredSample) -> list[Outcome]:
-    """Outcomes of the tests of skewness, of correlation and for two cores.
+    """Outcomes of the tests for skewness, correlation and two cores.
 
     Chips with fewer than `MIN_STARS` stars are left out.
     """
@@ -150,7 +159,7 @@ def shape_tests(sample: ScoredSample) -> list[Outcome]:
 
 
 def _chips(sample: ScoredSample) -> Iterator[_Chip]:
-    """Residuals of the chips that have stars enough."""
+    """Iterate over the residuals of the chips with enough stars."""
     leverage = np.broadcast_to(sample.leverage, sample.score.shape)
     usable = sample.used & (leverage.max(axis=0) < LARGEST_LEVERAGE) & (sample.inlier > 0)
     free = _free_radius(sample)
@@ -159,7 +168,7 @@ def _chips(sample: ScoredSample) -> Iterator[_Chip]:
         if len(np.unique(sample.star[rows])) < MIN_STARS:
             continue
         variance = sample.variance[:, rows] * (1.0 - leverage[:, rows])
-        # to the axes of the detector; the frames' scales are next to one
+        # rotate to the detector axes; the scale factors of the frames are close to 1
         z = sample.residual[:, rows] / np.sqrt(variance)
         z = np.einsum("nji,jn->in", _rotations(sample.turn[rows]), z)
         part = _Chip(
@@ -181,7 +190,9 @@ def _chips(sample: ScoredSample) -> Iterator[_Chip]:
         part = replace(part, z=z, free=1.0 - len(polynomial_terms(order)) / part.n_stars)
         scale = _scale(part.z, part.inlier)
         part = replace(part, z=part.z / scale, sigma=part.sigma * scale)
-        if free is not None:  # of the disc about the solution that lies in the match circle
+        if (
+            free is not None
+        ):  # radius of the disc about the solution that is entirely inside the match circle
             reach = free[rows] / (scale * np.sqrt(variance.max(axis=0)))
             part = part.at(np.flatnonzero((reach > FREE) & (np.hypot(*part.z) < reach)))
         if part.n_stars >= MIN_STARS:
@@ -189,14 +200,17 @@ def _chips(sample: ScoredSample) -> Iterator[_Chip]:
 
 
 def _free_radius(sample: ScoredSample) -> Float | None:
-    """Distance (N,) of the model's position from the edge of the match circle, if there is any."""
+    """Distance (N,) of the model's position from the edge of the match circle.
+
+    None if the sample has no match circle.
+    """
     if sample.from_nominal is None or not sample.match_radius:
         return None
     return np.asarray(sample.match_radius - np.hypot(*(sample.from_nominal - sample.residual)))
 
 
 def _rotations(turn: Float) -> Float:
-    """Rotations (n, 2, 2) that are next to linear maps (n, 2, 2)."""
+    """Rotations (n, 2, 2) nearest to linear maps (n, 2, 2)."""
     angle = np.arctan2(turn[:, 1, 0] - turn[:, 0, 1], turn[:, 0, 0] + turn[:, 1, 1])
     c, s = np.cos(angle), np.sin(angle)
     return np.stack([np.stack([c, -s], -1), np.stack([s, c], -1)], -2)
@@ -209,7 +223,7 @@ def _legendre(X: Float, Y: Float, terms: tuple[tuple[int, int], ...]) -> Float:
 
 
 def _higher_order(order: int, n_stars: int) -> int:
-    """Highest order above that of the model that so many stars determine; else the model's."""
+    """Highest order that `n_stars` stars constrain, at least the order of the model."""
     for total in range(order + HIGHER, order, -1):
         if STARS_PER_TERM * len(polynomial_terms(total)) <= n_stars:
             return total
@@ -217,7 +231,7 @@ def _higher_order(order: int, n_stars: int) -> int:
 
 
 def _without_means(chip: _Chip, order: int) -> Float:
-    """Residuals (2, n) less polynomials up to an order, and low terms of each exposure."""
+    """Residuals (2, n) minus polynomials up to `order` and low-order terms of each exposure."""
     z = _smoothed_away(_legendre(chip.X, chip.Y, polynomial_terms(order)), chip.z)
     codes, of = np.unique(chip.exposure, return_inverse=True)
     if len(codes) > 1:
@@ -232,18 +246,18 @@ def _without_means(chip: _Chip, order: int) -> Float:
 
 
 def _smoothed_away(F: Float, z: Float) -> Float:
-    """Residuals z (2, n) less their robust fit by functions F (n, K)."""
-    left, ridge = z, RIDGE * np.eye(F.shape[1])
+    """Residuals z (2, n) minus their robust fit with functions F (n, K)."""
+    remainder, ridge = z, RIDGE * np.eye(F.shape[1])
     for _ in range(PASSES):
-        weight = np.exp(-(left**2).sum(axis=0) / (2 * (REST * _scale(left)) ** 2))
+        weight = np.exp(-(remainder**2).sum(axis=0) / (2 * (REST * _scale(remainder)) ** 2))
         WF = F * weight[:, None]
         normal = WF.T @ F
-        left = z - (F @ np.linalg.solve(normal + np.trace(normal) * ridge, WF.T @ z.T)).T
-    return np.asarray(left)
+        remainder = z - (F @ np.linalg.solve(normal + np.trace(normal) * ridge, WF.T @ z.T)).T
+    return np.asarray(remainder)
 
 
 def _scale(z: Float, weight: Float | None = None) -> float:
-    """Scatter along an axis of residuals (2, n), by the weighted median of their squares."""
+    """Scatter per axis of residuals (2, n), from the weighted median of their squares."""
     square = (z**2).sum(axis=0)
     if weight is None:
         return float(np.sqrt(max(np.median(square), TINY) / (2 * np.log(2))))
@@ -254,9 +268,9 @@ def _scale(z: Float, weight: Float | None = None) -> float:
 
 
 def _displacements(z: Float) -> tuple[tuple[Float, Float], tuple[Float, Float]]:
-    """Scores (2, n) of the core and of the rest by a displacement, and their derivatives (n,).
+    """Scores of the core and of the remaining residuals with respect to a displacement.
 
-    Derivatives are averaged over both axes.
+    Returns a pair of (score (2, n), derivative (n,)); the derivatives are averaged over both axes.
     """
     square = (z**2).sum(axis=0)
     out = []
@@ -267,9 +281,10 @@ def _displacements(z: Float) -> tuple[tuple[Float, Float], tuple[Float, Float]]:
 
 
 def _skewness(chips: list[_Chip], unit: str) -> Outcome | None:
-    """Test whether the core is displaced from the rest of the residuals, as `TERMS` of position.
+    """Test whether the core is displaced from the rest of the residuals, as a function of position.
 
-    Where several exposures have stars enough, each is tested by itself as well.
+    The displacement is expanded in `TERMS`. If several exposures have enough stars, each is also
+    tested separately.
     """
     parts = [part for chip in chips if (part := _displaced(chip)) is not None]
     if not parts:
@@ -278,8 +293,8 @@ def _skewness(chips: list[_Chip], unit: str) -> Outcome | None:
     exposures = [
         part
         for chip in chips
-        for one in (chip.by_exposure() if np.ptp(chip.exposure) else ())
-        if one.n_stars >= MIN_STARS_OF_EXPOSURE and (part := _displaced(one)) is not None
+        for exposure in (chip.by_exposure() if np.ptp(chip.exposure) else ())
+        if exposure.n_stars >= MIN_STARS_OF_EXPOSURE and (part := _displaced(exposure)) is not None
     ]
     if len(exposures) > 1:
         alone = _together(exposures)
@@ -292,18 +307,21 @@ def _skewness(chips: list[_Chip], unit: str) -> Outcome | None:
 
 @dataclass(frozen=True, eq=False)
 class _Part:
-    """Statistic of one chip or exposure."""
+    """Test statistic of one chip or exposure."""
 
     statistic: float
     dof: int
     n_stars: int
-    squares: tuple[float, float]  # mean square over the field, noise included, and of the noise
+    squares: tuple[
+        float, float
+    ]  # mean square over the field, noise included, and that of the noise
 
     @classmethod
     def of(cls, change: Float, star: Int, area: Float) -> _Part | None:
-        """Of the sum of changes (n, q), whose squares over the field are weighted by area (q,).
+        """Build from the changes (n, q) that the detections contribute.
 
-        None where the changes are not independent of each other.
+        `area` (q,) weights the squares of their sums over the field. Returns None if the changes
+        are linearly dependent.
         """
         by_star = sums_over(star, change)
         total, covariance = by_star.sum(axis=0), by_star.T @ by_star
@@ -316,12 +334,12 @@ class _Part:
 
     @property
     def p_value(self) -> float:
-        """Probability of a larger statistic (Hotelling)."""
+        """Probability of a larger statistic (Hotelling's distribution)."""
         return hotelling_p(self.statistic, self.dof, self.n_stars)
 
 
 def _together(parts: list[_Part]) -> tuple[float, float, float | None, float]:
-    """Statistic, degrees of freedom, those of the residuals, and probability of all parts."""
+    """Combined statistic, degrees of freedom, residual degrees of freedom and p-value."""
     if len(parts) == 1:
         (part,) = parts
         return part.statistic, part.dof, float(part.n_stars - part.dof), part.p_value
@@ -331,7 +349,7 @@ def _together(parts: list[_Part]) -> tuple[float, float, float | None, float]:
 
 
 def _displaced(chip: _Chip) -> _Part | None:
-    """Displacement of the core from the rest of a chip's residuals, as `TERMS` of position."""
+    """Displacement of the core from the rest of a chip's residuals, expanded in `TERMS`."""
     F, change = chip.terms, np.zeros((len(chip.X), 2 * len(TERMS)))
     for sign, (score, derivative) in zip((1, -1), _displacements(chip.z), strict=True):
         try:
@@ -344,10 +362,11 @@ def _displaced(chip: _Chip) -> _Part | None:
 
 
 def _correlation(chips: list[_Chip], unit: str) -> Outcome | None:
-    """Test whether the product of both residuals goes with `TERMS` of position but the constant.
+    """Test whether the product of the residuals along both axes varies with position.
 
-    What is the same over the field displaces nothing.  The size is half the correlation, by which
-    the standard deviations along both diagonals differ from their mean.
+    The product is expanded in `TERMS` without the constant: a correlation that is constant over the
+    field displaces nothing. The size is half the correlation: the amount by which the standard
+    deviations along both diagonals differ from their mean.
     """
     parts = [part for chip in chips if (part := _correlated(chip)) is not None]
     if not parts:
@@ -374,22 +393,23 @@ def _correlated(chip: _Chip) -> _Part | None:
     part = _Part.of(F * (product - product.mean())[:, None] @ step, chip.star, AREA[1:])
     if part is None:
         return None
-    # what the fit takes from all residuals together correlates them: the variance of sums of their
-    # products is larger than the squares of these show, by the inverse of what is left
+    # The fit correlates the residuals, so that the variance of sums of their products is larger
+    # than their squares show, by the inverse of the remaining degrees of freedom per residual.
     return replace(part, statistic=part.statistic * chip.free)
 
 
 def _patch(chips: list[_Chip], unit: str) -> Outcome | None:
-    """Test for a patch of a chip whose residuals are lopsided, as a ghost makes them.
+    """Test for a patch of a chip with lopsided residuals, as caused by a ghost.
 
-    Every square of `PATCHES` cells has a statistic of its own; the largest counts as one of all.
+    Every square of `PATCHES` cells has its statistic; the p-value of the largest is multiplied by
+    their number.
     """
     worst, n_patches = None, 0
     for chip in chips:
-        found = _worst_patch(chip)
-        n_patches += found.n_patches
-        if worst is None or found.p_value < worst.p_value:
-            worst = found
+        patch = _worst_patch(chip)
+        n_patches += patch.n_patches
+        if worst is None or patch.p_value < worst.p_value:
+            worst = patch
     if worst is None or not n_patches:
         return None
     present = (
@@ -413,19 +433,21 @@ class _Patch:
     """The patch of a chip with the most lopsided residuals."""
 
     statistic: float
-    p_value: float  # by itself
+    p_value: float  # uncorrected
     n_stars: int
-    n_patches: int  # that were looked at
-    # size, middle: pixels
+    n_patches: int  # number of patches examined
+    # in pixels
     size: tuple[float, float]
     middle: tuple[float, float]
-    squares: tuple[float, float]  # mean square over the field, noise included, and of the noise
+    squares: tuple[
+        float, float
+    ]  # mean square over the field, noise included, and that of the noise
 
 
 def _worst_patch(chip: _Chip) -> _Patch:
-    core, rest = _displacements(chip.z)
-    lopsided = core[0] / core[1].mean() - rest[0] / rest[1].mean()
-    # a star counts once, at its mean position
+    core, outer = _displacements(chip.z)
+    lopsided = core[0] / core[1].mean() - outer[0] / outer[1].mean()
+    # each star counts once, at its mean position
     count = np.bincount(chip.star)
     X, Y = (np.bincount(chip.star, at) / count for at in (chip.X, chip.Y))
     u, v = sums_over(chip.star, lopsided.T).T
@@ -463,11 +485,11 @@ def _worst_patch(chip: _Chip) -> _Patch:
 
 
 def _two_cores(chips: list[_Chip], unit: str) -> Outcome | None:
-    """Test for residuals that have two cores.
+    """Test for residuals with two cores.
 
-    Of residuals t along the axis of their largest scatter, in cells of the detector, the mean of
-    exp(-t^2 / (2 r^2)) cos(k t) is positive for every mixture of Gaussians about zero, and negative
-    for two cores that are 2 pi / k apart.
+    For residuals t along the axis of their largest scatter, per cell of the detector, the mean of
+    exp(-t^2 / (2 r^2)) cos(k t) is positive for every mixture of Gaussians centred on zero, and
+    negative for two cores that are separated by 2 pi / k.
     """
     t, star, sigma, offset = [], [], [], 0
     for chip in chips:
@@ -487,7 +509,7 @@ def _two_cores(chips: list[_Chip], unit: str) -> Outcome | None:
         statistics.append(-by_star.sum() / np.sqrt((by_star**2).sum()))
     k = int(np.argmax(statistics))
     p_value = min(1.0, len(WAVES) * float(norm_sf(statistics[k])))
-    # half the distance of the cores, in units of the scatter
+    # half the separation of the cores, in units of the scatter
     half = np.pi / WAVES[k] * typical
     n = len(np.unique(all_stars))
     present = f"the residuals have two cores, some {2 * half:.2g} {unit} apart"
@@ -504,7 +526,10 @@ def _two_cores(chips: list[_Chip], unit: str) -> Outcome | None:
 
 
 def _along_main_axis(chip: _Chip) -> tuple[Float, Int]:
-    """Residuals along the axis of the largest scatter of their cell, in units of it, and rows."""
+    """Residuals along the axis of largest scatter in their cell, and their rows.
+
+    The residuals are in units of the scatter along that axis.
+    """
     side = int(np.clip(np.sqrt(chip.n_stars / STARS_PER_CELL), 1, MAX_CELLS))
     cell = cell_index(chip.X, chip.Y, (side, side))
     along, rows = [np.zeros(0)], [np.zeros(0, np.int64)]
@@ -522,7 +547,10 @@ def _along_main_axis(chip: _Chip) -> tuple[Float, Int]:
 
 
 def _smallest_half(n: int, level: float) -> float:
-    """Half the distance of two equal cores that n stars show, in units of the whole scatter."""
+    """Half the separation of two equal cores that n stars can show.
+
+    It is in units of the total scatter.
+    """
     needed = float(norm_isf(level / len(WAVES)) + norm_isf(0.1)) / np.sqrt(n / 2)
     half = np.linspace(0.5, 1.0, 51)[:, None]
     waves = np.array(WAVES)

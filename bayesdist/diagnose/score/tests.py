@@ -1,4 +1,4 @@
-"""Tests of one solution, corrected for their number."""
+"""All score tests of one solution, corrected for their number."""
 
 from __future__ import annotations
 
@@ -31,38 +31,40 @@ def score_tests(
     priors: GaussianPriors | None = None,
     match_radius: float | None = None,
 ) -> tuple[ScoreTest, ...]:
-    """Targeted tests for what a model lacks, and for noise that is not as the errors say.
+    """Test for effects that a model lacks, and for noise that differs from the stated errors.
 
-    A test is left out where the data cannot be asked: without magnitudes or dates, of one exposure,
-    with too few stars.
+    Tests that the data do not allow are left out, for example without magnitudes or dates, with a
+    single exposure, or with too few stars.
 
     Parameters
     ----------
     table : Matches
-        The matches that the solution was made from, or some of them; of more than `SAMPLE` rows,
-        every k-th is taken, and the tests are as strong as that sample is.
+        The N matches that the solution was made from, or a part of them.  If there are more than
+        `SAMPLE` rows, every k-th is used, and the power of the tests is that of this sample.
     solution : Posterior or LinearFit
+        The solution to test.
     priors : GaussianPriors, optional
-        Those of the solution; flat by default.
+        Priors of the solution; flat by default.
     match_radius : float, optional
-        Within which the stars were matched, in the unit of u and v.
+        Radius within which the stars were matched, in the unit of u and v.
 
     Returns
     -------
     tuple of ScoreTest
+        Results in a fixed order.
 
     Raises
     ------
     InputError
-        When the table does not go with the solution's model, or the solution does not say how it
-        was fitted.
+        If the table does not match the solution's model, or if the solution does not say how it was
+        fitted.
     """
     priors, mean = priors or GaussianPriors.none(solution.model), np.asarray(solution.mean, float)
     projection = projection_of(
         functions_for(scored_sample(table, solution, match_radius)), mean, priors
     )
     sample = projection.scored
-    found = [
+    outcomes = [
         truncation_test(sample, match_radius),
         radius_test(sample),
         *shape_tests(sample),
@@ -76,4 +78,4 @@ def score_tests(
         pattern_test(sample),
         ring_test(sample),
     ]
-    return corrected([one for one in found if one is not None])
+    return corrected([outcome for outcome in outcomes if outcome is not None])

@@ -1,14 +1,15 @@
-"""Tests of the match radius: residuals that end too abruptly, or elsewhere than it says.
+"""Tests of the match radius: do the residuals end too abruptly, or elsewhere than at that radius?
 
-Matching takes no pair beyond its radius.  Where that cuts into the true matches, their residuals
-are too small: the errors seem too large, chi-square is too small, and so is the scatter that
-everything else is judged by.  Errors that are merely quoted too large shrink all residuals alike;
-so the scale of the residuals is taken from themselves, and the question is how many of them should
-lie beyond the last ones that there are.
+Matching accepts no pair beyond its radius. If the radius cuts into the true matches, their
+residuals are too small: the quoted errors seem too large, chi-square is too small, and so is the
+scatter that all other results are compared with. Quoted errors that are merely too large shrink all
+residuals by the same factor. The scale of the residuals is therefore estimated from the residuals
+themselves, and the test compares the number of true matches expected beyond the outermost ones with
+the number observed there.
 
-The likelihood of false matches, and of the circle about nominal positions, takes the radius as it
-is stated.  Where matches were cut at a smaller one, false matches are missing beyond the last ones
-that there are; where they were cut at a larger one, there are matches beyond the stated radius.
+The likelihoods of false matches and of the match circle about nominal positions use the stated
+radius. If the matches were cut at a smaller radius, false matches are missing beyond the outermost
+ones; if they were cut at a larger radius, there are matches beyond the stated radius.
 """
 
 from __future__ import annotations
@@ -44,40 +45,42 @@ RADIUS = Family(
 )
 MIN_STARS = 50
 LARGEST_LEVERAGE = 0.5
-MAX_FRACTION_BEYOND = 0.25  # of the expected number: with more, nothing ends at the match radius
-STARS_PER_PART = 150  # with errors alike, from which their scatter is measured
+# of the expected number: with more, the residuals do not end at the radius
+MAX_FRACTION_BEYOND = 0.25
+STARS_PER_PART = 150  # of similar quoted errors, from which the scatter of a part is measured
 MAX_PARTS = 12
-MIN_EXPECTED = 0.5  # expected matches whose absence says nothing
-MOST_TESTS = 100  # score tests of a run, at most
-BEYOND = (0, 3)  # stars that may lie beyond a radius: the edge need not be sharp
-INSIDE = 0.9  # of the stated radius: matches that end nearer to it are not said to end elsewhere
+MIN_EXPECTED = 0.5  # with fewer expected matches, their absence is not significant
+MOST_TESTS = 100  # upper limit to the number of score tests of a run
+BEYOND = (0, 3)  # numbers of stars that may be beyond a radius: the edge need not be sharp
+INSIDE = 0.9  # of the stated radius: beyond this, matches count as ending there
 CLEAR = 4.5  # errors beyond which a match is clearly false, if errors are not larger than quoted
 MIN_FALSE = 8
-SHARE = 0.9  # of the clearly false ones, that lie within what is called their end
-FAR = 1.5  # median of their squared distances beyond those of true ones, over the largest of these:
-# that of Student's t with four degrees of freedom is 0.4
-# Without nominal positions, of which residuals are measured from others: how far beyond the stated
-# radius they may lie, in radii, and which fraction of the false ones.
+SHARE = 0.9  # fraction of the clearly false matches that defines their outer end
+# Limit to the median excess of their squared distances over the largest squared distance of true
+# matches, in units of the latter. For Student's t with four degrees of freedom it is 0.4.
+FAR = 1.5
+# Without nominal positions, residuals refer to the solution instead. NEAR: how far beyond the
+# stated radius they may extend, in radii. STRAY: fraction of the false matches that may do so.
 NEAR = 1.25
 STRAY = 0.01
 NODES, WEIGHTS = np.polynomial.hermite_e.hermegauss(15)
-ANGLES = (np.arange(8) + 0.5) * np.pi / 16  # of a quarter of the circle
+ANGLES = (np.arange(8) + 0.5) * np.pi / 16  # in the first quadrant
 
 
 @dataclass(frozen=True, eq=False)
 class _Deficit:
-    """True matches expected beyond a radius, and detections that are there."""
+    """Number of true matches expected beyond a radius, and number of detections observed there."""
 
     expected: float
     beyond: int
     radius: float
     unit: str
-    # standard deviation of the logarithm of `expected`, as the scale is not known exactly
+    # standard deviation of log(expected), due to the uncertainty of the scale
     spread: float
 
     @property
     def p_value(self) -> float:
-        """Probability of so few, over what the scale may be."""
+        """Probability of at most `beyond` matches, averaged over the uncertainty of the scale."""
         if self.expected < MIN_EXPECTED or self.beyond > MAX_FRACTION_BEYOND * self.expected:
             return 1.0
         at = self.expected * np.exp(self.spread * NODES)
@@ -87,32 +90,32 @@ class _Deficit:
 
 @dataclass(frozen=True, eq=False)
 class _Radii:
-    """Residuals in units of their own scatter."""
+    """Residuals in units of their measured scatter."""
 
     inlier: Float  # (N,) probability of being a true match
-    # (2, N) squared residuals over their quoted variance, by which they scatter as a whole
+    # (2, N) squared residuals over quoted variances, divided by their overall mean
     square: Float
-    relative: float  # relative error of that factor
+    relative: float  # relative standard error of that mean
     radius2: Float  # (N,) squared residuals of both axes, in the unit of u and v
-    part: Int  # (N,) stars of about equal quoted errors
-    # (2, P) of the residuals along each axis, in each part, given back what the fit has taken
+    part: Int  # (N,) codes of parts of the stars with similar quoted errors
+    # (2, P) variance of the residuals per axis and part, corrected for the leverage
     variance: Float
-    left: Float  # (2, P) as the fit has left it
-    relative_of: Float  # (P,) its relative error
+    left: Float  # (2, P) variance of the residuals without that correction
+    relative_of: Float  # (P,) relative standard error of the variance of each part
 
     @classmethod
     def of(cls, sample: ScoredSample, inlier: Float) -> _Radii:
-        """Residuals of a sample, its true matches by their probabilities (N,)."""
+        """Build from a sample and the probabilities (N,) that its detections are true matches."""
         n = inlier.sum()
-        # given back what the fit has taken of them
+        # corrected for the leverage of each detection
         square = sample.residual**2 / (1.0 - sample.leverage)
         part = _alike(sample.variance.sum(axis=0), inlier)
         count = np.bincount(part, inlier)
-        # not by the quoted errors of single stars: where they are wrong, those with large ones
-        # would be expected far out
+        # Measured scatter is used because quoted errors of single stars may be wrong: stars with
+        # large quoted errors would be expected far out.
         variance, left = (
-            np.stack([np.bincount(part, inlier * one) / count for one in both])
-            for both in (square, sample.residual**2)
+            np.stack([np.bincount(part, inlier * axis_square) / count for axis_square in squares])
+            for squares in (square, sample.residual**2)
         )
         excess = square.sum(axis=0) / variance.sum(axis=0)[part] - 1.0
         square = square / sample.variance
@@ -130,29 +133,32 @@ class _Radii:
         )
 
     def lost(self, end: Float) -> float:
-        """Rms scatter along an axis that was cut off; `end` (P,) as of `_lost`."""
+        """Rms scatter per axis that was cut off.
+
+        `end` (P,) is half the squared radius, as in `_lost`.
+        """
         count = np.bincount(self.part, self.inlier)
-        # where nothing is cut the largest of so many lies there
+        # without truncation the largest of this many values is expected here
         free = _lost(np.log(count.sum()))
-        excess = np.array([max(_lost(one) ** 2 - free**2, 0.0) for one in end])
+        excess = np.array([max(_lost(half_square) ** 2 - free**2, 0.0) for half_square in end])
         return float(np.sqrt(np.average(self.variance.mean(axis=0) * excess, weights=count)))
 
 
 @dataclass(frozen=True, eq=False)
 class _FalseMatches:
-    """Matches that are clearly false, by their distances from where they were looked for."""
+    """Distances of clearly false matches from the positions at which they were searched."""
 
     square: Float  # (m,) squared distances, ascending
-    hidden2: float  # squared distance up to which true ones hide them
-    gaussian: bool  # whether the likelihood takes their distances for Gaussian
+    hidden2: float  # squared distance within which true matches outnumber them
+    gaussian: bool  # True if the likelihood assumes a Gaussian distribution of their distances
 
     @classmethod
     def of(
         cls, distance: Float, residual: Float, sigma: Float, *, gaussian: bool
     ) -> _FalseMatches | None:
-        """By distances (N,), sizes of the residuals (N,) and errors along an axis (N,).
+        """Select them from distances (N,), residual sizes (N,) and errors per axis (N,).
 
-        None for fewer than `MIN_FALSE`.
+        Returns None if fewer than `MIN_FALSE` matches are clearly false.
         """
         clear = residual > CLEAR * sigma
         if clear.sum() < MIN_FALSE:
@@ -162,26 +168,29 @@ class _FalseMatches:
 
     @property
     def end2(self) -> float:
-        """Squared distance within which `SHARE` of them lie."""
+        """Squared distance within which a fraction `SHARE` of them is found."""
         return float(self.square[int(np.ceil(SHARE * len(self.square))) - 1])
 
     @property
     def numbers(self) -> tuple[int, int, float]:
-        """Numbers in the outer half of the area within the end, and beyond; where that begins."""
+        """Counts in the outer half of the area within the end and beyond the end, and a radius.
+
+        The radius, squared, is that at which the outer half begins.
+        """
         middle2 = (self.hidden2 + self.end2) / 2
         beyond = int((self.square > self.end2).sum())
         return int((self.square > middle2).sum()) - beyond, beyond, middle2
 
     def expected(self, radius: float) -> float:
-        """Number beyond the end if they are even within a radius."""
+        """Number expected beyond the end if they are uniformly distributed within `radius`."""
         outer, _, middle2 = self.numbers
         return outer * (radius**2 - self.end2) / (self.end2 - middle2)
 
     def p_value(self, radius: float) -> float:
-        """Probability of so few beyond the end if they are even within a radius.
+        """Probability of the observed number beyond the end for a uniform density within `radius`.
 
-        At least that of their distances if these are Gaussian, or a long tail of those of the true
-        ones: they become few by themselves.
+        If the distances are Gaussian, or a long tail of those of true matches, their number also
+        falls off without a cut; then the larger of both probabilities is returned.
         """
         if self.end2 > (INSIDE * radius) ** 2 or self.end2 <= self.hidden2:
             return 1.0
@@ -191,28 +200,28 @@ class _FalseMatches:
         over = self.square.clip(self.hidden2) - self.hidden2
         if not self.gaussian and np.median(over) > FAR * self.hidden2:
             return even
-        # squares of Gaussian distances are exponential, those of other tails longer
+        # squared Gaussian distances are exponential; other distributions have longer tails
         largest = -np.expm1(-over[-1] / max(float(over.mean()), 1e-300))
         return max(even, float(largest ** len(over)))
 
 
 def _weights(sample: ScoredSample) -> Float:
-    """Probabilities (N,) of true matches, those of one star divided by their number.
+    """Probabilities (N,) of true matches, divided by the number of detections of the same star.
 
-    They are 0 for residuals that the fit has taken.  Detections that share the error of one
-    reference position lie beyond a radius together, or not at all.
+    They are zero for residuals with a large leverage. Detections that share the error of one
+    reference position lie beyond a radius together or not at all, so that a star counts once.
     """
     leverage = np.broadcast_to(sample.leverage, sample.score.shape)
     return np.asarray(sample.inlier * sample.share * (leverage.max(axis=0) < LARGEST_LEVERAGE))
 
 
 def _alike(variance: Float, inlier: Float) -> Int:
-    """Parts (N,) with stars of about equal errors."""
+    """Codes (N,) of parts that contain stars of similar quoted errors."""
     n = int(np.clip(inlier.sum() // STARS_PER_PART, 1, MAX_PARTS))
     edges = np.unique(np.quantile(variance, np.linspace(0, 1, n + 1)[1:-1]))
     part = np.searchsorted(edges, variance, side="right")
     count = np.bincount(part, inlier, minlength=len(edges) + 1)
-    # what equal errors leave with few stars goes to its neighbour
+    # parts with too few stars, left by equal errors, are merged with their neighbours
     large = np.flatnonzero(count >= STARS_PER_PART / 2)
     if not len(large):
         return np.zeros(len(variance), np.int64)
@@ -220,28 +229,29 @@ def _alike(variance: Float, inlier: Float) -> Int:
 
 
 def truncation_test(sample: ScoredSample, match_radius: float | None) -> Outcome | None:
-    """Test for true matches missing beyond some radius.
+    """Test for true matches that are missing beyond some radius.
 
-    `match_radius` is in the unit of u and v. None for less than `MIN_STARS` true matches.
+    `match_radius` is in the unit of u and v. Returns None if there are fewer than `MIN_STARS` true
+    matches.
     """
     inlier = _weights(sample)
     n = float(inlier.sum())
     if n < MIN_STARS:
         return None
     radii = _Radii.of(sample, inlier)
-    found = [
+    deficits = [
         *_in_sigmas(radii),
         *_along_an_axis(radii),
         *_in_units(radii, sample.model.unit, match_radius),
     ]
-    worst = min(found, key=lambda one: (one.p_value, -one.expected))
-    both = radii.variance.sum(axis=0)
-    end = np.full(len(both), worst.radius**2 / 2)
+    worst = min(deficits, key=lambda deficit: (deficit.p_value, -deficit.expected))
+    total_variance = radii.variance.sum(axis=0)
+    end = np.full(len(total_variance), worst.radius**2 / 2)
     if worst.unit == sample.model.unit:
-        end = worst.radius**2 / both
-    sigma = float(np.sqrt(np.median(both[radii.part]) / 2))
+        end = worst.radius**2 / total_variance
+    sigma = float(np.sqrt(np.median(total_variance[radii.part]) / 2))
     chi2 = sample.residual**2 / (sample.variance * (1.0 - sample.leverage))
-    p_value = min(1.0, len(found) * worst.p_value)
+    p_value = min(1.0, len(deficits) * worst.p_value)
     present = (
         f"the residuals end too abruptly: {worst.expected:.3g} true matches are expected beyond "
         f"{worst.radius:.3g} {worst.unit}, and there are {worst.beyond}, so that the matching has "
@@ -255,15 +265,15 @@ def truncation_test(sample: ScoredSample, match_radius: float | None) -> Outcome
         None,
         p_value,
         radii.lost(end),
-        partial(_smallest, sigma, n, len(found)),
+        partial(_smallest, sigma, n, len(deficits)),
         sample.model.unit,
     )
 
 
 def radius_test(sample: ScoredSample) -> Outcome | None:
-    """Test whether the matches end at the match radius that is stated.
+    """Test whether the matches end at the stated match radius.
 
-    None without such a radius, and for less than `MIN_STARS` matches.
+    Returns None without a stated radius and for fewer than `MIN_STARS` matches.
     """
     radius = sample.match_radius
     if radius is None or len(sample) < MIN_STARS:
@@ -279,10 +289,10 @@ def radius_test(sample: ScoredSample) -> Outcome | None:
 
 
 def _ends_inside(sample: ScoredSample, radius: float) -> Outcome:
-    """Outcome of a test whose matches may end inside the stated radius."""
+    """Outcome of the test for matches that end inside the stated radius."""
     unit, n = sample.model.unit, len(sample)
     residual, sigma = np.hypot(*sample.residual), np.sqrt(sample.variance.max(axis=0))
-    # by the median: false matches pass for larger errors if the area of the circle is wrong
+    # the median, because false matches count as large errors if the circle's area is wrong
     ratio = float(np.median(residual / sigma)) / np.sqrt(2 * np.log(2))
     distance, centre, columns = residual, "the solution", ", and give u_nominal and v_nominal"
     if sample.from_nominal is not None:
@@ -320,7 +330,7 @@ def _ends_inside(sample: ScoredSample, radius: float) -> Outcome:
 
 
 def _cut_by_circle(sample: ScoredSample, distance: Float) -> _Deficit:
-    """True matches that are missing beyond the largest distances (N,) from nominal positions."""
+    """True matches missing beyond the largest distances (N,) from the nominal positions."""
     unit = sample.model.unit
     nothing = _Deficit(0.0, 0, float(distance.max()), unit, 0.0)
     if sample.from_nominal is None or sample.match_radius is None:
@@ -331,10 +341,10 @@ def _cut_by_circle(sample: ScoredSample, distance: Float) -> _Deficit:
     for k, end in _ends(distance):
         if end > INSIDE * sample.match_radius:
             continue
-        # of round Gaussians about the offsets
+        # of round Gaussians centred on the offsets
         tail = 1.0 - special.chndtr(end**2 / variance, 2, offset**2 / variance)
         total = float(sample.inlier @ tail)
-        # the logarithm of a tail goes with that of the variance by some half its square
+        # derivative of the log of the tail with respect to the log of the variance: half the square
         relative = np.sqrt(1.0 / max(float(sample.inlier.sum()), 1.0))
         slope = float(sample.inlier @ (tail * (end - offset).clip(0) ** 2 / variance)) / 2
         spread = relative * slope / max(total, 1e-300)
@@ -343,7 +353,7 @@ def _cut_by_circle(sample: ScoredSample, distance: Float) -> _Deficit:
 
 
 def _beyond_radius(sample: ScoredSample, radius: float, far: Float, p_value: float) -> Outcome:
-    """Outcome of a test that has found matches far beyond the stated radius."""
+    """Outcome of the test if matches far beyond the stated radius were found."""
     unit, n = sample.model.unit, len(sample)
     largest = float(far.max())
     present = (
@@ -360,7 +370,7 @@ def _beyond_radius(sample: ScoredSample, radius: float, far: Float, p_value: flo
 
 
 def _radius_outcome(family: Family, sample: ScoredSample, p_value: float, size: float) -> Outcome:
-    """Outcome whose size is the rms, along an axis, of the matches that are missing or astray."""
+    """Outcome with the rms per axis of the missing or stray matches as its size."""
     radius, n = float(sample.match_radius or 0.0), len(sample)
 
     def smallest(level: float) -> float:
@@ -379,13 +389,16 @@ def _radius_outcome(family: Family, sample: ScoredSample, p_value: float, size: 
 
 
 def _rounded_up(radius: float) -> str:
-    """Three digits of a radius, not below it."""
+    """Radius rounded up to three significant digits."""
     step = 10.0 ** (np.floor(np.log10(radius)) - 2)
     return f"{np.ceil(radius / step) * step:.3g}"
 
 
 def _in_sigmas(radii: _Radii) -> list[_Deficit]:
-    """Deficits by the radius in units of the errors: half its square is exponential."""
+    """Deficits in the radius in units of the errors.
+
+    Half the square of this radius is exponentially distributed.
+    """
     n = float(radii.inlier.sum())
     return [
         _Deficit(n * np.exp(-end), k, np.sqrt(2 * end), "sigma", radii.relative * end)
@@ -394,7 +407,7 @@ def _in_sigmas(radii: _Radii) -> list[_Deficit]:
 
 
 def _along_an_axis(radii: _Radii) -> list[_Deficit]:
-    """Deficits by the larger of both axes, as a match in a square leaves them."""
+    """Deficits in the larger coordinate of both axes, as matching within a square cuts it."""
     out = []
     for k, end in _ends(radii.square.max(axis=0)):
         tail = float(special.erfc(np.sqrt(end / 2)))
@@ -405,7 +418,7 @@ def _along_an_axis(radii: _Radii) -> list[_Deficit]:
 
 
 def _in_units(radii: _Radii, unit: str, match_radius: float | None) -> list[_Deficit]:
-    """Deficits by the radius itself, whatever the errors of each star are."""
+    """Deficits in the radius in the unit of u and v, independent of the errors of single stars."""
     ends = _ends(radii.radius2)
     if match_radius is not None:
         outside = int((radii.radius2 > match_radius**2).sum())
@@ -413,7 +426,7 @@ def _in_units(radii: _Radii, unit: str, match_radius: float | None) -> list[_Def
     out = []
     for k, end in ends:
         expected = np.bincount(radii.part, radii.inlier) * _tail(radii.left, end)
-        # by how much the logarithm goes with that of the variance
+        # derivative of the log of the expected number with respect to the log of the variance
         slope = end / radii.left.sum(axis=0)
         spread = np.sqrt(((expected * slope * radii.relative_of) ** 2).sum())
         total = float(expected.sum())
@@ -422,12 +435,12 @@ def _in_units(radii: _Radii, unit: str, match_radius: float | None) -> list[_Def
 
 
 def _ends(values: Float) -> list[tuple[int, float]]:
-    """Numbers of `BEYOND`, each with the limit beyond which so many values lie."""
+    """Pairs (k, limit) for each k of `BEYOND`: exactly k values exceed the limit."""
     return [(k, float(np.partition(values, -k - 1)[-k - 1])) for k in BEYOND]
 
 
 def _tail(variance: Float, radius2: float) -> Float:
-    """Probability (P,) of a residual beyond a radius, by the variances (2, P) along both axes."""
+    """Probability (P,) of a residual beyond a radius for the variances (2, P) along both axes."""
     u, v = variance
     out = np.zeros(len(u))
     for angle in ANGLES:
@@ -437,12 +450,12 @@ def _tail(variance: Float, radius2: float) -> Float:
 
 
 def _lost(end: float) -> float:
-    """Scatter along an axis that was cut off, in units of what is left.
+    """Scatter per axis that was cut off, in units of the remaining scatter.
 
-    `end` is half the square of the radius in units of the scatter that is left.
+    `end` is half the squared radius in units of the remaining scatter.
     """
-    # mean of an exponential of scale s cut at `end`: s - end / (exp(end / s) - 1) = 1
-    if end <= 2.0:  # as flat a distribution as there is
+    # mean of an exponential of scale s that is truncated at `end`: s - end / (exp(end / s) - 1) = 1
+    if end <= 2.0:  # the flattest distribution possible
         return 1.0
 
     def mean(s: float) -> float:
@@ -453,7 +466,7 @@ def _lost(end: float) -> float:
 
 
 def _smallest(sigma: float, n: float, several: int, level: float) -> float:
-    """Scatter that is lost where just so many stars are as have to be missed."""
+    """Lost scatter at which the expected number of missing stars is just significant."""
     expected = -np.log(level / several)
     if expected >= n:
         return sigma

@@ -1,1 +1,1 @@
-"""Tests of the residuals of self-calibrations, whose stars are eliminated."""
+"""Tests of the residuals of self-calibrations, with the positions of the stars eliminated."""

@@ -1,8 +1,9 @@
 """Discrepancy of a self-calibration, estimated from its residuals with the stars eliminated.
 
-As for matched stars (`diagnose.correlated.estimate`), with this difference: stars follow the common
-part of their detections, which couples axes and chips.  So the structure on all of them is one part
-of one posterior, with amplitudes and a correlation length in common.
+The method is that for matched stars (`diagnose.correlated.estimate`) with one difference: fitted
+stars follow the common displacement of their detections, which couples axes and chips.  The
+structure on all of them is therefore one part of a common posterior with the same amplitudes and
+correlation length.
 """
 
 from __future__ import annotations
@@ -33,8 +34,8 @@ from bayesdist.infer.selfcal.problem import Problem
 from bayesdist.utils.arrays import Float
 
 DRAWS = 2000
-MAX_SINES = 700  # of all axes and chips: their information is decomposed
-# of the field, in longer half sides; all equally probable beforehand
+MAX_SINES = 700  # of all axes and chips together, because their information is decomposed
+# correlation lengths of the field, in longer half sides; equal prior probabilities
 LENGTHS = np.geomspace(0.08, 0.6, 5)
 
 
@@ -47,7 +48,20 @@ def selfcal_discrepancy(
 ) -> Discrepancy:
     """Discrepancy of a self-calibration at its mode, with priors on its size.
 
-    In the gauge of the solution: parameters that it fixes have no errors.
+    The result is in the gauge of the solution: fixed parameters have no errors.
+
+    Parameters
+    ----------
+    solution : SelfCalibrationMode
+        Mode of the self-calibration.
+    rng : numpy.random.Generator
+        Source of random numbers.
+    priors : DiscrepancyPriors, optional
+        Prior medians of the sizes.
+
+    Returns
+    -------
+    Discrepancy
     """
     priors, model = priors or DiscrepancyPriors(), solution.problem.model
     working = scores_of_detections(solution)
@@ -55,40 +69,42 @@ def selfcal_discrepancy(
     cov = solution.cov
     noise, ratio = not_narrower(squared_scores(solution, working).by_evidence, cov)
 
-    some = EvenStars.of(solution)
-    flat, working = flat.at(some.rows), working.at(some.rows)
-    functions, deviations = _functions(some.problem), some.deviations
-    columns = Columns(some.problem, solution.theta, functions, deviations)
-    N, score, taken = eliminated(columns, flat, some.stars, working=working)
-    left = without_parameters(solution, N, score)
-    S, score = left.information, left.score
-    # effect of a unit of each function on the fit of all detections
-    D, all_of_them = model.n_params, len(solution.problem) / len(some.problem)
-    taken = cov @ taken[:, D:] * all_of_them
+    star_subset = EvenStars.of(solution)
+    flat, working = flat.at(star_subset.rows), working.at(star_subset.rows)
+    functions, deviations = _functions(star_subset.problem), star_subset.deviations
+    columns = Columns(star_subset.problem, solution.theta, functions, deviations)
+    N, score, response = eliminated(columns, flat, star_subset.stars, working=working)
+    efficient = without_parameters(solution, N, score)
+    S, score = efficient.information, efficient.score
+    # effect of a unit of each function on the fit to all detections
+    D, all_of_them = model.n_params, len(solution.problem) / len(star_subset.problem)
+    response = cov @ response[:, D:] * all_of_them
 
     m = 2 * sum(f.n_known for f in functions.values())
-    found, theta, sizes = _structure(
-        solution, functions, (S[:m, :m], score[:m], taken[:, :m]), priors, rng
+    structures, theta, sizes = _structure(
+        solution, functions, (S[:m, :m], score[:m], response[:, :m]), priors, rng
     )
     facts: dict[str, object] = {"structure": sizes, "unit": model.unit, "noise_ratio": ratio}
-    facts["structure_correlation"] = structure_correlation(model, found, theta)
+    facts["structure_correlation"] = structure_correlation(model, structures, theta)
     linear = None
     if deviations is not None:
-        linear = deviation_draws(deviations, S[m:, m:], score[m:], taken[:, m:], priors, DRAWS, rng)
+        linear = deviation_draws(
+            deviations, S[m:, m:], score[m:], response[:, m:], priors, DRAWS, rng
+        )
         facts |= linear.facts
         if linear.outlying:
             facts["exposures_outlying"] = [model.exposures[code] for code in linear.outlying]
     if model.frames != "affine" and not (linear and linear.scatter):
         facts["exposures_measured"] = False
-    return Discrepancy(model, solution.theta, cov, noise, found, theta, linear, facts)
+    return Discrepancy(model, solution.theta, cov, noise, structures, theta, linear, facts)
 
 
 def _functions(problem: Problem) -> dict[int, StructureFunctions]:
-    """Functions on each chip (by code) that has detections."""
+    """Structure functions of each chip (by code) that has detections."""
     model = problem.model
     n = np.bincount(problem.groups.chip[problem.groups.index], minlength=len(model.chips))
     used = np.flatnonzero(n)
-    # sines in a circle of frequencies: a side squared, times pi / 4
+    # sines within a circle of frequencies: side squared, times pi / 4
     side = np.sqrt(MAX_SINES / (2 * len(used)) / (np.pi / 4))
     out = {}
     for code in used:
@@ -110,9 +126,9 @@ def _structure(
     """Structure by chip number, its effect on the parameters (DRAWS, D), and its sizes."""
     problem, model = solution.problem, solution.problem.model
     pixel = model.pixel_size(solution.theta)
-    S, score, taken = sums
+    S, score, response = sums
     posterior = structure_posterior(
-        [[one for one in functions.values() for _ in "uv"]],
+        [[chip_functions for chip_functions in functions.values() for _ in "uv"]],
         [S],
         [score],
         noise=pixel * float(np.sqrt(np.median(problem.var) + solution.mixture.jitter**2)),
@@ -120,14 +136,14 @@ def _structure(
         structure=priors.structure * pixel,
         lengths=LENGTHS,
     )
-    waves = {code: one.finer_waves(rng) for code, one in functions.items()}
+    waves = {code: chip_functions.finer_waves(rng) for code, chip_functions in functions.items()}
     drawn = posterior.draws(DRAWS, rng, [[w for w in waves.values() for _ in "uv"]])
-    out, rows, known = dict[int, ChipStructure](), list[dict[str, object]](), []
-    for k, (code, one) in enumerate(functions.items()):
+    out, rows, coefficients = dict[int, ChipStructure](), list[dict[str, object]](), []
+    for k, (code, chip_functions) in enumerate(functions.items()):
         chip, pair = model.chips[code], drawn[2 * k : 2 * k + 2]
-        found = ChipStructure(one, waves[code], np.stack(pair, axis=1))
-        rows += found.sizes(chip, posterior.length)
-        out[chip.number] = found
-        known += [axis[:, : one.n_known] for axis in pair]
-    # the fit absorbs structure into polynomials; the truth lies on the other side
-    return out, -np.concatenate(known, axis=1) @ taken.T, rows
+        chip_structure = ChipStructure(chip_functions, waves[code], np.stack(pair, axis=1))
+        rows += chip_structure.sizes(chip, posterior.length)
+        out[chip.number] = chip_structure
+        coefficients += [axis[:, : chip_functions.n_known] for axis in pair]
+    # the fit absorbs structure into polynomials, so that its error has the opposite sign
+    return out, -np.concatenate(coefficients, axis=1) @ response.T, rows

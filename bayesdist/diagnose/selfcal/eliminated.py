@@ -1,14 +1,15 @@
-"""Information and scores of parameters and of further functions, with the stars eliminated.
+"""Information and scores of parameters and added functions, with the stars eliminated.
 
-A detection is displaced by the parameters, by functions over its chip and by deviations of its
-exposure; its star follows.  With Z the derivatives of positions by all of these, S those by a
-star's own parameters, H the curvature and g the gradient of each detection,
+The parameters, functions over a chip, and deviations of an exposure displace its detections, and
+the fitted positions of stars follow.  Let Z and S be the derivatives of positions with respect to
+all these columns and to a star's parameters, and H and g the curvature and gradient of each
+detection.  Then
 
     N = sum Z^T H Z - sum_s T^T A^-1 T        T = sum S^T H Z,  A = sum S^T H S + prior
     score = sum Z^T g - sum_s T^T A^-1 b      b = sum S^T g - pull of the prior
 
-where the second sums go over the stars, and those within over the detections of each.  Polynomials
-and functions over a chip are dense columns, parameters of single exposures sparse ones.
+where the sums over s include all stars, and those within T, A and b the detections of a star.
+Polynomials and functions over a chip are dense columns, parameters of single exposures sparse ones.
 """
 
 from __future__ import annotations
@@ -36,17 +37,17 @@ from bayesdist.infer.selfcal.mode import SelfCalibrationMode
 from bayesdist.infer.selfcal.problem import Problem
 from bayesdist.utils.arrays import Bool, Float, Int
 
-DETECTIONS = 8192  # in memory at a time
-MAX_DETECTIONS = 60_000  # that are looked at
-MAX_EXPOSURES = 150  # whose single deviations are looked at
+DETECTIONS = 8192  # per chunk in memory
+MAX_DETECTIONS = 60_000  # largest number that is examined
+MAX_EXPOSURES = 150  # largest number of exposures with separate deviations
 
 
 @dataclass(frozen=True, eq=False)
 class Columns:
     """Displacements of detections by parameters, functions over chips and deviations of exposures.
 
-    In this order they are the columns of all matrices; functions of one chip after the other, those
-    along u before those along v.  `functions` are by the code of a chip; none by default.
+    This is the order of the columns in all matrices.  Functions are sorted by chip, those along u
+    before those along v.  `functions` maps chip codes to functions; it is empty by default.
     """
 
     problem: Problem
@@ -56,7 +57,7 @@ class Columns:
 
     @cached_property
     def structure(self) -> PlaceDerivatives:
-        """Dependence of positions on the parameters."""
+        """Derivatives of positions with respect to the parameters."""
         return PlaceDerivatives.at(self.problem, self.theta)
 
     @property
@@ -65,11 +66,11 @@ class Columns:
         return self.problem.model.n_params
 
     def n_functions(self, chip: int) -> int:
-        """Number of functions over a chip (by code), along one axis."""
+        """Number of functions over a chip (by code) along one axis."""
         return self.functions[chip].n_known if chip in self.functions else 0
 
     def values(self, chip: int, rows: Int) -> Float:
-        """Values (n, n_functions) of the functions at some detections on the chip."""
+        """Values (n, n_functions) of the functions at detections on the chip."""
         if chip not in self.functions:
             return np.zeros((len(rows), 0))
         return self.functions[chip].evaluate(self.problem.X[rows], self.problem.Y[rows])
@@ -82,9 +83,9 @@ class Columns:
 
     @cached_property
     def n_sparse(self) -> int:
-        """Number of parameters that are no polynomials, and of deviations."""
-        others = self.n_params - self.problem.model.n_polynomial
-        return others + (0 if self.deviations is None else len(self.deviations))
+        """Number of deviations, and of parameters that are not polynomial coefficients."""
+        non_polynomial = self.n_params - self.problem.model.n_polynomial
+        return non_polynomial + (0 if self.deviations is None else len(self.deviations))
 
     def dense(self, chip: int, axis: int) -> slice:
         """Internal slice of the dense columns of a chip and axis: polynomials, then functions."""
@@ -102,14 +103,21 @@ class Columns:
         """Internal index of each column."""
         K, chips = self.problem.model.n_terms, range(len(self.widths))
         inside = [np.arange(self.sparse.stop)[self.dense(c, a)] for c in chips for a in (0, 1)]
-        others = np.arange(self.sparse.start, self.sparse.stop)
+        sparse_columns = np.arange(self.sparse.start, self.sparse.stop)
         n = self.n_params - self.problem.model.n_polynomial
-        parts = [*(one[:K] for one in inside), others[:n], *(one[K:] for one in inside)]
-        return np.concatenate([*parts, others[n:]])
+        parts = [
+            *(columns[:K] for columns in inside),
+            sparse_columns[:n],
+            *(columns[K:] for columns in inside),
+        ]
+        return np.concatenate([*parts, sparse_columns[n:]])
 
     @cached_property
     def centre(self) -> Float:
-        """Mean position of the exposures along the axes of the polynomials; 0 if none deviate."""
+        """Mean position of the exposures along the polynomial axes.
+
+        0 without deviations of exposures.
+        """
         if self.deviations is None:
             return np.zeros(2)
         p, out = self.problem, []
@@ -122,45 +130,46 @@ class Columns:
 
 @dataclass(frozen=True, eq=False)
 class EvenStars:
-    """Some stars of a solution, or all; a part of them is less informative, and unbiased."""
+    """All stars of a solution, or an unbiased subset."""
 
-    rows: Bool  # (N,) of their detections, among those of all stars
+    rows: Bool  # (N,) mask of their detections among those of all stars
     problem: Problem
     stars: Float  # (S, q)
-    deviations: DeviationColumns | None  # of their exposures
+    deviations: DeviationColumns | None  # deviations of their exposures
 
     @classmethod
     def of(cls, solution: SelfCalibrationMode) -> EvenStars:
-        """All stars, or every k-th, so that there are no more detections than `MAX_DETECTIONS`."""
-        whole = solution.problem
-        some = np.arange(0, whole.n_stars, int(np.ceil(len(whole) / MAX_DETECTIONS)))
-        problem = whole.of_stars(some)
+        """Select every k-th star, such that there are at most `MAX_DETECTIONS` detections."""
+        all_stars = solution.problem
+        selected = np.arange(0, all_stars.n_stars, int(np.ceil(len(all_stars) / MAX_DETECTIONS)))
+        problem = all_stars.of_stars(selected)
         groups = problem.groups
         counts = np.bincount(groups.index, minlength=len(groups)).astype(float)
         deviations = deviation_columns(
-            whole.model, solution.theta, groups, counts, most=MAX_EXPOSURES
+            all_stars.model, solution.theta, groups, counts, most=MAX_EXPOSURES
         )
-        return cls(np.isin(whole.star, some), problem, solution.stars[some], deviations)
+        return cls(np.isin(all_stars.star, selected), problem, solution.stars[selected], deviations)
 
 
 @dataclass(frozen=True, eq=False)
 class Piece:
-    """Some stars with their n detections, displaced along the axes of the polynomials."""
+    """A chunk of stars with their n detections, displaced along the axes of the polynomials."""
 
-    stars: slice  # in the problem
-    rows: slice  # of the detections, in the problem
-    star: Int  # which of these stars each detection (n,) belongs to
-    by_star: Float  # derivatives (n, 2, q) of positions by the parameters of their stars
-    frame: Float  # matrix (n, 2, 2) from the axes of the polynomials to those of the sky
-    # for each chip, the detections on it, and the values of its columns
+    stars: slice  # range of stars in the problem
+    rows: slice  # range of their detections in the problem
+    star: Int  # (n,) index of each detection's star in the chunk
+    # (n, 2, q) derivatives of positions with respect to the parameters of their stars
+    by_star: Float
+    frame: Float  # (n, 2, 2) matrix from the axes of the polynomials to those of the sky
+    # for each chip, the indices of its detections and the values of its columns
     dense: tuple[tuple[Int, Float], ...]
-    sparse: csr_array  # displacements along both axes, in turn (2 n, n_sparse)
+    sparse: csr_array  # (2 n, n_sparse) displacements along both axes in turn
 
     def scores(self, every: DetectionScores) -> DetectionScores:
         """Scores of these detections along the axes of the polynomials."""
-        some = every.at(self.rows)
-        gradient = np.einsum("nab,na->nb", self.frame, some.gradient)
-        return DetectionScores(gradient, self.frame.mT @ some.curvature @ self.frame)
+        in_piece = every.at(self.rows)
+        gradient = np.einsum("nab,na->nb", self.frame, in_piece.gradient)
+        return DetectionScores(gradient, self.frame.mT @ in_piece.curvature @ self.frame)
 
     def __len__(self) -> int:
         return len(self.star)
@@ -175,7 +184,7 @@ class Piece:
 
 
 def pieces(columns: Columns) -> Iterator[Piece]:
-    """Iterator over the detections in chunks of some stars."""
+    """Iterate over the detections in chunks of stars."""
     p, structure = columns.problem, columns.structure
     n_sparse_params = columns.n_params - p.model.n_polynomial
     bases = [p.model.basis(chip.number) for chip in p.model.chips]
@@ -189,23 +198,25 @@ def pieces(columns: Columns) -> Iterator[Piece]:
         phi = np.empty((n, p.model.n_terms))
         dense = []
         for code, basis in enumerate(bases):
-            here = np.flatnonzero(chip == code)
-            phi[here] = basis.evaluate_scaled(p.X[rows][here], p.Y[rows][here])
-            more = columns.values(code, rows.start + here)
-            dense.append((here, np.concatenate([phi[here], more], axis=1)))
+            members = np.flatnonzero(chip == code)
+            phi[members] = basis.evaluate_scaled(p.X[rows][members], p.Y[rows][members])
+            added = columns.values(code, rows.start + members)
+            dense.append((members, np.concatenate([phi[members], added], axis=1)))
         entries = []
         back = np.linalg.inv(structure.linear)
         for g in np.unique(group):
-            here = np.flatnonzero(group == g)
+            members = np.flatnonzero(group == g)
             # parameters of exposures and drifts
             used = np.flatnonzero(structure.columns[g] >= 0)
-            values = np.einsum("mak,nk->nam", back[g] @ structure.extra[g][used], phi[here])
+            values = np.einsum("mak,nk->nam", back[g] @ structure.extra[g][used], phi[members])
             moved = [(structure.columns[g][used] - p.model.n_polynomial, values)]
             if columns.deviations is not None:
                 place = int(p.groups.chip[g]), float(p.groups.epoch[g])
-                which, values = columns.deviations.at(int(g), *place, phi[here], columns.centre)
-                moved.append((n_sparse_params + which, values))
-            row = 2 * here[:, None, None] + np.arange(2)[:, None]
+                indices, values = columns.deviations.at(
+                    int(g), *place, phi[members], columns.centre
+                )
+                moved.append((n_sparse_params + indices, values))
+            row = 2 * members[:, None, None] + np.arange(2)[:, None]
             for at, values in moved:
                 parts = (values, row, at)
                 entries.append([np.broadcast_to(part, values.shape).ravel() for part in parts])
@@ -219,16 +230,16 @@ def pieces(columns: Columns) -> Iterator[Piece]:
 
 @dataclass(frozen=True, eq=False)
 class Absorbed:
-    """Parts of the information and score of a piece that its stars absorb."""
+    """Contributions to the information and score of a chunk that its stars absorb."""
 
-    rows: Float  # A^-1/2 T (S q, columns), by internal columns
-    right: Float  # A^-1/2 b (S q,)
+    rows: Float  # (S q, columns) A^-1/2 T, with internal columns
+    right: Float  # (S q,) A^-1/2 b
 
 
 def without_parameters(solution: SelfCalibrationMode, N: Float, score: Float) -> EfficientScore:
-    """Columns other than the parameters, these eliminated as free in the solution, with its priors.
+    """Columns other than the parameters, with the free parameters eliminated.
 
-    N and `score` are those of `eliminated`.
+    The priors of the solution are included.  For N and `score` see `eliminated`.
     """
     D, prior = len(solution.theta), solution.prior
     free = np.ix_(solution.free, solution.free)
@@ -242,22 +253,25 @@ def without_parameters(solution: SelfCalibrationMode, N: Float, score: Float) ->
 def absorbed_by_stars(
     columns: Columns, piece: Piece, scores: DetectionScores, stars: Float
 ) -> Absorbed:
-    """Sums over the detections of each star of a piece, the stars (S, q) where the scores are."""
+    """Sums over the detections of each star of a chunk.
+
+    `stars` (S, q) are the parameters of the stars.
+    """
     priors = columns.problem.priors
     precision = priors.precision[piece.stars]
     pull = np.einsum("skq,sq->sk", precision, priors.centre[piece.stars] - stars[piece.stars])
     S, q = pull.shape
     S_H = np.swapaxes(piece.by_star, 1, 2) @ scores.curvature  # (n, q, 2)
-    own = precision + sums_over(piece.star, S_H @ piece.by_star, S)
+    information = precision + sums_over(piece.star, S_H @ piece.by_star, S)
     gradient = np.einsum("naq,na->nq", piece.by_star, scores.gradient)
     b = sums_over(piece.star, gradient, S) - pull
     T = np.zeros((S * q, columns.sparse.stop))
-    for code, (here, values) in enumerate(piece.dense):
+    for code, (members, values) in enumerate(piece.dense):
         for axis in (0, 1):
-            summed = piece.of_stars(S_H[:, :, axis, None])[:, here] @ values
+            summed = piece.of_stars(S_H[:, :, axis, None])[:, members] @ values
             T[:, columns.dense(code, axis)] = summed
     T[:, columns.sparse] = (piece.of_stars(S_H) @ piece.sparse).toarray()
-    roots = inverse_roots(own)
+    roots = inverse_roots(information)
     rows = np.reshape(roots @ T.reshape(S, q, -1), (S * q, -1))
     return Absorbed(rows, np.ravel(np.einsum("skq,sq->sk", roots, b)))
 
@@ -269,10 +283,10 @@ def eliminated(
     *,
     working: DetectionScores | None = None,
 ) -> tuple[Float, Float, Float]:
-    """Information (n, n) and score (n,) of all columns with the stars (S, q) eliminated.
+    """Information (n, n) and score (n,) of all columns, with the stars (S, q) eliminated.
 
-    The third result (D, n) is the information of parameters and all columns by the `working`
-    likelihood, that of the solution, where it differs from that of the scores.
+    The third result (D, n) is the information between parameters and all columns according to the
+    `working` likelihood, that of the solution, if it differs from the likelihood of the scores.
     """
     p, n = columns.problem, columns.sparse.stop
     total, score = np.zeros((n, n)), np.zeros(n)
@@ -287,46 +301,46 @@ def eliminated(
             np.arange(columns.sparse.start, columns.sparse.start + narrow.n_sparse),
         ]
     )
-    other = np.zeros((len(inside), n))
+    by_working = np.zeros((len(inside), n))
     for piece in pieces(columns):
-        here = piece.scores(scores)
-        sums = absorbed_by_stars(columns, piece, here, stars)
-        add_products(total, columns, columns, piece, here.curvature)
+        piece_scores = piece.scores(scores)
+        sums = absorbed_by_stars(columns, piece, piece_scores, stars)
+        add_products(total, columns, columns, piece, piece_scores.curvature)
         total -= sums.rows.T @ sums.rows
-        score += _pulled(columns, piece, here.gradient) - sums.rows.T @ sums.right
+        score += _pulled(columns, piece, piece_scores.gradient) - sums.rows.T @ sums.right
         if working is not None:
-            here = piece.scores(working)
-            sums = absorbed_by_stars(columns, piece, here, stars)
-            add_products(other, narrow, columns, piece, here.curvature)
-            other -= sums.rows[:, inside].T @ sums.rows
+            piece_scores = piece.scores(working)
+            sums = absorbed_by_stars(columns, piece, piece_scores, stars)
+            add_products(by_working, narrow, columns, piece, piece_scores.curvature)
+            by_working -= sums.rows[:, inside].T @ sums.rows
     if working is None:
-        other = total[inside]
+        by_working = total[inside]
     total = total[np.ix_(columns.order, columns.order)]
-    return (total + total.T) / 2, score[columns.order], other[narrow.order][:, columns.order]
+    return (total + total.T) / 2, score[columns.order], by_working[narrow.order][:, columns.order]
 
 
 def add_products(N: Float, left: Columns, right: Columns, piece: Piece, H: Float) -> None:
-    """Add Z^T H Z of a piece to N, by internal columns; `left` may lack the dense functions."""
-    n, others = len(piece), left.n_sparse
+    """Add Z^T H Z of a chunk to N, with internal columns; `left` may lack the dense functions."""
+    n, n_left_sparse = len(piece), left.n_sparse
     across = np.arange(2 * n).reshape(n, 2)
-    for code, (here, values) in enumerate(piece.dense):
-        some = values[:, : left.widths[code]]
+    for code, (members, values) in enumerate(piece.dense):
+        left_values = values[:, : left.widths[code]]
         for a in (0, 1):
-            # of dense columns along the axis a with the sparse ones
+            # products of dense columns along the axis a with the sparse columns
             turn = csr_array(
                 (
-                    H[here, :, a].ravel(),
-                    (np.repeat(np.arange(len(here)), 2), across[here].ravel()),
+                    H[members, :, a].ravel(),
+                    (np.repeat(np.arange(len(members)), 2), across[members].ravel()),
                 ),
-                shape=(len(here), 2 * n),
+                shape=(len(members), 2 * n),
             )
             moved = (turn @ piece.sparse).T.tocsr()
-            N[left.dense(code, a), right.sparse] += (moved @ some).T
-            N[left.sparse, right.dense(code, a)] += (moved @ values)[:others]
+            N[left.dense(code, a), right.sparse] += (moved @ left_values).T
+            N[left.sparse, right.dense(code, a)] += (moved @ values)[:n_left_sparse]
             for b in (0, 1):
                 if left is right and b < a:
                     continue
-                product = some.T @ (H[here, a, b, None] * values)
+                product = left_values.T @ (H[members, a, b, None] * values)
                 N[left.dense(code, a), right.dense(code, b)] += product
                 if left is right and b > a:
                     N[left.dense(code, b), right.dense(code, a)] += product.T
@@ -334,14 +348,16 @@ def add_products(N: Float, left: Columns, right: Columns, piece: Piece, H: Float
         (H.ravel(), (np.repeat(across, 2), np.repeat(across, 2, axis=0).ravel())),
         shape=(2 * n, 2 * n),
     )
-    N[left.sparse, right.sparse] += (piece.sparse.T @ (blocks @ piece.sparse)).toarray()[:others]
+    N[left.sparse, right.sparse] += (piece.sparse.T @ (blocks @ piece.sparse)).toarray()[
+        :n_left_sparse
+    ]
 
 
 def _pulled(columns: Columns, piece: Piece, gradient: Float) -> Float:
-    """Sums (n,) of Z^T g over a piece, by internal columns."""
+    """Sums (n,) of Z^T g over a chunk, with internal columns."""
     out = np.zeros(columns.sparse.stop)
-    for code, (here, values) in enumerate(piece.dense):
+    for code, (members, values) in enumerate(piece.dense):
         for axis in (0, 1):
-            out[columns.dense(code, axis)] = values.T @ gradient[here, axis]
+            out[columns.dense(code, axis)] = values.T @ gradient[members, axis]
     out[columns.sparse] = piece.sparse.T @ gradient.ravel()
     return out

@@ -1,4 +1,4 @@
-"""Covariance of a self-calibration by the scatter of its detections, star by star."""
+"""Covariance of a self-calibration from the scatter of the scores of its stars."""
 
 from __future__ import annotations
 
@@ -12,10 +12,12 @@ from bayesdist.utils.arrays import Float
 
 
 def squared_scores(solution: SelfCalibrationMode, scores: DetectionScores) -> SquaredScores:
-    """Sums over the stars of products of their scores, and what is expected; 0 if fixed.
+    """Sums over the stars of products of their scores, and their expectation.
 
-    The detections of a star share its position, so that their scores are added up.  The leverage is
-    that of the star's detections, per degree of freedom in excess of the star's own parameters.
+    0 for fixed parameters.
+
+    The detections of a star share its position, so that their scores are summed.  The leverage is
+    that of the star's detections per degree of freedom, beyond the star's parameters.
     """
     p, free = solution.problem, solution.free
     columns = Columns(p, solution.theta)
@@ -26,19 +28,23 @@ def squared_scores(solution: SelfCalibrationMode, scores: DetectionScores) -> Sq
     unbiased, jackknife = np.zeros((2, columns.n_params, columns.n_params))
     products = np.zeros(3)
     for piece in pieces(columns):
-        here = piece.scores(scores)
-        sums = absorbed_by_stars(columns, piece, here, solution.stars)
+        piece_scores = piece.scores(scores)
+        sums = absorbed_by_stars(columns, piece, piece_scores, solution.stars)
         S, q = piece.stars.stop - piece.stars.start, p.n_star
         moved = _displacements(columns, piece, inside)
-        whole = np.einsum("nab,naf,nbf->n", here.curvature, moved, moved, optimize=True)
-        leverage = np.bincount(piece.star, whole, S)
+        total_leverage = np.einsum(
+            "nab,naf,nbf->n", piece_scores.curvature, moved, moved, optimize=True
+        )
+        leverage = np.bincount(piece.star, total_leverage, S)
         leverage -= np.sum((sums.rows @ inside) ** 2, axis=1).reshape(S, q).sum(axis=1)
-        number = np.maximum(2 * np.bincount(piece.star, here.curvature[:, 0, 0] > 0, S) - q, 1)
+        number = np.maximum(
+            2 * np.bincount(piece.star, piece_scores.curvature[:, 0, 0] > 0, S) - q, 1
+        )
         mean = np.clip(leverage / number, 0.0, 1 - MIN_FREE)
-        psi = star_scores(columns, piece, here.gradient) / np.sqrt(1 - mean)[:, None]
+        psi = star_scores(columns, piece, piece_scores.gradient) / np.sqrt(1 - mean)[:, None]
         unbiased += psi.T @ psi
         square = np.sum((psi @ root) ** 2, axis=1)
-        # a star's expected squares are taken to be the same in all of its degrees of freedom
+        # expected squares of a star are assumed equal for all its degrees of freedom
         products += [square @ square, square @ mean, leverage @ mean]
         psi /= np.sqrt(1 - mean)[:, None]
         jackknife += psi.T @ psi
@@ -56,26 +62,27 @@ def squared_scores(solution: SelfCalibrationMode, scores: DetectionScores) -> Sq
 
 
 def star_scores(columns: Columns, piece: Piece, gradient: Float) -> Float:
-    """Scores (S, n) of each star of a piece, by all columns.
+    """Scores (S, n) of each star of a chunk with respect to all columns.
 
-    At the stars' modes: their own parameters have no gradient, and nothing is to be eliminated.
+    Stars are at their modes: the gradient with respect to their parameters is zero, so that nothing
+    needs to be eliminated.
     """
     S = piece.stars.stop - piece.stars.start
     out = np.zeros((S, columns.sparse.stop))
-    # one value for each star
-    for code, (here, values) in enumerate(piece.dense):
+    # one value per star
+    for code, (members, values) in enumerate(piece.dense):
         for axis in (0, 1):
-            summed = piece.of_stars(gradient[:, None, axis, None])[:, here] @ values
+            summed = piece.of_stars(gradient[:, None, axis, None])[:, members] @ values
             out[:, columns.dense(code, axis)] = summed
     out[:, columns.sparse] = (piece.of_stars(gradient[:, None, :]) @ piece.sparse).toarray()
     return out[:, columns.order]
 
 
 def _displacements(columns: Columns, piece: Piece, root: Float) -> Float:
-    """Displacements (n, 2, f) of detections by some changes (internal columns, f)."""
+    """Displacements (n, 2, f) of detections due to changes `root` (internal columns, f)."""
     out = np.zeros((len(piece), 2, root.shape[1]))
-    for code, (here, values) in enumerate(piece.dense):
+    for code, (members, values) in enumerate(piece.dense):
         for axis in (0, 1):
-            out[here, axis] = values @ root[columns.dense(code, axis)]
+            out[members, axis] = values @ root[columns.dense(code, axis)]
     out += (piece.sparse @ root[columns.sparse]).reshape(out.shape)
     return np.asarray(out)

@@ -1,9 +1,9 @@
 """Score tests of self-calibrations: what a model lacks, with the stars eliminated.
 
-The questions are those to matched stars (`diagnose.score.questions`), with the positions of stars
-among the parameters that are projected out, and with the scores of a star's detections added up.
-What stars take up cannot be tested: directions in which known stars would say much more are left
-out.
+The questions are those for matched stars (`diagnose.score.questions`).  The positions of stars are
+among the parameters that are projected out, and the scores of a star's detections are summed.
+Effects that the stars absorb cannot be tested: directions that would be far better determined if
+the stars were known are left out.
 """
 
 from __future__ import annotations
@@ -41,9 +41,9 @@ from bayesdist.infer.selfcal.mode import SelfCalibrationMode
 from bayesdist.infer.selfcal.problem import Problem
 from bayesdist.utils.arrays import Bool, Float, Int
 
-STARS_PER_DIRECTION = 2  # below, a covariance of the scores says nothing
-MIN_INFORMATION = 0.02  # of a direction, relative to that with known stars
-UNDITHERED = 1e-3  # of half a side: offsets that say nothing
+STARS_PER_DIRECTION = 2  # with fewer, the covariance of the scores is meaningless
+MIN_INFORMATION = 0.02  # of a direction, relative to that for known stars
+UNDITHERED = 1e-3  # of half a side: smaller pointing offsets do not constrain the pointing test
 EXPOSURES_OF_SELFCAL = replace(
     EXPOSURES, remedy="give selfcal.frames a scale where it has none, or leave out exposures"
 )
@@ -65,11 +65,11 @@ class _AddedColumns(Columns):
         return self.added.n_added
 
     def values(self, chip: int, rows: Int) -> Float:
-        """Values (n, n_functions) of these."""
+        """Values (n, n_functions) of these functions."""
         return self.added.at(rows)[self.problem.model.n_terms :].T
 
     def along_axes(self, functions: Int) -> Int:
-        """Columns of some functions: those of one chip after the other, along u and v in turn."""
+        """Columns of the given functions, chip by chip, along u and v in turn."""
         n, chips = self.n_functions(0), np.arange(len(self.problem.model.chips))
         first = functions - self.problem.model.n_terms
         return np.ravel(2 * n * chips[:, None, None] + first[:, None] + [0, n])
@@ -83,11 +83,11 @@ class _AddedColumns(Columns):
 
 @dataclass(frozen=True, eq=False)
 class _Sums:
-    """Information and score of the further columns of a problem."""
+    """Information and score of the columns that are added to the parameters."""
 
-    known: Float  # (n, n) information if stars and parameters were known
+    known: Float  # (n, n) information for known stars and parameters
     left: EfficientScore
-    covariance: Float  # (n, n) of the score, by the scores of single stars
+    covariance: Float  # (n, n) of the score, from the scores of single stars
     square: Float  # (n, n) mean products of displacements over the detections
     n_stars: int
     unit: str
@@ -100,61 +100,81 @@ def selfcal_score_tests(
     colour: Float | None = None,
     epoch: Float | None = None,
 ) -> tuple[ScoreTest, ...]:
-    """Targeted tests of a self-calibration for what its model lacks, and for its noise.
+    """Test a self-calibration for effects that its model lacks, and for unexpected noise.
 
-    A test is left out where the data cannot be asked.  `mag`, `colour` and `epoch` (N,) are those
-    of each detection of its problem, the last in decimal years.
+    Tests that the data do not allow are left out.
+
+    Parameters
+    ----------
+    solution : SelfCalibrationMode
+        The solution to test; its problem has N detections.
+    mag, colour : ndarray, shape (N,), optional
+        Magnitude and colour of each detection.
+    epoch : ndarray, shape (N,), optional
+        Date of each detection, in decimal years.
+
+    Returns
+    -------
+    tuple of ScoreTest
     """
-    whole, some, scores = solution.problem, EvenStars.of(solution), scores_of_detections(solution)
-    chosen = scores.at(some.rows)
-    sample = _sample(solution, some, chosen, mag=mag, colour=colour, epoch=epoch)
+    problem, star_subset, scores = (
+        solution.problem,
+        EvenStars.of(solution),
+        scores_of_detections(solution),
+    )
+    chosen = scores.at(star_subset.rows)
+    sample = _sample(solution, star_subset, chosen, mag=mag, colour=colour, epoch=epoch)
     functions = functions_for(sample)
     columns = _AddedColumns(
-        some.problem, solution.theta, deviations=some.deviations, added=functions
+        star_subset.problem, solution.theta, deviations=star_subset.deviations, added=functions
     )
-    sums = _summed(solution, columns, chosen, some.stars)
-    found = one_of_each(_regressor_tests(sums, columns, functions))
-    which = columns.of_exposures
-    every = np.ones(len(which), bool)
-    deviating = _tested(sums, EXPOSURES_OF_SELFCAL, which, every, np.eye(len(which)))
+    sums = _summed(solution, columns, chosen, star_subset.stars)
+    outcomes = one_of_each(_regressor_tests(sums, columns, functions))
+    of_exposures = columns.of_exposures
+    all_columns = np.ones(len(of_exposures), bool)
+    deviating = _tested(
+        sums, EXPOSURES_OF_SELFCAL, of_exposures, all_columns, np.eye(len(of_exposures))
+    )
     moving = None
-    if epoch is not None and whole.n_star == 2 and np.ptp(epoch) > SHORTEST:
+    if epoch is not None and problem.n_star == 2 and np.ptp(epoch) > SHORTEST:
         stars = StarResiduals(
-            whole.star, epoch, scores.gradient, scores.curvature, whole.priors.precision
+            problem.star, epoch, scores.gradient, scores.curvature, problem.priors.precision
         )
-        moving = motion_outcome(stars, whole.model.unit, MOTIONS_OF_SELFCAL)
-    found += [one for one in (deviating, moving) if one is not None]
-    return corrected([*found, *noise_tests(sample)])
+        moving = motion_outcome(stars, problem.model.unit, MOTIONS_OF_SELFCAL)
+    outcomes += [outcome for outcome in (deviating, moving) if outcome is not None]
+    return corrected([*outcomes, *noise_tests(sample)])
 
 
 def _summed(
     solution: SelfCalibrationMode, columns: _AddedColumns, scores: DetectionScores, stars: Float
 ) -> _Sums:
-    """Sums over the detections of some stars of a solution."""
+    """Sums over the detections of a solution's stars, or of a part of them."""
     p, n, D = columns.problem, columns.sparse.stop, columns.n_params
-    known, taken, square = (np.zeros((n, n)) for _ in range(3))
+    uneliminated, absorbed, square = (np.zeros((n, n)) for _ in range(3))
     score, psi = np.zeros(n), []
     for piece in pieces(columns):
-        here = piece.scores(scores)
-        sums = absorbed_by_stars(columns, piece, here, stars)
-        taken += sums.rows.T @ sums.rows
+        piece_scores = piece.scores(scores)
+        sums = absorbed_by_stars(columns, piece, piece_scores, stars)
+        absorbed += sums.rows.T @ sums.rows
         score -= sums.rows.T @ sums.right
-        add_products(known, columns, columns, piece, here.curvature)
+        add_products(uneliminated, columns, columns, piece, piece_scores.curvature)
         add_products(square, columns, columns, piece, piece.frame.mT @ piece.frame)
-        psi.append(star_scores(columns, piece, here.gradient))
+        psi.append(star_scores(columns, piece, piece_scores.gradient))
     inside = np.ix_(columns.order, columns.order)
-    own = np.concatenate(psi)
-    N = (known - taken)[inside]
-    left = without_parameters(solution, N, score[columns.order] + own.sum(axis=0))
-    own = own[:, D:] - own[:, :D] @ left.gain
-    # given back what the parameters have taken: a little, and much the same everywhere
+    by_star = np.concatenate(psi)
+    N = (uneliminated - absorbed)[inside]
+    efficient = without_parameters(solution, N, score[columns.order] + by_star.sum(axis=0))
+    by_star = by_star[:, D:] - by_star[:, :D] @ efficient.gain
+    # correction for the leverage of the parameters, which is small and nearly uniform
     numbers = 2 * float((scores.curvature[:, 0, 0] > 0).sum()) - p.n_star * p.n_stars
     free = max(1 - len(solution.free) / max(numbers, 1.0), 0.1)
-    covariance = own.T @ own / free + left.gain.T @ solution.prior.precision @ left.gain
+    covariance = (
+        by_star.T @ by_star / free + efficient.gain.T @ solution.prior.precision @ efficient.gain
+    )
     further = np.ix_(columns.order[D:], columns.order[D:])
     return _Sums(
-        known[further],
-        left,
+        uneliminated[further],
+        efficient,
         covariance,
         square[further] / len(p),
         p.n_stars,
@@ -165,14 +185,21 @@ def _summed(
 def _regressor_tests(
     sums: _Sums, columns: _AddedColumns, functions: Functions
 ) -> Iterator[tuple[Regressors, Outcome]]:
-    """Tests of all regressors that there are stars enough for."""
+    """Iterate over the tests of all regressors for which there are enough stars."""
     n_chips = len(columns.problem.model.chips)
-    for one in functions.regressors:
-        which, own = columns.along_axes(one.every), one.own(n_chips)
-        least = max(MIN_INFORMATION, one.least)
-        found = _tested(sums, one.family, which, own, one.directions(n_chips), least)
-        if found is not None:
-            yield one, found
+    for regressors in functions.regressors:
+        indices, is_tested = columns.along_axes(regressors.every), regressors.own(n_chips)
+        min_information = max(MIN_INFORMATION, regressors.least)
+        result = _tested(
+            sums,
+            regressors.family,
+            indices,
+            is_tested,
+            regressors.directions(n_chips),
+            min_information,
+        )
+        if result is not None:
+            yield regressors, result
 
 
 def _tested(
@@ -183,16 +210,22 @@ def _tested(
     combinations: Float,
     least: float = MIN_INFORMATION,
 ) -> Outcome | None:
-    """Outcome of one test of some columns, as of `Directions`; None where they cannot be asked."""
-    known = sums.known[np.ix_(which[own], which[own])]
-    one, n = Directions.of(sums.left, which, own, combinations, known, least), sums.n_stars
-    q = one.q
+    """Outcome of one test; None if the data do not determine any direction.
+
+    For `which`, `own`, `combinations` and `least` see `Directions`.
+    """
+    uneliminated = sums.known[np.ix_(which[own], which[own])]
+    directions, n = (
+        Directions.of(sums.left, which, own, combinations, uneliminated, least),
+        sums.n_stars,
+    )
+    q = directions.q
     if q == 0 or n < STARS_PER_DIRECTION * q + 2:
         return None
     at = np.ix_(which, which)
-    V = one.basis.T @ sums.covariance[at] @ one.basis
-    T = float(one.score @ np.linalg.solve(V, one.score))
-    square, noise = one.squares(V, sums.square[at])
+    V = directions.basis.T @ sums.covariance[at] @ directions.basis
+    T = float(directions.score @ np.linalg.solve(V, directions.score))
+    square, noise = directions.squares(V, sums.square[at])
     return outcome(
         family,
         T,
@@ -211,11 +244,12 @@ def _sample(
     scores: DetectionScores,
     **known: Float | None,
 ) -> ScoredSample:
-    """Sample of detections along the axes of the detector, in the unit of u and v.
+    """Sample of detections along the detector axes, in the unit of u and v.
 
-    Rolls turn the axes of the sky from exposure to exposure, and errors are those of pixels.
+    The detector axes are used because roll angles rotate the sky from exposure to exposure, and
+    because errors are given in pixels.
     """
-    whole, theta, model = solution.problem, solution.theta, solution.problem.model
+    problem, theta, model = solution.problem, solution.theta, solution.problem.model
     p, rows, pixel = some.problem, some.rows, model.pixel_size(theta)
     group = p.groups.index
     J = p.jacobians(theta, slice(0, len(p)))
@@ -224,8 +258,8 @@ def _sample(
     r = (p.places(theta) - p.star_places(some.stars))[..., None]
     residual = np.linalg.solve(J, r)[:, :, 0] * pixel
     variance = (p.var + solution.mixture.jitter**2) * pixel**2
-    taken = taken_by_stars(solution)[rows]
-    at_rows = {name: None if one is None else one[rows] for name, one in known.items()}
+    leverage = taken_by_stars(solution)[rows]
+    at_rows = {name: None if column is None else column[rows] for name, column in known.items()}
     frames = [model.frame(theta, e) for e in range(len(model.exposures))]
     position, offset = _pointings(p, theta, frames)
     return ScoredSample(
@@ -236,7 +270,7 @@ def _sample(
         curvature=np.stack([H[:, 0, 0], H[:, 0, 1], H[:, 1, 1]]),
         residual=np.asarray(residual.T, float),
         variance=np.stack([variance, variance]),
-        inlier=memberships(whole, theta, solution.mixture, solution.stars)[rows],
+        inlier=memberships(problem, theta, solution.mixture, solution.stars)[rows],
         mag=at_rows["mag"],
         colour=at_rows["colour"],
         epoch=at_rows["epoch"],
@@ -247,16 +281,16 @@ def _sample(
         has_catalogue=False,
         position=position,
         offset=offset,
-        leverage=np.stack([taken, taken]),
+        leverage=np.stack([leverage, leverage]),
     )
 
 
 def _pointings(
     problem: Problem, theta: Float, frames: Sequence[tuple[Float, Float]]
 ) -> tuple[Float, Float | None]:
-    """Positions (2, N), and offsets (2, N) of the exposures, along the axes of the detector.
+    """Positions (2, N), and pointing offsets (2, N) of the exposures, along the detector axes.
 
-    Lengths are in half sides of the detector; no offsets where nothing was dithered.
+    Lengths are in half sides of the detector.  The offsets are None without dithers.
     """
     model = problem.model
     exposure = problem.groups.exposure[problem.groups.index]
@@ -264,10 +298,10 @@ def _pointings(
     on_sky = problem.places(theta) - np.asarray(model.origin)
     offsets, positions = np.zeros((len(problem), 2)), np.empty((len(problem), 2))
     for e in np.unique(exposure):
-        here = exposure == e
+        in_exposure = exposure == e
         M, shift = frames[e]
         back = np.linalg.inv(M).T / half
-        offsets[here] = shift @ back
-        positions[here] = (on_sky[here] - shift) @ back
-    offsets -= offsets.mean(axis=0)  # of a mean the polynomials take care
+        offsets[in_exposure] = shift @ back
+        positions[in_exposure] = (on_sky[in_exposure] - shift) @ back
+    offsets -= offsets.mean(axis=0)  # the polynomials absorb a mean offset
     return positions.T, None if np.abs(offsets).max() < UNDITHERED else offsets.T

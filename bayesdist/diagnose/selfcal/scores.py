@@ -1,4 +1,4 @@
-"""Scores of single detections at a self-calibration, and how much of them their stars absorb."""
+"""Scores of single detections of a self-calibration, and the fraction of them that stars absorb."""
 
 from __future__ import annotations
 
@@ -16,32 +16,33 @@ from bayesdist.infer.selfcal.problem import Problem
 from bayesdist.model.grid import cell_index
 from bayesdist.utils.arrays import Bool, Float, Int
 
-# relative curvature below which a combination of parameters, or of a star's, is undetermined
+# relative curvature below which a combination of parameters, or of a star's parameters, counts as
+# undetermined
 UNKNOWN = 1e-10
 
 
 @dataclass(frozen=True, eq=False)
 class DetectionScores:
-    """Gradient and curvature of the log density of each detection by its sky position."""
+    """Gradient and curvature of each detection's log density with respect to sky position."""
 
     gradient: Float  # (N, 2)
-    # minus the second derivatives (N, 2, 2); zero where a detection may or may not belong to its
-    # star, so that every sum is that of a possible likelihood
+    # (N, 2, 2) minus the second derivatives; zero for detections with uncertain membership, so that
+    # every sum is positive definite
     curvature: Float
 
     def at(self, rows: slice | Bool) -> DetectionScores:
-        """Scores of some detections."""
+        """Scores of the given detections."""
         return DetectionScores(self.gradient[rows], self.curvature[rows])
 
     def flattened(self, excess: Float) -> DetectionScores:
-        """Scores of a likelihood whose variances are larger by factors (N,)."""
+        """Scores of a likelihood with variances multiplied by factors (N,)."""
         return DetectionScores(
             self.gradient / excess[:, None], self.curvature / excess[:, None, None]
         )
 
 
 def scores_of_detections(solution: SelfCalibrationMode) -> DetectionScores:
-    """Scores of all detections of a solution, their stars at their modes."""
+    """Scores of all detections of a solution, with the stars at their modes."""
     p, mixture = solution.problem, solution.mixture
     member = memberships(p, solution.theta, mixture, solution.stars)
     r = p.places(solution.theta) - p.star_places(solution.stars)
@@ -49,33 +50,35 @@ def scores_of_detections(solution: SelfCalibrationMode) -> DetectionScores:
     inverse = 1.0 / (p.var + mixture.jitter**2)
     pulled = inverse[:, None] * np.einsum("nab,nb->na", W, r)
     H = (member * inverse)[:, None, None] * W
-    # derivative of the membership by position
+    # derivative of the membership with respect to position
     H -= (member * (1 - member))[:, None, None] * (pulled[:, :, None] * pulled[:, None, :])
     good = (H[:, 0, 0] > 0) & (np.linalg.det(H) > 0)
     return DetectionScores(-member[:, None] * pulled, np.where(good[:, None, None], H, 0.0))
 
 
 def score_excess(solution: SelfCalibrationMode, scores: DetectionScores) -> Float:
-    """Ratio (N,) of the variance of the scores to their curvature, by blocks of the detector.
+    """Ratio (N,) of the variance of the scores to their curvature, in blocks of the detector.
 
-    Stars absorb a part of the residuals of their detections, for which the ratios are corrected;
-    those of blocks are shrunk to their mean as for matched stars.
+    The ratios are corrected for the part of the residuals that stars absorb.  Those of the blocks
+    are shrunk to their mean, as for matched stars.
     """
     p = solution.problem
     free = 1.0 - taken_by_stars(solution)
     free *= max(1.0 - len(solution.free) / max(2 * float(free.sum()), 1.0), 0.1)
-    to_pixels = np.linalg.inv(_square(p))  # of a squared gradient
+    to_pixels = np.linalg.inv(_square(p))  # converts squared gradients to pixels
     top = np.einsum("na,nab,nb->n", scores.gradient, to_pixels, scores.gradient) / free
     bottom = np.einsum("nab,nba->n", to_pixels, scores.curvature)
     chip = p.groups.chip[p.groups.index]
     out = np.ones(len(p))
     for code in range(len(p.model.chips)):
-        here = np.flatnonzero(chip == code)
-        if not len(here) or bottom[here].sum() <= 0:
+        on_chip = np.flatnonzero(chip == code)
+        if not len(on_chip) or bottom[on_chip].sum() <= 0:
             continue
-        side = int(np.clip(np.sqrt(len(here) / STARS_PER_BLOCK), 1, MAX_BLOCKS))
-        block = cell_index(p.X[here], p.Y[here], (side, side))
-        out[here] = block_ratios(block, np.stack([top, bottom, 2 * free], axis=1)[here], side**2)
+        side = int(np.clip(np.sqrt(len(on_chip) / STARS_PER_BLOCK), 1, MAX_BLOCKS))
+        block = cell_index(p.X[on_chip], p.Y[on_chip], (side, side))
+        out[on_chip] = block_ratios(
+            block, np.stack([top, bottom, 2 * free], axis=1)[on_chip], side**2
+        )
     return out
 
 
@@ -85,20 +88,20 @@ def _square(problem: Problem) -> Float:
 
 @dataclass(frozen=True, eq=False)
 class StarBlock:
-    """Some stars with their n detections, in pixels of the detector."""
+    """A block of stars with their n detections, in detector pixels."""
 
-    rows: slice  # detections, in the order of the problem
-    star: Int  # which of these stars each detection (n,) belongs to
-    member: Float  # probability (n,) to belong to the star
-    weight: Float  # inverse variance (n,) of each axis, times that probability
-    residual: Float  # detection minus star (n, 2)
-    # R B (n, q, 2): B is the curvature of the log density by the star's parameters and the
-    # detection's pixels, R^T R the inverse of that by the star's parameters alone
+    rows: slice  # range of detections in the problem
+    star: Int  # (n,) index of each detection's star in the block
+    member: Float  # (n,) probability of belonging to the star
+    weight: Float  # (n,) inverse variance per axis, times that probability
+    residual: Float  # (n, 2) detection minus star
+    # (n, q, 2) R B: B is the curvature of the log density with respect to the star's parameters and
+    # the detection's pixels, R^T R the inverse of that with respect to the star's parameters
     ties: Float
 
 
 def star_blocks(solution: SelfCalibrationMode) -> Iterator[StarBlock]:
-    """Iterator over the stars of a solution, some at a time, with their detections."""
+    """Iterate over the stars of a solution in blocks, with their detections."""
     p, theta, mixture = solution.problem, solution.theta, solution.mixture
     members = memberships(p, theta, mixture, solution.stars)
     weights = members / (p.var + mixture.jitter**2)
@@ -110,8 +113,8 @@ def star_blocks(solution: SelfCalibrationMode) -> Iterator[StarBlock]:
         w, star = weights[rows], p.star[rows] - first
         by_star = np.swapaxes(to_pixels @ places_by_star(p, rows), 1, 2)
         curvature = w[:, None, None] * by_star @ np.swapaxes(by_star, 1, 2)
-        own = p.priors.precision[first:last] + sums_over(star, curvature, last - first)
-        roots = inverse_roots(own)
+        information = p.priors.precision[first:last] + sums_over(star, curvature, last - first)
+        roots = inverse_roots(information)
         residual = np.einsum("nij,nj->ni", to_pixels, residuals[rows])
         ties = w[:, None, None] * (roots[star] @ by_star)
         yield StarBlock(rows, star, members[rows], w, residual, ties)
@@ -120,14 +123,17 @@ def star_blocks(solution: SelfCalibrationMode) -> Iterator[StarBlock]:
 def taken_by_stars(solution: SelfCalibrationMode) -> Float:
     """Fraction (N,) of each detection's variance that its star absorbs, at most `MOST_TAKEN`."""
     out = np.empty(len(solution.problem))
-    for some in star_blocks(solution):
-        square = np.sum(some.ties**2, axis=(1, 2))
-        out[some.rows] = square / (2 * np.maximum(some.weight, np.finfo(float).tiny))
+    for block in star_blocks(solution):
+        square = np.sum(block.ties**2, axis=(1, 2))
+        out[block.rows] = square / (2 * np.maximum(block.weight, np.finfo(float).tiny))
     return np.minimum(out, MOST_TAKEN)
 
 
 def inverse_roots(matrices: Float) -> Float:
-    """R with R^T R the inverse of each matrix (S, q, q), without undetermined directions."""
+    """Matrices R with R^T R the inverse of each matrix (S, q, q).
+
+    Undetermined directions are left out.
+    """
     scale = np.sqrt(np.maximum(np.einsum("sqq->sq", matrices), 1e-300))
     values, vectors = np.linalg.eigh(matrices / (scale[:, :, None] * scale[:, None, :]))
     good = values > UNKNOWN
@@ -136,7 +142,7 @@ def inverse_roots(matrices: Float) -> Float:
 
 
 def places_by_star(problem: Problem, rows: slice) -> Float:
-    """Derivatives (n, 2, q) of positions of detections by the parameters of their stars."""
+    """Derivatives (n, 2, q) of positions with respect to the parameters of their stars."""
     n, q, unit = rows.stop - rows.start, problem.n_star, np.eye(2)
     out = np.broadcast_to(unit, (n, 2, 2))
     if q >= 4:

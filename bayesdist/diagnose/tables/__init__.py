@@ -1,1 +1,1 @@
-"""Errors that look-up tables leave between their nodes."""
+"""Errors of look-up tables between their nodes."""

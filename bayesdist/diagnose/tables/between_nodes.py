@@ -1,16 +1,16 @@
-"""Error that a look-up table leaves between its nodes: measured, not derived from smoothness.
+"""Error of a look-up table between its nodes, measured rather than derived from smoothness.
 
-A table is bilinear between nodes, and the distortion is not.  Two stars at the same place, of two
-exposures, see the same of it and nothing else in common: the mean product of their residuals is the
-mean square of what the table has left there.  The table and its polynomial were fitted to the
-same residuals and have taken some of them up: as much as their own posterior variance V, for a
-fit leaves residuals of covariance N - V.
+A table is bilinear between nodes, and the distortion is not.  Two stars at the same position in
+different exposures share the error of the table and nothing else: the mean product of their
+residuals is the mean square of that error.  The table and its polynomial were fitted to the same
+residuals and have absorbed part of them.  That part equals their posterior variance V, because a
+fit leaves residuals with the covariance N - V:
 
     S = <r_i r_j> + V          i, j: different stars, different exposures, same cell
 
-Cells divide the squares between nodes evenly, into 4 x 4 and 8 x 8.  What a smooth error of a
-square loses as its mean over a cell goes with the cell's area, so that both together tell the mean
-square at a point.
+The squares between nodes are divided evenly into 4 x 4 and 8 x 8 cells.  Averaging over a cell
+reduces the mean square of a smooth error in proportion to the cell's area, so that both divisions
+together determine the mean square at a point.
 """
 
 from __future__ import annotations
@@ -26,23 +26,23 @@ from bayesdist.errors import DegenerateError
 from bayesdist.model import Chip
 from bayesdist.utils.arrays import Bool, Float, Int
 
-FINE, COARSE = 8, 4  # cells along a side of the squares between nodes
-AREA_RATIO = (FINE / COARSE) ** 2  # areas of the cells
+FINE, COARSE = 8, 4  # number of cells along a side of the squares between nodes
+AREA_RATIO = (FINE / COARSE) ** 2  # ratio of the areas of the cells
 MIN_PAIRS = 30  # pairs of stars
 MAX_ITERATIONS = 3  # of weights that depend on the result
-CELLS_SAMPLED = 1500  # cells in which the variance of the fit is looked at
+CELLS_SAMPLED = 1500  # number of cells in which the variance of the fit is evaluated
 
 
 @dataclass(frozen=True, eq=False)
 class BetweenNodes:
-    """Mean square of what a table leaves on one chip."""
+    """Mean square error of a table between its nodes, on one chip."""
 
     chip: int  # chip number
-    # square, error (2,): along x and y, square pixels, and standard deviations; a square may come
-    # out below zero
+    # square, error (2,): along x and y, square pixels, and standard deviations; a square may be
+    # negative
     square: Float
     error: Float
-    n_pairs: int  # of stars
+    n_pairs: int  # number of pairs of stars
 
     @property
     def left(self) -> MeanSquare:
@@ -62,23 +62,43 @@ def between_nodes(
     step: tuple[float, float],
     taken: Callable[[Float, Float], Float],
 ) -> BetweenNodes:
-    """Mean square of what a table leaves of the distortion of one chip.
+    """Mean square error of a table between its nodes, on one chip.
 
-    `x` and `y` (N,) are raw pixels, `residual` (N, 2) is what table and polynomial leave, pixels,
-    `precision` (N, 2) the inverse variances that they were fitted with, 0 for a star that did not
-    count; `star` and `exposure` (N,) are codes, `step` the pixels between nodes. `taken` is the
-    variance (n, 2) of table and polynomial at pixels (n,): what the fit has taken of the residuals,
-    square pixels. It is negative for a table that was not fitted to them: its own error is in the
-    products. Raises `DegenerateError` when too few stars lie that near to each other, or in too few
-    places.
+    Parameters
+    ----------
+    x, y : ndarray, shape (N,)
+        Raw pixels.
+    residual : ndarray, shape (N, 2)
+        Residuals from table and polynomial, pixels.
+    precision : ndarray, shape (N, 2)
+        Inverse variances used in the fit; 0 for stars that were not used.
+    star, exposure : ndarray of int, shape (N,)
+        Codes of the stars and exposures.
+    chip : Chip
+        The chip of the table.
+    step : tuple of float
+        Pixels between nodes along x and y.
+    taken : callable
+        Variance (n, 2) of table and polynomial at pixels x, y (n,), square pixels: the part of the
+        residuals that the fit absorbed.  It is negative for a table that was not fitted to them,
+        because the products then include the error of the table.
+
+    Returns
+    -------
+    BetweenNodes
+
+    Raises
+    ------
+    DegenerateError
+        If too few stars are close to each other, or in too few positions.
     """
     used = (precision > 0).all(axis=1)
     stars = x[used], y[used], residual[used], precision[used], star[used], exposure[used]
     fine, coarse = (_pairs(_NodeCells.of(chip, step, parts), *stars) for parts in (FINE, COARSE))
     n_pairs = round(float(fine.number.sum()) / 2)
     part = fine.cells.areas(chip)
-    seen = ((fine.weight > 0) & (coarse.weight > 0)).all(axis=1) & (part > 0)
-    if n_pairs < MIN_PAIRS or not seen.any():
+    is_measured = ((fine.weight > 0) & (coarse.weight > 0)).all(axis=1) & (part > 0)
+    if n_pairs < MIN_PAIRS or not is_measured.any():
         raise DegenerateError(
             f"{n_pairs} pairs of stars at the same position do not show what lies between nodes",
             where=f"look-up table of chip {chip.number}",
@@ -87,44 +107,47 @@ def between_nodes(
     common = _of_stars(*stars[2:5])
     square, error = np.empty(2), np.empty(2)
     for a in (0, 1):
-        near, far = fine.weight[seen, a], coarse.weight[seen, a]
-        each = AREA_RATIO * (fine.product[seen, a] / near) - coarse.product[seen, a] / far
+        near, far = fine.weight[is_measured, a], coarse.weight[is_measured, a]
+        each = (
+            AREA_RATIO * (fine.product[is_measured, a] / near)
+            - coarse.product[is_measured, a] / far
+        )
         each /= AREA_RATIO - 1
-        # pairs in a fine cell are among those of the coarse one around it
-        own = fine.scatter(a)
-        noise = AREA_RATIO**2 * (own / near) - 2 * AREA_RATIO * (own / far)
+        # pairs in a fine cell are also pairs in the coarse cell around it
+        fine_scatter = fine.scatter(a)
+        noise = AREA_RATIO**2 * (fine_scatter / near) - 2 * AREA_RATIO * (fine_scatter / far)
         noise = (noise + coarse.scatter(a) / far) / (AREA_RATIO - 1) ** 2
         size = max(float(np.average(each, weights=1 / noise)), 0.0)
         for _ in range(MAX_ITERATIONS):
-            # squares differ by about what they hold: where that is well known, area counts
-            weight = 1 / (noise + size**2 / part[seen])
+            # squares differ by about their size: if they are well determined, weight them by area
+            weight = 1 / (noise + size**2 / part[is_measured])
             weight /= weight.sum()
-            square[a] = weight @ each + fine.average(taken, a, seen, weight)
+            square[a] = weight @ each + fine.average(taken, a, is_measured, weight)
             size = max(square[a], 0.0)
         off = -part / part.sum()
-        off[seen] += weight
+        off[is_measured] += weight
         uneven = size**2 * np.sum(off[part > 0] ** 2 / part[part > 0])
         error[a] = np.sqrt(weight**2 @ noise + uneven + 4 * size * common[a])
     return BetweenNodes(chip.number, square, error, n_pairs)
 
 
 def _of_stars(residual: Float, precision: Float, star: Int) -> Float:
-    """Variance (2,) of the mean of all residuals, as far as stars err by themselves."""
+    """Variance (2,) of the mean of all residuals due to independent errors of the stars."""
     return squares_over(star, precision * residual)[0] / precision.sum(axis=0) ** 2
 
 
 @dataclass(frozen=True, eq=False)
 class _Pairs:
-    """Sums over ordered pairs of different stars in different exposures of the same cell."""
+    """Sums over ordered pairs of different stars in different exposures and the same cell."""
 
     cells: _NodeCells
     by_cell: Float  # (cells, 2) weights
-    # product, weight, spread (squares, 2): products and weights by square; variance of the former
-    # as far as stars err by themselves
+    # product, weight, spread (squares, 2): products and weights per square, and variance of the
+    # products due to independent errors of the stars
     product: Float
     weight: Float
     spread: Float
-    number: Float  # (squares,)
+    number: Float  # (squares,) number of ordered pairs
 
     def scatter(self, a: int) -> float:
         """Noise of mean products along one axis, times their weight."""
@@ -137,14 +160,17 @@ class _Pairs:
         seen: Bool,
         weight: Float,
     ) -> float:
-        """Mean of a function of the place (n, 2) along one axis, squares having weights."""
+        """Weighted mean along one axis of a function (n, 2) of position.
+
+        `weight` applies to squares.
+        """
         each = np.zeros(len(seen))
         each[seen] = weight / self.weight[seen, a]
         of_cell = self.by_cell[:, a] * each[self.cells.squares()]
-        there = np.flatnonzero(of_cell > 0)
-        some = there[:: max(1, len(there) // CELLS_SAMPLED)]
-        values = function(*self.cells.centres(some))[:, a]
-        return float(np.average(values, weights=of_cell[some]))
+        with_weight = np.flatnonzero(of_cell > 0)
+        sampled = with_weight[:: max(1, len(with_weight) // CELLS_SAMPLED)]
+        values = function(*self.cells.centres(sampled))[:, a]
+        return float(np.average(values, weights=of_cell[sampled]))
 
 
 def _pairs(
@@ -160,26 +186,33 @@ def _pairs(
     p = precision * residual
     each = np.column_stack([p, precision, p**2, np.ones(len(p))])
 
-    # of all pairs, those of one star and those of one exposure are taken off; the stars with
-    # themselves, taken off twice, are put back
+    # From all pairs, those of one star and those of one exposure are subtracted; pairs of a
+    # detection with itself, which were subtracted twice, are added.
     sums = squares_over(np.zeros_like(cell), each, cell, n)
     for of in (star, exposure):
         sums -= squares_over(of, each, cell, n)
     sums += squares_over(np.arange(len(cell)), each, cell, n)
     squares = cells.squares()
-    whole = sums_over(squares, sums)
-    return _Pairs(cells, sums[:, 2:4], whole[:, :2], whole[:, 2:4], 2 * whole[:, 4:6], whole[:, 6])
+    by_square = sums_over(squares, sums)
+    return _Pairs(
+        cells,
+        sums[:, 2:4],
+        by_square[:, :2],
+        by_square[:, 2:4],
+        2 * by_square[:, 4:6],
+        by_square[:, 6],
+    )
 
 
 @dataclass(frozen=True)
 class _NodeCells:
     """Cells that divide the squares between nodes."""
 
-    # pixel of the corner of the first cell: on the node before the first one of the table
+    # pixel at the corner of the first cell: the node before the first node of the table
     origin: tuple[float, float]
     side: tuple[float, float]
-    shape: tuple[int, int]  # cells along x and y
-    parts: int  # along a side of a square
+    shape: tuple[int, int]  # number of cells along x and y
+    parts: int  # number of cells along a side of a square
 
     @classmethod
     def of(cls, chip: Chip, step: tuple[float, float], parts: int) -> _NodeCells:
@@ -198,7 +231,7 @@ class _NodeCells:
         return self.shape[0] * self.shape[1]
 
     def of_pixels(self, x: Float, y: Float) -> Int:
-        """Cell of each pixel, shape (N,)."""
+        """Index (N,) of the cell of each pixel."""
         i, j = (
             np.clip(((p - o) // s).astype(np.int64), 0, n - 1)
             for p, o, s, n in zip((x, y), self.origin, self.side, self.shape, strict=True)
@@ -212,7 +245,7 @@ class _NodeCells:
         return x, y
 
     def areas(self, chip: Chip) -> Float:
-        """Fraction of each square that lies on the chip."""
+        """Fraction of each square that is on the chip."""
         shares = []
         for o, s, n, size in zip(self.origin, self.side, self.shape, chip.size, strict=True):
             edges = o + s * self.parts * np.arange(n // self.parts + 1)
@@ -220,23 +253,23 @@ class _NodeCells:
         return np.outer(shares[1], shares[0]).ravel()
 
     def squares(self) -> Int:
-        """Square (cells,) that each cell lies in."""
+        """Index (cells,) of the square of each cell."""
         j, i = np.divmod(np.arange(self.number), self.shape[0])
         return j // self.parts * (self.shape[0] // self.parts) + i // self.parts
 
 
 @dataclass(frozen=True, eq=False)
 class MeanSquare:
-    """Mean squares of two axes, given their measurements and that none is negative."""
+    """Mean squares on two axes, given their measurements and that they are not negative."""
 
-    measured: Float  # (2,) of u and v; noise may have carried one below zero
-    error: Float  # (2,) standard deviations of these numbers, independent of each other
+    measured: Float  # (2,) of u and v; may be negative because of noise
+    error: Float  # (2,) standard deviations of the measurements, independent of each other
 
     @property
     def mean(self) -> Float:
-        """Mean (2,) of N(measured, error^2) cut off below zero.
+        """Mean (2,) of the normal distribution N(measured, error^2), truncated at zero.
 
-        The less is known, the larger it is: ignorance of an error does not make it smaller.
+        It increases with the error: less knowledge does not make the result smaller.
         """
         return self._moments[0]
 
@@ -244,12 +277,12 @@ class MeanSquare:
     def relative_error(self) -> float:
         """Relative error of the radial rms."""
         mean, variance = self._moments
-        whole = mean.sum()
-        return float(np.sqrt(variance.sum()) / (2 * whole)) if whole > 0 else 0.0
+        total = mean.sum()
+        return float(np.sqrt(variance.sum()) / (2 * total)) if total > 0 else 0.0
 
     def relative_draws(self, n: int, rng: np.random.Generator) -> Float:
         """Draws (n, 2) of the mean squares relative to their mean."""
-        from scipy.stats import truncnorm  # a second, and few runs have tables
+        from scipy.stats import truncnorm  # takes a second to import, and few runs have tables
 
         mean, variance = self._moments
         out = np.ones((n, 2))
@@ -264,7 +297,7 @@ class MeanSquare:
         exact = self.error <= 0
         error = np.where(exact, 1.0, self.error)
         z = self.measured / error
-        # density over probability, in logarithms: z is far below zero where errors are too small
+        # density over probability, in logarithms: z is far below zero if errors are too small
         ratio = np.exp(-(z**2) / 2 - log_ndtr(z)) / np.sqrt(2 * np.pi)
         mean = np.where(exact, np.maximum(self.measured, 0.0), error * (z + ratio))
         variance = error**2 * np.maximum(1 - ratio * (z + ratio), 0.0)

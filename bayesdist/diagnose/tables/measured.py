@@ -1,4 +1,4 @@
-"""Errors that look-up tables leave between their nodes, from neighbours in different exposures."""
+"""Errors of look-up tables between their nodes, from neighbouring stars in different exposures."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from bayesdist.infer.nodes import (
 from bayesdist.model import Chip, LookupTable
 from bayesdist.utils.arrays import Float
 
-FAR = 6.0  # standard deviations
+FAR = 6.0  # residual beyond which a match is excluded, in standard deviations
 
 log = logging.getLogger("bayesdist")
 
@@ -38,56 +38,74 @@ def measured_between(
     mixture: ResidualMixture | None = None,
     fitted: bool = True,
 ) -> tuple[BetweenNodes, ...]:
-    """Distortion that tables leave between their nodes, for each chip where it can be measured.
+    """Distortion that tables lack between their nodes, for each chip on which it can be measured.
 
-    `pairs`: at raw pixels, with errors. `fit`: the polynomial that goes with the tables. `filter`:
-    of the pairs. `posteriors`: of the tables that were fitted to these pairs. `mixture`: of the
-    pairs; by default that of their residuals. `fitted`: whether the tables were fitted to these
-    pairs. Those that were not err by themselves.
+    Parameters
+    ----------
+    pairs : Matches
+        Pairs at raw pixels, with errors.
+    fit : LinearFit
+        The polynomial that belongs to the tables.
+    tables : sequence of LookupTable
+        Look-up tables of all chips and filters.
+    filter : str
+        Filter of the pairs.
+    posteriors : sequence of TablePosterior
+        Posteriors of the tables that were fitted to these pairs.
+    mixture : ResidualMixture, optional
+        Mixture model of the pairs; fitted to their residuals by default.
+    fitted : bool
+        True if the tables were fitted to these pairs.  Otherwise the errors of the tables are
+        independent of them.
+
+    Returns
+    -------
+    tuple of BetweenNodes
+        One item per chip; empty if the pairs have no star codes.
     """
     if pairs.star is None:
         return ()
     numbers = pairs.chip_number
-    left = pixel_shifts(fit, corrected_matches(tables, pairs))
-    mixture = mixture or fit_mixture(left.shift, left.variance)
+    shifts = pixel_shifts(fit, corrected_matches(tables, pairs))
+    mixture = mixture or fit_mixture(shifts.shift, shifts.variance)
     jitter = np.full(len(pairs), mixture.jitter)
-    for one in posteriors:
-        jitter[numbers == one.table.chip] = one.jitter
-    total = left.variance + jitter[:, None] ** 2
-    # a false match has nothing in common with its neighbours: to leave out no more than those far
-    # off keeps stars that the pattern itself has moved
-    near = (left.shift**2 / total).sum(axis=1, keepdims=True) < FAR**2
+    for table_posterior in posteriors:
+        jitter[numbers == table_posterior.table.chip] = table_posterior.jitter
+    total = shifts.variance + jitter[:, None] ** 2
+    # A false match is independent of its neighbours. Only those far off are excluded, so that stars
+    # displaced by the pattern itself are kept.
+    near = (shifts.shift**2 / total).sum(axis=1, keepdims=True) < FAR**2
     precision = near / total
     out = []
     for chip in fit.model.chips:
-        own = [t for t in tables if t.chip == chip.number and t.filter in ("", filter)]
+        chip_tables = [t for t in tables if t.chip == chip.number and t.filter in ("", filter)]
         rows = np.flatnonzero(numbers == chip.number)
-        if not own or not len(rows):
+        if not chip_tables or not len(rows):
             continue
         posterior = next((p for p in posteriors if p.table.chip == chip.number), None)
         try:
-            found = between_nodes(
+            result = between_nodes(
                 pairs.x[rows],
                 pairs.y[rows],
-                left.shift[rows],
+                shifts.shift[rows],
                 precision[rows],
                 star=pairs.star[rows],
                 exposure=pairs.exposure[rows],
                 chip=chip,
-                step=own[-1].step,
-                taken=_taken(posterior, own, chip, fitted),
+                step=chip_tables[-1].step,
+                taken=_taken(posterior, chip_tables, chip, fitted),
             )
         except DegenerateError as error:
             log.info("fit: %s", error)
             continue
-        out.append(found)
+        out.append(result)
     return tuple(out)
 
 
 def _taken(
     posterior: TablePosterior | None, tables: Sequence[LookupTable], chip: Chip, fitted: bool
 ) -> Callable[[Float, Float], Float]:
-    """Variance (n, 2) that tables and polynomial have taken of the residuals at pixels (n,)."""
+    """Function for the variance (n, 2) that tables and polynomial absorb at pixels (n,)."""
     if posterior is not None:
         return partial(_of_posterior, posterior, chip)
 
@@ -99,7 +117,7 @@ def _taken(
 
 
 def _of_posterior(posterior: TablePosterior, chip: Chip, x: Float, y: Float) -> Float:
-    """Variance (n, 2) of a posterior with that of its polynomial."""
+    """Variance (n, 2) of a posterior, including that of its polynomial."""
     out = posterior.position_sigma(x, y, refitted=True) ** 2
     phi = posterior.grid.basis.evaluate(*_on(chip, x, y))
     for a, axis in enumerate(posterior.axes):
@@ -108,6 +126,6 @@ def _of_posterior(posterior: TablePosterior, chip: Chip, x: Float, y: Float) -> 
 
 
 def _on(chip: Chip, x: Float, y: Float) -> tuple[Float, Float]:
-    """The nearest pixels of the chip: cells at its edge have their middle beyond."""
+    """Nearest pixels on the chip: centres of cells at its edge may be outside."""
     nx, ny = chip.size
     return np.clip(x, 0.5, nx + 0.5), np.clip(y, 0.5, ny + 0.5)

@@ -1,4 +1,4 @@
-"""ACS of HST: a simulated campaign, published lines, and what its handbook shows."""
+"""HST/ACS: a simulated campaign, published linear terms, and the figures of its handbook."""
 
 from bayesdist.mission import Mission
 

@@ -1,4 +1,4 @@
-"""Commands of HST: handbook, pam, and the simulated campaign of ACS."""
+"""Command line for HST: handbook, pam, and the simulated campaign of ACS."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ def handbook(line: str, file: str, output: str, **options: Any) -> None:
     "--image",
     type=click.Path(),
     metavar="FLT",
-    help="A calibrated image that the maps shall match.",
+    help="Calibrated image (flt or flc) for which the maps are made.",
 )
 @force
 def pam(file: str, output: str, **options: Any) -> None:
@@ -107,7 +107,7 @@ def pam(file: str, output: str, **options: Any) -> None:
 @click.option("--false", type=float, default=0.05, help="Fraction of false detections.")
 @click.option("--outlying", type=float, default=0.0, help="Fraction of outlying exposures.")
 @click.option("--cte", is_flag=True, help="Shift stars by trailed charge.")
-@click.option("--no-tables", is_flag=True, help="Leave out the look-up tables.")
+@click.option("--no-tables", is_flag=True, help="Omit the look-up tables.")
 def simulate(output: str, **options: Any) -> None:
     """Simulate star lists, catalogue and log of the 47 Tuc campaign."""
     from bayesdist.missions.acs.simulated_campaign import simulate_campaign

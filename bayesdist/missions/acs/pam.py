@@ -26,9 +26,9 @@ def write_area_maps(
     image: str | Path | None,
     force: bool,
 ) -> str:
-    """Text to print, once the pixel area maps of a calibration are written.
+    """Write the pixel area maps of a calibration; returns text to print.
 
-    With an image, maps are of its chips, in its order, and of its subarrays.
+    With an image, the maps are made for its subarrays, in the order of its chips.
     """
     output = Path(output)
     if output.suffix.lower() != ".fits":
@@ -38,15 +38,15 @@ def write_area_maps(
             do="choose a name that ends in .fits",
         )
     refuse_existing(output, force)
-    found = calibration_of_scale(path, filter=filter, scale=scale, epoch=epoch)
-    chips, (pixel, source) = found.in_frame(epoch), found.pixel(epoch)
-    images = images_of(found, image=image)
+    calibration = calibration_of_scale(path, filter=filter, scale=scale, epoch=epoch)
+    chips, (pixel, source) = calibration.in_frame(epoch), calibration.pixel(epoch)
+    images = images_of(calibration, image=image)
     numbers = list(images or chips)
     if chip is not None:
         if chip not in numbers:
             raise InputError(
                 f"there is no chip {chip}",
-                where=found.name,
+                where=calibration.name,
                 do=f"choose one of {', '.join(map(str, numbers))}",
             )
         numbers = [chip]
@@ -54,17 +54,17 @@ def write_area_maps(
     write_pam(
         output,
         maps,
-        instrument=found.instrument,
-        detector=found.detector,
-        source=found.name,
+        instrument=calibration.instrument,
+        detector=calibration.detector,
+        source=calibration.name,
     )
-    notes = "".join(f"; {note}" for note in notes_of(found, epoch))
-    unit = "pix of u, v" if found.unit == "pix" else found.unit
+    notes = "".join(f"; {note}" for note in notes_of(calibration, epoch))
+    unit = "pix of u, v" if calibration.unit == "pix" else calibration.unit
     head = (
         f"{output}: pixel area over that of {number(pixel, 6)} {unit} squared "
-        f"({source}), by {found.name}{notes}"
+        f"({source}), by {calibration.name}{notes}"
     )
-    return "\n".join([head, *(_line(one) for one in maps)])
+    return "\n".join([head, *(_line(area_map) for area_map in maps)])
 
 
 def _line(one: PixelAreaMap) -> str:

@@ -1,4 +1,4 @@
-"""Published linear terms of ACS/WFC, to stand beside those of a run.
+"""Published linear terms of ACS/WFC, for comparison with those of a run.
 
 ACS ISR 2015-06 (Kozhurina-Platais et al. 2015), Tables 1 to 3, and Section 4.4.1; filter F606W.
 """
@@ -12,7 +12,7 @@ from bayesdist.report.sections.campaign.lines import Published, PublishedLine, p
 
 SOURCE = "ACS ISR 2015-06"
 
-# term: where it stands
+# location of each term in the report
 WHERE = {"A_2": "Table 1", "B_3": "Table 2", "B_2": "Table 3", "B_1": "Section 4.4.1"}
 
 
@@ -46,7 +46,7 @@ LINES: dict[str, tuple[PublishedLine, ...]] = {
 def published_lines(
     config: Mapping[str, Any], filter: str, chips: tuple[str, ...]
 ) -> dict[str, Published]:
-    """The published lines where the run is of ACS/WFC in F606W; else none."""
+    """Published lines by term if the run is of ACS/WFC in F606W, otherwise an empty dict."""
     release = config.get("products", {}).get("release") or {}
     detector = (release.get("instrument", "ACS"), release.get("detector", "WFC"))
     if detector != ("ACS", "WFC") or set(chips) != {"WFC1", "WFC2"} or filter != "F606W":

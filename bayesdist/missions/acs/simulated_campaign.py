@@ -1,4 +1,4 @@
-"""`bayesdist simulate acs`: the 47 Tuc campaign as files, and how to calibrate it."""
+"""`bayesdist simulate acs`: write the 47 Tuc campaign and configurations for its calibration."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ from bayesdist.utils.arrays import Float
 from bayesdist.utils.quantities import Random
 
 START = "start_idc.fits"
-REFERENCE = "F606W"  # the filter of the detector's tables and of the drift
+REFERENCE = "F606W"  # filter in which the detector tables and the drift are fitted
 SCALE_ARCSEC = 0.05
-V2V3 = (257.4, 302.6)  # arcsec: where the reference chip's zero point lies, about
+V2V3 = (257.4, 302.6)  # approximate position of the reference chip's zero point, arcsec
 
 CONFIG = """\
 # Calibrates one filter of a simulated campaign: bayesdist run THIS -o {run}
@@ -79,7 +79,7 @@ unit = "pix"
 RELEASE = """
 [products.release]
 name = "acs_wfc"
-reference = "{start}"        # how V2 and V3 lie
+reference = "{start}"        # orientation of V2 and V3
 [[products.release.period]]
 name = "pre"
 years = [2002.2, 2009.4]
@@ -105,11 +105,11 @@ def simulate_campaign(
     cte: bool,
     no_tables: bool,
 ) -> str:
-    """Text to print, once a campaign is simulated and written into a folder."""
+    """Simulate a campaign and write it to a folder; returns text to print."""
     folder = Path(output)
     if (folder / "lists").exists() and not force:
         raise InputError(
-            "the folder holds a campaign", where=str(folder), do="replace it by --force"
+            "the folder contains a campaign", where=str(folder), do="use --force to replace it"
         )
     with progress_bar("exposures") as progress:
         campaign = simulate_acs(
@@ -138,7 +138,7 @@ def simulate_campaign(
         runs = " ".join(str(folder / _run(name)) for name in names)
         lines.append(f"bayesdist release {runs} -o {folder / 'release'}")
     return (
-        f"{table_text(_rows(campaign))}\n\n{folder / 'README.txt'} says what the files hold\n"
+        f"{table_text(_rows(campaign))}\n\n{folder / 'README.txt'} describes the files\n"
         "calibrate it:\n  " + "\n  ".join(lines)
     )
 
@@ -152,26 +152,28 @@ def _run(filter: str) -> str:
 
 
 def _config(filter: str, reference: str) -> str:
-    """Text of a configuration: other filters take tables and drift from the reference's run."""
+    """Configuration text; other filters take tables and drift from the run of the reference."""
     text = CONFIG + RELEASE if filter == reference else CONFIG
-    own = filter == reference
+    is_reference = filter == reference
     return text.format(
         filter=filter,
         start=START,
         run=_run(filter),
         detector=""
-        if own
-        else f'\ndetector = "{_run(reference)}"       # held; fitted is the filter\'s',
-        rates="" if own else f'\nrates = "{_run(reference)}"          # one drift for all filters',
+        if is_reference
+        else f'\ndetector = "{_run(reference)}"       # fixed; only the filter table is fitted',
+        rates=""
+        if is_reference
+        else f'\nrates = "{_run(reference)}"          # one drift for all filters',
     )
 
 
 def _stale() -> IdcTab:
-    """IDCTAB that an observer has before: the distortion of 2004.5, without drift."""
+    """Initial IDCTAB for the matching: the distortion of 2004.5, without drift."""
     model, theta = acs_solution()
-    known = replace(model, time=None)
+    without_drift = replace(model, time=None)
     return idctab_from_solution(
-        _Exact(known, theta[: known.n_params]),
+        _Exact(without_drift, theta[: without_drift.n_params]),
         instrument="ACS",
         detector="WFC",
         scale_arcsec=SCALE_ARCSEC,
@@ -183,7 +185,7 @@ def _stale() -> IdcTab:
 
 @dataclass(frozen=True, eq=False)
 class _Exact(Solution):
-    """Given parameters as a solution without errors."""
+    """Solution with exact parameters."""
 
     model: DistortionModel
     mean: Float
@@ -197,22 +199,22 @@ class _Exact(Solution):
 
 
 def _rows(campaign: AcsCampaign) -> list[dict[str, object]]:
-    """One row for each filter."""
+    """Rows of the table of filters that is printed."""
     epochs = campaign.log.values("epoch")
-    filters = np.array([one.filter for one in campaign.log])
-    sizes = np.array([len(one) for one in campaign.lists])
-    false = np.array([int((one.star < 0).sum()) for one in campaign.truth.detections])
+    filters = np.array([item.filter for item in campaign.log])
+    sizes = np.array([len(item) for item in campaign.lists])
+    false = np.array([int((item.star < 0).sum()) for item in campaign.truth.detections])
     rows: list[dict[str, object]] = []
     for name in campaign.log.filters:
-        of = filters == name
+        in_filter = filters == name
         rows.append(
             {
                 "filter": name,
-                "exposures": int(of.sum()),
-                "first": f"{epochs[of].min():.2f}",
-                "last": f"{epochs[of].max():.2f}",
-                "detections": int(sizes[of].sum()),
-                "false": int(false[of].sum()),
+                "exposures": int(in_filter.sum()),
+                "first": f"{epochs[in_filter].min():.2f}",
+                "last": f"{epochs[in_filter].max():.2f}",
+                "detections": int(sizes[in_filter].sum()),
+                "false": int(false[in_filter].sum()),
                 "catalogue": len(campaign.catalog),
             }
         )

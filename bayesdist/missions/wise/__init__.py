@@ -1,4 +1,4 @@
-"""WISE: simulated pairs, the tables and figures of its distortion report, and its files."""
+"""WISE: simulated pairs, tables and figures of its distortion report, and file formats."""
 
 import lazy_loader
 

@@ -1,4 +1,4 @@
-"""Commands of WISE: demo, bands, bring-up, rotate, rvb, and its simulated pairs."""
+"""Command line for WISE: demo, bands, bring-up, rotate, rvb, and simulated pairs."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from bayesdist.app.commands.options import (
 def _number(
     *names: str, help: str, default: float = 0.0, metavar: str = "A"
 ) -> Callable[[Callable[..., None]], Callable[..., None]]:
-    """Option with a number."""
+    """Option that takes a number."""
     return click.option(*names, type=float, default=default, metavar=metavar, help=help)
 
 
@@ -46,7 +46,7 @@ _rotation_of_nothing = Unused(
     "--as",
     "format",
     type=click.Choice(["jwst", "roman", "tpv"]),
-    help="Write the result in this format, too.",
+    help="Also write the result in this format.",
 )
 @click.option("--force", is_flag=True, help="Replace an earlier demo.")
 @click.pass_obj
@@ -60,18 +60,16 @@ def demo(line: str, output: str, format: str | None, force: bool) -> None:
 @command(example="wise bands w1-run w2-run -o bands", unused=[_rotation_of_nothing])
 @click.argument("runs", nargs=-1, required=True, metavar="RUN...", type=click.Path())
 @new_folder
-@click.option(
-    "--bins", type=int, default=31, metavar="N", help="Number of residual bins on each axis."
-)
+@click.option("--bins", type=int, default=31, metavar="N", help="Number of residual bins per axis.")
 @click.option(
     "--optical",
     type=CommaList(),
     default=(),
     metavar="FILE,...",
-    help="SIP header or WISE meta-data of an optical model; one, or one for each run.",
+    help="SIP header or WISE meta-data of an optical model; one for all runs, or one per run.",
 )
 @_optical_rotation
-@click.option("--no-published", is_flag=True, help="Leave out the values of WISE's report.")
+@click.option("--no-published", is_flag=True, help="Omit the published values of WISE.")
 @click.pass_obj
 def bands(
     line: str,
@@ -82,9 +80,9 @@ def bands(
     rotation: float,
     no_published: bool,
 ) -> None:
-    """Compare bands: tables and diagrams.
+    """Compare bands: tables and figures.
 
-    Each RUN is a finished run of another band.
+    Each RUN is a finished run of a different band.
     """
     from bayesdist.missions.wise.bands.command import bands_of_runs
 
@@ -111,7 +109,7 @@ def bands(
 @click.option("--band", required=True, metavar="W1", help="Band of the detections.")
 @click.option("--order", type=int, default=4, metavar="N", help="Final order of the polynomial.")
 @_number("--radius", default=1.0, help="Acceptance radius of pairs at the array's centre, pixels.")
-@_number("--corner-radius", default=3.0, help="The same in the corners.")
+@_number("--corner-radius", default=3.0, help="Acceptance radius in the corners, pixels.")
 @click.option(
     "--optical", metavar="FILE", help="SIP header or WISE meta-data of the initial distortion."
 )
@@ -130,7 +128,7 @@ def bring_up(line: str, detections: str, reference: str, output: str, **options:
 @command(example="wise rotate codev.hdr --angle 270 -o turned.hdr")
 @click.argument("file", metavar="FILE", type=click.Path())
 @_number("--angle", metavar="DEG", help="Angle from x towards y, degrees.")
-@click.option("--mirror", is_flag=True, help="Change the sign of x first.")
+@click.option("--mirror", is_flag=True, help="Reverse x before the rotation.")
 @click.option(
     "-o", "--output", type=click.Path(), required=True, metavar="OUT", help="File to write."
 )
@@ -148,15 +146,15 @@ def rvb() -> None:
 
 
 def _pairs(function: Callable[..., None]) -> Callable[..., None]:
-    """Argument and options of pairs, which both commands have."""
+    """Decorator that adds the common argument and options of both commands."""
     for decorate in (
         click.option(
             "--columns",
             type=column_names,
             metavar="KEY=NAME,...",
-            help="Names of columns, as data.columns.",
+            help="Names of columns, as in data.columns.",
         ),
-        click.option("--band", metavar="W1", help="Band, needed where the files hold several."),
+        click.option("--band", metavar="W1", help="Band; required if the files contain several."),
         new_folder,
         click.argument("files", nargs=-1, required=True, metavar="FILE...", type=click.Path()),
     ):
@@ -171,10 +169,10 @@ def _pairs(function: Callable[..., None]) -> Callable[..., None]:
 @_pairs
 @_number("--dx", help="Shift along x, pixels.")
 @_number("--dy", help="Shift along y, pixels.")
-@_number("--rotation", metavar="DEG", help="About the array's centre, from x towards y.")
-@_number("--scale-x", help="Relative to one: 1e-4 stretches x by so much.")
-@_number("--scale-y", help="Relative to one.")
-@click.option("--fit", is_flag=True, help="Fit these five to the pairs, by least squares.")
+@_number("--rotation", metavar="DEG", help="Rotation about the centre, from x towards y, degrees.")
+@_number("--scale-x", help="Scale of x minus 1: 1e-4 stretches x by this fraction.")
+@_number("--scale-y", help="Scale of y minus 1.")
+@click.option("--fit", is_flag=True, help="Fit these five parameters by least squares.")
 def transform(files: tuple[str, ...], output: str, **options: Any) -> None:
     """Transform all pairs by one linear transformation.
 
@@ -192,13 +190,13 @@ def transform(files: tuple[str, ...], output: str, **options: Any) -> None:
     "free",
     required=True,
     metavar="TABLE",
-    help="Solutions with which the pairs were made.",
+    help="Frame solutions with which the pairs were made.",
 )
 @click.option(
-    "--to", "fixed", required=True, metavar="TABLE", help="Solutions to which they are transformed."
+    "--to", "fixed", required=True, metavar="TABLE", help="Frame solutions to transform them to."
 )
 def rereference(files: tuple[str, ...], output: str, **options: Any) -> None:
-    """Transform each frame from one solution to another."""
+    """Transform the pairs of each frame from one solution to another."""
     from bayesdist.missions.wise.rvb.command import rereference_files
 
     click.echo(rereference_files(files, output, **options))
@@ -209,7 +207,7 @@ rvb.add_command(rereference)
 
 
 def _one_table(options: Mapping[str, Any]) -> bool:
-    """True if one small table is asked for."""
+    """True if one small table is requested."""
     return any(options[name] is not None for name in ("stars", "band", "fraction"))
 
 
@@ -221,7 +219,7 @@ def _one_table(options: Mapping[str, Any]) -> bool:
             "bands pairs false_fraction partition_pattern",
             "for one small table (--stars, --band or --fraction)",
             _one_table,
-            "leave these out",
+            "omit these options",
         )
     ],
 )
@@ -243,9 +241,9 @@ def _one_table(options: Mapping[str, Any]) -> bool:
     help="Number of pairs in each band.",
 )
 @_number("--false-fraction", default=0.03, metavar="F", help="Fraction of false matches.")
-@click.option("--partition-pattern", is_flag=True, help="Add a pattern of blocks to the residuals.")
+@click.option("--partition-pattern", is_flag=True, help="Add a block pattern to the residuals.")
 @click.option(
-    "--stars", type=int, metavar="N", help="Make one small table of one band with N stars instead."
+    "--stars", type=int, metavar="N", help="Make a single table of one band with N stars instead."
 )
 @click.option("--band", metavar="W2", help="Band of the small table.")
 @click.option("--fraction", type=float, help="Fraction of false matches in the small table.")
@@ -265,5 +263,5 @@ def simulate(
         click.echo(simulate_sets(output, seed=seed, force=force, **options))
         return
     asked: Mapping[str, Any] = {"stars": stars, "band": band, "fraction": fraction}
-    given = {name: value for name, value in asked.items() if value is not None}
-    click.echo(simulate_table(output, seed=seed, force=force, **given))
+    small_table = {name: value for name, value in asked.items() if value is not None}
+    click.echo(simulate_table(output, seed=seed, force=force, **small_table))

@@ -1,4 +1,4 @@
-"""`bayesdist demo`: the main job on simulated WISE W2 pairs, with the truth beside the estimate."""
+"""`bayesdist demo`: calibrate simulated WISE W2 pairs and compare the result with the truth."""
 
 from __future__ import annotations
 
@@ -24,9 +24,9 @@ from bayesdist.infer import LinearFit, Posterior
 from bayesdist.missions.wise.simulate import simulate_wise
 from bayesdist.simulate import Truth
 
-SEED = 20110201  # the date of the report that the coefficients come from
+SEED = 20110201  # date of the report from which the coefficients are taken
 N_STARS = 6000
-SCALES = {"jwst": 0.0656, "roman": 0.1075, "tpv": 2.75}  # arcsec in a pixel, as of a detector
+SCALES = {"jwst": 0.0656, "roman": 0.1075, "tpv": 2.75}  # arcsec per pixel, by format
 
 _PLACED = {
     "useafter": "2026-01-01T00:00:00",
@@ -36,7 +36,7 @@ _PLACED = {
     "v3ref": 0.0,
     "v3idlyangle": 0.0,
 }
-# formats of `--as`, with settings of each: whose detector this is not
+# formats of `--as`, with placeholder settings (the demo is not of these detectors)
 FILES: dict[str, dict[str, Any]] = {
     "jwst": {"instrument": "NIRISS", "detector": "NIS", "filter": "CLEAR", "pupil": "F200W"}
     | _PLACED,
@@ -46,7 +46,7 @@ FILES: dict[str, dict[str, Any]] = {
 
 _CONFIG = """\
 # Matched WISE {band} and 2MASS positions, simulated from the published distortion
-# (WSDC D-T033, Appendix B); truth.ecsv holds what they were made from.
+# (WSDC D-T033, Appendix B); truth.ecsv contains the true parameters.
 
 [data]
 matches = "stars.ecsv"
@@ -69,7 +69,7 @@ seed = 1
 [assess]
 grid = [33, 33]
 
-[[budget]]                      # the system of 2MASS positions against the sky
+[[budget]]                      # zero point of 2MASS positions relative to the sky
 name = "reference catalogue"
 kind = "systematic"
 sigma_u = 0.005
@@ -94,7 +94,7 @@ probability = 0.95
 sip = {{inverse_order = 5, {sip}}}
 """
 
-MIDDLE = 508.5  # pixel from which u, v of the demo count, as offsets in a focal plane do
+MIDDLE = 508.5  # pixel at which u and v of the demo are zero, as for focal-plane offsets
 
 
 def write_simulation(
@@ -102,7 +102,7 @@ def write_simulation(
 ) -> None:
     """Write stars.ecsv, truth.ecsv and config.toml of a simulated band.
 
-    `sip`: how its SIP header states u, v; by default as WISE has it.
+    `sip` are settings for the SIP header in the configuration; the default is the form of WISE.
     """
     made_folder(folder)
     stars = QTable()
@@ -123,18 +123,20 @@ def write_simulation(
 
 
 def demo(folder: str | Path, *, format: str | None, force: bool, command: str) -> str:
-    """Text to print, once pairs are simulated, calibrated, and compared with the truth.
+    """Simulate pairs, calibrate them and compare with the truth; returns text to print.
 
-    The folder holds ``input/`` and ``run/`` afterwards, and with one of FILES for a format the
-    result in ``file/``.
+    The folder contains ``input/`` and ``run/``, and ``file/`` if a format, one of `FILES`, is
+    given.
     """
     folder = Path(folder)
-    known = {"input", "run", "file"}
-    if folder.is_dir() and {p.name for p in folder.iterdir()} - known:
-        raise InputError("the folder holds other files", where=str(folder), do="choose another one")
+    subfolders = {"input", "run", "file"}
+    if folder.is_dir() and {p.name for p in folder.iterdir()} - subfolders:
+        raise InputError(
+            "the folder contains other files", where=str(folder), do="choose another one"
+        )
     if (folder / "run").exists() and not force:
         raise InputError(
-            "the folder holds another demo", where=str(folder), do="replace it by --force"
+            "the folder contains another demo", where=str(folder), do="use --force to replace it"
         )
     matches, truth = _from_middle(*simulate_wise(N_STARS, rng=np.random.default_rng(SEED)))
     write_simulation(folder / "input", matches, truth, "W2", sip='axes = "linear"')
@@ -159,7 +161,7 @@ def demo(folder: str | Path, *, format: str | None, force: bool, command: str) -
 
 
 def _from_middle(matches: Matches, truth: Truth) -> tuple[Matches, Truth]:
-    """Matches and truth whose u, v are offsets from the middle of the detector."""
+    """Matches and truth with u and v as offsets from the centre of the detector."""
     theta = truth.theta.copy()
     theta[[truth.model.names.index(name) for name in ("u_0_0", "v_0_0")]] -= MIDDLE
     moved = replace(matches, u=matches.u - MIDDLE, v=matches.v - MIDDLE)

@@ -1,4 +1,4 @@
-"""What WISE adds to the package, as its entry point names it."""
+"""Entry point of the mission WISE: its commands, file formats and simulations."""
 
 from bayesdist.mission import Mission
 

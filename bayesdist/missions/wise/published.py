@@ -1,4 +1,4 @@
-"""Printed values of the report of the WISE calibration (WSDC D-T033)."""
+"""Published values of the WISE distortion calibration (WSDC D-T033)."""
 
 from __future__ import annotations
 
@@ -7,10 +7,11 @@ from dataclasses import dataclass
 WISE_BANDS = ("W1", "W2", "W3", "W4")
 
 # Appendix B.  band: (A, B), each in the order of polynomial_terms(4): 00, 10, 01, 20, 11, 02, 30,
-# ...  All as printed but for one: as B_0_2 of W1 the report prints B_1_1 once more.  The value here
-# is the one for which the printed inverse closes best (0.0002 px rms over the array); with it
-# B_DMAX is 1.066 as printed, with the printed one 1.97.  A_1_0 of W3 is printed with a digit too
-# many; which one it is changes no position by more than 3e-7 px.
+# ...  All values are as published except B_0_2 of W1, for which the report repeats B_1_1.  The
+# value here gives the smallest closure error of the published inverse (0.0002 px rms over the
+# array).  It also gives the published B_DMAX of 1.066, instead of 1.97 for the published value.
+# A_1_0 of W3 is published with an extra digit; removing any one digit changes positions by at most
+# 3e-7 px.
 # fmt: off
 WISE_COEFFICIENTS: dict[str, tuple[tuple[float, ...], tuple[float, ...]]] = {
     "W1": (
@@ -48,14 +49,14 @@ WISE_COEFFICIENTS: dict[str, tuple[tuple[float, ...], tuple[float, ...]]] = {
 }
 # fmt: on
 
-# section 4: longest vector, the zeroth order suppressed
+# section 4: longest vector without the constant, pixels
 LONGEST_VECTORS = {"W1": 2.931, "W2": 3.048, "W3": 3.004, "W4": 1.435}
 
-# section 4: pairs in the calibrations; section 6: largest radius of the formal uncertainty, px
+# section 4: numbers of pairs; section 6: largest radius of the formal uncertainty, pixels
 SAMPLE_SIZES = {"W1": 10_350_744, "W2": 11_213_542, "W3": 3_765_817, "W4": 315_505}
 FORMAL_RADII = {"W1": 0.0093, "W2": 0.0082, "W3": 0.0028, "W4": 0.0026}
 
-# Table 5-1, px: sigma over 31 x 31 bins of the mean residual in X and Y
+# Table 5-1: sigma over 31 x 31 bins of the mean residual in X and Y, pixels
 RESIDUAL_SIGMAS = {
     "W1": (0.01949, 0.01159),
     "W2": (0.01679, 0.008914),
@@ -66,19 +67,19 @@ RESIDUAL_SIGMAS = {
 
 @dataclass(frozen=True)
 class WiseArray:
-    """Detector array: columns and rows, and arcsec per pixel."""
+    """Detector array of a band."""
 
-    size: tuple[float, float]
-    scale: float
+    size: tuple[float, float]  # columns and rows
+    scale: float  # arcsec per pixel
 
     @property
     def centre(self) -> tuple[float, float]:
-        """Reference pixel, FITS 1-based: u = v = 0 of Appendix B."""
+        """Reference pixel, FITS 1-based, at which u = v = 0 in Appendix B."""
         return (self.size[0] + 1) / 2, (self.size[1] + 1) / 2
 
 
-# W4 is binned 2 x 2.  The printed A_DMAX and B_DMAX are reached with u, v within +-507.5 pixels,
-# the centres of the outermost ones; of W4 within +-254, their edges.
+# W4 is binned 2 x 2.  The published A_DMAX and B_DMAX are the maxima for u and v within +-507.5
+# pixels, the centres of the outermost pixels; for W4 within +-254 pixels, the edges of the array.
 _FULL = WiseArray((1016.0, 1016.0), 2.75)
 WISE_ARRAYS = {"W1": _FULL, "W2": _FULL, "W3": _FULL, "W4": WiseArray((508.0, 508.0), 5.5)}
 WISE_ARCSEC = {band: array.scale for band, array in WISE_ARRAYS.items()}  # per pixel

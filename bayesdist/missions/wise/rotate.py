@@ -1,4 +1,4 @@
-"""`bayesdist wise rotate`: a product in rotated or mirrored pixels."""
+"""`bayesdist wise rotate`: rotate or mirror the pixel frame of a SIP header or WISE meta-data."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def rotate(
     mirror: bool,
     force: bool,
 ) -> str:
-    """Text to print, once a SIP header or WISE meta-data are written in rotated pixels."""
+    """Write a SIP header or WISE meta-data in a rotated pixel frame; returns text to print."""
     path, output = Path(path), Path(output)
     refuse_existing(output, force)
     key = open_document(path).format.key
@@ -36,12 +36,14 @@ def rotate(
         write_sip(turned, output)
         lines = [_line("", turned)]
     elif key == "wise_meta":
-        bands = {one.band: _turned(one, degrees, mirror, str(path)) for one in read_wise_meta(path)}
+        bands = {
+            band.band: _turned(band, degrees, mirror, str(path)) for band in read_wise_meta(path)
+        }
         write_wise_meta(output, bands)
-        lines = [_line(f"W{one.band}: ", one.sip) for one in read_wise_meta(output)]
+        lines = [_line(f"W{band.band}: ", band.sip) for band in read_wise_meta(output)]
     else:
         raise InputError(
-            "holds no SIP keywords", where=str(path), do="give a SIP header or WISE meta-data"
+            "has no SIP keywords", where=str(path), do="give a SIP header or WISE meta-data"
         )
     mirrored = "mirrored and " if mirror else ""
     return "\n".join([f"{output}: {mirrored}rotated by {degrees:g} degrees", *lines])
@@ -50,21 +52,25 @@ def rotate(
 def _turned(one: WiseBand, degrees: float, mirror: bool, where: str) -> SipHeader:
     if degrees % 90 != 0:
         raise InputError(
-            f"the angle is {degrees:g}, and arrays of WISE meta-data lie along the pixel axes",
+            f"the angle is {degrees:g}, but arrays in WISE meta-data are aligned with the axes",
             where=where,
             do="give a multiple of 90",
         )
     if one.skew != 0:
-        # a factor on one axis becomes one on the other, and a rotation
+        # the skew would become a scale of the other axis and a rotation
         raise InputError(
             f"SKEW of band {one.band} is {one.skew:g} rad, which cannot be kept in a rotated frame",
             where=where,
-            do="put it into A and B",
+            do="include it in A and B",
         )
     return rotated_sip(one.sip, degrees, mirror=mirror)
 
 
 def _line(name: str, sip: SipHeader) -> str:
-    said = {"A_DMAX": sip.a_dmax, "B_DMAX": sip.b_dmax, "worst closure": sip.closure}
-    parts = [f"{what} {number(value)} px" for what, value in said.items() if value is not None]
+    maxima = {"A_DMAX": sip.a_dmax, "B_DMAX": sip.b_dmax, "worst closure": sip.closure}
+    parts = [
+        f"{name_of_value} {number(value)} px"
+        for name_of_value, value in maxima.items()
+        if value is not None
+    ]
     return f"  {name}{', '.join(parts) or 'no maxima and no closure stated'}"

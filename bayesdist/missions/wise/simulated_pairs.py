@@ -1,4 +1,4 @@
-"""`bayesdist simulate wise`: pairs of WISE and 2MASS, and how to calibrate them."""
+"""`bayesdist simulate wise`: write simulated pairs, and configurations for their calibration."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ from bayesdist.missions.wise.simulate.optical import DELIVERED_TURN, write_optic
 
 WISE_CONFIG = """\
 # Calibrates WISE {band} from simulated pairs: bayesdist run THIS -o {run}
-# {truth} holds what they were made from
+# {truth} contains the true parameters
 [data]
 matches = "{folder}"
 simulated = true
 format = "rvb"
 band = "{band}"
-columns = {{exposure = ""}}    # without the frames: one distortion serves all
+columns = {{exposure = ""}}    # without frames: the distortion is the same in all
 
 [detector]
 mission = "WISE"
@@ -44,7 +44,7 @@ grid = [33, 33]
 [[budget]]
 name = "reference catalogue"
 kind = "random"
-sigma_u = 0.0                # the simulation's is exact; of 2MASS state yours
+sigma_u = 0.0                # exact in the simulation; for 2MASS give its error
 sigma_v = 0.0
 source = "simulation"
 
@@ -68,16 +68,16 @@ def simulate_table(
     seed: int,
     force: bool,
 ) -> str:
-    """Text to print, once one small table of one band and its configuration are written."""
+    """Write a single table of one band and its configuration; returns text to print."""
     if stars < 1 or not 0 <= fraction < 1:
         raise InputError(
-            "a simulation needs stars, and true matches among them",
-            do="give --stars 1 or more and --fraction in [0, 1)",
+            "a simulation needs stars and true matches",
+            do="give --stars of at least 1 and --fraction in [0, 1)",
         )
     folder = Path(output)
     if (folder / "config.toml").exists() and not force:
         raise InputError(
-            "the folder holds a configuration", where=str(folder), do="replace it by --force"
+            "the folder contains a configuration", where=str(folder), do="use --force to replace it"
         )
     rng = np.random.default_rng(seed)
     matches, truth = simulate_wise(stars, band=band, fraction=fraction, rng=rng)
@@ -98,10 +98,10 @@ def simulate_sets(
     seed: int,
     force: bool,
 ) -> str:
-    """Text to print, once full sets of bands in Parquet and their configurations are written."""
+    """Write full sets of bands in Parquet and their configurations; returns text to print."""
     folder = Path(output)
     if len(set(bands)) < len(bands):
-        raise InputError("a band is named twice", where="--bands", do="name each once")
+        raise InputError("a band is given twice", where="--bands", do="give each band once")
     sets = [
         wise_set(
             band,
@@ -112,22 +112,24 @@ def simulate_sets(
         )
         for band in bands
     ]
-    names = [one.band.lower() for one in sets]
+    names = [wise_band_set.band.lower() for wise_band_set in sets]
     used = [name for name in ("config.toml", *names) if (folder / name).exists()]
     if used and not force:
         raise InputError(
-            f"the folder holds {used[0]} already", where=str(folder), do="replace it by --force"
+            f"the folder contains {used[0]} already",
+            where=str(folder),
+            do="use --force to replace it",
         )
     rows: list[dict[str, object]] = []
     lines = []
-    for one, name in zip(sets, names, strict=True):
-        n_false = write_wise_set(one, folder, threads=os.cpu_count() or 1, force=force)
-        write_text(folder / f"{name}.toml", _wise_config(one))
-        blocks = 0 if one.pattern is None else one.pattern.blocks
+    for wise_band_set, name in zip(sets, names, strict=True):
+        n_false = write_wise_set(wise_band_set, folder, threads=os.cpu_count() or 1, force=force)
+        write_text(folder / f"{name}.toml", _wise_config(wise_band_set))
+        blocks = 0 if wise_band_set.pattern is None else wise_band_set.pattern.blocks
         rows.append(
             {
-                "band": one.band,
-                "pairs": one.pairs,
+                "band": wise_band_set.band,
+                "pairs": wise_band_set.pairs,
                 "false": n_false,
                 "partition": f"{blocks} x {blocks}" if blocks else "none",
             }

@@ -1,1 +1,1 @@
-"""Formats of calibration files, one module or folder each."""
+"""Formats of calibration files, one module or subpackage per format."""

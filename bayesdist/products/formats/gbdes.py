@@ -1,10 +1,10 @@
-"""Model parameters of gbdes with their covariance, as Rubin's gbdesAstrometricFit writes them.
+"""Model parameters of gbdes with their covariance, as written by Rubin's gbdesAstrometricFit.
 
-A table with the columns mapName, coordinate (x or y), coefficientNumber, parameter and, for each of
-its rows, a column ``{map}_{x|y}_{n}_cov`` with that row of the covariance matrix, n counting
-through both coordinates of a map.  A map of a detector, ``{band}/{detector}/poly``, takes pixels
-that run from -1 to 1, x' = 2 x / NX - 1 with x counted from 0, to degrees; maps of visits follow
-it.  Coefficients are in the order 1, x, y, x^2, xy, y^2, ...
+The table has the columns mapName, coordinate (x or y), coefficientNumber and parameter. For each
+row it also has a column ``{map}_{x|y}_{n}_cov`` with that row of the covariance matrix, where n
+counts through both coordinates of a map. The map of a detector, ``{band}/{detector}/poly``,
+converts pixels scaled to -1 to 1, x' = 2 x / NX - 1 with x counted from 0, to degrees; the map of a
+visit is applied after it. Coefficients are in the order 1, x, y, x^2, xy, y^2, ...
 """
 
 from __future__ import annotations
@@ -36,24 +36,24 @@ if TYPE_CHECKING:
 
 _COLUMNS = ("mapName", "coordinate", "coefficientNumber", "parameter")
 _DEVICE = re.compile(r"(.+)/(\d+)/poly$")
-_NOT_EVEN = 1e-9  # by which a covariance matrix may differ from its transpose, of its size
+_NOT_EVEN = 1e-9  # relative tolerance for the symmetry of a covariance matrix
 
 
 @dataclass(frozen=True, eq=False)
 class GbdesParameters:
-    """Table of parameters."""
+    """Table of gbdes model parameters."""
 
     name: str
     table: Table
 
     @property
     def maps(self) -> dict[str, Int]:
-        """Rows of each map, x before y, by its name."""
+        """Row indices of each map, x before y, by the name of the map."""
         names = np.asarray(self.table["mapName"]).astype(str)
         return {str(n): np.flatnonzero(names == n) for n in dict.fromkeys(names)}
 
     def order(self, rows: Int) -> int:
-        """Order of a map; FormatError where its coefficients are those of no order."""
+        """Polynomial order of a map; FormatError if the number of coefficients fits no order."""
         half = len(rows) // 2
         for order in range(MAX_ORDER + 1):
             if len(polynomial_terms(order)) == half and len(rows) == 2 * half:
@@ -62,7 +62,7 @@ class GbdesParameters:
 
     @property
     def covariance(self) -> Float | None:
-        """Matrix of all parameters in the order of the rows; None where a column is missing."""
+        """Covariance of all parameters in the order of the rows; None if a column is missing."""
         columns = []
         for name, rows in self.maps.items():
             for p in range(len(rows)):
@@ -74,9 +74,9 @@ class GbdesParameters:
         return np.stack(columns)
 
     def devices(self, band: str | None) -> dict[int, Int]:
-        """Rows of the maps of detectors, by number, of one band."""
-        found = {n: m for n in self.maps if (m := _DEVICE.match(n)) is not None}
-        bands = list(dict.fromkeys(match[1] for match in found.values()))
+        """Row indices of the detector maps of one band, by detector number."""
+        matches = {n: m for n in self.maps if (m := _DEVICE.match(n)) is not None}
+        bands = list(dict.fromkeys(match[1] for match in matches.values()))
         if band is None and len(bands) > 1:
             raise InputError(
                 f"holds the bands {', '.join(bands)}",
@@ -91,12 +91,12 @@ class GbdesParameters:
                 do="give the parameters of a fit with maps BAND/DETECTOR/poly",
             )
         return {
-            int(match[2]): self.maps[name] for name, match in found.items() if match[1] == chosen
+            int(match[2]): self.maps[name] for name, match in matches.items() if match[1] == chosen
         }
 
 
 def _parse(content: Content) -> GbdesParameters | None:
-    # of thousands of columns the names stand anywhere in the end of a Parquet file
+    # with thousands of columns, the column names are far from the end of a Parquet file
     if content.path is None or not all(name.encode() in content.raw for name in _COLUMNS):
         return None
     from bayesdist.files.tables import read_table  # slow to import
@@ -150,7 +150,7 @@ def _findings(found: GbdesParameters) -> Iterator[Finding]:
 
 
 def _describe(found: GbdesParameters) -> list[str]:
-    """Lines of text on the maps, and the findings."""
+    """Lines of text on the maps, followed by the findings."""
     lines = [f"{found.name}: model parameters of gbdes, {len(found.maps)} maps"]
     cov = found.covariance
     sigma = None if cov is None else np.sqrt(np.maximum(np.diag(cov), 0.0))
@@ -165,7 +165,7 @@ def _describe(found: GbdesParameters) -> list[str]:
 
 
 def _calibration(found: GbdesParameters, name: str, choice: Choice) -> Calibration:
-    """Calibration of the detectors' maps, with their joint covariance, in degrees."""
+    """Calibration in degrees from the maps of the detectors, with their joint covariance."""
     if choice.size is None:
         raise MissingSizeError(
             "does not say how large the detectors are",
@@ -183,15 +183,15 @@ def _calibration(found: GbdesParameters, name: str, choice: Choice) -> Calibrati
         maps[number] = _map(values[rows], found.order(rows), order, choice.size, name, number)
         changes.append(_change(found.order(rows), maps[number].basis))
         used.append(rows)
-    cov, whole = None, found.covariance
-    if whole is not None:
+    cov, full_cov = None, found.covariance
+    if full_cov is not None:
         rows = np.concatenate(used)
         sizes = [c.shape[0] for c in changes]
         J = np.zeros((sum(sizes), len(rows)))
         at = np.cumsum([0, *sizes]), np.cumsum([0, *(c.shape[1] for c in changes)])
         for k, change in enumerate(changes):
             J[at[0][k] : at[0][k + 1], at[1][k] : at[1][k + 1]] = change
-        cov = J @ whole[np.ix_(rows, rows)] @ J.T
+        cov = J @ full_cov[np.ix_(rows, rows)] @ J.T
         cov = (cov + cov.T) / 2
     return calibration_of_maps(
         maps, name, cov=cov, errors="covariance", filter=choice.filter or "",
@@ -220,8 +220,8 @@ def _change(own: int, basis: PolynomialBasis) -> Float:
     for k in range(len(polynomial_terms(own))):
         values = np.zeros((2, len(polynomial_terms(own))))
         values[0, k] = 1.0
-        one = _map(values.ravel(), own, basis.order, basis.size, "", 1)
-        columns.append(one.coefficients[0])
+        chip_map = _map(values.ravel(), own, basis.order, basis.size, "", 1)
+        columns.append(chip_map.coefficients[0])
     return np.kron(np.eye(2), np.stack(columns, axis=1))
 
 

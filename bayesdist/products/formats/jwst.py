@@ -1,4 +1,4 @@
-"""JWST's distortion reference files, ASDF, as its pipeline reads them."""
+"""JWST distortion reference files in ASDF, as read by the JWST pipeline."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ class Settings(PlacedSettings):
 
 
 def _node(content: Content) -> tuple[Mapping[str, Any], str] | None:
-    """Node of any ASDF file that is not Roman's: of another kind it is refused."""
+    """Root node of an ASDF file, None for a Roman file; FormatError for any other content."""
     tree = tree_of(content)
     if "roman" in tree:
         return None
@@ -40,7 +40,7 @@ def _node(content: Content) -> tuple[Mapping[str, Any], str] | None:
 _SHORT = ("NRCA1", "NRCA2", "NRCA3", "NRCA4", "NRCB1", "NRCB2", "NRCB3", "NRCB4")
 _LONG = ("NRCALONG", "NRCBLONG")
 _SIDE = (2048.0, 2048.0)
-# Scales: mean pixels of the FULL apertures in the SIAF (PRDOPSSOC-075).
+# Pixel scales: mean over the FULL apertures in the SIAF (PRDOPSSOC-075).
 _DETECTORS = {
     "NIRCAM": dict.fromkeys(_SHORT, Detector(_SIDE, 0.0311))
     | dict.fromkeys(_LONG, Detector(_SIDE, 0.0630)),
@@ -48,7 +48,7 @@ _DETECTORS = {
     "FGS": dict.fromkeys(("GUIDER1", "GUIDER2"), Detector(_SIDE, 0.0690)),
     "MIRI": {"MIRIMAGE": Detector((1032.0, 1024.0), 0.1109)},
 }
-# Of an exposure that takes an image of the sky.
+# Types of exposures that take direct images.
 EXPOSURE_TYPES = {
     "NIRCAM": "NRC_IMAGE",
     "NIRISS": "NIS_IMAGE",
@@ -63,19 +63,19 @@ def _detector(instrument: Mapping[str, Any]) -> Detector | None:
 
 
 def module_and_channel(detector: str) -> tuple[str, str]:
-    """NIRCam's module and channel of a detector, as in NRCA1 and NRCBLONG."""
+    """NIRCam module and channel of a detector, from names such as NRCA1 and NRCBLONG."""
     return detector[3], "LONG" if detector in _LONG else "SHORT"
 
 
 def _instrument(detector: str, settings: Settings) -> dict[str, Any]:
-    """Node meta.instrument; InputError for a detector that the instrument has not."""
+    """Node meta.instrument; InputError for a detector that the instrument does not have."""
     instrument = settings.instrument
-    known = _DETECTORS[instrument]
-    if detector not in known:
+    detectors = _DETECTORS[instrument]
+    if detector not in detectors:
         raise InputError(
             f"the detector is {detector!r}, none of {instrument}",
             where="products.jwst",
-            do=f"choose one of {', '.join(known)}",
+            do=f"choose one of {', '.join(detectors)}",
         )
     meta: dict[str, Any] = {"name": instrument, "detector": detector}
     if instrument == "NIRCAM":
@@ -85,12 +85,12 @@ def _instrument(detector: str, settings: Settings) -> dict[str, Any]:
     if settings.pupil:
         meta["pupil"] = settings.pupil
     if instrument == "NIRCAM":
-        # the data model asks for the pupils that the file is for
+        # the data model requires the pupils for which the file is valid
         meta["p_pupil"] = f"{settings.pupil or 'ANY'}|"
     return meta
 
 
-# What the data model asks of every reference file, and of the distortion of NIRCam.
+# Keywords that the data model requires of every reference file, and of NIRCam distortion files.
 _REQUIRED = ("reftype", "description", "author", "pedigree", "useafter", "telescope")
 _NIRCAM = ("module", "channel", "p_pupil")
 
@@ -110,7 +110,7 @@ def _meta(detector: str, settings: Settings) -> dict[str, Any]:
 
 
 def lint_meta(meta: Mapping[str, Any]) -> Iterator[Finding]:
-    """Findings on what identifies a file."""
+    """Findings on the metadata that identify a file."""
     instrument = meta["instrument"]
     missing = [f"meta.{key}" for key in _REQUIRED if not meta.get(key)]
     missing += [f"meta.instrument.{key}" for key in ("name", "detector") if not instrument.get(key)]

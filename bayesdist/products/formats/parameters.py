@@ -1,4 +1,4 @@
-"""Tables of parameters with their covariance, alone or beside text files, as a format."""
+"""Format of FITS tables of parameters and their covariance."""
 
 from __future__ import annotations
 
@@ -22,11 +22,11 @@ KIND = "table of parameters"
 
 
 class Settings(FormatSettings):
-    """Configuration of a table of parameters."""
+    """Configuration of a table of parameters, which has no options."""
 
 
 def _parse(content: Content) -> tuple[str, Hdu] | None:
-    """Name of a file that is such a table, and its extension."""
+    """Name and table HDU of a file that holds only a parameter table; None for any other file."""
     hdu = stored_in(content)
     if hdu is None or not hdu.number == len(content.tables) - 1 == 1:
         return None
@@ -36,20 +36,22 @@ def _parse(content: Content) -> tuple[str, Hdu] | None:
 def _describe(table: tuple[str, Hdu]) -> list[str]:
     """Lines of text on the table."""
     name, hdu = table
-    found = stored_calibration(hdu, name)
-    chips = ", ".join(f"{c.number} ({c.size[0]:g} x {c.size[1]:g} px)" for c in found.model.chips)
+    calibration = stored_calibration(hdu, name)
+    chips = ", ".join(
+        f"{c.number} ({c.size[0]:g} x {c.size[1]:g} px)" for c in calibration.model.chips
+    )
     return [
         f"{name}: parameters of a calibration, by bayesdist",
-        f"  order     {found.model.order}, u and v in {found.unit}",
+        f"  order     {calibration.model.order}, u and v in {calibration.unit}",
         f"  chips     {chips}",
-        f"  errors    {found.errors}",
+        f"  errors    {calibration.errors}",
         "",
         *finding_lines(()),
     ]
 
 
 def build(calibration: Calibration, _: Settings, options: BuildOptions) -> tuple[Built, ...]:
-    """One FITS file with all chips at one date; InputError for look-up tables, which it lacks."""
+    """Build one FITS file with all chips at one date; InputError for look-up tables."""
     if calibration.before or calibration.after:
         raise InputError(
             "a table of parameters has no look-up tables",

@@ -1,4 +1,4 @@
-"""Distortion reference files of Roman's Wide Field Instrument: ASDF, as romancal reads them."""
+"""Distortion reference files of Roman's Wide Field Instrument in ASDF, as read by romancal."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ class Settings(PlacedSettings):
 
 
 def _node(content: Content) -> tuple[Mapping[str, Any], str] | None:
-    """Node roman of an ASDF file: of another kind than ours it is refused."""
+    """Node "roman" of an ASDF file, None without it; FormatError if it has no distortion."""
     if b"\nroman:" not in content.raw:
         return None
     tree = tree_of(content).get("roman")
@@ -39,18 +39,19 @@ def _node(content: Content) -> tuple[Mapping[str, Any], str] | None:
     return tree, KEY
 
 
-# The newest one that both romancal 1.1 and roman_datamodels 1.2 read.
+# Newest version that both romancal 1.1 and roman_datamodels 1.2 can read.
 TAG = "asdf://stsci.edu/datamodels/roman/tags/reference_files/distortion-1.3.0"
 ELEMENTS = (
     "F062", "F087", "F106", "F129", "F146", "F158", "F184", "F213", "GRISM", "PRISM", "DARK",
 )  # fmt: skip
 DETECTORS = tuple(f"WFI{n:02d}" for n in range(1, 19))
-_WFI = Detector((4088.0, 4088.0), 0.1075)  # mean pixel of the FULL apertures: 0.1059 to 0.1093
+# mean pixel scale of the FULL apertures, which range from 0.1059 to 0.1093
+_WFI = Detector((4088.0, 4088.0), 0.1075)
 _REQUIRED = ("reftype", "description", "author", "pedigree", "useafter", "telescope", "origin")
 
 
 def _meta(detector: str, settings: Settings) -> dict[str, Any]:
-    """Node meta of the file of one detector; InputError for values that the schema has not."""
+    """Node meta of the file of one detector; InputError for values outside the schema."""
     for key, value, allowed in (
         ("detector", detector, DETECTORS),
         ("optical_element", settings.optical_element, ELEMENTS),
@@ -89,7 +90,7 @@ def _time(text: str) -> Time:
 
 
 def lint_meta(meta: Mapping[str, Any]) -> Iterator[Finding]:
-    """Findings on what identifies a file."""
+    """Findings on the metadata that identify a file."""
     instrument = meta["instrument"]
     missing = [f"meta.{key}" for key in _REQUIRED if not meta.get(key)]
     missing += [
@@ -117,5 +118,5 @@ FORMAT = Observatory[Settings](
     lambda meta, model, record, file: {
         "roman": tagged({"meta": meta, KEY: model, "bayesdist": record}, TAG, file)
     },
-    units=("pixel", "arcsec"),  # by the schema
+    units=("pixel", "arcsec"),  # as defined by the schema
 ).format("a Roman distortion reference file", 6, Settings)

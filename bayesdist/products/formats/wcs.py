@@ -1,4 +1,4 @@
-"""Files with the keywords of a world coordinate system, of whatever kind, as a format."""
+"""Format of files with WCS keywords that no other format recognizes."""
 
 from __future__ import annotations
 
@@ -15,11 +15,13 @@ from bayesdist.products.formats.sip.format import describe_wcs
 
 def _parse(content: Content) -> Content | None:
     headers = [hdu.header for hdu in content.hdus]
-    return content if any(holds_wcs(one) or projection_code(one) for one in headers) else None
+    return (
+        content if any(holds_wcs(header) or projection_code(header) for header in headers) else None
+    )
 
 
 def _refuse(content: Content, name: str) -> None:
-    """Name the projection of a header that has another one than TAN."""
+    """Raise the InputError that names an unsupported projection."""
     for hdu in content.hdus:
         code = projection_code(hdu.header)
         if code and code not in HELD_PROJECTIONS:

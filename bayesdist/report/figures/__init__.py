@@ -1,1 +1,1 @@
-"""What figures are drawn with: style, panels, fields of arrows, and figures of commands."""
+"""Drawing of figures: style, panels, fields of arrows, and figures of commands."""

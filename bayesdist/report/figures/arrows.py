@@ -1,4 +1,4 @@
-"""Vectors over panels, and errors as crosses, each drawn to one scale that a key states."""
+"""Vectors in panels, and errors as crosses, drawn at a common scale that a key states."""
 
 from __future__ import annotations
 
@@ -33,23 +33,23 @@ if TYPE_CHECKING:
     from bayesdist.assess.solution import ChipFrame
     from bayesdist.diagnose.residuals.binned import BinnedResiduals
 
-MOST_CROSSES = 13  # of errors along each axis: more hide each other
+MOST_CROSSES = 13  # along each axis; more would overlap
 CHANCE = 0.0455  # probability that noise alone puts one axis beyond 2 sigma
 
 # -- grids ----------------------------------------------------------------------------------------
 
 
 def spacing(x: Float, y: Float) -> float:
-    """Smaller distance between neighbouring points of a grid, in pixels."""
+    """Smallest distance between neighbouring points of a grid, in pixels."""
     steps = [np.diff(np.unique(a)) for a in (x, y)]
     return float(min((s.min() for s in steps if s.size), default=1.0))
 
 
 def square_cells(x: Float, y: Float, every: int = 1) -> tuple[slice, slice]:
-    """Rows and columns of a grid whose points are about as far apart on both axes.
+    """Rows and columns of a grid such that the spacing is similar along both axes.
 
-    Only steps that include both ends are taken: the corners are where distortions are largest.  For
-    small panels `every` is a further step.
+    Only steps that include both ends are used, because distortions are largest in the corners.
+    `every` is an additional step for small panels.
     """
     steps = [(a[-1] - a[0]) / (len(a) - 1) for a in (y, x)]
     out = []
@@ -61,27 +61,27 @@ def square_cells(x: Float, y: Float, every: int = 1) -> tuple[slice, slice]:
 
 
 def sparse_step(maps: Sequence[UncertaintyMap], most: int = MOST_CROSSES) -> int:
-    """Smallest further step of `square_cells` that leaves at most so many points on each axis.
+    """Smallest additional step of `square_cells` that leaves at most `most` points per axis.
 
-    1 if no step that includes both ends of the grids does.
+    1 if there is no such step that includes both ends of the grids.
     """
-    for every in range(1, max(len(m.x) + len(m.y) for m in maps)):
-        cells = [square_cells(m.x, m.y, every) for m in maps]
+    for step in range(1, max(len(m.x) + len(m.y) for m in maps)):
+        cells = [square_cells(m.x, m.y, step) for m in maps]
         points = [
             (len(m.y[rows]), len(m.x[columns]))
             for m, (rows, columns) in zip(maps, cells, strict=True)
         ]
         if max(map(max, points)) <= most:
-            return every
+            return step
     return 1
 
 
 def significant_cells(binned: BinnedResiduals) -> Bool:
-    """Boolean mask of the cells whose mean is as far from zero as noise puts it with `CHANCE`.
+    """Boolean mask of the cells with a mean that noise produces with a probability below `CHANCE`.
 
-    False where a standard error is unknown or zero.
+    False if a standard error is unknown or zero.
     """
-    # the errors are those of as few stars as the cell has: the tails are nearly Fisher's
+    # standard errors come from the few stars of a cell, so the F distribution applies
     beyond = 2.0 * f_isf(CHANCE, 2, np.maximum(binned.count - 1, 1))
     with np.errstate(divide="ignore", invalid="ignore"):
         z2 = (binned.mean_u / binned.sem_u) ** 2 + (binned.mean_v / binned.sem_v) ** 2
@@ -93,21 +93,21 @@ def significant_cells(binned: BinnedResiduals) -> Bool:
 
 @dataclass(frozen=True, eq=False)
 class Arrows:
-    """Vectors of one chip as they are drawn."""
+    """Vectors of one chip as drawn."""
 
     x: Float  # (N,), tails, pixels
     y: Float
     du: Float  # (N,), in the unit of the map
     dv: Float
-    step: float  # between neighbouring vectors, pixels
-    clear: Bool | None = None  # (N,), hardly due to noise; others are pale; None without noise
-    ring: tuple[float, float] | None = None  # position of the largest vector, ringed
+    step: float  # spacing of the vectors, pixels
+    clear: Bool | None = None  # (N,), True if significant; others are pale; None without noise
+    ring: tuple[float, float] | None = None  # position of the largest vector, marked by a ring
 
     @classmethod
     def of_grid(
         cls, x: Float, y: Float, du: Float, dv: Float, *, every: int = 1, clear: Bool | None = None
     ) -> Arrows:
-        """Vectors (ny, nx) of a grid that are far enough apart, the largest of all ringed."""
+        """Vectors from a grid (ny, nx), thinned out, with a ring at the largest one."""
         rows, columns = square_cells(x, y, every)
         gx, gy = np.meshgrid(x[columns], y[rows])
         iy, ix = np.unravel_index(int(np.hypot(du, dv).argmax()), du.shape)
@@ -123,22 +123,22 @@ class Arrows:
 
     @classmethod
     def of_map(cls, vectors: VectorMap, every: int = 1) -> Arrows:
-        """Vectors of the distortion, along the axes of the detector in its pixels."""
+        """Distortion vectors along the axes of the detector, in its pixels."""
         return cls.of_grid(vectors.x, vectors.y, *vectors.on_detector, every=every)
 
     def placed(self, frame: ChipFrame, *, ringed: bool) -> Arrows:
-        """The vectors in the focal plane; the ring is left out unless `ringed`."""
+        """The vectors in the focal plane, with the ring only if `ringed`."""
         x, y = frame(self.x, self.y)
         du, dv = frame.turn @ np.stack([self.du, self.dv])
         ring = None
         if ringed and self.ring is not None:
-            (left,), (up,) = frame(*np.array(self.ring)[:, None])
-            ring = float(left), float(up)
+            (across,), (up,) = frame(*np.array(self.ring)[:, None])
+            ring = float(across), float(up)
         return replace(self, x=x, y=y, du=du, dv=dv, ring=ring)
 
     @classmethod
     def of_cells(cls, binned: BinnedResiduals, min_count: int = 1) -> Arrows:
-        """Mean residuals of the cells with at least so many stars; empty cells stay empty."""
+        """Mean residuals of the cells with at least `min_count` stars; empty cells stay empty."""
         full = np.isfinite(binned.mean_u) & np.isfinite(binned.mean_v)
         full &= np.asarray(binned.count) >= min_count
         gx, gy = np.meshgrid(binned.x, binned.y)
@@ -148,16 +148,16 @@ class Arrows:
 
     @property
     def length(self) -> Float:
-        """Lengths of the vectors that are drawn."""
+        """Lengths of the vectors, shape (N,)."""
         return np.hypot(self.du, self.dv)
 
     @property
     def n_clear(self) -> int:
-        """Number of vectors that noise alone hardly makes."""
+        """Number of significant vectors."""
         return self.x.size if self.clear is None else int(self.clear.sum())
 
     def reach(self, magnification: float, size: tuple[float, float]) -> float:
-        """Largest extent of the vectors beyond a chip of that size, in pixels."""
+        """Largest extent of the vectors beyond a chip of the given size, in pixels."""
         over = [
             np.abs(a + magnification * d - (n + 1) / 2).max() - n / 2
             for a, d, n in ((self.x, self.du, size[0]), (self.y, self.dv, size[1]))
@@ -166,9 +166,9 @@ class Arrows:
 
 
 def cell_magnification(step: float, length: float) -> float:
-    """Factor of two digits, rounded down, that draws a length as one step of a grid.
+    """Factor of two digits, rounded down, by which a length is drawn as one step of a grid.
 
-    1 for a length of rounding errors.
+    1 if the length is a rounding error.
     """
     if not length > 1e-10 * step:
         return 1.0
@@ -177,7 +177,7 @@ def cell_magnification(step: float, length: float) -> float:
 
 
 def magnification_of(step: float, length: float) -> float:
-    """Round factor that draws a length about a step long; 1 for a length of rounding errors."""
+    """Round factor by which a length is drawn about one step long; 1 for rounding errors."""
     return nice_below(step / length) if length > 1e-10 * step else 1.0
 
 
@@ -194,17 +194,18 @@ def vector_map(
     fine: bool = False,
     colored: bool = False,
 ) -> None:
-    """Draw vectors of each chip, all to one scale that a key states.
+    """Draw the vectors of each chip at a common scale that a key states.
 
-    `panels` are framed: their limits are final.  `magnification` is in pixels of the axes for one
-    unit of the vectors, `key` the length of the arrow above each panel in `unit`; titles are `pad`
-    points away, 17 and more to be above the key.  `fine` is for small panels.  If `colored`, the
-    colour of a vector is its length, and a colour bar stands beside the panels.
+    `panels`: already framed, because their limits must be final. `magnification`: in pixels of the
+    axes per unit of the vectors. `key`: length of the arrow above each panel, in `unit`. `pad`:
+    distance of titles in points, at least 17 to be above the key. `fine`: True for small panels.
+    `colored`: True to show the length of a vector by its colour, with a colour bar next to the
+    panels.
     """
-    norm = length_norm([one for one in chips if one is not None]) if colored else None
+    norm = length_norm([arrows for arrows in chips if arrows is not None]) if colored else None
     drawn: Quiver | None = None
     keys: dict[Axes, float] = {}
-    for k, (arrows, one) in enumerate(
+    for k, (arrows, key_length) in enumerate(
         zip(chips, np.broadcast_to(np.asarray(key, float), len(chips)), strict=True)
     ):
         if arrows is None:
@@ -212,7 +213,7 @@ def vector_map(
         ax = panels.axes[k][0]
         look: dict[str, Any] = {"magnification": magnification, "fine": fine, "norm": norm}
         drawn = draw_arrows(ax, arrows, panels.offset(k), **look)
-        keys.setdefault(ax, float(one))
+        keys.setdefault(ax, float(key_length))
     for ax, title in zip(panels.all_axes, titles, strict=True):
         ax.set_title(title, pad=pad)
     for ax, length in keys.items():
@@ -223,8 +224,8 @@ def vector_map(
 
 
 def length_norm(chips: Sequence[Arrows]) -> Normalize:
-    """Colour scale of lengths from 0 to the longest vector of some chips."""
-    longest = max((float(one.length.max()) for one in chips if one.x.size), default=0.0)
+    """Colour scale from 0 to the length of the longest vector of all chips."""
+    longest = max((float(arrows.length.max()) for arrows in chips if arrows.x.size), default=0.0)
     return Normalize(0.0, longest if longest > 0 else 1.0)
 
 
@@ -237,7 +238,7 @@ def draw_arrows(
     fine: bool = False,
     norm: Normalize | None = None,
 ) -> Quiver:
-    """Arrows from (x, y) to (x + M du, y + M dv), in the axes' own pixels; pale unless clear.
+    """Draw arrows from (x, y) to (x + M du, y + M dv) in pixels of the axes; pale unless clear.
 
     With `norm` their colour is their length.
     """
@@ -251,14 +252,14 @@ def draw_arrows(
     head: dict[str, Any] = dict(
         zip(("headwidth", "headlength", "headaxislength"), heads, strict=True)
     )
-    for some, color in parts:
-        lengths = () if norm is None else (arrows.length[some],)
+    for chosen, color in parts:
+        lengths = () if norm is None else (arrows.length[chosen],)
         look = {"color": color} if norm is None else {"norm": norm, "cmap": SIZES}
         drawn = ax.quiver(
-            x[some],
-            y[some],
-            arrows.du[some],
-            arrows.dv[some],
+            x[chosen],
+            y[chosen],
+            arrows.du[chosen],
+            arrows.dv[chosen],
             *lengths,
             angles="xy",
             scale_units="xy",
@@ -284,9 +285,9 @@ def draw_key(
     unit: str = "pix",
     scale_mas: float | None = None,
 ) -> None:
-    """Arrow of a stated length above the axes' right end; their limits must be final.
+    """Draw an arrow of a stated length above the right end of axes with final limits.
 
-    The length is in `unit`, and stated in mas if it is in pixels and `scale_mas`, the size of a
+    `length` is in `unit`. It is stated in mas if it is in pixels and `scale_mas`, the size of a
     pixel, is given.
     """
     end = ax.get_xlim()[1]
@@ -333,16 +334,18 @@ def cross_map(
 ) -> None:
     """Draw errors as four vectors from each point, to all combinations of (±sigma_u, ±sigma_v).
 
-    `maps` are those of the first chip, then those of the next; `magnification` and `key` are for
-    all panels or for each, `every` is as in `square_cells`, and `panels` are framed.
+    `maps`: maps of the first chip, followed by those of the next one. `magnification` and `key`:
+    for all panels or for each. `every`: see `square_cells`. `panels` must be framed.
     """
     places = [(column, ax) for several in panels.axes for column, ax in enumerate(several)]
     scales, keys = (np.broadcast_to(np.asarray(a, float), len(maps)) for a in (magnification, key))
-    for (column, ax), one, title, M, length in zip(places, maps, titles, scales, keys, strict=True):
-        draw_crosses(ax, one, magnification=float(M), every=every, color=CYCLE[column])
+    for (column, ax), errors, title, M, length in zip(
+        places, maps, titles, scales, keys, strict=True
+    ):
+        draw_crosses(ax, errors, magnification=float(M), every=every, color=CYCLE[column])
         ax.set_title(title, pad=20)
-        # one key serves all panels, but a panel that is cut out must state its scale too
-        draw_key(ax, float(length), magnification=float(M), unit=one.unit)
+        # one key would be enough, but a panel that is cut out must also state its scale
+        draw_key(ax, float(length), magnification=float(M), unit=errors.unit)
 
 
 def draw_crosses(
@@ -354,18 +357,18 @@ def draw_crosses(
 
 
 def crosses_magnification(maps: Sequence[UncertaintyMap], every: int = 1) -> float:
-    """Round factor that draws the largest error of some maps as 0.8 of a grid step, or less."""
+    """Round factor by which the largest error is drawn as at most 0.8 of a grid step."""
     widest = max(max(m.sigma_u_max, m.sigma_v_max) for m in maps)
     steps = []
     for m in maps:
         rows, columns = square_cells(m.x, m.y, every)
         steps.append(spacing(m.x[columns], m.y[rows]))
-    # beyond half a grid step crosses overlap: a few do, in the corners, so that the inner ones show
+    # crosses overlap beyond half a step: a few in the corners may, so that inner ones are visible
     return nice_below(0.8 * min(steps) / max(widest, 1e-300))
 
 
 def _crosses(m: UncertaintyMap, magnification: float, every: int) -> Float:
-    """Ends (4 N, 2, 2) of the four segments from each point."""
+    """End points (4 N, 2, 2) of the four segments at each point."""
     rows, columns = square_cells(m.x, m.y, every)
     gx, gy = np.meshgrid(m.x[columns], m.y[rows])
     start = np.stack([gx.ravel(), gy.ravel()], axis=-1)

@@ -1,4 +1,4 @@
-"""Figures of commands: orders, dither patterns, differences of calibrations and of filters."""
+"""Figures of commands: orders, dither patterns, differences between calibrations and filters."""
 
 from __future__ import annotations
 
@@ -42,14 +42,14 @@ if TYPE_CHECKING:
 
 
 LEVELS = (0.0, 1.0, 2.0, 3.0, 4.0, 5.0)
-# from white to a blue on which black arrows are still seen
+# from white to a blue on which black arrows are visible
 _SHADES = LinearSegmentedColormap.from_list("significance", ["#FFFFFF", PALETTE["sky"]])
 
 
 def gaussian_sigmas(chi2: Float) -> Float:
-    """Sigmas of one axis that are as improbable as a chi-square of two axes.
+    """Deviation in sigma of one axis that is as improbable as a chi-square of two axes.
 
-    NaN stays NaN; not above 37, where probabilities underflow.
+    NaN remains NaN; values are limited to 37, where probabilities underflow.
     """
     p = np.clip(chi2_sf(chi2, 2), 1e-300, 1.0)
     return np.asarray(norm_isf(p / 2))
@@ -59,9 +59,9 @@ def gaussian_sigmas(chi2: Float) -> Float:
 def difference_vectors(
     found: Sequence[Comparison], *, names: tuple[str, str] = ("A", "B")
 ) -> Figure:
-    """Arrows of A minus B, over shades of the significance of each by itself.
+    """Draw arrows of A minus B, over shades of the significance at each position.
 
-    One chip is drawn above the other, on one scale; without shades where no covariance is known.
+    Chips are drawn one above the other at the same scale; without shades if no covariance is known.
     """
     mosaic = Mosaic(
         tuple((float(c.x.max()), float(c.y.max())) for c in found),
@@ -73,7 +73,7 @@ def difference_vectors(
     largest = max(c.largest for c in found)
     M = 1.0
     if largest > 1e-12:
-        M = nice_below(1.5 * min(one.step for one in chips) / largest)
+        M = nice_below(1.5 * min(arrows.step for arrows in chips) / largest)
     panels = ChipPanels(mosaic, colorbar=shaded)
     panels.frame(M * largest + 0.02 * mosaic.longest_side)
     titles = [
@@ -101,10 +101,10 @@ def difference_vectors(
 
 @figure_style()
 def change_over_time(first: Float, gain: Float, dof: int, p_value: float | None) -> Figure:
-    """Figure of the chi-square gains of a change from each first date (P,), in decimal years.
+    """Draw the chi-square gain of a change at each possible first date (P,), in decimal years.
 
-    `dof` is that of a change, `p_value` that of the largest, the search over the dates accounted
-    for.
+    `dof`: degrees of freedom of a change. `p_value`: probability of the largest gain by chance,
+    accounting for the search over dates.
     """
     first, gain = np.asarray(first, float), np.asarray(gain, float)
     low, high = chi2_ppf([0.025, 0.975], dof)
@@ -134,7 +134,7 @@ class FilterTerm:
 
     filter: str
     chip: str
-    epoch: Float  # (E,), of the exposures
+    epoch: Float  # (E,), epochs of the exposures
     value: Float  # (E,), per pixel
     sigma: Float
     alpha: Float  # (S,), released value of each segment at its reference date
@@ -143,10 +143,10 @@ class FilterTerm:
 
 @figure_style()
 def filters_figure(term: str, courses: Sequence[FilterTerm], breaks: Sequence[float]) -> Figure:
-    """Figure with a panel for each chip: points are exposures, lines the released values.
+    """Draw a panel for each chip: points are exposures, lines the released values.
 
-    `courses` are of all chips and filters, the reference filter first, for a term as 'A_2';
-    `breaks` are the dates between which the released values hold.
+    `courses`: terms of all chips and filters, the reference filter first. `term`: name of the term,
+    such as 'A_2'. `breaks`: dates that separate the segments of the released values.
     """
     by_chip: Mapping[str, list[FilterTerm]] = {
         chip: [c for c in courses if c.chip == chip]
@@ -157,16 +157,16 @@ def filters_figure(term: str, courses: Sequence[FilterTerm], breaks: Sequence[fl
     panels = fig.subplots(len(by_chip), 1, sharex=True, squeeze=False)[:, 0]
     for ax, (chip, mine) in zip(panels, by_chip.items(), strict=True):
         reference = round(float(mine[0].alpha[0]), 5)
-        for one in mine:
-            k = filters.index(one.filter)
+        for course in mine:
+            k = filters.index(course.filter)
             color = CYCLE[k % len(CYCLE)]
             ax.errorbar(
-                one.epoch, 1e6 * (one.value - reference), 1e6 * one.sigma,
+                course.epoch, 1e6 * (course.value - reference), 1e6 * course.sigma,
                 fmt=MARKERS[k % len(MARKERS)], ms=3, mec="none", elinewidth=0.6,
-                color=color, alpha=0.8, label=one.filter,
+                color=color, alpha=0.8, label=course.filter,
             )  # fmt: skip
-            edges = (one.epoch.min() - 0.3, *breaks, one.epoch.max() + 0.3)
-            for s, (level, error) in enumerate(zip(one.alpha, one.sigma_alpha, strict=True)):
+            edges = (course.epoch.min() - 0.3, *breaks, course.epoch.max() + 0.3)
+            for s, (level, error) in enumerate(zip(course.alpha, course.sigma_alpha, strict=True)):
                 low, high = sorted((edges[s], edges[s + 1]))
                 y = 1e6 * (level - reference)
                 ax.plot((low, high), (y, y), color=color, lw=1.0)
@@ -185,18 +185,18 @@ def filters_figure(term: str, courses: Sequence[FilterTerm], breaks: Sequence[fl
     return fig
 
 
-_NEAR = 10.0  # log density within which the right-hand axis is linear
-_APART = 0.12  # of an order, by which markers of one order are apart
+_NEAR = 10.0  # log density below which the scale of the right-hand panel is linear
+_APART = 0.12  # distance between markers of one order, in units of an order
 
 
 @figure_style()
 def order_comparison(found: OrderSelection) -> Figure:
-    """Figure with surfaces on the left, held-out stars and regions on the right."""
+    """Draw binned surfaces on the left, held-out stars and regions on the right."""
     fig = new_figure(WIDTH, 3.1)
-    left, right = fig.subplots(1, 2)
-    _surfaces(left, found)
+    left_panel, right = fig.subplots(1, 2)
+    _surfaces(left_panel, found)
     _held_out(right, found)
-    for ax in (left, right):
+    for ax in (left_panel, right):
         ax.axvspan(found.order - 0.35, found.order + 0.35, color="#E8ECF0", zorder=0)
         ax.set_xlabel("order of the polynomial (chosen one shaded)")
         ax.xaxis.set_major_locator(MaxNLocator(integer=True))
@@ -245,23 +245,28 @@ FIRST = PALETTE["vermilion"]
 
 @figure_style()
 def pattern_maps(found: Sequence[PlannedPattern]) -> Figure:
-    """Footprints on one scale, each with its uncertainty per axis on one colour scale."""
-    bounded = [one.per_axis(kind) for one in found for kind in SHOWN if one.maps[kind] is not None]
+    """Draw footprints and uncertainty maps of dither patterns, each on a common scale."""
+    bounded = [
+        pattern.per_axis(kind)
+        for pattern in found
+        for kind in SHOWN
+        if pattern.maps[kind] is not None
+    ]
     values = np.concatenate(bounded)
     norm = LogNorm(max(values.min(), 1e-4 * values.max()), values.max() * (1 + 1e-9))
-    outlines = [_outlines(one) for one in found]
+    outlines = [_outlines(pattern) for pattern in found]
     limits = _limits(np.concatenate([o for of_one in outlines for o in of_one]))
     fig = new_figure(WIDTH, ROW * len(found) + 0.5, layout="compressed")
     axes = fig.subplots(len(found), 1 + len(SHOWN), squeeze=False)
     filled: list[QuadMesh] = []
-    for k, (row, one, of_one) in enumerate(zip(axes, found, outlines, strict=True)):
+    for k, (row, pattern, of_one) in enumerate(zip(axes, found, outlines, strict=True)):
         last = k == len(found) - 1
-        _footprint(row[0], one, of_one, limits, last)
+        _footprint(row[0], pattern, of_one, limits, last)
         row[0].set_title(
-            f"first exposure in orange\n{one.pattern.name}" if not k else one.pattern.name
+            f"first exposure in orange\n{pattern.pattern.name}" if not k else pattern.pattern.name
         )
         for ax, kind in zip(row[1:], SHOWN, strict=True):
-            filled += _map(ax, one, kind, norm, last)
+            filled += _map(ax, pattern, kind, norm, last)
             if not k:
                 ax.set_title(f"{kind}, rms\n{ax.get_title(loc='left')}")
     label = "per axis (1 σ) [pix]"
@@ -304,7 +309,7 @@ def _footprint(
 
 
 def _map(ax: Axes, one: PlannedPattern, kind: str, norm: LogNorm, last: bool) -> list[QuadMesh]:
-    """Draw the chips where they are in the first exposure; words where errors are unbounded."""
+    """Draw the chips as in the first exposure; a text instead of values for unbounded errors."""
     model, theta, maps = one.solution.model, one.solution.mean, one.maps[kind]
     outlines = [
         model.predict(theta, *outline_pixels(c.size), exposure=0, chip=c.number)

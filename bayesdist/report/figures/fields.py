@@ -1,4 +1,4 @@
-"""Values over panels: contours or cells, with one colour scale or one for each map."""
+"""Maps in panels, as contours or cells, with one colour scale or a scale for each map."""
 
 from __future__ import annotations
 
@@ -23,30 +23,30 @@ from bayesdist.report.figures.style import COLORBAR, INK, SEQUENTIAL, figure_sty
 from bayesdist.utils.arrays import Float
 
 Drawn = QuadContourSet | AxesImage | QuadMesh
-EMPTY = "#D9DEE3"  # of a cell without a value
-NARROW = 1.5  # factor between errors, below which even levels show them as well
-MANTISSAS = (  # of logarithmic levels, 3 to 40 in a decade
+EMPTY = "#D9DEE3"  # colour of a cell without a value
+NARROW = 1.5  # ratio of largest to smallest error, below which linear levels are used
+MANTISSAS = (  # of logarithmic levels, 3 to 40 per decade
     (1.0, 2.0, 5.0),
     (1.0, 1.5, 2.0, 3.0, 5.0, 7.0),
     (1.0, 1.25, 1.6, 2.0, 2.5, 3.2, 4.0, 5.0, 6.3, 8.0),
     tuple(np.round(10 ** (np.arange(20) / 20), 2)),
     tuple(np.round(10 ** (np.arange(40) / 40), 2)),
 )
-FAR = 15.0  # factor between values, from which on even steps would show the largest alone
+FAR = 15.0  # ratio of values, above which linear levels would show only the largest ones
 
 
 @dataclass(frozen=True, eq=False)
 class Grid:
-    """Values on a grid of one chip."""
+    """Values on a grid over one chip."""
 
-    x: Float  # (nx,), points, or centres of cells, pixels
+    x: Float  # (nx,), points or centres of cells, pixels
     y: Float  # (ny,)
-    values: Float  # (ny, nx), in the unit that is shown
-    ring: tuple[float, float] | None = None  # position that is ringed
+    values: Float  # (ny, nx), in the displayed unit
+    ring: tuple[float, float] | None = None  # position marked by a ring
 
 
 def contour_levels(values: ArrayLike, n: int = 10) -> Float:
-    """Round levels that span some values, at least two; 1, 2, 5, 10 of values far apart."""
+    """Round levels that span the values, at least two; 1, 2, 5, 10 if the range is large."""
     low, high = float(np.nanmin(values)), float(np.nanmax(values))
     if low > 0 and high > FAR * low:
         decades = 10.0 ** np.arange(np.floor(np.log10(low)), np.ceil(np.log10(high)) + 1)
@@ -60,10 +60,10 @@ def contour_levels(values: ArrayLike, n: int = 10) -> Float:
 
 
 def error_levels(values: ArrayLike, least: int = 7) -> Float:
-    """Round levels of errors, in equal steps of their logarithm as far as round numbers are.
+    """Round levels for errors, in approximately equal logarithmic steps.
 
-    At least `least` of them lie among the values.  Even levels if values are not positive, or
-    differ by less than a factor of 1.5.
+    At least `least` levels are within the range of the values. Levels are linear if values are not
+    positive, or differ by less than a factor of 1.5.
     """
     low, high = float(np.nanmin(values)), float(np.nanmax(values))
     if not (low > 0 and high >= NARROW * low):
@@ -89,12 +89,12 @@ def scalar_map(
     cmap: str | Colormap = SEQUENTIAL,
     labelled: bool = False,
 ) -> None:
-    """Draw values of each map of each chip, smooth between levels or cell by cell.
+    """Draw the maps of each chip, as contours or cells.
 
-    `grids` are the maps of the first chip, then those of the next, over framed `panels`; `label` is
-    of the colour bar (none without it), with the unit; with `levels` contours are drawn, `labelled`
-    with their values, else cells; `norm` is one scale for all maps, or one and a colour bar for
-    each.
+    `grids`: maps of the first chip, followed by those of the next one, in framed `panels`.
+    `label`: label of the colour bar with its unit; empty for no colour bar. `levels`: levels of
+    contours; cells are drawn without it. `labelled`: True to show the values of contours. `norm`:
+    one scale for all maps, or a scale for each map, with its colour bar.
     """
     drawn: dict[Axes, Drawn] = {}
     places = [(k, ax) for k, maps in enumerate(panels.axes) for ax in maps]
@@ -102,10 +102,15 @@ def scalar_map(
     norms: Sequence[Normalize | None] = (
         [norm] * len(places) if norm is None or isinstance(norm, Normalize) else norm
     )
-    for (k, ax), grid, one in zip(places, grids, norms, strict=True):
+    for (k, ax), grid, map_norm in zip(places, grids, norms, strict=True):
         if grid is None:
             continue
-        look: dict[str, Any] = {"levels": levels, "norm": one, "cmap": cmap, "labelled": labelled}
+        look: dict[str, Any] = {
+            "levels": levels,
+            "norm": map_norm,
+            "cmap": cmap,
+            "labelled": labelled,
+        }
         drawn[ax] = draw_grid(ax, grid, panels.offset(k), frame=panels.frame_of(k), **look)
     for ax, title in zip(panels.all_axes, titles, strict=True):
         ax.set_title(title)
@@ -134,10 +139,11 @@ def draw_grid(
     cmap: str | Colormap = SEQUENTIAL,
     labelled: bool = False,
 ) -> Drawn:
-    """Draw the values of one grid as contours between `levels`, else as cells, with its ring.
+    """Draw the values of a grid as contours between `levels`, or as cells, with its ring.
 
-    `offset` is that of the grid's pixels in the axes, `frame` takes the pixels to the axes in its
-    place; `labelled` contours show their values.
+    `offset`: offset of the pixels of the grid in the axes. `frame`: function that converts pixels
+    to positions in the axes, used instead of `offset`. `labelled`: True to show the values of
+    contours.
     """
     if levels is not None:
         drawn: Drawn = _contours(ax, grid, offset, levels, frame=frame, labelled=labelled)
@@ -149,7 +155,7 @@ def draw_grid(
         at = np.add(grid.ring, offset)
         if frame is not None:
             at = frame(*np.array(grid.ring)[:, None])[:, 0]
-        # dark on light, so that it is seen on every colour of the map in every style
+        # dark on light, visible on every colour of the map in every style
         for color, width, order in (("white", 2.2, 5), (INK, 1.0, 6)):
             ax.plot(*at, "o", ms=5, mfc="none", mec=color, mew=width, clip_on=False, zorder=order)
     return drawn
@@ -164,18 +170,18 @@ def _contours(
     frame: ToPlane | None,
     labelled: bool,
 ) -> QuadContourSet:
-    """Draw filled contours with lines between them, by a spline, as all maps are polynomials.
+    """Draw filled contours with lines between them; a spline suits maps that are polynomials.
 
-    Around positions without a value, off the field of a detector, nothing is drawn.
+    Nothing is drawn around positions without a value, outside the field of a detector.
     """
     x, y, values = grid.x, grid.y, grid.values
     empty = ~np.isfinite(values)
-    if empty.any():  # a spline needs all values: the nearest ones, which are not drawn
+    if empty.any():  # a spline needs all values: use the nearest ones, which are masked later
         nearest = distance_transform_edt(empty, return_distances=False, return_indices=True)
         values = values[tuple(nearest)]
     spline = RectBivariateSpline(y, x, values, kx=min(3, len(y) - 1), ky=min(3, len(x) - 1))
     fine_x, fine_y = (np.linspace(a[0], a[-1], 4 * len(a)) for a in (x, y))
-    # the spline may overshoot a little, and values above the last level would stay white
+    # the spline may overshoot slightly, and values above the last level would remain white
     fine = np.clip(spline(fine_y, fine_x), values.min(), values.max())
     if empty.any():
         rows, columns = (
@@ -200,7 +206,7 @@ def _contours(
 
 
 def _in_plane(frame: ToPlane, x: Float, y: Float) -> tuple[Float, Float]:
-    """Positions (ny, nx) in a focal plane of a grid of pixels."""
+    """Positions (ny, nx) of a grid of pixels in the focal plane."""
     X, Y = np.meshgrid(x, y)
     at = frame(X.ravel(), Y.ravel())
     return at[0].reshape(X.shape), at[1].reshape(X.shape)
@@ -209,7 +215,7 @@ def _in_plane(frame: ToPlane, x: Float, y: Float) -> tuple[Float, Float]:
 def _turned_cells(
     ax: Axes, grid: Grid, frame: ToPlane, norm: Normalize | None, cmap: str | Colormap
 ) -> QuadMesh:
-    """Draw cells of one colour each in a focal plane, where chips may be turned."""
+    """Draw cells in the focal plane, where chips may be rotated."""
     edges = []
     for a in (grid.x, grid.y):
         half = 0.5 * (a[-1] - a[0]) / max(len(a) - 1, 1)
@@ -221,7 +227,7 @@ def _turned_cells(
 def _cells(
     ax: Axes, grid: Grid, offset: tuple[float, float], norm: Normalize | None, cmap: str | Colormap
 ) -> AxesImage:
-    """Draw cells of one colour each."""
+    """Draw cells of uniform colour."""
     limits = ax.get_xlim(), ax.get_ylim()
     if not np.isfinite(grid.values).all():
         ax.set_facecolor(EMPTY)
@@ -238,12 +244,12 @@ def _cells(
         aspect="equal",
         interpolation="nearest",
     )
-    ax.set(xlim=limits[0], ylim=limits[1])  # the image has set its own
+    ax.set(xlim=limits[0], ylim=limits[1])  # imshow has changed the limits
     return image
 
 
 def _extend(grids: Sequence[Grid | None], limits: tuple[float, float]) -> str:
-    """Sides of the colour bar beyond which there are values."""
+    """Ends of the colour bar beyond which there are values, in the terms of matplotlib."""
     low, high = limits
     values = np.concatenate([g.values[np.isfinite(g.values)] for g in grids if g is not None])
     below, above = (values < low).any(), (values > high).any()

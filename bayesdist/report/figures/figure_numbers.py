@@ -1,4 +1,4 @@
-"""Numbers of a figure as CSV: what its marks stand for, panel by panel."""
+"""Numbers of a figure as CSV: the data of its marks, panel by panel."""
 
 from __future__ import annotations
 
@@ -18,21 +18,22 @@ from matplotlib.patches import Rectangle, StepPatch
 from matplotlib.quiver import Quiver
 
 HEADS = ("panel", "mark", "label", "x", "y", "value", "value_2")
-MOST_ROWS = 20_000  # beyond them a figure is a picture of a table of its own
+MOST_ROWS = 20_000  # a figure with more data shows a table that is available as a file
 
 
 def numbers_of(figure: Figure) -> str:
-    """CSV of the marks of a figure in the units of its axes; at most `MOST_ROWS` rows.
+    """CSV of the marks of a figure in the units of its axes, with at most `MOST_ROWS` rows.
 
-    Lines that begin with # name the panels and their axes. Arrows have their components as values,
-    segments their other end, cells and contours the value that their colour stands for.
+    Lines that begin with # name the panels and their axes. The values of arrows are their
+    components, those of segments their other end, and those of cells and contours the value that
+    their colour represents.
     """
     out = io.StringIO()
     panels = [ax for ax in figure.axes if ax.get_label() != "<colorbar>"]
     for k, ax in enumerate(panels, start=1):
         title = ax.get_title() or ax.get_title(loc="left")
         words = (title, f"x: {ax.get_xlabel()}", f"y: {ax.get_ylabel()}")
-        out.write(f"# panel {k}: {'; '.join(' '.join(one.split()) for one in words if one)}\n")
+        out.write(f"# panel {k}: {'; '.join(' '.join(text.split()) for text in words if text)}\n")
     out.write(",".join(HEADS) + "\n")
     out.writelines(islice(_lines(panels), MOST_ROWS))
     return out.getvalue()
@@ -47,13 +48,13 @@ def _lines(panels: Sequence[Axes]) -> Iterator[str]:
 
 
 def _marks(ax: Axes) -> Iterator[tuple[str, str, Iterable[Sequence[float]]]]:
-    """Kind, label and numbers of each artist that stands for data."""
+    """Kind, label and numbers of each artist that represents data."""
     for line in ax.lines:
         if line.get_transform() == ax.transData:
             yield "line", _label(line), np.asarray(line.get_xydata(), float)
-    for one in ax.collections:
-        kind, rows = _of_collection(one)
-        yield kind, _label(one), rows
+    for collection in ax.collections:
+        kind, rows = _of_collection(collection)
+        yield kind, _label(collection), rows
     for image in ax.images:
         yield "cell", _label(image), _cells(image)
     for patch in ax.patches:
@@ -61,8 +62,8 @@ def _marks(ax: Axes) -> Iterator[tuple[str, str, Iterable[Sequence[float]]]]:
             values, edges, _ = patch.get_data()
             yield "bar", _label(patch), np.column_stack([edges[:-1], edges[1:], values])
     for bars in ax.containers:
-        if bars and all(isinstance(one, Rectangle) for one in bars):
-            boxes = [one.get_bbox() for one in bars]
+        if bars and all(isinstance(bar, Rectangle) for bar in bars):
+            boxes = [bar.get_bbox() for bar in bars]
             yield "bar", _label(bars), [(b.x1, (b.y0 + b.y1) / 2, b.width) for b in boxes]
 
 
@@ -79,8 +80,8 @@ def _of_collection(one: Any) -> tuple[str, Iterable[Sequence[float]]]:
     if isinstance(one, LineCollection):
         paths = [np.asarray(path.vertices, float) for path in one.get_paths()]
         ends = np.array([path for path in paths if len(path) == 2])
-        whole = np.isfinite(ends).all(axis=(1, 2)) if ends.size else []
-        return "segment", ends.reshape(-1, 4)[whole]
+        complete = np.isfinite(ends).all(axis=(1, 2)) if ends.size else []
+        return "segment", ends.reshape(-1, 4)[complete]
     if isinstance(one, PathCollection | PolyCollection):
         at, values = np.asarray(one.get_offsets(), float), one.get_array()
         if values is not None and len(np.ravel(values)) == len(at):
@@ -93,9 +94,9 @@ def _cells(image: AxesImage) -> Iterator[Sequence[float]]:
     values: Any = np.ma.filled(np.ma.asarray(image.get_array(), float), np.nan)
     if values.ndim != 2:
         return
-    left, right, bottom, top = image.get_extent()
+    x_start, right, bottom, top = image.get_extent()
     ny, nx = values.shape
-    x = left + (np.arange(nx) + 0.5) * (right - left) / nx
+    x = x_start + (np.arange(nx) + 0.5) * (right - x_start) / nx
     y = bottom + (np.arange(ny) + 0.5) * (top - bottom) / ny
     if image.origin == "upper":
         y = y[::-1]
@@ -104,7 +105,7 @@ def _cells(image: AxesImage) -> Iterator[Sequence[float]]:
 
 
 def _quoted(text: str) -> str:
-    """Field of a line of CSV."""
+    """Text as a field of a CSV line."""
     line = io.StringIO()
     csv.writer(line, lineterminator="").writerow([text])
     return line.getvalue() if text else ""

@@ -9,7 +9,7 @@ from bayesdist.model import Chip
 
 Size = tuple[float, float]
 
-MAX_COLUMNS = 3  # of panels: more would be too narrow to be read
+MAX_COLUMNS = 3  # of panels; more would be too narrow
 
 
 @dataclass(frozen=True)
@@ -17,23 +17,23 @@ class Mosaic:
     """Arrangement of the chips of a detector."""
 
     sizes: tuple[Size, ...]  # columns and rows of each chip, pixels
-    names: tuple[str, ...] = ("",)  # shown where there are several chips
-    places: tuple[tuple[int, int], ...] = ((0, 0),)  # row (0 on top) and column of each chip
+    names: tuple[str, ...] = ("",)  # shown if there are several chips
+    places: tuple[tuple[int, int], ...] = ((0, 0),)  # row (0 at the top) and column of each chip
 
     @classmethod
     def of_chips(cls, chips: Sequence[Chip], places: Sequence[tuple[int, int]]) -> Mosaic:
-        """Arrangement of the chips of a model, with their names where there are several."""
+        """Arrangement of the chips of a model, with their names if there are several."""
         names = tuple(chip.name if len(chips) > 1 else "" for chip in chips)
         return cls(tuple(chip.size for chip in chips), names, tuple(places))
 
     @property
     def several(self) -> bool:
-        """True where there is more than one chip."""
+        """True if there is more than one chip."""
         return len(self.sizes) > 1
 
     @property
     def largest(self) -> Size:
-        """Columns and rows that hold every chip."""
+        """Numbers of columns and rows that are sufficient for every chip."""
         return max(s[0] for s in self.sizes), max(s[1] for s in self.sizes)
 
     @property
@@ -43,7 +43,7 @@ class Mosaic:
 
     @property
     def legible_places(self) -> tuple[tuple[int, int], ...]:
-        """Rows and columns of the chips; those of a wide detector row by row in fewer columns."""
+        """Row and column of each chip; a wide detector is wrapped to fewer columns."""
         if max(column for _, column in self.places) < MAX_COLUMNS:
             return self.places
         order = sorted(self.places)

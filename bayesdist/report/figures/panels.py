@@ -1,4 +1,4 @@
-"""Panels of a figure: one for each chip, or one for all of them as one array."""
+"""Panels of a figure: one for each chip, or one for all chips as a single array."""
 
 from __future__ import annotations
 
@@ -26,40 +26,41 @@ from bayesdist.report.figures.style import (
 from bayesdist.utils.arrays import Float
 
 Size = tuple[float, float]
-ToPlane = Callable[[Float, Float], Float]  # pixels x, y of a chip to positions (2, N)
+ToPlane = Callable[[Float, Float], Float]  # function of pixels x, y that returns positions (2, N)
 
 TALLEST_PANEL = 8.0  # inches
-WIDE = 0.7  # rows over columns below which a chip is wide: its maps are one above the other
+WIDE = 0.7  # ratio of rows to columns below which maps of a chip are drawn one above the other
 
 
 class Panels:
-    """Axes of a figure by chip and by map; titles begin with the chip's name where there is one."""
+    """Axes of a figure by chip and map; titles begin with the name of the chip if it has one."""
 
     def __init__(self, figure: Figure, axes: list[list[Axes]], names: Sequence[str]) -> None:
         self.figure, self.axes, self.names = figure, axes, tuple(names)
 
     @property
     def all_axes(self) -> list[Axes]:
-        """Axes of all maps, each once."""
+        """Axes of all maps, without duplicates."""
         return list(dict.fromkeys(ax for maps in self.axes for ax in maps))
 
     def offset(self, chip: int) -> tuple[float, float]:
-        """Offset of a chip's pixels, counted from 0, in its axes."""
+        """Offset in the axes of the pixels of a chip, counted from 0."""
         return 0.0, 0.0
 
     def frame_of(self, chip: int) -> ToPlane | None:
-        """Function from pixels of a chip to positions in its axes; None if they are the same."""
+        """Function that converts pixels of a chip to positions in its axes; None for identity."""
         return None
 
     def title(self, chip: int, text: str, joined: str = ": ") -> str:
-        """Title of a panel, with the name of the chip where there are several."""
+        """Title of a panel, with the name of the chip if there are several."""
         return f"{self.names[chip]}{joined}{text}" if self.names[chip] else text
 
 
 class ChipPanels(Panels):
-    """One panel for each of one or two maps of each chip, arranged as the chips, all on one scale.
+    """A panel for each map of each chip, arranged like the chips, all at the same scale.
 
-    `colorbar` leaves room for one common colour bar.
+    `maps`: number of maps per chip, one or two. `colorbar`: True to leave room for a common colour
+    bar.
     """
 
     @figure_style()
@@ -68,10 +69,10 @@ class ChipPanels(Panels):
         columns = 1 + max(place[1] for place in mosaic.legible_places)
         rows = 1 + max(place[0] for place in mosaic.legible_places)
         aspect = mosaic.largest[1] / mosaic.largest[0]
-        # maps of a chip are side by side; of a wide detector, or chip, one above the other
+        # maps of a chip are side by side; for a wide detector or chip one above the other
         side_by_side = columns == 1 if mosaic.several else aspect >= WIDE
         down, across = (rows, maps) if side_by_side else (maps * rows, columns)
-        # panels of one column share a line of the page with another figure
+        # panels in a single column share a line of the page with another figure
         narrow = aspect >= WIDE or down > 1
         width = WIDTH if across > 1 or not narrow else HALF_WIDTH
         margin = 0.75 + 0.55 * (across - 1) + (0.8 if colorbar else 0.0)
@@ -87,7 +88,7 @@ class ChipPanels(Panels):
             ax.remove()
 
     def frame(self, margin: float = 0.0) -> None:
-        """Make all panels maps of their chips, with so many pixels beyond the outline."""
+        """Make all panels maps of their chips; `margin` is in pixels beyond the outline."""
         largest = self.mosaic.largest
         for size, maps in zip(self.mosaic.sizes, self.axes, strict=True):
             for ax in maps:
@@ -102,10 +103,10 @@ class ChipPanels(Panels):
 
 
 class ArrayPanels(Panels):
-    """Panels of several arrays, equally wide, each in its own pixels, in two columns.
+    """Panels of several arrays with equal widths, each in its pixels, in two columns.
 
-    `sizes` are columns and rows by the array's name; `colorbar` leaves room for one common colour
-    bar.
+    `sizes`: columns and rows by name of the array. `colorbar`: True to leave room for a common
+    colour bar.
     """
 
     @figure_style()
@@ -124,24 +125,24 @@ class ArrayPanels(Panels):
         self._columns, self._rows = columns, rows
 
     def frame(self, margin: float = 0.0) -> None:
-        """Make panels maps; the margin is a part of each array's longer side."""
+        """Make all panels maps; `margin` is a fraction of the longer side of each array."""
         n, differ = len(self.sizes), len(set(self.sizes)) > 1
         for k, (size, (ax,)) in enumerate(zip(self.sizes, self.axes, strict=True)):
             chip_axes(ax, size, margin=margin * max(size))
             ax.label_outer()
-            if differ:  # then a neighbour's numbers do not serve
+            if differ:  # tick labels of a neighbour do not apply
                 ax.tick_params(labelbottom=True, labelleft=True)
-            # nothing stands below it in a last row that is not full
+            # a panel above an empty place in the last row
             if k // self._columns == self._rows - 2 and k + self._columns >= n:
                 ax.tick_params(labelbottom=True)
                 ax.set_xlabel("x [pix]")
 
 
 class OneArray(Panels):
-    """One panel for all chips, as one array.
+    """A single panel for all chips, as one array.
 
-    `sizes` are columns and rows by chip number, `offsets` are added to the pixels of each chip,
-    `margin` is the room beyond the array in pixels; `colorbar` leaves room for a colour bar.
+    `sizes`: columns and rows by chip number. `offsets`: added to the pixels of each chip.
+    `margin`: room beyond the array in pixels. `colorbar`: True to leave room for a colour bar.
     """
 
     @figure_style()
@@ -168,11 +169,11 @@ class OneArray(Panels):
         super().__init__(figure, [[ax]] * len(sizes), [""] * len(sizes))
 
     def offset(self, chip: int) -> tuple[float, float]:
-        """Offset of a chip's pixels, counted from 0, in the array."""
+        """Offset in the array of the pixels of a chip, counted from 0."""
         return self._offsets[chip]
 
     def _outline(self, ax: Axes, sizes: Mapping[int, Size]) -> None:
-        """Draw the edges of all chips; those of one column are named at the right."""
+        """Draw the edges of all chips; chips in a single column are named at the right."""
         shift = max(abs(px) for px, _ in self._offsets)
         named = len(sizes) > 1 and shift < 0.5 * min(size[0] for size in sizes.values())
         for (number, (nx, ny)), (px, py) in zip(sizes.items(), self._offsets, strict=True):
@@ -185,11 +186,11 @@ class OneArray(Panels):
 
 
 class FocalPlane(Panels):
-    """One panel for all chips, each where and as it lies in the focal plane; of several maps more.
+    """A panel for each map that shows all chips at their positions in the focal plane.
 
-    `outlines` are the corners (4, 2) of each chip in the axes' pixels, `margin` is the room beyond
-    them in pixels, `colorbar` leaves room for a colour bar.  `frames` take pixels of each chip to
-    the axes; without them what is drawn is there already.
+    `outlines`: corners (4, 2) of each chip in pixels of the axes. `margin`: room beyond them in
+    pixels. `colorbar`: True to leave room for a colour bar. `frames`: functions that convert pixels
+    of each chip to the axes; not needed if the data are already in the focal plane.
     """
 
     @figure_style()
@@ -223,7 +224,7 @@ class FocalPlane(Panels):
         super().__init__(figure, [row] * len(outlines), [""] * len(outlines))
 
     def frame_of(self, chip: int) -> ToPlane | None:
-        """Function from pixels of a chip to positions in the plane."""
+        """Function that converts pixels of a chip to positions in the focal plane."""
         return self.frames[chip] if self.frames else None
 
 
@@ -239,11 +240,11 @@ _CHIP_NAME: Any = {
 }
 
 
-OVERLAP = 0.2  # of the shorter side: sizes that are wrong by less still show where chips lie
+OVERLAP = 0.2  # of the shorter side; smaller errors of sizes do not obscure the arrangement
 
 
 def overlap(outlines: Sequence[Float]) -> bool:
-    """True if chips lie on each other, by more than `OVERLAP`."""
+    """True if chips overlap by more than `OVERLAP`."""
     for k, a in enumerate(outlines):
         for b in outlines[k + 1 :]:
             shared = np.minimum(a.max(axis=0), b.max(axis=0)) - np.maximum(
@@ -255,9 +256,9 @@ def overlap(outlines: Sequence[Float]) -> bool:
 
 
 def chip_axes(ax: Axes, size: Size, *, margin: float = 0.0) -> None:
-    """Make axes a map of a chip: x to the right, y up, pixels square, outline drawn.
+    """Make axes a map of a chip: x to the right, y up, square pixels, outline drawn.
 
-    `margin` is the width of the border around the outline, in pixels.
+    `margin`: width of the border around the outline, in pixels.
     """
     nx, ny = size
     ax.set_aspect("equal")
@@ -271,16 +272,16 @@ def chip_axes(ax: Axes, size: Size, *, margin: float = 0.0) -> None:
 
 
 def _label_edges(ax: Axes) -> None:
-    """Label axes that are at the edge because there is no chip beyond them."""
+    """Label axes that are at the edge because no chip is below or to the left of them."""
     spec = ax.get_subplotspec()
     if spec is None:
         return
-    others = [o.get_subplotspec() for o in ax.figure.axes if o is not ax]
-    here = spec.rowspan.start, spec.colspan.start
-    places = [(o.rowspan.start, o.colspan.start) for o in others if o is not None]
-    if not any(row > here[0] and column == here[1] for row, column in places):
+    neighbours = [o.get_subplotspec() for o in ax.figure.axes if o is not ax]
+    position = spec.rowspan.start, spec.colspan.start
+    places = [(o.rowspan.start, o.colspan.start) for o in neighbours if o is not None]
+    if not any(row > position[0] and column == position[1] for row, column in places):
         ax.tick_params(labelbottom=True)
         ax.set_xlabel("x [pix]")
-    if not any(column < here[1] and row == here[0] for row, column in places):
+    if not any(column < position[1] and row == position[0] for row, column in places):
         ax.tick_params(labelleft=True)
         ax.set_ylabel("y [pix]")

@@ -1,6 +1,6 @@
-"""Style of every figure: one palette, one width, plain numbers at ticks.
+"""Style of all figures: one palette, one width, plain numbers at ticks.
 
-Figures are made by objects, never through pyplot, and the caller's rcParams are left alone.
+Figures are created as objects, never through pyplot, and the caller's rcParams are not changed.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from matplotlib.ticker import LogFormatterSciNotation, ScalarFormatter
 
 from bayesdist.report.figures.ticks import OneTickFigure
 
-# Okabe and Ito's palette: eight colours that remain distinct in every common colour blindness
+# palette of Okabe and Ito: eight colours that are distinct with any common colour blindness
 PALETTE = {
     "black": "#000000",
     "orange": "#E69F00",
@@ -44,24 +44,24 @@ LEVEL_COLORS = {
 }
 SEQUENTIAL = "cividis"
 SIZES = ListedColormap(colormaps["cividis_r"](np.linspace(0.2, 1.0, 256)), "sizes")  # of vectors
-DIVERGING = "RdBu_r"  # of values on both sides of zero; told apart in every common colour blindness
+DIVERGING = "RdBu_r"  # for values of both signs; distinct with any common colour blindness
 INK = "#1F2A37"
 PALE = "#A9B4C0"  # vectors that may be noise alone, and stars in the background
-OUTLINE = "#9AA5B1"  # of chips, and lines at zero
-GUIDE = "#E3E8ED"  # lines of a grid behind data
-BARS = "#C5CED8"  # of a histogram behind a curve
+OUTLINE = "#9AA5B1"  # outlines of chips, and lines at zero
+GUIDE = "#E3E8ED"  # grid lines behind data
+BARS = "#C5CED8"  # histogram behind a curve
 PAPER = "#FFFFFF"
 COLORBAR: dict[str, Any] = {"fraction": 0.05, "pad": 0.02}  # next to maps
 WIDTH = 7.2  # inches: the text width of an A4 or Letter page
-LARGE_WIDTH = 4.6  # of a map that stands beside a figure of full width on a wide screen
-HALF_WIDTH = WIDTH / 2  # of figures that stand side by side
+LARGE_WIDTH = 4.6  # of a map next to a figure of full width on a wide screen
+HALF_WIDTH = WIDTH / 2  # of figures side by side
 
 _RC: Any = {
-    "font.family": ["DejaVu Sans"],  # ships with matplotlib: the same page on every machine
+    "font.family": ["DejaVu Sans"],  # ships with matplotlib, so pages are equal on all machines
     "font.size": 8.5,
     "axes.titlesize": 8.5,
     "axes.titlelocation": "left",
-    "axes.titley": 1.0,  # else all ticks are measured again in case that some are above the panel
+    "axes.titley": 1.0,  # otherwise all ticks are measured again, in case some are above the panel
     "axes.labelsize": 8.5,
     "axes.linewidth": 0.7,
     "axes.edgecolor": INK,
@@ -83,20 +83,20 @@ _RC: Any = {
     "image.cmap": SEQUENTIAL,
     "figure.facecolor": "white",
     "savefig.facecolor": "white",
-    "figure.autolayout": False,  # panels are laid out once, see `bayesdist.report.drawing`
+    "figure.autolayout": False,  # panels are laid out only once, see `bayesdist.report.drawing`
     "figure.constrained_layout.use": False,
     "figure.constrained_layout.h_pad": 0.06,
     "figure.constrained_layout.w_pad": 0.06,
-    "svg.fonttype": "path",  # a page on paper has its letters whatever fonts there are
+    "svg.fonttype": "path",  # independent of the fonts of the viewer
     "svg.hashsalt": "bayesdist",
 }
 
 
 @contextmanager
 def figure_style() -> Iterator[None]:
-    """Context, or decorator of a function, with the style; the caller's settings come back.
+    """Context manager or decorator that applies the style and restores the caller's settings.
 
-    Within another such context nothing is set: copying all settings takes milliseconds.
+    Nested contexts do nothing, because copying all settings takes milliseconds.
     """
     if all(dict.get(matplotlib.rcParams, key) == value for key, value in _RC.items()):
         yield
@@ -111,7 +111,7 @@ def new_figure(
     *,
     layout: Literal["constrained", "compressed", "none"] = "constrained",
 ) -> Figure:
-    """Empty figure (inches) that belongs to no window and to no pyplot state."""
+    """Empty figure without a window and without pyplot state; sizes are in inches."""
     fig = OneTickFigure(figsize=(width, height))
     fig.set_layout_engine(layout)
     FigureCanvasAgg(fig)
@@ -120,9 +120,9 @@ def new_figure(
 
 @dataclass(frozen=True)
 class Tones:
-    """Neutral colours of a panel: those of the report, or shades of the user's own style.
+    """Neutral colours of a panel: those of the report, or shades of the user's style.
 
-    Colours that carry meaning (of a verdict, an axis, a kind of error) are the same in all styles.
+    Colours with a meaning (of a verdict, an axis, a kind of error) are the same in all styles.
     """
 
     ink: str = INK  # vectors, lines at zero
@@ -134,7 +134,7 @@ class Tones:
 
     @classmethod
     def of(cls, ax: Axes) -> Tones:
-        """Colours that stand out from the background of a panel as its labels do."""
+        """Colours that contrast with the background of a panel as its labels do."""
         ink = to_hex(ax.xaxis.label.get_color()).upper()
         layers = (ax.get_facecolor(), ax.figure.get_facecolor())
         paper = next((to_hex(c).upper() for c in layers if to_rgba(c)[3] > 0), PAPER)
@@ -150,39 +150,39 @@ class Tones:
 
 
 def small_font() -> Any:
-    """Font size of what stands inside a panel or beside it: that of legends."""
+    """Font size of text inside or next to a panel: that of legends."""
     return matplotlib.rcParams["legend.fontsize"]
 
 
 def legend_above(figure: Figure, ax: Axes, **look: Any) -> None:
-    """Draw the legend of one panel above all panels, in one row."""
+    """Draw the legend of one panel in a row above all panels."""
     handles, labels = ax.get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside upper left", ncols=len(labels), **look)
 
 
 def guide_lines(ax: Axes) -> None:
-    """Draw lines of a grid behind the data."""
+    """Draw grid lines behind the data."""
     ax.grid(True, lw=0.4, color=Tones.of(ax).guide)
     ax.set_axisbelow(True)
 
 
 def nice_below(value: float) -> float:
-    """Largest of 1, 2, 5 times a power of ten that does not exceed a positive number; else 1."""
+    """Largest of 1, 2, 5 times a power of ten not above a positive number; 1 for other values."""
     if not (value > 0 and math.isfinite(value)):
         return 1.0
     power = 10.0 ** math.floor(math.log10(value))
-    # the factor pardons the rounding of 5 / 5 = 0.9999999999999999 and the like
+    # the factor allows for rounding, such as 5 / 5 = 0.9999999999999999
     step = max((m for m in (1.0, 2.0, 5.0) if m * power <= value * (1 + 1e-9)), default=1.0)
     return float(f"{step * power:.0e}")
 
 
-# -- ticks: mathematical text takes most of the time of drawing ------------------------------------
+# -- ticks: without mathematical text, which takes most of the drawing time ------------------------
 
 _RAISED = str.maketrans("0123456789-−", "⁰¹²³⁴⁵⁶⁷⁸⁹⁻⁻")
 
 
 class _Powers(LogFormatterSciNotation):
-    """Formatter of powers of ten in raised digits."""
+    """Formatter of powers of ten with superscript digits."""
 
     def __call__(self, x: float, pos: int | None = None) -> str:
         text = super().__call__(x, pos)
@@ -191,7 +191,7 @@ class _Powers(LogFormatterSciNotation):
 
 
 class _Plain(ScalarFormatter):
-    """Formatter of decimal numbers with a common power of ten in raised digits."""
+    """Formatter of decimal numbers with a common power of ten in superscript digits."""
 
     def get_offset(self) -> str:
         text = super().get_offset()
@@ -207,7 +207,7 @@ def _signs(text: str) -> str:
 
 
 def plain_ticks(figure: Figure) -> None:
-    """Replace matplotlib's own formatters on every axis by those without mathematical text."""
+    """Replace the formatters of matplotlib on every axis by those without mathematical text."""
     for axes in figure.axes:
         for axis in (axes.xaxis, axes.yaxis):
             for now, put in (
@@ -219,9 +219,9 @@ def plain_ticks(figure: Figure) -> None:
                 elif type(now) is LogFormatterSciNotation:
                     put(
                         _Powers(
-                            now._base,  # type: ignore[attr-defined]  # it has no getter
+                            now._base,  # type: ignore[attr-defined]  # has no getter
                             labelOnlyBase=now.labelOnlyBase,
                             minor_thresholds=now.minor_thresholds,
-                            linthresh=now._linthresh,  # type: ignore[attr-defined]  # nor this
+                            linthresh=now._linthresh,  # type: ignore[attr-defined]  # no getter
                         )
                     )

@@ -1,4 +1,4 @@
-"""Axes on which one tick stands for all: ticks of their own take most of the time of drawing."""
+"""Axes with a single tick object for all ticks, since ticks take most of the drawing time."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from bayesdist.utils.arrays import Bool, Float
 
 
 class _AllTicks:
-    """Tick that stands for all of an axis: its lines have all marks, its labels are moved."""
+    """Tick that represents all ticks of an axis: its lines have all marks, its labels are moved."""
 
     def __init__(self: Any, *place: Any, **look: Any) -> None:
         super().__init__(*place, **look)
@@ -44,7 +44,7 @@ class _AllTicks:
                     moved.draw(renderer)
 
     def boxes(self: Any, label: Text, renderer: Any) -> list[Bbox]:
-        """Extents of one of the two labels at all positions."""
+        """Bounding boxes of one of the two labels at all positions."""
         if not (label.get_visible() and label.get_in_layout()):
             return []
         out, dpi = [], self.axes.figure.dpi
@@ -59,7 +59,7 @@ class _AllTicks:
         return out
 
     def moved(self: Any, label: Text) -> Iterator[Text]:
-        """Label with the text of each position, at that position."""
+        """Yield the label with the text of each position, moved to that position."""
         (side,) = self.in_order(label.get_position()[1:], label.get_position()[:1])[0]
         for at, text in zip(self.at, self.texts, strict=True):
             label.set_position(self.in_order(at, side))
@@ -80,29 +80,29 @@ class _YTicks(_AllTicks, YTick):
 
 
 class _OneTickAxis:
-    """Axis whose ticks are one artist; those who ask for single labels get them from matplotlib."""
+    """Axis with a single tick object; requests for single labels are handled by matplotlib."""
 
     _one_by_one = False
     _placed: tuple[Any, ...] = ()
     _measured: tuple[Any, ...] = ()
 
     def reset_ticks(self: Any) -> None:
-        """Drop the ticks: those that are needed are made when they are drawn."""
+        """Drop the ticks; they are created again when they are drawn."""
         self.majorTicks: list[Any] = []
         self.minorTicks: list[Any] = []
         self._placed = ()
 
     def _update_ticks(self: Any) -> list[Any]:
-        """Ticks that are drawn: one of the numbers, and one of the marks between them."""
+        """Ticks to be drawn: one for major and one for minor ticks."""
         if self._one_by_one:
             ticks: list[Any] = super()._update_ticks()  # type: ignore[misc]
             return ticks
-        bbox, dpi = self.axes.bbox, self.axes.figure.dpi  # ticks depend on the size, not the place
+        bbox, dpi = self.axes.bbox, self.axes.figure.dpi  # ticks depend on size, not on position
         size = round(bbox.width / dpi, 6), round(bbox.height / dpi, 6)
         sources = (self.major.locator, self.major.formatter, self.minor.locator)
         state = (*sources, *self.get_view_interval(), *size)
         if not self._placed or self._placed[0] != state:
-            found = []
+            single_ticks = []
             for major, locs, formatter in (
                 (True, self.get_majorticklocs(), self.major.formatter),
                 (False, self.get_minorticklocs(), self.minor.formatter),
@@ -112,9 +112,11 @@ class _OneTickAxis:
                 if shown.any():
                     tick = self._tick_of_all(major)
                     at = np.asarray(locs, float)[shown]
-                    tick.place(at, [text for text, one in zip(texts, shown, strict=True) if one])
-                    found.append(tick)
-            self._placed = state, found
+                    tick.place(
+                        at, [text for text, visible in zip(texts, shown, strict=True) if visible]
+                    )
+                    single_ticks.append(tick)
+            self._placed = state, single_ticks
         return list(self._placed[1])
 
     def _within(self: Any, locs: Any) -> Bool:
@@ -140,7 +142,7 @@ class _OneTickAxis:
             return boxes
         shown = [(t, t.label1.get_visible(), t.label2.get_visible()) for t in ticks]
         state = self._placed[0], shown, self.axes.bbox.bounds, self.axes.figure.dpi
-        if not self._measured or self._measured[0] != state:  # each is asked for twice in a row
+        if not self._measured or self._measured[0] != state:  # this is called twice in a row
             first = [box for tick in ticks for box in tick.boxes(tick.label1, renderer)]
             second = [box for tick in ticks for box in tick.boxes(tick.label2, renderer)]
             self._measured = state, first, second
@@ -157,7 +159,7 @@ class _OneTickAxis:
 
     @contextmanager
     def _separate(self) -> Iterator[None]:
-        """Context in which ticks are those of matplotlib."""
+        """Context manager that restores the ticks of matplotlib."""
         self._one_by_one, self._placed = True, ()
         try:
             yield
@@ -165,13 +167,13 @@ class _OneTickAxis:
             self._one_by_one = False
 
     def get_majorticklabels(self) -> list[Text]:
-        """Labels as matplotlib has them, one for each number."""
+        """Labels of the major ticks as matplotlib creates them."""
         with self._separate():
             labels: list[Text] = super().get_majorticklabels()  # type: ignore[misc]
         return labels
 
     def get_minorticklabels(self) -> list[Text]:
-        """Labels as matplotlib has them, one for each mark between the numbers."""
+        """Labels of the minor ticks as matplotlib creates them."""
         with self._separate():
             labels: list[Text] = super().get_minorticklabels()  # type: ignore[misc]
         return labels
@@ -186,7 +188,7 @@ class _OneTickYAxis(_OneTickAxis, YAxis):
 
 
 class OneTickAxes(Axes):
-    """Axes that look like matplotlib's and are laid out and drawn in a third of the time."""
+    """Axes that look like those of matplotlib but are laid out and drawn in a third of the time."""
 
     def _init_axis(self) -> None:
         self.xaxis, self.yaxis = _OneTickXAxis(self, clear=False), _OneTickYAxis(self, clear=False)
@@ -195,23 +197,23 @@ class OneTickAxes(Axes):
                 self.spines[side].register_axis(axis)
 
     def clear(self) -> None:
-        """Remove all that is drawn, with spines at the edges."""
+        """Remove all content, and put the spines at the edges."""
         super().clear()
-        for spine in self.spines.values():  # else the first of many ticks does it
+        for spine in self.spines.values():  # otherwise the first of many ticks does this
             spine.set_position(("outward", 0.0))
 
 
 class OneTickFigure(Figure):
-    """Figure whose panels and colour bars are such axes."""
+    """Figure with `OneTickAxes` as panels and colour bars."""
 
     def __init__(self, *size: Any, **options: Any) -> None:
         super().__init__(*size, **options)
         self.around: dict[tuple[Any, ...], Float] = {}  # extents of labels about their positions
 
     def add_subplot(self, *place: Any, **options: Any) -> Any:
-        """Panel in a grid."""
+        """Add a panel in a grid."""
         return super().add_subplot(*place, **{"axes_class": OneTickAxes} | options)
 
     def add_axes(self, *place: Any, **options: Any) -> Any:
-        """Panel at a place of the figure."""
+        """Add a panel at a position of the figure."""
         return super().add_axes(*place, **{"axes_class": OneTickAxes} | options)

@@ -16,15 +16,15 @@ from bayesdist.utils.numbers import Scale, display_scale
 def axes_of(ax: Axes | None, *, height: float = 0.0) -> Axes:
     """Axes to draw into: `ax`, or those of a new pyplot figure if it is None.
 
-    The new figure has the size of the user's style and is at least `height` inches high.
+    The new figure has the size of the user's style and a height of at least `height` inches.
     """
     if ax is None:
-        from matplotlib import pyplot  # pyplot chooses a backend: only if a figure is asked for
+        from matplotlib import pyplot  # selects a backend, so only if a figure is needed
 
         size = matplotlib.rcParams["figure.figsize"]
-        # compressed: labels fit, and maps, whose pixels are square, have no room around them
-        _, made = pyplot.subplots(figsize=(size[0], max(size[1], height)), layout="compressed")
-        return made
+        # compressed: labels fit, and maps with square pixels have no empty space around them
+        _, new_axes = pyplot.subplots(figsize=(size[0], max(size[1], height)), layout="compressed")
+        return new_axes
     if not isinstance(ax, Axes):
         shape = f" of shape {np.shape(ax)}" if np.ndim(ax) else ""
         raise InputError(
@@ -36,9 +36,9 @@ def axes_of(ax: Axes | None, *, height: float = 0.0) -> Axes:
 
 
 def scale_of(unit: str, largest: float, scale_mas: float | None) -> Scale:
-    """Unit in which values of at most `largest` are shown, and the factor that leads to it.
+    """Unit in which values of at most `largest` are shown, and the factor of conversion to it.
 
-    Pixels become milliarcseconds if `scale_mas`, the size of a pixel, is given.
+    Pixels are converted to milliarcseconds if `scale_mas`, the size of a pixel, is given.
     """
     if scale_mas is None or unit != "pix":
         return display_scale(unit, largest)
@@ -47,16 +47,16 @@ def scale_of(unit: str, largest: float, scale_mas: float | None) -> Scale:
 
 
 def add_colorbar(ax: Axes, drawn: ScalarMappable, label: str, **look: Any) -> None:
-    """Draw a colour bar beside `ax` that is as high as `ax`, whatever the layout of the figure."""
+    """Draw a colour bar next to `ax` with the same height, independent of the figure's layout."""
     ax.figure.colorbar(drawn, cax=ax.inset_axes((1.03, 0.0, 0.05, 1.0)), label=label, **look)
 
 
 def set_title(
     ax: Axes, title: str | None, default: str, name: str = "", *, pad: float | None = None
 ) -> None:
-    """Set the title of a plot: the default one if `title` is None, and none if it is empty.
+    """Set the title of a plot: the default if `title` is None, no title if it is empty.
 
-    The default one begins with the name of the chip if there is one.
+    The default title begins with the name of the chip, if any.
     """
     text = (f"{name}: {default}" if name else default) if title is None else title
     if text:

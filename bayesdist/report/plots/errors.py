@@ -1,4 +1,4 @@
-"""Plots of the error budget, of margins against requirements, and of validity periods."""
+"""Plots of the error budget, of margins relative to requirements, and of validity periods."""
 
 from __future__ import annotations
 
@@ -34,8 +34,8 @@ if TYPE_CHECKING:
     from bayesdist.assess import ErrorBudget, Margin
     from bayesdist.assess.requirements.validity import ValidityPeriod
 
-SHOWN_QUANTILES = (0.001, 0.999)  # of the draws between which a histogram is drawn
-# shape in addition to colour
+SHOWN_QUANTILES = (0.001, 0.999)  # quantiles of the draws that limit a histogram
+# shapes in addition to colours
 MARKERS = {"met": "o", "not shown": "s", "undecided": "D", "missed": "X"}
 KIND_COLORS = {
     "random": PALETTE["sky"],
@@ -43,8 +43,7 @@ KIND_COLORS = {
     "local": PALETTE["green"],
     PRODUCT: OUTLINE,
 }
-# marker and vertical shift of each axis: u and v are often equal
-# of the markers: yellow with a dark edge is seen on bars of all colours
+# style of the markers of u and v: yellow with a dark edge is visible on bars of all colours
 MARKER_STYLE: dict[str, Any] = {
     "ms": 5.5,
     "color": PALETTE["yellow"],
@@ -52,10 +51,10 @@ MARKER_STYLE: dict[str, Any] = {
     "mew": 0.7,
     "zorder": 4,
 }
-AXIS_MARKERS = {"u": ("o", -0.15), "v": ("s", 0.15)}
+AXIS_MARKERS = {"u": ("o", -0.15), "v": ("s", 0.15)}  # with a shift, as u and v are often equal
 LETTERS_PER_LINE = 26  # of the name of a term
 
-Row = Mapping[str, Any]  # of `ErrorBudget.rows`
+Row = Mapping[str, Any]  # row of `ErrorBudget.rows`
 
 # -- budget ---------------------------------------------------------------------------------------
 
@@ -79,20 +78,20 @@ def plot_budget(
     ----------
     budget : ErrorBudget
     ax : matplotlib.axes.Axes, optional
-        A new figure is made without it.
+        By default the axes of a new figure.
     chip : int, optional
-        Number of the chip whose errors are shown; all chips together by default.
+        Number of the chip to show; all chips together by default.
     scale_mas : float, optional
         Size of a pixel in mas; if given, errors in pixels are shown in mas.
     largest : float, optional
-        Error in the unit of the budget that is at the right end of the axis, for several plots with
-        one scale; that of the largest term by default.
+        Largest error on the axis in the unit of the budget, to give several plots the same scale;
+        that of the largest term by default.
     over : str, optional
-        Area that the rms is taken over, for the label of the axis.
+        Area over which the rms is computed, for the label of the axis.
     names : bool
-        True for the names of the terms beside the axes.
+        True to show the names of the terms next to the axes.
     legend : bool
-        True for a legend above the axes.
+        True to show a legend above the axes.
 
     Returns
     -------
@@ -101,7 +100,7 @@ def plot_budget(
     Raises
     ------
     InputError
-        For a chip that the budget does not have, or if `ax` is not one Axes.
+        If the budget does not have the chip, or `ax` is not a single Axes.
 
     Examples
     --------
@@ -120,7 +119,7 @@ def plot_budget(
     end = largest_error([rows]) if largest is None else largest
     scale = scale_of(budget.unit, end, scale_mas)
     _bars(ax, rows, scale)
-    # the number beyond the longest bar needs room
+    # room for the number next to the longest bar
     ax.set_xlim(0, 1.2 * end * scale.factor or 1.0)
     area = over or ("the detector" if chip is None else f"chip {chip}")
     ax.set_xlabel(f"rms over {area} [{scale.unit}]")
@@ -135,7 +134,7 @@ def plot_budget(
 
 
 def is_total(row: Row) -> bool:
-    """True if a row of `ErrorBudget.rows` is the sum of the others."""
+    """True if a row of `ErrorBudget.rows` is the total."""
     return bool(row["kind"] == "total")
 
 
@@ -145,7 +144,7 @@ def row_per_axis(row: Row) -> float:
 
 
 def largest_error(parts: Sequence[Sequence[Row]]) -> float:
-    """Largest error along u or v of some budgets' rows."""
+    """Largest error along u or v in the rows of some budgets."""
     return max(max(float(row["u"]), float(row["v"])) for rows in parts for row in rows)
 
 
@@ -184,7 +183,7 @@ def _bars(ax: Axes, rows: Sequence[Row], scale: Scale) -> None:
     for axis, (marker, shift) in AXIS_MARKERS.items():
         values = np.array([row[axis] for row in rows], float) * scale.factor
         ax.plot(values, place + shift, marker, **MARKER_STYLE)
-    # beyond the bar and its markers
+    # numbers are placed beyond the bar and its markers
     ends = np.array([max(float(row["u"]), float(row["v"])) for row in rows]) * scale.factor
     for k, (value, end) in enumerate(zip(sizes, ends, strict=True)):
         text = ax.annotate(number(value), (end, k), (6, 0), textcoords="offset points")
@@ -199,15 +198,15 @@ def _bars(ax: Axes, rows: Sequence[Row], scale: Scale) -> None:
 def plot_margins(margins: Sequence[Margin], ax: Axes | None = None) -> Axes:
     """Plot requirements: each statistic in units of its limit, which is the line at 1.
 
-    Each row has a histogram of the draws, a bar of their central 95 %, a marker at the median whose
-    shape and colour show the verdict, and the verdict in words.
+    Each row has a histogram of the draws, a bar of their central 95 %, a marker at the median, and
+    the verdict in words. Shape and colour of the marker also show the verdict.
 
     Parameters
     ----------
     margins : sequence of Margin
-        Of `check_requirements`.
+        Result of `check_requirements`.
     ax : matplotlib.axes.Axes, optional
-        A new figure is made without it.
+        By default the axes of a new figure.
 
     Returns
     -------
@@ -216,7 +215,7 @@ def plot_margins(margins: Sequence[Margin], ax: Axes | None = None) -> Axes:
     Raises
     ------
     InputError
-        If there is no margin, or if `ax` is not one Axes.
+        If there is no margin, or `ax` is not a single Axes.
 
     Examples
     --------
@@ -273,7 +272,7 @@ def plot_margins(margins: Sequence[Margin], ax: Axes | None = None) -> Axes:
 
 
 def _ridge(ax: Axes, k: int, values: Float, color: str) -> None:
-    """Draw a histogram of the draws that stands on row k."""
+    """Draw a histogram of the draws above row k."""
     low, high = np.quantile(values, SHOWN_QUANTILES)
     counts, edges = np.histogram(values, bins=40, range=(low, high if high > low else low + 1e-9))
     top = k - 0.6 * counts / max(counts.max(), 1)
@@ -302,20 +301,25 @@ def plot_validity(
 ) -> Axes:
     """Plot the probability of meeting a requirement against time.
 
-    The band is the 95 % interval of counting draws. A red line, with the band of its interval, is
-    the date at which the probability falls below what is asked.
+    The band is the 95 % interval of a probability counted in draws. A red line with a band for its
+    interval is the date at which the probability falls below the required one.
 
     Parameters
     ----------
     period : ValidityPeriod
     ax : matplotlib.axes.Axes, optional
-        A new figure is made without it.
+        By default the axes of a new figure.
     title : str, optional
-        By default the date in words; an empty title for none.
+        By default the date in a sentence; an empty string for no title.
 
     Returns
     -------
     matplotlib.axes.Axes
+
+    Raises
+    ------
+    InputError
+        If `ax` is not a single Axes.
     """
     ax = axes_of(ax)
     ink, asked = Tones.of(ax).ink, period.requirement.probability

@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
 KINDS = ("contours", "crosses")
 KEY_PAD = 20.0  # points between a panel and its title, so that the key fits below the title
-BORDER = 0.02  # of the longer side of a chip, around its outline
+BORDER = 0.02  # width of the border around a chip, as a fraction of its longer side
 
 
 def plot_map(
@@ -51,24 +51,24 @@ def plot_map(
     ----------
     uncertainty_map : UncertaintyMap
     ax : matplotlib.axes.Axes, optional
-        A new figure is made without it.
+        By default the axes of a new figure.
     kind : str
         'contours': filled contours of the uncertainty per axis, the rms of sigma_u and sigma_v,
-        with a ring where it is largest. 'crosses': four vectors from each point of the grid, to all
-        combinations of (+-sigma_u, +-sigma_v), enlarged as the key above the axes states.
+        with a ring at its maximum. 'crosses': four vectors from each point of the grid to all
+        combinations of (+-sigma_u, +-sigma_v), magnified as stated by the key above the axes.
     scale_mas : float, optional
         Size of a pixel in mas; if given, errors in pixels are shown in mas.
     levels : array_like, optional
-        Levels of the contours in the unit of the map, such as those of another plot; round numbers
-        by default.
+        Levels of the contours in the unit of the map, for example those of another plot; round
+        numbers by default.
     magnification : float, optional
         Length of the crosses in pixels of the axes for an error of 1; a round number by default.
     colorbar : bool or sequence of matplotlib.axes.Axes
-        True for a colour bar of the contours beside `ax`; or all axes that share this colour bar.
+        True for a colour bar next to `ax`, or all axes that share a colour bar.
     name : str
         Name of the chip, which begins the default title.
     title : str, optional
-        By default the solution and its range of errors; an empty title for none.
+        By default the solution and its range of errors; an empty string for no title.
 
     Returns
     -------
@@ -77,7 +77,7 @@ def plot_map(
     Raises
     ------
     InputError
-        For an unknown kind, or if `ax` is not one Axes.
+        If the kind is unknown, or `ax` is not a single Axes.
 
     Examples
     --------
@@ -132,32 +132,37 @@ def plot_distortion(
 ) -> Axes:
     """Plot the distortion of a chip as vectors, with a ring around the origin of the longest.
 
-    Vectors are along x and y of the detector and in its pixels. They run from a position to where
-    the distortion moves it, enlarged as the key above the axes states; their colour is their
+    Vectors are along x and y of the detector, in its pixels. They point from a position to the
+    position after distortion, magnified as stated by the key above the axes. Their colour is their
     length.
 
     Parameters
     ----------
     vector_map : VectorMap
-        Of `distortion_vectors`.
+        Result of `distortion_vectors`.
     ax : matplotlib.axes.Axes, optional
-        A new figure is made without it.
+        By default the axes of a new figure.
     scale_mas : float, optional
         Size of a pixel in mas; if given, lengths are stated in mas.
     magnification : float, optional
-        By which vectors are enlarged; by default the longest is as long as a step of the grid.
+        Magnification of the vectors; by default the longest one is as long as a grid step.
     key : float, optional
         Length of the vector above the axes, in pixels; a round number by default.
     colorbar : bool
-        True for a colour bar of the lengths beside the axes.
+        True for a colour bar of the lengths next to the axes.
     name : str
         Name of the chip, which begins the default title.
     title : str, optional
-        By default the largest length; an empty title for none.
+        By default the largest length; an empty string for no title.
 
     Returns
     -------
     matplotlib.axes.Axes
+
+    Raises
+    ------
+    InputError
+        If `ax` is not a single Axes.
 
     Examples
     --------
@@ -186,17 +191,17 @@ def plot_distortion(
 
 
 def distortion_magnification(vectors: Sequence[VectorMap]) -> float:
-    """Factor of two digits that draws the longest vector of some maps as one step of the grid."""
+    """Two-digit factor by which the longest vector of some maps is drawn as one grid step."""
     largest = max(map(_largest, vectors))
     return cell_magnification(min(Arrows.of_map(v).step for v in vectors), largest)
 
 
 def _largest(vectors: VectorMap) -> float:
-    """Largest length in pixels of the detector."""
+    """Largest length, in pixels of the detector."""
     return float(np.hypot(*vectors.on_detector).max())
 
 
 def _key_length(below: float, unit: str, scale_mas: float | None) -> float:
-    """Length of a key in `unit`, not above a limit, that is a round number where it is stated."""
+    """Length of a key in `unit`, not above `below`, that is a round number when displayed."""
     factor = scale_mas if scale_mas is not None and unit == "pix" else 1.0
     return nice_below(below * factor) / factor

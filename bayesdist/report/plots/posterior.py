@@ -25,15 +25,15 @@ if TYPE_CHECKING:
     from bayesdist.infer import Posterior
 
 MIXTURE = ("f", "j", "s_out")
-MAX_DRAWS = 20_000  # of a corner plot
+MAX_DRAWS = 20_000  # in a corner plot
 CORNER_BINS = 26  # along each axis
-SHOWN_SIGMA = 4.0  # half of the width of an axis of a corner plot, in standard deviations
+SHOWN_SIGMA = 4.0  # half width of an axis of a corner plot, in standard deviations
 QUANTILES = (0.1587, 0.8413)
 # probability inside the contours of 1 and 2 sigma of a Gaussian in two dimensions
 CONTENTS = 1.0 - np.exp(-0.5 * np.array([1.0, 2.0]) ** 2)
-MAX_TICKS = 3  # of an axis of a corner plot
-MAX_CORNER = 4  # parameters of a corner plot by default
-MAX_NAMES = 25  # names of coefficients along an axis
+MAX_TICKS = 3  # per axis of a corner plot
+MAX_CORNER = 4  # number of parameters of a corner plot by default
+MAX_NAMES = 25  # number of coefficient names along an axis
 RANK_BINS = 20
 
 # -- corner plot ----------------------------------------------------------------------------------
@@ -57,8 +57,8 @@ def plot_corner(
 ) -> NDArray[Any]:
     """Plot the joint posterior of each pair of some parameters, and the histogram of each.
 
-    Contours hold what 1 and 2 sigma hold of a Gaussian in two dimensions, 39 and 86 %; dashed lines
-    hold 68 %. Coefficients are shown relative to their posterior means.
+    Contours enclose 39 and 86 %, like 1 and 2 sigma of a Gaussian in two dimensions; dashed lines
+    enclose 68 %. Coefficients are shown relative to their posterior means.
 
     Parameters
     ----------
@@ -68,7 +68,7 @@ def plot_corner(
         mixture. By default the parameters of the mixture that were sampled or, if there are none,
         the coefficients with the fewest effective draws.
     fig : matplotlib.figure.Figure or SubFigure, optional
-        Empty figure to draw into; a new one is made without it.
+        Empty figure to draw into; by default a new figure.
 
     Returns
     -------
@@ -78,7 +78,7 @@ def plot_corner(
     Raises
     ------
     InputError
-        For an unknown parameter or one that was not sampled, or if `fig` is not empty.
+        If a parameter is unknown or was not sampled, or `fig` is not empty.
     """
     names = default_parameters(posterior) if parameters is None else tuple(parameters)
     if isinstance(parameters, str) or not names:
@@ -92,14 +92,14 @@ def plot_corner(
         side = 2.0 * len(columns) + 1.2
         fig = pyplot.figure(figsize=(side, side), layout="constrained")
     elif isinstance(fig, Figure) and fig.get_layout_engine() is None:
-        fig.set_layout_engine("constrained")  # else the labels of a large style do not fit
+        fig.set_layout_engine("constrained")  # otherwise labels of a large style do not fit
     if fig.axes:
         raise InputError("the figure has axes", where="plot_corner", do="give an empty figure")
     return draw_corner(fig, columns)
 
 
 def default_parameters(posterior: Posterior) -> tuple[str, ...]:
-    """Parameters of the mixture that were sampled; else the slowest coefficients."""
+    """Sampled parameters of the mixture; if there are none, the slowest coefficients."""
     sampled = tuple(name for name in MIXTURE if name in posterior.hyper)
     return sampled or slowest_parameters(posterior, without=fixed_parameters(posterior))
 
@@ -128,10 +128,10 @@ def _thinned(draws: Float) -> Float:
 
 
 def draw_corner(fig: Figure | SubFigure, columns: Sequence[Column]) -> NDArray[Any]:
-    """Draw a corner plot of some quantities into an empty figure; its panels (n, n)."""
+    """Draw a corner plot into an empty figure; returns its panels (n, n)."""
     n = len(columns)
     limits = np.array([_limits(column) for column in columns])
-    # by the middle of the axis: the numbers at its ticks are not the largest
+    # units are chosen for the centre of an axis, since the ticks are not at its largest values
     sizes = [abs(low + high) / 2 if low >= 0 else high for low, high in limits]
     scales = [display_scale(c.unit, size) for c, size in zip(columns, sizes, strict=True)]
     factors = np.array([scale.factor for scale in scales])
@@ -187,9 +187,9 @@ def _marginal(ax: Axes, draws: Float, edges: Float) -> None:
 
 
 def _joint(ax: Axes, x: Float, y: Float, x_edges: Float, y_edges: Float) -> None:
-    """Draw contours of the smoothed density that hold the probabilities `CONTENTS`."""
+    """Draw contours of the smoothed density that enclose the probabilities `CONTENTS`."""
     counts, _, _ = np.histogram2d(x, y, (x_edges, y_edges))
-    # a border of empty cells closes contours that reach the edge
+    # a border of empty cells closes contours at the edge
     density = np.pad(gaussian_filter(counts, 1.0, mode="constant"), 1)
     levels = contour_heights(density)
     centres = []
@@ -207,17 +207,17 @@ def _joint(ax: Axes, x: Float, y: Float, x_edges: Float, y_edges: Float) -> None
 
 
 def contour_heights(density: Float) -> Float:
-    """Densities, ascending, above which a histogram holds 2 and 1 sigma of its probability."""
+    """Densities, ascending, of the contours that enclose 2 and 1 sigma of the probability."""
     ordered = np.sort(density.ravel())[::-1]
     held = np.cumsum(ordered) / ordered.sum()
     heights = [ordered[np.searchsorted(held, content)] for content in CONTENTS[::-1]]
-    # contours need levels that differ, even if all draws are in one cell
+    # contour levels must differ, even if all draws are in one cell
     heights[1] = max(heights[1], heights[0] * (1 + 1e-6) + 1e-12)
     return np.asarray(heights)
 
 
 def _numbers(ax: Axes, *, below: bool, beside: bool) -> None:
-    """Show numbers at the ticks only at the edges of the figure."""
+    """Show tick labels only at the edges of the figure."""
     ax.tick_params(axis="x", labelbottom=below, labelrotation=45)
     ax.tick_params(axis="y", labelleft=beside, labelrotation=45)
 
@@ -228,17 +228,22 @@ def _numbers(ax: Axes, *, below: bool, beside: bool) -> None:
 def plot_correlations(posterior: Posterior, ax: Axes | None = None) -> Axes:
     """Plot the correlations between coefficients in the posterior as a matrix of colours.
 
-    Parameters of the frames of exposures and parameters that are held fixed are left out.
+    Parameters of the frames of exposures and fixed parameters are left out.
 
     Parameters
     ----------
     posterior : Posterior
     ax : matplotlib.axes.Axes, optional
-        A new figure is made without it.
+        By default the axes of a new figure.
 
     Returns
     -------
     matplotlib.axes.Axes
+
+    Raises
+    ------
+    InputError
+        If `ax` is not a single Axes.
     """
     ax = axes_of(ax)
     names, matrix = correlation_matrix(posterior)
@@ -253,13 +258,13 @@ def plot_correlations(posterior: Posterior, ax: Axes | None = None) -> Axes:
 
 
 def fixed_parameters(posterior: Posterior) -> frozenset[str]:
-    """Names of the coefficients that are the same in all draws."""
+    """Names of the coefficients with the same value in all draws."""
     fixed = np.ptp(posterior.flat, axis=0) == 0
     return frozenset(posterior.model.names[k] for k in np.flatnonzero(fixed))
 
 
 def correlation_matrix(posterior: Posterior) -> tuple[list[str], Float]:
-    """Names and correlations (n, n) of the free coefficients that are not of an exposure."""
+    """Names and correlations (n, n) of the free coefficients, without those of exposures."""
     fixed = fixed_parameters(posterior)
     parameters = enumerate(posterior.model.parameters)
     chosen = [k for k, p in parameters if p.kind != "frame" and p.name not in fixed]
@@ -280,7 +285,7 @@ def plot_ranks(
 ) -> Axes:
     """Plot the ranks of the draws of each ensemble among the draws of all ensembles.
 
-    Ensembles that sample the same distribution have flat histograms, inside the band of 2 sigma.
+    Ensembles that sample the same distribution have flat histograms within the 2 sigma band.
 
     Parameters
     ----------
@@ -289,7 +294,7 @@ def plot_ranks(
         Name of a coefficient, or 'f', 'j' or 's_out'; by default the coefficient with the fewest
         effective draws.
     ax : matplotlib.axes.Axes, optional
-        A new figure is made without it.
+        By default the axes of a new figure.
     legend : bool
         True for a legend inside the axes.
 
@@ -300,7 +305,7 @@ def plot_ranks(
     Raises
     ------
     InputError
-        For an unknown parameter, or if `ax` is not one Axes.
+        If the parameter is unknown, or `ax` is not a single Axes.
     """
     name = parameter
     if name is None:
@@ -317,10 +322,10 @@ def plot_ranks(
 
 
 def rank_band(posterior: Posterior) -> float:
-    """Two standard deviations of the share of an ensemble's draws in a bin, relative to its mean.
+    """Twice the standard deviation of the fraction of an ensemble's draws in a bin, relative to it.
 
-    A share of 1 / `RANK_BINS` is as uncertain as the effective draws of the slowest parameter make
-    it.
+    The uncertainty of the fraction 1 / `RANK_BINS` follows from the number of effective draws of
+    the slowest parameter.
     """
     ensembles, draws = posterior.theta.shape[:2]
     finite = [v for v in posterior.convergence.ess_bulk if np.isfinite(v)]
@@ -330,7 +335,7 @@ def rank_band(posterior: Posterior) -> float:
 
 
 def draw_ranks(ax: Axes, posterior: Posterior, name: str, band: float) -> float:
-    """Draw a histogram of ranks for each ensemble; the largest distance from 1, at least `band`."""
+    """Draw a rank histogram per ensemble; returns the largest distance from 1, at least `band`."""
     draws = _draws_of(posterior, name)
     ax.axhspan(1 - band, 1 + band, color=Tones.of(ax).outline, alpha=0.25, lw=0)
     edges, farthest = np.linspace(0.0, 1.0, RANK_BINS + 1), band
@@ -344,7 +349,7 @@ def draw_ranks(ax: Axes, posterior: Posterior, name: str, band: float) -> float:
 
 
 def _draws_of(posterior: Posterior, name: str) -> Float:
-    """Draws (ensembles, draws) of a coefficient or a parameter of the mixture; else InputError."""
+    """Draws (ensembles, draws) of a coefficient or a mixture parameter; raises InputError."""
     if name in posterior.hyper:
         return np.asarray(posterior.hyper[name], float)
     names = posterior.model.names
@@ -358,11 +363,11 @@ def _draws_of(posterior: Posterior, name: str) -> Float:
 
 
 def rank_counts(draws: Float, bins: int) -> Int:
-    """Numbers (ensembles, bins) of draws (ensembles, draws) in equal bins of their ranks."""
+    """Counts (ensembles, bins) of draws (ensembles, draws) in equal bins of their ranks."""
     order = np.argsort(draws, axis=None, kind="stable")
-    which = np.empty(draws.size, np.int64)
-    which[order] = np.arange(draws.size) * bins // draws.size
-    return np.array([np.bincount(w, minlength=bins) for w in which.reshape(draws.shape)])
+    bins_of_draws = np.empty(draws.size, np.int64)
+    bins_of_draws[order] = np.arange(draws.size) * bins // draws.size
+    return np.array([np.bincount(w, minlength=bins) for w in bins_of_draws.reshape(draws.shape)])
 
 
 def slowest_parameters(

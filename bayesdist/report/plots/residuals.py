@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 
 AXES = ("u", "v")
 VECTOR_PAD = 24.0  # points between a panel and its title, so that the key fits below the title
-SIGMA_BINS = 200  # widths that stand for those of all stars
+SIGMA_BINS = 200  # largest number of widths, to which those of all stars are binned
 
 # -- over the detector ----------------------------------------------------------------------------
 
@@ -53,13 +53,13 @@ def plot_residual_vectors(
 ) -> Axes:
     """Plot the mean residual of each cell of a chip as a vector.
 
-    Dark vectors differ from zero by more than 2 sigma; pale ones are what noise alone would give.
+    Dark vectors differ from zero by more than 2 sigma; pale ones are consistent with noise.
 
     Parameters
     ----------
     binned : BinnedResiduals
     ax : matplotlib.axes.Axes, optional
-        A new figure is made without it.
+        By default the axes of a new figure.
     unit : str
         Unit of the residuals.
     scale_mas : float, optional
@@ -71,11 +71,16 @@ def plot_residual_vectors(
     name : str
         Name of the chip, which begins the default title.
     title : str, optional
-        By default the number of significant vectors; an empty title for none.
+        By default the number of significant vectors; an empty string for no title.
 
     Returns
     -------
     matplotlib.axes.Axes
+
+    Raises
+    ------
+    InputError
+        If `ax` is not a single Axes.
     """
     ax = axes_of(ax)
     arrows = Arrows.of_cells(binned)
@@ -93,14 +98,14 @@ def plot_residual_vectors(
 def vector_scale(chips: Sequence[Arrows]) -> tuple[float, float]:
     """Magnification of the mean residuals of some chips, and length of their key."""
     length = np.concatenate([arrows.length for arrows in chips])
-    # one bad cell with three stars must not flatten all others
+    # a single bad cell with three stars must not make all other vectors short
     typical = float(np.quantile(length, 0.95)) if length.size else 0.0
     step = min(arrows.step for arrows in chips)
     return magnification_of(1.1 * step, typical), nice_below(typical)
 
 
 def significant(arrows: Arrows) -> str:
-    """Number of significant vectors of a chip, and of those expected by chance."""
+    """Number of significant vectors of a chip, and number expected by chance."""
     n = arrows.x.size
     return f"{arrows.n_clear} of {n} significant, {CHANCE * n:.0f} by chance"
 
@@ -110,18 +115,18 @@ def significant(arrows: Arrows) -> str:
 
 @dataclass(frozen=True)
 class MixtureCurve:
-    """Distribution of one axis of the residuals under the fitted mixture."""
+    """Distribution of the residuals along one axis under the fitted mixture."""
 
     sigma: Float  # (N,), quoted error of each star on this axis
-    fraction: float = 0.0  # of outliers, f
-    jitter: float = 0.0  # j, in quadrature with every quoted error
+    fraction: float = 0.0  # fraction of outliers, f
+    jitter: float = 0.0  # j, added in quadrature to every quoted error
     scale: float = 0.0  # s_out of Gaussian outliers, or the match radius of uniform ones
     outliers: str = "none"  # 'gaussian', 'uniform' or 'none'
-    taken: Float | float = 0.0  # (N,), fraction of the variance taken by fitted star positions
+    taken: Float | float = 0.0  # (N,), fraction of the variance absorbed by fitted star positions
 
     @property
     def typical_error(self) -> float:
-        """Root of the median variance of true matches."""
+        """Square root of the median variance of true matches."""
         return float(np.sqrt(np.median(self.sigma**2 + self.jitter**2)))
 
     @property
@@ -130,7 +135,7 @@ class MixtureCurve:
         return float(np.sqrt(np.max(self.sigma**2 + self.jitter**2)))
 
     def expected(self, edges: ArrayLike) -> tuple[Float, Float]:
-        """Stars expected in each bin (B,) between edges (B + 1,): good component, outliers."""
+        """Expected numbers of true matches and of outliers in bins (B,) with edges (B + 1,)."""
         edges = np.asarray(edges, float)
         sigma, weight = self._widths()
         good = weight @ np.diff(ndtr(edges / sigma[:, None]), axis=1)
@@ -140,15 +145,17 @@ class MixtureCurve:
         return (1.0 - f) * good, f * outlying
 
     def _widths(self) -> tuple[Float, Float]:
-        """Total widths that occur, and numbers of stars with each (binned where there are many)."""
+        """Distinct total widths, and numbers of stars with each; binned if there are many."""
         total = np.hypot(self.sigma, self.jitter) * np.sqrt(1.0 - self.taken)
         values, counts = np.unique(total, return_counts=True)
         if values.size > SIGMA_BINS:
-            # in equal steps of log width; the mean square in a bin keeps the variance exact
+            # equal steps of log width; the mean square of a bin preserves the variance
             edges = np.geomspace(values[0], values[-1], SIGMA_BINS + 1)
-            which = np.clip(np.searchsorted(edges, total, side="right") - 1, 0, SIGMA_BINS - 1)
-            counts = np.bincount(which, minlength=SIGMA_BINS)
-            square = np.bincount(which, weights=total**2, minlength=SIGMA_BINS)
+            bin_of_star = np.clip(
+                np.searchsorted(edges, total, side="right") - 1, 0, SIGMA_BINS - 1
+            )
+            counts = np.bincount(bin_of_star, minlength=SIGMA_BINS)
+            square = np.bincount(bin_of_star, weights=total**2, minlength=SIGMA_BINS)
             keep = counts > 0
             values, counts = np.sqrt(square[keep] / counts[keep]), counts[keep]
         return values, counts.astype(float)
@@ -165,9 +172,9 @@ class MixtureCurve:
 def mixture_curves(
     sample: StarSample, fit: LinearFit, posterior: Posterior | None
 ) -> tuple[MixtureCurve, MixtureCurve]:
-    """Distributions of the residuals in u and in v by a posterior, or by the quoted errors alone.
+    """Distributions of the residuals in u and v for a posterior, or for the quoted errors only.
 
-    The rms of the fit replaces errors that are not quoted.
+    The rms of the fit is used if no errors are quoted.
     """
     table = sample.table
     sigmas = [
@@ -183,12 +190,13 @@ def mixture_curves(
 
     mixture = posterior.mixture
     jitter = sampled("j") if mixture.jitter is None else float(mixture.jitter)
-    taken = 0.0 if sample.taken is None else sample.taken
+    absorbed = 0.0 if sample.taken is None else sample.taken
     scale = sampled("s_out")
     if mixture.model == "uniform":
         scale = required(mixture.match_radius, "a uniform mixture needs a match radius")
     u, v = (
-        MixtureCurve(sigma, sampled("f"), jitter, scale, mixture.model, taken) for sigma in sigmas
+        MixtureCurve(sigma, sampled("f"), jitter, scale, mixture.model, absorbed)
+        for sigma in sigmas
     )
     return u, v
 
@@ -212,20 +220,20 @@ def plot_residual_histogram(
     Parameters
     ----------
     sample : StarSample
-        Of `star_sample` or of the diagnostics.
+        Result of `star_sample`, or the sample of the diagnostics.
     ax : matplotlib.axes.Axes, optional
-        A new figure is made without it.
+        By default the axes of a new figure.
     fit : LinearFit
     posterior : Posterior, optional
-        The posterior that the residuals are of; without it the curve is that of the quoted errors.
+        Posterior of the residuals; without it the curve uses the quoted errors.
     axis : str
         'u' or 'v'.
     tails : bool
-        True for all residuals on a logarithmic scale of counts, False for the core alone.
+        True for all residuals with a logarithmic scale of counts, False for the core only.
     rows : str
         Word for the rows of the data in labels, such as 'stars' or 'detections'.
     title : str, optional
-        By default the axis and the range; an empty title for none.
+        By default the axis and the range; an empty string for no title.
     legend : bool
         True for a legend inside the axes.
 
@@ -236,7 +244,7 @@ def plot_residual_histogram(
     Raises
     ------
     InputError
-        For an unknown axis, or if `ax` is not one Axes.
+        If the axis is unknown, or `ax` is not a single Axes.
     """
     require_known(axis, AXES, "axis", where="axis")
     ax, residual = axes_of(ax), sample.residual
@@ -257,7 +265,7 @@ def plot_residual_histogram(
 
 
 def histogram_reach(residual: Float, curves: Sequence[MixtureCurve]) -> tuple[float, float]:
-    """Largest residuals shown of the core, and of everything; the same for both axes."""
+    """Largest residuals shown in the core and in full histograms, the same for both axes."""
     typical = max(curve.typical_error for curve in curves)
     widest = max(curve.largest_error for curve in curves)
     core = min(6.0 * typical, 4.0 * widest)
@@ -265,7 +273,7 @@ def histogram_reach(residual: Float, curves: Sequence[MixtureCurve]) -> tuple[fl
 
 
 def largest_count(residual: Float, tail: float) -> int:
-    """Largest count of a bin of both axes: expected curves fall far below one star."""
+    """Largest count of a bin on both axes, since expected curves may be far below one star."""
     edges = np.linspace(-tail, tail, 122)
     return max(*(int(np.histogram(values, edges)[0].max()) for values in residual.T), 1)
 
@@ -280,7 +288,7 @@ def draw_histogram(
     *,
     tails: bool,
 ) -> None:
-    """Draw bars of residuals between -reach and reach, and the numbers expected in them."""
+    """Draw a histogram of residuals between -reach and reach, and the expected numbers."""
     edges = np.linspace(-reach, reach, (121 if tails else 81) + 1)
     counts, _ = np.histogram(values, edges)
     good, outlying = curve.expected(edges)
@@ -315,9 +323,9 @@ def plot_residual_density(
     Parameters
     ----------
     sample : StarSample
-        Of `star_sample` or of the diagnostics.
+        Result of `star_sample`, or the sample of the diagnostics.
     ax : matplotlib.axes.Axes, optional
-        A new figure is made without it.
+        By default the axes of a new figure.
     unit : str
         Unit of the residuals.
     axis : str
@@ -327,9 +335,9 @@ def plot_residual_density(
     rows : str
         Word for the rows of the data in labels, such as 'stars' or 'detections'.
     title : str, optional
-        By default the number of residuals outside the axes; an empty title for none.
+        By default the number of residuals outside the axes; an empty string for no title.
     colorbar : bool
-        True for a colour bar beside `ax`.
+        True for a colour bar next to `ax`.
 
     Returns
     -------
@@ -338,7 +346,7 @@ def plot_residual_density(
     Raises
     ------
     InputError
-        For stars without magnitudes, an unknown axis, or if `ax` is not one Axes.
+        If stars have no magnitudes, the axis is unknown, or `ax` is not a single Axes.
     """
     require_known(axis, AXES, "axis", where="axis")
     mag = sample.table.mag
@@ -370,14 +378,14 @@ def draw_density(
     unit: str,
     errors: MagnitudeErrors | None,
 ) -> tuple[PolyCollection, Scale, str]:
-    """Draw hexagons that count the residuals (N, 2) along one axis; limits are those of both axes.
+    """Draw hexagons with counts of the residuals (N, 2) along one axis; both axes share limits.
 
-    Returns the hexagons, the unit of the axes, and how many of how many residuals lie outside.
+    Returns the hexagons, the unit of the axes, and a text with the number of residuals outside.
     """
     k = AXES.index(axis)
     values, reach = residual[:, k], _magnitude_reach(residual, errors)
     scale = scale_of(unit, reach, None)
-    low, high = np.quantile(mag, [0.002, 0.998])  # a few very bright stars must not fill the plot
+    low, high = np.quantile(mag, [0.002, 0.998])  # ignore a few very bright stars
     pad = 0.02 * max(high - low, 0.1)
     inside = (np.abs(values) <= reach) & (np.abs(2 * mag - low - high) <= high - low + 2 * pad)
     drawn = ax.hexbin(
@@ -404,7 +412,7 @@ def draw_density(
 
 
 def _magnitude_reach(residual: Float, errors: MagnitudeErrors | None) -> float:
-    """Largest residual that is shown: four times the errors of faint stars, without outliers."""
+    """Largest residual shown: four times the errors of faint stars, ignoring outliers."""
     if errors is not None:
         return 4.0 * float(max(np.max(errors.sigma_u), np.max(errors.sigma_v)))
     scatter = 1.4826 * float(np.median(np.abs(residual)))

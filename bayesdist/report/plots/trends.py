@@ -1,4 +1,4 @@
-"""Plots of what residuals depend on: means in bins of a quantity, and scatter by exposure."""
+"""Plots of trends in residuals: means in bins of a quantity, and scatter by exposure."""
 
 from __future__ import annotations
 
@@ -22,17 +22,17 @@ if TYPE_CHECKING:
     from bayesdist.infer.solution.solution import Solution
 
 QUANTITIES = ("x", "y", "magnitude", "colour", "epoch")
-MAX_POINTS = 1200  # single stars in a panel: more hide each other
-STARS_PER_BIN = 25  # at least, on average
+MAX_POINTS = 1200  # single stars in a panel; more would overlap
+STARS_PER_BIN = 25  # least average number of stars in a bin
 MAX_BINS = 20  # along an axis
-FEW_DAYS = 0.05  # years: dates in years would differ in their last digits alone
+FEW_DAYS = 0.05  # years; dates in a shorter interval are shown in days
 DAYS_PER_YEAR = 365.25
 CHIP_MARKERS = "osD^vP"  # in addition to colours
 
 
 @dataclass(frozen=True, eq=False)
 class Means:
-    """Weighted means of the residuals in bins that hold two stars or more."""
+    """Weighted means of the residuals in bins with at least two stars."""
 
     at: Float  # (B,), mean of the quantity in the bin
     mean: Float  # (B, 2), of u and v
@@ -56,7 +56,7 @@ class Means:
 
 
 def means_in_bins(t: Float, residual: Float, weight: Float, edges: Float) -> Means:
-    """Means of the residuals (N, 2) of stars at t (N,), between edges (B + 1,)."""
+    """Means of the residuals (N, 2) of stars at t (N,), in bins with edges (B + 1,)."""
     bins = len(edges) - 1
     k = np.clip(np.searchsorted(edges, t, side="right") - 1, 0, bins - 1)
     n, w = np.bincount(k, minlength=bins), np.bincount(k, weight, minlength=bins)
@@ -72,20 +72,20 @@ def means_in_bins(t: Float, residual: Float, weight: Float, edges: Float) -> Mea
 
 @dataclass(frozen=True, eq=False)
 class TrueResiduals:
-    """Residuals of the stars that are probably true, along the axes of the polynomials."""
+    """Residuals of the stars that are probably true matches, along the axes of the polynomials."""
 
     sample: StarSample
     solution: Solution
-    shown: Bool  # (N,), stars of the sample that are probably true
-    residual: Float  # (n, 2), of those shown
+    shown: Bool  # (N,), True for stars of the sample that are probably true matches
+    residual: Float  # (n, 2), of these stars
     weight: Float  # (n,), inverse of the expected mean square
 
     @classmethod
     def of(cls, sample: StarSample, solution: Solution) -> TrueResiduals:
-        """Residuals of a sample, brought from the frames of the exposures to the detector."""
+        """Residuals of a sample, converted from the frames of the exposures to the detector."""
         table, shown = sample.table, sample.probably_true
         residual, model = sample.residual[shown], solution.model
-        if model.n_frame:  # what belongs to the detector would cancel along the axes of the sky
+        if model.n_frame:  # effects of the detector would average out along the axes of the sky
             codes, theta = table.exposure[shown], np.asarray(solution.mean, float)
             residual = residual.copy()
             for code in np.unique(codes):
@@ -97,36 +97,38 @@ class TrueResiduals:
 
     @property
     def scatter(self) -> float:
-        """Robust standard deviation of one axis."""
+        """Robust standard deviation per axis."""
         return 1.4826 * float(np.median(np.abs(self.residual)))
 
     def pixels(self, which: str) -> Float:
-        """Pixels x or y (n,) of the stars that are shown."""
+        """Pixels x or y (n,) of the shown stars."""
         values = getattr(self.sample.table, which)[self.shown]
         return np.asarray(values, float)
 
     def on_chips(self) -> Iterator[tuple[int, Bool]]:
-        """Index and mask (n,) of the stars that are shown, of each chip that has some."""
+        """Index of each chip with stars, and mask (n,) of the shown stars on it."""
         chips = self.solution.model.chips
         numbers = self.sample.table.chip_number[self.shown]
         for k, chip in enumerate(chips):
-            here = numbers == chip.number if len(chips) > 1 else np.ones(len(numbers), bool)
-            if here.any():
-                yield k, here
+            on_chip = numbers == chip.number if len(chips) > 1 else np.ones(len(numbers), bool)
+            if on_chip.any():
+                yield k, on_chip
 
     def by_pixel(self, which: str, most: int = MAX_BINS) -> dict[int, Means]:
-        """Means in equal bins of x or y, by index of the chip; at most so many bins of a chip."""
+        """Means in equal bins of x or y by index of the chip; at most `most` bins per chip."""
         t, column = self.pixels(which), "xy".index(which)
         means = {}
-        for k, here in self.on_chips():
+        for k, on_chip in self.on_chips():
             extent = self.solution.model.chips[k].size[column]
-            bins = int(np.clip(int(here.sum()) // STARS_PER_BIN, 2, most))
+            bins = int(np.clip(int(on_chip.sum()) // STARS_PER_BIN, 2, most))
             edges = np.linspace(0.5, extent + 0.5, bins + 1)
-            means[k] = means_in_bins(t[here], self.residual[here], self.weight[here], edges)
+            means[k] = means_in_bins(
+                t[on_chip], self.residual[on_chip], self.weight[on_chip], edges
+            )
         return means
 
     def by_property(self, values: Float) -> Means:
-        """Means in bins with equal numbers of stars of some values (N,) of the sample."""
+        """Means in bins of values (N,) of the sample, with equal numbers of stars."""
         t = values[self.shown]
         good = np.isfinite(t)
         edges = _quantile_edges(t[good])
@@ -134,7 +136,7 @@ class TrueResiduals:
 
 
 def properties_of(sample: StarSample) -> dict[str, tuple[str, Float]]:
-    """Label with unit and values (N,) of magnitude, colour and epoch, as far as these differ."""
+    """Label with unit and values (N,) of magnitude, colour and epoch, unless all are equal."""
     table = sample.table
     columns = {
         "magnitude": ("magnitude [mag]", table.mag),
@@ -156,7 +158,7 @@ def properties_of(sample: StarSample) -> dict[str, tuple[str, Float]]:
 
 
 def _quantile_edges(values: Float) -> Float:
-    """Edges of bins with equal numbers of stars; of few distinct values, between these."""
+    """Edges of bins with equal numbers of stars, or midpoints if there are few distinct values."""
     distinct = np.unique(values)
     if distinct.size <= MAX_BINS:
         middle = (distinct[1:] + distinct[:-1]) / 2
@@ -176,23 +178,23 @@ def plot_residual_means(
 ) -> Axes:
     """Plot weighted means of the residuals along one axis, with their errors.
 
-    A trend of the means is an error that the model does not follow. Likely false matches are left
-    out. Against x and y single stars are points behind the means.
+    A trend of the means is an error that the model does not describe. Likely false matches are
+    left out. In plots against x and y, single stars are shown as points behind the means.
 
     Parameters
     ----------
     sample : StarSample
-        Of `star_sample` or of the diagnostics.
+        Result of `star_sample`, or the sample of the diagnostics.
     against : str
         'x', 'y', 'magnitude', 'colour' or 'epoch'.
     ax : matplotlib.axes.Axes, optional
-        A new figure is made without it.
+        By default the axes of a new figure.
     solution : LinearFit or Posterior
-        The solution that the residuals are of.
+        Solution of the residuals.
     axis : str
         'u' or 'v'.
     title : str, optional
-        By default the chi-square of the means; an empty title for none.
+        By default the chi-square of the means; an empty string for no title.
 
     Returns
     -------
@@ -201,8 +203,8 @@ def plot_residual_means(
     Raises
     ------
     InputError
-        For an unknown axis or quantity, a quantity that the stars do not have or that is the same
-        for all of them, or if `ax` is not one Axes.
+        If the axis or quantity is unknown, the stars do not have the quantity or it is the same for
+        all of them, or `ax` is not a single Axes.
     """
     require_known(axis, AXES, "axis", where="axis")
     require_known(against, QUANTITIES, "quantity", where="against")
@@ -217,20 +219,20 @@ def plot_residual_means(
         if len(solution.model.chips) > 1:
             ax.legend()
     else:
-        found = properties_of(sample)
-        if against not in found:
+        properties = properties_of(sample)
+        if against not in properties:
             raise InputError(
                 f"the stars have no {against}, or the same one",
                 where="residuals",
-                do=f"plot them against {', '.join(['x', 'y', *found])}",
+                do=f"plot them against {', '.join(['x', 'y', *properties])}",
             )
         ax = axes_of(ax)
-        label, values = found[against]
+        label, values = properties[against]
         mean = residuals.by_property(values)
         scale = scale_of(solution.model.unit, mean.reach or 1.0, None)
         default = draw_property_means(ax, mean, axis, against, scale)
         ax.set_xlabel(label)
-        ax.ticklabel_format(axis="x", useOffset=False)  # years are numbers of four digits
+        ax.ticklabel_format(axis="x", useOffset=False)  # show years with four digits
     ax.set_ylabel(f"residual d{axis} [{scale.unit}]")
     set_title(ax, title, default)
     return ax
@@ -246,7 +248,7 @@ def draw_pixel_means(
     *,
     points: bool = True,
 ) -> str:
-    """Draw the means of each chip against x or y, with points for single stars; a title."""
+    """Draw the means of each chip against x or y, with points for single stars; returns a title."""
     tones, k = Tones.of(ax), AXES.index(axis)
     chips = residuals.solution.model.chips
     if points:
@@ -266,7 +268,7 @@ def draw_pixel_means(
 
 
 def draw_property_means(ax: Axes, mean: Means, axis: str, against: str, scale: Scale) -> str:
-    """Draw means against a property of the stars; a title."""
+    """Draw means against a property of the stars; returns a title."""
     k = AXES.index(axis)
     ax.axhline(0.0, color=Tones.of(ax).ink, lw=0.6, zorder=2)
     draw_means(ax, 0, mean.at, mean.mean[:, k] * scale.factor, mean.error[:, k] * scale.factor)
@@ -288,18 +290,23 @@ def draw_means(ax: Axes, chip: int, at: Float, mean: Float, error: Float, label:
 def plot_exposures(scatter: ExposureScatter, ax: Axes | None = None) -> Axes:
     """Plot the chi-square per degree of freedom of each exposure.
 
-    The line is that of all exposures; the band around it holds 95 % by chance.
+    The line is the value of all exposures; the band around it contains 95 % by chance.
 
     Parameters
     ----------
     scatter : ExposureScatter
         `StarSample.by_exposure`.
     ax : matplotlib.axes.Axes, optional
-        A new figure is made without it.
+        By default the axes of a new figure.
 
     Returns
     -------
     matplotlib.axes.Axes
+
+    Raises
+    ------
+    InputError
+        If `ax` is not a single Axes.
     """
     ax = axes_of(ax)
     tones, n, mean = Tones.of(ax), len(scatter.names), scatter.of_all

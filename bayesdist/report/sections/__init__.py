@@ -1,6 +1,6 @@
-"""Sections of the report of a run; importing this registers all of them.
+"""Sections of the report of a run; importing this package registers all of them.
 
-Modules that missions name add theirs, after the rest.
+Modules named by missions add their sections at the end.
 """
 
 from importlib import import_module

@@ -1,4 +1,4 @@
-"""Numbers of a page from which it computes the budget, and shows maps, by itself."""
+"""Data embedded in the page for its scripts, to compute the budget and to show maps."""
 
 from __future__ import annotations
 
@@ -18,16 +18,16 @@ from bayesdist.report.figures.style import CYCLE, SEQUENTIAL
 from bayesdist.utils.arrays import Float
 from bayesdist.utils.numbers import ladder
 
-MOMENT_DIGITS = 7  # quadratic forms of moments, and differences of displacements, cancel in part
+MOMENT_DIGITS = 7  # quadratic forms of moments, and differences of displacements, partly cancel
 CURVED_DIGITS = 9  # of moments at more than three epochs, which differ by orders of magnitude
 MAP_DIGITS = 5
-MOST_POINTS = 65  # of a map on the longer side: a pointer cannot separate more of them
+MOST_POINTS = 65  # along the longer side of a map; a pointer cannot resolve more
 _COLORS = 12
 
 
 @REPORT.data(needs=("surface",))
 def budget_data(r: ReportInput) -> dict[str, Any]:
-    """Budget as a function of position, epoch and magnitude."""
+    """Error budget as a function of position, epoch and magnitude."""
     s = needed(r.surface)
     nodes = s.spans[0].nodes
     return _common(r) | {
@@ -66,7 +66,7 @@ def budget_data(r: ReportInput) -> dict[str, Any]:
 
 @REPORT.data()
 def map_data(r: ReportInput) -> dict[str, Any]:
-    """Maps that a pointer reads: uncertainty per axis and pixel area."""
+    """Maps of the uncertainty per axis and the pixel area, read with a pointer."""
     chips = r.chips
     layers = []
     for k, first in enumerate(chips[0].maps):
@@ -106,13 +106,13 @@ def _layer(name: str, unit: str, maps: list[Float], digits: int = MAP_DIGITS) ->
 
 
 def _step(n: int) -> int:
-    """Step between the points that stay, so that the outermost ones are among them."""
+    """Step between the points that are kept; it includes the outermost points."""
     steps = [k for k in range(1, n) if (n - 1) % k == 0 and (n - 1) // k < MOST_POINTS]
     return steps[0] if steps else 1
 
 
 def _triangles(moments: Float) -> list[list[list[float | None]]]:
-    """Upper triangles row by row, by node and axis; symmetric pairs are added up."""
+    """Upper triangles row by row, by node and axis; symmetric elements are added."""
     K = moments.shape[-1]
     i, j = np.triu_indices(K)
     values = moments[..., i, j] * np.where(i == j, 1.0, 2.0)
@@ -128,7 +128,7 @@ def _product(term: GridRow) -> dict[str, Any]:
     """Displacements on the grid, by span, chip, node and axis."""
     spans = [
         {
-            str(chip): [[_short(one[:, axis], MOMENT_DIGITS) for axis in (0, 1)] for one in nodes]
+            str(chip): [[_short(node[:, axis], MOMENT_DIGITS) for axis in (0, 1)] for node in nodes]
             for chip, nodes in shifts.items()
         }
         for shifts in term.values
@@ -137,7 +137,7 @@ def _product(term: GridRow) -> dict[str, Any]:
 
 
 def _short(values: Float, digits: int) -> list[float | None]:
-    """Numbers of so many digits; null where there is none."""
+    """Numbers rounded to `digits` digits; None (null in JSON) for missing numbers."""
     return [float(f"{v:.{digits - 1}e}") if np.isfinite(v) else None for v in np.ravel(values)]
 
 

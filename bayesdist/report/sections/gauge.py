@@ -1,7 +1,7 @@
-"""The gauge of coefficients and errors, in plain words.
+"""The gauge of coefficients and errors, in sentences.
 
-A change common to all frames is a change of the polynomials: shift and rotation of a solution mean
-nothing before their zero is defined.
+A change that is common to all frames is equivalent to a change of the polynomials. Shift and
+rotation of a solution are therefore meaningless until their zero points are defined.
 """
 
 from __future__ import annotations
@@ -10,12 +10,12 @@ from bayesdist.report.context import ReportInput
 
 
 def gauge_mark(r: ReportInput) -> str:
-    """Words of a caption on the gauge; empty for a single system, where there is no choice."""
+    """Clause of a caption about the gauge; empty if a single system leaves no choice."""
     return ", in the fit's own gauge" if r.fit.model.n_frame else ""
 
 
 def gauge_note(r: ReportInput) -> str:
-    """Sentences on the fit's own gauge; empty where there is no choice."""
+    """Sentences on the gauge of the fit; empty if there is no choice."""
     model = r.fit.model
     if not model.n_frame:
         return ""
@@ -47,7 +47,7 @@ def gauge_of_maps(r: ReportInput) -> str:
 
 
 def gauge_of_new_exposure(r: ReportInput) -> str:
-    """Sentence on the exposures that a campaign's budget and margins are for; empty for others."""
+    """Sentence on the exposures for which a campaign's results hold; empty for other runs."""
     if r.campaign is None:
         return ""
     return (

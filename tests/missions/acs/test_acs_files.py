@@ -96,7 +96,7 @@ def test_the_readme_names_every_column(written):
 def test_nothing_is_replaced_unasked_and_nothing_old_stays(tmp_path):
     first = simulate_acs(n_exposures=3, n_stars=200)
     write_acs(first, tmp_path)
-    with pytest.raises(InputError, match="holds a campaign"):
+    with pytest.raises(InputError, match="contains a campaign"):
         write_acs(first, tmp_path)
     write_acs(simulate_acs(n_exposures=2, n_stars=200, fine_scale=False), tmp_path, force=True)
     back = read_acs(tmp_path)

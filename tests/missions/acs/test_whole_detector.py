@@ -105,5 +105,5 @@ def test_what_is_no_detector_is_refused():
         WholeDetector({}, 0.05)
     with pytest.raises(InputError, match="the scale is -1"):
         WholeDetector({1: chip(linear(np.eye(2)))}, -1.0)
-    with pytest.raises(InputError, match="to a line"):
+    with pytest.raises(InputError, match="singular linear part"):
         WholeDetector({1: chip(linear([[1.0, 1.0], [1.0, 1.0]]))}, 1.0)

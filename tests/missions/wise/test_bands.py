@@ -278,7 +278,7 @@ def test_an_optical_model_of_another_field_is_refused(compared, tmp_path):
         header[key] *= 0.05 / 2.75
     header.totextfile(tmp_path / "camera.hdr")
     options = ["--bins", BINS, "--optical", tmp_path / "camera.hdr"]
-    words = ["camera.hdr", "0.847 arcmin", "W1 sees 46.6", "own field"]
+    words = ["camera.hdr", "0.847 arcmin", "W1 covers 46.6", "band's field"]
     refused(
         tmp_path, "wise", "bands", compared.run("W1"), "-o", tmp_path / "out", *options, words=words
     )
@@ -325,7 +325,7 @@ def test_two_runs_of_one_band_are_refused(compared, tmp_path):
         (["--optical", "nowhere.hdr"], ["nowhere.hdr", "there is no such file"]),
         (["--optical", "README.md"], ["README.md"]),
         (["--optical", "a.hdr,b.hdr"], ["2 optical models", "1 runs"]),
-        (["--bins", "5"], ["--bins", "give 6 or more"]),
+        (["--bins", "5"], ["--bins", "give at least 6"]),
     ],
 )
 def test_options_that_cannot_be_used_are_refused(compared, tmp_path, monkeypatch, options, words):
@@ -362,7 +362,7 @@ def test_bands_of_another_instrument_have_no_word_of_wise(tmp_path):
 def test_a_missing_scale_is_refused(tmp_path):
     config = write_job(tmp_path / "in", detector={"name": "blue", "size": SIZE})
     run = partly_run(tmp_path / "run", config, "fit", "sample", "diagnose")
-    words = ["size of a pixel", "detector.scale_mas"]
+    words = ["pixel scale", "detector.scale_mas"]
     refused(tmp_path, "wise", "bands", run, "-o", tmp_path / "out", words=words)
 
 

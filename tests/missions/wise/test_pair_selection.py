@@ -81,13 +81,13 @@ def test_what_leaves_nothing_or_cannot_be_done_is_refused(rng):
             SelectedPairs(lambda: [given], selection, SIZE).table()
 
     unknown = int(np.isnan(pairs.colour).sum())
-    refused(rf"no pair of 400 is left .* no colour \({unknown}\), colour \({400 - unknown}\)",
+    refused(rf"none of the 400 pairs .* no colour \({unknown}\), colour \({400 - unknown}\)",
             RvbBlock(colour=(8.0, 9.0)))  # fmt: skip
-    refused("hence no colours", RvbBlock(bluest=3), RvbPairs(pairs.matches))
+    refused("therefore no colours", RvbBlock(bluest=3), RvbPairs(pairs.matches))
     m = pairs.matches
     nameless = RvbPairs(Matches(m.x, m.y, m.u, m.v), pairs.colour)
     refused("no column of frames", RvbBlock(bluest=3), nameless)
-    with pytest.raises(ValueError, match=r"colour goes from 1 to 0"):
+    with pytest.raises(ValueError, match=r"colour is from 1 to 0"):
         RvbBlock(colour=(1.0, 0.0))
     with pytest.raises(ValueError, match=r"bluest\n.*greater than 0"):
         RvbBlock(bluest=0)
@@ -157,7 +157,7 @@ def test_pairs_in_place_are_checked_against_the_array(rng, tmp_path):
     assert len(open_rvb(path, band=None, **OPTIONS)) == 300
     with pytest.raises(InputError, match="outside the 508 pixels of W1's array"):
         open_rvb(path, band="W1", **(OPTIONS | {"size": (508.0, 508.0)}))
-    with pytest.raises(InputError, match=r"lie within x <= .* positions of a smaller array"):
+    with pytest.raises(InputError, match=r"are within x <= .* positions of a smaller array"):
         open_rvb(path, band="W1", **(OPTIONS | {"size": (4096.0, 4096.0)}))
     table["u"], table["v"] = table["v"].copy(), table["u"].copy()
     swapped = write(table, tmp_path / "swapped.parquet")

@@ -148,15 +148,15 @@ def test_what_a_file_lacks_is_said(rng, tmp_path):
     table = rvb_table(rng)
     path = write(table, tmp_path / "a.tbl")
     counts = re.escape(", ".join(f"{b} ({n} pairs)" for b, n in rvb_bands(path).items()))
-    refused(f"a.tbl: holds several bands: {counts}; choose one", path)
-    refused(f"holds no W3, but {counts}", path, band="W3")
-    refused("'W7' is no band; give one of W1, W2, W3, W4", path, band="W7")
+    refused(f"a.tbl: contains several bands: {counts}; choose one", path)
+    refused(f"does not contain W3, but {counts}", path, band="W3")
+    refused("'W7' is not a band; give one of W1, W2, W3, W4", path, band="W7")
     refused("column 'xx' is missing; name 'x' if that is meant", path, columns={"x": "xx"})
     refused("columns has the key 'chip', which is no quantity", path, columns={"chip": "band"})
     table["band"][7] = "K"
-    refused("b.tbl, row 8, column 'band': 'K' is no band", write(table, tmp_path / "b.tbl"))
+    refused("b.tbl, row 8, column 'band': 'K' is not a band", write(table, tmp_path / "b.tbl"))
     table.remove_column("band")
-    refused("c.tbl: has no column of bands", write(table, tmp_path / "c.tbl"))
+    refused("c.tbl: has no column with the band", write(table, tmp_path / "c.tbl"))
     table.remove_column("u")
     refused("d.tbl: no column for 'u' among frame, x, y, v", write(table, tmp_path / "d.tbl"))
     table = rvb_table(rng)
@@ -187,7 +187,7 @@ def test_bands_mixed_up_are_seen_by_the_array(rng, tmp_path, suffix):
                        band="W4")  # fmt: skip
     first = np.flatnonzero((table["band"] == "W4") & (table["x"] > 509.0))[0]
     assert f"row {first + 1}, column 'x'" in sentence
-    refused("pairs of W1 lie within x <= 50., y <= 50. of an array of 1016 x 1016", path, band="W1")
+    refused("pairs of W1 are within x <= 50., y <= 50. of an array of 1016 x 1016", path, band="W1")
     # a smaller array that is meant is none of another band
     assert len(read_rvb(path, band="W1", size=(508.0, 508.0)))
 
@@ -289,7 +289,7 @@ def test_both_limits_are_judged(rng):
 def test_acceptance_refuses_what_it_cannot_judge():
     one = np.array([1.0, 2.0])
     matches = Matches(one, one, one + 5, one)
-    beyond = r"no pair of 2 is left .*: offset beyond the radial limit \(2\)"
+    beyond = r"none of the 2 pairs are selected: .*offset beyond the radial limit \(2\)"
     with pytest.raises(InputError, match=beyond):
         taken(RvbPairs(matches), offset=RadialLimit(1.0, 2.0))
     with pytest.raises(InputError, match="needs errors"):

@@ -229,7 +229,7 @@ def test_solutions_that_say_too_little_or_too_much(tmp_path):
         table.write(tmp_path / "s.ecsv", format="ascii.ecsv", overwrite=True)
         return read_solutions(tmp_path / "s.ecsv", centre=CENTRE)
 
-    with pytest.raises(InputError, match="row 3: frame 'a' stands twice"):
+    with pytest.raises(InputError, match="row 3: frame 'a' occurs twice"):
         read()
     table["frame"] = ["a", "b", "c"]
     assert read()["b"].values.tolist() == [2.0, 0.0, 0.0, 0.0, 0.0, 0.0]
@@ -237,7 +237,7 @@ def test_solutions_that_say_too_little_or_too_much(tmp_path):
     with pytest.raises(InputError, match="no column of parameters"):
         read()
     table["rotation"] = Column([0.0, 0.1, 0.2], unit="m")
-    with pytest.raises(InputError, match="unit m is not one of angles"):
+    with pytest.raises(InputError, match="unit m is not an angle"):
         read()
 
 

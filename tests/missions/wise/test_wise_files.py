@@ -257,7 +257,7 @@ def test_what_cannot_be_simulated_is_refused(tmp_path):
     before = {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*.*")}
     with pytest.raises(InputError, match=r"holds w4 already.*--force"):  # before W1 is begun
         simulated(tmp_path)
-    with pytest.raises(InputError, match="holds Parquet files already"):
+    with pytest.raises(InputError, match="contains Parquet files already"):
         write_wise_set(wise_set("W4", pairs=10), tmp_path)
     assert {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*.*")} == before
     (tmp_path / "file").write_text("")

@@ -1,1 +1,1 @@
-"""Commands on files: positions, contents, a first configuration."""
+"""Commands on files: transformations, content, initial configuration."""

@@ -1,4 +1,4 @@
-"""`bayesdist apply`: positions on the detector to the undistorted frame, and back."""
+"""`bayesdist apply`: transform detector positions to the undistorted frame, or back."""
 
 from __future__ import annotations
 
@@ -57,49 +57,79 @@ def apply_to_table(
     corner: tuple[float, float] | None = None,
     force: bool = False,
 ) -> str:
-    """Take the positions of a table to the output frame, or `inverse` back to pixels, into a file.
+    """Transform the positions of a table to the output frame, or back to pixels, and write a file.
 
-    Positions are in `columns`, by default those with the usual names of pixels (back: x_out,
-    y_out), and the chip's number in a column chip unless `chip` gives it.  Pixels that
-    are read count from `pixel_origin`, by default from that of the program whose columns they are;
-    those that are written count from 1.
+    Pixels are 1-based when written.
 
-    `method` is one of METHODS: Newton's method on the forward
-    polynomials, a polynomial fitted here, of an `order`, or the INVERSE rows of an IDCTAB; `epoch`
-    is in decimal years; `origin` is the output pixel of the zero point, (0, 0) by default.  Filter,
-    scale and size are as of `calibration_of_scale`; image, ltv and corner as of `images_of`.  What
-    is to be printed is returned.
+    Parameters
+    ----------
+    path : path
+        Calibration file or run.
+    table, output : path
+        Table to read, and file to write.
+    inverse : bool
+        Transform back to pixels.
+    method : str
+        Method of the inverse: 'newton' (on the forward polynomials), 'polynomial' (fitted here), or
+        'table' (INVERSE rows of an IDCTAB).
+    order : int, optional
+        Order of the fitted polynomial.
+    columns : sequence of str, optional
+        Columns with the positions; by default those with usual names for pixels, or x_out and y_out
+        for the inverse.
+    pixel_origin : float, optional
+        Coordinate of the centre of the first pixel in the table; by default that of the program
+        that wrote the columns.
+    chip : int, optional
+        Chip number, in place of a column 'chip'.
+    filter, scale, size
+        See `calibration_of_scale`.
+    epoch : float, optional
+        Date in decimal years.
+    origin : tuple of float, optional
+        Output pixel of the zero point, (0, 0) by default.
+    vafactor : float
+        VAFACTOR of the exposure.
+    image, ltv, corner
+        See `images_of`.
+    force : bool
+        Replace an existing file.
+
+    Returns
+    -------
+    str
+        Text to print.
     """
     output = Path(output)
     check_output(output, force)
-    found = calibration_of_scale(path, filter=filter, scale=scale, size=size, epoch=epoch)
-    chips_of = found.in_frame(epoch)
-    pixel, source = found.pixel(epoch)
+    calibration = calibration_of_scale(path, filter=filter, scale=scale, size=size, epoch=epoch)
+    chips_of = calibration.in_frame(epoch)
+    pixel, source = calibration.pixel(epoch)
     ox, oy = origin or (0.0, 0.0)
     frame = OutputFrame(pixel, (ox, oy), vafactor)
-    images = images_of(found, image=image, ltv=ltv, corner=corner)
+    images = images_of(calibration, image=image, ltv=ltv, corner=corner)
     a = Application(chips_of, frame, images)
     rows = read_positions(Path(table))
     if inverse:
         x, y = (position_column(rows, name, str(table)) for name in columns or OUT)
     else:
         x, y, first, reason = pixel_columns(rows, columns, pixel_origin, str(table))
-    what = found.name, str(table)
+    names = calibration.name, str(table)
     if inverse:
-        given = chip is not None or len(chips_of) == 1 or "chip" in rows.colnames
-        chips = chip_numbers(rows, chip, list(chips_of), *what) if given else None
-        at, lines = _back(a, found, x, y, chips, method, order, epoch)
+        has_chips = chip is not None or len(chips_of) == 1 or "chip" in rows.colnames
+        chips = chip_numbers(rows, chip, list(chips_of), *names) if has_chips else None
+        at, lines = _back(a, calibration, x, y, chips, method, order, epoch)
         added = ("x", "y")
     else:
-        chips = chip_numbers(rows, chip, list(chips_of), *what)
+        chips = chip_numbers(rows, chip, list(chips_of), *names)
         parts = {n: (chips == n, a.forward(x[chips == n], y[chips == n], chip=n)) for n in a.chips}
         at, added = _gathered(parts, x.size), OUT
         lines = [origin_line(first, reason), *_frame_lines(a, source)]
     add_positions(rows, at, added, str(table))
-    rows.meta = {"calibration": found.name, "scale": pixel, "unit": found.unit}
+    rows.meta = {"calibration": calibration.name, "scale": pixel, "unit": calibration.unit}
     rows.meta |= {"origin": [ox, oy], "vafactor": vafactor}
     write_positions(rows, output)
-    head = head_line(output, f"{at.x.size} positions", found, epoch)
+    head = head_line(output, f"{at.x.size} positions", calibration, epoch)
     return "\n".join([head, *lines, *_losses(a, at, x, y, inverse)])
 
 
@@ -113,7 +143,7 @@ def _back(
     order: int | None,
     epoch: float | None,
 ) -> tuple[Positions, list[str]]:
-    """Pixels, and what to say of their error."""
+    """Pixels, and lines of text on the errors of the inverse."""
     if chips is None:
         at = a.locate(X, Y)
     else:
@@ -130,7 +160,7 @@ def _back(
         chip = about_zero[n]
         if method == "polynomial":
             back = fitted_inverse(chip, order)
-            what = f"polynomial of order {back.order}"
+            method_name = f"polynomial of order {back.order}"
         else:
             if n not in found.inverses:
                 raise InputError(
@@ -138,22 +168,22 @@ def _back(
                     where=found.name,
                     do="choose --method newton or polynomial",
                 )
-            back, what = found.inverses[n], "INVERSE row"
+            back, method_name = found.inverses[n], "INVERSE row"
         zero = a.chips[n].at(*(([v]) for v in chip.basis.reference_pixel))
         pixels = back.pixels(*(a.plane(X[mine], Y[mine]) - zero))
         x[mine], y[mine] = a.images[n].from_chip(*pixels) if n in a.images else pixels
         worst, rms = back.misses(chip)
         errors = f"{number(worst, 3)} pix at worst, {number(rms, 3)} rms"
-        lines.append(f"  chip {n}: {what}, closes to {errors}")
+        lines.append(f"  chip {n}: {method_name}, closes to {errors}")
     return Positions(x, y, at.cov, at.chip), lines
 
 
 def _gathered(parts: dict[int, tuple[Bool, Positions]], n: int) -> Positions:
-    """Positions of several chips in the order of the rows."""
+    """Positions on several chips in the order of the rows."""
     at = np.full((2, n), np.nan)
     number = np.zeros(n, np.int64)
-    known = all(p.cov is not None for _, p in parts.values())
-    cov = np.full((n, 2, 2), np.nan) if known else None
+    has_cov = all(p.cov is not None for _, p in parts.values())
+    cov = np.full((n, 2, 2), np.nan) if has_cov else None
     for mine, part in parts.values():
         at[0, mine], at[1, mine], number[mine] = part.x, part.y, part.chip
         if cov is not None:
@@ -173,7 +203,7 @@ def _frame_lines(a: Application, source: str) -> list[str]:
 
 
 def _losses(a: Application, at: Positions, x: Float, y: Float, inverse: bool) -> list[str]:
-    """Lines on positions without a pixel, or beyond the detector."""
+    """Lines of text on positions without a pixel, and on positions outside the detector."""
     out = []
     if inverse:
         none = int((~np.isfinite(at.x)).sum())

@@ -1,4 +1,4 @@
-"""Options of commands that use the calibration of a file or a run."""
+"""Calibrations of files or runs with the options of commands."""
 
 from __future__ import annotations
 
@@ -22,10 +22,23 @@ def calibration_of_scale(
     size: tuple[float, float] | None = None,
     epoch: float | None = None,
 ) -> Calibration:
-    """Calibration of a file or a run, as `calibration_at` gives it.
+    """Calibration of a file or a run with a given pixel scale.
 
-    `scale` is the size of a corrected pixel in the unit of u and v, by default that of the file.
-    InputError for an `epoch` (decimal years) if it does not depend on time.
+    Parameters
+    ----------
+    path : path
+    filter, size
+        See `calibration_at`.
+    scale : float, optional
+        Size of a corrected pixel in the unit of u and v; that of the file by default.
+    epoch : float, optional
+        Date in decimal years, which is only checked.
+
+    Raises
+    ------
+    InputError
+        If the scale is not positive, or an epoch is given and the calibration does not depend on
+        time.
     """
     calibration = calibration_at(path, filter=filter, size=size)
     refuse_unused_date(epoch, calibration)
@@ -37,7 +50,7 @@ def calibration_of_scale(
 
 
 def notes_of(found: Calibration, epoch: float | None) -> tuple[str, ...]:
-    """Notes for a reader of results by a calibration."""
+    """Notes for readers of results that were obtained with a calibration."""
     first = found.chip(epoch=epoch)
     errors = {
         "none": ("it holds no errors",),
@@ -54,12 +67,25 @@ def images_of(
     ltv: tuple[float, float] | None = None,
     corner: tuple[float, float] | None = None,
 ) -> dict[int, Subarray]:
-    """Where pixels lie on their chips, as one of three options says; empty for whole chips.
+    """Positions of subarrays on their chips, by chip number; empty for full chips.
 
-    `corner`: the pixel of the chip that is the subarray's first.
+    Parameters
+    ----------
+    found : Calibration
+    image : path, optional
+        Calibrated image with the keywords of its subarray.
+    ltv : tuple of float, optional
+        LTV1 and LTV2.
+    corner : tuple of float, optional
+        Pixel of the chip that is the first pixel of the subarray.
+
+    Raises
+    ------
+    InputError
+        If more than one of the options is given.
     """
-    given = [("--image", image), ("--ltv", ltv), ("--corner", corner)]
-    named = [name for name, value in given if value is not None]
+    options = [("--image", image), ("--ltv", ltv), ("--corner", corner)]
+    named = [name for name, value in options if value is not None]
     if len(named) > 1:
         raise InputError(
             f"{' and '.join(named)} say the same", where="options", do="keep one of them"

@@ -1,4 +1,4 @@
-"""`bayesdist convert`: a calibration in another format, with what is lost by it."""
+"""`bayesdist convert`: write a calibration in another format, and report what is lost."""
 
 from __future__ import annotations
 
@@ -41,9 +41,9 @@ from bayesdist.products.writing import (
 )
 from bayesdist.utils.arrays import Float
 
-_GRID = 65  # points of each axis over which the loss is measured
-BAD_PIX = 0.1  # pixels: a sampled polynomial that is further off is warned of
-_ROUNDING = 1e-6  # pixels: what is less is called none
+_GRID = 65  # grid points per axis on which the loss is measured
+BAD_PIX = 0.1  # pixels: larger errors of a sampled polynomial cause a warning
+_ROUNDING = 1e-6  # pixels: smaller differences count as none
 
 
 def convert(
@@ -61,55 +61,80 @@ def convert(
     sample: bool = False,
     force: bool = False,
 ) -> str:
-    """Write the calibration of a file or a run in another format, and say what was lost.
+    """Write the calibration of a file or a run in another format, and report what is lost.
 
-    `to` is the key of a format that can be built, `options` are KEY=VALUE of its table in a
-    configuration, values as in TOML.  `output` is a folder, or the name of the file where the
-    format makes one; by default the present folder.  `order` is of the polynomial where another one
-    than that of the calibration is wanted; look-up tables go into it where the format has none.
-    `scale` is arcseconds in a pixel, by default as the run says.  `filter`, `epoch` and `size` are
-    as of `calibration_at`.  With `sample` the file is a header of any projection, which is sampled
-    through astropy.wcs and followed by a polynomial of `order`, by default one that is good enough.
-    What is to be printed is returned.  InputError for what the format cannot hold, or files that
-    are there without `force`.
+    Parameters
+    ----------
+    path : path
+        Calibration file or run.
+    to : str
+        Key of a format that can be written.
+    output : path, optional
+        Folder, or file name if the format consists of one file; the current folder by default.
+    options : sequence of str
+        KEY=VALUE of the section of the format in a configuration, with values as in TOML.
+    order : int, optional
+        Order of the output polynomial; that of the calibration by default.  Look-up tables are
+        included in the polynomial if the format cannot hold them.
+    chip : int, optional
+        Number of the only chip to convert.
+    filter, epoch, size
+        See `calibration_at`.
+    scale : float, optional
+        Pixel size in arcsec; that of the run by default.
+    sample : bool
+        The file is a header of any projection, which is sampled through astropy.wcs and fitted by a
+        polynomial of `order`, by default a sufficient one.
+    force : bool
+        Replace existing files.
+
+    Returns
+    -------
+    str
+        Text to print.
+
+    Raises
+    ------
+    InputError
+        If the format cannot hold the calibration, or files exist and are not to be replaced.
     """
     target = format_of(to)
     sampled = _sampled(path, order, size, chip=chip, filter=filter, epoch=epoch) if sample else None
     if sampled is None:
-        found = on_the_sky(Path(path), calibration_at(path, filter=filter, size=size))
-        refuse_unused_date(epoch, found)
+        calibration = on_the_sky(Path(path), calibration_at(path, filter=filter, size=size))
+        refuse_unused_date(epoch, calibration)
     else:
-        found, order = sampled.calibration, None
+        calibration, order = sampled.calibration, None
     settings = _settings(to, options)
-    source = found if chip is None else found.only(chip, epoch)
+    source = calibration if chip is None else calibration.only(chip, epoch)
     at = None
     if source.model.time is not None:
         at = source.reference_date if epoch is None else epoch
-    made, notes = representable(source, target, order, at)
+    converted, notes = representable(source, target, order, at)
     if scale is None and source.pixel_mas is not None:
         scale = source.pixel_mas / 1000
     if scale is not None and not (np.isfinite(scale) and scale > 0):
         raise InputError(f"the scale is {scale}", where="--scale", do="give a positive number")
-    refuse_unknown_scale(made, target, settings, scale)
+    refuse_unknown_scale(converted, target, settings, scale)
     place = _target(output)
-    built = built_for(to, made, settings, BuildOptions(at, scale), place)
+    built = built_for(to, converted, settings, BuildOptions(at, scale), place)
     places = places_of(built, place)
     for path_of_file in places:
         refuse_existing(path_of_file, force)
     write_built(built, places)
-    held = [p for p, one in zip(places, built, strict=True) if one.kind != PARAMETERS]
+    held = [p for p, file in zip(places, built, strict=True) if file.kind != PARAMETERS]
     lines = [f"{', '.join(str(p) for p in places)}: by {source.name}"]
     if sampled is not None:
         lines.append(f"  {sampled.sentence}")
         if sampled.largest_pix > BAD_PIX:
             lines.append("  warning: no polynomial follows this header well; do not use it blindly")
-    back = _read_back(held, filter, made.model.chips[0].size)
+    back = _read_back(held, filter, converted.model.chips[0].size)
     lines += [f"  {note}" for note in (*source.notes, *notes)]
     if source.errors == "none":
         lines.append("  note: it states no errors, and neither do the new files")
-    lines += [f"  warning: {w}" for w in dict.fromkeys(w for one in built for w in one.warnings)]
-    lines += [f"  note: {n}" for n in dict.fromkeys(n for one in built for n in one.notes)]
-    used = _read_back(held, filter, made.model.chips[0].size, as_used=True)
+    lines += [f"  warning: {w}" for w in dict.fromkeys(w for file in built for w in file.warnings)]
+    lines += [f"  note: {n}" for n in dict.fromkeys(n for file in built for n in file.notes)]
+    used = _read_back(held, filter, converted.model.chips[0].size, as_used=True)
     lines += [f"  {line}" for line in _losses(source, back, used, at, scale)]
     return "\n".join(lines)
 
@@ -117,12 +142,12 @@ def convert(
 def _sampled(
     path: str | Path, order: int | None, size: tuple[float, float] | None, **others: object
 ) -> SampledCalibration:
-    """Header that is sampled; options that such a header has no use for are refused."""
-    given = next((name for name, value in others.items() if value is not None), None)
-    if given is not None:
+    """Calibration sampled from a header; options that do not apply to it are refused."""
+    refused = next((name for name, value in others.items() if value is not None), None)
+    if refused is not None:
         raise InputError(
             "a header that is sampled has one chip, no filter and no dates",
-            where=f"--{given}",
+            where=f"--{refused}",
             do="leave it out",
         )
     if Path(path).is_dir():
@@ -133,18 +158,18 @@ def _sampled(
 
 
 def _settings(to: str, options: Sequence[str]) -> FormatSettings:
-    """Settings of a format from KEY=VALUE, values as in TOML."""
+    """Settings of a format from KEY=VALUE, with values as in TOML."""
     values: dict[str, Any] = {}
     for text in options:
         key, mark, value = text.partition("=")
         if not mark or not key.strip():
             raise InputError(f"{text!r} is not KEY=VALUE", where="--option", do="write it so")
         try:
-            found = toml_of(f"x = {value}", "--option")["x"]
+            parsed = toml_of(f"x = {value}", "--option")["x"]
         except InputError:
-            found = value.strip()
-        # settings have dates as text
-        values[key.strip()] = value.strip() if isinstance(found, (date, time)) else found
+            parsed = value.strip()
+        # dates are text in settings
+        values[key.strip()] = value.strip() if isinstance(parsed, (date, time)) else parsed
     return settings_of(to, values)
 
 
@@ -152,7 +177,7 @@ def _settings(to: str, options: Sequence[str]) -> FormatSettings:
 
 
 def _target(output: str | Path | None) -> Path:
-    """Folder, which is made if it does not exist, or file to write."""
+    """Folder, which is created if necessary, or file to write."""
     target = Path("." if output is None else output)
     made_folder(target.parent if target.suffix and not target.is_dir() else target)
     return target
@@ -165,11 +190,11 @@ def _read_back(
     *,
     as_used: bool = False,
 ) -> list[Calibration]:
-    """Calibrations of files that were written; with `as_used` as other programs have them."""
+    """Calibrations of the written files; with `as_used` as other programs interpret them."""
     return [open_document(place).calibration(Choice(filter, size, as_used)) for place in places]
 
 
-# -- what is lost ---------------------------------------------------------------------------------
+# -- losses ---------------------------------------------------------------------------------------
 
 
 def _losses(
@@ -180,7 +205,9 @@ def _losses(
     scale: float | None,
 ) -> list[str]:
     lines = []
-    errors = min((one.errors for one in back), key=("none", "sigma", "covariance").index)
+    errors = min(
+        (calibration.errors for calibration in back), key=("none", "sigma", "covariance").index
+    )
     if source.errors == "covariance" and errors != "covariance":
         lost = {"sigma": "correlations of the coefficients", "none": "all errors"}[errors]
         lines.append(f"lost: {lost}")
@@ -191,9 +218,11 @@ def _losses(
         lines.append("lost: where the chips lie to each other, of which each has a file")
     if len(back) > 1 and source.errors == "covariance":
         lines.append("lost: correlations between chips, of which each has a file")
-    if source.model.time is not None and all(one.model.time is None for one in back):
+    if source.model.time is not None and all(
+        calibration.model.time is None for calibration in back
+    ):
         lines.append(f"lost: the dependence on time; the file is of {epoch:g}")
-    if source.plane.kind == "sky" and all(one.plane.kind != "sky" for one in back):
+    if source.plane.kind == "sky" and all(calibration.plane.kind != "sky" for calibration in back):
         lines.append("lost: where the plane touches the sky")
     worst, rms, frame = _difference(source, used, epoch)
     mas = _mas_per_pixel(source, scale, epoch)
@@ -209,32 +238,39 @@ def _losses(
 def _difference(
     source: Calibration, back: Sequence[Calibration], epoch: float | None
 ) -> tuple[float, float, str]:
-    """Largest and rms difference of positions over the detector grid, pixels, and in which frame.
+    """Largest and rms difference of positions over the detector in pixels, and a note on the frame.
 
-    On the sky where both lie there, as they are where both have one plane and unit, and else after
-    the best similarity, which planes of different kinds leave open: over all chips, or of each
-    chip where it has a file of its own.
+    Positions are compared on the sky if both calibrations are on the sky, and directly if both have
+    the same plane and unit.  Otherwise the best similarity is removed first, because planes of
+    different kinds agree only up to a similarity: one for all chips, or one per chip if each has
+    its own file.
     """
-    here, there, pixels = [], [], []
+    source_positions, file_positions, pixels = [], [], []
     pairs = _pairs(source, back)
-    sky = source.plane.point is not None and all(one.plane.point for _, one, _ in pairs)
-    for number, one, its in pairs:
+    sky = source.plane.point is not None and all(
+        calibration.plane.point for _, calibration, _ in pairs
+    )
+    for number, calibration, its in pairs:
         size = source.model.chips[source.numbers.index(number)].size
         x, y = detector_grid(size, _GRID)
         a = source.forward(x, y, chip=number, epoch=epoch)
-        drifts = epoch if one.model.time is not None else None
-        b = one.forward(x, y, chip=its, epoch=drifts)
+        drifts = epoch if calibration.model.time is not None else None
+        b = calibration.forward(x, y, chip=its, epoch=drifts)
         if sky:
             a, b = (
-                np.stack(positions_on_the_sky(c, p), axis=-1) for c, p in ((source, a), (one, b))
+                np.stack(positions_on_the_sky(c, p), axis=-1)
+                for c, p in ((source, a), (calibration, b))
             )
-        here.append(a)
-        there.append(b)
+        source_positions.append(a)
+        file_positions.append(b)
         pixels.append(float(np.sqrt(abs(np.linalg.det(source.chip(number, epoch).linear)))))
     if not sky and not _comparable(source, back) and len(back) == 1:
-        here, there = [np.concatenate(here)], [np.concatenate(there)]
+        source_positions, file_positions = (
+            [np.concatenate(source_positions)],
+            [np.concatenate(file_positions)],
+        )
     parts, frame = [], ""
-    for k, (a, b) in enumerate(zip(here, there, strict=True)):
+    for k, (a, b) in enumerate(zip(source_positions, file_positions, strict=True)):
         if sky:
             east = (a[:, 0] - b[:, 0] + 180) % 360 - 180
             far = 3600 * np.hypot(east * np.cos(np.radians(a[:, 1])), a[:, 1] - b[:, 1])
@@ -251,28 +287,34 @@ def _difference(
 
 
 def _comparable(source: Calibration, back: Sequence[Calibration]) -> bool:
-    """True where positions of both are in one plane and unit, about one zero point."""
+    """True if both have the same plane, unit and zero point."""
     mine = (source.plane.kind, source.unit)
-    same = all((one.plane.kind, one.unit) == mine for one in back)
-    return same and source.plane.kind != "aperture"
+    is_equal = all((calibration.plane.kind, calibration.unit) == mine for calibration in back)
+    return is_equal and source.plane.kind != "aperture"
 
 
 def _pairs(source: Calibration, back: Sequence[Calibration]) -> list[tuple[int, Calibration, int]]:
-    """Chips of the source with the file that has each, and its number there."""
-    if len(back) == len(source.numbers):  # one file for each chip
-        return [(n, one, one.numbers[0]) for n, one in zip(source.numbers, back, strict=True)]
-    [one] = back
-    return [(n, one, n if n in one.numbers else one.numbers[0]) for n in source.numbers]
+    """Chip numbers of the source, each with its file and its number in the file."""
+    if len(back) == len(source.numbers):  # one file per chip
+        return [
+            (n, calibration, calibration.numbers[0])
+            for n, calibration in zip(source.numbers, back, strict=True)
+        ]
+    [calibration] = back
+    return [
+        (n, calibration, n if n in calibration.numbers else calibration.numbers[0])
+        for n in source.numbers
+    ]
 
 
 def _after_similarity(a: Float, b: Float) -> Float:
-    """Distances that the best similarity leaves, mirrored or not."""
+    """Distances after the best similarity, mirrored or not."""
     z, w = (at[:, 0] + 1j * at[:, 1] for at in (a, b))
-    found = []
+    residuals = []
     for v in (w, w.conj()):
-        v, here = v - v.mean(), z - z.mean()
-        found.append(np.abs(here - np.vdot(v, here) / np.vdot(v, v) * v))
-    return min(found, key=lambda far: float(far.max()))
+        v, centred = v - v.mean(), z - z.mean()
+        residuals.append(np.abs(centred - np.vdot(v, centred) / np.vdot(v, v) * v))
+    return min(residuals, key=lambda far: float(far.max()))
 
 
 def _mas_per_pixel(source: Calibration, scale: float | None, epoch: float | None) -> float | None:

@@ -29,11 +29,11 @@ from bayesdist.files.atomic import atomic_path
 
 log = logging.getLogger("bayesdist")
 
-SIGMA = 0.05  # for tables that say nothing about their errors
-SAMPLE = 20_000  # matches that are looked at
-# size of u, v beside x, y
+SIGMA = 0.05  # assumed error for tables that do not state any
+SAMPLE = 20_000  # number of matches that are examined
+# ratio of the extents of u, v and x, y
 LIKE_PIXELS = (0.5, 2.0)
-DEGREES = 1e-3  # below it is the degree: pixels of more than 3.6 arcsec are rare
+DEGREES = 1e-3  # smaller ratios mean degrees: pixels larger than 3.6 arcsec are rare
 MAS = 20.0
 
 
@@ -119,27 +119,43 @@ def init(
     size: tuple[int, int] | None = None,
     force: bool = False,
 ) -> str:
-    """Write a new configuration with comments; returned is what it is for, and what comes next.
+    """Write a new configuration with comments.
 
-    `path` is the TOML file, `matches` its ``data.matches``, `columns` its ``data.columns``; `size`
-    are columns and rows of each chip, by default as large as the positions ask for.  Of a table in
-    which columns are lacking it is a draft, as of `draft_of`.
+    A draft is written for a table with missing columns; see `draft_of`.
+
+    Parameters
+    ----------
+    path : path
+        TOML file to write.
+    matches : path
+        Value of ``data.matches``.
+    columns : mapping of str to str, optional
+        Value of ``data.columns``.
+    size : tuple of int, optional
+        Columns and rows of each chip; guessed from the positions by default.
+    force : bool
+        Replace an existing file.
+
+    Returns
+    -------
+    str
+        Text to print: what the configuration is for, and the next step.
     """
     path = Path(path)
     refuse_existing(path, force)
     relative = quoted(os.path.relpath(Path(matches), path.resolve().parent))
-    own = mission_template(matches) if columns is None else None
-    if own is not None and size is not None:
+    mission = mission_template(matches) if columns is None else None
+    if mission is not None and size is not None:
         raise InputError(
             "is of a kind whose detector is known, with its size",
             where=str(matches),
             do="leave --size out, and change the size in the configuration if it is another one",
         )
-    draft = draft_of(path, matches, relative, columns, size) if own is None else None
+    draft = draft_of(path, matches, relative, columns, size) if mission is None else None
     if draft is not None:
         text, outcome = draft
     else:
-        n, values = _of_matches(matches, columns, size) if own is None else own
+        n, values = _of_matches(matches, columns, size) if mission is None else mission
         order = 4 if n >= 300 else 3 if n >= 100 else 2
         text = _TEMPLATE.format(matches=relative, order=order, **{"not_finite": ""} | values)
         parse_config(text, str(path))
@@ -152,7 +168,7 @@ def init(
 def _of_matches(
     matches: str | Path, columns: Mapping[str, str] | None, size: tuple[int, int] | None
 ) -> tuple[int, dict[str, object]]:
-    """Number of matches of a table, and what it puts into the template."""
+    """Number of matches of a table, and values for the template."""
     not_finite = ""
     try:
         table, unit_line, sigma, read_sigma = _read(matches, columns)
@@ -193,7 +209,7 @@ def _of_matches(
 def _read(
     matches: str | Path, columns: Mapping[str, str] | None, **options: str
 ) -> tuple[Matches, str, str, bool]:
-    """Matches, the line about their unit, where errors come from, and whether columns are read."""
+    """Matches, the line on their unit, the value of sigma, and whether error columns are read."""
     unit, line = None, ""
     sigma: float | str = "columns"
     while True:
@@ -211,29 +227,29 @@ def _read(
         else:
             break
     layout = table_layout(matches, columns)
-    taken = {} if layout is None else layout.taken
-    if sigma == "columns" and "sigma_ra" in taken and table.has_mag:
-        errors = f"{taken['sigma_ra']}, {taken['sigma_dec']}"
+    columns_used = {} if layout is None else layout.taken
+    if sigma == "columns" and "sigma_ra" in columns_used and table.has_mag:
+        errors = f"{columns_used['sigma_ra']}, {columns_used['sigma_dec']}"
         why = f"the errors of the table ({errors}) are the catalogue's alone"
         return table, line, f'"by_magnitude"        # {why}', True
     if sigma == "columns":
         return table, line, '"columns"', True
     if table.has_mag:
         return table, line, '"by_magnitude"        # the table carries no errors', False
-    what = "GUESSED: the table carries neither errors nor magnitudes"
-    if "flux" in taken:
-        what += f" (not all {taken['flux']} are positive)"
-    found = scatter_about_polynomials(table.sample(SAMPLE))
-    if not found:
-        return table, line, f"{SIGMA}                    # {what}", False
+    remark = "GUESSED: the table carries neither errors nor magnitudes"
+    if "flux" in columns_used:
+        remark += f" (not all {columns_used['flux']} are positive)"
+    scatter = scatter_about_polynomials(table.sample(SAMPLE))
+    if not scatter:
+        return table, line, f"{SIGMA}                    # {remark}", False
     how = "the scatter about a polynomial"
-    return table, line, f"{found:<24g}# {what}; {how}", False
+    return table, line, f"{scatter:<24g}# {remark}; {how}", False
 
 
 def _guessed_unit(table: Matches, layout: TableLayout | None) -> str:
-    """Unit of u and v by their size beside pixels, and by their names."""
-    some = table.sample(SAMPLE)
-    ratio = float(np.ptp(some.u) / max(np.ptp(some.x), 1.0))
+    """Unit of u and v, guessed from their scale relative to pixels and from their names."""
+    subset = table.sample(SAMPLE)
+    ratio = float(np.ptp(subset.u) / max(np.ptp(subset.x), 1.0))
     name = "" if layout is None else layout.taken.get("u", "").lower()
     is_angle = name == "xi" or "arcsec" in name
     if LIKE_PIXELS[0] < ratio < LIKE_PIXELS[1]:
@@ -242,14 +258,14 @@ def _guessed_unit(table: Matches, layout: TableLayout | None) -> str:
 
 
 def _warn_of_pixels(matches: Matches, where: str) -> None:
-    """Warn of positions that lie on no pixel, before the first one."""
-    found = [
+    """Warn about positions before the first pixel."""
+    batches = [
         (int(((t.x < 0.5) | (t.y < 0.5)).sum()), t.x.min(), t.y.min()) for t in matches.batches()
     ]
-    n, (_, *least) = sum(one[0] for one in found), np.min(found, axis=0)
+    n, (_, *lowest) = sum(batch[0] for batch in batches), np.min(batches, axis=0)
     if n:
         log.warning(
             "%s: %d of %d positions lie before the first pixel, whose centre is (1, 1): x from "
             "%.1f, y from %.1f; if they count from elsewhere on the detector, add its pixel there",
-            *(where, n, len(matches), *least),
+            *(where, n, len(matches), *lowest),
         )

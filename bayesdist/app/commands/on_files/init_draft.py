@@ -1,4 +1,4 @@
-"""`bayesdist init` of a table in which columns are lacking: a draft with the candidates."""
+"""`bayesdist init` for a table with missing columns: a draft that lists candidates."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from bayesdist.data.formats.files import input_files, kind_of
 from bayesdist.data.formats.hst1pass import read_hst1pass
 from bayesdist.data.formats.layout import TableLayout, table_layout
 
-MAX_CANDIDATES = 40  # columns that are listed
+MAX_CANDIDATES = 40  # largest number of columns listed
 
 _HEAD = """\
 # A DRAFT: no columns of {file} are known as {lacking}.
@@ -77,16 +77,36 @@ def draft_of(
     columns: Mapping[str, str] | None,
     size: tuple[int, int] | None,
 ) -> tuple[str, str] | None:
-    """Text of a draft and what it is, for a table in which columns are lacking; None for others.
+    """Draft for a table with missing columns; None if no columns are missing.
 
-    With pixels alone it is a self-calibration, and all else is commented; without pixels nothing
-    can be run.  `path` is to be written, `relative` is what it calls the table.
+    A table with pixels alone becomes a self-calibration, with other possibilities as comments.
+    Without pixels nothing can be run.
+
+    Parameters
+    ----------
+    path : Path
+        File to write.
+    matches : path
+        Table.
+    relative : str
+        Quoted name of the table in the draft.
+    columns : mapping of str to str, optional
+        Columns named by the user.
+    size : tuple of int, optional
+        Columns and rows of each chip.
+
+    Returns
+    -------
+    tuple of str
+        Text of the draft, and a description of it.
     """
     layout = table_layout(matches, columns)
     lacking = _lacking(matches, columns) if layout is None else layout.lacking
     if not lacking:
         return None
-    words = " and ".join(what for pair, what in _PAIRS.items() if set(pair) & set(lacking))
+    words = " and ".join(
+        description for pair, description in _PAIRS.items() if set(pair) & set(lacking)
+    )
     head = _HEAD.format(file=Path(matches).name, lacking=words)
     if layout is not None:
         head += _candidates(path, matches, layout)
@@ -94,8 +114,10 @@ def draft_of(
         wanted = ", ".join(f'{key} = ""' for key in lacking)
         text = head + _WITHOUT_PIXELS.format(relative=relative, wanted=wanted)
         return text, f"an incomplete draft with the candidates: no columns are known as {words}"
-    taken = {} if layout is None else layout.taken
-    named = {key: taken[key] for key in _LIST_KEYS if key in taken} | dict(columns or {})
+    columns_used = {} if layout is None else layout.taken
+    named = {key: columns_used[key] for key in _LIST_KEYS if key in columns_used} | dict(
+        columns or {}
+    )
     text = head + _of_star_list(matches, relative, named, size)
     parse_config(text, str(path))
     return text, (
@@ -105,7 +127,7 @@ def draft_of(
 
 
 def _lacking(matches: str | Path, columns: Mapping[str, str] | None) -> list[str]:
-    """Reference positions that a list of hst1pass lacks; nothing of other formats."""
+    """Reference positions missing from a list of hst1pass; empty for other formats."""
     file = input_files(matches)[0]
     if kind_of(file, columns) != "hst1pass":
         return []
@@ -113,7 +135,7 @@ def _lacking(matches: str | Path, columns: Mapping[str, str] | None) -> list[str
 
 
 def _candidates(path: Path, matches: str | Path, layout: TableLayout) -> str:
-    """Lines on the columns that may be those which are lacking."""
+    """Lines on the columns that may be the missing ones."""
     spans = list(layout.spans.items())
     listed = [f"{name} ({low:g} to {high:g})" for name, (low, high) in spans[:MAX_CANDIDATES]]
     if len(spans) > MAX_CANDIDATES:
@@ -130,8 +152,11 @@ def _candidates(path: Path, matches: str | Path, layout: TableLayout) -> str:
 def _of_star_list(
     matches: str | Path, relative: str, columns: dict[str, str], size: tuple[int, int] | None
 ) -> str:
-    """Text of a self-calibration, with the size of the chips by the detections."""
-    pixels = ((one.x, one.y, one.chip) for one in read_star_lists(matches, columns or None))
+    """Text of a self-calibration, with the chip sizes guessed from the detections."""
+    pixels = (
+        (detections.x, detections.y, detections.chip)
+        for detections in read_star_lists(matches, columns or None)
+    )
     detector, _ = detector_lines(pixels, {}, size, input_files(matches)[0].stem)
     inline = ", ".join(f"{key} = {quoted(name)}" for key, name in columns.items())
     return _STAR_LIST.format(

@@ -1,4 +1,4 @@
-"""Columns, detector and scatter of a table, as `bayesdist init` finds them."""
+"""Columns and detector of a table, as guessed by `bayesdist init`."""
 
 from __future__ import annotations
 
@@ -38,10 +38,25 @@ def detector_lines(
     given: Size | None,
     name: str,
 ) -> tuple[str, dict[int, Size]]:
-    """Lines on one detector, or on several chips; and columns and rows of each, by its number.
+    """Lines of a configuration on one detector or several chips, and the size of each chip.
 
-    `pixels` are x, y and chips of some tables, `names` the chips' names; `given` is the size of
-    each where the user knows it, and `name` that of a detector of one chip.
+    Parameters
+    ----------
+    pixels : iterable of tuple of ndarray
+        x, y and chip numbers of each table.
+    names : mapping of int to str
+        Names of the chips.
+    given : tuple of int, optional
+        Columns and rows of each chip if the user has given them.
+    name : str
+        Name of a detector with one chip.
+
+    Returns
+    -------
+    str
+        The lines.
+    dict of int to tuple of int
+        Columns and rows by chip number.
     """
     reach: dict[int, tuple[float, float]] = {}
     for x, y, chips in pixels:
@@ -57,17 +72,17 @@ def detector_lines(
              "ny": ny, "how": how, "cx": (nx + 1) / 2, "cy": (ny + 1) / 2}
         )  # fmt: skip
     if len(sizes) > 1:
-        return "\n".join(_CHIP.format(**one) for one in values), sizes
+        return "\n".join(_CHIP.format(**chip_values) for chip_values in values), sizes
     return _DETECTOR.format(**values[0] | {"name": quoted(name)}), sizes
 
 
 def quoted(text: str) -> str:
-    """Text as TOML has it."""
+    """Text as a TOML string."""
     return '"' + text.replace("\\", "\\\\").replace('"', '\\"') + '"'
 
 
 def _guess(largest: float) -> int:
-    """Detector size: the next multiple of 2 above the data, or a power of 2 that is near."""
+    """Detector size: a power of 2 just above the largest coordinate, else the next even number."""
     largest -= 0.5
     if largest < 1:
         raise InputError(
@@ -81,9 +96,9 @@ def _guess(largest: float) -> int:
     return int(np.ceil(largest / 2) * 2)
 
 
-# names under which SExtractor writes what the image's own WCS makes of the pixels
+# names of SExtractor columns that are computed from the pixels with the WCS of the image
 _BY_THE_IMAGE = ("alpha_j2000", "alphawin_j2000", "alphapsf_j2000", "sky_centroid.ra")
-_TOLD = 3  # columns that may be chips
+_TOLD = 3  # largest number of possible chip columns mentioned
 
 _NONE = """\
 # columns = {x = "x", y = "y", u = "u", v = "v"}  # they are found by their names
@@ -91,25 +106,25 @@ _NONE = """\
 
 
 def column_lines(layout: TableLayout | None, columns: Mapping[str, str] | None) -> str:
-    """Lines of [data] that name the columns taken, the pixel origin and the epochs.
+    """Lines of [data] on the columns, the pixel origin and the epochs.
 
-    `layout`: none of a format that fixes its columns. `columns`: as the user names them; empty
-    names stay.
+    `layout` is None for a format with fixed columns. `columns` are those named by the user; empty
+    names, which leave a column out, are kept.
     """
     if layout is None:
         return _NONE + "# pixel_origin = 1              # of x, y: 1 as in FITS, or 0\n"
-    taken = layout.taken | {key: "" for key, name in (columns or {}).items() if not name}
-    pairs = ", ".join(f"{key} = {quoted(name)}" for key, name in taken.items())
+    columns_used = layout.taken | {key: "" for key, name in (columns or {}).items() if not name}
+    pairs = ", ".join(f"{key} = {quoted(name)}" for key, name in columns_used.items())
     out = [f"columns = {{{pairs}}}"]
     out += [f"# {text}" for text in _remarks(layout)]
     why = layout.why or "of x, y: 1 as in FITS, or 0"
     out.append(f"pixel_origin = {layout.origin}                # {why}")
-    if "pm_ra" in taken and "epoch" not in taken and not layout.dated:
+    if "pm_ra" in columns_used and "epoch" not in columns_used and not layout.dated:
         out.append(
             "# epoch = 2012.5                # of the exposures: without it proper motions are not "
             "used"
         )
-    if "pm_ra" in taken and "catalogue_epoch" not in taken:
+    if "pm_ra" in columns_used and "catalogue_epoch" not in columns_used:
         out.append(
             "# catalogue_epoch = 2016.0      # of ra, dec (Gaia DR3: 2016.0, DR2: 2015.5): without "
             "it proper motions are not used"
@@ -118,7 +133,7 @@ def column_lines(layout: TableLayout | None, columns: Mapping[str, str] | None) 
 
 
 def _remarks(layout: TableLayout) -> list[str]:
-    """Remarks on columns that a user has to look at."""
+    """Remarks on columns that the user should check."""
     out = []
     ra = layout.taken.get("ra", "")
     if ra.lower() in _BY_THE_IMAGE:

@@ -1,4 +1,4 @@
-"""`bayesdist inspect`: what a file holds, and what is wrong in it."""
+"""`bayesdist inspect`: content of a file, and its faults."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 
 def inspect(path: str | Path) -> str:
-    """Text on a calibration file, a WCS in FITS, a fit, a posterior, or the posterior of a run."""
+    """Describe a calibration file, a WCS in FITS, a fit, a posterior, or the posterior of a run."""
     path = Path(path)
     if path.is_dir() or path.suffix == ".nc":
         from bayesdist.infer.posterior.files import load_fit, load_posterior
@@ -27,7 +27,7 @@ def inspect(path: str | Path) -> str:
                 with suppress(FormatError):
                     return _fit_text(load_fit(path))
             raise
-    from bayesdist.products.registry import describe  # each reading loads what it needs alone
+    from bayesdist.products.registry import describe  # imports only what the format needs
 
     return describe(path)
 

@@ -1,4 +1,4 @@
-"""Tables of positions that `bayesdist apply` reads, adds to, writes and describes."""
+"""Reading, writing and description of the position tables of `bayesdist apply`."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ _FORMATS = {".ecsv": "ascii.ecsv", ".csv": "ascii.csv", ".fits": "fits"}
 
 
 def check_output(output: Path, force: bool) -> None:
-    """Refuse a file that cannot be written, or that is there already."""
+    """Refuse an output file with an unknown extension, or one that exists."""
     if output.suffix.lower() not in _FORMATS:
         raise InputError(
             f"extension {output.suffix!r} is not one that can be written",
@@ -37,7 +37,7 @@ def check_output(output: Path, force: bool) -> None:
 
 
 def read_positions(path: Path) -> Table:
-    """A table of positions, of which there have to be some."""
+    """Read a table of positions; raises InputError if it is empty."""
     table = read_table(path)
     if not len(table):
         raise InputError("has no rows", where=str(path), do="give a table of positions")
@@ -50,7 +50,7 @@ def origin_line(origin: float, reason: str) -> str:
 
 
 def add_positions(table: Table, at: Positions, names: tuple[str, str], where: str) -> None:
-    """Add positions and their errors, and back on the detector the chip, as columns."""
+    """Add columns with positions and their errors and, for detector positions, the chip."""
     x, y = names
     new: dict[str, NDArray] = {x: at.x, y: at.y}
     if at.cov is not None:
@@ -66,7 +66,7 @@ def add_positions(table: Table, at: Positions, names: tuple[str, str], where: st
 
 
 def fits_table(table: Table) -> Table:
-    """Table as FITS holds it: text in ASCII, and a header of short names without lists."""
+    """Table suitable for FITS: ASCII text, short header keywords, and no lists in the header."""
     out = table.copy(copy_data=False)
     for name in table.colnames:
         if out[name].dtype.kind == "U":
@@ -83,14 +83,14 @@ def fits_table(table: Table) -> Table:
 
 
 def write_positions(table: Table, output: Path) -> None:
-    """Write a table in the format of its extension, whole or not at all."""
+    """Write a table in the format of its extension, atomically."""
     kind = _FORMATS[output.suffix.lower()]
     if kind == "fits":
         table = fits_table(table)
     with atomic_path(output) as temporary:
         try:
             table.write(temporary, format=kind)
-        except (TypeError, ValueError) as error:  # of columns that hold arrays, or objects
+        except (TypeError, ValueError) as error:  # from columns of arrays or objects
             raise InputError(
                 f"not every column can be written as {output.suffix}",
                 where=str(output),
@@ -99,13 +99,13 @@ def write_positions(table: Table, output: Path) -> None:
 
 
 def head_line(output: Path, positions: str, found: Calibration, epoch: float | None) -> str:
-    """What was written, and by which calibration."""
+    """Line on the output file and the calibration that was used."""
     notes = "".join(f"; {note}" for note in notes_of(found, epoch))
     return f"{output}: {positions}, by {found.name}{notes}"
 
 
 def closing_lines(outside: int, sigma: Sequence[Float] | None, unit: str) -> list[str]:
-    """Lines on positions beyond the detector, and on the largest error."""
+    """Lines on positions outside the detector, and on the largest error."""
     out = []
     if outside:
         out.append(

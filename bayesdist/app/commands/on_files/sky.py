@@ -1,4 +1,4 @@
-"""`bayesdist apply --sky`: pixels to the sky, with all errors that a calibration carries."""
+"""`bayesdist apply --sky`: transform pixels to the sky, with all errors of the calibration."""
 
 from __future__ import annotations
 
@@ -42,9 +42,10 @@ def sky_to_table(
     point: tuple[float, float] | None = None,
     size: tuple[float, float] | None = None,
 ) -> str:
-    """Write the table of `Calibration.to_sky`; what is to be printed is returned.
+    """Write the table of `Calibration.to_sky`, and return the text to print.
 
-    With `joint` a FITS file has the covariance of all stars as an image extension.
+    If `joint` is True a FITS file with the covariance of all stars as an image extension is
+    written.
     """
     output = Path(output)
     check_output(output, force)
@@ -54,12 +55,12 @@ def sky_to_table(
             where=str(output),
             do="name a .fits file",
         )
-    found = on_the_sky(Path(path), calibration_at(path, filter=filter, size=size))
-    refuse_unused_date(epoch, found)
+    calibration = on_the_sky(Path(path), calibration_at(path, filter=filter, size=size))
+    refuse_unused_date(epoch, calibration)
     positions = read_positions(Path(table))
     origin, reason = pixel_columns(positions, columns, pixel_origin, str(table))[2:]
     rows = table_on_sky(
-        found,
+        calibration,
         QTable(positions),
         name=str(table),
         columns=columns,
@@ -71,12 +72,12 @@ def sky_to_table(
         covariance=joint,
     )
     matrix = rows.meta.pop(COVARIANCE, None)
-    plain = Table(rows)  # units as text, which all formats have
+    plain = Table(rows)  # units as text, which all formats can hold
     if matrix is None:
         write_positions(plain, output)
     else:
         _write_joint(plain, matrix, output)
-    head, *lines = _lines(output, found, rows, epoch, centroids)
+    head, *lines = _lines(output, calibration, rows, epoch, centroids)
     return "\n".join([head, origin_line(origin, reason), *lines])
 
 
@@ -99,10 +100,10 @@ def _lines(
 
 
 def _write_joint(table: Table, matrix: Float, output: Path) -> None:
-    """Write a table, and the covariance of all its rows as an image."""
+    """Write a table, with the covariance of all its rows as an image."""
     image = fits.ImageHDU(matrix, name="COVARIANCE")
     image.header["BUNIT"] = "mas2"
     image.header.add_comment("rows: east and north of each star in turn, as in the table")
-    made = fits.HDUList([fits.PrimaryHDU(), fits.table_to_hdu(fits_table(table)), image])
+    hdus = fits.HDUList([fits.PrimaryHDU(), fits.table_to_hdu(fits_table(table)), image])
     with atomic_path(output) as temporary:
-        made.writeto(temporary)
+        hdus.writeto(temporary)

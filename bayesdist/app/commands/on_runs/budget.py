@@ -1,4 +1,4 @@
-"""`bayesdist budget`: what the error of a position, or of the distance of two, is made of."""
+"""`bayesdist budget`: error budget of a position, or of the separation of two positions."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from bayesdist.calibration.chip_map import chosen_chip
 from bayesdist.calibration.sky_table import chip_numbers, pixel_columns
 from bayesdist.errors import InputError
 
-SCHEMA = 1  # of --json
+SCHEMA = 1  # version of the output of --json
 COLUMNS = ("x", "y")
 CIRCLES = (("CE68", 0.68), ("CE95", 0.95))
 
@@ -38,13 +38,36 @@ def budget_at(
     magnitude: float | None = None,
     as_json: bool = False,
 ) -> str:
-    """The error budget of a pixel `at` (FITS 1-based) of a run that has been sampled, as text.
+    """Error budget of positions in a run that has been sampled, as text.
 
-    With other pixels `to` of the same image it is that of their differences to it.  `at_table` is a
-    table of positions in place of `at`; `columns` are those of its pixels, x and y by default.
-    `chip` is needed where there are several and no column has it; `epoch` (decimal years) is by
-    default that of the assessment; with a `magnitude` of the stars the errors of their centroids
-    are a term.  With `as_json` the text is JSON with all terms of all positions.
+    Parameters
+    ----------
+    run : path
+    at : tuple of float or None
+        FITS 1-based pixel.
+    at_table : path, optional
+        Table of positions, in place of `at`.
+    columns : tuple of str, optional
+        Columns of the pixels in the table; x and y by default.
+    to : sequence of tuple of float
+        Other pixels of the same image: the budget is then that of their separations from `at`.
+    chip : int, optional
+        Chip number, needed if there are several chips and no column has it.
+    epoch : float, optional
+        Date in decimal years; that of the assessment by default.
+    magnitude : float, optional
+        Magnitude of the stars; their centroid error is then a term.
+    as_json : bool
+        Return JSON with all terms of all positions.
+
+    Returns
+    -------
+    str
+
+    Raises
+    ------
+    InputError
+        If not exactly one of `at` and `at_table` is given, or a position or chip is invalid.
     """
     if (at is None) == (at_table is None):
         raise InputError(
@@ -54,7 +77,7 @@ def budget_at(
         )
     with open_results(RunDirectory.open(run)) as results:
         results.run.require("budget", ("fit", "sample"))
-        numbers = [one.number for one in results.posterior.model.chips]
+        numbers = [chip_of_model.number for chip_of_model in results.posterior.model.chips]
         errors = errors_of(results)
         date = results.epoch if epoch is None else epoch
         mas = results.config.detector.scale_mas if errors.unit == "pix" else None
@@ -63,13 +86,13 @@ def budget_at(
             table = read_positions(Path(at_table))
             x, y, origin, reason = pixel_columns(table, columns or COLUMNS, None, name)
             chips = chip_numbers(table, chip, numbers, str(run), name)
-            found = _budgets(errors, x, y, chips, date, magnitude)
-            rows = list(_entries(found, np.argsort(chips, kind="stable")))
+            budgets = _budgets(errors, x, y, chips, date, magnitude)
+            rows = list(_entries(budgets, np.argsort(chips, kind="stable")))
             if as_json:
                 return _json(errors.unit, date, magnitude, rows, pixel_origin=origin)
             return "\n".join([_list(rows, errors.unit, mas), origin_line(origin, reason)])
         number_of = chosen_chip(numbers, chip, where=str(run), argument="--chip")
-        first = at or (0.0, 0.0)  # one of the two is given
+        first = at or (0.0, 0.0)  # `at` is given if there is no table
         positions = np.array([first, *to], float)
         budget = place_budget(
             errors, *positions.T, chip=number_of, epoch=date, magnitude=magnitude, relative=bool(to)
@@ -89,7 +112,7 @@ def _budgets(
     epoch: float | None,
     magnitude: float | None,
 ) -> list[ErrorBudget]:
-    """One budget for the positions on each chip."""
+    """Error budgets of the positions, one per chip."""
     return [
         place_budget(
             errors, x[chips == k], y[chips == k], chip=int(k), epoch=epoch, magnitude=magnitude
@@ -99,7 +122,7 @@ def _budgets(
 
 
 def _entries(budgets: Sequence[ErrorBudget], rows: Sequence[int] | Any) -> Iterator[dict[str, Any]]:
-    """Entries of all positions, in the order of the table, whose `rows` the budgets are of."""
+    """Entries of all positions; `rows` are the table rows of the positions of the budgets."""
     entries = [
         {
             "x": float(budget.x[k]),
@@ -136,14 +159,14 @@ def _json(
     *,
     pixel_origin: float = 1.0,
 ) -> str:
-    """JSON of the entries, whose x and y are FITS 1-based; `pixel_origin`: that of the table."""
+    """JSON of the entries with 1-based x and y; `pixel_origin` is that of the table."""
     content = {"schema": SCHEMA, "unit": unit, "epoch": epoch, "magnitude": magnitude}
     content["pixel_origin_of_table"] = pixel_origin
     return json.dumps(content | {"positions": entries}, indent=1, allow_nan=False)
 
 
 def _list(entries: Sequence[dict[str, Any]], unit: str, scale_mas: float | None) -> str:
-    """One line for each position: its total error and the largest of its terms."""
+    """One line per position: its total error and the largest of its terms."""
     rows = []
     for entry in entries:
         *terms, total = (t for t in entry["terms"] if t["kind"] != PRODUCT)
@@ -178,13 +201,15 @@ def _text(found: ErrorBudget, at: tuple[float, float], scale_mas: float | None) 
         for t in found.every:
             u, v = float(t.u[k]), float(t.v[k])
             size = float(per_axis(u, v))
-            known = "" if t.relative_error is None else f" +- {number(t.relative_error * size, 1)}"
+            uncertainty = (
+                "" if t.relative_error is None else f" +- {number(t.relative_error * size, 1)}"
+            )
             row = {
                 "term": t.name,
                 "kind": "" if t.kind == TOTAL else t.kind,
                 f"u ({found.unit})": number(u),
                 f"v ({found.unit})": number(v),
-                "per axis": f"{number(size)}{known}",
+                "per axis": f"{number(size)}{uncertainty}",
             }
             if scale_mas is not None:
                 row["mas"] = number(size * scale_mas)

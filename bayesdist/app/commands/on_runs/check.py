@@ -1,4 +1,4 @@
-"""`bayesdist check`: what a configuration would do, without sampling."""
+"""`bayesdist check`: the effect of a configuration, without sampling."""
 
 from __future__ import annotations
 
@@ -23,21 +23,22 @@ from bayesdist.infer.solution.geometry import geometries
 from bayesdist.utils.checks import warnings_of
 
 # measured on two cores of a server at orders 4 and 5; other machines differ by factors
-STAR_S = 3e-9  # of the likelihood, for each star and pass
-EXPANSION_S = 1.5e-8  # of an expansion to second order, for each star
-IN_CIRCLE = 80.0  # times as much for a star that was matched in a circle about its nominal position
-EXPANSIONS = 40  # in the search for the proposal
-OVERHEAD_S = 6e-5  # of emcee and the proposal, for each walker and step
-FIXED_S = 1.0  # diagnostics and files
-MEMORY_MB = 256.0  # of stars: it passes over them a few times, and no more need stay in memory
-# stars and parameters up to which the run's own pilot is tried, in some ten seconds
+STAR_S = 3e-9  # seconds per star and pass of the likelihood
+EXPANSION_S = 1.5e-8  # seconds per star of an expansion to second order
+IN_CIRCLE = 80.0  # factor for stars matched within a circle about nominal positions
+EXPANSIONS = 40  # number of expansions in the search for the proposal
+OVERHEAD_S = 6e-5  # seconds per walker and step in emcee and the proposal
+FIXED_S = 1.0  # seconds for diagnostics and files
+MEMORY_MB = 256.0  # memory for stars; enough for the few passes of a check
+# largest numbers of stars and parameters for a pilot run, which takes about ten seconds
 MOST_STARS, MOST_PARAMS = 200_000, 200
 
 
 def check(path: str | Path) -> str:
     """Units, rank, null space and expected cost of a configuration, as text.
 
-    Whatever would stop the run is refused: bad input, or parameters that the data do not determine.
+    Raises InputError if a run would be refused: for bad input, or parameters that the data do not
+    determine.
     """
     config, text = load_config(path)
     config = config.holding_at_most(MEMORY_MB)
@@ -50,7 +51,7 @@ def check(path: str | Path) -> str:
 
 
 def _lines(results: Results) -> Iterator[str]:
-    """Lines on the fit of matched stars."""
+    """Lines of text on the fit of matched stars."""
     data, config = results.data, results.config
     matches, model, fit, fitted = data.placed, data.model, data.fit, data.fitted
     sigma = data.shards.survey.reference_sigma
@@ -70,8 +71,8 @@ def _lines(results: Results) -> Iterator[str]:
         yield f"jitter       {grouping_sentence(fitted.grouped, fit.unit)}"
     yield f"model        order {model.order}, frames '{model.frames}', {model.n_params} parameters"
     if len(model.chips) > 1:
-        found = zip(model.chips, data.shards.survey.chips, strict=True)
-        yield "chips        " + ", ".join(f"{c.name} {s.n} stars" for c, s in found)
+        counts = zip(model.chips, data.shards.survey.chips, strict=True)
+        yield "chips        " + ", ".join(f"{c.name} {s.n} stars" for c, s in counts)
     yield f"rank         {model.n_params} of {model.n_params}, nothing is degenerate"
     yield f"condition    {number(fit.condition)} (normal matrix, unit diagonal)"
     yield (
@@ -95,7 +96,7 @@ def _lines(results: Results) -> Iterator[str]:
 
 
 def _cost(data: FitData, config: Config) -> str:
-    """Expected passes and seconds, or why they cannot be known before sampling."""
+    """Line on the expected passes and seconds, or on why they cannot be predicted."""
     sampler, n = config.sampler, len(data.shards)
     limits = Limits(sampler.target_ess, sampler.target_rhat)
     mixture = config.mixture(data.matched.stars.match_radius)
@@ -113,7 +114,7 @@ def _cost(data: FitData, config: Config) -> str:
     elif dear * n > MOST_STARS or n_params > MOST_PARAMS:
         provided = " if the posterior is close to normal, which was not examined"
     else:
-        found = predict_sampling(
+        trial = predict_sampling(
             data.fit,
             data.shards,
             outliers=mixture,
@@ -124,15 +125,15 @@ def _cost(data: FitData, config: Config) -> str:
             limits=limits,
             max_steps=sampler.max_steps,
         )
-        if found.passes is None:
-            most = number(search + found.most_passes * (per_pass + OVERHEAD_S), 2)
+        if trial.passes is None:
+            longest = number(search + trial.most_passes * (per_pass + OVERHEAD_S), 2)
             return (
                 f"cost         cannot be known before sampling {over}: the posterior is far from "
-                f"normal (importance efficiency {number(found.quality.efficiency, 2)}, Pareto k "
-                f"{number(found.quality.k, 2)}); sampler.max_steps ends it after "
-                f"{found.most_passes} passes, about {most} s"
+                f"normal (importance efficiency {number(trial.quality.efficiency, 2)}, Pareto k "
+                f"{number(trial.quality.k, 2)}); sampler.max_steps ends it after "
+                f"{trial.most_passes} passes, about {longest} s"
             )
-        passes = found.passes
+        passes = trial.passes
     total = search + passes * (per_pass + OVERHEAD_S)
     return (
         f"cost         {how}about {passes} passes {over}: "

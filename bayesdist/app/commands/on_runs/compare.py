@@ -1,4 +1,4 @@
-"""`bayesdist compare`: two calibrations from whatever files, how they differ, as text and files."""
+"""`bayesdist compare`: differences of two calibrations in any files, as text and files."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ from bayesdist.report.figures.commands import difference_vectors
 
 @dataclass(frozen=True)
 class SkyDifference:
-    """Distances on the sky between the positions of one chip by two calibrations."""
+    """Distances on the sky between the positions of one chip in two calibrations."""
 
     largest_arcsec: float
     rms_arcsec: float
@@ -62,7 +62,7 @@ class SkyDifference:
 
     @property
     def sentence(self) -> str:
-        """Line of the text below the verdict."""
+        """Line of text for the report of a comparison."""
         if self.largest_pix < IDENTICAL_SKY:
             return "on the sky A and B have the same positions"
         return (
@@ -84,7 +84,7 @@ def write_comparison(
     command: str,
     sky: Sequence[SkyDifference | None],
 ) -> None:
-    """Write tables, summary and figure of chips and the gaps between them into a new folder."""
+    """Write tables, summary and figure of chips and the gaps between them to a new folder."""
     with record_folder(output, "comparison.json", command) as (folder, record):
         write_table(joined(found, comparison_table), folder / "comparison.ecsv")
         write_table(joined(found, difference_table), folder / "difference.ecsv")
@@ -92,10 +92,10 @@ def write_comparison(
             write_table(gap_table(gaps), folder / "gap.ecsv")
         save_figures({"difference": difference_vectors(found)}, folder / "figures")
         record["chips"] = [
-            comparison_summary(one) | {"sky": None if far is None else asdict(far)}
-            for one, far in zip(found, sky, strict=True)
+            comparison_summary(item) | {"sky": None if far is None else asdict(far)}
+            for item, far in zip(found, sky, strict=True)
         ]
-        record["gaps"] = [_gap_summary(one) for one in gaps]
+        record["gaps"] = [_gap_summary(item) for item in gaps]
 
 
 def comparison_summary(found: Comparison) -> dict[str, Any]:
@@ -145,17 +145,17 @@ def _gap_summary(gap: GapDifference) -> dict[str, Any]:
 
 
 def joined(found: Sequence[Comparison], table_of: Any) -> Table:
-    """The tables of all chips as one, with the chip in front where there are several."""
+    """Tables of all chips combined, with a first column 'chip' if there are several."""
     tables = []
-    for one in found:
-        table = table_of(one)
+    for comparison in found:
+        table = table_of(comparison)
         if len(found) > 1:
-            table.add_column([one.a.chip] * len(table), name="chip", index=0)
+            table.add_column([comparison.a.chip] * len(table), name="chip", index=0)
         tables.append(table)
     return vstack(tables, metadata_conflicts="silent")
 
 
-SKY_GRID = 65  # points of each axis where positions on the sky are compared
+SKY_GRID = 65  # grid points per axis on which sky positions are compared
 
 
 def compare_files(
@@ -171,48 +171,72 @@ def compare_files(
     grid: Sequence[int] = DEFAULT_GRID,
     command: str = "",
 ) -> str:
-    """Verdicts on two calibrations, as text; tables, summary and figure in a new folder `output`.
+    """Compare two calibrations; tables, summary and figure are written to a new folder `output`.
 
-    `a` and `b` are each a run directory, posterior.nc, fit.nc, or a file that holds a calibration,
-    of any format.  All chips that both have are compared by default, each by itself.  `filter` is
-    of IDCTABs, or the band of WISE meta-data; two, joined by a colon, are for A and B.  `epoch` is
-    in decimal years; `keep` leaves shift, rotation and scale in the difference; `grid` are points
-    on x and y; `size` is of files that do not say.
+    Parameters
+    ----------
+    a, b : path
+        Run directory, posterior.nc, fit.nc, or calibration file of any format.
+    output : path, optional
+        Folder to create.
+    chip : int, optional
+        Chip to compare; by default all common chips, one by one.
+    filter : str, optional
+        Filter of IDCTABs, or band of WISE meta-data; two for A and B, joined by a colon.
+    epoch : float, optional
+        Date in decimal years.
+    size : tuple of float, optional
+        Columns and rows, for files that do not state them.
+    keep : bool
+        Do not remove shift, rotation and scale.
+    grid : sequence of int
+        Number of points along x and y.
+    command : str
+        Command line, for the record.
+
+    Returns
+    -------
+    str
+        Verdicts.
     """
     first, _, second = (filter or "").partition(":")
-    both = _read((Path(a), Path(b)), (first or None, second or first or None), size)
-    refuse_unused_date(epoch, *both)
-    maps = [one.by_chip(epoch) for one in both]
-    numbers = _common(both, chip)
+    calibrations = _read((Path(a), Path(b)), (first or None, second or first or None), size)
+    refuse_unused_date(epoch, *calibrations)
+    maps = [item.by_chip(epoch) for item in calibrations]
+    numbers = _common(calibrations, chip)
     rng = np.random.default_rng(NOISE_SEED)
     nx, ny = grid
-    found = [compare(maps[0][n], maps[1][m], rng=rng, grid=(nx, ny), keep=keep) for n, m in numbers]
-    gaps = _gaps(both, epoch, [n for n, m in numbers if n == m])
-    laid = on_the_sky(Path(a), both[0]), on_the_sky(Path(b), both[1])
+    comparisons = [
+        compare(maps[0][n], maps[1][m], rng=rng, grid=(nx, ny), keep=keep) for n, m in numbers
+    ]
+    gaps = _gaps(calibrations, epoch, [n for n, m in numbers if n == m])
+    laid = on_the_sky(Path(a), calibrations[0]), on_the_sky(Path(b), calibrations[1])
     sky = [_sky_difference(laid, pair, epoch) for pair in numbers]
     if output is not None:
-        write_comparison(Path(output), found, gaps, command, sky)
-    runs = [run_of(Path(one)) for one in (a, b)]
+        write_comparison(Path(output), comparisons, gaps, command, sky)
+    runs = [run_of(Path(item)) for item in (a, b)]
     scales = [None if run is None else run.config.detector.scale_mas for run in runs]
     homes = [
-        Path(one).resolve() if run is None else run.path.resolve()
-        for one, run in zip((a, b), runs, strict=True)
+        Path(item).resolve() if run is None else run.path.resolve()
+        for item, run in zip((a, b), runs, strict=True)
     ]
-    return _text(found, gaps, scales[0] or scales[1], sky, related=homes[0] == homes[1])
+    return _text(comparisons, gaps, scales[0] or scales[1], sky, related=homes[0] == homes[1])
 
 
 def _sky_difference(
     both: tuple[Calibration, Calibration], pair: tuple[int, int], epoch: float | None
 ) -> SkyDifference | None:
-    """Distances on the sky over a grid of one chip; None unless both calibrations lie there."""
-    if any(one.plane.point is None or one.unit not in ARCSEC for one in both):
+    """Distances on the sky over a grid of one chip; None unless both are on the sky."""
+    if any(
+        calibration.plane.point is None or calibration.unit not in ARCSEC for calibration in both
+    ):
         return None
     x, y = detector_grid(both[0].model.chips[both[0].numbers.index(pair[0])].size, SKY_GRID)
     places = []
-    for one, number in zip(both, pair, strict=True):
-        date = epoch if one.model.time is not None else None
-        at = one.forward(x, y, chip=number, epoch=date)
-        places.append(positions_on_the_sky(one, at))
+    for calibration, number in zip(both, pair, strict=True):
+        date = epoch if calibration.model.time is not None else None
+        at = calibration.forward(x, y, chip=number, epoch=date)
+        places.append(positions_on_the_sky(calibration, at))
     far = 3600.0 * separation(places[0], *places[1])
     linear = both[0].chip(pair[0], epoch if both[0].model.time is not None else None).linear
     pixel = ARCSEC[both[0].unit] * float(np.sqrt(abs(np.linalg.det(linear))))
@@ -225,29 +249,29 @@ def _read(
     filters: tuple[str | None, str | None],
     size: tuple[float, float] | None,
 ) -> tuple[Calibration, Calibration]:
-    """Both calibrations; a header that does not say its size has the given, or the other's."""
+    """Both calibrations; a header without a size gets the given size, or that of the other file."""
     asked = [asks_of(path) for path in paths]
     chosen: list[str | None] = list(filters)
     sizes: list[tuple[float, float] | None] = [size, size]
-    for k, other in ((0, 1), (1, 0)):  # what one of them uses is no mistake of the other
-        if "filter" not in asked[k] and "filter" in asked[other]:
+    for k, partner in ((0, 1), (1, 0)):  # options that only one of the files uses are allowed
+        if "filter" not in asked[k] and "filter" in asked[partner]:
             chosen[k] = None
-        if "size" not in asked[k] and "size" in asked[other]:
+        if "size" not in asked[k] and "size" in asked[partner]:
             sizes[k] = None
-    for k, other in ((0, 1), (1, 0)):
+    for k, partner in ((0, 1), (1, 0)):
         try:
             calibration_at(paths[k], filter=chosen[k], size=sizes[k])
         except MissingSizeError:
-            sizes[k] = calibration_at(paths[other], filter=chosen[other]).model.chips[0].size
+            sizes[k] = calibration_at(paths[partner], filter=chosen[partner]).model.chips[0].size
     a, b = (
-        calibration_at(path, filter=one, size=its)
-        for path, one, its in zip(paths, chosen, sizes, strict=True)
+        calibration_at(path, filter=chosen_filter, size=its)
+        for path, chosen_filter, its in zip(paths, chosen, sizes, strict=True)
     )
     return a, b
 
 
 def _common(both: tuple[Calibration, Calibration], chip: int | None) -> list[tuple[int, int]]:
-    """Pairs of chips that are compared: by their numbers, or the single ones of both."""
+    """Pairs of chip numbers to compare."""
     if chip is not None:
         return [(_number(both[0], chip), _number(both[1], chip))]
     return common_chips(*both)
@@ -268,7 +292,7 @@ def _number(one: Calibration, number: int) -> int:
 def _gaps(
     both: tuple[Calibration, Calibration], epoch: float | None, numbers: list[int]
 ) -> list[GapDifference]:
-    """Differences of every further chip's place against the reference chip of A."""
+    """Differences in position of each other chip relative to the reference chip of A."""
     if len(numbers) < 2:
         return []
     reference = next(n for n in both[0].numbers if n in numbers)
@@ -276,7 +300,7 @@ def _gaps(
     for number in numbers:
         if number == reference:
             continue
-        a, b = (pair_of_chips(one, reference, number, epoch=epoch) for one in both)
+        a, b = (pair_of_chips(calibration, reference, number, epoch=epoch) for calibration in both)
         out.append(gap_difference(a, b))
     return out
 
@@ -290,21 +314,21 @@ def _text(
     related: bool,
 ) -> str:
     lines = []
-    for one, far in zip(found, sky, strict=True):
+    for comparison, far in zip(found, sky, strict=True):
         if len(found) > 1:
-            lines.append(f"chip {one.a.chip}, by itself:")
+            lines.append(f"chip {comparison.a.chip}, by itself:")
         apart = far is not None and far.largest_pix > IDENTICAL_SKY
-        if apart and one.largest < IDENTICAL:
+        if apart and comparison.largest < IDENTICAL:
             lines.append(SAME_SHAPE)
         else:
-            lines.append(verdict(one, scale))
+            lines.append(verdict(comparison, scale))
         if far is not None:
             lines.append(far.sentence)
-        lines += comparison_lines(one)
+        lines += comparison_lines(comparison)
     for gap in gaps:
         lines += [gap_verdict(gap), *gap_lines(gap)]
-    if related and any(one.errors_of == "both" for one in found):
+    if related and any(comparison.errors_of == "both" for comparison in found):
         lines.append("A and B come from one source: errors that they share make p too large here")
-    elif any(one.errors_of == "both" for one in found):
+    elif any(comparison.errors_of == "both" for comparison in found):
         lines.append("the errors of A and B are taken as independent")
     return "\n".join(lines)

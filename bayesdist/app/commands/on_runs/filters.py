@@ -1,6 +1,6 @@
-"""Filters beside the reference: offsets of linear terms, whether all drift alike, and figures.
+"""Comparison of other filters with the reference: linear terms, drift, and figures.
 
-ACS ISR 2015-06, section 4.4.4 and Figures 25 and 26.
+See ACS ISR 2015-06, section 4.4.4 and Figures 25 and 26.
 """
 
 from __future__ import annotations
@@ -23,33 +23,32 @@ from bayesdist.utils.limits import DIFFERENCE
 
 Measured = tuple[float, float]  # value and standard deviation
 
-# places of the linear terms: power of x, power of y
+# powers of x and y of the linear terms
 POWERS = {"2": (1, 0), "3": (0, 1)}
 
 
 @dataclass(frozen=True, eq=False)
 class FilterComparison:
-    """Differences between filters, as exposures that were each fitted alone show them."""
+    """Differences between filters, from exposures that were fitted one by one."""
 
-    reference: str  # the filter that the others are compared with
-    # what a filter adds to a drifting term, as 'WFC2.A_2', where all filters drift alike
+    reference: str  # reference filter
+    # offset by (filter, term), with terms such as 'WFC2.A_2', if all filters have a common drift
     offsets: Mapping[tuple[str, str], Measured]
-    # what it adds to the term's rate, per year, where it has rates of its own
+    # difference of the rate, per year, by (filter, term), if each filter has separate rates
     rates: Mapping[tuple[str, str], Measured]
-    # probability of such differences of rates where there are none: the least of all chips,
-    # multiplied by their number
+    # p-value of the differences of rates: the smallest of all chips, multiplied by their number
     p_value: float
-    # whether on some chip rates of each filter's own predict exposures better that were not used
+    # True if separate rates for each filter predict unused exposures better on any chip
     depends: bool
 
     @property
     def alike(self) -> bool:
-        """Boolean: one drift serves all filters."""
+        """True if one drift is sufficient for all filters."""
         return not self.depends and DIFFERENCE.met_by(self.p_value)
 
     @property
     def sentence(self) -> str:
-        """The verdict in words."""
+        """Verdict in words."""
         if self.alike:
             return f"one drift serves all filters (p = {self.p_value:.2g})"
         worst = max(self.rates, key=lambda key: abs(self.rates[key][0] / self.rates[key][1]))
@@ -65,8 +64,22 @@ def compare_filters(
 ) -> FilterComparison:
     """Compare the drifting terms of exposures in several filters, chip by chip.
 
-    `series`: the reference filter first. `time`: what drifts. InputError where nothing can be
-    compared.
+    Parameters
+    ----------
+    series : mapping of str to Series
+        Linear terms of the exposures of each filter; the reference filter comes first.
+    time : TimeDependence or None
+        Drift of the model.
+    seed : int
+
+    Returns
+    -------
+    FilterComparison
+
+    Raises
+    ------
+    InputError
+        If nothing drifts, or no drifting term is known in all filters.
     """
     if time is None:
         raise InputError("nothing drifts", where="model.tdd", do="give the terms that do")
@@ -74,8 +87,8 @@ def compare_filters(
     trend = TrendModel("lines" if time.breaks else "line", time.breaks, reference=time.epoch0)
     by_chip: dict[str, list[str]] = {}
     for term in series[reference].coefficients:
-        in_all = all(term in one.coefficients for one in series.values())
-        # the distance between the chips has steps only: no rates to compare
+        in_all = all(term in item.coefficients for item in series.values())
+        # constant terms have steps but no rates to compare
         if in_all and _place(term) in time.terms and any(_place(term)[1:]):
             by_chip.setdefault(term.rpartition(".")[0], []).append(term)
     if not by_chip:
@@ -86,33 +99,35 @@ def compare_filters(
         )
     offsets: dict[tuple[str, str], Measured] = {}
     rates: dict[tuple[str, str], Measured] = {}
-    found = []
-    # chips scatter together: fitted jointly their chains hardly move, and would say little more
+    dependences = []
+    # fitted separately: chips scatter together, so that joint chains would hardly move
     for terms in by_chip.values():
-        one = filter_dependence(_pooled(series, terms), trend, seed=seed)
-        offsets |= _against(one, one.common.group_offset, reference)
-        rates |= _against(one, one.separate.group_slope, reference)
-        found.append(one)
-    p_value = min(1.0, len(found) * min(one.all_slopes.p_value for one in found))
-    return FilterComparison(reference, offsets, rates, p_value, any(one.depends for one in found))
+        item = filter_dependence(_pooled(series, terms), trend, seed=seed)
+        offsets |= _against(item, item.common.group_offset, reference)
+        rates |= _against(item, item.separate.group_slope, reference)
+        dependences.append(item)
+    p_value = min(1.0, len(dependences) * min(item.all_slopes.p_value for item in dependences))
+    return FilterComparison(
+        reference, offsets, rates, p_value, any(item.depends for item in dependences)
+    )
 
 
 def _pooled(series: Mapping[str, Series], terms: Sequence[str]) -> Series:
     """Exposures of all filters in one series, with the filters as groups."""
-    chosen = {filter: one.only(*terms) for filter, one in series.items()}
+    chosen = {filter: selected.only(*terms) for filter, selected in series.items()}
     return Series(
-        np.concatenate([one.epoch for one in chosen.values()]),
-        np.concatenate([one.values for one in chosen.values()]),
-        np.concatenate([one.cov for one in chosen.values()]),
+        np.concatenate([selected.epoch for selected in chosen.values()]),
+        np.concatenate([selected.values for selected in chosen.values()]),
+        np.concatenate([selected.cov for selected in chosen.values()]),
         tuple(terms),
-        tuple(f"{filter}.{name}" for filter, one in chosen.items() for name in one.names),
-        tuple(filter for filter, one in chosen.items() for _ in one.names),
+        tuple(f"{filter}.{name}" for filter, selected in chosen.items() for name in selected.names),
+        tuple(filter for filter, selected in chosen.items() for _ in selected.names),
         source="exposures of all filters",
     )
 
 
 def _place(term: str) -> tuple[str, int, int]:
-    """Axis and powers of a linear term: 'WFC2.B_2' is ('v', 1, 0)."""
+    """Axis and powers of a linear term; for example, 'WFC2.B_2' is ('v', 1, 0)."""
     letter, _, digit = term.split(".")[-1].partition("_")
     return ("u" if letter == "A" else "v", *POWERS.get(digit, (0, 0)))
 
@@ -120,9 +135,9 @@ def _place(term: str) -> tuple[str, int, int]:
 def _against(
     found: FilterDependence, draws: Float, reference: str
 ) -> dict[tuple[str, str], Measured]:
-    """Draws (n, G - 1, k) of what filters add to the first one, as differences to the reference."""
-    every = np.concatenate([np.zeros_like(draws[:, :1]), draws], axis=1)
-    difference = every - every[:, [found.names.index(reference)]]
+    """Mean and sigma of filter offsets relative to `reference`, from draws (n, G - 1, k)."""
+    offsets = np.concatenate([np.zeros_like(draws[:, :1]), draws], axis=1)
+    difference = offsets - offsets[:, [found.names.index(reference)]]
     mean, sigma = difference.mean(axis=0), difference.std(axis=0, ddof=1)
     return {
         (filter, term): (float(mean[f, k]), float(sigma[f, k]))
@@ -135,39 +150,48 @@ def _against(
 def comparison_table(
     solutions: Mapping[str, Solution], comparison: FilterComparison | None, *, chip: int
 ) -> Table:
-    """Linear terms of each filter with the drift taken out, and how they differ.
+    """Linear terms of each filter after removal of the drift, and their differences.
 
-    `solutions`: the reference filter first; without a `comparison` offsets are theirs. A row is a
-    filter, chip and term A_2, A_3, B_2, B_3 that the gauge does not fix, at the reference date: per
-    pixel of u, v, and as what it does at half the chip, in the unit of u, v.
+    There is one row per filter, chip and term A_2, A_3, B_2, B_3 that the gauge does not fix, at
+    the reference date.  Terms are per pixel, and also as their effect at half the chip, in the unit
+    of u, v.
+
+    Parameters
+    ----------
+    solutions : mapping of str to Solution
+        Solutions by filter; the reference filter comes first.
+    comparison : FilterComparison or None
+        Offsets and rates; without it offsets are differences of the solutions.
+    chip : int
+        Number of the chip that defines the gauge.
     """
     reference = next(iter(solutions))
     offsets = {} if comparison is None else comparison.offsets
     rates = {} if comparison is None else comparison.rates
-    known: dict[str, Measured] = {}
+    reference_terms: dict[str, Measured] = {}
     rows = []
     for filter, solution in solutions.items():
         view = reference_gauge(solution, chip)
         time = view.model.time
         epoch = None if time is None else time.epoch0[0]
-        for one in view.model.chips:
-            found = linear_terms(view, one.number, epoch=epoch)
-            fixed = {"A_1", "B_1", "A_3"} if one.number == chip else {"A_1", "B_1"}
-            for name, value, sigma in zip(found.labels, found.values, found.sigma, strict=True):
+        for item in view.model.chips:
+            terms = linear_terms(view, item.number, epoch=epoch)
+            fixed = {"A_1", "B_1", "A_3"} if item.number == chip else {"A_1", "B_1"}
+            for name, value, sigma in zip(terms.labels, terms.values, terms.sigma, strict=True):
                 if name in fixed:
                     continue
-                term = f"{one.name}.{name}" if len(view.model.chips) > 1 else name
-                first = known.setdefault(term, (value, sigma))
+                term = f"{item.name}.{name}" if len(view.model.chips) > 1 else name
+                first = reference_terms.setdefault(term, (value, sigma))
                 offset = (0.0, 0.0)
                 if filter != reference:
                     plain = value - first[0], float(np.hypot(sigma, first[1]))
                     offset = offsets.get((filter, term), plain)
                 rate = rates.get((filter, term), (np.nan, np.nan))
-                lever = one.size[0 if _place(term)[1] else 1] / 2
+                lever = item.size[0 if _place(term)[1] else 1] / 2
                 rows.append(
                     {
                         "filter": filter,
-                        "chip": one.number,
+                        "chip": item.number,
                         "term": name,
                         "value": value,
                         "sigma": sigma,
@@ -202,8 +226,8 @@ def draw_filters(
     fits: Mapping[str, Fitted],
     solutions: Mapping[str, Solution],
 ) -> tuple[str, ...]:
-    """Write filters_A_2.png and the like, and return their names."""
-    # figures take seconds to import
+    """Write filters_A_2.png and so on, and return their names."""
+    # imported here because plotting takes seconds to import
     from bayesdist.report.drawing import save_figures
     from bayesdist.report.figures.commands import FilterTerm, filters_figure
 
@@ -212,8 +236,8 @@ def draw_filters(
     if time is None or len(fits) < 2:
         return ()
     views = {
-        name: reference_gauge(without_frames(one), model.chips[0].number)
-        for name, one in solutions.items()
+        name: reference_gauge(without_frames(item), model.chips[0].number)
+        for name, item in solutions.items()
     }
     edges = np.asarray(time.breaks)
     figures = {}
@@ -225,13 +249,14 @@ def draw_filters(
                 series = required(fitted.alone, "fits of single exposures")
                 if label not in series.coefficients:
                     continue
-                found = [lines(views[name], s, chip=chip.number) for s in range(time.n_segments)]
+                segments = [lines(views[name], s, chip=chip.number) for s in range(time.n_segments)]
                 alpha, beta = (
-                    [one.select(f"{term}.{part}") for one in found] for part in ("alpha", "beta")
+                    [item.select(f"{term}.{part}") for item in segments]
+                    for part in ("alpha", "beta")
                 )
                 k = series.coefficients.index(label)
                 s = np.searchsorted(edges, series.epoch, side="right")
-                rate = np.array([one.values[0] for one in beta])[s]
+                rate = np.array([item.values[0] for item in beta])[s]
                 courses.append(
                     FilterTerm(
                         name,
@@ -239,8 +264,8 @@ def draw_filters(
                         series.epoch,
                         series.values[:, k] - rate * (series.epoch - np.array(time.epoch0)[s]),
                         np.sqrt(np.maximum(series.cov[:, k, k], 0.0)),
-                        np.array([one.values[0] for one in alpha]),
-                        np.array([one.sigma[0] for one in alpha]),
+                        np.array([item.values[0] for item in alpha]),
+                        np.array([item.sigma[0] for item in alpha]),
                     )
                 )
         if courses:

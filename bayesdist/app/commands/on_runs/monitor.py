@@ -1,4 +1,4 @@
-"""`bayesdist monitor`: does the released solution of a run still describe new matches?"""
+"""`bayesdist monitor`: test whether the released solution of a run still describes new matches."""
 
 from __future__ import annotations
 
@@ -35,19 +35,35 @@ from bayesdist.infer.solution.linear import Rejection
 from bayesdist.report.drawing import save_figures
 from bayesdist.report.figures.commands import change_over_time, difference_vectors
 
-CHANGE_MAPS = 1  # of the random streams that follow from the one seed
+CHANGE_MAPS = 1  # number of the random stream of the maps, derived from the seed
 
 
 def monitor(
     run: str | Path, new: str | Path, output: str | Path | None = None, *, command: str = ""
 ) -> str:
-    """Verdict of new matches on the posterior of a run, as text; files in a new folder `output`.
+    """Test new matches against the posterior of a run; files are written to a new folder `output`.
 
-    The matches that the run was made from are not needed any more.  `new` are matches, which are
-    read as the run's were, or a configuration, a run or a folder with a config.toml whose [data]
-    says how; files that the release was made from are left out.  Of a campaign another run of
-    which stage 'match' is done, or pairs as a run keeps them; of a self-calibration a configuration
-    with [data], whose linear part is free in each exposure.
+    The matches that the run was made from are no longer needed.
+
+    Parameters
+    ----------
+    run : path
+        Released run.
+    new : path
+        New matches, which are read like those of the run; or a configuration, a run or a folder
+        with a config.toml that has a section [data].  Files that the release was made from are left
+        out.  For a campaign: another run with completed stage 'match', or pairs as stored in a run.
+        For a self-calibration: a configuration with [data]; the linear part of each exposure is
+        free.
+    output : path, optional
+        Folder to create.
+    command : str
+        Command line, for the record.
+
+    Returns
+    -------
+    str
+        Verdict and further lines.
     """
     directory = RunDirectory(run)
     if not directory.is_initialized:
@@ -64,7 +80,7 @@ def monitor(
         date = scan_dates(scores, change) if scores else None
         late = date is not None and is_late(change, date)
         nx, ny = config.assess.grid
-        found = Monitored(
+        result = Monitored(
             change=change,
             maps=change_maps(
                 date.change if late and date is not None else change,
@@ -83,34 +99,34 @@ def monitor(
     finally:
         fitted.target.shards.close()
     if output is not None:
-        _write(Path(output), found, scores, facts, command)
-    return "\n".join([found.verdict, *_lines(found, facts, scores)])
+        _write(Path(output), result, scores, facts, command)
+    return "\n".join([result.verdict, *_lines(result, facts, scores)])
 
 
 def _fitted(
     run: RunDirectory, config: Config, new: Path
 ) -> tuple[Posterior, Matches, NewFit, tuple[str, ...]]:
-    """Release, new matches and their fit, and exposures or files that the release has seen."""
+    """Release, new matches and their fit, and exposures or files that the release has used."""
     if config.campaign is not None:
         release = results_of(run)
         return release.solution, *fit_new_exposures(release, new)
     posterior = results_of(run).solution
-    matches, seen = _new_matches(run, config, new)
-    found = fit_new(
+    matches, used_files = _new_matches(run, config, new)
+    new_fit = fit_new(
         posterior,
         matches,
         rejection=Rejection(config.fit.clip_chi2, config.fit.clip_abs),
         compute=config.resources(),
-        # new matches lie on a sky that a self-calibration has not seen
+        # the orientation on the sky is unknown to a self-calibration
         frames=None if config.selfcal is None else "affine",
     )
-    return posterior, matches, found, seen
+    return posterior, matches, new_fit, used_files
 
 
 def _new_matches(run: RunDirectory, config: Config, new: Path) -> tuple[Matches, tuple[str, ...]]:
-    """New matches with errors, read as those of the run or as their own configuration says.
+    """New matches with errors, read like those of the run or as a configuration of theirs states.
 
-    The second value names files that are left out, because the release was made from them.
+    The second value names files that are left out because the release was made from them.
     """
     if not new.exists():
         raise InputError("there is no such file", where=str(new), do="check the name")
@@ -133,14 +149,14 @@ def _new_matches(run: RunDirectory, config: Config, new: Path) -> tuple[Matches,
                 where=str(new),
                 do="give a configuration whose [data] names it",
             )
-        # the date of the run's exposures is not that of new ones
+        # new exposures have another date than those of the run
         data = config.data.model_copy(update={"epoch": None})
-    seen = _files_of_release(run, path)
-    if seen and not Path(new).is_dir():
-        path = [file for file in input_files(path) if file not in seen]
+    used_files = _files_of_release(run, path)
+    if used_files and not Path(new).is_dir():
+        path = [file for file in input_files(path) if file not in used_files]
     matches = read_configured(path, data, size=size, chips=config.chip or chips)
-    from_release = [k for k, name in enumerate(matches.sources) if Path(name) in seen]
-    if from_release:  # parts of one table, which are read together
+    from_release = [k for k, name in enumerate(matches.sources) if Path(name) in used_files]
+    if from_release:  # parts of one table that are read together
         matches = matches.load()
         matches = matches.select(~np.isin(matches.source, from_release))
     if data.sigma == "by_magnitude":
@@ -152,11 +168,11 @@ def _new_matches(run: RunDirectory, config: Config, new: Path) -> tuple[Matches,
                 do="give data.sigma another value",
             )
         matches = matches.with_errors(errors)
-    return matches, tuple(str(file) for file in seen)
+    return matches, tuple(str(file) for file in used_files)
 
 
 def _configuration_of(run: RunDirectory, new: Path) -> tuple[Config, Path] | None:
-    """Configuration that says how new matches are read, and the folder of its names.
+    """Configuration for reading new matches, and the folder that its names are relative to.
 
     `new` is a configuration, a run, or a folder with a config.toml; None for anything else.
     """
@@ -169,32 +185,32 @@ def _configuration_of(run: RunDirectory, new: Path) -> tuple[Config, Path] | Non
                 where=str(new),
                 do="give a file of new matches, or a configuration whose [data] names it",
             )
-        other = RunDirectory(new)
-        return other.config, other.base
+        new_run = RunDirectory(new)
+        return new_run.config, new_run.base
     if (new / "config.toml").exists():
         return load_config(new / "config.toml")[0], new
     return None
 
 
 def _files_of_release(run: RunDirectory, path: Path | list[Path]) -> list[Path]:
-    """Files among the new ones that the release was made from, under whatever name.
+    """Files of `path` that the release was made from, identified by content.
 
-    They cannot test it, and are refused if there are no others.
+    They cannot test the release.  Raises InputError if there are no other files.
     """
-    known = set(run.facts["inputs"].values())
+    hashes = set(run.facts["inputs"].values())
     files = input_files(path)
-    seen = [file for file in files if sha256_of(file) in known]
-    if len(seen) == len(files):
+    used_files = [file for file in files if sha256_of(file) in hashes]
+    if len(used_files) == len(files):
         raise InputError(
             "these are matches that the release was made from, and say nothing new of it",
-            where=str(seen[0]),
+            where=str(used_files[0]),
             do="give matches that were not in its fit",
         )
-    return seen
+    return used_files
 
 
 def _facts(new: NewFit, posterior: Posterior) -> dict[str, Any]:
-    """Facts on the new matches beside the change."""
+    """Facts about the new matches other than the change."""
     n = new.target.n_theta
     shards = new.target.shards
     flagged, _ = count_outliers(shards, new.target.hyper, new.theta[None], new.psi[None, n:])
@@ -213,7 +229,7 @@ def _facts(new: NewFit, posterior: Posterior) -> dict[str, Any]:
 
 
 def _lines(found: Monitored, facts: dict[str, Any], scores: Sequence[PeriodScore]) -> list[str]:
-    """Lines below the verdict."""
+    """Lines of text below the verdict."""
     frames = "nothing" if facts["frames"] == "none" else facts["frames"].replace("_", ", ")
     lines = [
         f"new matches: {facts['n_matches']}, of which {facts['n_flagged']} are more likely false "
@@ -223,18 +239,21 @@ def _lines(found: Monitored, facts: dict[str, Any], scores: Sequence[PeriodScore
         lines.append("exposures deviate as those of the release scatter")
     if facts["left_out"]:
         names = facts["left_out"]
-        more = "" if len(names) < 4 else ", ..."
+        ellipsis = "" if len(names) < 4 else ", ..."
         lines.append(
             f"left out: {len(names)} exposure(s) or file(s) that the release was made from "
-            f"({', '.join(names[:3])}{more})"
+            f"({', '.join(names[:3])}{ellipsis})"
         )
     lines += [f"rows left out: {n} ({reason})" for reason, n in facts["rejected"].items()]
-    for key, what in (("j", "error beyond the quoted ones"), ("f", "fraction of false matches")):
+    for key, title in (
+        ("j", "error beyond the quoted ones"),
+        ("f", "fraction of false matches"),
+    ):
         if key in facts["mixture"] and key in facts["mixture_released"]:
             old = facts["mixture_released"][key]
             unit = f" {facts['unit']}" if key == "j" else ""
             lines.append(
-                f"{what}: {facts['mixture'][key]:.3g}{unit}; of the release {old['mean']:.3g} +- "
+                f"{title}: {facts['mixture'][key]:.3g}{unit}; of the release {old['mean']:.3g} +- "
                 f"{old['sd']:.2g}"
             )
     if found.change.epoch is not None:
@@ -313,15 +332,26 @@ def _summary(found: Monitored, facts: dict[str, Any]) -> dict[str, Any]:
 
 
 def fit_new_exposures(release: Results, new: Path) -> tuple[Matches, NewFit, tuple[str, ...]]:
-    """New exposures of a campaign by themselves, deviating as those of the release scatter.
+    """Fit new exposures of a campaign, with deviations drawn from the scatter of the release.
 
-    `new`: run directory of a campaign whose stage 'match' has been run, or pairs in a file or
-    folder as a run keeps them; star lists have to be matched first.  What a star's error in the
-    catalogue does to all its exposures is added, and where the release has the same catalogue, what
-    it did to the release is taken into account.
+    The catalogue error of a star, which is common to all its exposures, is included.  If the
+    release has the same catalogue, the effect of that error on the release is taken into account.
 
-    Result: pairs with errors, at the pixels that the release's tables have corrected; their fit;
-    and exposures that are left out, as the release has been made from them.
+    Parameters
+    ----------
+    release : Results
+    new : Path
+        Run directory of a campaign with completed stage 'match', or a file or folder of pairs as
+        stored in a run.  Star lists must be matched first.
+
+    Returns
+    -------
+    Matches
+        Pairs with errors, and with pixels corrected by the look-up tables of the release.
+    NewFit
+        Their fit.
+    tuple of str
+        Exposures that are left out because the release was made from them.
     """
     run = RunDirectory(new) if (new / "run.json").exists() else None
     released, fitted, config = release.solution, release.fitted, release.config
@@ -329,9 +359,9 @@ def fit_new_exposures(release: Results, new: Path) -> tuple[Matches, NewFit, tup
     if not pairs.has_epoch:
         raise InputError("has no epochs", where=str(new), do="give a column 'epoch'")
     _refuse_other_filters(config, pairs, ", ".join(pairs.sources))
-    seen = np.isin(pairs.exposure_names, released.model.exposures)
-    left_out = tuple(np.asarray(pairs.exposure_names)[seen].tolist())
-    fresh = ~seen[pairs.exposure]
+    is_released = np.isin(pairs.exposure_names, released.model.exposures)
+    left_out = tuple(np.asarray(pairs.exposure_names)[is_released].tolist())
+    fresh = ~is_released[pairs.exposure]
     if not fresh.any():
         raise InputError(
             f"all of {len(left_out)} exposures are those that the release was made from",
@@ -346,7 +376,7 @@ def fit_new_exposures(release: Results, new: Path) -> tuple[Matches, NewFit, tup
     if placed.mag is not None and errors is not None:
         placed = placed.with_errors(errors, in_quadrature=True)
     scatter = required(fitted.scatter, "joint fit of exposures")
-    found = fit_new(
+    new_fit = fit_new(
         released,
         placed,
         rejection=Rejection(config.fit.clip_chi2, config.fit.clip_abs),
@@ -355,14 +385,14 @@ def fit_new_exposures(release: Results, new: Path) -> tuple[Matches, NewFit, tup
     )
     of_catalogue = _catalogue_errors(pairs)
     if of_catalogue is not None:
-        same = run is not None and _catalogue_of(run) == _catalogue_of(release.run)
-        made_from = (release.data.fit, release.data.stars) if same else None
-        found = with_star_errors_of(of_catalogue, found, placed, made_from)
-    return placed, found, left_out
+        has_same_catalogue = run is not None and _catalogue_of(run) == _catalogue_of(release.run)
+        made_from = (release.data.fit, release.data.stars) if has_same_catalogue else None
+        new_fit = with_star_errors_of(of_catalogue, new_fit, placed, made_from)
+    return placed, new_fit, left_out
 
 
 def _pairs(run: RunDirectory | None, new: Path, unit: str) -> Matches:
-    """Pairs as another run keeps them, or of a table."""
+    """Matched pairs of another run, or of a table."""
     if run is None:
         if new.suffix == ".toml":
             raise InputError(
@@ -372,7 +402,7 @@ def _pairs(run: RunDirectory | None, new: Path, unit: str) -> Matches:
             )
         if not new.exists():
             raise InputError("there is no such file", where=str(new), do="check the name")
-        found = read_matches(new, unit=unit)
+        pairs = read_matches(new, unit=unit)
     else:
         if run.config.campaign is None or not part_files(run / PAIRS):
             raise InputError(
@@ -380,23 +410,23 @@ def _pairs(run: RunDirectory | None, new: Path, unit: str) -> Matches:
                 where=str(run.path),
                 do="give one whose stage 'match' has been run, or a table of pairs",
             )
-        found = read_matches(run / PAIRS, unit=unit)
-    return found
+        pairs = read_matches(run / PAIRS, unit=unit)
+    return pairs
 
 
 def _refuse_other_filters(config: Config, pairs: Matches, where: str) -> None:
     mine = None if config.campaign is None else config.campaign.filter
-    others = sorted({name for name in pairs.filter_names if name} - {mine})
-    if mine is not None and others:
+    other_filters = sorted({name for name in pairs.filter_names if name} - {mine})
+    if mine is not None and other_filters:
         raise InputError(
-            f"the pairs are in filter {others[0]}, and the release is in {mine}",
+            f"the pairs are in filter {other_filters[0]}, and the release is in {mine}",
             where=where,
             do="give pairs in the filter of the release",
         )
 
 
 def _catalogue_errors(pairs: Matches) -> StarErrors | None:
-    """The least error that each star of the catalogue has in its pairs, by code of the star."""
+    """Smallest error of each star in its pairs, by star code: the error of the catalogue."""
     if pairs.star is None or pairs.sigma_u is None or pairs.sigma_v is None or pairs.mag is None:
         return None
     sigma = np.full((int(pairs.star.max()) + 1, 2), np.inf)
@@ -406,9 +436,9 @@ def _catalogue_errors(pairs: Matches) -> StarErrors | None:
 
 
 def _catalogue_of(run: RunDirectory) -> str | None:
-    """Hash of a run's catalogue."""
+    """Hash of the catalogue of a run."""
     block, base = run.config.campaign, Path(run.facts["base"])
     if block is None:
         return None
-    found: str | None = run.facts["inputs"].get(input_name(base / block.catalog, base))
-    return found
+    digest: str | None = run.facts["inputs"].get(input_name(base / block.catalog, base))
+    return digest

@@ -1,4 +1,4 @@
-"""`bayesdist select-order`: which polynomial order do the data of a configuration ask for?"""
+"""`bayesdist select-order`: select the polynomial order for the data of a configuration."""
 
 from __future__ import annotations
 
@@ -40,12 +40,31 @@ def order(
     figure: str | Path | None = None,
     force: bool = False,
 ) -> str:
-    """Orders from the lowest to the highest compared on the data of a configuration, as text.
+    """Compare polynomial orders on the data of a configuration.
 
-    Its own order, priors and extra weights do not matter; frames of exposures and drift are taken
-    out as a fit of the highest order has them.  `chip` is needed where there are several.
-    `output` is an ECSV file for the table, `figure` a PNG file.  Orders that the data do not
-    determine are rows that say so, as long as two lower ones can be compared.
+    The order, priors and extra weights of the configuration have no effect.  Frames of exposures
+    and drift are removed as in a fit of the highest order.  Orders that the data do not determine
+    are listed with the reason, provided that two lower ones can be compared.
+
+    Parameters
+    ----------
+    path : path
+        Configuration.
+    orders : sequence of int
+        Lowest and highest order.
+    output : path, optional
+        ECSV file for the table.
+    chip : int, optional
+        Chip number, needed if there are several chips.
+    figure : path, optional
+        PNG file for the figure.
+    force : bool
+        Replace existing files.
+
+    Returns
+    -------
+    str
+        Table and verdict.
     """
     targets = [Path(name) for name in (output, figure) if name is not None]
     for target in targets:
@@ -65,23 +84,25 @@ def order(
             where=str(path),
             do="run it, and see whether the report asks for terms of a higher order",
         )
-    chips = [one.number for one in config.chips()]
+    chips = [chip_of_model.number for chip_of_model in config.chips()]
     number_of = chosen_chip(chips or [1], chip, where=str(path), argument="--chip")
     with TemporaryDirectory() as nowhere:
         run = RunDirectory.plan(nowhere, config, text, Path(path).resolve().parent)
         with open_results(run) as results:
-            found, failed = _selected(results, range(low, high + 1), number_of if chips else None)
+            selection, failed = _selected(
+                results, range(low, high + 1), number_of if chips else None
+            )
     if output is not None:
-        write_table(_table(found, failed), Path(output))
+        write_table(_table(selection, failed), Path(output))
     if figure is not None:
-        _draw(found, Path(figure))
-    return "\n\n".join([_text(found, failed), found.sentence])
+        _draw(selection, Path(figure))
+    return "\n\n".join([_text(selection, failed), selection.sentence])
 
 
 def _selected(
     results: Results, orders: Sequence[int], chip: int | None
 ) -> tuple[OrderSelection, dict[int, str]]:
-    """The comparison, and why the orders above those compared cannot be fitted."""
+    """Comparison of orders, and reasons why higher orders cannot be fitted."""
     failed: dict[int, str] = {}
     matched = results.kind.match(results.inputs, results.config)
     for top in sorted(orders, reverse=True):
@@ -97,17 +118,17 @@ def _selected(
 def _compared(
     results: Results, matched: Matched, orders: Sequence[int], chip: int | None
 ) -> OrderSelection:
-    """The comparison of orders, by a configuration of the highest.
+    """Comparison of orders, based on a configuration of the highest.
 
-    Errors by magnitude, tables, frames and drift are those of a fit of that order: its residuals
-    hold the least misfit.
+    Errors by magnitude, tables, frames and drift are those of a fit of that order, because its
+    residuals contain the least misfit.
     """
     config, reader = results.config.of_order(max(orders)), results.reader
     matched = matched.of_order(max(orders))
     rejection = Rejection(config.fit.clip_chi2, config.fit.clip_abs)
     stars: Matches | Shards
     one_frame = config.model.frames == "none" and config.time() is None
-    if config.data is not None and len(config.chips()) < 2 and one_frame:  # one map at any date
+    if config.data is not None and len(config.chips()) < 2 and one_frame:  # one map at all dates
         errors = QUOTED
         if config.data.sigma == "by_magnitude":
             errors = fit_stars(matched, config, reader=reader).errors
@@ -115,18 +136,22 @@ def _compared(
         stars = shards_of(matched.stars, model, config, errors, reader)
     else:
         data = FitData(matched, results.kind.fit(matched, config, results.base, reader), reader)
-        one = next(one for one in data.model.chips if chip in (None, one.number))
-        model = DistortionModel(max(orders), (one,), unit=data.model.unit)
-        stars = in_one_frame(data.fit, data.stars, one.number)
+        chip_of_model = next(
+            chip_of_model
+            for chip_of_model in data.model.chips
+            if chip in (None, chip_of_model.number)
+        )
+        model = DistortionModel(max(orders), (chip_of_model,), unit=data.model.unit)
+        stars = in_one_frame(data.fit, data.stars, chip_of_model.number)
     return select_order(stars, model, orders=orders, rejection=rejection)
 
 
 def _rows(found: OrderSelection, failed: dict[int, str]) -> list[dict[str, Any]]:
-    """A row for each order, rising; of those that cannot be fitted nothing but their terms."""
+    """One row per order, ascending; orders that cannot be fitted have only the number of terms."""
     rows = found.rows()
     empty = dict.fromkeys(rows[0])
-    more = [empty | {"order": n, "terms": (n + 1) * (n + 2) // 2} for n in sorted(failed)]
-    return rows + more
+    unfitted = [empty | {"order": n, "terms": (n + 1) * (n + 2) // 2} for n in sorted(failed)]
+    return rows + unfitted
 
 
 def _table(found: OrderSelection, failed: dict[int, str]) -> Table:
@@ -157,7 +182,7 @@ def _table(found: OrderSelection, failed: dict[int, str]) -> Table:
 
 
 def _text(found: OrderSelection, failed: dict[int, str]) -> str:
-    """Surfaces on the left, what is held out on the right."""
+    """Table with surfaces on the left, and held-out stars and regions on the right."""
     noise, s = found.surfaces.noise, found.surfaces
     rows = [
         {
@@ -190,7 +215,7 @@ def _with_error(value: float | None, error: float | None) -> str:
 
 
 def _draw(found: OrderSelection, path: Path) -> None:
-    from bayesdist.report.drawing import png_of  # figures take seconds to import
+    from bayesdist.report.drawing import png_of  # plotting takes seconds to import
     from bayesdist.report.figures.commands import order_comparison
 
     png = png_of(order_comparison(found))

@@ -23,7 +23,7 @@ NO_VERDICT = "no verdict is recorded; 'bayesdist stage report' makes one"
 
 
 def overview(runs: Sequence[str | Path], output: str | Path) -> str:
-    """Text to print, once the page that compares runs by their summary.json is written."""
+    """Write a page that compares runs by their summary.json, and return the text to print."""
     rows = [_row(RunDirectory(run), Path(output)) for run in runs]
     table = [
         {"Status": row.level.replace("fail", "FAIL"), "Run": row.name, "Verdict": row.headline}
@@ -40,14 +40,14 @@ def _row(run: RunDirectory, output: Path) -> OverviewRow:
     margins: list[Mapping[str, Any]] = summary.get("margins") or []
     worst = min(margins, key=lambda row: row["margin_percent"], default=None)
     until, is_open = _validity(summary.get("validity_periods") or [])
-    found, fit = summary.get("map"), summary.get("fit")
+    map_section, fit = summary.get("map"), summary.get("fit")
     verdict = summary.get("verdict") or {"level": "note", "headline": NO_VERDICT}
     damage = next(filter(None, map(run.damage, run.record.artefacts)), None)
-    if damage is not None:  # what is recorded is of other files
+    if damage is not None:  # the recorded verdict is for other files
         verdict = {"level": "fail", "headline": " ".join(damage)}
         log.warning("%s: WARNING: %s %s", run.path, *damage)
     report, link = run / "report.html", ""
-    if report.exists():  # its address as seen from the page
+    if report.exists():  # address relative to the page
         link = quote(os.path.relpath(report.resolve(), output.resolve().parent))
     return OverviewRow(
         name=run.path.as_posix(),
@@ -60,10 +60,10 @@ def _row(run: RunDirectory, output: Path) -> OverviewRow:
         worst_requirement="" if worst is None else worst["name"],
         valid_until=until,
         open_ended=is_open,
-        epoch=None if found is None else found["epoch"],
+        epoch=None if map_section is None else map_section["epoch"],
         uncertainty=""
-        if found is None or found.get("sigma_max") is None  # of an earlier version
-        else with_mas(found["sigma_max"], found["unit"], config.detector.scale_mas),
+        if map_section is None or map_section.get("sigma_max") is None  # run of an earlier version
+        else with_mas(map_section["sigma_max"], map_section["unit"], config.detector.scale_mas),
         n_used=summary["data"]["n_used"] if summary.get("data") else None,
         chi2_per_dof=fit["chi2"] / fit["dof"] if fit and fit["dof"] else None,
         began=head["began"],
@@ -71,7 +71,7 @@ def _row(run: RunDirectory, output: Path) -> OverviewRow:
 
 
 def _validity(rows: Sequence[Mapping[str, Any]]) -> tuple[float | None, bool]:
-    """Date at which the first requirement fails; and whether that is a lower bound."""
+    """Date at which the first requirement fails, and True if that is a lower bound."""
     dates = [row["date"] for row in rows if row["date"] is not None]
     if dates:
         return min(dates), False

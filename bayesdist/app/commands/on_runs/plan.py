@@ -1,4 +1,4 @@
-"""`bayesdist plan`: how many more exposures, and when, a requirement takes."""
+"""`bayesdist plan`: number and dates of further exposures that requirements need."""
 
 from __future__ import annotations
 
@@ -28,13 +28,19 @@ from bayesdist.infer.compare.planning import (
 from bayesdist.infer.solution.solution import Solution
 from bayesdist.utils.arrays import Float
 
-LATER = 4  # dates that stand for exposures spread evenly
+LATER = 4  # number of dates that represent evenly spread exposures
 
 
 def plan(run: str | Path, *, name: str | None = None, epochs: Sequence[float] = ()) -> str:
-    """Exposures like those at hand that a run's requirements would take, as text.
+    """Number of exposures like the existing ones that the requirements of a run need, as text.
 
-    Of all requirements, or of one `name`; exposures could be taken at `epochs`, decimal years.
+    Parameters
+    ----------
+    run : path
+    name : str, optional
+        Name of one requirement; all by default.
+    epochs : sequence of float
+        Possible dates of further exposures, in decimal years.
     """
     if str(run).endswith(".toml"):
         raise InputError(
@@ -82,18 +88,22 @@ def needs_of(
     name: str | None = None,
     epochs: Sequence[float] = (),
 ) -> list[tuple[Requirement, tuple[Need, ...]]]:
-    """How many exposures of each schedule each requirement of a run takes.
+    """Number of exposures that each requirement of a run needs, for each schedule.
 
     Parameters
     ----------
     results : Results
-        Of a run that was evaluated.
+        Results of a run that was evaluated.
     content : ExposureContent
-        The average exposure of the run, as of `content_of`.
+        Average exposure of the run, from `content_of`.
     name : str, optional
-        Of one requirement; all by default.
+        Name of one requirement; all by default.
     epochs : sequence of float
-        Dates of further exposures, decimal years.
+        Dates of further exposures in decimal years.
+
+    Returns
+    -------
+    list of tuple of Requirement and tuple of Need
 
     Raises
     ------
@@ -103,11 +113,11 @@ def needs_of(
     requirements = judged_requirements(results.run)
     chosen = [r for r in requirements if name is None or r.name == name]
     if not chosen:
-        known = ", ".join(repr(r.name) for r in requirements)
+        names = ", ".join(repr(r.name) for r in requirements)
         raise InputError(
-            f"has no requirement {name!r}" if known else "has no requirements",
+            f"has no requirement {name!r}" if names else "has no requirements",
             where=str(results.run.path),
-            do=f"name one of {known}" if known else "judge some with 'bayesdist requirements'",
+            do=f"name one of {names}" if names else "judge some with 'bayesdist requirements'",
         )
     now = {row["name"]: row["probability_met"] for row in results.run.summary["margins"]}
     future, out = futures_of(results, content), []
@@ -123,7 +133,7 @@ def needs_of(
 
 
 def content_of(results: Results) -> ExposureContent:
-    """The average exposure of the run."""
+    """Average exposure of the run."""
     stars = results.diagnostics.sample
     jitter = float(np.mean(results.posterior.hyper.get("j", [0.0])))
     sigma = np.stack([np.asarray(stars.table.sigma_u), np.asarray(stars.table.sigma_v)], axis=1)
@@ -145,13 +155,13 @@ def schedules_of(
     content: ExposureContent,
     epochs: Sequence[float] = (),
 ) -> list[Schedule]:
-    """Single exposures at dates that matter to a requirement, or at any."""
+    """Schedules of exposures: at relevant dates, or one schedule if dates do not matter."""
     solution, epoch, solved = results.solution, results.epoch, results.fitted.solved
     if solved is not None:
-        # an exposure by itself says nothing: of stars that were seen before it does
+        # a single exposure is informative only about stars in other exposures
         information = solved.mode.gain * solved.mode.distortion_information / _n_exposures(results)
         further = further_dithers(solved.mode, results.config.sampler.seed)
-        together = [one.information for one in further]
+        together = [dithers.information for dithers in further]
         return [Schedule("dithered like these", information, together=together)]
 
     def worth(date: float | None) -> Float:
@@ -161,33 +171,33 @@ def schedules_of(
         return [Schedule("at any date", worth(None))]
     wanted = requirement.epoch or (requirement.epochs or [epoch])[-1]
     last = float(np.max(results.diagnostics.sample.table.column("epoch")))
-    found = [
+    schedules = [
         Schedule(f"at {date:.2f}", worth(date), single_date=True)
         for date in dict.fromkeys([*epochs, wanted])
     ]
     if wanted > last:
         spread = [worth(float(date)) for date in np.linspace(last, wanted, LATER + 1)[1:]]
         name = f"evenly from {last:.2f} to {wanted:.2f}"
-        found.append(Schedule(name, np.sum(spread, axis=0) / len(spread)))
-    return found
+        schedules.append(Schedule(name, np.sum(spread, axis=0) / len(spread)))
+    return schedules
 
 
 def futures_of(results: Results, content: ExposureContent) -> Callable[[Requirement], Futures]:
-    """Runs with more exposures, for any requirement."""
+    """Function that predicts the run with more exposures, for any requirement."""
     settings, errors = results.settings, results.errors
     errors = with_measured_centroids(errors, results.diagnostics, settings)
     diagnostics = results.diagnostics
     hierarchy = results.fitted.linear if results.fitted.scatter is not None else None
-    # what the errors of the catalogue's stars do, further exposures of these do not make smaller
+    # further exposures of the same stars do not reduce the effect of catalogue errors
     independent = with_diagnosed_errors(
         results.posterior, replace(diagnostics, catalogue=None), hierarchy, noise_alone=True
     )
 
     def solution(information: Float) -> Solution:
-        more = with_information(independent, information)
+        extended = with_information(independent, information)
         if diagnostics.catalogue is None or hierarchy is None:
-            return more
-        return with_shared_stars(more, hierarchy, diagnostics.catalogue)
+            return extended
+        return with_shared_stars(extended, hierarchy, diagnostics.catalogue)
 
     solved = results.fitted.solved
     gain = 1.0 if solved is None else solved.mode.gain

@@ -38,12 +38,25 @@ def release_runs(
     allow_unconverged: bool = False,
     command: str = "",
 ) -> str:
-    """Write IDCTABs, D2IMFILE and NPOLFILEs of several filters into a new folder; what to print.
+    """Write IDCTABs, D2IMFILE and NPOLFILEs for several filters to a new folder.
 
-    The runs are finished ones of campaigns, one for each filter.  The first is that of the
-    reference filter: its [products.release] says what is written, its drift is stored, and its
-    tables are the detector's.  Runs that have not converged are refused unless allowed; the files
-    then say so.
+    Parameters
+    ----------
+    runs : sequence of path
+        Finished runs of campaigns, one per filter.  The first is that of the reference filter: its
+        section [products.release] defines the files, its drift is stored, and its tables are those
+        of the detector.
+    output : path
+        Folder to create.
+    allow_unconverged : bool
+        Accept runs that have not converged; the files then state this.
+    command : str
+        Command line, for the record.
+
+    Returns
+    -------
+    str
+        Text to print.
     """
     with ExitStack() as stack:
         by_filter: dict[str, Results] = {}
@@ -72,10 +85,15 @@ def release_runs(
             files = write_files(block, chip, first.base, folder, solutions, tables, notes)
             write_table(table, folder / "filters.ecsv")
             figures = draw_filters(
-                folder, {k: one.fitted for k, one in by_filter.items()}, solutions
+                folder,
+                {k: results_of_filter.fitted for k, results_of_filter in by_filter.items()},
+                solutions,
             )
             record |= {
-                "runs": {name: str(one.run.path) for name, one in by_filter.items()},
+                "runs": {
+                    name: str(results_of_filter.run.path)
+                    for name, results_of_filter in by_filter.items()
+                },
                 "converged": not doubts,
                 "drift": table.meta["drift"],
                 "products": files,
@@ -87,7 +105,7 @@ def release_runs(
 
 
 def _opened(path: str | Path) -> Results:
-    """The results of a finished run of a campaign."""
+    """Results of a finished run of a campaign."""
     run = RunDirectory.open(path)
     if run.config.campaign is None:
         raise InputError(
@@ -97,12 +115,12 @@ def _opened(path: str | Path) -> Results:
     return results_of(run)
 
 
-# -- whether the runs go together -----------------------------------------------------------------
+# -- compatibility of the runs ---------------------------------------------------------------------
 
 
 def _require_alike(by_filter: Mapping[str, Results]) -> ReleaseBlock:
-    """What is released, as the first run says; InputError for runs that do not go together."""
-    first, *others = by_filter.values()
+    """Section of the release in the first run; raises InputError if runs are incompatible."""
+    first, *other_runs = by_filter.values()
     block = first.config.products.release
     if block is None:
         raise InputError(
@@ -111,12 +129,12 @@ def _require_alike(by_filter: Mapping[str, Results]) -> ReleaseBlock:
             do="put the run of the reference filter first",
         )
     mine = _structure(first)
-    for results in others:
-        for what, theirs in _structure(results).items():
-            if theirs != mine[what]:
+    for results in other_runs:
+        for name, theirs in _structure(results).items():
+            if theirs != mine[name]:
                 raise InputError(
-                    f"the {what} are not those of {first.run.path}"
-                    + (f": {theirs} and {mine[what]}" if what != "chips" else ""),
+                    f"the {name} are not those of {first.run.path}"
+                    + (f": {theirs} and {mine[name]}" if name != "chips" else ""),
                     where=str(results.run.path),
                     do="run both filters with one structure",
                 )
@@ -130,7 +148,7 @@ def _require_alike(by_filter: Mapping[str, Results]) -> ReleaseBlock:
 
 
 def _structure(results: Results) -> dict[str, Any]:
-    """Properties that files of several filters must have in common, in words that take a plural."""
+    """Properties that the runs must have in common, by names in the plural."""
     model, time = results.posterior.model, results.posterior.model.time
     return {
         "chips": model.chips,
@@ -144,14 +162,14 @@ def _structure(results: Results) -> dict[str, Any]:
 
 
 def _same_detector(a: Fitted, b: Fitted) -> bool:
-    """Boolean: two runs corrected the pixels alike, as far as a D2IMFILE holds it."""
+    """True if two runs have equal detector tables, to the precision of a D2IMFILE."""
     mine, theirs = (
         {
             t.chip: (t.first, t.step, t.values.astype(np.float32))
-            for t in one.tables.tables
+            for t in fitted.tables.tables
             if not t.filter
         }
-        for one in (a, b)
+        for fitted in (a, b)
     )
     return mine.keys() == theirs.keys() and all(
         mine[c][:2] == theirs[c][:2] and np.array_equal(mine[c][2], theirs[c][2]) for c in mine
@@ -175,14 +193,14 @@ def _doubts(by_filter: Mapping[str, Results], *, allowed: bool) -> list[str]:
     return out
 
 
-# -- what is released -----------------------------------------------------------------------------
+# -- content of the release -----------------------------------------------------------------------
 
 
 def _solutions(by_filter: Mapping[str, Results]) -> dict[str, Solution]:
-    """The reference filter's solution, and the others with its drift."""
-    (first, reference), *others = by_filter.items()
+    """Solution of the reference filter, and those of other filters with its drift."""
+    (first, reference), *other_filters = by_filter.items()
     out: dict[str, Solution] = {first: reference.solution}
-    for name, results in others:
+    for name, results in other_filters:
         solution: Solution = results.solution
         if solution.model.time is not None:
             solution = with_drift_of(
@@ -196,32 +214,32 @@ def _solutions(by_filter: Mapping[str, Results]) -> dict[str, Solution]:
 
 
 def _tables(by_filter: Mapping[str, Results]) -> list[LookupTable]:
-    """The detector's tables, once, and those of the filters."""
+    """Tables of the detector, once, and those of the filters."""
     published = [
-        published_tables(one.fitted.tables, held=one.config.tables.detector is not None)
-        for one in by_filter.values()
+        published_tables(results.fitted.tables, held=results.config.tables.detector is not None)
+        for results in by_filter.values()
     ]
     out = [table for table in published[0] if not table.filter]
     return out + [table for tables in published for table in tables if table.filter]
 
 
 def _compared(by_filter: Mapping[str, Results]) -> tuple[FilterComparison | None, str]:
-    """The comparison of the filters, or why there is none."""
+    """Comparison of the filters, or the reason why there is none."""
     if len(by_filter) < 2:
         return None, "not compared: there is one filter"
     first = next(iter(by_filter.values()))
     try:
-        found = compare_filters(
+        comparison = compare_filters(
             {
-                name: required(one.fitted.alone, "fits of single exposures")
-                for name, one in by_filter.items()
+                name: required(results.fitted.alone, "fits of single exposures")
+                for name, results in by_filter.items()
             },
             first.posterior.model.time,
             seed=first.config.sampler.seed,
         )
-    except InputError as error:  # too few exposures, or nothing that drifts
+    except InputError as error:  # too few exposures, or no drift
         return None, f"not compared: {error.cause}"
-    return found, ""
+    return comparison, ""
 
 
 def _notes(by_filter: Mapping[str, Results], comparison: FilterComparison | None) -> list[str]:
@@ -231,12 +249,12 @@ def _notes(by_filter: Mapping[str, Results], comparison: FilterComparison | None
     first = next(iter(by_filter))
     out = [f"Filters {', '.join(by_filter)}; the drift is that of {first}."]
     if comparison is not None:
-        said = comparison.sentence
-        out.append(f"Tested on the exposures: {said}.")
+        verdict = comparison.sentence
+        out.append(f"Tested on the exposures: {verdict}.")
     return out
 
 
-# -- what is printed ------------------------------------------------------------------------------
+# -- printed text ---------------------------------------------------------------------------------
 
 
 def _text(

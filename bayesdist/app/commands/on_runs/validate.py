@@ -1,4 +1,4 @@
-"""`bayesdist requirements`: the margins of a run against requirements of their own file."""
+"""`bayesdist requirements`: margins of a run for requirements in a separate file."""
 
 from __future__ import annotations
 
@@ -15,15 +15,25 @@ from bayesdist.app.tables.result_files import save_margins
 from bayesdist.assess import Margin, Requirement
 from bayesdist.errors import InputError
 
-# by the verdict, in the order in which they count where several are given
+# by verdict, in order of precedence
 EXIT_CODES = {"missed": 4, "undecided": 6, "not shown": 5}
 
 
 def validate(run: str | Path, requirements: str | Path) -> tuple[str, int]:
     """Judge a run that has been sampled, and replace its margins and validity periods.
 
-    `requirements` is a TOML file of ``[[requirement]]`` blocks.  Returns the text to print and the
-    exit code, which is that of the first of `EXIT_CODES` whose verdict is given.
+    Parameters
+    ----------
+    run : path
+    requirements : path
+        TOML file of ``[[requirement]]`` blocks.
+
+    Returns
+    -------
+    str
+        Text to print.
+    int
+        Exit code; see `exit_code`.
     """
     asked = load_requirements(requirements)
     directory = RunDirectory.open(run)
@@ -39,7 +49,7 @@ def validate(run: str | Path, requirements: str | Path) -> tuple[str, int]:
         report = directory / "report.html"
         outdated = report.exists() and not directory.done("report")
     warnings = posterior.approximation, idle_dates(results.config, asked, str(requirements))
-    lines = [*_lines(margins), *(one.sentence for one in periods)]
+    lines = [*_lines(margins), *(period.sentence for period in periods)]
     lines += [f"WARNING: {text}" for text in warnings if text]
     if outdated:
         lines.append(f"{report} shows earlier margins; renew it by 'bayesdist stage report {run}'")
@@ -47,14 +57,14 @@ def validate(run: str | Path, requirements: str | Path) -> tuple[str, int]:
 
 
 def exit_code(margins: Sequence[Margin]) -> int:
-    """Exit code of verdicts: that of the first word of `EXIT_CODES` which is given; 0 if none."""
+    """Exit code of the first verdict in `EXIT_CODES` that any margin has; 0 if there is none."""
     verdicts = {m.verdict for m in margins}
     return next((code for word, code in EXIT_CODES.items() if word in verdicts), 0)
 
 
 @contextmanager
 def _named_after(path: str | Path, asked: Sequence[Requirement]) -> Iterator[None]:
-    """Put the name of their file before errors of its requirements."""
+    """Prefix errors of requirements with the name of their file."""
     try:
         yield
     except InputError as error:

@@ -1,4 +1,4 @@
-"""`bayesdist plan-dither`: which dither pattern makes a self-calibration well determined?"""
+"""`bayesdist plan-dither`: compare dither patterns for a self-calibration."""
 
 from __future__ import annotations
 
@@ -31,21 +31,32 @@ LEGEND = (
 
 
 def plan_patterns(path: str | Path, output: str | Path | None = None, command: str = "") -> str:
-    """Compare the dither patterns of a file by the covariance to be expected.
+    """Compare the dither patterns of a file by their expected covariance.
 
-    `path`: TOML with ``[[pattern]]`` blocks. `output`: new or empty folder for table, record and
-    figure.
+    Parameters
+    ----------
+    path : path
+        TOML file with ``[[pattern]]`` blocks.
+    output : path, optional
+        New or empty folder for table, record and figure.
+    command : str
+        Command line, for the record.
+
+    Returns
+    -------
+    str
+        Text to print.
     """
     config = load_plan(path)
     camera = config.camera()
-    found = compare_patterns(config.patterns(), camera, config.stars_planned(), config.known())
+    planned = compare_patterns(config.patterns(), camera, config.stars_planned(), config.known())
     if output is not None:
-        _write(Path(output), found, config, command)
-    return _text(found, config)
+        _write(Path(output), planned, config, command)
+    return _text(planned, config)
 
 
 def _row(one: PlannedPattern) -> dict[str, Any]:
-    """A pattern in one row of the table."""
+    """Row of the table for one pattern."""
     problem = one.solution.problem
     rolls = np.unique(np.round(np.degrees(one.pattern.rolls), 3))
     row: dict[str, Any] = {
@@ -68,14 +79,14 @@ def _text(found: Sequence[PlannedPattern], config: PlanConfig) -> str:
         f"Order {config.model.order}, {s.per_detector:g} stars per exposure of {s.sigma:g} pix "
         f"each, {100 * s.false:g} % of them false",
         "",
-        table_text([_row(one) for one in found], 3),
+        table_text([_row(planned) for planned in found], 3),
         "",
         LEGEND,
     ]
-    for one in found:
-        lines += ["", f"{one.pattern.name}:"]
-        said = (*lacking(one), *one.solution.gauge.sentences, nearly_free(one))
-        lines += [f"  {sentence}" for sentence in said if sentence]
+    for planned in found:
+        lines += ["", f"{planned.pattern.name}:"]
+        sentences = (*lacking(planned), *planned.solution.gauge.sentences, nearly_free(planned))
+        lines += [f"  {sentence}" for sentence in sentences if sentence]
     best, mas = found[0], config.detector.scale_mas
     rms, largest = best.rms("shape"), best.largest("shape")
     if np.isfinite(rms):
@@ -88,22 +99,22 @@ def _text(found: Sequence[PlannedPattern], config: PlanConfig) -> str:
 
 
 def _write(output: Path, found: Sequence[PlannedPattern], config: PlanConfig, command: str) -> None:
-    from bayesdist.report.drawing import save_figures  # figures take seconds to import
+    from bayesdist.report.drawing import save_figures  # plotting takes seconds to import
     from bayesdist.report.figures.commands import pattern_maps
 
     with record_folder(output, "plan.json", command) as (folder, record):
         write_table(_table(found), folder / "patterns.ecsv")
         save_figures({"patterns": pattern_maps(found)}, folder / "figures")
         record |= {"config": config.model_dump(), "unit": "pix"}
-        record["patterns"] = [_record(one) for one in found]
+        record["patterns"] = [_record(planned) for planned in found]
 
 
 def _table(found: Sequence[PlannedPattern]) -> Table:
     rows = [
-        {key.replace(" ", "_").replace("-", "_"): value for key, value in _row(one).items()}
-        | {f"degree_{k}": value for k, value in one.by_degree.items()}
-        | {"lacks": "; ".join(lacking(one))}
-        for one in found
+        {key.replace(" ", "_").replace("-", "_"): value for key, value in _row(planned).items()}
+        | {f"degree_{k}": value for k, value in planned.by_degree.items()}
+        | {"lacks": "; ".join(lacking(planned))}
+        for planned in found
     ]
     table = Table(rows)
     for name in table.colnames:
@@ -114,7 +125,7 @@ def _table(found: Sequence[PlannedPattern]) -> Table:
 
 
 def _record(one: PlannedPattern) -> dict[str, Any]:
-    """Record of a pattern for scripts; what is unbounded is null there."""
+    """Record of a pattern for scripts; unbounded values are null."""
     gauge, problem = one.solution.gauge, one.solution.problem
     return {
         "name": one.pattern.name,

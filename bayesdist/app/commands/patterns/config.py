@@ -1,4 +1,4 @@
-"""The file of a comparison of dither patterns: every key, its type and its default."""
+"""Configuration of a comparison of dither patterns: all keys with their types and defaults."""
 
 from __future__ import annotations
 
@@ -34,8 +34,9 @@ from bayesdist.simulate.patterns import (
 from bayesdist.utils.arrays import Float
 
 Pair = tuple[PositiveFloat, PositiveFloat]
-MOST_EXPOSURES = 10_000  # of one pattern
-Count = Annotated[int, Field(ge=1, le=MOST_EXPOSURES)]  # of exposures, or of one side of their grid
+MOST_EXPOSURES = 10_000  # largest number of exposures of a pattern
+# number of exposures, or of grid points per axis
+Count = Annotated[int, Field(ge=1, le=MOST_EXPOSURES)]
 Pointing = tuple[float, float] | tuple[float, float, float]
 
 
@@ -46,20 +47,20 @@ class PlannedChip(ChipBlock):
 
 
 class PlannedSelfcal(Section):
-    """Settings of a self-calibration that matter before there are detections."""
+    """Settings of a self-calibration that matter without detections."""
 
     frames: Frames = "shift_rotation"
     min_detections: MinDetections = 2
 
 
 class PlannedScale(Section):
-    """Error with which the size of a pixel will be known."""
+    """Expected error of the pixel scale."""
 
     sigma: PositiveFloat
 
 
 class PlannedGauge(Section):
-    """Constraints that there will be beside the detections, each by its error."""
+    """Expected errors of the constraints in addition to the detections."""
 
     offset_sigma: PositiveFloat | None = None
     roll_sigma_deg: PositiveFloat | None = None
@@ -68,7 +69,7 @@ class PlannedGauge(Section):
 
 
 class StarsBlock(Section):
-    """The field of stars."""
+    """Star field."""
 
     per_detector: PositiveFloat
     sigma: PositiveFloat
@@ -91,7 +92,7 @@ class ScalesBlock(Section):
 
 
 class PatternBlock(Section):
-    """One pattern."""
+    """Dither pattern."""
 
     name: str
     offsets: list[Pointing] | None = None
@@ -102,33 +103,33 @@ class PatternBlock(Section):
     exposures: Count | None = None
 
     def faults(self) -> Iterator[str]:
-        """Anything but one kind of offsets, and what does not go with them."""
-        where = f"pattern {self.name!r}"
-        if sum(one is not None for one in (self.offsets, self.grid, self.scales)) != 1:
-            yield f"{where} has offsets, a grid, or scales; give one of the three"
+        """Faults of offsets that are missing or given in several ways."""
+        name = f"pattern {self.name!r}"
+        if sum(entry is not None for entry in (self.offsets, self.grid, self.scales)) != 1:
+            yield f"{name} has offsets, a grid, or scales; give one of the three"
         on_grid = 0 if self.grid is None else self.grid.n[0] * self.grid.n[1]
         if on_grid > MOST_EXPOSURES:
             yield (
-                f"{where} has {on_grid} exposures, and {MOST_EXPOSURES} are the most; "
+                f"{name} has {on_grid} exposures, and {MOST_EXPOSURES} are the most; "
                 "give a smaller grid"
             )
         if self.offsets == [] or self.rolls == []:
             key = "offsets" if self.offsets == [] else "rolls"
-            yield f"{where} has an empty list of {key}; fill it or leave it out"
-        if self.rolls is not None and any(len(one) == 3 for one in self.offsets or []):
-            yield f"{where} has rolls in its offsets and a list of rolls; give one of the two"
+            yield f"{name} has an empty list of {key}; fill it or leave it out"
+        if self.rolls is not None and any(len(entry) == 3 for entry in self.offsets or []):
+            yield f"{name} has rolls in its offsets and a list of rolls; give one of the two"
         if self.scales is not None:
             if self.exposures is None:
-                yield f"{where} has scales without a number of exposures; give it"
+                yield f"{name} has scales without a number of exposures; give it"
             if self.unit != "pix":
                 yield (
-                    f"{where} has a unit, and scales go from least, in pixels, to largest, a part "
+                    f"{name} has a unit, and scales go from least, in pixels, to largest, a part "
                     "of the detector; leave the unit out"
                 )
 
 
 class PlanConfig(Section):
-    """The whole file."""
+    """Complete file."""
 
     detector: Detector = Detector()
     chip: list[PlannedChip] = Field(default_factory=list)
@@ -139,10 +140,10 @@ class PlanConfig(Section):
     pattern: list[PatternBlock] = Field(default_factory=list)
 
     def faults(self) -> Iterator[str]:
-        """Chips, frames and patterns that do not go together."""
+        """Faults of chips, frames and patterns."""
         yield from detector_faults(self.chip, self.detector, self.model.reference_pixel)
-        given = sum(c.place is not None for c in self.chip)
-        if 0 < given < len(self.chip):
+        n_places = sum(c.place is not None for c in self.chip)
+        if 0 < n_places < len(self.chip):
             yield "some [[chip]] blocks have the key place and some do not; give all or none"
         yield from scale_faults(self.gauge.exposure_scale_sigma, self.selfcal.frames)
         if not self.pattern:
@@ -161,26 +162,26 @@ class PlanConfig(Section):
                 )
 
     def chips(self) -> tuple[Chip, ...]:
-        """Chips of the model, also for a detector of one."""
+        """Chips of the model, also for a detector with one chip."""
         if self.chip:
             return chips_of(self.chip)
         return (one_chip(self.detector, self.model.reference_pixel, 1, "detector"),)
 
     def camera(self) -> Camera:
-        """The detector that is planned for."""
+        """Detector that the patterns are planned for."""
         chips = self.chips()
         places = [c.place for c in reference_first(self.chip)]
-        given = [p for p in places if p is not None]
-        flat = flat_coefficients(self.model.order, chips, given or None)
+        known_places = [p for p in places if p is not None]
+        flat = flat_coefficients(self.model.order, chips, known_places or None)
         return Camera(chips, flat, self.selfcal.frames)
 
     def stars_planned(self) -> PlannedStars:
-        """The field of stars."""
-        s, least = self.stars, self.selfcal.min_detections
-        return PlannedStars(s.per_detector, s.sigma, s.false, least, s.seed)
+        """Star field."""
+        s, min_detections = self.stars, self.selfcal.min_detections
+        return PlannedStars(s.per_detector, s.sigma, s.false, min_detections, s.seed)
 
     def known(self) -> PriorInformation:
-        """Constraints that there will be beside the detections."""
+        """Expected constraints in addition to the detections."""
         g = self.gauge
         return PriorInformation(
             g.offset_sigma,
@@ -190,18 +191,18 @@ class PlanConfig(Section):
         )
 
     def patterns(self) -> tuple[DitherPattern, ...]:
-        """The patterns, each against its first exposure."""
+        """Patterns, with offsets and rolls relative to the first exposure."""
         side = self.camera().side
         return tuple(_pattern(block, side, self.stars.seed) for block in self.pattern)
 
 
 def _pattern(block: PatternBlock, side: float, seed: int) -> DitherPattern:
     unit = side if block.unit == "detector" else 1.0
-    own = block.rolls or [0.0]
+    rolls = block.rolls or [0.0]
     if block.offsets is not None:
-        round_ = unit * np.array([one[:2] for one in block.offsets])
-        if any(len(one) == 3 for one in block.offsets):
-            listed = np.array([one[2] if len(one) == 3 else 0.0 for one in block.offsets])
+        round_ = unit * np.array([offset[:2] for offset in block.offsets])
+        if any(len(offset) == 3 for offset in block.offsets):
+            listed = np.array([offset[2] if len(offset) == 3 else 0.0 for offset in block.offsets])
             n = block.exposures or len(round_)
             return _against_first(block.name, round_, listed[np.arange(n) % len(listed)])
     elif block.grid is not None:
@@ -209,7 +210,7 @@ def _pattern(block: PatternBlock, side: float, seed: int) -> DitherPattern:
         pair = step if isinstance(step, tuple) else (step, step)
         round_ = unit * grid_offsets(block.grid.n, pair)
     elif block.scales is not None and block.exposures is not None:
-        # the same offsets for patterns that differ in their rolls alone
+        # equal seeds give equal offsets to patterns that differ only in their rolls
         rng = np.random.default_rng([seed, 2])
         low, high = block.scales.least, block.scales.largest
         round_, _ = dither_pattern(
@@ -217,8 +218,8 @@ def _pattern(block: PatternBlock, side: float, seed: int) -> DitherPattern:
         )
     else:
         raise ValueError(f"pattern {block.name!r} has no offsets, grid or scales; give one")
-    n = block.exposures or len(round_) * len(own)
-    return _against_first(block.name, round_, rolls_in_turn(n, len(round_), own))
+    n = block.exposures or len(round_) * len(rolls)
+    return _against_first(block.name, round_, rolls_in_turn(n, len(round_), rolls))
 
 
 def _against_first(name: str, round_: Float, rolls_deg: Float) -> DitherPattern:

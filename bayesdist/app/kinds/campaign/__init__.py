@@ -1,1 +1,1 @@
-"""A campaign: from the star lists of many exposures to released files, as stages of a run."""
+"""A campaign: calibration of many exposures from their star lists and a reference catalogue."""

@@ -1,4 +1,4 @@
-"""The fit of a campaign: tables, errors, all exposures jointly, and every one alone."""
+"""Fit of a campaign: look-up tables, errors, all exposures jointly, and each exposure alone."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ SERIES = ("A_2", "A_3", "B_1", "B_2", "B_3")
 
 
 def fit_campaign(matched: CampaignMatched) -> Fitted:
-    """Tables, errors, all exposures jointly, and every one alone."""
+    """Fit the look-up tables, the errors, all exposures jointly, and each exposure alone."""
     with frames_not_set():
         return _fitted(matched)
 
@@ -79,7 +79,7 @@ def _fitted(matched: CampaignMatched) -> Fitted:
 def _joint(
     stars: Matches, affine: DistortionModel, inputs: Inputs, rejection: Rejection
 ) -> HierarchicalFit:
-    """All exposures jointly, deviating from the model as they are found to scatter."""
+    """Fit all exposures jointly; they deviate from the model by the scatter that is found."""
     config = inputs.config
     asked, scale = config.time(), config.detector.scale_mas
     pixel = 1.0 if scale is None else inputs.pixel_arcsec / inputs.unit_arcsec
@@ -98,7 +98,7 @@ def _joint(
 
 
 def _series(alone: ExposureSolutions, reference: Chip) -> Series:
-    """Linear terms of all chips, and the constant in v, without those that the gauge fixes."""
+    """Linear terms of all chips and the constant in v, without terms that the gauge fixes."""
     fixed = {f"{prefix}{term}" for prefix in ("", f"{reference.name}.") for term in FIXED}
     labels = [s for s in alone.labels if s.split(".")[-1] in SERIES and s not in fixed]
     epoch, values, cov = alone.series(*labels)
@@ -106,9 +106,9 @@ def _series(alone: ExposureSolutions, reference: Chip) -> Series:
 
 
 def _trends(joint: HierarchicalFit, stars: Matches) -> list[str]:
-    """Deviations that go with time although they are taken to scatter, each as a clause.
+    """Clauses about deviations that drift with time although they are modelled as scatter.
 
-    Only scale and shears: how the chips move against each other has a test of its own
+    Only scale and shears are tested: motion of the chips relative to each other has its own test
     (`bayesdist.diagnose.score.gap`).
     """
     if stars.epoch is None:
@@ -122,8 +122,8 @@ def _trends(joint: HierarchicalFit, stars: Matches) -> list[str]:
     breaks = () if model.time is None else model.time.breaks
     p = trend_p_values(values, epoch, breaks)
     return [
-        f"the {kind} of the exposures drifts with time (p = {one:.1g}), and is taken to scatter "
+        f"the {kind} of the exposures drifts with time (p = {p_k:.1g}), and is taken to scatter "
         "between exposures: extend model.tdd.terms"
-        for kind, one in zip(joint.scatter.kinds, p, strict=True)
-        if kind.split(".")[-1] not in RIGID and one * len(p) < TREND.value
+        for kind, p_k in zip(joint.scatter.kinds, p, strict=True)
+        if kind.split(".")[-1] not in RIGID and p_k * len(p) < TREND.value
     ]

@@ -1,4 +1,4 @@
-"""Validation of what a campaign begins with: refusals, and warnings of what it cannot tell."""
+"""Validation of the inputs of a campaign: refusals, and warnings about unknown quantities."""
 
 from __future__ import annotations
 
@@ -19,16 +19,16 @@ from bayesdist.model import TimeDependence
 from bayesdist.products import read_idctab
 from bayesdist.utils.arrays import Float, Int
 
-MIN_EXPOSURES = 3  # exposures: two of them differ, but do not scatter
-ONE_DAY = 1.0 / 365.25  # years: epochs within say nothing of a rate
-LINEAR_KINDS = 3  # drifting terms from which on scale and both shears drift
-ONE_ROLL = 2.0  # degrees: roll angles that scatter by less are one
-MAX_NAMED = 5  # exposures in a sentence
-YEARS_AT_REST = 1.0  # years over which stars may stand still
+MIN_EXPOSURES = 3  # exposures: two do not determine a scatter
+ONE_DAY = 1.0 / 365.25  # in years: shorter spans do not determine a rate
+LINEAR_KINDS = 3  # number of drifting terms from which scale and both shears drift
+ONE_ROLL = 2.0  # degrees: roll angles that scatter by less count as one
+MAX_NAMED = 5  # exposures named in a sentence
+YEARS_AT_REST = 1.0  # years over which proper motions may be neglected
 
 
 def refuse_campaign(inputs: Inputs) -> None:
-    """Refuse inputs that do not go together, and files of others that cannot be used."""
+    """Refuse inconsistent inputs, and files of other runs or products that cannot be used."""
     config, base = inputs.config, inputs.base
     refuse_unsound(inputs)
     read_idctab(base / config.campaign.initial_distortion)
@@ -38,7 +38,7 @@ def refuse_campaign(inputs: Inputs) -> None:
 
 
 def refuse_unsound(inputs: Inputs) -> None:
-    """Refuse exposures, lists and catalogue that a run could not use; nothing is matched."""
+    """Refuse exposures, lists or a catalogue that cannot be used; stars are not matched."""
     config, lists = inputs.config, inputs.star_lists
     refuse_other_chips(lists.lists, config.chips(), "campaign.lists")
     check_campaign(lists.lists, inputs.log, inputs.catalog)
@@ -48,7 +48,8 @@ def refuse_unsound(inputs: Inputs) -> None:
             where=inputs.catalog.source,
             do="give the columns sigma_u and sigma_v",
         )
-    if not any(good.any() for good in lists.passed):  # of one exposure: left out when it matches
+    # a single exposure without usable detections is left out in matching
+    if not any(good.any() for good in lists.passed):
         raise InputError(
             f"the cuts leave none of {len(lists)} detections in {len(lists.lists)} exposures "
             f"({lists.cut_words})",
@@ -63,12 +64,12 @@ def refuse_unsound(inputs: Inputs) -> None:
 
 
 def input_warnings(inputs: Inputs) -> list[str]:
-    """Warnings of what a campaign cannot tell, or takes on trust, each as a clause."""
+    """Clauses that warn about quantities that a campaign cannot determine or has to assume."""
     config, log, catalog = inputs.config, inputs.log, inputs.catalog
     out = []
     if inputs.unlogged:
         out.append(_unlogged(inputs.unlogged, log.source))
-    for key in ("exptime", "ra", "dec"):  # PA_V3 is examined with the matches
+    for key in ("exptime", "ra", "dec"):  # PA_V3 is checked together with the matches
         unknown = int(np.isnan(log.values(key)).sum())
         if 0 < unknown < len(log):
             out.append(f"{key} is missing of {unknown} of {len(log)} exposures in {log.source}")
@@ -85,12 +86,13 @@ def input_warnings(inputs: Inputs) -> list[str]:
             "good at all epochs"
         )
     asked = {"assess.epoch": config.assess.epoch} | {
-        f"requirement {one.name!r}": one.epoch for one in config.requirements()
+        f"requirement {requirement.name!r}": requirement.epoch
+        for requirement in config.requirements()
     }
-    for where, epoch in asked.items():
+    for name, epoch in asked.items():
         if epoch is not None and not epochs.min() - span <= epoch <= epochs.max() + span:
             out.append(
-                f"{where} asks for {epoch:g}, and the exposures are from {epochs.min():.2f} to "
+                f"{name} asks for {epoch:g}, and the exposures are from {epochs.min():.2f} to "
                 f"{epochs.max():.2f}: the drift is extrapolated by more than they span"
             )
     if config.campaign.vafactor_source == "earth":
@@ -102,30 +104,33 @@ def input_warnings(inputs: Inputs) -> list[str]:
 
 
 def _unlogged(names: tuple[str, ...], log: str) -> str:
-    more = f" and {len(names) - MAX_NAMED} more" if len(names) > MAX_NAMED else ""
+    remainder = f" and {len(names) - MAX_NAMED} more" if len(names) > MAX_NAMED else ""
     several = len(names) > 1
     return (
         f"{len(names)} star list{'s are of exposures' if several else ' is of an exposure'} that "
         f"{log} does not have, and {'are' if several else 'is'} not used: "
-        f"{', '.join(names[:MAX_NAMED])}{more}"
+        f"{', '.join(names[:MAX_NAMED])}{remainder}"
     )
 
 
 def one_roll_angle(angles: Float) -> bool:
-    """Boolean: roll angles (E,), in radians, see a shear of the catalogue alike.
+    """True if all roll angles (E,), in radians, respond alike to a shear of the catalogue.
 
-    An exposure at roll angle a sees a shear of the catalogue as one of its detector turned by 2a:
-    at one angle, or at angles half a turn apart, nothing tells the two apart.
+    An exposure at roll angle a sees a shear of the catalogue as a shear of its detector rotated by
+    2a. At a single angle, or at angles 180 degrees apart, the two shears are degenerate.
     """
     spread = 1.0 - abs(np.exp(2j * angles).mean())  # 2 s^2 for angles that scatter by a small s
     return bool(spread < 2.0 * np.radians(ONE_ROLL) ** 2)
 
 
 def shear_warnings(rolls: Float, of: str) -> list[str]:
-    """Warnings of exposures at roll angles, in degrees, that leave a catalogue's shear open."""
-    known = np.asarray(rolls, float)
-    known = known[np.isfinite(known)]
-    if not len(known) or not one_roll_angle(np.radians(known)):
+    """Warnings if the roll angles leave a shear of the catalogue undetermined.
+
+    `rolls` are in degrees, NaN if unknown. `of` says where they are from.
+    """
+    angles = np.asarray(rolls, float)
+    angles = angles[np.isfinite(angles)]
+    if not len(angles) or not one_roll_angle(np.radians(angles)):
         return []
     return [
         f"all exposures have one roll angle, or angles half a turn apart ({of}): a shear of the "
@@ -135,7 +140,7 @@ def shear_warnings(rolls: Float, of: str) -> list[str]:
 
 @contextmanager
 def frames_not_set() -> Iterator[None]:
-    """Refusals of a fit without the advice to set model.frames, which a campaign has by itself."""
+    """Drop the advice to set model.frames from errors; campaigns set the frames themselves."""
     try:
         yield
     except DegenerateError as error:
@@ -144,18 +149,18 @@ def frames_not_set() -> Iterator[None]:
 
 
 def segment_counts(epochs: Float, time: TimeDependence) -> list[int]:
-    """Exposures in each segment of the drift."""
+    """Number of exposures in each segment of the drift."""
     counts = np.bincount(_segment(epochs, time), minlength=time.n_segments)
     return [int(n) for n in counts]
 
 
 def _segment(epochs: Float, time: TimeDependence) -> Int:
-    """Number of the segment of the drift, from 0, of each epoch (E,)."""
+    """Number of the drift segment, from 0, of each epoch (E,)."""
     return np.searchsorted(time.breaks, epochs, side="right")
 
 
 def segment_text(time: TimeDependence, number: int) -> str:
-    """A segment of the drift, by its number from 0, and its dates."""
+    """A segment of the drift, given by its number from 0, with its dates, as text."""
     edges = [None, *time.breaks, None]
     first, last = edges[number], edges[number + 1]
     dates = [
@@ -166,12 +171,12 @@ def segment_text(time: TimeDependence, number: int) -> str:
 
 
 def refuse_few(epochs: Float, time: TimeDependence | None) -> None:
-    """Refuse exposures at these epochs (E,) that cannot carry the scatter or the drift."""
+    """Refuse exposures at epochs (E,) that cannot determine the scatter or the drift."""
     n = len(epochs)
     if n < MIN_EXPOSURES:
-        few = "one exposure tells" if n == 1 else f"{n} exposures tell"
+        subject = "one exposure tells" if n == 1 else f"{n} exposures tell"
         raise DegenerateError(
-            f"{few} neither how exposures scatter nor how they drift",
+            f"{subject} neither how exposures scatter nor how they drift",
             where="campaign.exposures",
             do=f"give at least {MIN_EXPOSURES}, or calibrate matched stars ([data] in place of "
             "[campaign], model.frames = 'shift_rotation')",
@@ -185,8 +190,8 @@ def refuse_few(epochs: Float, time: TimeDependence | None) -> None:
         if not len(inside):
             fault = f"holds no exposure: they are from {epochs.min():.2f} to {epochs.max():.2f}"
         elif np.ptp(inside) < ONE_DAY:
-            which = "exposure" if len(inside) == 1 else "epoch"
-            fault = f"holds one {which} only, at {inside[0]:.2f}: its rate is not determined"
+            noun = "exposure" if len(inside) == 1 else "epoch"
+            fault = f"holds one {noun} only, at {inside[0]:.2f}: its rate is not determined"
         if fault:
             raise DegenerateError(
                 f"{segment_text(time, k)} {fault}",
@@ -207,12 +212,12 @@ def refuse_few(epochs: Float, time: TimeDependence | None) -> None:
 def _refuse_periods(release: ReleaseBlock | None, time: TimeDependence | None) -> None:
     edges = [-np.inf, *(() if time is None else time.breaks), np.inf]
     for k, period in enumerate(() if release is None else release.period):
-        where = f"products.release.period[{k + 1}]"
+        key = f"products.release.period[{k + 1}]"
         if period.segment > len(edges) - 2:
             raise ConfigError(
                 f"segment {period.segment} is asked for, and the drift has segments 0 to "
                 f"{len(edges) - 2}",
-                where=where,
+                where=key,
                 do="correct it, or give model.tdd.breaks",
             )
         first, last = edges[period.segment], edges[period.segment + 1]
@@ -220,6 +225,6 @@ def _refuse_periods(release: ReleaseBlock | None, time: TimeDependence | None) -
             raise ConfigError(
                 f"{period.years[0]:g} to {period.years[1]:g} lies outside "
                 f"{segment_text(time, period.segment)}",
-                where=where,
+                where=key,
                 do=f"correct the years, or segment = {period.segment} (counted from 0)",
             )

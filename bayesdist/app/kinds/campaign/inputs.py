@@ -1,4 +1,4 @@
-"""The files that a campaign begins with; plane, parity and errors of its catalogue."""
+"""Input files of a campaign; tangent plane, parity and errors of its catalogue."""
 
 from __future__ import annotations
 
@@ -34,39 +34,39 @@ class Inputs:
     """Catalogue, exposures and star lists of a campaign."""
 
     config: CampaignConfig
-    base: Path  # folder that its files are relative to
-    whole_catalog: ReferenceCatalog  # all stars that the file holds
-    # without stars whose proper motions are badly measured, where these were asked to go
+    base: Path  # folder that file names are relative to
+    whole_catalog: ReferenceCatalog  # all stars in the file
+    # without stars that have unreliable proper motions, if these are to be excluded
     catalog: ReferenceCatalog
-    log: ExposureLog  # of the exposures of the filter, with VAFACTOR
-    star_lists: StarLists  # of these exposures
-    # exposures that have a list and no entry in the log file, of whatever filter: not used
+    log: ExposureLog  # exposures of the calibrated filter, with VAFACTOR
+    star_lists: StarLists  # star lists of the exposures in `log`
+    # exposures with a list but without an entry in the log, in any filter; not used
     unlogged: tuple[str, ...] = ()
-    plane: str = ""  # what the catalogue's u and v are, where they come from the sky
+    plane: str = ""  # description of the tangent plane; empty if the catalogue has u and v
 
     @property
     def largest_vafactor(self) -> float:
-        """By which the catalogue's errors are divided: all factors are nearly the same."""
+        """Largest VAFACTOR, by which catalogue errors are divided; all factors are nearly equal."""
         return float(self.log.values("vafactor").max())
 
     @property
     def pixel_arcsec(self) -> float:
-        """Size of a pixel; that of ACS/WFC where the configuration gives none."""
+        """Pixel size in arcsec; that of ACS/WFC if the configuration gives none."""
         return (self.config.detector.scale_mas or 50.0) / 1000
 
     @property
     def unit_arcsec(self) -> float:
-        """Size of a unit of u and v."""
+        """Size of the unit of u and v in arcsec."""
         return ARCSEC.get(self.catalog.unit, self.pixel_arcsec)
 
     @property
     def filter(self) -> str:
-        """The one filter of the exposures."""
+        """Filter of the exposures."""
         return self.log.filters[0]
 
 
 def outline_of_campaign(inputs: Inputs) -> Outline:
-    """Shape of the solution, with the look-up tables that are fitted and those that are held."""
+    """Shape of the solution, including fitted look-up tables and those held fixed."""
     config = inputs.config
     chips, block = config.chips(), config.tables
     tables = held_tables(block, chips, inputs.base)
@@ -82,13 +82,13 @@ def outline_of_campaign(inputs: Inputs) -> Outline:
 
 
 def read_campaign(config: CampaignConfig, base: Path) -> Inputs:
-    """Read catalogue, exposures and star lists."""
+    """Read the catalogue, the exposure log and the star lists."""
     block = config.campaign
     whole_log = read_exposures(base / block.exposures)
-    whole, plane = read_campaign_catalog(block, base, whole_log)
+    full_catalog, plane = read_campaign_catalog(block, base, whole_log)
     log = _exposures_of(block, whole_log)
-    found = lists_of(block, base)
-    lists = found.of(log.names)
+    all_lists = lists_of(block, base)
+    lists = all_lists.of(log.names)
     missing = sorted(set(log.names) - set(lists.names))
     if missing:
         raise InputError(
@@ -97,13 +97,13 @@ def read_campaign(config: CampaignConfig, base: Path) -> Inputs:
             where=log.source,
             do="add the list, or take the exposure out of the log",
         )
-    unlogged = dict.fromkeys(name for name in found.names if name not in whole_log)
-    reliable = block.pm_selection == "reliable" and whole.sigma_pm_u is not None
+    unlogged = dict.fromkeys(name for name in all_lists.names if name not in whole_log)
+    reliable = block.pm_selection == "reliable" and full_catalog.sigma_pm_u is not None
     return Inputs(
         config,
         base,
-        whole,
-        select_motions(whole) if reliable else whole,
+        full_catalog,
+        select_motions(full_catalog) if reliable else full_catalog,
         log,
         lists,
         tuple(unlogged),
@@ -112,7 +112,7 @@ def read_campaign(config: CampaignConfig, base: Path) -> Inputs:
 
 
 def _exposures_of(block: CampaignBlock, log: ExposureLog) -> ExposureLog:
-    """Exposures of the filter that is calibrated, with VAFACTOR."""
+    """Exposures of the filter to be calibrated, with VAFACTOR."""
     if block.filter is not None and block.filter not in log.filters:
         raise InputError(
             f"there is no exposure in filter {block.filter!r}",
@@ -128,7 +128,7 @@ def _exposures_of(block: CampaignBlock, log: ExposureLog) -> ExposureLog:
     if block.filter is not None:
         log = log.select(filter=block.filter)
     if block.vafactor_source == "earth":
-        bare = tuple(replace(one, vafactor=None) for one in log)
+        bare = tuple(replace(exposure, vafactor=None) for exposure in log)
         log = ExposureLog(bare, log.source).with_aberration()
     log.require("vafactor")
     return log
@@ -137,10 +137,17 @@ def _exposures_of(block: CampaignBlock, log: ExposureLog) -> ExposureLog:
 def read_campaign_catalog(
     block: CampaignBlock, base: Path, log: ExposureLog
 ) -> tuple[ReferenceCatalog, str]:
-    """The catalogue, and what its plane is where it has right ascension and declination.
+    """Read the catalogue, and describe its tangent plane if it has right ascension and declination.
 
-    The plane touches the sky in the middle of the exposures of all filters, where the log says
-    where they point and that lies among the stars; else in the middle of these.
+    The plane touches the sky at the mean pointing of the exposures of all filters if the log has
+    all pointings and their mean is within the field of the stars; otherwise at the centre of the
+    stars.
+
+    Returns
+    -------
+    catalog : ReferenceCatalog
+    plane : str
+        Description of the tangent plane; empty if the catalogue has u and v.
     """
     path = base / block.catalog
     table = read_table(path)
@@ -179,7 +186,7 @@ def read_campaign_catalog(
 
 
 def _middle_of(log: ExposureLog, catalog: ReferenceCatalog) -> tuple[float, float] | None:
-    """Mean direction of the exposures; None where the log lacks it, or it is not in the field."""
+    """Mean pointing of the exposures; None if unknown or outside the field of the stars."""
     ra, dec = log.values("ra"), log.values("dec")
     if not np.isfinite([ra, dec]).all() or catalog.tangent_point is None:
         return None
@@ -194,10 +201,10 @@ def _middle_of(log: ExposureLog, catalog: ReferenceCatalog) -> tuple[float, floa
 
 
 def parities_of(block: CampaignBlock, catalog: ReferenceCatalog, tab: IdcTab) -> tuple[bool, ...]:
-    """Parities of the catalogue to try, the more probable first: True is mirrored.
+    """Parities of the catalogue to try, the more probable one first; True is mirrored.
 
-    V2 and V3 lie on the sky as east and north do but for a rotation, and the table says how its
-    axes lie along V2 and V3.
+    V2 and V3 have the same parity on the sky as east and north, and the IDCTAB states how its axes
+    are oriented with respect to V2 and V3.
     """
     if block.parity != "auto":
         return (block.parity == "mirrored",)
@@ -208,10 +215,10 @@ def parities_of(block: CampaignBlock, catalog: ReferenceCatalog, tab: IdcTab) ->
 
 
 def errors_by_star(catalog: ReferenceCatalog, largest_vafactor: float = 1.0) -> StarErrors | None:
-    """Errors of the catalogue by code of the star; None where it has none.
+    """Errors of the catalogue by star code; None if there are none.
 
-    `largest_vafactor`: by which catalogue positions were divided; a star in many exposures has one
-    error, and the factors differ by less than a ten-thousandth.
+    `largest_vafactor` is the factor that catalogue positions were divided by.  A star in several
+    exposures has one error, because the factors differ by less than 1e-4.
     """
     position = columns_by_code(catalog, "sigma_u", "sigma_v")
     if position is None or not position.any():

@@ -1,8 +1,8 @@
-"""Linear terms of a campaign, and the step between its chips, as in ACS ISR 2015-06.
+"""Linear terms of a campaign, and the shift between its chips, as in ACS ISR 2015-06.
 
-ACS ISR 2015-06, Section 4.4.1, adopts a mean B_1 of WFC1 before SM4 and another one after it.  The
-drift of a model has a rate, and a step at each break, for every term and chip; what is not meant is
-held at zero by a prior that is narrow against all that can be measured.
+ACS ISR 2015-06, Section 4.4.1, adopts one mean B_1 of WFC1 before SM4 and another after it.  A
+drift in the model has a rate, and a step at each break, for every term and chip.  Those that are
+not wanted are held at zero by a prior much narrower than any measurement error.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ SIGMA_HELD = 1e-6  # pixels, and pixels per year
 
 
 def with_gap(model: DistortionModel) -> DistortionModel:
-    """The model with steps of the constant terms, where it has several chips and breaks."""
+    """Model with steps of the constant terms, if it has several chips and breaks."""
     time = model.time
     if time is None or not time.breaks or len(model.chips) == 1:
         return model
@@ -31,10 +31,17 @@ def with_gap(model: DistortionModel) -> DistortionModel:
 def gap_priors(
     model: DistortionModel, asked: TimeDependence | None, pixel: float
 ) -> GaussianPriors:
-    """Priors that leave of the constant terms' drift the steps of all chips but the first.
+    """Priors that restrict the drift of constant terms to steps of all chips except the first.
 
-    The reference chip comes first: its constant terms are where the exposures point. Constant terms
-    that are `asked` for have rates as well. `pixel`: its size in the unit of u, v.
+    The first chip is the reference chip: its constant terms are the pointing of the exposures.
+
+    Parameters
+    ----------
+    model : DistortionModel
+    asked : TimeDependence or None
+        Configured drift.  Constant terms among its terms keep their rates.
+    pixel : float
+        Pixel size in the unit of u, v.
     """
     reference, named = model.chips[0].number, () if asked is None else asked.terms
     held = {
@@ -47,7 +54,7 @@ def gap_priors(
     return GaussianPriors.of(model, held)
 
 
-FIXED = ("A_1", "B_1", "A_3")  # by the gauge, on the reference chip
+FIXED = ("A_1", "B_1", "A_3")  # fixed by the gauge, on the reference chip
 
 
 def line_sections(solution: Solution, chip: int) -> dict[str, object]:
@@ -58,16 +65,16 @@ def line_sections(solution: Solution, chip: int) -> dict[str, object]:
 
 
 def _lines(view: TransformedSolution) -> list[dict[str, object]]:
-    """alpha and beta of the joint fit in the reference gauge, as Tables 1 to 3 of the report."""
+    """alpha and beta of the joint fit in the reference gauge, as in Tables 1 to 3 of the ISR."""
     time, out = view.model.time, []
     for s, epoch0 in enumerate(() if time is None else time.epoch0):
         for chip in view.model.chips:
-            found = lines(view, s, chip=chip.number)
-            for term in dict.fromkeys(label.split(".")[0] for label in found.labels):
+            drift = lines(view, s, chip=chip.number)
+            for term in dict.fromkeys(label.split(".")[0] for label in drift.labels):
                 row: dict[str, object] = {"segment": s, "chip": chip.number, "epoch0": epoch0}
                 row["term"] = term
                 for part in ("alpha", "beta"):
-                    one = found.select(f"{term}.{part}")
-                    row |= {part: float(one.values[0]), f"sigma_{part}": float(one.sigma[0])}
+                    line = drift.select(f"{term}.{part}")
+                    row |= {part: float(line.values[0]), f"sigma_{part}": float(line.sigma[0])}
                 out.append(row)
     return out

@@ -1,4 +1,4 @@
-"""The matched stars of a campaign: with the lists, catalogue and log that they are from."""
+"""Matched stars of a campaign, with the lists, catalogue and log that they come from."""
 
 from __future__ import annotations
 
@@ -26,12 +26,12 @@ from bayesdist.infer.catalogue.star_errors import StarErrors
 from bayesdist.infer.solution.solution import Solution
 from bayesdist.model import DistortionModel, LookupTable
 
-GAUGE_EXPOSURES = 1  # the first ones, which cannot be held out: they define the gauge
+GAUGE_EXPOSURES = 1  # leading exposures that define the gauge and cannot be held out
 
 
 @dataclass(frozen=True, eq=False)
 class CampaignMatched(Matched):
-    """Raw pixels beside aberration-neutral catalogue positions, with the catalogue's errors."""
+    """Raw pixels matched with aberration-corrected catalogue positions and their errors."""
 
     section: ClassVar[str] = "matching"
     along_detector: ClassVar[bool] = True
@@ -41,7 +41,7 @@ class CampaignMatched(Matched):
 
     @cached_property
     def affine_model(self) -> DistortionModel:
-        """The configured polynomial with a free linear part of each exposure."""
+        """Configured polynomial with a free linear part for each exposure."""
         return affine_model_of(self.inputs.config, self.stars)
 
     def of_order(self, order: int) -> Self:
@@ -51,20 +51,20 @@ class CampaignMatched(Matched):
 
     @property
     def filter(self) -> str:
-        """The one filter of the exposures."""
+        """Filter of the exposures."""
         return self.inputs.filter
 
     @property
     def star_errors(self) -> StarErrors | None:
-        """Errors of the catalogue by code of the star; None where it has none."""
+        """Errors of the catalogue by star code; None if there are none."""
         return errors_by_star(self.inputs.catalog, self.inputs.largest_vafactor)
 
     def aberration(self, scatter: ExposureScatter, solution: Solution) -> ScaleError:
-        """Error of the scale by velocity aberration, which is among the scatter."""
+        """Scale error by velocity aberration, which is a part of the exposure scatter."""
         return aberration_term(scatter, self.inputs, solution)
 
     def overlap(self, posterior: Posterior, tables: tuple[LookupTable, ...]) -> OverlapTest | None:
-        """Two exposures far apart in time laid on each other; None where none are known so."""
+        """Comparison of two exposures far apart in time; None if there is no such pair."""
         inputs, block = self.inputs, self.inputs.config.campaign
         return overlap_test(
             self.stars,
@@ -73,11 +73,11 @@ class CampaignMatched(Matched):
             tables,
             unit_arcsec=inputs.unit_arcsec,
             pixel=inputs.pixel_arcsec,
-            rolls={one.name: one.pa_v3 for one in inputs.log},
+            rolls={exposure.name: exposure.pa_v3 for exposure in inputs.log},
         )
 
     def save(self, folder: Path) -> None:
-        """Write the files of a run's folder that belong to it."""
+        """Write the matches to the folder of a run."""
         super().save(folder)
         for stale in part_files(folder / PAIRS):
             stale.unlink()
@@ -85,16 +85,17 @@ class CampaignMatched(Matched):
 
 
 def matched_campaign(pairs: Matches, inputs: Inputs, **more: Any) -> CampaignMatched:
-    """Matches of a campaign, with what the configuration holds out set aside."""
+    """Matches of a campaign, divided into fitted and held-out stars as configured."""
     pairs = pairs.named_below(str(inputs.base))
     parts = set_aside(inputs.config, pairs, GAUGE_EXPOSURES)
     return CampaignMatched(*parts, catalogue=inputs.catalog, inputs=inputs, pairs=pairs, **more)
 
 
 def affine_model_of(config: CampaignConfig, stars: Matches) -> DistortionModel:
-    """The configured polynomial with a free linear part of each exposure.
+    """Configured polynomial with a free linear part for each exposure.
 
-    For tables and errors: whatever drifts or scatters in the linear terms is taken up.
+    It is used to fit look-up tables and errors, because it absorbs all drift and scatter of the
+    linear terms.
     """
     return DistortionModel(
         config.model.order,
@@ -108,7 +109,7 @@ def affine_model_of(config: CampaignConfig, stars: Matches) -> DistortionModel:
 def load_matched_campaign(
     folder: Path, inputs: Inputs, summary: Mapping[str, Any]
 ) -> CampaignMatched:
-    """The matches of an earlier stage."""
+    """Load the matches of an earlier stage from the folder of a run."""
     pairs = read_matches(folder / PAIRS, unit=inputs.catalog.unit)
     return matched_campaign(pairs, inputs, facts=summary.get("matching", {}))
 
@@ -116,16 +117,17 @@ def load_matched_campaign(
 # Cox & Gilliland (2002, HST Calibration Workshop): the scale varies by up to 5e-5 over an orbit
 SWING = 5e-5
 PERIOD = 5760.0  # s, of 96 minutes
-LONG_EXPOSURE = 1000.0  # s, where the log has no exposure times
+LONG_EXPOSURE = 1000.0  # s, assumed if the log has no exposure times
 PUBLISHED = "published: 5e-5 in an orbit (Cox & Gilliland 2002)"
 
 
 def scale_error(exptime: float | None) -> float:
-    """Relative standard deviation of the scale.
+    """Relative standard deviation of the scale by aberration that VAFACTOR does not correct.
 
-    Over `exptime` seconds the instant of VAFACTOR is uniform; None where the factor lacks the
-    orbit. A sine of amplitude SWING / 2 at any phase has the standard deviation of its amplitude by
-    the root of 2, and its rate 2 pi / PERIOD times as much.
+    `exptime` is the exposure time in seconds; the instant that VAFACTOR refers to is taken as
+    uniform within it.  None if VAFACTOR does not include the orbit of the telescope.  A sine of
+    amplitude SWING / 2 at a random phase has a standard deviation of amplitude / sqrt(2), and its
+    rate of change 2 pi / PERIOD times that.
     """
     spread = SWING / 2 / math.sqrt(2)
     if exptime is None:
@@ -134,27 +136,28 @@ def scale_error(exptime: float | None) -> float:
 
 
 def aberration_term(scatter: ExposureScatter, inputs: Inputs, solution: Solution) -> ScaleError:
-    """The error of the scale that VAFACTOR leaves, at most as large as exposures scatter.
+    """Scale error by residual velocity aberration, limited to the measured scatter in scale.
 
-    The factor holds for an instant, and a telescope in a low orbit turns its velocity while it
-    exposes.  At which instant it was computed no log says: it is taken to lie anywhere in the
-    exposure.  Computed from the Earth's motion alone it lacks the orbit altogether.  All of it
-    makes exposures scatter in scale, and that scatter is measured: the term is a part of it.
+    VAFACTOR holds for one instant, but the velocity of a telescope in a low orbit changes direction
+    during an exposure.  No log states the instant, which is taken as uniform within the exposure.
+    A factor computed from the motion of the Earth alone does not include the orbit at all.  All of
+    this makes the scales of exposures scatter.  That scatter is measured, so that the term is a
+    part of it.
     """
     source = PUBLISHED
     if inputs.config.campaign.vafactor_source == "earth":
         sigma = scale_error(None)
         source += ", not corrected"
     else:
-        given = [one.exptime for one in inputs.log if one.exptime is not None]
-        seconds = math.sqrt(np.mean(np.square(given))) if given else LONG_EXPOSURE
+        times = [exposure.exptime for exposure in inputs.log if exposure.exptime is not None]
+        seconds = math.sqrt(np.mean(np.square(times))) if times else LONG_EXPOSURE
         sigma = scale_error(seconds)
         source += f", over {seconds:.0f} s"
-        if not given:
+        if not times:
             source += " (assumed: the log has no times)"
     if "scale" in scatter.kinds:
-        found = scatter.tau[:, scatter.kinds.index("scale")]
-        measured = float(np.sqrt(np.mean(found**2)))
+        scale_draws = scatter.tau[:, scatter.kinds.index("scale")]
+        measured = float(np.sqrt(np.mean(scale_draws**2)))
         if measured < sigma:
             sigma, source = measured, f"{source}, and no more than exposures scatter"
     source = f"{source}; part of {EXPOSURE_SCATTER}"

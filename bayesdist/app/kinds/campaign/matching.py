@@ -1,4 +1,4 @@
-"""Star lists of a campaign, matched with its catalogue."""
+"""Matching of the star lists of a campaign with its catalogue."""
 
 from __future__ import annotations
 
@@ -40,14 +40,14 @@ log = logging.getLogger("bayesdist")
 
 
 def match_lists(inputs: Inputs) -> CampaignMatched:
-    """Star lists matched with a catalogue, exposure by exposure."""
+    """Match star lists with a catalogue, exposure by exposure."""
     config, block, lists = inputs.config, inputs.config.campaign, inputs.star_lists
     tab = read_idctab(inputs.base / block.initial_distortion)
     parities = parities_of(block, inputs.catalog, tab)
     for text in (*([inputs.plane] if inputs.plane else []), *inputs.catalog.notes):
         log.info("match: catalogue: %s", text)
     start = start_of(tab, inputs.unit_arcsec, block.filter)
-    found = match_campaign(
+    matches = match_campaign(
         _gauge_first(lists, config.chips()[0].number),
         inputs.log,
         inputs.catalog,
@@ -56,31 +56,31 @@ def match_lists(inputs: Inputs) -> CampaignMatched:
         radius=block.radius,
         mirrored=parities,
     )
-    _refuse_bare(found.table, config.chips(), inputs.catalog.source)
-    if found.left_out:
-        left = inputs.log.select(names=found.table.exposure_names)
-        refuse_few(left.values("epoch"), config.time())
-    table = _table(found, inputs.log)
+    _refuse_bare(matches.table, config.chips(), inputs.catalog.source)
+    if matches.left_out:
+        remaining = inputs.log.select(names=matches.table.exposure_names)
+        refuse_few(remaining.values("epoch"), config.time())
+    table = _table(matches, inputs.log)
     warnings = [
-        *_doubtful_parity(found.mirrored, parities, f"{tab.instrument}/{tab.detector}"),
-        *found.warnings(inputs.log),
+        *_doubtful_parity(matches.mirrored, parities, f"{tab.instrument}/{tab.detector}"),
+        *matches.warnings(inputs.log),
         *input_warnings(inputs),
-        # as the stars show them, for the log need not have them
+        # roll angles of the matches, because the log need not have them
         *shear_warnings(np.asarray(table["rotation"]), "of the matches"),
     ]
-    pairs = neutralise_aberration(found.table, inputs.log)
-    facts = _facts(found, table, inputs, warnings)
+    pairs = neutralise_aberration(matches.table, inputs.log)
+    facts = _facts(matches, table, inputs, warnings)
     matched = matched_campaign(pairs, inputs, facts=facts, table=table)
     if matched.held is not None:
         _refuse_bare(matched.stars, config.chips(), "what is not held out")
-        some = inputs.log.select(names=matched.stars.exposure_names)
-        refuse_few(some.values("epoch"), config.time() if config.has_free_rates else None)
+        fitted_log = inputs.log.select(names=matched.stars.exposure_names)
+        refuse_few(fitted_log.values("epoch"), config.time() if config.has_free_rates else None)
     _log(matched, int(table["detected"].sum()))
     return matched
 
 
 def _table(found: CampaignMatches, exposures: ExposureLog) -> Table:
-    """One row for each exposure, with its VAFACTOR and roll angle."""
+    """One row per exposure, with its VAFACTOR and roll angle."""
     table = found.summary()
     names = list(exposures.names)
     order = [names.index(name) for name in table["exposure"]]
@@ -134,7 +134,7 @@ def _log(matched: CampaignMatched, n_detected: int) -> None:
 
 
 def _doubtful_parity(mirrored: bool, parities: tuple[bool, ...], detector: str) -> list[str]:
-    """A warning, as a clause, of stars with another parity than the known distortion says."""
+    """Warning, as a clause, if the parity of the stars contradicts the initial distortion."""
     if mirrored == parities[0]:
         return []
     return [
@@ -145,14 +145,14 @@ def _doubtful_parity(mirrored: bool, parities: tuple[bool, ...], detector: str) 
 
 
 def _gauge_first(star_lists: StarLists, chip: int) -> tuple[Detections, ...]:
-    """The lists, led by one with enough stars on the reference chip.
+    """Star lists, reordered if necessary so that the first has enough stars on the reference chip.
 
-    The first exposure's stars there define the gauge of the joint fit.  The order stays where the
-    first list has at least half of what the others have.
+    These stars of the first exposure define the gauge of the joint fit.  The order is kept if the
+    first list has at least half the median number of stars there.
     """
     lists = star_lists.lists
     pairs = zip(lists, star_lists.passed, strict=True)
-    counts = np.array([int((one.chip[good] == chip).sum()) for one, good in pairs])
+    counts = np.array([int((detections.chip[good] == chip).sum()) for detections, good in pairs])
     usual = np.median(counts[counts > 0]) if counts.any() else 0.0
     if counts[0] >= 0.5 * usual:
         return lists
@@ -161,7 +161,7 @@ def _gauge_first(star_lists: StarLists, chip: int) -> tuple[Detections, ...]:
 
 
 def _refuse_bare(pairs: Matches, chips: tuple[Chip, ...], where: str) -> None:
-    """Refuse pairs that leave a chip without any."""
+    """Refuse pairs if a chip has none."""
     for chip in chips:
         if chip.number not in pairs.chip_numbers:
             raise InputError(
@@ -172,12 +172,12 @@ def _refuse_bare(pairs: Matches, chips: tuple[Chip, ...], where: str) -> None:
 
 
 def campaign_lines(inputs: Inputs) -> Iterator[str]:
-    """Inputs, dates and roll angles of a campaign, as lines of text."""
+    """Lines of text about the inputs, dates and roll angles of a campaign."""
     config, log, catalog, lists = inputs.config, inputs.log, inputs.catalog, inputs.star_lists
     epochs, rolls = log.values("epoch"), log.values("pa_v3")
     yield f"exposures    {len(log.names)} in {', '.join(log.filters)}"
-    passed, left = sum(int(good.sum()) for good in lists.passed), lists.cut_words
-    yield f"detections   {len(lists)}: {passed} pass the cuts" + (f", {left}" if left else "")
+    passed, removed = sum(int(good.sum()) for good in lists.passed), lists.cut_words
+    yield f"detections   {len(lists)}: {passed} pass the cuts" + (f", {removed}" if removed else "")
     yield f"catalogue    {len(catalog)} of {len(inputs.whole_catalog)} stars, in {catalog.unit}"
     for text in (*([inputs.plane] if inputs.plane else []), *catalog.notes):
         yield f"             {text}"
@@ -192,11 +192,11 @@ def campaign_lines(inputs: Inputs) -> Iterator[str]:
         yield f"segments     {', '.join(str(k) for k in counts)} exposures"
     chips = ", ".join(chip.name for chip in config.chips())
     yield f"model        order {config.model.order}, chips {chips}, tables: {config.tables.method}"
-    known = known_calibration(
+    initial = known_calibration(
         inputs.base / config.campaign.initial_distortion, config.campaign.filter
     )
-    for number in sorted({chip.number for chip in config.chips()} & set(known.numbers)):
-        sentence = geometry_of(known.solution, number).sentence
+    for number in sorted({chip.number for chip in config.chips()} & set(initial.numbers)):
+        sentence = geometry_of(initial.solution, number).sentence
         yield f"geometry     chip {number} of campaign.initial_distortion: {sentence}"
     for number, names in _without(inputs).items():
         yield f"chip {number}       no detections that pass the cuts in {', '.join(names)}"
@@ -208,17 +208,17 @@ def campaign_lines(inputs: Inputs) -> Iterator[str]:
 
 
 def _rolls(rolls: np.ndarray) -> str:
-    known = rolls[np.isfinite(rolls)]
-    if not len(known):
+    angles = rolls[np.isfinite(rolls)]
+    if not len(angles):
         return "not known; roll angles will be those of the matches"
-    return f"{known.min():.1f} to {known.max():.1f} degrees"
+    return f"{angles.min():.1f} to {angles.max():.1f} degrees"
 
 
 def _without(inputs: Inputs) -> dict[int, list[str]]:
-    """Exposures that have nothing on a chip, by its number."""
+    """Exposures without usable detections on a chip, by chip number."""
     lists, out = inputs.star_lists, dict[int, list[str]]()
-    for name, one, good in zip(lists.names, lists.lists, lists.passed, strict=True):
+    for name, detections, good in zip(lists.names, lists.lists, lists.passed, strict=True):
         for chip in inputs.config.chips():
-            if chip.number not in one.chip[good]:
+            if chip.number not in detections.chip[good]:
                 out.setdefault(chip.number, []).append(name)
     return out

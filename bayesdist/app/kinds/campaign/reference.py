@@ -1,4 +1,4 @@
-"""Tables of the detector and drift that a run takes over from that of the reference filter."""
+"""Detector tables and drift that a run takes over from the run of the reference filter."""
 
 from __future__ import annotations
 
@@ -17,16 +17,16 @@ from bayesdist.products import read_d2im
 
 
 def held_tables(block: TablesBlock, chips: tuple[Chip, ...], base: Path) -> tuple[LookupTable, ...]:
-    """The detector's tables that a run holds; none where it has none to hold.
+    """Look-up tables of the detector that are held fixed; empty if the configuration names none.
 
-    All `chips` must have one.
+    Raises InputError if any of `chips` has no table.
     """
     if block.detector is None:
         return ()
     path = tables_file(base / block.detector)
     if path.name == TABLES:
-        found = read_tables(path, do="run its stage 'fit' again").tables
-        tables = tuple(table for table in found if not table.filter)
+        stored = read_tables(path, do="run its stage 'fit' again").tables
+        tables = tuple(table for table in stored if not table.filter)
     else:
         tables = read_d2im(path)
     have = {table.chip for table in tables}
@@ -43,7 +43,7 @@ def held_tables(block: TablesBlock, chips: tuple[Chip, ...], base: Path) -> tupl
 
 
 def rate_priors(config: Config, model: DistortionModel, base: Path) -> GaussianPriors | None:
-    """Priors on the drift of a model from the posterior of another run; None where it is free."""
+    """Priors on the drift of a model from the posterior of another run; None if it is free."""
     tdd, chip = config.model.tdd, config.chips()[0].number
     if tdd is None or config.has_free_rates:
         return None
@@ -57,7 +57,7 @@ def rate_priors(config: Config, model: DistortionModel, base: Path) -> GaussianP
 
 
 def rehearse_references(config: Config, unit: str, base: Path) -> None:
-    """Read all that a run takes over from others; nothing is fitted."""
+    """Read everything that a run takes over from other runs, without fitting."""
     chips = config.chips()
     held_tables(config.tables, chips, base)
     if not config.has_free_rates:

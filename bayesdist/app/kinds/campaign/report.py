@@ -1,4 +1,4 @@
-"""Content of the report of a campaign, from its results."""
+"""Content that a campaign adds to the report of a run."""
 
 from __future__ import annotations
 
@@ -30,11 +30,11 @@ from bayesdist.report.context import (
     LinearSeries,
 )
 
-MAX_MARKERS = 20_000  # markers in a figure: more only hide each other
-CELL_PIX = 64.0  # pixels: the nodes of ACS ISR 2015-06
-MIN_STARS_PER_CELL = 20  # stars that a cell should have at the median
-HELD_BY_PRIOR = 0.99  # of the prior's sigma: what narrows it by less is no measurement
-WIDEST_CELL = 8  # cells of this many times the size, however few stars there are
+MAX_MARKERS = 20_000  # markers in a figure: more would only overlap
+CELL_PIX = 64.0  # pixels: node spacing of ACS ISR 2015-06
+MIN_STARS_PER_CELL = 20  # median number of stars that a cell should have
+HELD_BY_PRIOR = 0.99  # ratio to the prior sigma above which the data determine nothing
+WIDEST_CELL = 8  # largest factor on the size of cells
 
 
 def campaign_results(
@@ -67,20 +67,20 @@ def campaign_results(
 
 
 def held_parameters(fit: LinearFit, priors: GaussianPriors) -> tuple[str, ...]:
-    """Coefficients and rates of which the data say nothing beside what a prior does.
+    """Names of coefficients and rates that are determined by their prior rather than by the data.
 
-    The deviations of single exposures are not among them: their prior is what was found.
+    Deviations of single exposures are not included, because their prior is the measured scatter.
     """
     share = fit.sigma * np.sqrt(priors.precision)
     return tuple(
         p.name
-        for p, known in zip(fit.model.parameters, share, strict=True)
-        if p.kind != "frame" and known > HELD_BY_PRIOR
+        for p, ratio in zip(fit.model.parameters, share, strict=True)
+        if p.kind != "frame" and ratio > HELD_BY_PRIOR
     )
 
 
 def _spread_rows(n: int, most: int) -> slice:
-    """Evenly spread rows, at most that many: lists come in the order of the field, or in none."""
+    """Slice of evenly spread rows, at most `most` of `n`."""
     return slice(None, None, max(1, -(-n // most)))
 
 
@@ -109,21 +109,25 @@ def _catalog_stars(inputs: Inputs, matching: Table) -> CatalogStars | None:
 
 
 def _detections(inputs: Inputs) -> Detections | None:
-    """Quality against magnitude, of some detections of every exposure."""
+    """Quality and magnitude of an evenly spread subset of the detections."""
     star_lists = inputs.star_lists
     lists, cuts, passed = star_lists.lists, star_lists.cuts, star_lists.passed
-    if any(one.mag is None or one.q is None for one in lists):
+    if any(detections.mag is None or detections.q is None for detections in lists):
         return None
-    every = max(1, -(-len(star_lists) // MAX_MARKERS))
-    mag, q, kept = (
-        np.concatenate([np.asarray(a)[::every] for a in columns])
-        for columns in ([one.mag for one in lists], [one.q for one in lists], passed)
+    stride = max(1, -(-len(star_lists) // MAX_MARKERS))
+    mag, q, passes = (
+        np.concatenate([np.asarray(a)[::stride] for a in columns])
+        for columns in (
+            [detections.mag for detections in lists],
+            [detections.q for detections in lists],
+            passed,
+        )
     )
     edges = () if cuts.mag is None else cuts.mag
     return Detections(
         mag=mag,
         q=q,
-        kept=kept.astype(bool),
+        kept=passes.astype(bool),
         n_total=len(star_lists),
         n_kept=int(sum(p.sum() for p in passed)),
         mag_cuts=(*edges, *(() if cuts.saturation is None else (cuts.saturation,))),
@@ -132,7 +136,10 @@ def _detections(inputs: Inputs) -> Detections | None:
 
 
 def _footprints(posterior: Posterior, inputs: Inputs, mirrored: bool) -> Footprints:
-    """Outlines of all exposures over the catalogue; `mirrored`: u has the opposite sign there."""
+    """Outlines of all exposures with the stars of the catalogue.
+
+    `mirrored` is True if u has the opposite sign to that of the catalogue.
+    """
     model, theta, catalog = posterior.model, posterior.mean, inputs.catalog
     outlines, epochs = [], []
     for name in model.exposures:
@@ -149,46 +156,46 @@ def _footprints(posterior: Posterior, inputs: Inputs, mirrored: bool) -> Footpri
 
 @one_thread
 def _residuals(data: FitData, config: CampaignConfig) -> tuple[ChipResiduals, ...]:
-    """Pairs of each chip without the tables and with them, along the detector's axes."""
+    """Residuals of each chip without and with the tables, along the detector axes."""
     pairs, moved = data.matched.stars, data.stars
     model = affine_model_of(config, pairs)
     tables = data.fitted.tables.tables
     errors, farthest = data.fitted.errors.by_magnitude, config.fit.clip_abs
     plain = pairs if errors is None else pairs.with_errors(errors, in_quadrature=True)
-    if any(table.filter for table in tables):  # those of the detector are not of this run
+    if any(table.filter for table in tables):  # the detector's tables are from another run
         detector = [table for table in tables if not table.filter]
         plain = corrected_matches(detector, plain)
-    # the stars that neither has moved off their chip
-    kept = data.fitted.inside(pairs)
-    both = kept & inside_chips(plain, model)
+    # stars that are on their chip with and without the tables
+    inside = data.fitted.inside(pairs)
+    common = inside & inside_chips(plain, model)
     pairs, plain, moved = (
-        one if rows.all() else one.select(rows, reason="moved off the chip")
-        for one, rows in ((pairs, both), (plain, both), (moved, both[kept]))
+        matches if rows.all() else matches.select(rows, reason="moved off the chip")
+        for matches, rows in ((pairs, common), (plain, common), (moved, common[inside]))
     )
-    numbers, left = pairs.chip_number, []
+    numbers, shifts = pairs.chip_number, []
     for table in (plain, moved) if tables else (plain,):
-        # errors are those of the centroids: beside what the tables take out, chi-square is no guide
+        # errors are those of the centroids, so that chi-square is meaningless without the tables
         fit = fit_linear(table, model, rejection=Rejection(np.inf, farthest))
-        left.append(pixel_shifts(fit, table).shift)
-    good = np.all([np.hypot(*r.T) < (farthest or np.inf) for r in left], axis=0)
+        shifts.append(pixel_shifts(fit, table).shift)
+    good = np.all([np.hypot(*r.T) < (farthest or np.inf) for r in shifts], axis=0)
     out = []
     for chip in model.chips:
-        here = good & (numbers == chip.number)
-        bins = _cells(chip.size, int(here.sum()))
+        on_chip = good & (numbers == chip.number)
+        bins = _cells(chip.size, int(on_chip.sum()))
         x, y = (
-            np.clip(a[here], 0.5, n + 0.5)
+            np.clip(a[on_chip], 0.5, n + 0.5)
             for a, n in zip((pairs.x, pairs.y), chip.size, strict=True)
         )
-        binned = [binned_residuals(x, y, *r[here].T, bins=bins, size=chip.size) for r in left]
-        rows = _spread_rows(int(here.sum()), MAX_MARKERS // (2 * len(model.chips)))
-        points = [r[here][rows] for r in left]
-        again = (points[-1], binned[-1]) if tables else (None, None)
-        out.append(ChipResiduals(chip, points[0], again[0], binned[0], again[1]))
+        binned = [binned_residuals(x, y, *r[on_chip].T, bins=bins, size=chip.size) for r in shifts]
+        rows = _spread_rows(int(on_chip.sum()), MAX_MARKERS // (2 * len(model.chips)))
+        points = [r[on_chip][rows] for r in shifts]
+        with_tables = (points[-1], binned[-1]) if tables else (None, None)
+        out.append(ChipResiduals(chip, points[0], with_tables[0], binned[0], with_tables[1]))
     return tuple(out)
 
 
 def _cells(size: tuple[float, float], n: int) -> tuple[int, int]:
-    """Cells of a chip along x and y: of the tables' size, or wider where stars are few."""
+    """Number of cells of a chip along x and y, of the tables' size or wider if stars are few."""
     for k in (1, 2, 4, WIDEST_CELL):
         nx, ny = (max(1, round(s / (k * CELL_PIX))) for s in size)
         if n >= MIN_STARS_PER_CELL * nx * ny:

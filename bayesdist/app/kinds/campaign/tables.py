@@ -1,4 +1,4 @@
-"""Look-up tables of a campaign: fitted with the polynomial, or held as another run has them."""
+"""Look-up tables of a campaign: fitted together with the polynomial, or taken from another run."""
 
 from __future__ import annotations
 
@@ -31,33 +31,33 @@ from bayesdist.model import DistortionModel, LookupTable, corrected
 from bayesdist.model.grid import grid_pixels, mesh
 from bayesdist.utils.arrays import Float
 
-MIN_SCATTER_RATIO = 2.0  # ratio of scatters beyond which centroids are not what most of it is
-MIN_EXPLAINED = 0.5  # fraction of the variance of the scatters that the dates must explain
-MIN_EXPOSURES = 5  # exposures: a parabola in time takes three
-SIGMA_OF_MEDIAN = 1.4826  # of the median of |z|
+MIN_SCATTER_RATIO = 2.0  # ratio of scatters above which centroid errors cannot explain them
+MIN_EXPLAINED = 0.5  # fraction of the variance of the scatters explained by the dates
+MIN_EXPOSURES = 5  # exposures: a parabola in time has three parameters
+SIGMA_OF_MEDIAN = 1.4826  # standard deviation in units of the median absolute deviation
 
 
 def refuse_outrun_stars(inputs: Inputs, fit: LinearFit, pairs: Matches) -> None:
-    """Refuse a catalogue without motions where residuals grow with the time from its epoch.
+    """Refuse a catalogue without proper motions if residuals grow with the time from its epoch.
 
-    The square of the residuals of stars that move is a parabola in time.
+    The mean square residual of moving stars is a parabola in time.
     """
     if inputs.catalog.pm_u is not None or pairs.epoch is None:
         return
     size = np.abs(residuals(fit, pairs))
     names = range(len(pairs.exposure_names))
     rows = [np.flatnonzero(pairs.exposure == k) for k in names]
-    rows = [one for one in rows if len(one)]
+    rows = [star_rows for star_rows in rows if len(star_rows)]
     if len(rows) < MIN_EXPOSURES:
         return
-    date = np.array([pairs.epoch[one[0]] for one in rows])
-    scatter = np.array([SIGMA_OF_MEDIAN * np.median(size[one]) for one in rows])
+    date = np.array([pairs.epoch[star_rows[0]] for star_rows in rows])
+    scatter = np.array([SIGMA_OF_MEDIAN * np.median(size[star_rows]) for star_rows in rows])
     if np.ptp(date) == 0 or scatter.max() < MIN_SCATTER_RATIO * scatter.min():
         return
     at = (date - date.mean()) / np.ptp(date)
     curve = np.polynomial.Polynomial.fit(at, scatter**2, 2).convert()
-    left = np.var(scatter**2 - curve(at)) / np.var(scatter**2)
-    if left > 1.0 - MIN_EXPLAINED or curve.coef[2] <= 0:
+    unexplained = np.var(scatter**2 - curve(at)) / np.var(scatter**2)
+    if unexplained > 1.0 - MIN_EXPLAINED or curve.coef[2] <= 0:
         return
     low, high = int(np.argmin(scatter)), int(np.argmax(scatter))
     raise InputError(
@@ -71,14 +71,21 @@ def refuse_outrun_stars(inputs: Inputs, fit: LinearFit, pairs: Matches) -> None:
 
 log = logging.getLogger("bayesdist")
 
-ROUGH_ITERATIONS = 1  # of the tables from whose residuals the errors of the stars are taken
+ROUGH_ITERATIONS = 1  # iterations of the tables that are used only to estimate star errors
 
 
 def fit_tables(matched: CampaignMatched) -> tuple[StoredLookupTables, TableFit | None]:
-    """The look-up tables that are asked for, and those that are held; and their fit, if any.
+    """Fit the configured look-up tables, and combine them with those held fixed.
 
-    Fitted are the detector's, unless these are taken from another run: then the filter's.  The
-    linear part of each exposure is free.
+    The tables of the detector are fitted unless they are taken from another run, in which case the
+    tables of the filter are fitted.  The linear part of each exposure is free.
+
+    Returns
+    -------
+    stored : StoredLookupTables
+        Fitted and fixed tables.
+    fit : TableFit or None
+        None if no tables are fitted.
     """
     config, model, filter = matched.inputs.config, matched.affine_model, matched.inputs.filter
     block, grid = config.tables, config.assess.grid
@@ -93,7 +100,7 @@ def fit_tables(matched: CampaignMatched) -> tuple[StoredLookupTables, TableFit |
         of_nodes = _on_the_grid(held, fit, "", grid, partial(_held_variance, held))
         return _stored(held, of_nodes, between), None
     pairs, rough = _with_errors(matched, held)
-    found = fit_with_tables(
+    table_fit = fit_with_tables(
         pairs,
         model,
         filter=filter if held else "",
@@ -104,24 +111,26 @@ def fit_tables(matched: CampaignMatched) -> tuple[StoredLookupTables, TableFit |
         start=rough,
         report=_log_iteration,
     )
-    known = bool(found.posteriors)
-    variance = found.shift_variance if known else partial(_held_variance, found.tables)
+    has_covariance = bool(table_fit.posteriors)
+    variance = (
+        table_fit.shift_variance if has_covariance else partial(_held_variance, table_fit.tables)
+    )
     between = measured_between(
         pairs,
-        found.solution,
-        found.tables,
-        filter=found.filter,
-        posteriors=found.posteriors,
-        mixture=found.mixture,
+        table_fit.solution,
+        table_fit.tables,
+        filter=table_fit.filter,
+        posteriors=table_fit.posteriors,
+        mixture=table_fit.mixture,
     )
-    of_nodes = _on_the_grid(found.tables, found.solution, found.filter, grid, variance)
-    return _stored(found.tables, of_nodes, between), found
+    of_nodes = _on_the_grid(table_fit.tables, table_fit.solution, table_fit.filter, grid, variance)
+    return _stored(table_fit.tables, of_nodes, between), table_fit
 
 
 def scatter_by_magnitude(
     pairs: Matches, model: DistortionModel, inputs: Inputs
 ) -> tuple[LinearFit, Matches, MagnitudeErrors]:
-    """Fit of every exposure by itself and scatter by magnitude, as `fit_by_magnitude`."""
+    """Fit each exposure by itself and estimate the scatter; see `fit_by_magnitude`."""
     fit, _, errors = fit_by_magnitude(pairs, model)
     scattered = pairs.with_errors(errors)
     refuse_outrun_stars(inputs, fit, scattered)
@@ -131,11 +140,12 @@ def scatter_by_magnitude(
 def _with_errors(
     matched: CampaignMatched, held: tuple[LookupTable, ...]
 ) -> tuple[Matches, TableFit]:
-    """Pairs with errors by magnitude, free of the pattern of tables; and those rough tables.
+    """Pairs with errors by magnitude that exclude the table pattern, and a rough fit of the tables.
 
-    The scatter of the residuals before any table is twice that of the stars: with errors from
-    there the tables would be smoothed too much, and their own errors twice too large.  How smooth
-    the rough tables are hardly matters: their stars scatter alike.
+    Without tables the residuals scatter twice as much as the centroids.  With errors from that
+    scatter the tables would be smoothed too much, and the errors of the tables would be twice too
+    large.  The smoothness of the rough tables hardly matters, because it hardly affects the
+    scatter.
     """
     pairs, inputs, model = matched.stars, matched.inputs, matched.affine_model
     block = inputs.config.tables
@@ -157,11 +167,14 @@ def _with_errors(
 def _stored(
     tables: Sequence[LookupTable], of_nodes: Mapping[int, Float], between: Sequence[BetweenNodes]
 ) -> StoredLookupTables:
-    """Tables in the order in which their file has them: the detector's first, chips by number."""
+    """Tables in the order of their file: those of the detector first, by chip number."""
     return StoredLookupTables(
         tuple(sorted(tables, key=lambda table: (table.filter != "", table.chip))),
         dict(sorted(of_nodes.items())),
-        {one.chip: one for one in sorted(between, key=lambda one: one.chip)},
+        {
+            chip_between.chip: chip_between
+            for chip_between in sorted(between, key=lambda chip_between: chip_between.chip)
+        },
     )
 
 
@@ -181,9 +194,10 @@ def _on_the_grid(
     grid: tuple[int, int],
     variance: Callable[..., Float],
 ) -> dict[int, Float]:
-    """Errors (ny, nx, 2) of positions on the grid of the assessment, by chip.
+    """Position errors (ny, nx, 2) on the grid of the assessment, by chip.
 
-    `variance`: of the tables' shift (n, 2) at pixels x and y of a `chip`.
+    ``variance(x, y, chip=)`` returns the variance (n, 2) of the shift by the tables at pixels x and
+    y.
     """
     out = {}
     for chip in fit.model.chips:
@@ -196,12 +210,12 @@ def _on_the_grid(
 
 
 def _held_variance(tables: Sequence[LookupTable], x: Float, y: Float, *, chip: int) -> Float:
-    """Variance (n, 2) of the shift by tables that have no covariance, or are held."""
+    """Variance (n, 2) of the shift by tables that have no covariance or are held fixed."""
     return held_sigma(tables, x, y, chip=chip) ** 2
 
 
 def _warnings(config: Config, stored: StoredLookupTables, fit: TableFit | None) -> Iterator[str]:
-    """Warnings of the tables' errors, each as a clause."""
+    """Warnings about the errors of the tables, each as a clause."""
     block = config.tables
     if block.detector is not None and any(t.sigma is None for t in stored.tables if not t.filter):
         yield "the detector's tables have no errors, and none are counted"
@@ -232,7 +246,7 @@ def tables_section(
         "method": config.tables.method,
         "detector": config.tables.detector,
         "chips": [_row(table) for table in stored.tables],
-        "between_nodes": [_between(one) for one in stored.between.values()],
+        "between_nodes": [_between(chip_between) for chip_between in stored.between.values()],
         "warnings": list(_warnings(config, stored, fit)),
     }
     if fit is not None:
@@ -256,7 +270,7 @@ def _row(table: LookupTable) -> Mapping[str, object]:
 
 
 def _between(one: BetweenNodes) -> Mapping[str, object]:
-    """Pixels along x and y, as the budget has them, and mean squares as measured."""
+    """Rms between the nodes along x and y (pixels), and mean squares as measured."""
     return {
         "chip": one.chip,
         "rms_x": float(one.left.mean[0] ** 0.5),

@@ -1,1 +1,1 @@
-"""Stars that were matched before: reading, formats of missions, added errors."""
+"""Stars that were matched before the run: reading, mission formats, added errors."""

@@ -1,4 +1,4 @@
-"""Errors that groups of stars have beyond the quoted ones: when and in which words."""
+"""Errors of groups of stars in addition to the quoted ones: estimate, summary and sentence."""
 
 from __future__ import annotations
 
@@ -14,16 +14,16 @@ from bayesdist.infer.catalogue.added_errors import ONE, GroupedErrors, grouped_e
 
 log = logging.getLogger("bayesdist")
 
-MOST_LISTED = 4  # groups that are listed one by one
+MOST_LISTED = 4  # largest number of groups that are listed individually
 
 
 def compared_errors(
     config: Config, fit: LinearFit, sample: Matches, priors: GaussianPriors
 ) -> GroupedErrors | None:
-    """Jitters of groups of stars, or the one that will do, from a fit with the quoted errors.
+    """Errors added to groups of stars, or a single jitter, from a fit with the quoted errors.
 
-    None where that is not asked: where errors come from the residuals themselves, where the jitter
-    is given or is to be one, and where the match circle has cut the residuals.
+    None if groups are not compared: the errors come from the residuals, the jitter is given or is
+    to be a single one, or the match circle has truncated the residuals.
     """
     if not config.compares_jitters or in_circle(sample, config):
         return None
@@ -42,9 +42,9 @@ def compared_errors(
 
 
 def in_circle(stars: Matches, config: Config) -> bool:
-    """True if stars were matched within a known radius of nominal positions that they have.
+    """True if stars were matched within a known radius of nominal positions that are in the data.
 
-    The likelihood is then that of selected stars.
+    The likelihood then accounts for this selection.
     """
     if config.data is None or not stars.has_nominal:
         return False
@@ -52,7 +52,7 @@ def in_circle(stars: Matches, config: Config) -> bool:
 
 
 def added_errors_rows(found: GroupedErrors) -> dict[str, Any]:
-    """Part 'added_errors' of the section 'fit' of summary.json."""
+    """Entry 'added_errors' of the section 'fit' of summary.json."""
     columns = {
         "n": found.n,
         "added": found.sigma,
@@ -75,7 +75,7 @@ def added_errors_rows(found: GroupedErrors) -> dict[str, Any]:
 
 
 def grouping_sentence(found: GroupedErrors, unit: str) -> str:
-    """Clause on errors beyond the quoted ones; `unit` is of u and v."""
+    """Clause about errors in addition to the quoted ones; `unit` is that of u and v."""
     evidence = ", ".join(f"{name} {gain:.3g}" for name, gain in found.evidence.items())
     head = f"ln evidence gained by groups: {evidence}"
     if found.grouping == ONE:
@@ -83,7 +83,9 @@ def grouping_sentence(found: GroupedErrors, unit: str) -> str:
     each, joint = list(_each(found)), ", "
     if len(each) > MOST_LISTED:
         each, joint = [min(each), max(each)], " to "
-    sizes = joint.join(f"{value:.3g} +- {error:.2g} {unit} {where}" for value, error, where in each)
+    sizes = joint.join(
+        f"{value:.3g} +- {error:.2g} {unit} {group_name}" for value, error, group_name in each
+    )
     return (
         f"the errors beyond the quoted ones differ by {found.grouping}: {sizes} ({head}); what "
         "each has beyond the least was added to the quoted errors, and the jitter is the least"
@@ -91,10 +93,10 @@ def grouping_sentence(found: GroupedErrors, unit: str) -> str:
 
 
 def _each(found: GroupedErrors) -> Iterator[tuple[float, float, str]]:
-    """Added error, its standard error, and whose it is."""
+    """Added error, its standard error, and the name of the group, for each group and axis."""
     for g, label in enumerate(found.labels):
         of = f"of {found.by} {label}" if found.by else ""
         for a in range(2 if found.by_axis else 1):
             along = f"along {'uv'[a]}" if found.by_axis else ""
-            where = " ".join(part for part in (along, of) if part)
-            yield float(found.sigma[g, a]), float(found.sigma_error[g, a]), where
+            group_name = " ".join(part for part in (along, of) if part)
+            yield float(found.sigma[g, a]), float(found.sigma_error[g, a]), group_name

@@ -1,4 +1,4 @@
-"""Stars, dates and errors that cannot be meant, and those that are worth a warning."""
+"""Checks of stars, dates and errors: refusal of impossible values, warnings of unusual ones."""
 
 from __future__ import annotations
 
@@ -14,36 +14,37 @@ from bayesdist.model import DistortionModel, TimeDependence
 from bayesdist.model.basis import MAX_ORDER, polynomial_terms
 from bayesdist.utils.arrays import Float, Int
 
-OFF = 1e3  # factor on the scale by which u and v cannot be those of the detector
-ODD = 3.0  # factor that is worth a warning
-SMALLEST_ERROR = 1e-6  # pixels: no detector measures positions to that
-FEWEST = 10  # stars without which no scale can be told
-HALF_TURN = 180.0  # degrees: no plane of the sky reaches further
+OFF = 1e3  # factor on the expected scale beyond which u and v are refused
+ODD = 3.0  # factor on the expected scale beyond which there is a warning
+SMALLEST_ERROR = 1e-6  # pixels: smaller errors are impossible
+FEWEST = 10  # fewest stars that determine a scale
+HALF_TURN = 180.0  # degrees: largest plausible extent of u and v
 IN_DEGREES = {"deg": 1.0, "arcsec": 1 / 3600, "mas": 1 / 3.6e6}
-MADE_FROM_PIXELS = 1e-3  # pixels: scatter below which positions were computed from the pixels
-FAR_BELOW = 0.1  # fraction of the quoted errors that such a scatter does not reach
-STARS_PER_TERM = 3  # stars for each term and axis, below which residuals hardly show the errors
+MADE_FROM_PIXELS = 1e-3  # pixels: smaller scatter means that positions were computed from pixels
+FAR_BELOW = 0.1  # such a scatter is also below this fraction of the quoted errors
+STARS_PER_TERM = 3  # fewest stars per term and axis for which residuals show the errors
 ORDER = 4
-ROUNDS, ORDER_ROUNDS = 20, 6  # of rejection
+# rounds of rejection in estimates of the scatter, and in comparisons of orders
+ROUNDS, ORDER_ROUNDS = 20, 6
 NORMAL = 1.4826022185056018  # 1 / (median of |z|, z standard normal)
 CLIP = 4.0  # robust standard deviations
-EACH = 4  # stars for each coefficient, at least
-NOISE_FREE = 1e-8  # pixels: scatter that is rounding, and no measurement
-ON_A_LINE = 1e-6  # extent of positions across a line, relative to that along it
-LOW_ORDER = 1.7  # ratio of the scatters about two orders from which the lower one is too low
-BEST_ORDER = 1.2  # ratio of the scatters about two orders that follow the positions equally well
-MOST_STARS = 1500  # by which orders are compared
+EACH = 4  # fewest stars per coefficient
+NOISE_FREE = 1e-8  # pixels: smaller scatter is rounding, not measurement
+ON_A_LINE = 1e-6  # largest extent of positions across a line, relative to that along it
+LOW_ORDER = 1.7  # ratio of scatters about two orders above which the lower order is too low
+BEST_ORDER = 1.2  # ratio of scatters below which two orders are equally good
+MOST_STARS = 1500  # used to compare orders
 YEARS = (1950.0, 2100.0)
 
 
 def doubts_on_stars(stars: Matches, model: DistortionModel, config: Config) -> list[str]:
-    """Sentences on what is odd about matched stars, by all of them or a sample, in memory."""
-    found = list(_doubts(stars, model, config.detector.scale_mas))
-    return [*found, *_doubts_on_order(stars, model.order)]
+    """Sentences about unusual properties of matched stars (all or a sample, in memory)."""
+    doubts = list(_doubts(stars, model, config.detector.scale_mas))
+    return [*doubts, *_doubts_on_order(stars, model.order)]
 
 
 def refuse_stars(stars: Matches, model: DistortionModel, config: Config) -> None:
-    """Raise InputError for matched stars that cannot be meant; as `doubts_on_stars`."""
+    """Raise InputError for matched stars with impossible values; see `doubts_on_stars`."""
     for _ in _doubts(stars, model, config.detector.scale_mas):
         pass
 
@@ -62,7 +63,7 @@ def _doubts(stars: Matches, model: DistortionModel, scale_mas: float | None) -> 
 
 
 def doubts_on_numbers(stars: Matches, model: DistortionModel) -> Iterator[str]:
-    """Sentences on chips with fewer than three stars for each polynomial term of an axis."""
+    """Sentences about chips with fewer than three stars per polynomial term and axis."""
     terms = n_terms(model.order)
     needed = STARS_PER_TERM * terms
     counts = dict(zip(stars.chip_numbers, np.bincount(stars.chip), strict=False))
@@ -77,7 +78,7 @@ def doubts_on_numbers(stars: Matches, model: DistortionModel) -> Iterator[str]:
 
 
 def _scale(stars: Matches) -> float | None:
-    """Units of u and v in a pixel, by the spread of both; None where stars lie on one spot."""
+    """Units of u and v per pixel, from the spread of both; None if all stars coincide."""
     pixels = float(np.hypot(np.std(stars.x), np.std(stars.y)))
     plane = float(np.hypot(np.std(stars.u), np.std(stars.v)))
     return plane / pixels if pixels > 0 and plane > 0 else None
@@ -86,7 +87,7 @@ def _scale(stars: Matches) -> float | None:
 def _doubts_on_scale(
     stars: Matches, scale: float, unit: str, scale_mas: float | None
 ) -> Iterator[str]:
-    where = ", ".join(stars.sources)
+    files = ", ".join(stars.sources)
     if unit in IN_DEGREES:
         reach = float(max(np.ptp(stars.u), np.ptp(stars.v))) * IN_DEGREES[unit]
         if reach > HALF_TURN and stars.tangent_point is not None:
@@ -94,7 +95,7 @@ def _doubts_on_scale(
             raise InputError(
                 f"the field is some {width:.0f} degrees wide, and on the tangent plane of ra and "
                 f"dec it would span {reach:.4g} degrees, which no polynomial follows",
-                where=where,
+                where=files,
                 do="fit the field in parts, each with data.tangent_point at its centre, or give u "
                 "and v of a projection for wide fields, such as ARC or ZEA; check ra and dec if "
                 "the field is narrower",
@@ -102,7 +103,7 @@ def _doubts_on_scale(
         if reach > HALF_TURN:
             raise InputError(
                 f"u and v span {reach:.4g} degrees if they are in {unit}",
-                where=where,
+                where=files,
                 do="correct data.unit, or the unit in the table: they may be pixels",
             )
     expected = 1.0
@@ -112,35 +113,35 @@ def _doubts_on_scale(
         expected = scale_mas / 3.6e6 / IN_DEGREES[unit]
     factor = scale / expected
     by = "pixels" if unit == "pix" else f"pixels and detector.scale_mas = {scale_mas:g}"
-    said = f"u and v, in {unit}, span {factor:.3g} times what {by} say"
+    fault = f"u and v, in {unit}, span {factor:.3g} times what {by} say"
     if not 1 / OFF < factor < OFF:
-        raise InputError(said, where=where, do="correct data.unit, the scale or the columns")
+        raise InputError(fault, where=files, do="correct data.unit, the scale or the columns")
     if not 1 / ODD < factor < ODD:
-        yield f"{said}: check data.unit and the scale"
+        yield f"{fault}: check data.unit and the scale"
 
 
 def _doubts_on_errors(stars: Matches, scale: float) -> Iterator[str]:
     if not stars.has_sigma:
         return
     sigma = np.minimum(stars.column("sigma_u"), stars.column("sigma_v")) / scale
-    middle, least = float(np.median(sigma)), float(sigma.min())
+    middle, smallest = float(np.median(sigma)), float(sigma.min())
     if middle < SMALLEST_ERROR:
         raise InputError(
             f"half of the errors are below {middle:.2g} px, which no detector reaches",
             where=", ".join(stars.sources),
             do="check the unit of the columns of errors, or data.sigma",
         )
-    if least < SMALLEST_ERROR:
-        yield f"the smallest of the quoted errors is {least:.2g} px: check such rows"
+    if smallest < SMALLEST_ERROR:
+        yield f"the smallest of the quoted errors is {smallest:.2g} px: check such rows"
 
 
 def _doubts_on_scatter(stars: Matches, scale: float) -> Iterator[str]:
-    """A sentence on reference positions that are a function of the pixels."""
+    """Sentence about reference positions that are a function of the pixels."""
     scatter = scatter_about_polynomials(stars)
     if scatter is None:
         return
     in_pixels = scatter / scale
-    if in_pixels < NOISE_FREE and not _on_a_line(stars):  # which the fit refuses
+    if in_pixels < NOISE_FREE and not _on_a_line(stars):  # the fit refuses such stars
         raise InputError(
             f"the reference positions follow a polynomial of the pixels to {in_pixels:.1g} px: "
             "they were computed from the pixels by a WCS, or are those of a design, and without "
@@ -162,16 +163,17 @@ def _doubts_on_scatter(stars: Matches, scale: float) -> Iterator[str]:
 
 
 def _on_a_line(stars: Matches) -> bool:
-    """Boolean: the reference positions lie on a line, or in one point."""
+    """True if the reference positions form a line or a single point."""
     offsets = np.stack([stars.u - stars.u.mean(), stars.v - stars.v.mean()])
     long, short = np.linalg.svd(offsets, compute_uv=False)
     return bool(short <= ON_A_LINE * long)
 
 
 def _doubts_on_order(stars: Matches, order: int) -> Iterator[str]:
-    """A sentence on an order that is too low, by the exposure and chip with the most stars.
+    """Sentence about a polynomial order that is too low.
 
-    The positions that a polynomial does not follow are rejected, or taken for false matches.
+    It is tested on the exposure and chip with the most stars.  Positions that the polynomial cannot
+    follow would be rejected or treated as false matches.
     """
     groups = stars.exposure * len(stars.chip_numbers) + stars.chip
     rows = np.flatnonzero(groups == np.argmax(np.bincount(groups)))
@@ -183,18 +185,18 @@ def _doubts_on_order(stars: Matches, order: int) -> Iterator[str]:
     if not low > LOW_ORDER * high > 0:
         return
     tried = ((n, _scatter_about(stars, rows, n)) for n in higher)
-    best, least = next(one for one in tried if one[1] <= BEST_ORDER * high)
+    best, lowest = next(trial for trial in tried if trial[1] <= BEST_ORDER * high)
     scale = _scale(stars) or 1.0
     yield (
         f"the positions scatter by {low / scale:.2g} px about a polynomial of order {order}, and "
-        f"by {least / scale:.2g} px about one of order {best}: the order is too low, and matches "
+        f"by {lowest / scale:.2g} px about one of order {best}: the order is too low, and matches "
         "that it does not follow are rejected or taken for false ones; raise model.order "
         "(bayesdist select-order CONFIG.toml compares orders)"
     )
 
 
 def _doubts_on_dates(epochs: Float, where: str) -> Iterator[str]:
-    """Sentences on epochs that are hardly decimal years; InputError for those that are none."""
+    """Sentences about unlikely epochs; raises InputError if they are not decimal years."""
     first, last = float(np.min(epochs)), float(np.max(epochs))
     for date in (first, last):
         if not 1800 <= date <= 2200:
@@ -208,7 +210,7 @@ def _doubts_on_dates(epochs: Float, where: str) -> Iterator[str]:
 
 
 def refuse_empty_segments(epochs: Float, time: TimeDependence | None) -> None:
-    """Refuse a break of the drift without data on both of its sides, up to the next break."""
+    """Refuse a break of the drift if a segment before or after it has no data."""
     if time is None or not time.breaks:
         return
     counts = np.bincount(
@@ -226,9 +228,9 @@ def refuse_empty_segments(epochs: Float, time: TimeDependence | None) -> None:
 
 
 def scatter_about_polynomials(table: Matches) -> float | None:
-    """Robust scatter along an axis about polynomials on each chip of each exposure, two digits.
+    """Robust scatter per axis about a polynomial for each chip and exposure, to two digits.
 
-    It is in the unit of u, v; None of too few stars.
+    It is in the unit of u, v; None if there are too few stars.
     """
     groups = table.exposure * len(table.chip_numbers) + table.chip
     residuals = [
@@ -246,7 +248,7 @@ def n_terms(order: int) -> int:
 
 
 def _scatter_about(table: Matches, rows: Int, order: int) -> float:
-    """Robust scatter along an axis about one polynomial."""
+    """Robust scatter per axis about one polynomial."""
     return _robust(_clipped_residuals(table, rows, order, ORDER_ROUNDS))
 
 
@@ -255,18 +257,18 @@ def _robust(residuals: Float) -> float:
 
 
 def _clipped_residuals(table: Matches, rows: Int, order: int, rounds: int) -> Float:
-    """Residuals (2 M,) of rows within `CLIP` of a polynomial that is fitted to them."""
+    """Residuals (2 M,) of rows within `CLIP` of a polynomial fitted to these rows."""
     i, j = np.array(polynomial_terms(order)).T
     X, Y = (2 * (z - z.min()) / max(np.ptp(z), 1.0) - 1 for z in (table.x[rows], table.y[rows]))
     basis = legendre.legvander(X, order)[:, i] * legendre.legvander(Y, order)[:, j]
     data = np.stack([table.u[rows], table.v[rows]], axis=-1)
     used = np.ones(len(X), bool)
     for _ in range(rounds):
-        left = data - basis @ np.linalg.lstsq(basis[used], data[used])[0]
-        size = NORMAL * np.median(np.abs(left[used]))
-        now = (np.abs(left) <= CLIP * size).all(axis=1)
-        if (now == used).all() or now.sum() < 2 * len(i):
+        residuals = data - basis @ np.linalg.lstsq(basis[used], data[used])[0]
+        size = NORMAL * np.median(np.abs(residuals[used]))
+        inliers = (np.abs(residuals) <= CLIP * size).all(axis=1)
+        if (inliers == used).all() or inliers.sum() < 2 * len(i):
             break
-        used = now
-    # what the fit has taken up is given back
-    return np.asarray(left[used].ravel() * np.sqrt(used.sum() / (used.sum() - len(i))))
+        used = inliers
+    # corrected for the degrees of freedom of the fit
+    return np.asarray(residuals[used].ravel() * np.sqrt(used.sum() / (used.sum() - len(i))))

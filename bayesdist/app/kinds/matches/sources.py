@@ -1,4 +1,4 @@
-"""Matches as a section [data] names them, in memory or on disk, those of missions among them."""
+"""Reading of the matches of a section [data], in memory or on disk, including mission formats."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from bayesdist.errors import InputError
 from bayesdist.mission import load_object, missions
 from bayesdist.model import Chip
 
-IN_MEMORY = 1_000_000  # rows of Parquet above which they stay on disk
+IN_MEMORY = 1_000_000  # rows of Parquet above which tables stay on disk
 
 PathLike = str | os.PathLike[str]
 
@@ -24,7 +24,10 @@ PathLike = str | os.PathLike[str]
 def load_matches(
     path: PathLike | Sequence[PathLike], *, format: str = "auto", **options: Any
 ) -> Matches:
-    """Matches of any known kind, as of `read_matches`; large tables in Parquet stay on disk."""
+    """Read matches of any known format; large Parquet tables stay on disk.
+
+    Arguments are those of `read_matches`.
+    """
     if format in ("auto", "table") and is_large(path):
         if options.pop("not_finite", "refuse") == "reject":
             raise InputError(
@@ -32,13 +35,13 @@ def load_matches(
                 where="data.not_finite",
                 do="write the table without them",
             )
-        options.pop("same_position", None)  # equal positions are looked for in memory alone
+        options.pop("same_position", None)  # equal positions are searched only in memory
         return open_matches(path, **options)
     return read_matches(path, format=format, **options)
 
 
 def reading_options(data: Data, chips: Sequence[ChipBlock]) -> dict[str, Any]:
-    """Options of `load_matches` that a section [data] gives; chips may be named in tables."""
+    """Options of `load_matches` from a section [data]; tables may refer to chips by name."""
     names = (
         *("format", "columns", "unit", "sigma", "pixel_origin", "tangent_point"),
         *("epoch", "catalogue_epoch", "not_finite", "same_position", "plate_scale"),
@@ -48,7 +51,7 @@ def reading_options(data: Data, chips: Sequence[ChipBlock]) -> dict[str, Any]:
 
 
 def is_large(path: PathLike | Sequence[PathLike]) -> bool:
-    """Truth of files in Parquet with more rows than are taken into memory."""
+    """True if the files are in Parquet with too many rows to be held in memory."""
     files = input_files(path)
     if any(file.suffix.lower() != ".parquet" for file in files):
         return False
@@ -58,16 +61,16 @@ def is_large(path: PathLike | Sequence[PathLike]) -> bool:
 def check_chips(chips: Sequence[Chip], numbers: Sequence[int]) -> None:
     """Refuse a ``[[chip]]`` block without stars, and stars without a block.
 
-    `numbers` are the chips of the matches, (1,) also where they name none; nothing is checked where
-    there is no block.
+    `numbers` are the chips of the matches, (1,) also if the matches name no chip.  Nothing is
+    checked if there are no blocks.
     """
     if not chips:
         return
-    # stars that name no chip are on the only one there is, whatever its number
+    # stars without a chip are on the only chip, regardless of its number
     if len(chips) == 1 and tuple(numbers) in ((1,), (chips[0].number,)):
         return
-    known = {c.number for c in chips}
-    unknown = [str(n) for n in numbers if n not in known]
+    block_numbers = {c.number for c in chips}
+    unknown = [str(n) for n in numbers if n not in block_numbers]
     empty = [f"{c.number} ({c.name})" for c in chips if c.number not in set(numbers)]
     if unknown:
         plural = "chips" if len(unknown) > 1 else "chip"
@@ -91,44 +94,56 @@ Template = tuple[int, dict[str, object]]
 
 
 class RunInput(Protocol):
-    """Matches of a run that may have to be written before they can be used."""
+    """Matches of a run that may have to be written to disk before they can be used."""
 
     def load(self) -> Matches:
         """All matches that the configuration selects."""
 
     def move_into_run(self) -> bool:
-        """Truth of matches that were moved into the folder of the run, which has begun."""
+        """Move the matches into the folder of the run, which has begun; True if any were moved."""
 
     def close(self) -> None:
-        """Remove what was not moved."""
+        """Remove files that were not moved."""
 
 
 @dataclass(frozen=True)
 class MatchSource:
-    """Reader of the matches of one format."""
+    """Reader of matches in the format of a mission.
 
-    # of paths, the section [data] as the mission has it, and columns and rows of the detector: the
-    # matches in memory
+    Parameters
+    ----------
+    read : callable
+        ``read(paths, data, size)`` returns the matches in memory; `data` is the section [data] of
+        the mission, `size` the number of columns and rows of the detector.
+    input_of : callable
+        ``input_of(run)`` returns the `RunInput` of a run directory.
+    template : callable
+        ``template(path)`` returns the number of matches and their entries in the template of a
+        configuration, for `bayesdist init`; None if the files have another format.
+    """
+
     read: Callable[[Paths, Any, tuple[float, float]], Matches]
-    input_of: Callable[[RunDirectory], RunInput]  # of the folder of a run: its `RunInput`
-    # of a path that `bayesdist init` is given: the number of matches and what they put into the
-    # template of a configuration; None where the files are of another format
+    input_of: Callable[[RunDirectory], RunInput]
     template: Callable[[str | Path], Template | None]
 
 
 def _sources() -> dict[str, str]:
-    """Where the sources of all missions are, by the name of the format."""
-    return {name: where for one in missions().values() for name, where in one.match_sources.items()}
+    """Import paths of the match sources of all missions, by format name."""
+    return {
+        name: target
+        for mission in missions().values()
+        for name, target in mission.match_sources.items()
+    }
 
 
 def _source(name: str) -> MatchSource | None:
-    """Source of a format; None for the formats of the core."""
-    where = _sources().get(name)
-    return None if where is None else load_object(where)
+    """Match source of a format; None for formats that are not of a mission."""
+    target = _sources().get(name)
+    return None if target is None else load_object(target)
 
 
 def input_of_run(run: RunDirectory) -> RunInput | None:
-    """Input of a run whose format a mission reads; None for all others."""
+    """Input of a run in the format of a mission; None for any other run."""
     data = run.config.data
     source = None if data is None else _source(data.format)
     return None if source is None else source.input_of(run)
@@ -141,7 +156,10 @@ def read_configured(
     size: tuple[float, float] | None,
     chips: Sequence[ChipBlock],
 ) -> Matches:
-    """Matches as a section [data] reads them; `size` is columns and rows of a single chip."""
+    """Read the matches of a section [data].
+
+    `size` is the number of columns and rows of a detector with a single chip.
+    """
     source = _source(data.format)
     if source is not None and size is not None:
         return source.read(path, data, size)
@@ -149,10 +167,10 @@ def read_configured(
 
 
 def mission_template(matches: str | Path) -> Template | None:
-    """Number of matches and their part of a template, where a mission knows the files."""
+    """Number of matches and their part of a template; None if no mission reads the files."""
     for name in _sources():
         source = _source(name)
-        found = None if source is None else source.template(matches)
-        if found is not None:
-            return found
+        template = None if source is None else source.template(matches)
+        if template is not None:
+            return template
     return None

@@ -1,4 +1,4 @@
-"""Matched stars: read, fitted, also with an earlier calibration as prior, and sampled."""
+"""Stars matched before the run: reading, fit (optionally with a calibration prior), sampling."""
 
 from __future__ import annotations
 
@@ -51,12 +51,12 @@ from bayesdist.products.registry import read_calibration
 
 log = logging.getLogger("bayesdist")
 
-SAMPLING = 1  # of the random streams that follow from the one seed: that of the stage 'sample'
+SAMPLING = 1  # number of the random stream of the stage 'sample', derived from the seed
 
 
 def match_stars(stars: Matches, config: MatchesConfig) -> Matched:
-    """Stars to fit, and stars that are held out, of a configuration."""
-    where = ", ".join(stars.sources)
+    """Divide matched stars into fitted and held-out stars, as configured."""
+    files = ", ".join(stars.sources)
     if config.data.sigma == "by_magnitude":
         # These errors are estimated from residuals that the match circle has truncated, so that
         # the likelihood must not correct for the circle a second time.
@@ -66,15 +66,15 @@ def match_stars(stars: Matches, config: MatchesConfig) -> Matched:
     if in_circle(stars, config):
         for fault in config.circle_faults():
             cause, _, do = fault.partition("; ")
-            raise ConfigError(cause, where=where, do=do)
+            raise ConfigError(cause, where=files, do=do)
     config.mixture(stars.match_radius)  # uniform outliers need a radius
     return Matched(*set_aside(config, stars))
 
 
 def read_stars(config: MatchesConfig, base: Path) -> Matches:
-    """The matched stars that a configuration names, with the names of files as they are there.
+    """Read the matched stars that a configuration names.
 
-    So a run is the same in whatever folder it is made.
+    The stars keep the file names relative to `base`, so that a run does not depend on its folder.
     """
     data, size = config.data, config.detector.size
     stars = read_configured(data.paths(base), data, size=size, chips=config.chip)
@@ -82,7 +82,7 @@ def read_stars(config: MatchesConfig, base: Path) -> Matches:
 
 
 def model_of(stars: Matches, config: Config) -> DistortionModel:
-    """The model that a configuration asks for, for these stars."""
+    """Distortion model of a configuration for the given stars."""
     check_chips(config.chips(), stars.chip_numbers)
     return build_model(
         stars,
@@ -102,10 +102,10 @@ def fit_stars(
     base: Path = Path(),
     reader: StarReader | None = None,
 ) -> Fitted:
-    """The linear fit of matched stars, with the errors that its residuals ask for.
+    """Fit matched stars by least squares, with errors adjusted to the residuals.
 
-    The `reader` has the stars in the end, for the passes that follow. An error names the frames of
-    the exposures that would help.
+    After the fit `reader` holds the stars for later passes.  If the fit is degenerate or does not
+    settle, the error names the frames of the exposures that would help, if any.
     """
     if reader is None:
         with closing(StarReader(config.resources())) as reader:
@@ -113,7 +113,7 @@ def fit_stars(
     model = model_of(matched.stars, config)
     refuse_stars(reader.sample(matched.stars), model, config)
     if matched.stars.in_memory and matched.stars.epoch is not None:
-        # a sample may have none of a short segment
+        # only for all stars: a sample may have none in a short segment
         refuse_empty_segments(matched.stars.epoch, model.time)
     earlier = earlier_calibration(model, config, base)
     try:
@@ -140,13 +140,13 @@ def _fitted(
     reader: StarReader,
     earlier: CalibrationPrior | None,
 ) -> Fitted:
-    """The fit with errors by magnitude, or with the quoted ones as far as they will do."""
+    """Fit with errors by magnitude, or with the quoted errors adjusted to the residuals."""
     priors = priors_of(model, config)
     rejection = Rejection(config.fit.clip_chi2, config.fit.clip_abs, config.fit.radial_weight)
     by_magnitude = config.data is not None and config.data.sigma == "by_magnitude"
 
     def begun(priors: GaussianPriors) -> tuple[LinearFit, ErrorLaw]:
-        """First fit, with errors by magnitude or those that are quoted."""
+        """First fit, with errors by magnitude or with the quoted errors."""
         if by_magnitude:
             linear, _, errors = fit_by_magnitude(
                 stars, model, rejection=rejection, priors=priors, compute=reader.compute
@@ -157,7 +157,7 @@ def _fitted(
 
     if earlier is not None:
         loose = replace(priors, joint=earlier.loose().joint)
-        # the covariance turns with the frame, which a first fit finds
+        # the covariance is rotated into the frame, which a first fit determines
         turned = earlier.about(begun(loose)[0].mean) if earlier.turns else loose
         priors = replace(priors, joint=turned.joint)
         log.info(
@@ -186,7 +186,7 @@ def _fitted(
 def shards_of(
     stars: Matches, model: DistortionModel, config: Config, errors: ErrorLaw, reader: StarReader
 ) -> Shards:
-    """Stars as passes go over them, none of them outside the circle in which it was matched."""
+    """Stars in shards for passes over the data; raises if any is outside its match circle."""
     shards = reader.shards(model, stars, errors)
     if in_circle(stars, config):
         shards.survey.check_circle(config.match_radius(stars.match_radius))
@@ -194,7 +194,7 @@ def shards_of(
 
 
 def priors_of(model: DistortionModel, config: Config) -> GaussianPriors:
-    """Priors of the parameters, as the configuration gives them."""
+    """Configured priors on the parameters."""
     return GaussianPriors.of(model, {p.parameter: (p.mean, p.sigma) for p in config.prior})
 
 
@@ -205,7 +205,10 @@ def sample_stars(
     folder: Path | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> Posterior:
-    """The posterior of a fit; of exposures that were fitted jointly with the chips averaged."""
+    """Sample the posterior of a fit.
+
+    If exposures were fitted jointly, each chip has its mean position over the exposures.
+    """
     for text in doubts_on_numbers(data.sample, data.model):
         log.warning("sample: %s", text)
     posterior = sample(
@@ -227,7 +230,7 @@ def sample_stars(
 def earlier_calibration(
     model: DistortionModel, config: Config, base: Path
 ) -> CalibrationPrior | None:
-    """Prior of a model by the calibration that a configuration names; None where it names none."""
+    """Prior from the calibration that a configuration names; None if it names none."""
     block = config.prior_calibration
     if block is None:
         return None
@@ -242,7 +245,7 @@ def earlier_calibration(
 
 
 def _calibration(path: Path, filter: str | None) -> Calibration:
-    """Calibration of a file, or of a run with the errors that were found in it."""
+    """Calibration of a file, or of a run with the errors that its diagnostics found."""
     if path.suffix != ".nc":
         return read_calibration(path, filter=filter)
     if path.name == FIT:
@@ -251,10 +254,10 @@ def _calibration(path: Path, filter: str | None) -> Calibration:
     folder = path.parent
     if path.name == POSTERIOR and (folder / "run.json").exists():
         run = RunDirectory(folder)
-        # errors that are lost, or were never found, would narrow the prior
+        # without the errors found by the diagnostics the prior would be too narrow
         run.require("prior_calibration", ("fit", "sample", "diagnose"))
         fit = load_fit(folder / FIT)
-        found = load_diagnostics(run, fit, posterior)
+        diagnostics = load_diagnostics(run, fit, posterior)
         hierarchy = fit if run.config.campaign is not None else None
-        posterior = with_diagnosed_errors(posterior, found, hierarchy)
+        posterior = with_diagnosed_errors(posterior, diagnostics, hierarchy)
     return calibration_of(posterior, str(folder))

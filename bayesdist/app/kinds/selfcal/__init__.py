@@ -1,1 +1,1 @@
-"""Runs without a catalogue: the distortion from dithered exposures alone."""
+"""Self-calibration: distortion from dithered exposures without a reference catalogue."""

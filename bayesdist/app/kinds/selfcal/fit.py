@@ -1,4 +1,4 @@
-"""The solution of a self-calibration: its mode, its posterior, and as later stages read it."""
+"""Solution of a self-calibration: its mode, its posterior, and its restoration by later stages."""
 
 from __future__ import annotations
 
@@ -34,11 +34,11 @@ from bayesdist.model import DistortionModel
 from bayesdist.utils.arrays import Float
 
 ARRAYS = ("theta", "stars", "mixture", "held", "n_free", "reference")
-RELINEARISED = 3  # times a problem is linearised anew about a solution that is read
+RELINEARISED = 3  # number of times a problem is relinearised about a restored solution
 
 
 def arrays_of(solution: SelfCalibrationMode, reference: Float) -> dict[str, NDArray[Any]]:
-    """A solution as arrays; `reference` is where what is known beside it was linearised."""
+    """Arrays that store a solution; `reference` (D,) is where the constraints were linearised."""
     mixture, decision = solution.mixture, solution.decision
     counts = (0, 0) if decision is None else (decision.n_null, decision.n_open)
     held = np.setdiff1d(np.arange(len(solution.theta)), solution.free)
@@ -53,12 +53,12 @@ def arrays_of(solution: SelfCalibrationMode, reference: Float) -> dict[str, NDAr
 
 
 def load_selfcal(folder: Path, matched: Callable[[], SelfcalMatched]) -> Fitted:
-    """The fit of an earlier stage, with its solution."""
+    """Load the fit of an earlier stage, including its solution."""
     fitted = load_fitted(folder)
-    found = matched()
-    compute = found.inputs.config.resources()
+    matches = matched()
+    compute = matches.inputs.config.resources()
     arrays = read_arrays(folder / SOLUTION, "", "a solution of detections", ARRAYS, do=FIT_AGAIN)
-    return replace(fitted, solved=solved_of(found, fitted.linear.model, arrays, compute))
+    return replace(fitted, solved=solved_of(matches, fitted.linear.model, arrays, compute))
 
 
 def solved_of(
@@ -67,12 +67,15 @@ def solved_of(
     arrays: Mapping[str, NDArray[Any]],
     compute: Compute | None,
 ) -> SelfCalibrated:
-    """The solution that `arrays_of` made arrays of: what the fit has is what later stages read."""
+    """Restore the solution that `arrays_of` stored.
+
+    The fit itself uses the restored solution, so that later stages obtain the same one.
+    """
     inputs, held = matched.inputs, arrays["held"].astype(np.int64)
     theta, stars = arrays["theta"], arrays["stars"]
     jitter, fraction = (float(v) for v in arrays["mixture"])
     n_null, n_open = (int(n) for n in arrays["n_free"])
-    mixture, known = Mixture(jitter, fraction), inputs.known_for(model)
+    mixture, constraints = Mixture(jitter, fraction), inputs.known_for(model)
     problem = inputs.problem(model, matched.detections, theta, matched.theta)
     for _ in range(RELINEARISED):
         problem = problem.at(theta, stars)
@@ -82,12 +85,12 @@ def solved_of(
         stars,
         mixture,
         np.setdiff1d(np.arange(model.n_params), held),
-        known(arrays["reference"]),
+        constraints(arrays["reference"]),
         Decision(n_null, n_open, held),
         compute=compute,
     )
-    gauge = gauge_of(problem, theta, known(theta), solution)
-    fixed, places = fixed_by(gauge, solution, known), solution.stars
+    gauge = gauge_of(problem, theta, constraints(theta), solution)
+    fixed, places = fixed_by(gauge, solution, constraints), solution.stars
     contact = inputs.contact(model, matched.theta)
     return SelfCalibrated(
         solution,
@@ -97,14 +100,14 @@ def solved_of(
         gauge_table(gauge, fixed, model),
         matches_of(problem, places, matched.detections, inputs, matched.unused),
         arrays,
-        tuple(known.contradictions(theta)),
+        tuple(constraints.contradictions(theta)),
         inputs.catalog,
         contact,
     )
 
 
 def fit_selfcal(matched: SelfcalMatched) -> Fitted:
-    """Mode and gauge of a self-calibration, in one decision."""
+    """Find mode and gauge of a self-calibration together."""
     inputs, model = matched.inputs, matched.problem.model
     with one_cluster(inputs.config.resources()) as compute:
         mode = solve_in_gauge(
@@ -134,7 +137,7 @@ def sample_detections(
     folder: Path | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> Posterior:
-    """The posterior of a self-calibration, with errors in the unit of u, v."""
+    """Sample the posterior of a self-calibration, with errors in the unit of u, v."""
     return sample_selfcal(
         required(data.fitted.solved, "solution of detections").mode,
         outliers=config.mixture(),

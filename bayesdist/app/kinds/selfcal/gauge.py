@@ -1,4 +1,4 @@
-"""The gauge of a self-calibration: its directions, and what fixes them, in words."""
+"""Gauge of a self-calibration: its directions and the constraints on them, in words."""
 
 from __future__ import annotations
 
@@ -21,18 +21,18 @@ CONVENTION, DETECTIONS, REFERENCES = "convention", "detections", "reference star
 def fixed_by(
     gauge: Gauge, solution: SelfCalibrationMode, pieces: GaugeConstraints
 ) -> dict[str, str]:
-    """Source that fixes each property of the solution, by its name."""
+    """Source of the constraint on each property of the solution, by name of the property."""
     problem, theta = solution.problem, solution.theta
-    alone, known = solution.curvatures
-    found = {name: piece(theta) for name, piece in pieces.pieces.items()}
+    alone, with_priors = solution.curvatures
+    priors = {name: piece(theta) for name, piece in pieces.pieces.items()}
     sigmas: dict[str, dict[str, float]] = {}
     none = Prior.none(theta)
-    for name, information in found.items():
-        one = find_gauge(problem, theta, alone, information)
-        sigmas[name] = {d.name: d.sigma_fixed for d in one.directions}
+    for name, information in priors.items():
+        constrained = find_gauge(problem, theta, alone, information)
+        sigmas[name] = {d.name: d.sigma_fixed for d in constrained.directions}
     if problem.priors.informed.any():
-        one = find_gauge(problem, theta, alone, none, known=known)
-        sigmas[REFERENCES] = {d.name: d.sigma_fixed for d in one.directions}
+        constrained = find_gauge(problem, theta, alone, none, known=with_priors)
+        sigmas[REFERENCES] = {d.name: d.sigma_fixed for d in constrained.directions}
     return {d.name: _fixed_by(d, sigmas) for d in gauge.directions}
 
 
@@ -40,14 +40,14 @@ def _fixed_by(direction: NamedDirection, sigmas: Mapping[str, Mapping[str, float
     if not np.isfinite(direction.sigma_fixed):
         return CONVENTION
     limit = FAR * direction.sigma_fixed
-    found = [name for name, of in sigmas.items() if of[direction.name] < limit]
+    sources = [name for name, of in sigmas.items() if of[direction.name] < limit]
     if direction.by_detections:
         return DETECTIONS
-    return " and ".join(found) or "all together"
+    return " and ".join(sources) or "all together"
 
 
 def gauge_table(gauge: Gauge, fixed: Mapping[str, str], model: DistortionModel) -> Table:
-    """One row for each property of the solution, free ones first, then nearly free combinations."""
+    """One row per property of the solution: free ones first, then nearly free combinations."""
     rows = [
         _row(d, fixed) | {"edge_pix": d.edge_pix}
         for d in sorted(gauge.directions, key=lambda d: (not d.free, not d.weak))
@@ -64,7 +64,7 @@ def gauge_table(gauge: Gauge, fixed: Mapping[str, str], model: DistortionModel) 
 
 
 def _row(d: NamedDirection, fixed: Mapping[str, str]) -> dict[str, object]:
-    """Name of a property, how well it is known, and its constraint."""
+    """Name of a property, its uncertainty, and its constraint."""
     return {
         "name": d.name,
         "state": "free" if d.free else "nearly free" if d.weak else "known",
@@ -78,7 +78,7 @@ def _row(d: NamedDirection, fixed: Mapping[str, str]) -> dict[str, object]:
 def gauge_summary(
     gauge: Gauge, fixed: Mapping[str, str], model: DistortionModel
 ) -> dict[str, object]:
-    """Part 'gauge' of the section 'selfcal' of summary.json; infinite sigmas are null there."""
+    """Entry 'gauge' of the section 'selfcal' of summary.json; infinite sigmas become null."""
     return {
         "n_free": int(gauge.null.shape[1]),
         "n_by_convention": int(gauge.open.shape[1]),
@@ -95,15 +95,16 @@ def gauge_words(
     model: DistortionModel,
     contact: tuple[float, float] | None = None,
 ) -> str:
-    """In which gauge a product stands, and where its planes touch the sky.
+    """Text that states the gauge of a product and where its tangent planes touch the sky.
 
-    `contact`: point in u and v where the stars' plane touches the sky; None if the sky is flat.
+    `contact` is the point (u, v) where the plane of the stars touches the sky; None if the sky is
+    taken as flat.
     """
     by: dict[str, list[str]] = {}
     for d in gauge.directions:
         if d.free or d.weak:
             by.setdefault(fixed[d.name], []).append(d.name.replace("_", " "))
-    parts = [f"{', '.join(names)} by {what}" for what, names in by.items()]
+    parts = [f"{', '.join(names)} by {source}" for source, names in by.items()]
     held = ", ".join(model.names[k] for k in gauge.held)
     text = "Gauge of a self-calibration: " + ("; ".join(parts) or "all is known from detections")
     text += f"; held: {held}." if held else "."
@@ -111,7 +112,7 @@ def gauge_words(
 
 
 def _contact_words(model: DistortionModel, contact: tuple[float, float]) -> str:
-    """Points where the planes of exposures and stars touch the sky."""
+    """Sentence on the points where the planes of exposures and stars touch the sky."""
     chip = model.chips[0]
     x, y = (f"{z:.10g}" for z in chip.reference_pixel)
     u, v = (f"{z:.10g}" for z in contact)

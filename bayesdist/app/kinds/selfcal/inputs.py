@@ -1,4 +1,4 @@
-"""Inputs of a self-calibration: detections, and all that is known beside them."""
+"""Inputs of a self-calibration: detections, and additional constraints."""
 
 from __future__ import annotations
 
@@ -32,31 +32,31 @@ log = logging.getLogger("bayesdist")
 
 @dataclass(frozen=True, eq=False)
 class Inputs:
-    """Detections, and what is known of exposures and stars."""
+    """Detections, and additional information about exposures and stars."""
 
     config: SelfcalConfig
-    base: Path  # folder that its files are relative to
-    detections: Detections  # that pass the cuts; without star codes
-    n_read: int  # detections of the lists
-    rejected: Mapping[str, int]  # those that were cut, by reason
-    dilation: Float | None = None  # (E,), VAFACTOR, where the log has it
-    catalog: ReferenceCatalog | None = None  # reference stars, where there are any
-    commanded: Commanded | None = None  # commanded offsets and rolls, where there are any
+    base: Path  # folder that file names are relative to
+    detections: Detections  # those that pass the cuts; without star codes
+    n_read: int  # number of detections in the lists
+    rejected: Mapping[str, int]  # number of detections that fail the cuts, by reason
+    dilation: Float | None = None  # (E,), VAFACTOR, if the log states it
+    catalog: ReferenceCatalog | None = None  # reference stars, if any
+    commanded: Commanded | None = None  # commanded offsets and rolls, if any
 
     @property
     def unit_arcsec(self) -> float | None:
-        """Size of the unit of u, v; None where nobody says what a pixel is."""
+        """Size of the unit of u, v in arcsec; None if the pixel scale is unknown."""
         return _unit_arcsec(self.config)
 
     @property
     def jitter(self) -> float | None:
-        """The jitter in pixels that is held; None where it is fitted."""
+        """Fixed jitter in pixels; None if it is fitted."""
         jitter = self.config.outliers.jitter
         return None if jitter == "fit" else float(jitter)
 
     @property
     def references(self) -> ReferenceStars | None:
-        """Reference stars among the detected ones; None where there are none."""
+        """Reference stars to be identified among the detections; None if there are none."""
         reference = self.config.gauge.reference
         if self.catalog is None or reference is None:
             return None
@@ -64,14 +64,14 @@ class Inputs:
 
     @property
     def tangent_plane(self) -> TangentPlane | None:
-        """Plane of the reference stars, or of the middle of all pointings; None without a scale."""
+        """Plane of the reference stars, or at the mean pointing; None without a pixel scale."""
         if self.unit_arcsec is None:
             return None
         point = None if self.config.gauge.reference is None else (0.0, 0.0)
         return TangentPlane(self.unit_arcsec, point)
 
     def contact(self, model: DistortionModel, theta: Float) -> tuple[float, float] | None:
-        """Point in u and v where the stars' plane touches the sky; None if the sky is flat."""
+        """Point (u, v) where the stars' plane touches the sky; None if the sky is taken as flat."""
         if self.tangent_plane is None:
             return None
         u, v = self.tangent_plane.contact(contacts_of(model, theta, self.detections.epoch))
@@ -79,7 +79,7 @@ class Inputs:
 
     @cached_property
     def parallax_factors(self) -> Float | None:
-        """Parallax factors (E, 2) of exposures along u and v; None where stars have no parallax."""
+        """Parallax factors (E, 2) of exposures along u and v; None if parallaxes are not fitted."""
         if self.config.selfcal.motion != "parallax":
             return None
         epoch = self.detections.epoch
@@ -99,20 +99,20 @@ class Inputs:
 
     @cached_property
     def start(self) -> tuple[DistortionModel, Float]:
-        """Model, and parameters (D,) by which the detections of a star lie near each other."""
-        given = self.detections, self.unit_arcsec, self.catalog, self.commanded
-        return started(self.config, self.base, *given)
+        """Model, and initial parameters (D,) that align the detections of each star."""
+        arguments = self.detections, self.unit_arcsec, self.catalog, self.commanded
+        return started(self.config, self.base, *arguments)
 
     def known_for(self, model: DistortionModel) -> GaugeConstraints:
-        """Constraints on the gauge beside the detections."""
+        """Constraints on the gauge in addition to the detections."""
         return GaugeConstraints.of(self.config, model, self.commanded, self.unit_arcsec)
 
     def problem(
         self, model: DistortionModel, detections: Detections, theta: Float, first: Float
     ) -> Problem:
-        """Detections of stars, linearised at parameters (D,) near the solution.
+        """Detections of stars, linearised at parameters `theta` (D,) near the solution.
 
-        By the parameters `first` reference stars are found among the detected ones.
+        With the parameters `first` (D,) reference stars are identified among the detected stars.
         """
         block = self.config.selfcal
         problem = prepare(
@@ -132,18 +132,21 @@ class Inputs:
 
 
 def read_selfcal(config: SelfcalConfig, base: Path) -> Inputs:
-    """Read all that a self-calibration begins with; paths are relative to `base`."""
+    """Read all inputs of a self-calibration; paths are relative to `base`."""
     block, gauge = config.selfcal, config.gauge
-    found = lists_of(block, base, errors=block.sigma == "columns")
-    names = found.names
-    for name, one, good in zip(names, found.lists, found.passed, strict=True):
+    star_lists = lists_of(block, base, errors=block.sigma == "columns")
+    names = star_lists.names
+    for name, detections, good in zip(names, star_lists.lists, star_lists.passed, strict=True):
         if not good.any():
             raise InputError(
                 f"no detection of exposure {name} passes the cuts",
-                where=one.source,
+                where=detections.source,
                 do="widen them, or leave the exposure out",
             )
-    used = [one.select(good) for one, good in zip(found.lists, found.passed, strict=True)]
+    used = [
+        detections.select(good)
+        for detections, good in zip(star_lists.lists, star_lists.passed, strict=True)
+    ]
     if len(used) < 2:
         raise InputError(
             f"there is one exposure, {names[0]}, and distortion shows between exposures",
@@ -152,11 +155,15 @@ def read_selfcal(config: SelfcalConfig, base: Path) -> Inputs:
         )
     refuse_other_chips(used, config.chips(), "selfcal.lists")
     refuse_duplicates(
-        [np.column_stack([one.x, one.y, one.chip]) for one in used], names, source="selfcal.lists"
+        [np.column_stack([detections.x, detections.y, detections.chip]) for detections in used],
+        names,
+        source="selfcal.lists",
     )
     epoch, dilation = _of_log(config, base, names)
-    if epoch is None and all(one.epoch is not None for one in used):
-        epoch = np.concatenate([one.epoch for one in used if one.epoch is not None])
+    if epoch is None and all(detections.epoch is not None for detections in used):
+        epoch = np.concatenate(
+            [detections.epoch for detections in used if detections.epoch is not None]
+        )
     sigma = None if isinstance(block.sigma, str) else float(block.sigma)
     commanded, catalog = None, _read_references(config, base)
     if gauge.offsets is not None:
@@ -167,8 +174,8 @@ def read_selfcal(config: SelfcalConfig, base: Path) -> Inputs:
         config,
         base,
         detections_of(used, epoch=epoch, sigma=sigma),
-        len(found),
-        found.cut,
+        len(star_lists),
+        star_lists.cut,
         dilation,
         catalog,
         commanded,
@@ -176,20 +183,20 @@ def read_selfcal(config: SelfcalConfig, base: Path) -> Inputs:
 
 
 def refuse_selfcal(inputs: Inputs) -> None:
-    """Refuse exposures that cannot be laid onto each other, and a start that cannot be read."""
+    """Refuse exposures that cannot be aligned, and an initial distortion that cannot be read."""
     model, _ = inputs.start
     inputs.known_for(model)
 
 
 def outline_of_selfcal(inputs: Inputs) -> Outline:
-    """Shape of the solution, as its start has it."""
+    """Shape of the solution, from the initial model."""
     model, theta = inputs.start
     plain = DistortionModel(model.order, model.chips, model.unit, model.time)
     return Outline(plain, model.pixel_size(theta))
 
 
 def _unit_arcsec(config: SelfcalConfig) -> float | None:
-    """Size of the unit of u and v; None for pixels of a size that nobody gives."""
+    """Size of the unit of u and v in arcsec; None for pixels of unknown size."""
     scale = config.detector.scale_mas
     return ARCSEC.get(config.selfcal.unit, None if scale is None else scale / 1000)
 
@@ -197,27 +204,27 @@ def _unit_arcsec(config: SelfcalConfig) -> float | None:
 def _of_log(
     config: SelfcalConfig, base: Path, names: Sequence[str]
 ) -> tuple[Float | None, Float | None]:
-    """Dates and VAFACTOR of the exposures, where there is a log."""
+    """Dates and VAFACTOR of the exposures; None for what the log does not state."""
     exposures = config.selfcal.exposures
     if exposures is None:
         return None, None
     log = read_exposures(base / exposures)
-    found = [log[name] for name in names]
-    factors = np.array([np.nan if one.vafactor is None else one.vafactor for one in found])
-    known = np.isfinite(factors)
-    if known.any() and not known.all():
+    entries = [log[name] for name in names]
+    factors = np.array([np.nan if entry.vafactor is None else entry.vafactor for entry in entries])
+    has_factor = np.isfinite(factors)
+    if has_factor.any() and not has_factor.all():
         raise InputError(
-            f"exposure {names[int(np.argmin(known))]} has no vafactor, and others have",
+            f"exposure {names[int(np.argmin(has_factor))]} has no vafactor, and others have",
             where=log.source,
             do="give it for all exposures, or for none",
         )
-    return np.array([one.epoch for one in found]), factors if known.all() else None
+    return np.array([entry.epoch for entry in entries]), factors if has_factor.all() else None
 
 
 def _read_references(config: SelfcalConfig, base: Path) -> ReferenceCatalog | None:
-    """The reference stars, in the unit of u and v; None where there are none."""
+    """Reference stars in the unit of u and v; None if there are none."""
     block, unit_arcsec = config.gauge.reference, _unit_arcsec(config)
-    if block is None or unit_arcsec is None:  # the configuration asks for a scale with references
+    if block is None or unit_arcsec is None:  # with references the configuration requires a scale
         return None
     catalog = read_catalog(
         base / block.catalog,
@@ -237,14 +244,15 @@ def _read_references(config: SelfcalConfig, base: Path) -> ReferenceCatalog | No
             "a reference star has the error zero", where=catalog.source, do="drop it, or correct it"
         )
     catalog = _with_motions(catalog)
-    own = ARCSEC.get(catalog.unit, unit_arcsec)
-    return catalog.rescaled(own / unit_arcsec, config.selfcal.unit)
+    catalog_unit_arcsec = ARCSEC.get(catalog.unit, unit_arcsec)
+    return catalog.rescaled(catalog_unit_arcsec / unit_arcsec, config.selfcal.unit)
 
 
 def _with_motions(catalog: ReferenceCatalog) -> ReferenceCatalog:
-    """Without stars whose motion has the error zero: where they are at other dates is not known.
+    """Catalogue without stars that have a proper-motion error of zero.
 
-    So catalogues write motions that were not measured, beside those that were.
+    Some catalogues write unmeasured proper motions in this way.  The positions of such stars at
+    other dates are unknown.
     """
     if catalog.sigma_pm_u is None or catalog.sigma_pm_v is None:
         return catalog

@@ -1,4 +1,4 @@
-"""What is known beside the detections: commanded offsets and rolls, and what fixes the gauge."""
+"""Commanded offsets and rolls of exposures, and all constraints on the gauge."""
 
 from __future__ import annotations
 
@@ -34,26 +34,43 @@ _COLUMNS = {
 
 @dataclass(frozen=True, eq=False)
 class Commanded:
-    """Where exposures were to point."""
+    """Commanded pointings of the exposures."""
 
-    # (E, 2), along u and v, NaN where there is none; None in a file of rolls alone
+    # (E, 2), along u and v, NaN if an exposure has none; None if the file has only rolls
     offsets: Float | None
-    sigma: Float  # (E,), of each, on one axis
+    sigma: Float  # (E,), errors per axis
     roll: Float | None  # (E,), radians, from u to v
-    group: Int  # (E,), exposures with the same guide stars
+    group: Int  # (E,), equal for exposures with the same guide stars
 
 
 def read_commanded(
     path: Path, names: Sequence[str], unit: str, scale_mas: float | None, sigma: float | None
 ) -> Commanded:
-    """Commanded offsets and rolls of exposures from a table.
+    """Read commanded offsets and rolls of exposures from a table.
 
-    Columns are exposure, du and dv along u and v, sigma, roll in degrees from u to v, group.
-    `unit`: of columns without one. `sigma`: of offsets without such a column.
+    Its columns are exposure, du and dv along u and v, sigma, roll in degrees from u to v, and
+    group.
+
+    Parameters
+    ----------
+    path : Path
+    names : sequence of str
+        Names of the exposures.
+    unit : str
+        Unit of columns that state none.
+    scale_mas : float or None
+        Pixel size in mas.
+    sigma : float or None
+        Error of the offsets, if given, in place of a column sigma.
+
+    Raises
+    ------
+    InputError
+        If columns, exposures or errors are missing, or an exposure is listed twice.
     """
     table = read_table(path)
-    found = find_columns(table.colnames, None, _COLUMNS, source=str(path))
-    if "exposure" not in found or ("du" in found) != ("dv" in found):
+    columns = find_columns(table.colnames, None, _COLUMNS, source=str(path))
+    if "exposure" not in columns or ("du" in columns) != ("dv" in columns):
         raise InputError(
             f"no columns exposure, du and dv among {', '.join(table.colnames) or 'none'}",
             where=str(path),
@@ -61,18 +78,20 @@ def read_commanded(
         )
 
     def column(key: str) -> SourceColumn:
-        return SourceColumn(table[found[key]], str(path), found[key])
+        return SourceColumn(table[columns[key]], str(path), columns[key])
 
     def length(key: str) -> Float:
-        own = column(key).unit
-        return column(key).numbers() * (1.0 if own is None else _factor(own, unit, scale_mas, path))
+        column_unit = column(key).unit
+        return column(key).numbers() * (
+            1.0 if column_unit is None else _factor(column_unit, unit, scale_mas, path)
+        )
 
     codes, labels = column("exposure").labels()
     row_of = {labels[code]: k for k, code in enumerate(codes)}
     if len(row_of) < len(codes):
-        twice = labels[int(np.argmax(np.bincount(codes)))]
+        duplicate = labels[int(np.argmax(np.bincount(codes)))]
         raise InputError(
-            f"exposure {twice} stands there twice", where=str(path), do="keep one row of each"
+            f"exposure {duplicate} stands there twice", where=str(path), do="keep one row of each"
         )
     rows = np.array([row_of.get(name, -1) for name in names])
     if (rows < 0).all():
@@ -86,9 +105,9 @@ def read_commanded(
         return np.where(rows >= 0, values[rows], missing)
 
     offsets, error = None, np.full(len(names), np.nan if sigma is None else sigma)
-    if "du" in found:
+    if "du" in columns:
         offsets = np.stack([of_each(length("du")), of_each(length("dv"))], axis=1)
-        if "sigma" in found and sigma is None:
+        if "sigma" in columns and sigma is None:
             error = of_each(length("sigma"), 1.0)
         if not (error > 0).all():
             raise InputError(
@@ -97,14 +116,14 @@ def read_commanded(
                 do="give a column sigma above zero, or gauge.offset_sigma",
             )
     group = np.zeros(len(names), np.int64)
-    if "group" in found:
+    if "group" in columns:
         group = np.where(rows >= 0, column("group").labels()[0][rows], -1)
-    roll = np.radians(of_each(column("roll").numbers())) if "roll" in found else None
+    roll = np.radians(of_each(column("roll").numbers())) if "roll" in columns else None
     return Commanded(offsets, error, roll, group)
 
 
 def _factor(own: str, unit: str, scale_mas: float | None, path: Path) -> float:
-    """Factor from a unit `own` to `unit`, pixels among them."""
+    """Conversion factor from the unit `own` to `unit`; either may be the pixel."""
     if own == unit:
         return 1.0
     if "pix" not in (own, unit):
@@ -125,24 +144,27 @@ Piece = Callable[[Float], Prior]
 
 @dataclass(frozen=True, eq=False)
 class GaugeConstraints:
-    """Constraints on the gauge beside the detections, each from one source."""
+    """Constraints on the gauge in addition to the detections, each from one source."""
 
-    pieces: Mapping[str, Piece]  # prior linearised at parameters (D,), by what it is from
+    pieces: Mapping[str, Piece]  # priors as functions of parameters (D,), by source
 
     def __call__(self, theta: Float) -> Prior:
-        """Prior of all pieces together, linearised at theta (D,)."""
+        """Combined prior of all constraints, linearised at theta (D,)."""
         out = Prior.none(theta)
         for piece in self.pieces.values():
             out = out + piece(theta)
         return out
 
     def contradictions(self, theta: Float) -> Iterator[str]:
-        """Pieces that a solution (D,), which has them in it, is too far from, as sentences."""
+        """Sentences about constraints that disagree significantly with a solution `theta` (D,).
+
+        The solution itself includes the constraints.
+        """
         for name, piece in self.pieces.items():
-            known = piece(theta)
-            values, vectors = np.linalg.eigh(known.precision)
+            prior = piece(theta)
+            values, vectors = np.linalg.eigh(prior.precision)
             measured = values > 1e-10 * values[-1]
-            right = vectors[:, measured].T @ known.right
+            right = vectors[:, measured].T @ prior.right
             square, n = float(np.sum(right**2 / values[measured])), int(measured.sum())
             if chi2_sf(square, n) < GAUGE_CONTRADICTION.value:
                 yield (
@@ -176,9 +198,9 @@ class GaugeConstraints:
             pieces["commanded rolls"] = lambda theta: _rolls(model, theta, roll, error)
         if block.exposure_scale_sigma is not None:
             scatter = block.exposure_scale_sigma
-            same = np.zeros(len(model.exposures))  # scales are deviations from one
+            zeros = np.zeros(len(model.exposures))  # scales are deviations from 1
             pieces["scatter of the scales"] = lambda theta: frame_prior(
-                model, theta, "scale", same, scatter
+                model, theta, "scale", zeros, scatter
             )
         if block.scale is not None and unit_arcsec is not None:
             size, sigma = block.scale.mas / 1000 / unit_arcsec, block.scale.sigma
@@ -192,19 +214,22 @@ class GaugeConstraints:
 
 
 def _rolls(model: DistortionModel, theta: Float, roll: Float, sigma: float) -> Prior:
-    """Commanded rolls, each with its error; the first one's is shared by all the differences."""
-    now = np.zeros(len(model.exposures))
-    for e in range(1, len(now)):
+    """Prior on commanded rolls, each with its error.
+
+    The error of the first roll is common to all differences.
+    """
+    rotation = np.zeros(len(model.exposures))
+    for e in range(1, len(rotation)):
         names = model.free_frame_names(e)
         if "rotation" in names:
-            now[e] = theta[model.frame_slice(e).start + names.index("rotation")]
-    off = np.exp(1j * (roll - now))  # of each, all by one unknown zero point
-    # that is where the angles lie on average, and no angle is far from it
+            rotation[e] = theta[model.frame_slice(e).start + names.index("rotation")]
+    off = np.exp(1j * (roll - rotation))  # phase factors that have a common unknown zero point
+    # the zero point is the mean angle, and no angle is far from it
     zero = np.nanmean(off)
-    return frame_prior(model, theta, "rotation", now + np.angle(off / zero), sigma)
+    return frame_prior(model, theta, "rotation", rotation + np.angle(off / zero), sigma)
 
 
 def _scale(model: DistortionModel, theta: Float, size: float, sigma: float) -> Prior:
-    """A tie of the pixel at the first chip's reference pixel to a size."""
+    """Prior that ties the pixel scale at the first chip's reference pixel to `size`."""
     row = functionals(model, theta)["scale"]
     return tie(theta, row, float(np.log(size / model.linear_scale(theta))), sigma)

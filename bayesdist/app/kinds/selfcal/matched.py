@@ -1,7 +1,8 @@
-"""The detections of a self-calibration with their stars, also as pairs, and a first solution.
+"""Detections of a self-calibration matched with their stars, and a first solution.
 
-So the usual statistics of residuals, maps of bins and diagrams serve self-calibrations too.  Stars
-follow their detections: residuals are smaller than the errors by what that takes.
+As matches they can be used for the same statistics of residuals, maps and diagrams as those of
+other runs.  The stars are fitted to their detections, so that residuals are smaller than the errors
+by the corresponding degrees of freedom.
 """
 
 from __future__ import annotations
@@ -38,10 +39,18 @@ def matches_of(
     inputs: Inputs,
     unused: Mapping[str, int],
 ) -> Matches:
-    """Detections of the stars beside these, in the frame of each exposure's own VAFACTOR.
+    """Detections matched with their stars, in the frame of each exposure's own VAFACTOR.
 
-    `problem`: linearised at a solution with these `stars` (S, q). `unused`: detections that are of
-    no star, by reason.
+    Parameters
+    ----------
+    problem : Problem
+        Linearised at a solution.
+    stars : ndarray, shape (S, q)
+        Stars of the solution.
+    detections : Detections
+    inputs : Inputs
+    unused : mapping of str to int
+        Number of detections without a star, by reason.
     """
     p, d = problem, detections
     rows, model = p.rows, p.model
@@ -76,21 +85,21 @@ def matches_of(
 
 
 def _axes(W: Float) -> Float:
-    """Error along u and along v (N, 2) of a pixel of error: of W^-1."""
+    """Error along u and v (N, 2) that corresponds to one pixel: sqrt of the diagonal of W^-1."""
     det = W[:, 0] * W[:, 2] - W[:, 1] ** 2
     return np.sqrt(np.stack([W[:, 2], W[:, 0]], axis=1) / det[:, None])
 
 
 def magnitude_errors_of(solution: SelfCalibrationMode, matches: Matches) -> MagnitudeErrors | None:
-    """Errors of centroids by magnitude, in the unit of u, v; None without magnitudes."""
+    """Centroid errors by magnitude in the unit of u, v; None if there are no magnitudes."""
     if matches.mag is None:
         return None
     p = solution.problem
-    given = p, solution.theta, solution.mixture, solution.stars
-    middles, sigma = scatter_by_magnitude(*given, matches.mag)
+    state = p, solution.theta, solution.mixture, solution.stars
+    middles, sigma = scatter_by_magnitude(*state, matches.mag)
     sigma = sigma * p.model.pixel_size(solution.theta)
     edges = np.concatenate([[-np.inf], (middles[1:] + middles[:-1]) / 2, [np.inf]])
-    n = np.histogram(matches.mag, edges, weights=memberships(*given))[0]
+    n = np.histogram(matches.mag, edges, weights=memberships(*state))[0]
     return MagnitudeErrors(middles, sigma, sigma, n.astype(np.int64), sigma, sigma)
 
 
@@ -100,27 +109,27 @@ ARRAYS = ("x", "y", "star", "sigma", "theta", "stars", "mixture", "model")
 
 @dataclass(frozen=True, eq=False)
 class SelfcalMatched(Matched):
-    """Detections beside their stars, by a first solution."""
+    """Detections matched with their stars by a first solution."""
 
     section: ClassVar[str] = "selfcal"
     has_catalogue: ClassVar[bool] = False
     along_detector: ClassVar[bool] = True
 
     inputs: Inputs = field(kw_only=True)
-    # with their stars and errors, on one tangent plane
+    # with star codes and errors, on a common tangent plane
     detections: Detections = field(kw_only=True)
     problem: Problem = field(kw_only=True)  # linearised at the first solution
-    theta: Float = field(kw_only=True)  # (D,), of the first solution
-    places: Float = field(kw_only=True)  # (S, q), its stars
-    mixture: Mixture = field(kw_only=True)  # its errors
+    theta: Float = field(kw_only=True)  # (D,), parameters of the first solution
+    places: Float = field(kw_only=True)  # (S, q), stars of the first solution
+    mixture: Mixture = field(kw_only=True)  # errors of the first solution
 
     @property
     def unused(self) -> dict[str, int]:
-        """Detections that are of no star, by reason."""
+        """Number of detections without a star, by reason."""
         return dict(self.facts.get("detections", {}).get("unused", {}))
 
     def save(self, folder: Path) -> None:
-        """Write the files of a run's folder that belong to it."""
+        """Write the detections and the first solution to the folder of a run."""
         names, m = ("x", "y", "star", "sigma"), self.mixture
         arrays = {name: getattr(self.detections, name) for name in names}
         arrays |= {"theta": self.theta, "stars": self.places}
@@ -134,10 +143,10 @@ class SelfcalMatched(Matched):
 def load_matched_selfcal(
     folder: Path, inputs: Inputs, summary: Mapping[str, Any]
 ) -> SelfcalMatched:
-    """The detections of an earlier stage."""
-    path, what, do = folder / DETECTIONS, "a file of detections", "run the stage 'match' again"
-    arrays = read_arrays(path, "", what, ARRAYS, do=do)
-    with restoring(path, what, do=do):
+    """Load the detections of an earlier stage from the folder of a run."""
+    path, content, do = folder / DETECTIONS, "a file of detections", "run the stage 'match' again"
+    arrays = read_arrays(path, "", content, ARRAYS, do=do)
+    with restoring(path, content, do=do):
         text = arrays["model"].astype(np.uint8).tobytes().decode()
         model = DistortionModel.from_dict(json_of(text, str(path)))
         detections = replace(
@@ -161,7 +170,10 @@ def selfcal_matched(
     facts: Mapping[str, Any],
     table: Table | None = None,
 ) -> SelfcalMatched:
-    """Detections with codes of stars and errors, by a first solution: parameters, stars, errors."""
+    """Detections with star codes and errors, matched with their stars by a first solution.
+
+    `first` is that solution: parameters (D,), stars (S, q) and outlier mixture.
+    """
     theta, places, mixture = first
     problem = inputs.problem(model, detections, theta, theta)
     unused = facts.get("detections", {}).get("unused", {})

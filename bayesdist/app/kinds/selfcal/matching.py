@@ -1,4 +1,4 @@
-"""Detections of a self-calibration become stars, exposure by exposure."""
+"""Matching of the detections of a self-calibration to stars, exposure by exposure."""
 
 from __future__ import annotations
 
@@ -29,16 +29,16 @@ from bayesdist.utils.arrays import Bool, Float, Int
 log = logging.getLogger("bayesdist")
 
 
-FEW_COMMON = 0.5  # of the usual fraction of common detections: an exposure that does not fit
-HALF_TURN = np.radians(10.0)  # from half a turn
+FEW_COMMON = 0.5  # of the median fraction of common detections: fewer are refused
+HALF_TURN = np.radians(10.0)  # radians: tolerance on a rotation by 180 degrees
 TURN_BACK = "turn its pixels back by 180 degrees if they were turned, or leave it out"
-AMBIGUOUS = 0.05  # fraction of groups that may be of one star or several, worth a warning
+AMBIGUOUS = 0.05  # fraction of ambiguous groups above which there is a warning
 
 
 def match_dithers(inputs: Inputs) -> SelfcalMatched:
-    """Detections of dithered exposures with their stars, and a first solution."""
-    found = calibrated(inputs, lambda text: log.info("match: %s", text))
-    table, facts = exposure_table(found, inputs), matching_facts(found, inputs)
+    """Match detections of dithered exposures to stars, with a first solution."""
+    calibration = calibrated(inputs, lambda text: log.info("match: %s", text))
+    table, facts = exposure_table(calibration, inputs), matching_facts(calibration, inputs)
     refuse_unconnected(table)
     for text in facts["warnings"]:
         log.warning("match: WARNING: %s", text)
@@ -50,13 +50,13 @@ def match_dithers(inputs: Inputs) -> SelfcalMatched:
         facts["n_exposures"],
         facts["n_ambiguous"],
     )
-    s = found.mode
+    s = calibration.mode
     if inputs.tangent_plane is not None:
         moved = facts["tangent_planes_pix"]
         log.info("match: detections moved by up to %.2g pix onto one tangent plane", moved)
     return selfcal_matched(
         inputs,
-        found.detections,
+        calibration.detections,
         s.problem.model,
         (s.theta, s.stars, s.mixture),
         facts=facts,
@@ -67,8 +67,8 @@ def match_dithers(inputs: Inputs) -> SelfcalMatched:
 def calibrated(inputs: Inputs, report: Callable[[str], None]) -> SelfCalibration:
     """Stars and solution of a self-calibration.
 
-    `report`: called with what happens, in words. Where it does not settle and one exposure lies
-    half a turn from all the others, the error names it.
+    `report` is called with text about the progress.  If the solution does not settle and one
+    exposure is rotated by 180 degrees with respect to all others, the error names that exposure.
     """
     (model, theta), block = inputs.start, inputs.config.selfcal
     try:
@@ -105,7 +105,7 @@ def calibrated(inputs: Inputs, report: Callable[[str], None]) -> SelfCalibration
 
 
 def rolled_180(rolls: Float) -> list[int]:
-    """Exposures that lie half a turn from all the others, of at least three."""
+    """Exposures rotated by 180 degrees with respect to all others; empty for fewer than three."""
     if len(rolls) < 3:
         return []
     off = np.abs(np.angle(np.exp(1j * (rolls[:, None] - rolls)))) - np.pi
@@ -114,20 +114,20 @@ def rolled_180(rolls: Float) -> list[int]:
 
 
 def exposure_table(found: SelfCalibration, inputs: Inputs) -> Table:
-    """One row for each exposure: its detections, those in common with others, rms, and its frame.
+    """One row per exposure: its detections, those in common with others, rms in pixels, frame.
 
-    'overlapping' are detections that lie where other exposures look, 'common' those of them that
-    are of a common star, 'fraction_common' is that fraction; rms in pixels.
+    'overlapping' counts detections within the field of other exposures.  'common' counts those of
+    them with a star that other exposures detected, too.  'fraction_common' is their ratio.
     """
     s, d = found.mode, found.detections
     p, model, E = s.problem, s.problem.model, len(d.exposure_names)
     used = np.zeros(len(d), bool)
     used[p.rows] = True
     places = places_of(model, d, s.theta, inputs.dilation)
-    seen = _seen_by_others(model, s.theta, places, d.exposure)
+    overlaps = _seen_by_others(model, s.theta, places, d.exposure)
     total, overlap, common = (
-        np.bincount(d.exposure[which], minlength=E)
-        for which in (np.ones(len(d), bool), seen, used & seen)
+        np.bincount(d.exposure[mask], minlength=E)
+        for mask in (np.ones(len(d), bool), overlaps, used & overlaps)
     )
     w = memberships(p, s.theta, s.mixture, s.stars)
     square = p.squares(s.theta, s.stars)
@@ -153,13 +153,13 @@ def exposure_table(found: SelfCalibration, inputs: Inputs) -> Table:
 def refuse_unconnected(table: Table) -> None:
     """Refuse an exposure that hardly shares stars with the others where they overlap."""
     share = np.asarray(table["fraction_common"], float)
-    if len(share) < 3:  # of two nobody knows which one is wrong
+    if len(share) < 3:  # with two exposures it is unknown which one is wrong
         return
     usual = np.array([np.nanmedian(np.delete(share, k)) for k in range(len(share))])
-    few = share < FEW_COMMON * usual
-    if not few.any():
+    unconnected = share < FEW_COMMON * usual
+    if not unconnected.any():
         return
-    k = int(np.nanargmin(np.where(few, share / usual, np.nan)))
+    k = int(np.nanargmin(np.where(unconnected, share / usual, np.nan)))
     name = str(table["exposure"][k])
     half = k in rolled_180(np.radians(np.asarray(table["rotation"], float)))
     turned = ", and it lies half a turn from all the others" if half else ""
@@ -174,14 +174,14 @@ def refuse_unconnected(table: Table) -> None:
 
 
 def matching_facts(found: SelfCalibration, inputs: Inputs) -> dict[str, Any]:
-    """Section 'selfcal' of summary.json: how detections became stars."""
+    """Section 'selfcal' of summary.json: numbers of detections and stars."""
     d, friends, p = found.detections, found.friends, found.mode.problem
-    raw = inputs.detections  # as they were before they lay on one tangent plane
+    raw = inputs.detections  # before they were moved onto a common tangent plane
     counts = np.bincount(d.star[d.star != NO_STAR], minlength=friends.n_stars)
-    few = (counts > 1) & (counts < inputs.config.selfcal.min_detections)
+    too_few = (counts > 1) & (counts < inputs.config.selfcal.min_detections)
     unused = {
         "of a star that one exposure alone has": int((counts == 1).sum()),
-        "of a star with too few detections": int(counts[few].sum()),
+        "of a star with too few detections": int(counts[too_few].sum()),
         "second detection of a star in an exposure": friends.n_dropped,
         "in a chain of several stars": int((d.star == NO_STAR).sum()) - friends.n_dropped,
     }
@@ -213,7 +213,7 @@ def matching_facts(found: SelfCalibration, inputs: Inputs) -> dict[str, Any]:
 
 
 def tangent_plane_facts(found: SelfCalibration, inputs: Inputs) -> dict[str, Any] | None:
-    """Where exposures and stars touch the sky, for summary.json; None if the sky is flat."""
+    """Tangent points of exposures and stars, for summary.json; None if the sky is flat."""
     model = found.mode.problem.model
     contact = inputs.contact(model, found.mode.theta)
     if contact is None:
@@ -228,7 +228,7 @@ def tangent_plane_facts(found: SelfCalibration, inputs: Inputs) -> dict[str, Any
 
 
 def _seen_by_others(model: DistortionModel, theta: Float, places: Float, exposure: Int) -> Bool:
-    """Boolean mask (N,) of detections that lie on the sky where another exposure has a chip."""
+    """Boolean mask (N,) of detections that fall on a chip of another exposure."""
     E = len(model.exposures)
     outlines = [
         [hull_of(_corners(model, theta, e, chip.number, chip.size))[0] for chip in model.chips]
@@ -238,9 +238,9 @@ def _seen_by_others(model: DistortionModel, theta: Float, places: Float, exposur
     for e in range(E):
         rows = np.flatnonzero(exposure == e)
         inside = np.zeros(len(rows), bool)
-        for other in range(E):
-            if other != e:
-                for outline in outlines[other]:
+        for k in range(E):
+            if k != e:
+                for outline in outlines[k]:
                     inside |= inside_hull(places[rows], outline)
         out[rows] = inside
     return out
@@ -255,11 +255,11 @@ def _corners(
 
 
 def selfcal_lines(inputs: Inputs) -> Iterator[str]:
-    """Stars and free directions of a self-calibration, as lines of text: nothing is sampled."""
-    found = calibrated(inputs, lambda text: None)
-    s, gauge, model = found.mode, found.gauge, found.mode.problem.model
-    refuse_unconnected(exposure_table(found, inputs))
-    summary = matching_facts(found, inputs)
+    """Lines of text about stars and free directions of a self-calibration, without sampling."""
+    calibration = calibrated(inputs, lambda text: None)
+    s, gauge, model = calibration.mode, calibration.gauge, calibration.mode.problem.model
+    refuse_unconnected(exposure_table(calibration, inputs))
+    summary = matching_facts(calibration, inputs)
     fixed = fixed_by(gauge, s, inputs.known_for(model))
     d = summary["detections"]
     cut = "".join(f", {count} {reason}" for reason, count in d["cut"].items())
@@ -285,9 +285,9 @@ def selfcal_lines(inputs: Inputs) -> Iterator[str]:
         yield f"geometry     chip {chip.chip}: {chip.sentence}"
     n, held = gauge.null.shape[1], gauge.open.shape[1]
     yield f"null space   {n} directions are free, {held} of them held by convention"
-    for one in gauge.directions:
-        if one.free or one.weak:
-            yield f"             {_state_words(one, fixed[one.name])}"
+    for direction in gauge.directions:
+        if direction.free or direction.weak:
+            yield f"             {_state_words(direction, fixed[direction.name])}"
     for sigma, k in gauge.weakest:
         yield f"nearly free  {number(sigma)} pix at the edge, led by {model.names[int(k)]}"
     doubtful = [text for chip in chips for text in chip.warnings]
@@ -298,8 +298,8 @@ def selfcal_lines(inputs: Inputs) -> Iterator[str]:
 
 
 def _state_words(one: NamedDirection, by: str) -> str:
-    """Error of a direction by the detections, its constraint, and its error then."""
-    known = "" if one.free else f", {number(one.sigma)} {one.unit} from detections".rstrip()
+    """Text with the error of a direction from the detections, its constraint and final error."""
+    uncertainty = "" if one.free else f", {number(one.sigma)} {one.unit} from detections".rstrip()
     how = "held by convention" if by == CONVENTION else f"fixed by {by}"
     size = "" if by == CONVENTION else f", sigma {number(one.sigma_fixed)} {one.unit}".rstrip()
-    return f"{one.name}{known}: {how}{size}"
+    return f"{one.name}{uncertainty}: {how}{size}"

@@ -1,4 +1,4 @@
-"""The stars that a self-calibration found, as a catalogue that others can use."""
+"""Stars found by a self-calibration, written as a catalogue."""
 
 from __future__ import annotations
 
@@ -27,8 +27,8 @@ FLAGS = {
     DOUBTFUL: "more than a third of the detections are expected to be false",
     REFERENCE: "a reference star: its catalogue position is among its measurements",
 }
-MIN_MEMBERS = 2 / 3  # of the detections, below which a star is doubtful
-PARQUET_FROM = 100_000  # stars, above which there is a Parquet file beside the table
+MIN_MEMBERS = 2 / 3  # expected fraction of true detections below which a star is doubtful
+PARQUET_FROM = 100_000  # number of stars above which a Parquet file is written, too
 
 
 def write_stars(
@@ -38,14 +38,27 @@ def write_stars(
     notes: Mapping[str, Any],
     compute: Compute,
 ) -> dict[str, Any]:
-    """Write stars.ecsv, and of many stars stars.parquet.
+    """Write stars.ecsv and, if there are many stars, stars.parquet.
 
-    `correlated`: whose covariance of the parameters the stars share. Result: for summary.json.
+    Parameters
+    ----------
+    folder : Path
+    solved : SelfCalibrated
+    correlated : Discrepancy or None
+        Adds its covariance of the parameters, which all stars have in common.
+    notes : mapping
+        Metadata of the table.
+    compute : Compute
+
+    Returns
+    -------
+    dict
+        Entry for summary.json.
     """
     solution, references = solved.mode, solved.references
     cov = None if correlated is None else correlated.covariance
-    found = star_catalogue(solution, cov, compute=compute)
-    table = star_table(solution, found, solved.matches.mag, references)
+    catalogue = star_catalogue(solution, cov, compute=compute)
+    table = star_table(solution, catalogue, solved.matches.mag, references)
     table.meta |= notes
     if solved.contact is not None:
         table.meta["contact"] = list(solved.contact)
@@ -58,16 +71,16 @@ def write_stars(
         write_columns(path, columns, units)
     flags = np.asarray(table["flags"])
     sigma = np.hypot(table["sigma_u"], table["sigma_v"])
-    own = np.hypot(table["sigma_own_u"], table["sigma_own_v"])
+    radius_detections = np.hypot(table["sigma_own_u"], table["sigma_own_v"])
     return {
         "n": len(table),
-        "unit": found.unit,
-        "epoch": found.epoch or None,
+        "unit": catalogue.unit,
+        "epoch": catalogue.epoch or None,
         "n_two_detections": int((flags & FEW > 0).sum()),
         "n_doubtful": int((flags & DOUBTFUL > 0).sum()),
         "n_reference": int((flags & REFERENCE > 0).sum()),
         "radius_median": float(np.median(sigma)),
-        "radius_own_median": float(np.median(own)),
+        "radius_own_median": float(np.median(radius_detections)),
     }
 
 
@@ -77,11 +90,11 @@ def star_table(
     mag: Float | None = None,
     references: ReferenceCatalog | None = None,
 ) -> Table:
-    """Stars with their covariance: one row for each.
+    """Table of stars with their covariance, one row per star.
 
-    Columns u, v (and pm_u, pm_v), sigma_u and so on with the errors of distortion and frames in
-    the gauge of the run, cov_u_v and so on, sigma_own_u, sigma_own_v of the star's detections
-    alone, n, n_members, mag (the median), flags.
+    Columns are u, v (and pm_u, pm_v); sigma_u and so on, which include the errors of distortion and
+    frames in the gauge of the run; cov_u_v and so on; sigma_own_u and sigma_own_v from the
+    detections of the star alone; n, n_members, mag (the median) and flags.
     """
     names = NAMES[: found.values.shape[1]]
     units = [f"{found.unit} / yr" if name.startswith("pm") else found.unit for name in names]

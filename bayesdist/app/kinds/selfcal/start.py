@@ -1,4 +1,4 @@
-"""Model and first parameters of a self-calibration, from its lists alone or from what is known."""
+"""Initial model and parameters of a self-calibration, from its lists or an earlier calibration."""
 
 from __future__ import annotations
 
@@ -36,20 +36,19 @@ def started(
     references: ReferenceCatalog | None,
     commanded: Commanded | None,
 ) -> tuple[DistortionModel, Float]:
-    """Model, and parameters (D,) by which the detections of a star lie near each other.
+    """Model, and initial parameters (D,) that align the detections of each star.
 
-    The sky lies as the reference stars do, or else as the commanded offsets, or else as the first
-    exposure.
-
-    The error for exposures that have no stars in common names them.
+    The orientation on the sky is that of the reference stars, otherwise that of the commanded
+    offsets, otherwise that of the first exposure.  Raises InputError, which names the exposures, if
+    exposures have no stars in common.
     """
-    block, number = config.selfcal, int(d.chip[0])  # of a detector of one chip, as in the data
+    block, number = config.selfcal, int(d.chip[0])  # chip number of a detector with one chip
     chips = config.chips()
     if not chips:
         pixel = config.model.reference_pixel
         chips = (one_chip(config.detector, pixel, number, f"chip {number}"),)
     start = _first(config, base, chips, unit_arcsec)
-    # each chip of each exposure by itself: without a start nobody knows how the chips lie
+    # without an initial distortion the layout of the chips is unknown: each chip is a list
     several = len(chips) > 1 and block.initial_distortion is None
     exposure, chip, rows = _lists(d, apart=several)
     names = [d.exposure_names[e] for e in exposure]
@@ -76,7 +75,7 @@ def started(
             onto, on = turned, [turned(plane) for plane in on]
             frames = mutual_frames(on, mags, names, source="selfcal.lists")
     middles = np.stack([plane.mean(axis=0) for plane in on])
-    # frames turn about the point where the planes of the exposures touch the sky
+    # frames rotate about the point where the planes of the exposures touch the sky
     (x, y), number = chips[0].reference_pixel, chips[0].number
     origin = start(np.array([x]), np.array([y]), number)
     u, v = (origin if onto is None else onto(origin))[0]
@@ -95,21 +94,24 @@ def started(
 
 def _lists(d: Detections, *, apart: bool) -> tuple[Int, Int, list]:
     """Exposure and chip of each list, and the rows of its detections."""
-    found = []
+    lists = []
     for e in range(len(d.exposure_names)):
-        here = np.flatnonzero(d.exposure == e)
+        in_exposure = np.flatnonzero(d.exposure == e)
         if not apart:
-            found.append((e, 0, here))
+            lists.append((e, 0, in_exposure))
             continue
-        found += [(e, int(n), here[d.chip[here] == n]) for n in np.unique(d.chip[here])]
-    exposure, number, rows = zip(*found, strict=True)
+        lists += [
+            (e, int(n), in_exposure[d.chip[in_exposure] == n])
+            for n in np.unique(d.chip[in_exposure])
+        ]
+    exposure, number, rows = zip(*lists, strict=True)
     return np.array(exposure), np.array(number), list(rows)
 
 
 def _first(
     config: SelfcalConfig, base: Path, chips: tuple[Chip, ...], unit_arcsec: float | None
 ) -> Start:
-    """The known distortion: of an earlier run, an IDCTAB, or none."""
+    """Initial distortion: of an earlier run, of an IDCTAB, or none."""
     block, scale = config.selfcal, config.detector.scale_mas
     pixel = 1.0
     if block.unit != "pix" and scale is not None and unit_arcsec is not None:
@@ -118,17 +120,17 @@ def _first(
         return undistorted(chips, pixel)
     path = base / block.initial_distortion
     if path.is_dir() or path.suffix == ".nc":
-        known = load_fit(path) if path.name == "fit.nc" else load_posterior(path)
-        if known.model.unit != block.unit:
+        solution = load_fit(path) if path.name == "fit.nc" else load_posterior(path)
+        if solution.model.unit != block.unit:
             raise InputError(
-                f"is in {known.model.unit}, and selfcal.unit is {block.unit!r}",
+                f"is in {solution.model.unit}, and selfcal.unit is {block.unit!r}",
                 where=str(path),
                 do="calibrate in the same unit",
             )
 
         def earlier(x: Float, y: Float, chip: int) -> Float:
-            when = None if known.model.time is None else known.model.time.epoch0[0]
-            return np.asarray(known.model.predict(known.mean, x, y, chip=chip, epoch=when))
+            when = None if solution.model.time is None else solution.model.time.epoch0[0]
+            return np.asarray(solution.model.predict(solution.mean, x, y, chip=chip, epoch=when))
 
         return earlier
     if unit_arcsec is None:
@@ -143,7 +145,7 @@ def _first(
 def _onto_references(
     plane: Float, mag: Float | None, references: ReferenceCatalog | None
 ) -> LinearMap | None:
-    """Similarity from the first exposure onto the reference stars; a mirrored one is allowed."""
+    """Similarity from the first exposure to the reference stars, mirrored if necessary."""
     if references is None:
         return None
     index = pattern_index(np.column_stack([references.u, references.v]), references.mag)
@@ -169,11 +171,11 @@ def _onto_references(
 def _onto_offsets(
     matrices: Float, shifts: Float, middle: Float, offsets: Float
 ) -> LinearMap | None:
-    """Rotation and scale by which the exposures lie as they were commanded; None for one place."""
-    known = np.isfinite(offsets).all(axis=1)
-    if known.sum() < 2:
+    """Rotation and scale that align the exposures with commanded offsets; None if all coincide."""
+    commanded = np.isfinite(offsets).all(axis=1)
+    if commanded.sum() < 2:
         return None
-    places, asked = (matrices @ middle + shifts)[known], offsets[known]
+    places, asked = (matrices @ middle + shifts)[commanded], offsets[commanded]
     if not np.ptp(places, axis=0).max() > 0:
         return None
     return LinearMap(best_similarity(places, asked).matrix, np.zeros(2), middle)

@@ -1,4 +1,4 @@
-"""Forms in which errors are drawn: all that a new error term has to choose from."""
+"""Forms in which errors are drawn; a new error term uses one of them."""
 
 from bayesdist.assess.terms.forms.functions import FunctionField, Functions
 from bayesdist.assess.terms.forms.independent import Independent, Known, KnownField, NoiseField

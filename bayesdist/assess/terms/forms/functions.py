@@ -1,4 +1,4 @@
-"""Errors that are sums of functions of the position, of any shape."""
+"""Errors that are sums of arbitrary functions of the position."""
 
 from __future__ import annotations
 
@@ -14,29 +14,29 @@ from bayesdist.assess.terms.forms.rows import DrawnField, Image, Pool, Row, Scal
 from bayesdist.model.grid import DEFAULT_GRID, grid_pixels, mesh
 from bayesdist.utils.arrays import Float
 
-MANY = 64  # functions from which on their values are kept, not their coefficients alone
+MANY = 64  # number of functions above which values are kept instead of coefficients
 
 
 @dataclass(frozen=True, eq=False)
 class Functions:
-    """Errors that are sums of functions of the position: draw k is row k mod n' of coefficients."""
+    """Sums of functions of the position; draw k uses row k mod n' of the coefficients."""
 
     row: Row
-    # (n', 2, m), by chip number; a chip that is not there has no such error. Under None, those of
-    # all chips
+    # (n', 2, m) by chip number; a chip that is missing has no such error. The key None is for all
+    # chips
     coefficients: Mapping[int | None, NDArray[np.floating]]
-    # take a chip number and pixels x, y (N,) to values (N, m)
+    # functions(chip_number, x, y) with pixels x, y (N,) returns values (N, m)
     functions: Callable[[int, Float, Float], NDArray[np.floating]]
     n_draws: int
-    uniform: bool = False  # whether the error is the same at all positions
-    # (2, m, m), of the coefficients, where it is stated: mean squares are exact then, and it is not
-    # known how well their size is
+    uniform: bool = False  # True if the error is the same at all positions
+    # covariance (2, m, m) of the coefficients, if it is stated; mean squares are then exact, and
+    # the uncertainty of their size is unknown
     covariance: Mapping[int | None, Float] | None = None
-    pools: tuple[Pool, ...] = ()  # finite sets that the coefficients are taken from
+    pools: tuple[Pool, ...] = ()  # finite sets from which the coefficients are taken
     _cache: dict[EvaluationDomain, FunctionField] = field(default_factory=dict, repr=False)
 
     def on(self, domain: EvaluationDomain, image: Image) -> FunctionField:
-        """The errors at the positions of a domain; of those asked for last they are kept."""
+        """Errors at the positions of a domain; the most recent ones are cached."""
         key = domain.at(None)
         if key not in self._cache:
             self._cache.clear()
@@ -44,18 +44,18 @@ class Functions:
         return self._cache[key]
 
     def of(self, chip: int) -> NDArray[np.floating] | None:
-        """Coefficients (n', 2, m) on a chip; None where there is no error."""
+        """Coefficients (n', 2, m) on a chip; None if there is no error."""
         return self.coefficients.get(chip, self.coefficients.get(None))
 
     def values(self, chip: int, x: Float, y: Float) -> NDArray[np.floating]:
-        """Errors (n', N, 2) of all rows at pixels of a chip."""
-        own = self.of(chip)
-        if own is None:
+        """Errors (n', N, 2) of all rows of coefficients, at pixels of a chip."""
+        coefficients = self.of(chip)
+        if coefficients is None:
             return np.zeros((1, len(x), 2))
-        phi = self.functions(chip, x, y).astype(own.dtype)
-        # one product of matrices: 2000 of two rows each take seven times as long
-        both = own.reshape(-1, own.shape[2]) @ phi.T
-        return np.swapaxes(both.reshape(-1, 2, len(phi)), 1, 2)
+        phi = self.functions(chip, x, y).astype(coefficients.dtype)
+        # a single matrix product: 2000 products with two rows each take seven times as long
+        errors = coefficients.reshape(-1, coefficients.shape[2]) @ phi.T
+        return np.swapaxes(errors.reshape(-1, 2, len(phi)), 1, 2)
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,7 +71,7 @@ class FunctionField(DrawnField):
 
     @property
     def n_different(self) -> int:
-        """Rows of coefficients."""
+        """Number of rows of coefficients."""
         return max(len(values) for values, _ in self._parts)
 
     @property
@@ -81,30 +81,30 @@ class FunctionField(DrawnField):
 
     @cached_property
     def _parts(self) -> list[tuple[NDArray[np.floating], NDArray[np.floating] | None]]:
-        """Coefficients with functions (N, m) of each chip, or values where these are many."""
+        """For each chip: coefficients and functions (N, m), or values if there are many."""
         at = self.domain
         out: list[tuple[NDArray[np.floating], NDArray[np.floating] | None]] = []
         for chip, rows in at.by_chip():
             x, y = at.x[rows], at.y[rows]
-            own = self.of.of(chip)
-            if own is None or own.shape[2] > MANY:
+            coefficients = self.of.of(chip)
+            if coefficients is None or coefficients.shape[2] > MANY:
                 out.append((self.of.values(chip, x, y), None))
             else:
-                out.append((own, self.of.functions(chip, x, y)))
+                out.append((coefficients, self.of.functions(chip, x, y)))
         return out
 
     def errors(self, draws: slice, scale: Scale) -> Float:
-        """Errors (d, N, 2) of some draws."""
+        """Errors (d, N, 2) of the draws in a slice."""
         parts = []
         for values, phi in self._parts:
-            some = _of_draws(values, draws)
-            parts.append(some if phi is None else np.swapaxes(some @ phi.T, 1, 2))
+            drawn = _of_draws(values, draws)
+            parts.append(drawn if phi is None else np.swapaxes(drawn @ phi.T, 1, 2))
         out = parts[0] if len(parts) == 1 else np.concatenate(parts, axis=1)
         size = scale.get(self.of.row.name, 1.0)
         return np.asarray(out if size == 1.0 else size * out, float)
 
     def total(self) -> Float:
-        """Mean squares (P, 2): by the covariance, or over all rows of coefficients."""
+        """Mean squares (P, 2), from the covariance or over all rows of coefficients."""
         if self.of.covariance is not None:
             return self._stated(self.of.covariance)
         return super().total()
@@ -117,28 +117,30 @@ class FunctionField(DrawnField):
         }
 
         def squares(values: Float, chip: int) -> Float:
-            own = covariance[chip if chip in covariance else None]
-            return np.asarray(np.einsum("nk,akl,nl->na", values, own, values))
+            chip_covariance = covariance[chip if chip in covariance else None]
+            return np.asarray(np.einsum("nk,akl,nl->na", values, chip_covariance, values))
 
         pairs = at.pairs()
         if pairs is None:
             return np.concatenate([squares(values, chip) for chip, values in phi.items()])
-        every, out = np.concatenate(list(phi.values())), np.empty((pairs.shape[1], 2))
+        all_values, out = np.concatenate(list(phi.values())), np.empty((pairs.shape[1], 2))
         first, second = at.chip[pairs]
         for chip in phi:
             rows = first == chip
-            same = rows & ((second == chip) | (None in covariance))
-            out[same] = squares(every[pairs[1, same]] - every[pairs[0, same]], chip)
+            same_chip = rows & ((second == chip) | (None in covariance))
+            out[same_chip] = squares(
+                all_values[pairs[1, same_chip]] - all_values[pairs[0, same_chip]], chip
+            )
         apart = (first != second) & (None not in covariance)
         for side, chips in ((0, first), (1, second)):
             for chip in phi:
                 rows = apart & (chips == chip)
-                part = squares(every[pairs[side, rows]], chip)
+                part = squares(all_values[pairs[side, rows]], chip)
                 out[rows] = part if side == 0 else out[rows] + part
         return out
 
     def relative_error(self, chip: int, monte_carlo: float) -> float | None:
-        """As the rms of each draw over the chip scatters, where the size was measured."""
+        """Relative scatter of the rms of each draw over the chip; None for a stated size."""
         if self.of.covariance is not None:
             return None
         model = self.domain.model
@@ -150,7 +152,7 @@ class FunctionField(DrawnField):
 
 
 def _of_draws(values: NDArray[np.floating], draws: slice) -> NDArray[np.floating]:
-    """Rows (d, ...) of some draws: row k mod n' is that of draw k.  They are copied if need be."""
+    """Rows (d, ...) of the draws in a slice: draw k is row k mod n'. A view if possible."""
     if draws.stop <= len(values):
         return values[draws]
     if len(values) == 1:

@@ -1,4 +1,4 @@
-"""Errors that are independent from position to position, and displacements that are none."""
+"""Errors that are independent between positions, and known displacements."""
 
 from __future__ import annotations
 
@@ -15,39 +15,38 @@ from bayesdist.utils.arrays import Float
 
 @dataclass(frozen=True, eq=False)
 class Independent:
-    """Errors that are independent from position to position."""
+    """Errors that are independent between positions."""
 
     pools: ClassVar[tuple[Pool, ...]] = ()
 
     row: Row
-    # standard deviations (N, 2) at the positions of a domain; None where there is no such error, as
-    # of stars of no stated magnitude
+    # standard deviations (N, 2) at the positions of a domain; None if there is no such error, for
+    # example for stars without a magnitude
     sigma: Callable[[EvaluationDomain], Float | None]
-    # (n, 2), by chip number, what the variances of each draw are multiplied by; 1 where it is not
-    # there
+    # factors (n, 2) of the variances of each draw, by chip number; 1 for a chip that is missing
     sizes: Mapping[int, Float] = field(default_factory=dict)
-    # by chip number: how well the size is known, relative to it
+    # relative uncertainty of the size, by chip number
     known: Mapping[int, float | None] = field(default_factory=dict)
 
     def on(self, domain: EvaluationDomain, image: Image) -> NoiseField:
-        """The errors at the positions of a domain."""
+        """Errors at the positions of a domain."""
         sigma = self.sigma(domain)
         return NoiseField(() if sigma is None else (self.row,), domain, self, sigma)
 
 
 @dataclass(frozen=True, eq=False)
 class NoiseField(ErrorField):
-    """Independent errors at the positions of a domain: no row where there are none."""
+    """Independent errors at the positions of a domain; without a row if there are none."""
 
     of: Independent
     sigma: Float | None
 
     def squares(self) -> dict[str, Float]:
-        """Mean squares of the row, if there is one."""
+        """Mean squares of the row, if any."""
         return super().squares() if self.rows else {}
 
     def total(self) -> Float:
-        """Variances (P, 2); of differences those of both positions."""
+        """Variances (P, 2); for differences, the sum of the variances of both positions."""
         pairs = self.domain.pairs()
         if self.sigma is None:
             return np.zeros((self.domain.size if pairs is None else pairs.shape[1], 2))
@@ -55,31 +54,31 @@ class NoiseField(ErrorField):
         return square if pairs is None else square[pairs[0]] + square[pairs[1]]
 
     def relative_error(self, chip: int, monte_carlo: float) -> float | None:
-        """As it was stated."""
+        """Stated relative error; None if it is unknown."""
         return self.of.known.get(chip)
 
 
 @dataclass(frozen=True, eq=False)
 class Known:
-    """Displacements that are known, and no error."""
+    """Known displacements, which are not errors."""
 
     pools: ClassVar[tuple[Pool, ...]] = ()
 
-    row: Row  # in no total
-    # takes pixels x, y (N,), a chip number and an epoch (or None) to (N, 2)
+    row: Row  # not included in any total
+    # shift(x, y, chip_number, epoch) with pixels x, y (N,) and epoch or None returns (N, 2)
     shift: Callable[[Float, Float, int, float | None], Float]
 
     @property
     def rows(self) -> tuple[Row, ...]:
-        """The row."""
+        """A single row."""
         return (self.row,)
 
     def draw(self, n: int, rng: np.random.Generator) -> Known:
-        """Itself: it is the same in every draw."""
+        """Return this object: displacements are the same in every draw."""
         return self
 
     def on(self, domain: EvaluationDomain, image: Image) -> KnownField:
-        """The displacements at the positions of a domain."""
+        """Displacements at the positions of a domain."""
         parts = [
             self.shift(domain.x[rows], domain.y[rows], chip, domain.epoch)
             for chip, rows in domain.by_chip()
@@ -100,9 +99,9 @@ class KnownField(ErrorField):
         return {self.rows[0].name: moved**2}
 
     def total(self) -> Float:
-        """Nothing."""
+        """Zeros, because displacements are not errors."""
         return np.zeros_like(self.squares()[self.rows[0].name])
 
     def relative_error(self, chip: int, monte_carlo: float) -> float | None:
-        """Known exactly."""
+        """Zero, because displacements are exact."""
         return 0.0

@@ -1,4 +1,4 @@
-"""Errors of parameters: on any chip at any epoch a polynomial of the pixel."""
+"""Errors of parameters: polynomials of the pixel position, for each chip and epoch."""
 
 from __future__ import annotations
 
@@ -28,19 +28,19 @@ def polynomial_errors(
 ) -> Float:
     """Legendre coefficients (n, 2, K) of errors of parameters, along the axes of the gauge.
 
-    `mean`: (D,), where there is no error. `theta`: (n, D); without an exposure its first `n_global`
-    columns are enough. `rows`: (n,), of those in `theta`, where these are others. `epoch`: decimal
-    years. `chip`: chip number. `exposure`: (n,), code of the exposure, of all draws or of each,
-    whose frame is among the parameters that err; None for errors of the polynomials and their drift
-    alone.
+    `mean`: parameters without error, shape (D,). `theta`: parameters with errors, shape (n, D);
+    without an exposure the first `n_global` columns are sufficient. `rows`: row of `theta` for each
+    draw, shape (n,); all rows in order by default. `epoch`: decimal years. `chip`: chip number.
+    `exposure`: code of the exposure with errors in its frame, either for all draws or for each,
+    shape (n,); None for errors of the polynomials and their drift only.
     """
     if isinstance(exposure, np.ndarray):
         rows = np.arange(len(theta)) if rows is None else rows
         out = np.empty((len(rows), 2, model.n_terms))
         for e in np.unique(exposure):
-            own = exposure == e
-            out[own] = polynomial_errors(
-                model, mean, theta[rows[own]], epoch=epoch, chip=chip, exposure=int(e)
+            draws = exposure == e
+            out[draws] = polynomial_errors(
+                model, mean, theta[rows[draws]], epoch=epoch, chip=chip, exposure=int(e)
             )
         return out
     place = place_of(model, epoch=epoch, exposure=exposure, chip=chip)
@@ -54,14 +54,15 @@ def polynomial_errors(
 def without_rigid(
     errors: Mapping[int, Float], positions: Mapping[int, Float], model: DistortionModel
 ) -> dict[int, Float]:
-    """Take the best shift and rotation of the whole detector out of error fields.
+    """Subtract the best-fitting shift and rotation of the whole detector from error fields.
 
-    Whoever uses a calibration on an exposure fits where the telescope pointed.  What this takes up
-    is no error, and depends on the gauge: without it, a field is the same in every gauge.
+    Observers who apply a calibration to an exposure fit its pointing. The part of an error that
+    this fit absorbs is not an error, and it depends on the gauge; the residual is the same in every
+    gauge.
 
-    `errors`: (n, 2, K), by chip number, for all chips of the model: Legendre coefficients of each
-    error. `positions`: (2, K), those of the positions (u, v), in the same orientation. Returns (n,
-    2, K), the residual errors: least squares over stars that cover all chips evenly.
+    `errors`: Legendre coefficients (n, 2, K) of each error by chip number, for all chips of the
+    model. `positions`: coefficients (2, K) of the positions (u, v) in the same orientation. Returns
+    the residual errors (n, 2, K) of a least-squares fit to stars that cover all chips evenly.
     """
     chips = model.chips
     weight = mean_squares(model).reshape(len(chips), 2, -1)
@@ -70,32 +71,32 @@ def without_rigid(
     for c, chip in enumerate(chips):
         u, v = positions[chip.number]
         rigid[2, c] = -v, u
-    # about the middle of the detector a rotation is no shift
+    # shift the origin to the mean position, so that rotation and shifts are orthogonal
     rigid[2, ..., 0] -= np.einsum("ca,ca->a", weight[..., 0], rigid[2, ..., 0])
     stacked = np.stack([errors[chip.number] for chip in chips], axis=1)
     normal = np.einsum("pcak,cak,qcak->pq", rigid, weight, rigid)
     projected = np.einsum("pcak,ncak->np", rigid * weight, stacked)
-    rest = stacked - np.einsum("np,pcak->ncak", np.linalg.solve(normal, projected.T).T, rigid)
-    return {chip.number: rest[:, c] for c, chip in enumerate(chips)}
+    residual = stacked - np.einsum("np,pcak->ncak", np.linalg.solve(normal, projected.T).T, rigid)
+    return {chip.number: residual[:, c] for c, chip in enumerate(chips)}
 
 
 @dataclass(frozen=True, eq=False)
 class Polynomials:
-    """Errors of parameters: on any chip at any epoch a polynomial."""
+    """Errors of parameters, which are polynomials for each chip and epoch."""
 
     row: Row
     model: DistortionModel
-    mean: Float  # (D,), where there is no error
-    theta: Float  # (n, D), or (n, n_global) where no frame of an exposure errs
-    # code of an exposure whose frame errs, and takes the place of any new one
+    mean: Float  # parameters without error, (D,)
+    theta: Float  # (n, D), or (n, n_global) if no frame of an exposure has errors
+    # code of an exposure with errors in its frame, which represents any new exposure
     exposure: int | None = None
-    frames: bool = False  # whether the frame of the exposure of each draw's star errs
-    # takes an epoch and a chip number to what is added to these polynomials, (n, 2, K)
+    frames: bool = False  # True if the frame of the exposure of each draw's star has errors
+    # more(epoch, chip_number) returns coefficients (n, 2, K) that are added to these polynomials
     more: Callable[[float | None, int], Float] | None = None
-    pools: tuple[Pool, ...] = ()  # finite sets that the parameters are taken from
+    pools: tuple[Pool, ...] = ()  # finite sets from which the parameters are taken
 
     def on(self, domain: EvaluationDomain, image: Image) -> PolynomialField:
-        """The errors at the positions of a domain, less what an alignment takes up."""
+        """Errors at the positions of a domain, without the part that an alignment absorbs."""
 
         def coefficients(chip: int) -> Float:
             exposure = image.exposure if self.frames else self.exposure
@@ -109,7 +110,7 @@ class Polynomials:
 
 @dataclass(frozen=True, eq=False)
 class PolynomialField(DrawnField):
-    """Errors that are polynomials of the pixel: one row, or none for a sum of rows."""
+    """Errors that are polynomials of the pixel: a single row, or no row for a sum of rows."""
 
     coefficients: dict[int, Float]  # (n, 2, K), by chip number
 
@@ -123,15 +124,16 @@ class PolynomialField(DrawnField):
         image: Image,
         coefficients: Callable[[int], Float],
     ) -> PolynomialField:
-        """The field of coefficients by chip number, less what an alignment takes up."""
+        """Field from coefficients by chip, without the part that an alignment absorbs."""
         model, mean = domain.model, image.aligned_by
         if mean is None:
             return cls(rows, domain, {chip: coefficients(chip) for chip in domain.chips})
-        every = {chip.number: coefficients(chip.number) for chip in model.chips}
+        all_coefficients = {chip.number: coefficients(chip.number) for chip in model.chips}
         positions = {
-            chip: place_of(model, epoch=domain.epoch, chip=chip).polynomial(mean) for chip in every
+            chip: place_of(model, epoch=domain.epoch, chip=chip).polynomial(mean)
+            for chip in all_coefficients
         }
-        return cls(rows, domain, without_rigid(every, positions, model))
+        return cls(rows, domain, without_rigid(all_coefficients, positions, model))
 
     @property
     def n_draws(self) -> int:
@@ -139,19 +141,19 @@ class PolynomialField(DrawnField):
         return len(next(iter(self.coefficients.values())))
 
     def errors(self, draws: slice, scale: Scale) -> Float:
-        """Errors (d, N, 2) of some draws."""
+        """Errors (d, N, 2) of the draws in a slice."""
         size = scale.get(self.rows[0].name, 1.0) if self.rows else 1.0
         parts = []
         for chip, phi in self.domain.basis.items():
-            some = self.coefficients[chip][draws]
-            # one product of matrices: many of two rows each take longer
-            both = some.reshape(-1, some.shape[2]) @ phi.T
-            parts.append(np.swapaxes(both.reshape(-1, 2, len(phi)), 1, 2))
+            coefficients = self.coefficients[chip][draws]
+            # a single matrix product is faster than many with two rows each
+            errors = coefficients.reshape(-1, coefficients.shape[2]) @ phi.T
+            parts.append(np.swapaxes(errors.reshape(-1, 2, len(phi)), 1, 2))
         out = parts[0] if len(parts) == 1 else np.concatenate(parts, axis=1)
         return out if size == 1.0 else size * out
 
     def total(self) -> Float:
-        """Mean squares (P, 2), by second moments where they are those of positions."""
+        """Mean squares (P, 2); for positions they are computed from second moments."""
         if self.domain.relative:
             return self.by_draws(slice(0, self.n_draws))
         at, out = self.domain, []

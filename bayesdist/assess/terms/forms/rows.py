@@ -1,8 +1,8 @@
-"""The protocol of error terms: rows of a budget, draws, and fields of these at positions.
+"""Protocol of error terms: rows of a budget, draws, and error fields at positions.
 
-A term draws its chance once, for all chips, epochs and questions; its draws are evaluated at the
-positions of a domain wherever they are asked for.  Terms are independent of each other: what is
-correlated is one term with several rows.
+A term is drawn once for all chips, epochs and questions. Its draws are evaluated at the positions
+of any domain. Terms are independent of each other: correlated errors must be one term with several
+rows.
 """
 
 from __future__ import annotations
@@ -22,49 +22,50 @@ Scale = Mapping[str, float]
 LOCAL, PRODUCT = "local", "product"
 MEASURED, GIVEN, PUBLISHED = "measured in this run", "given by the user", "published"
 
-BLOCK = 200_000  # positions times draws that are evaluated at once
+BLOCK = 200_000  # number of positions times draws that are evaluated at a time
 
 
 @dataclass(frozen=True)
 class Row:
-    """One row of a budget."""
+    """One row of an error budget."""
 
     name: str
-    # 'systematic' (shared by all stars of an image), 'random' (of each star), 'local' (shared by
-    # the stars near a position) or 'product' (of a file: known, and no error)
+    # 'systematic' (shared by all stars of an image), 'random' (independent for each star), 'local'
+    # (shared by stars near a position) or 'product' (known deviation of a file, not an error)
     kind: str = "systematic"
     source: str = MEASURED  # begins with 'measured in this run', 'given by the user' or 'published'
-    # false for a row that is shown beside the others, as these hold it already
+    # False for a row that is only shown, because other rows already include it
     in_total: bool = True
 
 
 @dataclass(frozen=True, eq=False)
 class Image:
-    """In which image a position is asked for."""
+    """The image in which the position of a star is evaluated."""
 
-    # (n,), code of the exposure in which the star of each draw lies; None for a new exposure, or
-    # one of a model without frames
+    # (n,), code of the exposure in which each draw's star is observed; None for a new exposure, or
+    # for a model without frames
     exposure: Int | None = None
     # (D,), parameters of the positions to which the observer has fitted shift and rotation of the
-    # whole detector; None where nobody has
+    # whole detector; None if there was no such fit
     aligned_by: Float | None = None
 
 
 @dataclass(frozen=True, eq=False)
 class Pool:
-    """Finite set of draws from which those of a term are taken, some of them more than once.
+    """Finite set of draws from which those of a term are taken, possibly with repetitions.
 
-    More draws than these make a probability no better known, except for what other terms add.
+    Drawing more often than this does not make a probability more precise, except for the part
+    that other terms contribute.
     """
 
-    # (n,), which draw of the set each draw of the term is; None where that is not known
+    # (n,), number within the set of each draw of the term; None if it is unknown
     rows: Int | None
-    size: float  # independent draws that the whole set is worth
+    size: float  # effective number of independent draws in the set
     renewed: bool = False  # True if further draws of the term are taken from another set
 
 
 class ErrorTerm(Protocol):
-    """Something that moves positions: all that a new one has to give."""
+    """A contribution to the error of a position; every error term implements this protocol."""
 
     @property
     def rows(self) -> tuple[Row, ...]:
@@ -72,20 +73,20 @@ class ErrorTerm(Protocol):
         ...
 
     def draw(self, n: int, rng: np.random.Generator) -> ErrorDraws:
-        """Draws of the error, one chance for all chips and epochs."""
+        """Draw the error n times; each draw applies to all chips and epochs."""
         ...
 
 
 class ErrorDraws(Protocol):
-    """Draws of a term: one of the forms of this module."""
+    """Draws of a term; the forms of this package implement this protocol."""
 
     @property
     def pools(self) -> tuple[Pool, ...]:
-        """Finite sets that the draws are taken from; empty where each draw is a new one."""
+        """Finite sets from which the draws are taken; empty if each draw is independent."""
         ...
 
     def on(self, domain: EvaluationDomain, image: Image) -> ErrorField:
-        """The errors at the positions of a domain."""
+        """Errors at the positions of a domain, in an image."""
         ...
 
 
@@ -104,38 +105,38 @@ class ErrorField(ABC):
         return False
 
     def squares(self) -> dict[str, Float]:
-        """Mean squares (P, 2) of each row: at positions, or of the differences of pairs."""
+        """Mean squares (P, 2) of each row, at positions or of the differences of pairs."""
         (row,) = self.rows
         return {row.name: self.total()}
 
     @abstractmethod
     def total(self) -> Float:
-        """Mean squares (P, 2) of all rows together."""
+        """Mean squares (P, 2) of the sum of all rows."""
 
     @property
     def parts(self) -> tuple[ErrorField, ...]:
-        """Fields of single rows."""
+        """Fields of the single rows."""
         return (self,)
 
     @property
     def summed(self) -> tuple[ErrorField, ...]:
-        """Fields whose sum is the error."""
+        """Fields that sum to the error."""
         return (self,)
 
     def by_row(self) -> Iterator[tuple[Row, ErrorField, Float]]:
-        """Each row, with its own field and its mean squares (P, 2)."""
+        """Each row with its field and its mean squares (P, 2)."""
         squares = self.squares()
         for part in self.parts:
             for row in part.rows:
                 yield row, part, squares[row.name]
 
     def relative_error(self, chip: int, monte_carlo: float) -> float | None:
-        """Relative error of the size of a single row on a chip; None where it is not known."""
+        """Relative uncertainty of the size of a single row on a chip; None if it is unknown."""
         return monte_carlo
 
 
 class DrawnField(ErrorField):
-    """Errors that are the same at all positions of a draw, or vary over them as it says."""
+    """Errors that can be evaluated for every draw at the positions of a domain."""
 
     @property
     @abstractmethod
@@ -144,19 +145,19 @@ class DrawnField(ErrorField):
 
     @property
     def n_different(self) -> int:
-        """Draws after which they are the first ones again."""
+        """Number of different draws; further ones repeat them in order."""
         return self.n_draws
 
     @abstractmethod
     def errors(self, draws: slice, scale: Scale) -> Float:
-        """Errors (d, N, 2) of some draws, rows multiplied by factors."""
+        """Errors (d, N, 2) of the draws in a slice, with rows multiplied by factors."""
 
     def total(self) -> Float:
-        """Mean squares (P, 2) of all rows together."""
+        """Mean squares (P, 2) of the sum of all rows."""
         return self.by_draws(slice(0, self.n_different))
 
     def by_draws(self, draws: slice) -> Float:
-        """Mean squares (P, 2) over some draws, evaluated in blocks."""
+        """Mean squares (P, 2) over the draws in a slice, evaluated in blocks."""
         pairs, total, n = self.domain.pairs(), 0.0, draws.stop - draws.start
         step = max(1, BLOCK // max(self.domain.size, 1))
         for start in range(draws.start, draws.stop, step):

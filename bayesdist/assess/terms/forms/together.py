@@ -1,4 +1,4 @@
-"""Rows of one term: the same draw number in each, so that they may be correlated."""
+"""Correlated rows of one term, which use the same draw number."""
 
 from __future__ import annotations
 
@@ -16,25 +16,25 @@ from bayesdist.utils.arrays import Float
 
 @dataclass(frozen=True, eq=False)
 class Together:
-    """Rows of one term: the same draw number in each, so that they may be correlated.
+    """Correlated rows of one term, which use the same draw number.
 
-    The joint error is the sum of the rows that are in the total.  Rows that are not are held by it:
-    where one of them shrinks, the joint error does so at each position as the row's fraction of its
-    variance says.
+    The joint error is the sum of the rows that are in the total. It already includes the rows that
+    are not: if one of these is reduced, the variance of the joint error decreases at each position
+    by the variance that the row loses.
     """
 
     draws: tuple[Polynomials | Functions, ...]  # one for each row
-    # whether the last row counts as much as the joint error has beyond the other rows
+    # True if the last row is the excess of the joint error over the other rows
     remainder: bool = False
 
     @property
     def pools(self) -> tuple[Pool, ...]:
-        """Finite sets that the draws of the rows are taken from."""
-        return tuple(pool for one in self.draws for pool in one.pools)
+        """Finite sets from which the draws of the rows are taken."""
+        return tuple(pool for draws in self.draws for pool in draws.pools)
 
     def on(self, domain: EvaluationDomain, image: Image) -> TogetherField:
-        """The errors at the positions of a domain."""
-        parts = tuple(one.on(domain, image) for one in self.draws)
+        """Errors at the positions of a domain."""
+        parts = tuple(draws.on(domain, image) for draws in self.draws)
         return TogetherField.of(domain, parts, remainder=self.remainder)
 
 
@@ -43,8 +43,8 @@ class TogetherField(DrawnField):
     """Rows of one term at the positions of a domain."""
 
     members: tuple[DrawnField, ...]
-    whole: DrawnField | None = None  # the joint error, where it is more than the sum of the rows
-    remainder: bool = False  # as of `Together`
+    whole: DrawnField | None = None  # the joint error, if it is more than the sum of the rows
+    remainder: bool = False  # see `Together`
 
     @classmethod
     def of(
@@ -55,7 +55,7 @@ class TogetherField(DrawnField):
         *,
         remainder: bool = False,
     ) -> TogetherField:
-        """The field with the rows of all parts."""
+        """Field with the rows of all parts."""
         rows = tuple(row for part in parts for row in part.rows)
         return cls(rows, domain, parts, whole, remainder)
 
@@ -71,7 +71,7 @@ class TogetherField(DrawnField):
 
     @cached_property
     def summed(self) -> tuple[DrawnField, ...]:
-        """Fields whose sum is the joint error."""
+        """Fields that sum to the joint error."""
         return self._added if self.whole is None else (self.whole,)
 
     @cached_property
@@ -80,7 +80,7 @@ class TogetherField(DrawnField):
         return tuple(p for p in self.members if all(row.in_total for row in p.rows))
 
     def errors(self, draws: slice, scale: Scale) -> Float:
-        """The joint error (d, N, 2), each row multiplied by its factor."""
+        """Joint error (d, N, 2) of the draws in a slice, each row multiplied by its factor."""
         if self.whole is None:
             out = reduce(np.add, (part.errors(draws, scale) for part in self._added))
         else:
@@ -93,16 +93,16 @@ class TogetherField(DrawnField):
         return out if factor is None else factor * out
 
     def _factor(self, scale: Scale) -> Float | None:
-        """Factor (N, 2) of the joint error where rows shrink that it holds."""
+        """Factor (N, 2) of the joint error if rows that it includes are reduced."""
         held = [r.name for r in self.rows if not r.in_total and r.name in scale]
         if not held:
             return None
         assert not self.domain.relative
-        whole, by_row = self.total(), self.squares()
-        left = whole - sum(
-            (1.0 - scale[name] ** 2) * np.minimum(by_row[name], whole) for name in held
+        total, by_row = self.total(), self.squares()
+        remaining = total - sum(
+            (1.0 - scale[name] ** 2) * np.minimum(by_row[name], total) for name in held
         )
-        return np.sqrt(np.maximum(left, 0.0) / np.where(whole > 0, whole, 1.0))
+        return np.sqrt(np.maximum(remaining, 0.0) / np.where(total > 0, total, 1.0))
 
     def squares(self) -> dict[str, Float]:
         """Mean squares (P, 2) of each row."""
@@ -115,8 +115,8 @@ class TogetherField(DrawnField):
             out |= part.squares()
         if self.remainder:
             last = self.rows[-1].name
-            others = sum(square for name, square in out.items() if name != last)
-            out[last] = np.maximum(self.total() - others, 0.0)
+            other_rows = sum(square for name, square in out.items() if name != last)
+            out[last] = np.maximum(self.total() - other_rows, 0.0)
         return out
 
     @cached_property

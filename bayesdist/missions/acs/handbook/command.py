@@ -1,4 +1,4 @@
-"""`bayesdist hst handbook`: what section 4.1 of the ACS handbook shows, of any calibration."""
+"""`bayesdist hst handbook`: figures and numbers of section 4.1 of the ACS handbook."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def handbook(
     magnification: float | None,
     command: str,
 ) -> str:
-    """Text with the numbers of a calibration, once they and its figures are in a new folder."""
+    """Write the numbers and figures of a calibration to a new folder; returns text to print."""
     # figures take seconds to import
     from bayesdist.missions.acs.handbook.figures import (
         area_figure,
@@ -50,46 +50,49 @@ def handbook(
             where="--magnification",
             do="give a positive number",
         )
-    found = calibration_of_scale(path, filter=filter, scale=scale, epoch=epoch)
-    pixel, _ = found.pixel(epoch)
-    if detector is None and found.instrument == "ACS":
-        detector = found.detector
-    whole = WholeDetector(found.in_frame(epoch), pixel)
-    title = _title(found, filter, epoch)
+    calibration = calibration_of_scale(path, filter=filter, scale=scale, epoch=epoch)
+    pixel, _ = calibration.pixel(epoch)
+    if detector is None and calibration.instrument == "ACS":
+        detector = calibration.detector
+    whole_detector = WholeDetector(calibration.in_frame(epoch), pixel)
+    title = _title(calibration, filter, epoch)
     with record_folder(Path(output), "handbook.json", command) as (folder, record):
         figures = {
-            "non_linear": non_linear_figure(whole, title, magnification=magnification),
-            "pixel_area": area_figure(whole, title),
+            "non_linear": non_linear_figure(whole_detector, title, magnification=magnification),
+            "pixel_area": area_figure(whole_detector, title),
         }
         binned, missing = _residuals(Path(path))
         if binned:
-            figures["residuals"] = residual_figure(whole, binned, found.unit, title)
+            figures["residuals"] = residual_figure(whole_detector, binned, calibration.unit, title)
         rows = handbook_rows(
-            detector_numbers(whole), scale=pixel, unit=found.unit, detector=detector or ""
+            detector_numbers(whole_detector),
+            scale=pixel,
+            unit=calibration.unit,
+            detector=detector or "",
         )
         save_figures(figures, folder)
         write_table(Table(rows), folder / "numbers.ecsv")
-        record |= {"calibration": found.name, "detector": detector, "figures": list(figures)}
+        record |= {"calibration": calibration.name, "detector": detector, "figures": list(figures)}
     shown = [row | {"published": row["published"] or "-"} for row in rows]
     return f"{output}: {', '.join(figures)}{missing}\n{table_text(shown, 5)}"
 
 
 def _title(found: Calibration, filter: str | None, epoch: float | None) -> str:
     parts = [Path(found.name).resolve().name, filter or "", f"at {epoch:g}" if epoch else ""]
-    whose = "/".join(p for p in (found.instrument, found.detector) if p)
-    return ", ".join(p for p in (whose, *parts) if p)
+    instrument = "/".join(p for p in (found.instrument, found.detector) if p)
+    return ", ".join(p for p in (instrument, *parts) if p)
 
 
 def _residuals(path: Path) -> tuple[Mapping[int, BinnedResiduals], str]:
-    """Mean residuals in cells, by chip; or none, and what to say of that."""
+    """Mean residuals in cells by chip number, and a clause that explains their absence."""
     home = path if path.is_dir() else path.parent
-    product = path.is_file() and path.suffix != ".nc"  # its unit may be another one
+    product = path.is_file() and path.suffix != ".nc"  # it may be in another unit
     if product or not (home / "run.json").exists():
-        return {}, "; no residuals, which only runs have"
+        return {}, "; no residuals, since this is not a run"
     try:
         with open_results(RunDirectory.open(home)) as results:
             chips = results.fit.model.chips
             sums = zip(chips, results.diagnostics.shown, strict=True)
-            return {chip.number: one.residuals() for chip, one in sums}, ""
-    except InputError as error:  # matches that were moved away: all else can be shown without them
+            return {chip.number: chip_sums.residuals() for chip, chip_sums in sums}, ""
+    except InputError as error:  # the matches were moved: everything else can be shown
         return {}, f"; no residuals: {error}"

@@ -1,7 +1,7 @@
-"""Diagrams of a whole detector, its chips as one array: as Figures 4.1 to 4.5 of the ACS handbook.
+"""Figures of a whole detector with all chips as one array, like Figures 4.1 to 4.5 of the handbook.
 
-They are oriented as in pipelines, x to the right and y up; two of the handbook's are rotated by 180
-degrees.
+They are oriented as in pipelines, with x to the right and y upwards.  Two figures of the ACS
+handbook are rotated by 180 degrees relative to these.
 """
 
 from __future__ import annotations
@@ -25,30 +25,30 @@ from bayesdist.utils.numbers import size_of
 if TYPE_CHECKING:
     from bayesdist.diagnose.residuals.binned import BinnedResiduals
 
-# vectors, and points of contours, along the longer side of a chip
+# numbers of vectors, and of points for contours, along the longer side of a chip
 _VECTORS, _POINTS = 21, 65
 
 
 def non_linear_figure(
     detector: WholeDetector, title: str = "", *, magnification: float | None = None
 ) -> Figure:
-    """Figure of the residuals from the best linear map of the detector, as vectors in its pixels.
+    """Vector plot of the residuals from the best linear map of the detector, in its pixels.
 
-    `magnification` is the length of the vectors over the axes' pixels, by default a round number.
+    `magnification` is the factor by which vectors are enlarged, by default a round number.
     """
-    found, sizes, chips = detector_numbers(detector), _sizes(detector), []
+    numbers, sizes, chips = detector_numbers(detector), _sizes(detector), []
     for n, size in sizes.items():
         x, y = _grid(size, _VECTORS)
         f = detector.non_linear(n, x, y)
         along = f.along_x.ravel(), f.along_y.ravel()
         chips.append(Arrows(*mesh(x, y), *along, float(x[1] - x[0])))
-    step = min(one.step for one in chips)
-    longest = max(float(one.length.max()) for one in chips)
+    step = min(arrows.step for arrows in chips)
+    longest = max(float(arrows.length.max()) for arrows in chips)
     M = magnification or (nice_below(2.5 * step / longest) if longest > 1e-9 * step else 1.0)
     panels = OneArray(sizes, detector.places, margin=M * longest + 0.01 * step)
-    place = found.non_linear_at
+    place = numbers.non_linear_at
     at = f"({place[0]:.0f}, {place[1]:.0f})"
-    text = f"largest {found.non_linear_max:.3g}\u202foutput pix at {at}"
+    text = f"largest {numbers.non_linear_max:.3g}\u202foutput pix at {at}"
     text = text.replace("-", "−")
     vector_map(
         panels,
@@ -70,20 +70,20 @@ def non_linear_figure(
 
 
 def area_figure(detector: WholeDetector, title: str = "") -> Figure:
-    """Figure of the pixel area over that at the centre of the detector, as contours."""
+    """Contour plot of the pixel area relative to that at the centre of the detector."""
     sizes = _sizes(detector)
     grids = []
     for n, size in sizes.items():
         x, y = _grid(size, _POINTS)
         grids.append(Grid(x, y, detector.relative_area(n, x, y)))
-    every = np.concatenate([g.values.ravel() for g in grids])
+    areas = np.concatenate([g.values.ravel() for g in grids])
     panels = OneArray(sizes, detector.places, colorbar=True)
-    text = f"pixel area {every.min():.3f} to {every.max():.3f} of that at the centre"
+    text = f"pixel area {areas.min():.3f} to {areas.max():.3f} of that at the centre"
     scalar_map(
         panels,
         grids,
         [f"{title}\n{text}" if title else text],
-        levels=contour_levels(every, 12),
+        levels=contour_levels(areas, 12),
         label="pixel area / area at the centre",
         labelled=True,
     )
@@ -96,13 +96,13 @@ def residual_figure(
     unit: str,
     title: str = "",
 ) -> Figure:
-    """Figure of the mean residuals of a fit in cells of the detector, as vectors.
+    """Vector plot of the mean residuals of a fit in cells of the detector.
 
-    `binned` is by chip number, along the axes of (u, v).  Cells whose mean is within two of its
-    standard errors from zero are light.
+    `binned` are the residuals by chip number, along the axes of (u, v).  Cells with a mean within
+    two standard errors of zero are drawn in light colour.
     """
     chips = [Arrows.of_cells(b) for b in binned.values()]
-    length = np.concatenate([one.length for one in chips])
+    length = np.concatenate([arrows.length for arrows in chips])
     typical = float(np.quantile(length, 0.95)) if length.size else 0.0
     step = min(float(b.x[1] - b.x[0]) for b in binned.values())
     sizes = {n: _sizes(detector)[n] for n in binned}
@@ -129,6 +129,6 @@ def _sizes(detector: WholeDetector) -> dict[int, tuple[float, float]]:
 
 
 def _grid(size: tuple[float, float], longest: int) -> tuple[Float, Float]:
-    """Columns and rows about as far apart on both axes, corners included."""
+    """Columns and rows of a grid that includes the corners, with similar spacing on both axes."""
     nx, ny = (max(3, round((longest - 1) * n / max(size)) + 1) for n in size)
     return np.linspace(1.0, size[0], nx), np.linspace(1.0, size[1], ny)

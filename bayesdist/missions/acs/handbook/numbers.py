@@ -1,6 +1,6 @@
-"""Numbers of section 4.1 of the ACS handbook for a whole detector, with those published beside.
+"""Numbers of section 4.1 of the ACS handbook for a whole detector, with the published values.
 
-Its Table 4.1 is not here: only what its text says.
+Only numbers in the text of the section are included, not its Table 4.1.
 """
 
 from __future__ import annotations
@@ -14,33 +14,31 @@ from bayesdist.errors import InputError
 from bayesdist.missions.acs.handbook.whole_detector import WholeDetector
 from bayesdist.model.grid import mesh
 
-# Points on each axis of a chip where extremes are looked for: they lie at edges and in corners.
+# points per axis of the grid on which extremes are searched for; they occur at edges and corners
 _GRID = 129
 
 
 @dataclass(frozen=True)
 class DetectorNumbers:
-    """Numbers of a detector that section 4.1 of the ACS handbook gives."""
+    """Quantities of a detector that are given in section 4.1 of the ACS handbook."""
 
     non_linear_max: float  # largest non-linear displacement, output pixels
-    non_linear_at: tuple[float, float]  # where, pixels of the detector as one array
-    scale_x: float  # size of a pixel along the detector's axes at its centre
-    scale_y: float
-    mean_scale_x: float  # the same, mean over all pixels
-    mean_scale_y: float
-    scale_range: float  # largest size of a pixel (root of its area) over the smallest, less 1
+    non_linear_at: tuple[float, float]  # its position, pixels of the detector as one array
+    scale_x: float  # pixel scale along the detector's x axis at its centre
+    scale_y: float  # pixel scale along the y axis
+    mean_scale_x: float  # mean over all pixels of the scale along x
+    mean_scale_y: float  # mean over all pixels of the scale along y
+    scale_range: float  # ratio of the largest to the smallest scale (root of the area), minus 1
     angle: float  # between the detector's axes at its centre, degrees
-    # largest over smallest size of a pixel in any direction at the centre, less 1
-    elongation: float
-    area_min: float  # pixel area over that at the centre
-    area_max: float
-    # length of the array along its axes, gaps included: mean scales times pixels
-    size: tuple[float, float]
+    elongation: float  # ratio of the largest to the smallest scale at the centre, minus 1
+    area_min: float  # smallest pixel area relative to that at the centre
+    area_max: float  # largest pixel area relative to that at the centre
+    size: tuple[float, float]  # length of the array along x and y: mean scale times pixels
 
 
 def detector_numbers(detector: WholeDetector) -> DetectorNumbers:
-    """Numbers of any detector as section 4.1 of the ACS handbook gives them."""
-    best, where = -1.0, (0.0, 0.0)
+    """Compute the quantities of section 4.1 of the ACS handbook for any detector."""
+    best, position = -1.0, (0.0, 0.0)
     low, high = np.inf, 0.0
     scales, pixels = np.zeros(2), 0.0
     for n, c in detector.chips.items():
@@ -48,7 +46,7 @@ def detector_numbers(detector: WholeDetector) -> DetectorNumbers:
         field = detector.non_linear(n, x, y)
         iy, ix = np.unravel_index(int(field.length.argmax()), field.length.shape)
         if field.length[iy, ix] > best:
-            best, where = float(field.length[iy, ix]), (float(field.x[ix]), float(field.y[iy]))
+            best, position = float(field.length[iy, ix]), (float(field.x[ix]), float(field.y[iy]))
         area = detector.relative_area(n, x, y)
         low, high = min(low, float(area.min())), max(high, float(area.max()))
         slopes = c.slope(*mesh(x, y))
@@ -62,7 +60,7 @@ def detector_numbers(detector: WholeDetector) -> DetectorNumbers:
     extent = detector.bounds[1] - detector.bounds[0]
     return DetectorNumbers(
         non_linear_max=best,
-        non_linear_at=where,
+        non_linear_at=position,
         scale_x=float(abs(axes[0])),
         scale_y=float(abs(axes[1])),
         mean_scale_x=float(mean[0]),
@@ -76,7 +74,7 @@ def detector_numbers(detector: WholeDetector) -> DetectorNumbers:
     )
 
 
-# detector: quantity: as printed
+# published values by detector and quantity, as printed
 _PUBLISHED: dict[str, dict[str, str]] = {
     "WFC": {
         "non-linear": "82",
@@ -106,30 +104,41 @@ _PUBLISHED: dict[str, dict[str, str]] = {
     },
 }
 
-# what is printed in arcseconds
+# quantities that are published in arcseconds
 _ANGLES = ("non-linear arcsec", "size x", "size y", "output scale")
 
 
 def acs_detector(name: str) -> str:
-    """Name of a detector of ACS in capitals; any other is refused."""
-    found = name.strip().upper()
-    if found not in _PUBLISHED:
+    """Name of an ACS detector in capitals; raises InputError for any other name."""
+    key = name.strip().upper()
+    if key not in _PUBLISHED:
         raise InputError(
             f"ACS has no detector {name!r}",
             where="detector",
             do=f"choose one of {', '.join(_PUBLISHED)}",
         )
-    return found
+    return key
 
 
 def handbook_rows(
     numbers: DetectorNumbers, *, scale: float, unit: str, detector: str = ""
 ) -> list[dict[str, Any]]:
-    """Rows of the table: quantity, unit, published, ours.
+    """Rows of the table that compares a detector with the published values.
 
-    `scale`: size of an output pixel, in `unit`. `unit`: of the undistorted plane. `detector`: WFC,
-    HRC or SBC of ACS; of others nothing is printed. Returns keys quantity, unit, published (text,
-    empty where the handbook has nothing), value.
+    Parameters
+    ----------
+    numbers : DetectorNumbers
+    scale : float
+        Size of an output pixel in `unit`.
+    unit : str
+        Unit of the undistorted plane.
+    detector : str
+        WFC, HRC or SBC of ACS; for other detectors there are no published values.
+
+    Returns
+    -------
+    list of dict
+        Rows with the keys quantity, unit, published (text as printed, or empty) and value.
     """
     n = numbers
     angle = unit if unit != "pix" else "pix of u, v"
@@ -156,10 +165,15 @@ def handbook_rows(
         ("size y", "length along y", angle, n.size[1]),
         ("output scale", "size of an output pixel", angle, scale),
     ]
-    known = _PUBLISHED.get(detector.strip().upper(), {})
+    published = _PUBLISHED.get(detector.strip().upper(), {})
     if unit != "arcsec":
-        known = {key: text for key, text in known.items() if key not in _ANGLES}
+        published = {key: text for key, text in published.items() if key not in _ANGLES}
     return [
-        {"quantity": what, "unit": of, "published": known.get(key, ""), "value": float(value)}
-        for key, what, of, value in listed
+        {
+            "quantity": quantity,
+            "unit": row_unit,
+            "published": published.get(key, ""),
+            "value": float(value),
+        }
+        for key, quantity, row_unit, value in listed
     ]

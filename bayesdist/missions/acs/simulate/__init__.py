@@ -1,7 +1,8 @@
 """Simulated calibration campaign of ACS/WFC on 47 Tucanae, with its truth.
 
-Input as of ACS ISR 2015-06: star lists of exposures over twelve years, a standard catalogue, a log;
-and, unknown to a calibration, the distortion, tables, frames and stars behind them.
+The data are like those of ACS ISR 2015-06: star lists of exposures over twelve years, a standard
+catalogue and an exposure log.  The truth consists of the distortion, look-up tables, frames and
+stars.
 """
 
 from bayesdist.missions.acs.simulate.distortion import ACS_FILTERS, acs_model, acs_solution

@@ -1,4 +1,4 @@
-"""Detections of one exposure: stars with their errors, blends, and false detections."""
+"""Simulated detections of one exposure: measured stars, blends, and false detections."""
 
 from __future__ import annotations
 
@@ -14,13 +14,12 @@ from bayesdist.missions.acs.simulate.truth import AcsTruth, DetectionTruth
 from bayesdist.model import Chip
 from bayesdist.utils.arrays import Bool, Float
 
-BORDER = 5.0  # pixels: too close to an edge for a fit
-LIMIT, SOFT = -7.5, 0.3  # magnitude at which half of the stars are found, and width of the decline
-SATURATED = -14.0  # Figure 5
-
-LAUNCH = 2002.2
+BORDER = 5.0  # pixels: stars closer to an edge are not measured
+LIMIT, SOFT = -7.5, 0.3  # magnitude of 50 % completeness, and width of its decline
+SATURATED = -14.0  # magnitude of saturation (Figure 5)
+LAUNCH = 2002.2  # decimal year of the installation of ACS
 CTE = 0.1  # pixels after 12 years and 2048 transfers at magnitude -9 (Section 3)
-REACH = 2.0  # pixels within which a neighbour is blended
+REACH = 2.0  # pixels: closer neighbours are blended
 
 
 @dataclass(frozen=True)
@@ -28,17 +27,17 @@ class Detector:
     """Errors of the detections of an exposure."""
 
     centroid: float = 1.0  # factor on the centroid errors; 0 gives exact positions
-    false: float = 0.05  # fraction of a list that is no star: cosmic rays and junk
-    blended: float = 0.01  # fraction of the stars that a close neighbour displaces
-    cte: bool = False  # True where trailed charge displaces the positions
+    false: float = 0.05  # fraction of false detections in a list (cosmic rays, artefacts)
+    blended: float = 0.01  # fraction of the stars that are displaced by a close neighbour
+    cte: bool = False  # True if charge-transfer inefficiency displaces the positions
 
 
 def cte_shift(chip: int, y: Float, mag: Float, epoch: float) -> Float:
-    """Shift along y (N,), pixels, by charge that is left behind during the readout.
+    """Shift (N,) along y in pixels due to charge-transfer inefficiency (CTE).
 
-    ACS ISR 2015-06, Section 3: about 0.1 px, growing with time, with the number of transfers and to
-    the faint end.  WFC1 is read out at its upper edge and WFC2 at its lower one; the trail points
-    away from it.
+    According to ACS ISR 2015-06, Section 3, it is about 0.1 px and increases with time, with the
+    number of transfers and towards faint stars.  WFC1 is read out at its upper edge and WFC2 at its
+    lower edge; the trails point away from the edge.
     """
     transfers = (2048.5 - y if chip == 1 else y - 0.5) / 2048.0
     size = CTE * max(epoch - LAUNCH, 0.0) / 12.0 * transfers * 10 ** (0.15 * (mag + 9.0))
@@ -48,17 +47,17 @@ def cte_shift(chip: int, y: Float, mag: Float, epoch: float) -> Float:
 def star_list(
     truth: AcsTruth, exposure: str, detector: Detector, rng: np.random.Generator
 ) -> tuple[Detections, DetectionTruth]:
-    """Simulated detections of an exposure, in no order, and their truth."""
+    """Simulated detections of an exposure in random order, and their truth."""
     e = truth.frames.names.index(exposure)
     epoch = truth.log[exposure].epoch
     u, v = truth.stars.at(epoch)
     parts = []
     for chip in truth.model.chips:
         x, y = truth.to_pixels(exposure, u, v, chip.number)
-        seen = np.flatnonzero(_inside(x, y, chip))
-        mag = truth.stars.mag[seen]
-        found = rng.uniform(size=len(seen)) < 1.0 / (1.0 + np.exp((mag - LIMIT) / SOFT))
-        stars, mag = seen[found], mag[found]
+        on_chip = np.flatnonzero(_inside(x, y, chip))
+        mag = truth.stars.mag[on_chip]
+        detected = rng.uniform(size=len(on_chip)) < 1.0 / (1.0 + np.exp((mag - LIMIT) / SOFT))
+        stars, mag = on_chip[detected], mag[detected]
         part = _measured(chip, x[stars], y[stars], mag, epoch, detector, rng)
         part["star"] = stars
         parts += [part, _junk(chip, len(stars), detector.false, rng)]
@@ -87,14 +86,14 @@ def _measured(
     detector: Detector,
     rng: np.random.Generator,
 ) -> dict[str, NDArray[Any]]:
-    """Columns of the stars of a chip, found at true pixels."""
+    """Columns of the measured stars of a chip, from their true pixels and magnitudes."""
     n = len(x)
     error = centroid_error(mag)
     if detector.cte:
         y = y + cte_shift(chip.number, y, mag, epoch)
     moved = detector.centroid * error * rng.standard_normal((2, n))
 
-    # a neighbour draws the centroid by its fraction of the light
+    # a neighbour shifts the centroid in proportion to its fraction of the flux
     blended = rng.uniform(size=n) < detector.blended
     distance = REACH * np.sqrt(rng.uniform(size=n))
     angle = rng.uniform(0.0, 2.0 * np.pi, n)
@@ -105,13 +104,13 @@ def _measured(
     saturated = mag < SATURATED
     quality = np.where(saturated, 0.3 * np.exp(0.5 * rng.standard_normal(n)), quality)
     quality = np.where(blended, quality + 0.3 * pull, quality)
-    seen = mag + np.hypot(0.02, error) * rng.standard_normal(n)
-    seen -= np.where(blended, 2.5 * np.log10(1.0 + ratio), 0.0)
+    measured_mag = mag + np.hypot(0.02, error) * rng.standard_normal(n)
+    measured_mag -= np.where(blended, 2.5 * np.log10(1.0 + ratio), 0.0)
     return {
         "x": x + moved[0] + pull * np.cos(angle),
         "y": y + moved[1] + pull * np.sin(angle),
         "chip": np.full(n, chip.number, np.int64),
-        "mag": seen,
+        "mag": measured_mag,
         "q": quality,
         "blended": blended,
     }
@@ -120,7 +119,7 @@ def _measured(
 def _junk(
     chip: Chip, stars: int, share: float, rng: np.random.Generator
 ) -> dict[str, NDArray[Any]]:
-    """Columns of detections that are no stars: mostly faint, and mostly of a bad fit."""
+    """Columns of false detections, most of them faint and with a poor fit quality."""
     n = int(rng.poisson(stars * share / (1.0 - share)))
     nx, ny = chip.size
     return {

@@ -1,10 +1,10 @@
-"""Distortion of ACS/WFC as a model and its true parameters.
+"""Simulated distortion of ACS/WFC: model and true parameters.
 
-Linear terms and their drift are those of ACS ISR 2015-06, Tables 1-3 and Section 4.4.1, in the
-report's gauge: WFC2 is the reference, there A_1 = B_1 = 0 and A_3 = 0, and WFC1 lies in the system
-of WFC2.  The report does not print the higher terms.  They are made up here, to one or two digits
-of their size in the tables which the observatory delivers: a displacement of some 65 pixels in the
-corners.
+The linear terms and their drift are those of ACS ISR 2015-06, Tables 1-3 and Section 4.4.1, in the
+gauge of the report: WFC2 is the reference chip, with A_1 = B_1 = 0 and A_3 = 0, and WFC1 is in the
+same system.  The report does not contain the higher terms.  They are invented here, with sizes that
+agree to one or two digits with those in the IDCTABs of the observatory: displacements of some 65
+pixels in the corners.
 """
 
 from __future__ import annotations
@@ -42,13 +42,13 @@ DRIFT: dict[tuple[str, int, int], dict[int, tuple[float, float, float, float]]] 
     },
 }
 
-# Terms that stand still: B_1 of WFC1 is printed (2079.58 before SM4), A_1 and A_3 are made up
+# terms without drift: B_1 of WFC1 is published (2079.58 before SM4), A_1 and A_3 are invented
 STILL: dict[int, dict[tuple[str, int, int], float]] = {
     1: {("u", 0, 0): 4.3, ("v", 0, 0): 2079.58, ("u", 0, 1): 0.0074},
     2: {},
 }
 
-# Higher terms: displacement along u and v, in pixels, of (x', y') = (2048, 1024)
+# higher terms: displacement along u and v, in pixels, at (x', y') = (2048, 1024)
 # fmt: off
 SHAPE: dict[int, dict[tuple[int, int], tuple[float, float]]] = {
     1: {
@@ -70,46 +70,47 @@ SHAPE: dict[int, dict[tuple[int, int], tuple[float, float]]] = {
 }
 # fmt: on
 
-# Scale against F606W, from the offsets of A_2 over 2048 pixels in Figure 25: F435W and F475W
-# 0.05 px, F814W 0.1 px on the other side
+# scale relative to F606W, minus 1, from the offsets of A_2 over 2048 pixels in Figure 25: 0.05 px
+# for F435W and F475W, and 0.1 px with opposite sign for F814W
 SCALE = MappingProxyType(
     {"F435W": 0.05 / 2048, "F475W": 0.048 / 2048, "F606W": 0.0, "F814W": -0.1 / 2048}
 )
-# Figure 26: B_2 differs in one filter and on one chip only, by 0.06 px over 2048 pixels
+# B_2 differs for only one filter and chip, by 0.06 px over 2048 pixels (Figure 26)
 TURN = MappingProxyType({("F814W", 2): -0.06 / 2048})
 
 ACS_FILTERS = tuple(SCALE)
 
 
 def acs_model() -> DistortionModel:
-    """Structure of the truth: order 5, two chips, drifts of A_2, B_2 and B_3 before and after SM4.
+    """Model of the simulation: order 5, two chips, drifts of A_2, B_2 and B_3 with a break at SM4.
 
     Returns
     -------
     DistortionModel
-        In the reference gauge, without frames of exposures.
+        Model in the gauge of the report, without frames of exposures.
     """
     return DistortionModel(5, CHIPS, "pix", TimeDependence(tuple(DRIFT), EPOCH0, (SM4,)))
 
 
 def acs_solution(filter: str = "F606W") -> tuple[DistortionModel, Float]:
-    """True distortion in a filter.
+    """Simulated distortion in a filter.
 
     Parameters
     ----------
     filter : str
-        One of `ACS_FILTERS`.  Filters differ by a scale about the reference pixel of WFC2, which
-        moves WFC1 as well, and F814W by its B_2 on WFC2; the drifts are the same (Section 4.4.4).
+        One of `ACS_FILTERS`.  Filters differ by a scale about the reference pixel of WFC2, and
+        F814W also by B_2 of WFC2.  The drifts are the same in all filters (Section 4.4.4).
 
     Returns
     -------
     model : DistortionModel
     theta : ndarray, shape (114,)
+        True parameters.
 
     Raises
     ------
     InputError
-        For another filter.
+        If the filter is unknown.
     """
     if filter not in SCALE:
         raise InputError(
@@ -130,7 +131,7 @@ def acs_solution(filter: str = "F606W") -> tuple[DistortionModel, Float]:
         for (axis, i, j), values in DRIFT.items():
             before, rate, after, rate_after = values[chip.number]
             monomial[int(axis == "v"), terms.index((i, j))] = before
-            # the model's drifts are displacements at half the detector's size
+            # drifts of the model are displacements at half the size of the chip
             edge = HALF[0] ** i * HALF[1] ** j
             drift += [rate * edge, (after - before) * edge, rate_after * edge]
         monomial *= 1.0 + SCALE[filter]

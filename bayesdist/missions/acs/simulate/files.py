@@ -1,4 +1,4 @@
-"""Simulated campaign as a folder of files, written and read."""
+"""Write and read a simulated campaign as a folder of files."""
 
 from __future__ import annotations
 
@@ -25,70 +25,71 @@ CATALOG_UNITS = (
 )
 
 README = """\
-A simulated campaign of ACS/WFC on the field beside 47 Tucanae, after ACS ISR 2015-06.
+A simulated campaign of ACS/WFC on a field near 47 Tucanae, after ACS ISR 2015-06.
+
 {settings}
 
-What a calibration starts from
-------------------------------
+Input of a calibration
+----------------------
 catalog.parquet        standard catalogue, one row for each star
     star               code of the star, its row from 0
     u, v               position at 2004.5, pixels of 50 mas on the tangent plane; u to the west,
                        v to the north; (5000, 5000) is 00h 22m 35.0s -72d 04' 00"
-    sigma_u, sigma_v   its errors
-    pm_u, pm_v         proper motion, pixels per year; sigma_pm_u, sigma_pm_v its errors
+    sigma_u, sigma_v   errors of u, v
+    pm_u, pm_v         proper motion, pixels per year; sigma_pm_u, sigma_pm_v are its errors
     mag                instrumental magnitude, -2.5 log10(flux / exposure time)
-    epoch              of u, v
+    epoch              decimal year of u, v
 catalog_early.parquet, catalog_late.parquet
                        mean positions before and after Servicing Mission 4 (2009.4), with the mean
                        epoch of each star: proper motions may be derived from them
-exposures.ecsv         one row for each exposure: epoch in the middle, filter, exptime (s),
-                       vafactor, pa_v3, ra, dec (degrees; as commanded: pointings are off by some
-                       0.5" and rolls by some 0.003 degrees)
-lists/*.parquet        raw detections of each exposure, named for it
+exposures.ecsv         one row for each exposure: epoch of the middle, filter, exptime (s),
+                       vafactor, pa_v3, ra, dec (degrees; commanded values: true pointings differ by
+                       some 0.5" and roll angles by some 0.003 degrees)
+lists/*.parquet        raw detections of each exposure, in a file with its name
     x, y               FITS 1-based pixels of the chip
     chip               1 (WFC1) or 2 (WFC2)
     mag                instrumental magnitude, with a zero point of the exposure
     q                  quality of the fit: about the centroid error; poor for saturated stars
                        (brighter than -14) and for most false detections
 
-What it was made from: truth/
------------------------------
-theta.ecsv             true parameters of the distortion in each filter; its header holds the model
-                       and the settings of the simulation
+Truth, in the folder truth/
+---------------------------
+theta.ecsv             true parameters of the distortion in each filter; its header contains the
+                       model and the settings of the simulation
 tables.parquet         look-up tables, one row for each node: chip, filter (empty: detector), x, y,
-                       dx, dy to be added to the pixel
+                       and dx, dy to be added to the pixel
 stars.parquet          true positions at 2004.5, motions and magnitudes, rows as in the catalogue
 exposures.ecsv         true frames, rows as in the log:
-                       (u, v)_catalogue = (u, v) + vafactor R(angle) (I + shared) w, and w is the
-                       polynomial, on WFC1 with `own` times (x', y') added; linear terms A_1 ... B_3
-                       of each chip in the gauge of the report, with the exposure's deviations
-detections.parquet     rows of all lists one after the other, in the order of the log: exposure,
-                       star (row of the catalogue, -1: false detection), blended
+                       (u, v)_catalogue = (u, v) + vafactor R(angle) (I + shared) w, where w is the
+                       polynomial, plus `own` times (x', y') on WFC1; linear terms A_1 ... B_3 of
+                       each chip in the gauge of the report, including the exposure's deviations
+detections.parquet     rows of all lists in the order of the log: exposure, star (row of the
+                       catalogue; -1 for false detections), blended
 """
 
 
 def write_acs(
     campaign: AcsCampaign, folder: str | os.PathLike[str], *, force: bool = False
 ) -> list[Path]:
-    """Write a campaign; README.txt in the folder describes the files.
+    """Write a campaign and a README.txt that describes its files.
 
     Parameters
     ----------
     campaign : AcsCampaign
     folder : path-like
-        It is made if need be.
+        Folder for the files, which is created if necessary.
     force : bool, optional
-        Replace a campaign that is there.
+        True to replace an existing campaign.
 
     Returns
     -------
     list of pathlib.Path
-        Files that a calibration starts from: the three catalogues, the log, and the lists.
+        Input files of a calibration: the three catalogues, the log, and the star lists.
 
     Raises
     ------
     InputError
-        When the folder holds a campaign already, or cannot be written to.
+        If the folder contains a campaign already, or is not writable.
     """
     folder = Path(folder)
     _prepare(folder, force=force)
@@ -98,9 +99,9 @@ def write_acs(
         _write_catalog(getattr(campaign, attribute), out[-1])
     out.append(folder / "exposures.ecsv")
     write_exposures(campaign.log, out[-1])
-    for one in campaign.lists:
-        out.append(folder / "lists" / f"{one.name}.parquet")
-        columns = columns_of(one, ("x", "y", "chip", "mag", "q"))
+    for star_list in campaign.lists:
+        out.append(folder / "lists" / f"{star_list.name}.parquet")
+        columns = columns_of(star_list, ("x", "y", "chip", "mag", "q"))
         write_columns(out[-1], columns, {"x": "pix", "y": "pix"})
     write_truth(campaign.truth, folder / "truth")
     settings = ", ".join(f"{key} {value}" for key, value in campaign.truth.settings.items())
@@ -115,7 +116,7 @@ def read_acs(folder: str | os.PathLike[str]) -> AcsCampaign:
     Parameters
     ----------
     folder : path-like
-        As `write_acs` made it.
+        Folder that was written by `write_acs`.
 
     Returns
     -------
@@ -124,7 +125,7 @@ def read_acs(folder: str | os.PathLike[str]) -> AcsCampaign:
     Raises
     ------
     InputError
-        For files that are missing or damaged.
+        If a file is missing or damaged.
     """
     folder = Path(folder)
     catalogs = {
@@ -140,18 +141,18 @@ def _prepare(folder: Path, *, force: bool) -> None:
     old = sorted(lists.glob("*.parquet"))
     if old and not force:
         raise InputError(
-            "the folder holds a campaign", where=str(folder), do="choose another, or replace it"
+            "the folder contains a campaign", where=str(folder), do="choose another, or replace it"
         )
     for path in (lists, folder / "truth"):
         made_folder(path)
     try:
         for path in (*old, folder / "truth" / "tables.parquet"):
-            path.unlink(missing_ok=True)  # lists of other exposures must not stay among the new
+            path.unlink(missing_ok=True)  # remove star lists of a previous campaign
     except OSError as error:
         raise InputError(
             f"the folder cannot be emptied ({error.strerror})",
             where=str(folder),
-            do="choose one that you may write to",
+            do="choose one that is writable",
         ) from error
 
 

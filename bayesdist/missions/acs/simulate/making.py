@@ -1,4 +1,4 @@
-"""The 47 Tucanae campaign of ACS/WFC, all from one seed."""
+"""Simulation of the 47 Tucanae campaign of ACS/WFC from a single seed."""
 
 from __future__ import annotations
 
@@ -18,8 +18,10 @@ from bayesdist.missions.acs.simulate.tables import detector_tables, filter_table
 from bayesdist.missions.acs.simulate.truth import AcsCampaign, AcsTruth
 
 BASE = "F606W"
-FEWEST = 100  # stars
-SCATTER = 7e-6  # of the linear terms: 7e-6 / sqrt(60) is the sigma(alpha) of Table 1
+FEWEST = 100  # minimum number of stars
+SCATTER = (
+    7e-6  # exposure-to-exposure sd of linear terms: sigma(alpha) of Table 1 is 7e-6 / sqrt(60)
+)
 
 
 def simulate_acs(
@@ -39,41 +41,40 @@ def simulate_acs(
     pa_v3: float | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> AcsCampaign:
-    """Campaign of ACS ISR 2015-06: star lists of 47 Tuc, and their truth.
+    """Simulate the campaign of ACS ISR 2015-06: star lists of 47 Tuc, and their truth.
 
-    Each part has random numbers of its own: an option that changes one leaves the others as they
-    are.
+    The parts of the simulation have independent random streams, so that an option that changes one
+    part does not affect the others.
 
     Parameters
     ----------
     seed : int, optional
     n_exposures : int, optional
-        In F606W.
+        Number of exposures in F606W.
     n_stars : int, optional
-        Of the catalogue.
+        Number of stars in the catalogue.
     filters : sequence of str, optional
-        Of F435W, F475W, F606W, F814W.
+        One or more of F435W, F475W, F606W, F814W.
     n_other : int, optional
-        Exposures in each other filter.
+        Number of exposures in each filter other than F606W.
     fine_scale : bool, optional
-        True for look-up tables of the detector and of the filters.
+        True to include look-up tables of the detector and of the filters.
     cte : bool, optional
-        True where trailed charge displaces the positions.
+        True to displace the positions by charge-transfer inefficiency.
     scatter : float, optional
-        Standard deviation of A_2, B_2 and B_3 from exposure to exposure, mostly common to both
-        chips.
+        Exposure-to-exposure standard deviation of A_2, B_2 and B_3, mostly common to both chips.
     outlying : float, optional
-        Probability that an exposure deviates ten times as much.
+        Probability that the deviation of an exposure is ten times larger.
     centroid : float, optional
         Factor on the centroid errors; 0 gives exact positions.
     false : float, optional
-        Fraction of each list that is no star.
+        Fraction of false detections in each list.
     blended : float, optional
-        Fraction of the stars that a close neighbour displaces, by up to half a pixel.
+        Fraction of the stars that are displaced by a close neighbour, by up to half a pixel.
     pa_v3 : float, optional
-        One roll angle for all exposures, degrees, in place of angles that follow the Sun.
+        Common roll angle of all exposures in degrees; by default the roll angles follow the Sun.
     progress : callable, optional
-        Called with the exposures made and their number.
+        Function that is called with the number of finished exposures and their total number.
 
     Returns
     -------
@@ -82,8 +83,8 @@ def simulate_acs(
     Raises
     ------
     InputError
-        For an unknown or repeated filter, too few exposures or stars, fractions outside [0, 1), or
-        a negative size.
+        If a filter is unknown or repeated, there are too few exposures or stars, a fraction is
+        outside [0, 1), or another parameter is negative.
     """
     settings = {
         "seed": seed,
@@ -103,9 +104,9 @@ def simulate_acs(
     _check(filters, settings)
     if n_stars < FEWEST:
         raise InputError(
-            f"n_stars is {n_stars}, and exposures may stay empty",
+            f"n_stars is {n_stars}, so that exposures may be empty",
             where="n_stars",
-            do=f"give {FEWEST} or more",
+            do=f"give at least {FEWEST}",
         )
 
     def rng(*key: int) -> np.random.Generator:
@@ -114,12 +115,12 @@ def simulate_acs(
     stars = true_stars(n_stars, rng(0))
     catalog, early, late = measured_catalogs(stars, rng(1))
     code = {name: k for k, name in enumerate(ACS_FILTERS)}
-    keys: dict[Exposure, tuple[int, int]] = {}  # an exposure's own random numbers
+    keys: dict[Exposure, tuple[int, int]] = {}  # keys of the random stream of each exposure
     for name in filters:
         n = n_exposures if name == BASE else n_other
-        made = exposures_of(name, n, rng(2, code[name]), pa_v3=pa_v3)
-        keys |= {one: (code[name], k) for k, one in enumerate(made)}
-    log = ExposureLog(tuple(sorted(keys, key=lambda one: one.epoch)), source="simulation")
+        new = exposures_of(name, n, rng(2, code[name]), pa_v3=pa_v3)
+        keys |= {exposure: (code[name], k) for k, exposure in enumerate(new)}
+    log = ExposureLog(tuple(sorted(keys, key=lambda exposure: exposure.epoch)), source="simulation")
     tables = detector_tables(rng(3)) if fine_scale else ()
     for name in filters if fine_scale else ():
         tables += filter_tables(name, rng(4, code[name]))
@@ -131,15 +132,15 @@ def simulate_acs(
         stars=stars,
         log=log,
         frames=frames_of(
-            log, [rng(5, *keys[one]) for one in log], scatter=scatter, outlying=outlying
+            log, [rng(5, *keys[exposure]) for exposure in log], scatter=scatter, outlying=outlying
         ),
         detections=(),
         settings=settings,
     )
     detector = Detector(centroid, false, blended, cte)
     measured = []
-    for k, one in enumerate(log):
-        measured.append(star_list(truth, one.name, detector, rng(6, *keys[one])))
+    for k, exposure in enumerate(log):
+        measured.append(star_list(truth, exposure.name, detector, rng(6, *keys[exposure])))
         if progress is not None:
             progress(k + 1, len(log))
     lists, detections = zip(*measured, strict=True)
@@ -147,7 +148,7 @@ def simulate_acs(
     return AcsCampaign(catalog, early, late, log, lists, truth)
 
 
-# settings: lowest, first above the highest, and what to give
+# settings: lowest allowed value, exclusive upper bound, and description
 _RANGES: dict[tuple[str, ...], tuple[float, float, str]] = {
     ("n_exposures", "n_other"): (1, np.inf, "1 or more"),
     ("outlying", "false", "blended"): (0.0, 1.0, "a fraction in [0, 1)"),
@@ -160,7 +161,7 @@ def _check(filters: Sequence[str], settings: Mapping[str, Any]) -> None:
         acs_solution(name)
     if not filters or len(set(filters)) < len(filters):
         raise InputError(
-            f"filters are {', '.join(filters) or 'none'}", where="filters", do="name each one once"
+            f"filters are {', '.join(filters) or 'none'}", where="filters", do="list each one once"
         )
     for names, (low, high, words) in _RANGES.items():
         for name in names:

@@ -1,7 +1,8 @@
-"""Field west of 47 Tucanae: its true stars, and their standard catalogue.
+"""Simulated field west of 47 Tucanae: true stars, and their standard catalogue.
 
-ACS ISR 2015-06, Section 2: 53917 stars, tangent plane in ACS/WFC pixels, (5000, 5000) at the centre
-of the field 6.7' west of the cluster, epoch 2004.5. u grows to the west and v to the north.
+As in ACS ISR 2015-06, Section 2: 53917 stars on a tangent plane in ACS/WFC pixels at epoch 2004.5.
+(5000, 5000) is the centre of the field, 6.7' west of the cluster; u increases to the west and v to
+the north.
 """
 
 from __future__ import annotations
@@ -16,18 +17,16 @@ from bayesdist.utils.arrays import Float
 
 HALF_SIZE = 4500.0  # pixels from the centre to each side
 CENTRE = (5000.0, 5000.0)
-CLUSTER = (CENTRE[0] - 6.7 * 60 / 0.05, CENTRE[1])  # its centre lies to the east
-SLOPE = -1.5  # of the surface density; crowding makes the list shallower than the light
-CLOSEST = 4.0  # pixels: of two stars that are closer neither is well measured
-
-BRIGHT, FAINT = -15.0, -7.0
-COUNTS = 0.15  # stars rise as 10^(0.15 m)
-
+CLUSTER = (CENTRE[0] - 6.7 * 60 / 0.05, CENTRE[1])  # centre of the cluster, to the east
+SLOPE = -1.5  # of the surface density of detected stars, shallower than that of the light
+CLOSEST = 4.0  # pixels: closer pairs are removed, since neither star is well measured
+BRIGHT, FAINT = -15.0, -7.0  # range of instrumental magnitudes
+COUNTS = 0.15  # star counts increase as 10^(0.15 m)
 CATALOG_EPOCH = 2004.5
-DISPERSION = 0.01  # px/yr on each axis, Section 2.2
-EARLY, LATE = 2004.7, 2011.9  # mean epochs of the two halves
-EPOCH_SPREAD = 0.3
-POOR = 0.08  # 4270 of 53917 lie above the line of Figure 3
+DISPERSION = 0.01  # px/yr per axis, Section 2.2
+EARLY, LATE = 2004.7, 2011.9  # mean epochs of the observations before and after SM4
+EPOCH_SPREAD = 0.3  # standard deviation of the stars' mean epochs, years
+POOR = 0.08  # fraction of poorly measured stars: 4270 of 53917 are above the line in Figure 3
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,10 +49,11 @@ class TrueStars:
 
 
 def centroid_error(mag: Float) -> Float:
-    """Error of a measured position on each axis, pixels, at instrumental magnitudes.
+    """Centroid error per axis in pixels at instrumental magnitudes.
 
-    0.01 px at -14 and 0.02 px at -10 (Section 2.2 and Figure 3), from there with the noise of the
-    photons and then of the sky; above saturation at -14 growing with the excess.
+    It is 0.01 px at -14 and 0.02 px at -10 (Section 2.2 and Figure 3).  Towards fainter magnitudes
+    it follows the photon noise and then the sky noise.  For stars brighter than the saturation at
+    -14 it increases with the excess.
     """
     flux = 10 ** (-0.4 * (np.asarray(mag, float) + 10.0))
     noise = 0.015**2 / flux * (1.0 + 0.3 / flux)
@@ -63,15 +63,17 @@ def centroid_error(mag: Float) -> Float:
 
 
 def true_stars(n: int, rng: np.random.Generator) -> TrueStars:
-    """True stars of the field, denser towards the cluster in the east."""
+    """True stars of the field, with a density that increases towards the cluster in the east."""
     u, v = np.zeros(0), np.zeros(0)
-    nearest = CENTRE[0] - HALF_SIZE - CLUSTER[0]  # of the edge of the field to the cluster
+    nearest = (
+        CENTRE[0] - HALF_SIZE - CLUSTER[0]
+    )  # distance from the edge of the field to the cluster
     while len(u) < n:
         offsets = rng.uniform(-HALF_SIZE, HALF_SIZE, (2, 4 * n))
         new_u, new_v = CENTRE[0] + offsets[0], CENTRE[1] + offsets[1]
         density = (np.hypot(new_u - CLUSTER[0], new_v - CLUSTER[1]) / nearest) ** SLOPE
-        kept = rng.uniform(size=4 * n) < density
-        u, v = np.append(u, new_u[kept]), np.append(v, new_v[kept])
+        accepted = rng.uniform(size=4 * n) < density
+        u, v = np.append(u, new_u[accepted]), np.append(v, new_v[accepted])
         pairs = cKDTree(np.column_stack([u, v])).query_pairs(CLOSEST, output_type="ndarray")
         single = np.ones(len(u), bool)
         single[pairs.ravel()] = False
@@ -86,19 +88,19 @@ def true_stars(n: int, rng: np.random.Generator) -> TrueStars:
 def measured_catalogs(
     stars: TrueStars, rng: np.random.Generator
 ) -> tuple[ReferenceCatalog, ReferenceCatalog, ReferenceCatalog]:
-    """Standard catalogue (2004.5, with motions), and mean positions before and after SM4.
+    """Standard catalogue (2004.5, with proper motions), and mean positions before and after SM4.
 
-    Errors are normal, of the quoted size, and independent: of the stars, of the axes, of positions
-    and motions, and of the three catalogues.  Motions are as good as a difference of two mean
-    positions; of one star in twelve they are poor.  The mean positions are without motions, each
-    star at the mean epoch of its observations.
+    All errors are normal with the quoted sizes, and independent between stars, axes, positions and
+    motions, and catalogues.  Proper motions are as accurate as the difference of two mean
+    positions, and poor for one star in twelve.  The catalogues of mean positions have no proper
+    motions; each star is at the mean epoch of its observations.
     """
     n = len(stars)
     mag = stars.mag + 0.01 * rng.standard_normal(n)
     single = centroid_error(stars.mag)
-    # poorly measured stars were seen in few exposures
+    # poorly measured stars were observed in few exposures
     worse = np.where(rng.uniform(size=n) < POOR, rng.uniform(4.0, 12.0, n), 1.0)
-    often = np.exp(0.15 * rng.standard_normal(n))  # the number of exposures differs a little, too
+    often = np.exp(0.15 * rng.standard_normal(n))  # variation in the number of exposures
     sigma = 0.5 * single * often
     sigma_mean = 0.35 * single * often * worse
 

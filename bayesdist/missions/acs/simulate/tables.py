@@ -1,7 +1,8 @@
-"""Fine-scale distortion: random look-up tables of the published size.
+"""Simulated fine-scale distortion: random look-up tables of the published amplitudes.
 
-Sizes are the longest vectors of ACS ISR 2015-06: 0.17 px for the grid of pixels (Figure 7 and
-Section 4.3.1), half of that on WFC2 (Section 4.3), and for the filters those of Figures 11-13.
+The longest vectors are those of ACS ISR 2015-06: 0.17 px for the pixel grid of WFC1 (Figure 7 and
+Section 4.3.1), half of this for WFC2 (Section 4.3), and the values of Figures 11-13 for the
+filters.
 """
 
 from __future__ import annotations
@@ -21,20 +22,19 @@ from bayesdist.utils.arrays import Float
 STEP = 64.0
 SHAPE = (32, 64)  # nodes along y and x
 ORDER = 5  # the tables are orthogonal to polynomials of this order
-FINE = 16.0  # pixels between the points of integrals over the chip
-
-DETECTOR_LONGEST = {1: 0.17, 2: 0.085}
-DETECTOR_LENGTH = 200.0
+FINE = 16.0  # pixels between the points for integrals over the chip
+DETECTOR_LONGEST = {1: 0.17, 2: 0.085}  # longest vector by chip, pixels
+DETECTOR_LENGTH = 200.0  # correlation length, pixels
 COLUMNS = 4096 / 60  # "every 68th column": 60 equal strips of the mask
-COLUMN_AMPLITUDE = 0.1  # of the longest vector
-
-# Figures 12, 13, 11; F814W is not shown, and has the largest value for filters in the text
+COLUMN_AMPLITUDE = 0.1  # relative to the longest vector
+# longest vector in pixels, from Figures 12, 13 and 11; for F814W, which is not shown, it is the
+# largest value for filters in the text
 FILTER_LONGEST = {"F435W": 0.062, "F475W": 0.08, "F606W": 0.032, "F814W": 0.05}
 FILTER_LENGTH = 150.0  # "spatially coherent over ~150 pixels", Section 4.3.2
 
 
 def _nodes() -> tuple[Float, Float]:
-    """Pixels of all nodes, (ny nx,) each."""
+    """Pixels x and y (ny nx,) of all nodes."""
     x = (STEP + 1) / 2 + STEP * np.arange(SHAPE[1], dtype=float)
     y = (STEP + 1) / 2 + STEP * np.arange(SHAPE[0], dtype=float)
     return mesh(x, y)
@@ -50,11 +50,11 @@ def _factor(length: float) -> Float:
 
 @lru_cache(maxsize=2)
 def _followed(chip: int) -> Float:
-    """Orthonormal basis (2 nodes, 84) of the parts of a chip's table that a polynomial can follow.
+    """Orthonormal basis (2 nodes, 84) of the parts of a table that polynomials can absorb.
 
-    Its values at the nodes along x and y; and the nodes' parts in the integral over the chip of the
-    polynomial times the displacement of u and of v, for a fit of the polynomial alone would take
-    that from the table.
+    It spans the values of polynomials at the nodes, for shifts along x and y, and the weights of
+    the nodes in the integrals over the chip of polynomials times the displacement of u and of v.
+    A fit of polynomials without tables would absorb these parts.
     """
     model, theta = acs_solution()
     basis = PolynomialBasis(ORDER, CHIPS[0].size, HALF)
@@ -68,21 +68,21 @@ def _followed(chip: int) -> Float:
     ]
     index, weight = LookupTable(chip, np.zeros((2, *SHAPE))).weights(x, y)
     rows = np.repeat(np.arange(len(x)), 4)
-    shares = csr_array((weight.ravel(), (index.ravel(), rows)), shape=(n, len(x)))
+    node_weights = csr_array((weight.ravel(), (index.ravel(), rows)), shape=(n, len(x)))
     values = basis.evaluate(x, y) * (FINE / STEP) ** 2
     out = np.zeros((4, K, 2, n))
     for along in (0, 1):
         out[along, :, along] = at_nodes.T
         for axis in (0, 1):
-            out[2 + axis, :, along] = (shares @ (values * by_pixel[along][:, [axis]])).T
+            out[2 + axis, :, along] = (node_weights @ (values * by_pixel[along][:, [axis]])).T
     q, _ = np.linalg.qr(out.reshape(4 * K, 2 * n).T)
     return q
 
 
 def _without_polynomial(values: Float, chip: int) -> Float:
-    """Values at the nodes (2, nodes) less those a polynomial could follow: the truth is unique."""
+    """Values (2, nodes) without the parts that polynomials can absorb, so that they are unique."""
     q, flat = _followed(chip), values.ravel()
-    for _ in range(2):  # once more for the last digits
+    for _ in range(2):  # the second pass removes rounding errors
         flat = flat - q @ (q.T @ flat)
     return flat.reshape(values.shape)
 
@@ -94,12 +94,12 @@ def _table(values: Float, longest: float, chip: int, filter: str = "") -> Lookup
 
 
 def detector_tables(rng: np.random.Generator) -> tuple[LookupTable, ...]:
-    """Tables of the grid of pixels, one for each chip.
+    """Detector tables (irregularities of the pixel grid), one per chip.
 
-    A smooth random field, and along x the saw-tooth of a mask that was stepped over the columns.
-    Nodes 64 pixels apart see the saw-tooth of 68 pixels as a slow beat.  Free of polynomials up to
-    order 5: the sum over the nodes of value times polynomial is 0, and a fit of polynomials to
-    evenly spread stars finds nothing in u and v.
+    Each is the sum of a smooth random field and, along x, a saw-tooth due to a mask that was
+    stepped over the columns.  The nodes are 64 pixels apart and sample the saw-tooth of 68 pixels
+    as a slow beat.  The tables are orthogonal to polynomials up to order 5: the sum over the nodes
+    of value times polynomial is 0, and so is a polynomial fitted to uniformly distributed stars.
     """
     x, _ = _nodes()
     out = []
@@ -112,7 +112,7 @@ def detector_tables(rng: np.random.Generator) -> tuple[LookupTable, ...]:
 
 
 def filter_tables(filter: str, rng: np.random.Generator) -> tuple[LookupTable, ...]:
-    """Tables of a filter, one for each chip, as smooth and as free of polynomials."""
+    """Filter tables, one per chip: smooth random fields that are orthogonal to polynomials."""
     n = SHAPE[0] * SHAPE[1]
     fields = [(_factor(FILTER_LENGTH) @ rng.standard_normal((n, 2))).T for _ in CHIPS]
     longest = [

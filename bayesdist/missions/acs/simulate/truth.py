@@ -1,4 +1,4 @@
-"""A simulated campaign and its truth, with maps between pixels and the catalogue."""
+"""Simulated campaign and its truth, with transformations between pixels and the catalogue."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from bayesdist.model.lookup import LookupTable
 from bayesdist.utils.arrays import Bool, Float, Int
 
 LINEAR_TERMS = ("A_1", "A_2", "A_3", "B_1", "B_2", "B_3")
-MARGIN = 0.15  # beyond the edges of a chip, in halves of it: range of the inverse
+MARGIN = 0.15  # margin around a chip in which the inverse is computed, in units of its half size
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,7 +31,7 @@ class DetectionTruth:
     star : ndarray of int64, shape (N,)
         Row of the star in the catalogue; -1 for a false detection.
     blended : ndarray of bool, shape (N,)
-        Stars whose position is drawn towards a close neighbour.
+        True for stars that are displaced towards a close neighbour.
     """
 
     star: Int
@@ -45,17 +45,18 @@ class AcsTruth:
     Parameters
     ----------
     model : DistortionModel
-        In the reference gauge, without frames.
+        Model in the gauge of the report, without frames.
     theta : mapping of str to ndarray, shape (D,)
         True parameters for each filter.
     tables : tuple of LookupTable
-        Of the detector and of the filters; empty without fine scale.
+        Detector and filter tables; empty without fine-scale distortion.
     stars : TrueStars
-        In the order of the catalogue.
+        True stars in the order of the catalogue.
     log : ExposureLog
     frames : AcsFrames
+        True frames of the exposures.
     detections : tuple of DetectionTruth
-        One for each exposure.
+        Truth of the detections of each exposure.
     settings : mapping of str to object
         Arguments of the simulation.
     """
@@ -70,18 +71,21 @@ class AcsTruth:
     settings: Mapping[str, object]
 
     def to_catalog(self, exposure: str, x: ArrayLike, y: ArrayLike, chip: ArrayLike) -> Float:
-        """Positions in the catalogue of pixels of an exposure.
+        """Transform pixels of an exposure to catalogue positions.
 
         Parameters
         ----------
         exposure : str
+            Name of the exposure.
         x, y : array_like, shape (N,)
             Raw FITS 1-based pixels.
         chip : int or array_like, shape (N,)
+            Chip numbers.
 
         Returns
         -------
         ndarray, shape (N, 2)
+            Positions (u, v) at the epoch of the exposure, pixels of the catalogue.
         """
         e = self.frames.names.index(exposure)
         x, y = np.broadcast_arrays(np.atleast_1d(np.asarray(x, float)), np.asarray(y, float))
@@ -95,18 +99,21 @@ class AcsTruth:
     def to_pixels(
         self, exposure: str, u: ArrayLike, v: ArrayLike, chip: int
     ) -> tuple[Float, Float]:
-        """Raw pixels of a chip at positions of the catalogue: the inverse of `to_catalog`.
+        """Transform catalogue positions to raw pixels of a chip: the inverse of `to_catalog`.
 
         Parameters
         ----------
         exposure : str
+            Name of the exposure.
         u, v : array_like, shape (N,)
+            Positions, pixels of the catalogue.
         chip : int
+            Chip number.
 
         Returns
         -------
         x, y : ndarray, shape (N,)
-            FITS 1-based pixels, to 1e-9; NaN where the position is far off the chip.
+            FITS 1-based pixels, accurate to 1e-9; NaN if the position is far outside of the chip.
         """
         chip_map = self._map(self.frames.names.index(exposure), chip)
         sky = np.stack([np.atleast_1d(np.asarray(w, float)) for w in (u, v)])
@@ -119,18 +126,20 @@ class AcsTruth:
         return x, y
 
     def linear_terms(self, exposure: str, chip: int) -> Float:
-        """Linear terms of an exposure, with its deviations, as a perfect solution would have them.
+        """True linear terms of an exposure, including its deviations.
 
         Parameters
         ----------
         exposure : str
+            Name of the exposure.
         chip : int
+            Chip number.
 
         Returns
         -------
         ndarray, shape (6,)
-            A_1, A_2, A_3, B_1, B_2, B_3 in the reference gauge: on WFC2 A_1 = B_1 = A_3 = 0 in this
-            very exposure.  Free of velocity aberration.
+            A_1, A_2, A_3, B_1, B_2, B_3 without velocity aberration, in the gauge of the report for
+            this exposure: A_1 = B_1 = A_3 = 0 on WFC2.
         """
         e = self.frames.names.index(exposure)
         terms = self._linear(e, chip)
@@ -145,11 +154,11 @@ class AcsTruth:
         return np.asarray(basis.to_monomials(self._in_gauge(e, chip)))[:, :3]
 
     def _in_gauge(self, e: int, chip: int) -> Float:
-        """Legendre coefficients (2, K) of w with the exposure's deviations."""
-        one = self.log.exposures[e]
+        """Legendre coefficients (2, K) of w, including the deviations of the exposure."""
+        exposure = self.log.exposures[e]
         codes = np.array([self.model.chip_code(chip)])
-        theta = self.theta[one.filter]
-        P = self.model.polynomials(theta, codes, np.array([one.epoch]))[0]
+        theta = self.theta[exposure.filter]
+        P = self.model.polynomials(theta, codes, np.array([exposure.epoch]))[0]
         if chip == 1:
             monomial = np.zeros((2, self.model.n_terms))
             monomial[:, 1:3] = self.frames.own[e]  # the terms x and y follow the constant
@@ -157,11 +166,11 @@ class AcsTruth:
         return (np.eye(2) + self.frames.shared[e]) @ P
 
     def _map(self, e: int, chip: int) -> ChipMap:
-        """Map of a chip in an exposure to (u, v) in the catalogue."""
+        """Map of a chip in an exposure to catalogue positions (u, v)."""
         c, s = np.cos(self.frames.angle[e]), np.sin(self.frames.angle[e])
         P = self.frames.vafactor[e] * np.array([[c, -s], [s, c]]) @ self._in_gauge(e, chip)
         P[:, 0] += self.frames.centre[e]
-        filters = ("", self.log.exposures[e].filter)  # the detector's table comes first
+        filters = ("", self.log.exposures[e].filter)  # detector table first
         tables = [t for name in filters for t in self.tables if (t.chip, t.filter) == (chip, name)]
         name = self.frames.names[e]
         return ChipMap(name, self.model.basis(chip), "pix", P, chip=chip, before=tuple(tables))
@@ -169,14 +178,14 @@ class AcsTruth:
 
 @dataclass(frozen=True, eq=False)
 class AcsCampaign:
-    """A simulated campaign.
+    """Simulated campaign.
 
     Parameters
     ----------
     catalog : ReferenceCatalog
-        Standard catalogue: epoch 2004.5, with proper motions.
+        Standard catalogue at epoch 2004.5, with proper motions.
     early, late : ReferenceCatalog
-        Mean positions before and after SM4, of the same stars in the same order.
+        Mean positions of the same stars, in the same order, before and after SM4.
     log : ExposureLog
     lists : tuple of Detections
         Raw detections of each exposure, in the order of the log.

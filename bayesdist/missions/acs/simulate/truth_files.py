@@ -1,4 +1,4 @@
-"""Truth of a campaign as files, written and read."""
+"""Write and read the truth of a simulated campaign."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ MATRIX = ("uu", "uv", "vu", "vv")
 
 
 def write_truth(truth: AcsTruth, folder: Path) -> None:
-    """Write theta.ecsv, exposures.ecsv, stars, tables and detections .parquet to a folder."""
+    """Write the truth as theta.ecsv, exposures.ecsv, and stars, tables and detections.parquet."""
     theta = Table({"name": list(truth.model.names), "unit": list(truth.model.units)})
     for filter, values in truth.theta.items():
         theta[filter] = values
@@ -38,33 +38,35 @@ def write_truth(truth: AcsTruth, folder: Path) -> None:
     write_columns(folder / "stars.parquet", stars, STAR_UNITS)
     if truth.tables:
         _write_tables(truth, folder / "tables.parquet")
-    sizes = [len(one.star) for one in truth.detections]
+    sizes = [len(detection_truth.star) for detection_truth in truth.detections]
     write_columns(
         folder / "detections.parquet",
         {
             "exposure": (np.repeat(np.arange(len(sizes)), sizes), truth.frames.names),
-            "star": np.concatenate([one.star for one in truth.detections]),
-            "blended": np.concatenate([one.blended for one in truth.detections]),
+            "star": np.concatenate([detection_truth.star for detection_truth in truth.detections]),
+            "blended": np.concatenate(
+                [detection_truth.blended for detection_truth in truth.detections]
+            ),
         },
         {},
     )
 
 
 def read_truth(folder: Path, log: ExposureLog) -> AcsTruth:
-    """Truth that `write_truth` wrote for the campaign of a log.
+    """Read the truth of a campaign that was written by `write_truth`.
 
-    InputError for files that are missing or damaged.
+    Raises InputError if a file is missing or damaged.
     """
     folder = Path(folder)
     theta = read_table(folder / "theta.ecsv")
     frames = read_table(folder / "exposures.ecsv")
     stars = read_table(folder / "stars.parquet")
-    found = read_table(folder / "detections.parquet")
+    detections = read_table(folder / "detections.parquet")
     with naming_faults(folder):
         model = DistortionModel.from_dict(theta.meta["model"])
         settings = dict(theta.meta["settings"])
         names = tuple(str(name) for name in frames["exposure"])
-        exposure = np.asarray(found["exposure"]).astype(str)
+        exposure = np.asarray(detections["exposure"]).astype(str)
         rows = [exposure == name for name in names]
         return AcsTruth(
             model=model,
@@ -83,7 +85,9 @@ def read_truth(folder: Path, log: ExposureLog) -> AcsTruth:
                 zero_point=np.array(frames["zero_point"]),
             ),
             detections=tuple(
-                DetectionTruth(np.array(found["star"][r]), np.array(found["blended"][r], bool))
+                DetectionTruth(
+                    np.array(detections["star"][r]), np.array(detections["blended"][r], bool)
+                )
                 for r in rows
             ),
             settings=settings,
@@ -91,7 +95,7 @@ def read_truth(folder: Path, log: ExposureLog) -> AcsTruth:
 
 
 def _frames_table(truth: AcsTruth) -> Table:
-    """Table of the exposures: frame, deviations, and the linear terms that follow from them."""
+    """Table of the exposures: frames, deviations, and the resulting linear terms."""
     frames = truth.frames
     out = Table({"exposure": list(frames.names)})
     out["epoch"] = truth.log.values("epoch")
@@ -117,7 +121,7 @@ def _matrices(table: Table, name: str) -> np.ndarray:
 
 
 def _write_tables(truth: AcsTruth, path: Path) -> None:
-    """Write the look-up tables, one row for each node."""
+    """Write the look-up tables with one row per node."""
     rows: dict[str, list[Any]] = {key: [] for key in ("chip", "filter", "x", "y", "dx", "dy")}
     labels = tuple(dict.fromkeys(table.filter for table in truth.tables))
     for table in truth.tables:

@@ -1,1 +1,1 @@
-"""Residual tables and fields of the WISE report (WSDC D-T033), printed and measured."""
+"""Residual tables and distortion fields of the WISE report (WSDC D-T033), compared with runs."""

@@ -1,8 +1,9 @@
-"""Parts of the sigma of a residual table, and why it is not the printed one.
+"""Decomposition of the sigma of a residual table, and comparison with the published value.
 
-sigma^2 of means of bins is noise^2 + partition^2 + rest^2: the errors of single stars, blocks of
-the array that stand apart, and what is left.  Of a printed sigma the noise alone can be told, from
-the radial rows and the sample sizes; the remainder is structure.
+The variance of the mean residuals in bins is sigma^2 = noise^2 + partition^2 + rest^2: the errors
+of single stars, offsets between blocks of the array, and all other structure.  For a published
+sigma only the noise can be estimated, from the radial rows and the sample sizes; the remainder is
+structure.
 """
 
 from __future__ import annotations
@@ -30,7 +31,8 @@ from bayesdist.missions.wise.assess.residual_structure import ResidualPartition
 from bayesdist.missions.wise.published import SAMPLE_SIZES
 
 PRINTED_BINS = 31
-# section 4: longest difference vectors, in pixels of W1, and from the Code V model, in the band's
+# longest difference vectors in section 4: between bands, in pixels of W1; and from the optical
+# (Code V) model, in pixels of the band
 LONGEST_DIFFERENCES = {
     ("W2", "W1"): 0.398,
     ("W3", "W1"): 0.876,
@@ -45,32 +47,30 @@ PRINTED_TABLES = {"5-1": TABLE_5_1, "5-2": TABLE_5_2, "5-3": TABLE_5_3}
 
 @dataclass(frozen=True)
 class RowAccount:
-    """The parts of one row's sigma, and the printed row beside it."""
+    """Contributions to the sigma of one row, and comparison with the published row."""
 
     row: StatisticsRow
-    # rms that blocks of the array add, their noise subtracted; None where none were found, or the
-    # row is not of what blocks act on
+    # rms due to blocks of the array, with their noise subtracted; None if there are none, or blocks
+    # do not affect the row
     partition: float | None
-    printed: PrintedRow | None = None
-    # least and most noise that the printed sigma holds
-    printed_noise: tuple[float, float] | None = None
-    # what the printed numbers contradict in themselves or in each other
-    contradictions: tuple[str, ...] = ()
+    printed: PrintedRow | None = None  # published row
+    printed_noise: tuple[float, float] | None = None  # lowest and highest noise in its sigma
+    contradictions: tuple[str, ...] = ()  # sentences on inconsistent published numbers
 
     @property
     def structure(self) -> float:
-        """Sigma without noise."""
+        """Sigma with the noise subtracted in quadrature."""
         return self.row.noise_free["sigma"]
 
     @property
     def rest(self) -> float:
-        """Structure beside the partition; 0 where that explains all."""
+        """Structure that the partition does not explain; 0 if it explains all of it."""
         part = 0.0 if self.partition is None else self.partition
         return float(np.sqrt(max(self.structure**2 - part**2, 0.0)))
 
     @property
     def printed_variance(self) -> tuple[float, float] | None:
-        """Square of the printed sigma less the most and the least noise; may be below zero."""
+        """Published variance minus the highest and the lowest noise variance; may be negative."""
         if self.printed is None or self.printed_noise is None:
             return None
         total = self.printed.value["sigma"] ** 2
@@ -79,27 +79,27 @@ class RowAccount:
 
     @property
     def printed_structure(self) -> float | None:
-        """Printed sigma without its noise, in the middle of what that may be."""
+        """Published sigma without noise, for the mean of the highest and lowest noise variance."""
         v = self.printed_variance
         return None if v is None else float(np.sqrt(max(sum(v) / 2, 0.0)))
 
     @property
     def remains(self) -> float | None:
-        """Structure that one has and the other has not, in quadrature.
+        """Difference in quadrature between the published structure and that of this row.
 
-        Positive where the printed one has more; 0 where they may be the same.
+        It is positive if the published structure is larger, and 0 if both agree within the errors.
         """
-        v, here = self.printed_variance, self.row.variance
+        v, variance = self.printed_variance, self.row.variance
         if v is None:
             return None
-        apart = sum(v) / 2 - here
+        apart = sum(v) / 2 - variance
         return 0.0 if self.verdict == "same" else float(np.sign(apart) * np.sqrt(abs(apart)))
 
     @property
     def tolerance(self) -> float:
-        """Two standard errors of the difference of two variances, and the digits printed.
+        """Tolerance for the difference of the variances: two standard errors plus rounding.
 
-        The printed variance counts as uncertain as ours.
+        The published variance is assumed to be as uncertain as that of this row.
         """
         digits = 0.0
         if self.printed is not None:
@@ -108,19 +108,19 @@ class RowAccount:
 
     @property
     def verdict(self) -> str:
-        """'same', 'print has more', 'print has less' or 'below noise'; empty without a print."""
+        """'same', 'print has more', 'print has less' or 'below noise'; '' if not published."""
         if self.printed_variance is None:
             return ""
-        (low, high), here, slack = self.printed_variance, self.row.variance, self.tolerance
-        if low - slack <= here <= high + slack:
+        (low, high), variance, slack = self.printed_variance, self.row.variance, self.tolerance
+        if low - slack <= variance <= high + slack:
             return "same"
         if high < -slack:
             return "below noise"
-        return "print has more" if here < low else "print has less"
+        return "print has more" if variance < low else "print has less"
 
     @property
     def sentence(self) -> str:
-        """Why the printed sigma is not ours; empty without one."""
+        """Explanation of the difference between the two sigmas; empty if none is published."""
         if self.printed is None or self.printed_noise is None:
             return ""
         ours, theirs = self.row.value["sigma"], self.printed.value["sigma"]
@@ -132,15 +132,19 @@ class RowAccount:
         if self.verdict == "same":
             return f"{out}; structure is the same within its error."
         if self.verdict == "below noise":
-            return f"{out}, more than was published: its errors are distributed otherwise."
-        whose = "the published set" if self.verdict == "print has more" else "this set"
+            return (
+                f"{out}, which exceeds the published sigma: its errors have another distribution."
+            )
+        larger_set = "the published set" if self.verdict == "print has more" else "this set"
         if self.row.label.endswith("/radial"):
-            what = "in the scatter of single stars over the array"
+            origin = "in the variation over the array of the scatter of single stars"
         elif "-" in self.row.label:
-            what = "as the errors of its two bands are larger or less alike"
+            origin = "because the errors of its two bands are larger or less similar"
         else:
-            what = "from systematic errors that the other has not"
-        return f"{out}; {whose} has {abs(self.remains or 0.0):.2g} more in quadrature, {what}."
+            origin = "from systematic errors that the other does not have"
+        return (
+            f"{out}; {larger_set} has {abs(self.remains or 0.0):.2g} more in quadrature, {origin}."
+        )
 
 
 def accounts(
@@ -151,14 +155,29 @@ def accounts(
     *,
     published: bool,
 ) -> dict[str, tuple[RowAccount, ...]]:
-    """Accounts of all rows.
+    """Decompose the sigmas of all rows of the residual tables.
 
-    How much noise a printed sigma holds follows from the printed mean length of single residuals
-    and their distribution.  That is not printed: it may be normal, or as it is here.
+    The noise in a published sigma follows from the published mean length of single residuals and
+    their distribution.  The distribution is not published.  The limits of the noise are those for
+    a normal distribution and for the distribution in these data.
 
-    `tables`: by '5-1', '5-2' and '5-3'. `parts`: rms of the partition by table and label, as of
-    `partition_parts`. `arcsec`: arcsec per pixel of each band. `n_used`: pairs of each band in the
-    bins. `published`: True if the bands are those of WSDC D-T033 in as many bins.
+    Parameters
+    ----------
+    tables : mapping of str to StatisticsTable
+        Tables '5-1', '5-2' and '5-3'.
+    parts : mapping of (str, str) to float
+        Rms of the partition by table and label, from `partition_parts`.
+    arcsec : mapping of str to float
+        Arcsec per pixel of each band.
+    n_used : mapping of str to int
+        Number of pairs of each band in the bins.
+    published : bool
+        True if the bands and the number of bins are those of WSDC D-T033.
+
+    Returns
+    -------
+    dict of str to tuple of RowAccount
+        Rows by table.
     """
     out = {
         name: tuple(RowAccount(row, parts.get((name, row.label))) for row in table.rows)
@@ -172,13 +191,14 @@ def accounts(
     def with_printed(table: str, one: RowAccount) -> RowAccount:
         label = one.row.label
         printed = rows[table][label]
-        # a label with two bands is of Table 5-2, one that 5-3 shares with 5-1 is meant for 5-3
-        others = [s for s in across if table != "5-1" and s.startswith(f"{label}:")]
+        # labels occur in Tables 5-1 and 5-3 (one band) or only in 5-2 (two bands); contradictions
+        # belong to Tables 5-2 and 5-3
+        row_contradictions = [s for s in across if table != "5-1" and s.startswith(f"{label}:")]
         return replace(
             one,
             printed=printed,
             printed_noise=_noises(label, table, tables["5-1"], n_used, rows["5-1"], arcsec),
-            contradictions=(*contradictions_within(printed), *others),
+            contradictions=(*contradictions_within(printed), *row_contradictions),
         )
 
     return {name: tuple(with_printed(name, one) for one in out[name]) for name in out}
@@ -187,31 +207,40 @@ def accounts(
 def partition_parts(
     partitions: Mapping[str, ResidualPartition], arcsec: Mapping[str, float]
 ) -> dict[tuple[str, str], float]:
-    """Rms that significant partitions add to the sigma of each row.
+    """Rms contribution of significant partitions to the sigma of each row.
 
-    `partitions`: by band, of residuals in pixels; bands without one that is significant count as
-    having none. The result is by table and label: rms over the array without the noise of the
-    fitted blocks, in the unit of the table.
+    Parameters
+    ----------
+    partitions : mapping of str to ResidualPartition
+        Partitions by band, of residuals in pixels; those that are not significant are ignored.
+    arcsec : mapping of str to float
+        Arcsec per pixel of each band.
+
+    Returns
+    -------
+    dict of (str, str) to float
+        By table and label, the rms over the array without the noise of the fitted blocks, in the
+        unit of the table.
     """
-    found = {name: p for name, p in partitions.items() if p.significant}
+    significant = {name: p for name, p in partitions.items() if p.significant}
     out: dict[tuple[str, str], float] = {}
     names = list(partitions)
     for k, axis in enumerate("XY"):
-        for name, p in found.items():
+        for name, p in significant.items():
             out["5-1", f"{name}/{axis}"] = p.rms[k]
             out["5-3", f"{name}/{axis}"] = float(np.sqrt(2)) * arcsec[name] * p.rms[k]
         for i, earlier in enumerate(names):
             for later in names[i + 1 :]:
-                here = {name: found[name] for name in (earlier, later) if name in found}
-                if here:
-                    out["5-2", f"{later}-{earlier}/{axis}"] = _difference(here, arcsec, earlier, k)
+                pair = {name: significant[name] for name in (earlier, later) if name in significant}
+                if pair:
+                    out["5-2", f"{later}-{earlier}/{axis}"] = _difference(pair, arcsec, earlier, k)
     return out
 
 
 def _difference(
     found: Mapping[str, ResidualPartition], arcsec: Mapping[str, float], minus: str, axis: int
 ) -> float:
-    """Rms of the difference of two patterns, which may be alike, without their noise."""
+    """Rms of the difference of two patterns, without their noise."""
     scaled = [
         (-1 if name == minus else 1) * arcsec[name] * p.pattern[axis] for name, p in found.items()
     ]
@@ -231,7 +260,7 @@ def _noises(
     printed_fitting: Mapping[str, PrintedRow],
     arcsec: Mapping[str, float],
 ) -> tuple[float, float]:
-    """Least and most noise of a printed row; of two bands that of both together."""
+    """Lowest and highest noise of a published row, for the number of bands in its label."""
     bands, _, axis = label.partition("/")
     square = np.zeros(2)
     for band in bands.split("-"):
@@ -239,10 +268,10 @@ def _noises(
             noise_of_bins(r[f"{band}/radial"].value["mean"], n[band], PRINTED_BINS**2)
             for r, n in ((fitting, n_used), (printed_fitting, SAMPLE_SIZES))
         )
-        # lengths of normal residuals scatter less than the residuals themselves
+        # the scatter of the lengths of normal residuals is smaller than that of the residuals
         normal = float(np.sqrt(2 - np.pi / 2)) if axis == "radial" else 1.0
-        here = fitting[f"{band}/{axis}"].sigma_noise / length
+        ratio = fitting[f"{band}/{axis}"].sigma_noise / length
         scale = 1.0 if table == "5-1" else arcsec[band]
-        square += (scale * printed * np.sort([normal, here])) ** 2
+        square += (scale * printed * np.sort([normal, ratio])) ** 2
     low, high = np.sqrt(2 * square if table == "5-3" else square)
     return float(low), float(high)

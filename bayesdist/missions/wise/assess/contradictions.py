@@ -1,7 +1,7 @@
-"""Contradictions between the numbers of residual tables.
+"""Contradictions between the published numbers of residual tables.
 
-What statistics of any numbers must satisfy, and what differences of two bands or of all pairs of
-bins must be, is known without the data: it tells misprints, and tables made from other models.
+Statistics of any sample satisfy certain inequalities, and statistics of differences follow from
+those of the samples.  Violations reveal misprints, and tables that were made with other models.
 """
 
 from __future__ import annotations
@@ -16,12 +16,11 @@ from bayesdist.missions.wise.published import WISE_ARCSEC
 
 
 def contradictions_within(row: PrintedRow) -> list[str]:
-    """Sentences on statistics of a row that no set of numbers can have.
+    """Sentences on statistics of a row that are impossible for any sample.
 
-    The order of extremes, percentiles and median; a mean at most one sigma from the median; and
-    sigma^2 <= (max - mean) (mean - min), Bhatia and Davis.
-
-    Returns one sentence for each contradiction beyond the rounding of the digits.
+    The checks are the order of extremes, percentiles and median; a mean at most one sigma from the
+    median; and sigma^2 <= (max - mean) (mean - min) (Bhatia and Davis).  Differences that rounding
+    can explain are ignored.
     """
     v, h = row.value, row.rounding
     out = []
@@ -51,22 +50,31 @@ def contradictions_across(
 ) -> list[str]:
     """Sentences on numbers of Tables 5-2 and 5-3 that do not follow from Table 5-1.
 
-    All pairs of the bins of one band have sqrt(2) times the sigma, and the range as maximum.  Two
-    bands have the difference of the means, and a sigma within what theirs allow.  And within Table
-    5-2 a difference must be what the way over any third band gives.
+    The differences of all pairs of bins in one band have sqrt(2) times the sigma, and the range as
+    maximum.  For two bands the mean is the difference of their means, and sigma is limited by their
+    sigmas.  Within Table 5-2 the mean difference of two bands must equal the sum of those through a
+    third band.
 
-    `fitting`, `band_to_band`, `multiframe`: Tables 5-1 (pixels), 5-2 and 5-3 (arcsec). Returns one
-    sentence for each contradiction beyond the rounding of the digits, with the value that the other
-    numbers imply.
+    Parameters
+    ----------
+    fitting, band_to_band, multiframe : mapping of str to PrintedRow
+        Tables 5-1 (pixels), 5-2 and 5-3 (arcsec).
+
+    Returns
+    -------
+    list of str
+        One sentence per contradiction that rounding cannot explain, with the implied value.
     """
     out = []
     for label, row in multiframe.items():
-        one, scale = fitting[label], WISE_ARCSEC[label.partition("/")[0]]
-        sigma = np.sqrt(2) * scale * one.value["sigma"]
-        slack = np.sqrt(2) * scale * one.rounding["sigma"]
+        printed, scale = fitting[label], WISE_ARCSEC[label.partition("/")[0]]
+        sigma = np.sqrt(2) * scale * printed.value["sigma"]
+        slack = np.sqrt(2) * scale * printed.rounding["sigma"]
         out += _unequal(row, "sigma", float(sigma), float(slack))
-        extent = scale * (one.value["max"] - one.value["min"])
-        out += _unequal(row, "max", extent, scale * (one.rounding["max"] + one.rounding["min"]))
+        extent = scale * (printed.value["max"] - printed.value["min"])
+        out += _unequal(
+            row, "max", extent, scale * (printed.rounding["max"] + printed.rounding["min"])
+        )
     for label, row in band_to_band.items():
         bands, _, axis = label.partition("/")
         scaled = [(WISE_ARCSEC[name], fitting[f"{name}/{axis}"]) for name in bands.split("-")]
@@ -84,9 +92,10 @@ def contradictions_across(
 
 
 def _open_triangles(band_to_band: Mapping[str, PrintedRow]) -> list[str]:
-    """Means of two bands that no detour over a third one confirms.
+    """Mean differences of two bands that are not confirmed through any third band.
 
-    A wrong value opens all triangles it is a side of, and only one of those of another side.
+    A wrong value affects all triangles that contain it, but only one of the triangles of any other
+    difference.
     """
     sides: dict[tuple[str, str, str], tuple[float, float]] = {}
     for label, row in band_to_band.items():
@@ -104,10 +113,15 @@ def _open_triangles(band_to_band: Mapping[str, PrintedRow]) -> list[str]:
             for c in names
             if (a, c, axis) in sides and (c, b, axis) in sides
         ]
-        found = [(_unequal(row, "mean", one + two, h + k), c) for (one, h), (two, k), c in detours]
-        if len(found) > 1 and all(sentences for sentences, _ in found):
-            through = ", ".join(c for _, c in found)
-            out.append(found[0][0][0].replace(" follows.", f" follows by way of {through}."))
+        sentences_by_band = [
+            (_unequal(row, "mean", step_1 + step_2, h + k), c)
+            for (step_1, h), (step_2, k), c in detours
+        ]
+        if len(sentences_by_band) > 1 and all(sentences for sentences, _ in sentences_by_band):
+            through = ", ".join(c for _, c in sentences_by_band)
+            out.append(
+                sentences_by_band[0][0][0].replace(" follows.", f" follows by way of {through}.")
+            )
     return out
 
 
@@ -118,7 +132,7 @@ def _unequal(row: PrintedRow, name: str, implied: float, slack: float) -> list[s
 
 
 def _sigma_limits(a: float, first: PrintedRow, b: float, second: PrintedRow) -> tuple[float, float]:
-    """Limits of the sigma of a difference: those of correlation 1 and -1."""
-    one, two = a * first.value["sigma"], b * second.value["sigma"]
+    """Limits of the sigma of a difference, for correlations 1 and -1."""
+    sigma_a, sigma_b = a * first.value["sigma"], b * second.value["sigma"]
     slack = a * first.rounding["sigma"] + b * second.rounding["sigma"]
-    return max(abs(one - two) - slack, 0.0), one + two + slack
+    return max(abs(sigma_a - sigma_b) - slack, 0.0), sigma_a + sigma_b + slack

@@ -1,4 +1,4 @@
-"""The residual tables printed in WSDC D-T033, and the errors of pairs that its numbers imply."""
+"""Published residual tables of WSDC D-T033, and the implied errors of pairs."""
 
 from __future__ import annotations
 
@@ -61,18 +61,18 @@ W4/Y 0.0 0.1764 -0.8766 0.8766 0.0 -0.4102 0.4102
 
 @dataclass(frozen=True)
 class PrintedRow:
-    """A row as printed."""
+    """Row of a published table."""
 
     label: str
     value: Mapping[str, float]  # by the names in `STATISTICS`
-    rounding: Mapping[str, float]  # half a unit of the last digit printed
+    rounding: Mapping[str, float]  # half a unit of the last published digit
 
 
 def printed_rows(text: str) -> dict[str, PrintedRow]:
-    """Rows of a printed table, by label.
+    """Parse a published table into rows by label.
 
-    `text`: one row on a line: the label, then seven numbers in the order of `STATISTICS`.
-    InputError for a row that has not seven numbers.
+    Each line of `text` has a label and seven numbers in the order of `STATISTICS`.  Raises
+    InputError for any other line.
     """
     out = {}
     for k, line in enumerate(text.strip().splitlines(), 1):
@@ -96,29 +96,55 @@ def printed_rows(text: str) -> dict[str, PrintedRow]:
 
 
 def noise_of_bins(mean_length: float, n_pairs: float, n_bins: int = 31 * 31) -> float:
-    """Noise that means of bins must hold, from the mean length of single residuals.
+    """Noise of the mean residuals in bins, from the mean length of single residuals.
 
-    A residual of normal errors s on each axis has the mean length sqrt(pi / 2) s, which the radial
-    rows of Table 5-1 give; a bin's mean has the noise s / sqrt(pairs in the bin).
+    For normal errors s per axis the mean length of a residual is sqrt(pi / 2) s, which is given in
+    the radial rows of Table 5-1.  The noise of the mean in a bin is s / sqrt(pairs per bin).
 
-    `mean_length`: mean of a radial row. `n_pairs`: pairs of the band (section 4 gives them), evenly
-    over the bins. The result is of each axis, in the unit of `mean_length`.
+    Parameters
+    ----------
+    mean_length : float
+        Mean of a radial row.
+    n_pairs : float
+        Number of pairs of the band (given in section 4), distributed uniformly over the bins.
+    n_bins : int
+        Number of bins.
+
+    Returns
+    -------
+    float
+        Noise per axis in the unit of `mean_length`.
     """
     return float(mean_length / np.sqrt(np.pi / 2) / np.sqrt(n_pairs / n_bins))
 
 
 def implied_sigma(radius_max: float, n_pairs: int, *, order: int = 4) -> float:
-    """Error of a pair, equal on both axes, that a largest radius hypot(sigma_x, sigma_y) implies.
+    """Error per axis of a pair, from the largest position error of the fitted polynomial.
 
-    Pairs that lie evenly over the array determine products of Legendre polynomials independently of
-    each other: that of degrees i and j has the variance (2i + 1)(2j + 1) / N in a corner, where the
-    radius is largest.
+    If the pairs are distributed uniformly over the array, the coefficients of Legendre products are
+    independent.  The product of degrees i and j then contributes the variance (2i + 1)(2j + 1) / N
+    in a corner, where the error is largest.
 
-    `radius_max`: largest hypot(sigma_x, sigma_y) of a polynomial's position over the array.
-    `n_pairs`: pairs that determine the polynomial, evenly over the array. `order`: of the
-    polynomial. The result is in the unit of the radius. InputError for no pairs.
+    Parameters
+    ----------
+    radius_max : float
+        Largest hypot(sigma_x, sigma_y) of the polynomial's position over the array.
+    n_pairs : int
+        Number of pairs, uniformly over the array.
+    order : int
+        Order of the polynomial.
+
+    Returns
+    -------
+    float
+        Error in the unit of `radius_max`.
+
+    Raises
+    ------
+    InputError
+        If there are no pairs.
     """
     if n_pairs < 1:
-        raise InputError(f"{n_pairs} pairs are given", do="give one pair or more")
+        raise InputError(f"{n_pairs} pairs are given", do="give at least one pair")
     corner = sum((2 * i + 1) * (2 * j + 1) for i, j in polynomial_terms(order))
     return float(radius_max / np.sqrt(2 * corner / n_pairs))

@@ -1,4 +1,4 @@
-"""Two-point correlation of residuals over the detector: how far structure reaches."""
+"""Two-point correlation of residuals over the detector."""
 
 from __future__ import annotations
 
@@ -11,31 +11,31 @@ from bayesdist.diagnose.residuals.binned import BinnedResiduals
 from bayesdist.missions.wise.assess.residual_field import ResidualField, residual_field
 from bayesdist.utils.arrays import Float, Int
 
-DRAWS = 500  # noise fields that give mean and sigma, and half a thousand more for the ranks
-_AT_ONCE = 50
+DRAWS = 500  # number of noise fields for mean and sigma, and of further ones for the p-value
+_AT_ONCE = 50  # noise fields that are processed together
 _PAIRS = (("uu", 0, 0), ("vv", 1, 1), ("uv", 0, 1))
 
 
 @dataclass(frozen=True, eq=False)
 class ResidualCorrelation:
-    """Mean products of the residuals of two bins, by their separation."""
+    """Mean products of the residuals of two bins in R rings of separation."""
 
-    separation: Float  # (R,), mean distance of the pairs of bins in a ring, in pixels
-    # (R,), mean products, in the squared unit of the residuals, less what noise makes of them once
-    # a polynomial is fitted: it is slightly below zero
+    separation: Float  # (R,), mean distance of the pairs of bins in a ring, pixels
+    # (R,), mean products in the squared unit of the residuals, minus their expectation for noise,
+    # which is slightly negative after the fit of a polynomial
     uu: Float
     vv: Float  # (R,)
     uv: Float  # (R,)
-    sigma_uu: Float  # (R,), their standard deviations where noise is all there is
+    sigma_uu: Float  # (R,), standard deviations for pure noise
     sigma_vv: Float  # (R,)
     sigma_uv: Float  # (R,)
     n_pairs: Int  # (R,), pairs of bins in the ring
-    chi2: float  # sum of the squares of all three functions over their sigmas
-    p_value: float  # share of noise fields with as large a sum; not below 1 / 500
+    chi2: float  # sum over all three functions of the squares of value / sigma
+    p_value: float  # fraction of noise fields with a chi2 as large; at least 1 / 501
 
     @property
     def reach(self) -> float:
-        """Separation, in pixels, up to which uu + vv stays above three sigma; 0 if nowhere."""
+        """Separation in pixels up to which uu + vv exceeds three sigma; 0 if nowhere."""
         above = self.uu + self.vv > 3 * np.hypot(self.sigma_uu, self.sigma_vv)
         n = above.size if above.all() else int(np.argmin(above))
         return float(self.separation[n - 1]) if n else 0.0
@@ -46,30 +46,43 @@ def residual_correlation(
 ) -> ResidualCorrelation:
     """Two-point correlation of binned residuals, with its significance.
 
-    All pairs of bins count, by Fourier transforms padded to twice the size; rings are one bin wide
-    and reach to half the shorter side.  A bin is not paired with itself, so that noise, which is
-    independent between bins, adds nothing.  The fitted polynomial makes it slightly dependent:
-    mean and sigma come from noise fields that lost the same polynomial.
+    All pairs of different bins are used, by Fourier transforms that are padded to twice the size.
+    Rings are one bin wide and extend to half of the shorter side.  Noise is independent between
+    bins, apart from a slight dependence due to the fitted polynomial.  Mean and sigma are therefore
+    those of noise fields from which the same polynomial was removed.
 
-    `order`: of the polynomial fitted to these stars. InputError, DegenerateError as
-    `bayesdist.missions.wise.assess.residual_field.residual_field`.
+    Parameters
+    ----------
+    bins : BinnedResiduals
+    order : int
+        Order of the polynomial that was fitted to these stars.
+    rng : numpy.random.Generator
+
+    Returns
+    -------
+    ResidualCorrelation
+
+    Raises
+    ------
+    InputError, DegenerateError
+        See `bayesdist.missions.wise.assess.residual_field.residual_field`.
     """
     field = residual_field(bins, order=order)
     rings = _Rings.of(field)
-    found = rings.products(field.image(field.sem * field.white)[None])[0]
+    products = rings.products(field.image(field.sem * field.white)[None])[0]
     by_chance = np.concatenate(
         [
             rings.products(field.image(field.sem * field.noise(_AT_ONCE, rng)))
             for _ in range(2 * DRAWS // _AT_ONCE)
         ]
     )
-    # the first half says what to expect, the second how far chance goes: data and second half
-    # meet the same yardstick
+    # mean and sigma come from the first half; the data are compared with the second half, which is
+    # independent of them
     mean, sigma = by_chance[:DRAWS].mean(axis=0), by_chance[:DRAWS].std(axis=0, ddof=1)
-    chi2 = float((((found - mean) / sigma) ** 2).sum())
-    others = (((by_chance[DRAWS:] - mean) / sigma) ** 2).sum(axis=(1, 2))
-    p_value = (1 + int((others >= chi2).sum())) / (len(others) + 1)
-    (uu, vv, uv), (sigma_uu, sigma_vv, sigma_uv) = found - mean, sigma
+    chi2 = float((((products - mean) / sigma) ** 2).sum())
+    chi2_by_chance = (((by_chance[DRAWS:] - mean) / sigma) ** 2).sum(axis=(1, 2))
+    p_value = (1 + int((chi2_by_chance >= chi2).sum())) / (len(chi2_by_chance) + 1)
+    (uu, vv, uv), (sigma_uu, sigma_vv, sigma_uv) = products - mean, sigma
     return ResidualCorrelation(
         rings.separation,
         uu,
@@ -86,7 +99,7 @@ def residual_correlation(
 
 @dataclass(frozen=True, eq=False)
 class _Rings:
-    """Lags between bins, sorted into rings of separation."""
+    """Lags between bins, grouped into rings of separation."""
 
     shape: tuple[int, int]
     ring: Int
@@ -95,7 +108,7 @@ class _Rings:
 
     @property
     def n_pairs(self) -> Int:
-        # every pair is met from both of its bins
+        # every pair was counted twice
         return np.rint(self.counts / 2).astype(np.int64)
 
     @classmethod
@@ -127,13 +140,13 @@ class _Rings:
         out = np.empty((len(images), len(_PAIRS), self.counts.size))
         for k, (_, a, b) in enumerate(_PAIRS):
             lagged = _lagged(images[:, a], images[:, b], self.shape)[:, inside]
-            for i, one in enumerate(lagged):
-                out[i, k] = np.bincount(ring, one, self.counts.size) / self.counts
+            for i, values in enumerate(lagged):
+                out[i, k] = np.bincount(ring, values, self.counts.size) / self.counts
         return out
 
 
 def _lagged(a: Float, b: Float | None, shape: tuple[int, int]) -> Float:
-    """Sums over the grid of a(r) b(r + lag) for all lags; b is a where it is not given."""
+    """Sums over the grid of a(r) b(r + lag) for all lags; b is a by default."""
     first = fft.rfft2(a, shape)
     second = first if b is None or b is a else fft.rfft2(b, shape)
     return fft.irfft2(first.conj() * second, shape)

@@ -1,4 +1,4 @@
-"""Binned residuals as fields of known noise, what a fitted polynomial carries away removed."""
+"""Binned residuals as fields of known noise, without the part that a fitted polynomial absorbs."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ _FEWEST_STARS = 5
 
 @dataclass(frozen=True, eq=False)
 class ResidualField:
-    """Mean residuals of both axes over the used bins, and the noise they hold."""
+    """Mean residuals of both axes in M bins with enough stars, and their noise."""
 
-    x: Float  # (nx,)
-    y: Float  # (ny,), centres of the bins, FITS 1-based pixels
-    used: Bool  # (ny, nx), bins of five stars or more
-    sem: Float  # (2, M), noise of the means in u and v of the M used bins
-    white: Float  # (2, M), means over their noise, the polynomial removed
-    absorbed: Float  # (2, M, K), orthonormal columns: what polynomials can do to the whitened means
+    x: Float  # (nx,), centres of the bins, FITS 1-based pixels
+    y: Float  # (ny,)
+    used: Bool  # (ny, nx), True for bins with at least five stars
+    sem: Float  # (2, M), standard errors of the means in u and v
+    white: Float  # (2, M), whitened means (divided by their errors) without the polynomial
+    absorbed: Float  # (2, M, K), orthonormal basis of whitened polynomials
 
     @property
     def n_used(self) -> int:
@@ -38,16 +38,16 @@ class ResidualField:
         return float(self.x[1] - self.x[0]), float(self.y[1] - self.y[0])
 
     def without_polynomial(self, white: Float) -> Float:
-        """Whitened means (..., 2, M) with what polynomials can do to them removed."""
+        """Whitened means (..., 2, M), projected orthogonally to the polynomials."""
         part = np.einsum("amk,...am->...ak", self.absorbed, white)
         return white - np.einsum("amk,...ak->...am", self.absorbed, part)
 
     def noise(self, n: int, rng: np.random.Generator) -> Float:
-        """Whitened means (n, 2, M) as they are where the noise is all there is."""
+        """Random whitened means (n, 2, M) for pure noise."""
         return self.without_polynomial(rng.standard_normal((n, 2, self.n_used)))
 
     def image(self, values: Float) -> Float:
-        """Values (..., M) of the used bins on the grid, (..., ny, nx); 0 in the others."""
+        """Values (..., M) of the used bins as images (..., ny, nx); 0 in all other bins."""
         out = np.zeros((*values.shape[:-1], *self.used.shape))
         out[..., self.used] = values
         return out
@@ -56,31 +56,44 @@ class ResidualField:
 def residual_field(bins: BinnedResiduals, *, order: int = 0) -> ResidualField:
     """Prepare binned residuals for tests of structure.
 
-    `order`: total order of the polynomial that was fitted to these stars.  Its freedom is removed
-    from the means and from the noise they are compared with; a lower order than the fit's lets the
-    fit's own work look like structure. InputError for a negative order, or fewer than four bins on
-    an axis. DegenerateError when the bins that hold five stars are not twice as many as the
-    polynomial's terms.
+    Parameters
+    ----------
+    bins : BinnedResiduals
+    order : int
+        Total order of the polynomial that was fitted to these stars.  Polynomials of this order are
+        removed from the means and from the noise with which they are compared.  If it is lower than
+        that of the fit, effects of the fit may be taken for structure.
+
+    Returns
+    -------
+    ResidualField
+
+    Raises
+    ------
+    InputError
+        If the order is negative, or there are fewer than four bins per axis.
+    DegenerateError
+        If the number of bins with at least five stars is less than twice the number of terms.
     """
     if order < 0:
-        raise InputError(f"the order is {order}", where="order", do="give 0 or more")
+        raise InputError(f"the order is {order}", where="order", do="give 0 or higher")
     if min(bins.count.shape) < 4:
         raise InputError(
-            f"{bins.count.shape[1]} x {bins.count.shape[0]} bins show no structure",
+            f"{bins.count.shape[1]} x {bins.count.shape[0]} bins are too few to detect structure",
             where="bins",
-            do="take four or more on each axis",
+            do="take at least four per axis",
         )
     sems = np.stack([bins.sem_u, bins.sem_v])
     used = (bins.count >= _FEWEST_STARS) & (sems > 0).all(axis=0)
     terms = polynomial_terms(order)
     if used.sum() < max(2 * len(terms), 9):
         raise DegenerateError(
-            f"only {int(used.sum())} bins hold {_FEWEST_STARS} stars or more",
+            f"only {int(used.sum())} bins have at least {_FEWEST_STARS} stars",
             where=f"{bins.count.shape[1]} x {bins.count.shape[0]} bins",
             do="take fewer bins or more stars",
         )
     n = bins.count[used]
-    # the square of a t variable is larger than that of a normal one
+    # correct for the larger variance of Student's t distribution
     sem = sems[:, used] * np.sqrt((n - 1) / (n - 3))
     design = polynomials(bins.x, bins.y, used, order)
     absorbed = np.stack([np.linalg.qr(design / s[:, None])[0] for s in sem])
@@ -90,7 +103,7 @@ def residual_field(bins: BinnedResiduals, *, order: int = 0) -> ResidualField:
 
 
 def polynomials(x: Float, y: Float, used: Bool, order: int) -> Float:
-    """Columns (M, K) of Legendre products up to an order, at the used bins (ny, nx)."""
+    """Legendre products (M, K) up to an order at the used bins (ny, nx)."""
     by_x, by_y = (legendre.legvander(_scaled(c), order) for c in (x, y))
     return np.stack(
         [(by_y[:, j, None] * by_x[:, i])[used] for i, j in polynomial_terms(order)], axis=1
@@ -98,6 +111,6 @@ def polynomials(x: Float, y: Float, used: Bool, order: int) -> Float:
 
 
 def _scaled(centres: Float) -> Float:
-    """Centres of bins on -1 to 1."""
+    """Centres of bins, scaled to [-1, 1]."""
     middle = (centres[0] + centres[-1]) / 2
     return (centres - middle) / (centres[-1] - middle)

@@ -1,8 +1,9 @@
-"""A partition left in residuals: blocks of the detector that stand apart.
+"""Detection of a partition of the detector into blocks in the residuals.
 
-Point-source templates that change from block to block print their blocks on the residuals (WSDC
-D-T033, section 5: 5 x 5 in W1 and W2).  For each k, planes in k x k blocks that need not meet at
-the edges are fitted to the binned residuals, and the k that explains most for its freedom is named.
+If the point-source templates differ between blocks of the detector, the blocks appear in the
+residuals (WSDC D-T033, section 5: 5 x 5 blocks in W1 and W2).  For each k, independent planes in
+k x k blocks are fitted to the binned residuals.  The k with the largest gain in likelihood, given
+its degrees of freedom, is selected.
 """
 
 from __future__ import annotations
@@ -28,52 +29,50 @@ Base = tuple[Float, Float]
 
 PARTITIONS = tuple(range(2, 13))
 DRAWS = 999
-# log likelihood that blocks must gain over a polynomial of as many terms: odds of 1000 to 1
+# required gain in log likelihood over a polynomial with as many terms: odds of 1000 to 1
 _EDGES = float(np.log(1000.0))
-# bins on a side of the smallest block: its plane has three numbers
+# minimum number of bins along the side of a block, whose plane has three parameters
 _FEWEST_BINS = 3
-# directions below this part of the largest are rounding
+# singular values below this fraction of the largest are rounding errors
 _RANK = 1e-8
 
 
 @dataclass(frozen=True, eq=False)
 class ResidualPartition:
-    """The k x k partition that explains most of binned residuals."""
+    """Partition into k x k blocks that describes binned residuals best."""
 
-    k: int  # blocks on each axis
-    p_value: float  # probability that noise alone explains as much under the best of all k tried
-    # by k: gain in log likelihood by the blocks; negative where they differ less than the rest
+    k: int  # number of blocks per axis
+    p_value: float  # probability that the best of all k gains as much for pure noise
+    # gain in log likelihood due to the blocks, by k; negative if they vary less than the rest
     gain: Mapping[int, float]
-    # the same for a polynomial over the detector of as many free terms as the blocks have
-    gain_smooth: float
-    # of the blocks over the detector in u and v, their noise subtracted, in the unit of the
-    # residuals
+    gain_smooth: float  # the same for a polynomial with as many free terms as the blocks
+    # rms of the blocks in u and v, with their noise subtracted, in the unit of the residuals
     rms: tuple[float, float]
-    pattern: Float  # (2, ny, nx), the blocks as fitted, in the bins; NaN in bins not used
+    pattern: Float  # (2, ny, nx), fitted blocks in the bins; NaN in bins that are not used
 
     @property
     def significant(self) -> bool:
-        """True if there is more than chance."""
+        """True if the structure is statistically significant."""
         return not STRUCTURE.met_by(self.p_value)
 
     @property
     def edges_seen(self) -> bool:
-        """True if it is blocks: a polynomial of as many terms explains smooth structure better."""
+        """True if blocks describe the structure better than a polynomial with as many terms."""
         return self.significant and self.gain[self.k] - self.gain_smooth > _EDGES
 
     @property
     def sentence(self) -> str:
-        """Sentence on what was found."""
+        """Result in one sentence."""
         if not self.significant:
             return f"No partition of the detector stands out in residuals (p = {self.p_value:.2g})."
         size = float(np.hypot(*self.rms))
         if self.edges_seen:
             return (
-                f"The residuals hold a pattern of {self.k} x {self.k} blocks, {size:.2g} rms "
+                f"The residuals show a pattern of {self.k} x {self.k} blocks, {size:.2g} rms "
                 f"(p = {self.p_value:.1g})."
             )
         return (
-            f"The residuals hold structure of {size:.2g} rms (p = {self.p_value:.1g}) without the "
+            f"The residuals show structure of {size:.2g} rms (p = {self.p_value:.1g}) without the "
             f"edges of a partition: a polynomial describes it as well as {self.k} x {self.k} "
             "blocks."
         )
@@ -86,41 +85,57 @@ def residual_partition(
     tried: Sequence[int] = PARTITIONS,
     rng: np.random.Generator,
 ) -> ResidualPartition:
-    """Look for a partition of the detector in binned residuals.
+    """Search for a partition of the detector into blocks in binned residuals.
 
-    Blocks have d directions that the fitted polynomial leaves free, out of D in all; Q is the sum
-    of squares along them, T that of all.  With a variance of its own for the blocks, and another
-    for the rest, the log likelihood gains
+    Let D be the number of degrees of freedom of the whitened means after the polynomial fit, T
+    their sum of squares, d the degrees of freedom of the blocks, and Q the sum of squares that they
+    describe.  If the blocks and the rest have different variances, the log likelihood gains
 
         (D log(T / D) - d log(Q / d) - (D - d) log((T - Q) / (D - d))) / 2.
 
-    The rest is measured, not taken from the quoted noise: where means are so exact that every finer
-    partition explains more of what blocks do not describe, only one that describes it well gains.
-    Bins that an edge cuts belong to both blocks by their areas, so that 31 bins serve 5 blocks.
+    The variance of the rest is estimated from the data instead of the quoted noise.  Otherwise, for
+    very accurate means, finer partitions would always gain by describing other structure.  Bins
+    that are cut by an edge are divided between the blocks in proportion to the areas, so that 31
+    bins can be used for 5 blocks.  The p-value is the fraction of noise fields for which the best k
+    gains more.  If there are none, it is the Bonferroni bound from the F test if that is smaller.
+    The noise is assumed to be independent between bins and axes.
 
-    The p-value counts noise fields under which the best of all k gains more; where none does,
-    Bonferroni's bound on the F test is given if that is smaller.  Noise counts as independent
-    between bins and between axes.
+    Parameters
+    ----------
+    bins : BinnedResiduals
+        31 bins per axis are sufficient for up to 10 blocks, 45 for all 12 numbers.
+    order : int
+        Order of the polynomial that was fitted to these stars.
+    tried : sequence of int
+        Numbers of blocks per axis, at least 2; numbers above a third of the bins are ignored.
+    rng : numpy.random.Generator
 
-    `bins`: 31 on an axis show up to 10 blocks, 45 all twelve. `order`: of the polynomial fitted to
-    these stars. `tried`: numbers of blocks on an axis, at least 2; those above a third of the bins
-    are left out. InputError for a number of blocks below 2, none that the bins can show, and as
-    `residual_field`. DegenerateError as `residual_field`, and when blocks have no freedom beside
-    the polynomial or leave none.
+    Returns
+    -------
+    ResidualPartition
+
+    Raises
+    ------
+    InputError
+        If a number of blocks is below 2, all are too large for the bins, or see `residual_field`.
+    DegenerateError
+        If the blocks cannot be distinguished from the polynomial, or see `residual_field`.
     """
     field = residual_field(bins, order=order)
     if any(k < 2 or int(k) != k for k in tried):
-        raise InputError(f"the numbers of blocks are {list(tried)}", do="give whole numbers from 2")
+        raise InputError(
+            f"the numbers of blocks are {list(tried)}", do="give integers of at least 2"
+        )
     possible = [int(k) for k in tried if _FEWEST_BINS * k <= min(field.used.shape)]
     if not possible:
         raise InputError(
-            f"{min(field.used.shape)} bins on an axis show none of {list(tried)} blocks",
+            f"{min(field.used.shape)} bins per axis are too few for {list(tried)} blocks",
             where="bins",
-            do=f"take {_FEWEST_BINS} bins or more for a block",
+            do=f"take at least {_FEWEST_BINS} bins per block",
         )
     bases = {k: _free(field, _blocks(field, k)) for k in possible}
     gain = {k: float(_gain(field, field.white, base)) for k, base in bases.items()}
-    k = max(gain, key=lambda one: gain[one])
+    k = max(gain, key=lambda number: gain[number])
     noise = field.noise(DRAWS, rng)
     by_chance = np.max([_gain(field, noise, base) for base in bases.values()], axis=0)
     above = int((by_chance >= gain[k]).sum())
@@ -136,7 +151,7 @@ def residual_partition(
 
 
 def _blocks(field: ResidualField, k: int) -> Float:
-    """Columns (M, 3 k^2): each block's offset and its tilts along x and y."""
+    """Design matrix (M, 3 k^2) for the offset and the tilts along x and y of each block."""
     (sy, ty), (sx, tx) = (_shares(n, k) for n in field.used.shape)
     pairs = (sy, sx), (sy, tx), (ty, sx)
     columns = [np.einsum("yi,xj->yxij", a, b)[field.used] for a, b in pairs]
@@ -144,18 +159,19 @@ def _blocks(field: ResidualField, k: int) -> Float:
 
 
 def _shares(n: int, k: int) -> tuple[Float, Float]:
-    """Share (n, k) of each of n bins in each of k blocks, and that times its place in the block.
+    """Overlap (n, k) of each of n bins with each of k blocks, and its first moment (n, k).
 
-    Places go from -1 to 1.
+    The overlap is a fraction of the bin.  The moment is the overlap times its position in the
+    block, from -1 to 1.
     """
     low, edge = np.arange(n)[:, None] / n, np.arange(k) / k
     start, end = np.maximum(low, edge), np.minimum(low + 1 / n, edge + 1 / k)
-    share = n * np.maximum(end - start, 0.0)
-    return share, share * (k * (start + end - 2 * edge) - 1)
+    overlap = n * np.maximum(end - start, 0.0)
+    return overlap, overlap * (k * (start + end - 2 * edge) - 1)
 
 
 def _order_with(freedom: int, order: int) -> int:
-    """The lowest order above the fitted one with so many more terms."""
+    """Lowest polynomial order that has at least `freedom` more terms than `order`."""
     had = len(polynomial_terms(order))
     while len(polynomial_terms(order)) - had < freedom:
         order += 1
@@ -163,7 +179,7 @@ def _order_with(freedom: int, order: int) -> int:
 
 
 def _free(field: ResidualField, columns: Float) -> Base:
-    """Orthonormal columns (M, d) of u and of v: what given ones do that the fitted cannot."""
+    """Orthonormal bases (M, d) in u and v of columns (M, n), orthogonal to the polynomials."""
     out = []
     for absorbed, sem in zip(field.absorbed, field.sem, strict=True):
         white = columns / sem[:, None]
@@ -173,7 +189,7 @@ def _free(field: ResidualField, columns: Float) -> Base:
     base = out[0], out[1]
     if not _freedom(base) or _freedom(base) >= _freedom_of_all(field):
         raise DegenerateError(
-            f"{field.n_used} bins do not tell blocks from the fitted polynomial",
+            f"{field.n_used} bins cannot distinguish blocks from the fitted polynomial",
             where="bins",
             do="take more bins or a lower order",
         )
@@ -181,7 +197,7 @@ def _free(field: ResidualField, columns: Float) -> Base:
 
 
 def _freedom(base: Base) -> int:
-    """Directions on one axis, the mean of u and v."""
+    """Degrees of freedom per axis, the mean of u and v."""
     return round(sum(b.shape[1] for b in base) / 2)
 
 
@@ -190,33 +206,33 @@ def _freedom_of_all(field: ResidualField) -> int:
 
 
 def _squares(field: ResidualField, white: Float, base: Base) -> tuple[Float, int, Float, int]:
-    """Q, d, T - Q and D - d of whitened means (..., 2, M)."""
+    """Q, d, T - Q and D - d of whitened means (..., 2, M); see `residual_partition`."""
     along = [white[..., axis, :] @ columns for axis, columns in enumerate(base)]
     q, d = sum((a**2).sum(-1) for a in along), sum(a.shape[-1] for a in along)
-    rest = np.maximum((white**2).sum((-2, -1)) - q, np.finfo(float).tiny)
-    return np.maximum(q, np.finfo(float).tiny), d, rest, 2 * _freedom_of_all(field) - d
+    remainder = np.maximum((white**2).sum((-2, -1)) - q, np.finfo(float).tiny)
+    return np.maximum(q, np.finfo(float).tiny), d, remainder, 2 * _freedom_of_all(field) - d
 
 
 def _gain(field: ResidualField, white: Float, base: Base) -> Float:
-    q, d, rest, free = _squares(field, white, base)
-    total = (q + rest) / (d + free)
-    gain = d * np.log(total * d / q) + free * np.log(total * free / rest)
-    return np.sign(q / d - rest / free) * gain / 2
+    q, d, remainder, free = _squares(field, white, base)
+    total = (q + remainder) / (d + free)
+    gain = d * np.log(total * d / q) + free * np.log(total * free / remainder)
+    return np.sign(q / d - remainder / free) * gain / 2
 
 
 def _tail(field: ResidualField, base: Base) -> float:
-    q, d, rest, free = _squares(field, field.white, base)
-    return float(f_sf((q / d) / (rest / free), d, free))
+    q, d, remainder, free = _squares(field, field.white, base)
+    return float(f_sf((q / d) / (remainder / free), d, free))
 
 
 def _described(field: ResidualField, base: Base) -> tuple[tuple[float, float], Float]:
-    """Rms of the fitted blocks without their noise, and the blocks in the bins."""
+    """Rms of the fitted blocks with their noise subtracted, and their values (2, ny, nx)."""
     rms, fitted = [], []
     for axis, columns in enumerate(base):
         sem = field.sem[axis]
-        found = sem * (columns @ (columns.T @ field.white[axis]))
+        block_values = sem * (columns @ (columns.T @ field.white[axis]))
         noise = sem**2 * (columns**2).sum(axis=1)
-        rms.append(float(np.sqrt(max(np.mean(found**2 - noise), 0.0))))
-        fitted.append(found)
+        rms.append(float(np.sqrt(max(np.mean(block_values**2 - noise), 0.0))))
+        fitted.append(block_values)
     pattern = np.where(field.used, field.image(np.stack(fitted)), np.nan)
     return (rms[0], rms[1]), pattern

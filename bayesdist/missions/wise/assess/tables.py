@@ -1,4 +1,4 @@
-"""Tables 5-1, 5-2 and 5-3 of WSDC D-T033, each statistic with its error."""
+"""Tables 5-1, 5-2 and 5-3 of WSDC D-T033 for any bands, with errors of all statistics."""
 
 from __future__ import annotations
 
@@ -21,25 +21,44 @@ def residual_tables(
     arcsec: Mapping[str, float],
     absorbed: Mapping[str, int],
 ) -> dict[str, StatisticsTable]:
-    """Tables of several bands, in their order, by '5-1', '5-2' and '5-3'.
+    """Residual tables '5-1', '5-2' and '5-3' of several bands.
 
-    5-1 has the residuals of the fit in bins, in pixels; 5-2, of two bands or more, the differences
-    of two bands bin by bin, and 5-3 those over all pairs of bins of a band, both in arcsec.  Errors
-    of two bands count as independent.  Where both use the same catalogue stars in the same frames
-    they are not: the catalogue's errors cancel in the difference, its noise is smaller than said
-    here, and its noise-free part larger.
+    Table 5-1 has the residuals of the fit in bins, in pixels.  Table 5-2 has the differences of two
+    bands bin by bin, and Table 5-3 the differences over all pairs of bins of a band, both in
+    arcsec.  The errors of two bands are assumed to be independent.  If both use the same catalogue
+    stars in the same frames, the errors of the catalogue cancel in the difference.  Its noise is
+    then overestimated, and its noise-free part underestimated.
 
-    `bands`: as many bins of each, over the same field. `rng` is for the errors. `arcsec`: per pixel
-    of each band. `absorbed` are the coefficients of one axis that the fit took out of the
-    residuals: 15 at order 4; 1 where they are of a model that was not fitted to these stars. Raises
-    DegenerateError when too few bins of a band hold two stars.
+    Parameters
+    ----------
+    bands : mapping of str to BinnedSums
+        Binned residuals of each band, with equal numbers of bins over the same field.
+    rng : numpy.random.Generator
+        Random generator for the errors.
+    arcsec : mapping of str to float
+        Arcsec per pixel of each band.
+    absorbed : mapping of str to int
+        Number of coefficients per axis that were fitted to these stars, for example 15 at order 4;
+        1 for a model that was not fitted to them.
+
+    Returns
+    -------
+    dict of str to StatisticsTable
+        Tables that have rows; Table 5-2 needs at least two bands.
+
+    Raises
+    ------
+    DegenerateError
+        If too few bins of a band have two stars.
     """
     pixels = {(name, axis): bands[name].values(axis) for name, axis in product(bands, BAND_AXES)}
-    scaled = {(name, axis): one.scaled(arcsec[name]) for (name, axis), one in pixels.items()}
+    scaled = {(name, axis): values.scaled(arcsec[name]) for (name, axis), values in pixels.items()}
     fitting = tuple(
-        # the scatter of single stars is not what the coefficients are fitted to
-        bin_row(f"{name}/{axis}", one, absorbed=1 if axis == "radial" else absorbed[name], rng=rng)
-        for (name, axis), one in pixels.items()
+        # the fit does not reduce the scatter of single stars (radial rows)
+        bin_row(
+            f"{name}/{axis}", values, absorbed=1 if axis == "radial" else absorbed[name], rng=rng
+        )
+        for (name, axis), values in pixels.items()
     )
     between = tuple(
         bin_row(

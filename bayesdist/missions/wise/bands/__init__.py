@@ -1,1 +1,1 @@
-"""`bayesdist wise bands`: tables and diagrams of several bands beside each other."""
+"""`bayesdist wise bands`: tables and figures that compare several bands."""

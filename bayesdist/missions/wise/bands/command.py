@@ -1,4 +1,4 @@
-"""The command: from finished runs to a folder of tables, figures and one page."""
+"""`bayesdist wise bands`: write tables, figures and a page that compare finished runs."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from bayesdist.app.store.output import record_folder
 from bayesdist.app.store.record import write_text
 from bayesdist.errors import InputError
 
-# importing them registers what the page shows
+# importing these modules registers their tables and figures
 from bayesdist.missions.wise.bands import curves, figures, findings, tables  # noqa: F401
 from bayesdist.missions.wise.bands.context import BANDS, BandsInput
 from bayesdist.missions.wise.bands.findings import overview_table, verdict
@@ -27,7 +27,7 @@ from bayesdist.report.page import parts_of, template
 
 
 def _page(inputs: BandsInput, folder: Path) -> list[str]:
-    """Names of bands.html and its figures, once they are written into a folder."""
+    """Write bands.html and its figures to a folder; returns their names."""
     drawings = draw_all(BANDS, inputs, pdf=True)
     paths = save_drawings(drawings, folder / "figures")
     overview, *parts = parts_of(BANDS, inputs, drawings)
@@ -39,8 +39,8 @@ def _page(inputs: BandsInput, folder: Path) -> list[str]:
 
 log = logging.getLogger("bayesdist")
 
-FEWEST_BINS = 6  # three show a block, and there are two of them at least
-META_ORDER = 4  # of the inverse, as WSDC D-T033, Appendix B has it
+FEWEST_BINS = 6  # at least two blocks of three bins
+META_ORDER = 4  # order of the inverse, as in WSDC D-T033, Appendix B
 
 
 def bands_of_runs(
@@ -53,20 +53,22 @@ def bands_of_runs(
     published: bool,
     command: str,
 ) -> str:
-    """Text to print, once bands are compared and everything is written into a new folder.
+    """Compare bands and write the results to a new folder; returns text to print.
 
-    It appears with all files in it, or not at all.
+    The folder is created only if all files can be written.
     """
     if bins < FEWEST_BINS:
         raise InputError(
-            f"{bins} bins show no structure", where="--bins", do=f"give {FEWEST_BINS} or more"
+            f"{bins} bins are too few to detect structure",
+            where="--bins",
+            do=f"give at least {FEWEST_BINS}",
         )
     with ExitStack() as stack:
         bands = open_bands(runs)
         for band in bands.values():
             stack.enter_context(closing(band.results))
-        made = record_folder(Path(output), "bands.json", command)
-        folder, record = stack.enter_context(made)
+        recording = record_folder(Path(output), "bands.json", command)
+        folder, record = stack.enter_context(recording)
         order = {str(band.results.run.path): name for name, band in bands.items()}
         named = [order[str(Path(path))] for path in runs]
         inputs = measure_bands(
@@ -82,7 +84,7 @@ def bands_of_runs(
 
 
 def _meta(bands: Mapping[str, BandRun], folder: Path) -> list[str]:
-    """WISE meta-data, where all bands are WISE's and in pixels."""
+    """Write WISE meta-data if all bands are of WISE and in pixels; returns the file names."""
     models = [band.results.posterior.model for band in bands.values()]
     if not set(bands) <= set(WISE_BANDS) or any(model.unit != "pix" for model in models):
         return []
@@ -98,7 +100,7 @@ def _meta(bands: Mapping[str, BandRun], folder: Path) -> list[str]:
     }
     try:
         write_wise_meta(folder / "wise_meta.tbl", headers)
-    except InputError as error:  # arrays of another size, or orders that the layout has no room for
+    except InputError as error:  # other array sizes, or orders that exceed the layout
         log.warning("bands: no wise_meta.tbl: %s", error.cause)
         return []
     return ["wise_meta.tbl"]

@@ -1,4 +1,4 @@
-"""Input of the page that compares bands, and its sections."""
+"""Input and sections of the page that compares bands."""
 
 from __future__ import annotations
 
@@ -33,78 +33,77 @@ BANDS = Registry(
 
 @dataclass(frozen=True)
 class Printed:
-    """Numbers of a band that a published report gives."""
+    """Published numbers of a band, in pixels."""
 
-    longest_vector: float  # printed, found over the same part of the array, and printed; pixels
-    longest_vector_here: float
-    formal_radius: float
-    # error of a pair that the radius implies, with all pairs evenly over the array; pixels
-    implied_sigma: float
+    longest_vector: float  # published longest distortion vector
+    longest_vector_here: float  # that of the run, over the same part of the array
+    formal_radius: float  # published largest hypot(sigma_x, sigma_y)
+    implied_sigma: float  # error per pair that the radius implies for uniformly distributed pairs
 
 
 @dataclass(frozen=True, eq=False)
 class BandResult:
-    """One band."""
+    """Results of one band."""
 
-    name: str  # of the band, and of its run
-    path: str
+    name: str  # name of the band
+    path: str  # folder of its run
     simulated: bool
     converged: bool
-    reasons: tuple[str, ...]  # why it has not
-    arcsec: float  # per pixel
+    reasons: tuple[str, ...]  # reasons if it has not converged
+    arcsec: float  # arcsec per pixel
     size: tuple[float, float]  # columns and rows of the array
-    order: int
-    n_pairs: int  # all pairs, and those that the least-squares fit used
-    n_used: int
+    order: int  # order of the polynomial
+    n_pairs: int  # number of all pairs
+    n_used: int  # number of pairs in the least-squares fit
     sums: BandSums  # in pixels
     partition: ResidualPartition
     correlation: ResidualCorrelation
-    vectors: VectorMap  # the distortion without its constant, pixels
+    vectors: VectorMap  # distortion without its constant, pixels
     formal_map: UncertaintyMap
     posterior_map: UncertaintyMap
-    minus_optical: VectorMap | None  # the distortion less the optical model, pixels
+    minus_optical: VectorMap | None  # distortion minus the optical model, pixels
     printed: Printed | None
 
     @property
     def coverage_chi2(self) -> float:
-        """Chi-square of the pairs used in bins against their mean."""
+        """Chi-square of the numbers of pairs per bin, relative to uniform coverage."""
         count = self.sums.bins.count
         return float(((count - count.mean()) ** 2).sum() / count.mean())
 
 
 @dataclass(frozen=True, eq=False)
 class BandsInput:
-    """Several bands, and what is said of them together."""
+    """Results of several bands and their comparison."""
 
     bands: tuple[BandResult, ...]  # in the order of the tables
-    # by '5-1', '5-2', '5-3' as WSDC D-T033 numbers them; the second only of two bands or more
+    # by '5-1', '5-2' and '5-3' as in WSDC D-T033; '5-2' needs at least two bands
     tables: Mapping[str, StatisticsTable]
-    accounts: Mapping[str, tuple[RowAccount, ...]]  # likewise
-    # later bands less the first, as 'W2-W1', in pixels of the first
+    accounts: Mapping[str, tuple[RowAccount, ...]]  # by the same keys
+    # distortion of later bands minus the first, such as 'W2-W1', in pixels of the first
     differences: Mapping[str, VectorMap]
-    n_bins: int  # on each axis
-    wise: bool  # True if published values stand beside ours, which are those of WISE
-    optical: str  # what the optical model is; empty without one
+    n_bins: int  # per axis
+    wise: bool  # True if the bands are of WISE and published values are shown
+    optical: str  # description of the optical model; empty without one
     provenance: Mapping[str, Any]
 
     @property
     def provisional(self) -> bool:
-        """True if some band must not be relied on."""
+        """True if a band has not converged, so that the results are provisional."""
         return bool(self.not_converged)
 
     @property
     def not_converged(self) -> tuple[BandResult, ...]:
-        """Bands whose sampling has not reached its targets."""
+        """Bands that have not converged."""
         return tuple(b for b in self.bands if not b.converged)
 
     @property
     def simulated(self) -> bool:
-        """True if the data of some band are simulated."""
+        """True if the data of any band are simulated."""
         return any(b.simulated for b in self.bands)
 
     @property
     def title(self) -> str:
-        """Names of the bands, after that of the mission where it is known."""
+        """Names of the bands, preceded by that of the mission if it is known."""
         return ("WISE " if self.wise else "") + ", ".join(self.names)
 
     @property

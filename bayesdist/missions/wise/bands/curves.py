@@ -1,4 +1,4 @@
-"""Histograms of the residuals and their correlation over the array, band by band."""
+"""Figures of the histograms and of the spatial correlation of residuals, by band."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from bayesdist.report.contents import Plot
 from bayesdist.report.figures.style import INK, PALETTE, WIDTH, legend_above, new_figure
 from bayesdist.utils.numbers import probability
 
-# colour, width and dashes by case, drawn in this order
+# colour, line width and dashes of each case, in drawing order
 CASES = {
     "no correction": (PALETTE["blue"], 1.0, "-"),
     "optical model": (PALETTE["green"], 1.0, (0, (3.5, 1.0))),
@@ -20,7 +20,7 @@ CASES = {
 
 @BANDS.figure("histograms", printed=True)
 def histograms(inputs: BandsInput) -> Plot:
-    """Residuals along x and y of all pairs, on a logarithmic scale of counts."""
+    """Histograms of the residuals along x and y of all pairs, with logarithmic counts."""
     fig = new_figure(WIDTH, 0.5 + 1.75 * len(inputs.bands))
     axes = fig.subplots(len(inputs.bands), 2, sharey="row", sharex="row", squeeze=False)
     for band, row in zip(inputs.bands, axes, strict=True):
@@ -29,8 +29,15 @@ def histograms(inputs: BandsInput) -> Plot:
             for case, (color, width, dashes) in CASES.items():
                 if case not in cases:
                     continue
-                one = cases[case]
-                ax.stairs(one.counts[k], one.edges, color=color, lw=width, ls=dashes, label=case)
+                histogram = cases[case]
+                ax.stairs(
+                    histogram.counts[k],
+                    histogram.edges,
+                    color=color,
+                    lw=width,
+                    ls=dashes,
+                    label=case,
+                )
             reach = next(iter(cases.values())).reach
             ax.set_xlim(-reach, reach)
             ax.set_yscale("log")
@@ -40,21 +47,22 @@ def histograms(inputs: BandsInput) -> Plot:
     for ax in axes[-1]:
         ax.set_xlabel("residual [pix]")
     legend_above(fig, axes[0, 0])
-    said = "Without correction (blue)"
+    cases_text = "Without correction (blue)"
     if inputs.optical:
-        said += ", corrected by the optical model (green, dashed)"
+        cases_text += ", corrected by the optical model (green, dashed)"
     return Plot(
         fig,
         "Residuals of all pairs",
-        f"{said} and calibrated (orange); counts are logarithmic. The constant is the calibrated"
-        " one in all cases. The tails that all cases share, far from zero, are false matches.",
+        f"{cases_text} and calibrated (orange); counts are logarithmic. The constant is that of the"
+        " calibration in all cases. The tails far from zero, common to all cases, are false"
+        " matches.",
         "Histograms of the residuals in X and Y for each band: calibration makes a narrow peak.",
     )
 
 
 @BANDS.figure("structure", printed=True)
 def correlation(inputs: BandsInput) -> Plot:
-    """Correlation of mean residuals of bins against their separation, with what noise gives."""
+    """Correlation of mean residuals of bins against their separation, with its noise level."""
     bands = inputs.bands
     columns = min(2, len(bands))
     rows = -(-len(bands) // columns)
@@ -64,8 +72,8 @@ def correlation(inputs: BandsInput) -> Plot:
         ax.remove()
     for band, ax in zip(bands, axes, strict=False):
         c = band.correlation
-        both = (("X", c.uu, c.sigma_uu, "blue", "-"), ("Y", c.vv, c.sigma_vv, "orange", "--"))
-        for label, values, sigma, color, dashes in both:
+        axes_shown = (("X", c.uu, c.sigma_uu, "blue", "-"), ("Y", c.vv, c.sigma_vv, "orange", "--"))
+        for label, values, sigma, color, dashes in axes_shown:
             ax.fill_between(
                 c.separation,
                 -2e6 * sigma,
@@ -94,17 +102,18 @@ def correlation(inputs: BandsInput) -> Plot:
     return Plot(
         fig,
         "Correlation of mean residuals",
-        "Mean product of the residuals of two bins against their separation, less the expectation"
-        " from noise. Points beyond the shaded bands are structure that the polynomial leaves.",
+        "Mean product of the residuals of two bins against their separation, minus the expectation"
+        " for noise. Points outside of the shaded bands are structure that the polynomial does not"
+        " describe.",
         "Curves of the correlation of residuals against separation for each band.",
     )
 
 
 def chance_of(p: float) -> str:
-    """A probability counted in draws: the smallest that they tell is a bound."""
+    """p-value from random draws as text; an upper bound if it is the smallest possible one."""
     return f"p < {2 / DRAWS:g}" if below_draws(p) else probability(p)
 
 
 def below_draws(p: float) -> bool:
-    """True if no noise field reached the data: the smallest probability that draws can tell."""
+    """True if no noise field reached the value of the data, so that p is an upper bound."""
     return p < 1.5 / DRAWS

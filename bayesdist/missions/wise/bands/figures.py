@@ -1,4 +1,4 @@
-"""Maps of several bands beside each other, each band in its own pixels."""
+"""Maps of several bands side by side, each in pixels of its band."""
 
 from __future__ import annotations
 
@@ -23,23 +23,23 @@ if TYPE_CHECKING:
 
 Size = tuple[float, float]
 
-EVERY = 2  # every second vector of a map is drawn: more would hide each other in small panels
+EVERY = 2  # only every second vector of a map is drawn, to avoid overlaps in small panels
 FORMAL = 2000.0  # magnification in section 6 of WSDC D-T033
-SEEN = 0.15  # part of a grid step below which a cross is a dot
-DIVERGING = "RdBu_r"  # red and blue are told apart in every common colour blindness
+SEEN = 0.15  # smallest visible size of a cross, in grid steps
+DIVERGING = "RdBu_r"  # red and blue are distinguishable with all common types of colour blindness
 AXES = "xy"
 
 
 @BANDS.figure("vectors", printed=True)
 def vectors(inputs: BandsInput) -> Plot:
-    """The distortion of each band without its constant."""
+    """Distortion of each band without its constant."""
     bands = inputs.bands
     fig = _flows({b.name: b.vectors for b in bands}, {b.name: b.arcsec for b in bands})
     return Plot(
         fig,
         "Distortion",
-        "Vectors run from each position on the array to where the distortion puts it, the constant"
-        " suppressed. All bands have one scale in arcsec; the ring marks the longest vector.",
+        "Vectors from each position on the array to its undistorted position, without the constant."
+        " All bands have the same scale in arcsec; the ring marks the longest vector.",
         "Maps of arrows over the array of each band, longest in the corners.",
     )
 
@@ -54,7 +54,7 @@ def differences(inputs: BandsInput) -> Plot:
         fig,
         "Differences of bands",
         f"Later bands minus {first} at the same position in the field, in pixels of {first},"
-        " constants suppressed.",
+        " without constants.",
         "Maps of arrows: how the distortion of each band differs from that of the first.",
     )
 
@@ -63,34 +63,39 @@ def differences(inputs: BandsInput) -> Plot:
     "vectors", when=lambda inputs: any(b.minus_optical for b in inputs.bands), printed=True
 )
 def minus_optical(inputs: BandsInput) -> Plot:
-    """Distortion of each band less an optical model."""
-    found = {b.name: (b.minus_optical, b.arcsec) for b in inputs.bands}
-    maps = {f"{name} − optical": v for name, (v, _) in found.items() if v is not None}
-    arcsec = {f"{name} − optical": size for name, (_, size) in found.items()}
+    """Distortion of each band minus an optical model."""
+    maps_and_scales = {b.name: (b.minus_optical, b.arcsec) for b in inputs.bands}
+    maps = {f"{name} − optical": v for name, (v, _) in maps_and_scales.items() if v is not None}
+    arcsec = {f"{name} − optical": size for name, (_, size) in maps_and_scales.items()}
     fig = _flows(maps, arcsec)
     return Plot(
         fig,
         "Bands minus the optical model",
-        f"In pixels of each band, constants suppressed. Optical model: {inputs.optical}.",
-        "Maps of arrows: what the optical model leaves of each band's distortion.",
+        f"In pixels of each band, without constants. Optical model: {inputs.optical}.",
+        "Maps of arrows: difference between each band's distortion and the optical model.",
     )
 
 
 def _flows(maps: Mapping[str, VectorMap], arcsec: Mapping[str, float]) -> Figure:
-    """Vector-flow diagrams beside each other, as section 4 of WSDC D-T033.
+    """Vector maps side by side, as in section 4 of WSDC D-T033.
 
-    Panels are equally wide and vectors are longer by one factor than the arrays' own pixels: of
-    bands that see the same field, one length in arcsec is the same length on the page.
+    All panels have the same width and magnification relative to the pixels of the band.  For bands
+    with the same field of view, equal lengths on the page are therefore equal lengths in arcsec.
     """
     arrows = {name: Arrows.of_map(v, EVERY) for name, v in maps.items()}
     longest = {name: float(np.hypot(*v.on_detector).max()) for name, v in maps.items()}
     sizes = {name: (float(v.x.max()), float(v.y.max())) for name, v in maps.items()}
-    M = min(magnification_of(1.5 * one.step, longest[name]) for name, one in arrows.items())
+    M = min(
+        magnification_of(1.5 * arrow_map.step, longest[name]) for name, arrow_map in arrows.items()
+    )
     panels = ArrayPanels(sizes)
     panels.frame(
-        max(one.reach(M, sizes[name]) / max(sizes[name]) for name, one in arrows.items()) + 0.02
+        max(
+            arrow_map.reach(M, sizes[name]) / max(sizes[name]) for name, arrow_map in arrows.items()
+        )
+        + 0.02
     )
-    # about a step of the grid, a round number of the widest pixels
+    # a round number of the largest pixels, about one grid step
     widest = max(arrows, key=lambda name: arcsec[name])
     key = nice_below(arrows[widest].step / M) * arcsec[widest]
     vector_map(
@@ -118,8 +123,8 @@ def residuals(inputs: BandsInput, axis: str) -> Plot:
     return Plot(
         _images(images, sizes, axis.upper(), "pix"),
         f"Mean residuals in {axis.upper()}",
-        f"Of the pairs used, in {_bins(inputs)}; one colour scale for all bands, symmetric about"
-        " zero. Titles give the extremes. Blocks with sharp edges are not distortion.",
+        f"Pairs used in the fit, in {_bins(inputs)}; one colour scale for all bands, symmetric"
+        " about zero. Titles give the extremes. Blocks with sharp edges are not distortion.",
         f"Images of the mean residual in {axis.upper()} over the array of each band.",
     )
 
@@ -136,8 +141,10 @@ def alignment(inputs: BandsInput, axis: str) -> Plot:
     for k, earlier in enumerate(inputs.bands):
         for later in inputs.bands[k + 1 :]:
             name = f"{later.name}−{earlier.name}"
-            one, two = (b.sums.bins.values(axis.upper()).scaled(b.arcsec) for b in (later, earlier))
-            images[name], sizes[name] = one.minus(two).mean, earlier.size
+            later_values, earlier_values = (
+                b.sums.bins.values(axis.upper()).scaled(b.arcsec) for b in (later, earlier)
+            )
+            images[name], sizes[name] = later_values.minus(earlier_values).mean, earlier.size
     return Plot(
         _images(images, sizes, axis.upper(), "arcsec", own_scale=True),
         f"Mean residuals in {axis.upper()} of two bands, one minus the other",
@@ -180,7 +187,7 @@ def _cells(
     centre: float = 0.0,
     own_scale: bool = False,
 ) -> Figure:
-    """Images of bins, in colours that run to all but one bin in two hundred on both sides."""
+    """Images of bins with a symmetric colour scale that includes 99.5 % of the bins."""
     grids = []
     for name, image in images.items():
         steps = (n / cells for n, cells in zip(sizes[name], image.shape[::-1], strict=True))
@@ -203,10 +210,10 @@ def _cells(
 
 @BANDS.figure("formal", printed=True)
 def formal_uncertainty(inputs: BandsInput) -> Plot:
-    """Four vectors from each position of the array, as section 6 of WSDC D-T033.
+    """Four vectors from each position of the array, as in section 6 of WSDC D-T033.
 
-    Drawn 2000 times larger as there, or more where they would be dots, by a factor that each panel
-    states.
+    They are magnified 2000 times, as there, or by another factor if they would not be visible; each
+    panel states its factor.
     """
     maps = {b.name: b.formal_map for b in inputs.bands}
     sizes = {name: (float(m.x[-1]), float(m.y[-1])) for name, m in maps.items()}
@@ -227,7 +234,7 @@ def formal_uncertainty(inputs: BandsInput) -> Plot:
         fig,
         "Formal uncertainty",
         "Least squares: four vectors from each position to all combinations of ±1 σ in x and in y."
-        " Each panel states its magnification: 2000, or another where vectors would not be seen.",
+        " Each panel states its magnification: 2000, or another if vectors would not be visible.",
         "Maps of small crosses over the array of each band, largest in the corners.",
     )
 
@@ -242,7 +249,7 @@ def _magnification(m: UncertaintyMap) -> float:
 
 @BANDS.figure("coverage", printed=True)
 def coverage(inputs: BandsInput) -> Plot:
-    """Pairs used in each bin over the mean of all bins."""
+    """Number of pairs used in each bin relative to the mean of all bins."""
     images, titles = {}, []
     for b in inputs.bands:
         count = b.sums.bins.count
@@ -257,7 +264,7 @@ def coverage(inputs: BandsInput) -> Plot:
     return Plot(
         fig,
         "Coverage by pairs",
-        "Pairs used in each bin over the mean of all bins. Titles give that mean with the Poisson"
-        " error of one bin, and the fewest and most found.",
+        "Number of pairs used in each bin relative to the mean of all bins. Titles give the mean"
+        " with the Poisson error of one bin, and the lowest and highest number.",
         "Images of the number of pairs over the array of each band.",
     )

@@ -1,4 +1,4 @@
-"""Tables of what was found of each band, as text."""
+"""Tables and verdict of the page that compares bands."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from bayesdist.report.sections.run.status import Verdict
 from bayesdist.report.texttable import TextTable, listing
 from bayesdist.utils.numbers import MISSING, count, number, percent, probability, size_of
 
-SAME_VECTOR = 0.005  # of the printed maximum
+SAME_VECTOR = 0.005  # relative difference up to which the longest vector agrees with the published
 
 
 @BANDS.table("overview")
 def overview_table(inputs: BandsInput) -> TextTable:
-    """A line for each band, what matters most."""
+    """Table of the most important results, one row per band."""
     columns = ["Band", "Converged", "Pairs", "Structure", "Longest vector (pix)"]
     if inputs.wise:
         columns += ["Published (pix)", "Difference"]
@@ -36,23 +36,23 @@ def _overview(b: BandResult, *, wise: bool) -> Iterator[str]:
     yield "yes" if b.converged else "NO"
     yield count(b.n_pairs)
     yield _structure(b)
-    here = b.printed
-    yield number(b.vectors.length_max if here is None else here.longest_vector_here, 4)
-    if wise and here is not None:
-        apart = _apart(here)
-        yield number(here.longest_vector, 4)
-        mark = "✗" if _differs(b, here) else "(within 2 σ)"
+    printed = b.printed
+    yield number(b.vectors.length_max if printed is None else printed.longest_vector_here, 4)
+    if wise and printed is not None:
+        apart = _apart(printed)
+        yield number(printed.longest_vector, 4)
+        mark = "✗" if _differs(b, printed) else "(within 2 σ)"
         yield f"{percent(apart, 2)} {'✓' if abs(apart) <= SAME_VECTOR else mark}"
     yield _length(b, float(b.posterior_map.per_axis.max()))
 
 
 def _apart(here: Printed) -> float:
-    """Fraction by which the longest vector is longer than the printed one."""
+    """Relative difference of the longest vector from the published one."""
     return here.longest_vector_here / here.longest_vector - 1
 
 
 def _differs(b: BandResult, here: Printed) -> bool:
-    """True if the longest vector is not the printed one, nor within twice its error of it."""
+    """True if the longest vector differs from the published one by more than twice its error."""
     error = 2 * b.posterior_map.radius_max / here.longest_vector
     return abs(_apart(here)) > max(SAME_VECTOR, error)
 
@@ -61,7 +61,7 @@ def verdict(inputs: BandsInput) -> Verdict:
     """Verdict on all bands: convergence, structure in the residuals, and published values."""
     structure = [b.name for b in inputs.bands if _has_structure(b)]
     printed = [(b, b.printed) for b in inputs.bands if b.printed is not None]
-    different = [b.name for b, here in printed if _differs(b, here)]
+    different = [b.name for b, published in printed if _differs(b, published)]
     clauses = []
     if inputs.provisional:
         clauses.append(f"not converged: {', '.join(b.name for b in inputs.not_converged)}")
@@ -93,8 +93,8 @@ def _has_structure(b: BandResult) -> bool:
 def _structure(b: BandResult) -> str:
     p = b.partition
     if p.significant:
-        what = f"{p.k} × {p.k} blocks" if p.edges_seen else "smooth"
-        return f"{what}, {probability(max(p.p_value, 0.0))}"
+        description = f"{p.k} × {p.k} blocks" if p.edges_seen else "smooth"
+        return f"{description}, {probability(max(p.p_value, 0.0))}"
     if below_draws(b.correlation.p_value):
         return f"correlated bins, {chance_of(b.correlation.p_value)}"
     return f"none found, {probability(p.p_value)}"
@@ -114,7 +114,7 @@ def structure_table(inputs: BandsInput) -> TextTable:
                 (
                     f"{b.name}/{axis}",
                     number(free, 3),
-                    # sigma is zero where noise alone explains it: its square has an error
+                    # the variance has an error; sigma is set to zero if it is negative
                     number(row.variance / max(row.variance_error, 1e-300), 3),
                     number(nearest[0] / sigma[0], 3),
                     number(c.reach, 3) if c.reach else MISSING,
@@ -141,8 +141,8 @@ def structure_table(inputs: BandsInput) -> TextTable:
         ),
         tuple(rows),
         words=(0, 5, 6, 7, 9),
-        note="p, the probability of as much by chance, is of both axes together; the correlation"
-        " length is that of their sum.",
+        note="p is the probability of as much structure by chance, for both axes together; the"
+        " correlation length is that of their sum.",
     )
 
 
@@ -163,8 +163,8 @@ def vector_table(inputs: BandsInput) -> TextTable | None:
         return None
     rows = [
         (name, b.name, number(length, 4), number(length * b.arcsec, 3))
-        + ((_three(LONGEST_DIFFERENCES.get(both)),) if inputs.wise else ())
-        for name, both, length, b in lengths
+        + ((_three(LONGEST_DIFFERENCES.get(key)),) if inputs.wise else ())
+        for name, key, length, b in lengths
     ]
     return TextTable(
         "Longest difference vectors",
@@ -177,27 +177,27 @@ def vector_table(inputs: BandsInput) -> TextTable | None:
 
 
 def _three(value: float | None) -> str:
-    """A value as it is printed, with three decimals."""
+    """Published value with three decimals, or a dash."""
     return MISSING if value is None else f"{value:.3f}"
 
 
 @BANDS.table("histograms")
 def histogram_table(inputs: BandsInput) -> TextTable:
-    """Half widths of the histograms, and what lies beyond them."""
+    """Half widths of the histograms, and numbers of residuals outside of them."""
     rows = []
     for b in inputs.bands:
         for case in (c for c in CASES if c in b.sums.histograms):
-            one = b.sums.histograms[case]
-            x, y = one.half_width()
+            histogram = b.sums.histograms[case]
+            x, y = histogram.half_width()
             rows.append(
                 (
                     b.name,
                     case,
                     number(x, 3),
                     number(y, 3),
-                    count(one.n),
-                    count(one.outside[0]),
-                    count(one.outside[1]),
+                    count(histogram.n),
+                    count(histogram.outside[0]),
+                    count(histogram.outside[1]),
                 )
             )
     return TextTable(
@@ -208,18 +208,19 @@ def histogram_table(inputs: BandsInput) -> TextTable:
             "Half width X (pix)",
             "Half width Y (pix)",
             "Pairs",
-            "X beyond the histogram",
-            "Y beyond it",
+            "X outside the histogram",
+            "Y outside it",
         ),
         tuple(rows),
         words=(0, 1),
-        note="Half the width of the interval that holds 68.3 % of all pairs, false ones included.",
+        note="Half the width of the interval that contains 68.3 % of all pairs, including false"
+        " ones.",
     )
 
 
 @BANDS.table("coverage")
 def coverage_table(inputs: BandsInput) -> TextTable:
-    """Pairs in bins against even coverage."""
+    """Numbers of pairs per bin, compared with uniform coverage."""
     rows = []
     for b in inputs.bands:
         n = b.sums.bins.count
@@ -240,17 +241,17 @@ def coverage_table(inputs: BandsInput) -> TextTable:
         "Coverage: pairs used by the fit, in bins",
         ("Band", *heads),
         tuple(rows),
-        note="Expected from even coverage, with its Poisson error; χ² / dof is 1 without variation"
-        " beyond it.",
+        note="Expected for uniform coverage, with its Poisson error; χ² / dof is 1 if there is no"
+        " further variation.",
     )
 
 
 @BANDS.table("formal")
 def formal_table(inputs: BandsInput) -> TextTable:
-    """Table of the largest radii, with what printed ones imply, and of the errors per axis."""
+    """Table of the largest position errors, with the published radii and the implied pair error."""
     columns = ["Band", "Radius, least squares", "Radius, posterior"]
     if inputs.wise:
-        columns += ["Radius, published", "Error per pair it implies", "Half width found"]
+        columns += ["Radius, published", "Implied error per pair", "Half width found"]
     columns += ["Posterior per axis", "CE68", "CE95"]
     rows = []
     for b in inputs.bands:
@@ -266,14 +267,14 @@ def formal_table(inputs: BandsInput) -> TextTable:
         cells += [_length(b, float(error.max())) for error in errors]
         rows.append(tuple(cells))
     note = (
-        "Radius: hypot of σ x and σ y, as WSDC D-T033 has it. Per axis: rms of σ x and σ y. CE68,"
-        " CE95: radii of the circles that hold 68 and 95 %."
+        "Radius: hypot of σ x and σ y, as in WSDC D-T033. Per axis: rms of σ x and σ y. CE68,"
+        " CE95: radii of the circles that contain 68 and 95 %."
     )
     if inputs.wise:
         note += (
-            " A published radius implies an error of each pair if all published pairs lie evenly"
-            " over the array; where it differs from the scatter found, other pairs or weights were"
-            " used for it."
+            " A published radius implies an error per pair if all published pairs are distributed"
+            " uniformly over the array; if this differs from the scatter found, other pairs or"
+            " weights were used."
         )
     unit = "pix" if inputs.bands[0].formal_map.unit == "pix" else "unit as given"
     return TextTable(
@@ -286,5 +287,5 @@ def formal_table(inputs: BandsInput) -> TextTable:
 
 @BANDS.table("provenance")
 def provenance_table(inputs: BandsInput) -> TextTable:
-    """Table of what made the page."""
+    """Table of the command and the versions that made the page."""
     return listing("", {key: str(value) for key, value in inputs.provenance.items()})

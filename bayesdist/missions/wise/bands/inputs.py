@@ -1,4 +1,4 @@
-"""The runs of several bands: opened, and found to go together."""
+"""Open the runs of several bands and check that they can be compared."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ from bayesdist.errors import InputError
 from bayesdist.missions.wise.published import WISE_BANDS
 from bayesdist.model import Chip
 
-SAME_FIELD = 0.01  # by so much the fields of two bands may differ in size
-# section of the configuration, what it is called, and what to do
+SAME_FIELD = 0.01  # largest relative difference in size of the fields of two bands
+# unsupported kinds of runs: section of the configuration, name, and advice
 _OTHER_KINDS = (
     ("campaign", "campaign", "compare its filters by 'bayesdist release'"),
     ("selfcal", "self-calibration", "give runs of matched stars, one for each band"),
@@ -23,11 +23,11 @@ _OTHER_KINDS = (
 
 @dataclass(frozen=True, eq=False)
 class BandRun:
-    """A finished run of a band."""
+    """Finished run of a band."""
 
-    name: str  # of its detector
+    name: str  # name of the detector
     results: Results
-    arcsec: float  # per pixel
+    arcsec: float  # arcsec per pixel
 
     @property
     def path(self) -> str:
@@ -36,28 +36,28 @@ class BandRun:
 
     @property
     def chip(self) -> Chip:
-        """The one chip."""
+        """Chip of the band."""
         return self.results.posterior.model.chips[0]
 
     @property
     def field_of_view(self) -> tuple[float, float]:
-        """Extent on x and y, arcsec."""
+        """Extent of the array along x and y, arcsec."""
         nx, ny = self.chip.size
         return nx * self.arcsec, ny * self.arcsec
 
 
 def open_bands(paths: Sequence[str | Path]) -> dict[str, BandRun]:
-    """Runs of several bands, opened, in the order given; those of WISE in their own.
+    """Open the runs of several bands, in the given order, or sorted by band for WISE.
 
-    InputError for a run that is not finished, has several chips or no scale, for two runs of one
-    band, and for bands that do not see one field.
+    Raises InputError if a run is not finished, has several chips or no pixel scale, two runs are of
+    the same band, or the bands have different fields of view.
     """
     out: dict[str, BandRun] = {}
     for path in paths:
         band = _opened(path)
         if band.name in out:
             raise InputError(
-                f"is of band {band.name}, as {out[band.name].path} is",
+                f"is of band {band.name}, like {out[band.name].path}",
                 where=str(path),
                 do="give one run for each band",
             )
@@ -76,7 +76,7 @@ def _opened(path: str | Path) -> BandRun:
     chips = results.posterior.model.chips
     if len(chips) > 1:
         raise InputError(
-            f"has {len(chips)} chips, and bands are compared on one",
+            f"has {len(chips)} chips, but bands must have one chip",
             where=str(path),
             do="give runs of one chip each",
         )
@@ -84,7 +84,7 @@ def _opened(path: str | Path) -> BandRun:
     scale = pixel_scale_of(results.posterior, scale_mas=config.detector.scale_mas)
     if scale is None:
         raise InputError(
-            "the size of a pixel is not known",
+            "the pixel scale is unknown",
             where=f"{path}, detector.scale_mas",
             do="give it in the configuration and run again",
         )
@@ -92,12 +92,12 @@ def _opened(path: str | Path) -> BandRun:
 
 
 def _require_one_field(bands: Mapping[str, BandRun]) -> None:
-    first, *others = bands.values()
-    for band in others:
-        for mine, theirs in zip(first.field_of_view, band.field_of_view, strict=True):
-            if abs(theirs / mine - 1) > SAME_FIELD:
+    first, *further = bands.values()
+    for band in further:
+        for extent_first, extent in zip(first.field_of_view, band.field_of_view, strict=True):
+            if abs(extent / extent_first - 1) > SAME_FIELD:
                 raise InputError(
-                    f"sees {theirs:.4g} arcsec where {first.name} sees {mine:.4g}",
+                    f"has a field of {extent:.4g} arcsec, but {first.name} has {extent_first:.4g}",
                     where=band.path,
-                    do="compare bands that see the same field",
+                    do="compare bands with the same field of view",
                 )

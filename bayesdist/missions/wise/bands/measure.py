@@ -1,4 +1,4 @@
-"""Measurements on each band, and on several together."""
+"""Analysis of each band, and comparison of several bands."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def measure_bands(
     published: bool,
     provenance: Mapping[str, object],
 ) -> BandsInput:
-    """Everything that tables and diagrams show; stars are read once and let go of, band by band."""
+    """Compute the content of all tables and figures; the stars of each band are read once."""
     wise = published and set(runs) <= set(WISE_BANDS)
     fields = {
         name: field_of_solution(run.results.solution, epoch=run.results.epoch)
@@ -53,7 +53,7 @@ def measure_bands(
         arcsec=arcsec,
         absorbed={b.name: len(polynomial_terms(b.order)) for b in bands},
     )
-    first, *others = bands
+    first, *further = bands
     return BandsInput(
         bands=bands,
         tables=tables,
@@ -65,23 +65,23 @@ def measure_bands(
             published=wise and bins == PRINTED_BINS,
         ),
         differences={
-            # in the first band's pixels: this one's are b.arcsec / first.arcsec of them
+            # in pixels of the first band: a pixel of this band is b.arcsec / first.arcsec of them
             f"{b.name}−{first.name}": _times(
                 fields[b.name].minus(fields[first.name], first.arcsec / b.arcsec),
                 b.arcsec / first.arcsec,
                 fields[first.name],
             ).vectors(GRID)
-            for b in others
+            for b in further
         },
         n_bins=bins,
         wise=wise,
-        optical="; ".join(dict.fromkeys(one.label for one in optical.values())),
+        optical="; ".join(dict.fromkeys(model.label for model in optical.values())),
         provenance=provenance,
     )
 
 
 def _times(field: DistortionField, factor: float, like: DistortionField) -> DistortionField:
-    """A field on another array of the same part of the sky."""
+    """Scale the vectors of a field and transfer it to the array of another field."""
     order = field.basis.order
     basis = type(like.basis)(order, like.basis.size, like.basis.reference_pixel)
     return DistortionField(basis, factor * field.polynomial, like.to_pixels)
@@ -91,9 +91,11 @@ def _measured(
     run: BandRun, field: DistortionField, optical: OpticalModel | None, bins: int, wise: bool
 ) -> BandResult:
     results, fit = run.results, run.results.fit
-    less = None if optical is None else field.minus(optical.field(run.chip, run.arcsec))
+    minus_optical = None if optical is None else field.minus(optical.field(run.chip, run.arcsec))
     vectors = field.vectors(GRID)
-    without = {"no correction": field} | ({} if less is None else {"optical model": less})
+    without = {"no correction": field} | (
+        {} if minus_optical is None else {"optical model": minus_optical}
+    )
     rms = float(np.linalg.norm(field.to_pixels) * max(fit.rms_u, fit.rms_v) / np.sqrt(2))
     sums = results.data.shards.sum(
         band_sums,
@@ -125,15 +127,15 @@ def _measured(
         vectors=vectors,
         formal_map=uncertainty_map(fit, grid=GRID, epoch=results.epoch),
         posterior_map=uncertainty_map(results.solution, grid=GRID, epoch=results.epoch),
-        minus_optical=None if less is None else less.vectors(GRID),
+        minus_optical=None if minus_optical is None else minus_optical.vectors(GRID),
         printed=_printed(run.name, field) if wise else None,
     )
 
 
 def _printed(band: str, field: DistortionField) -> Printed:
     n = field.basis.size[0]
-    # the report's extremes of W4 are those to the edges of its array, of the others to the centres
-    # of the outermost pixels
+    # the published extremes extend to the edges of the array for W4, and to the centres of the
+    # outermost pixels for the other bands
     reach = 1.0 if band == "W4" else (n - 1) / n
     side = np.linspace(-reach, reach, GRID[0])
     longest = float(np.hypot(*field.at_scaled(*np.meshgrid(side, side))).max())

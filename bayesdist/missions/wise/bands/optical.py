@@ -1,4 +1,4 @@
-"""An optical model that bands are compared with: a SIP header, or WISE meta-data."""
+"""Optical models for comparison with bands, from SIP headers or WISE meta-data."""
 
 from __future__ import annotations
 
@@ -14,39 +14,39 @@ from bayesdist.model import Chip, PolynomialBasis
 from bayesdist.products import SipHeader, read_sip, read_wise_meta, rotated_sip
 from bayesdist.products.registry import open_document
 
-OTHER_FIELD = 1.5  # by this factor in extent the header's image is of another instrument
+OTHER_FIELD = 1.5  # ratio of extents above which a header must be of another instrument
 
 
 @dataclass(frozen=True, eq=False)
 class OpticalModel:
-    """An optical model as it is compared with a band."""
+    """Optical model of a band."""
 
-    label: str  # the file, and by how much it was turned
-    sip: SipHeader  # turned
+    label: str  # file name and rotation
+    sip: SipHeader  # after rotation
 
     def field(self, chip: Chip, arcsec: float) -> DistortionField:
-        """The model over an array that sees the same field, in that array's pixels.
+        """Distortion of the model over an array with the same field of view, in its pixels.
 
-        InputError when the header's image has another shape than the array, or covers a field of
-        quite another size by its CD matrix.
+        Raises InputError if the image of the header has another aspect ratio than the array, or its
+        CD matrix implies a field of very different size.
         """
         size = self.sip.size or chip.size
-        times = [own / n for own, n in zip(size, chip.size, strict=True)]
+        times = [n_model / n for n_model, n in zip(size, chip.size, strict=True)]
         if not np.isclose(times[0], times[1], rtol=1e-3):
             raise InputError(
-                f"is for {size[0]:g} x {size[1]:g} pixels, and the array of {chip.name} has "
+                f"is for {size[0]:g} x {size[1]:g} pixels, but the array of {chip.name} has "
                 f"{chip.size[0]:g} x {chip.size[1]:g}",
                 where=self.label,
                 do="give a model of an array of the same shape",
             )
-        own_arcsec = 3600 * float(np.sqrt(abs(np.linalg.det(self.sip.cd))))
-        extents = size[0] * own_arcsec, chip.size[0] * arcsec
+        model_arcsec = 3600 * float(np.sqrt(abs(np.linalg.det(self.sip.cd))))
+        extents = size[0] * model_arcsec, chip.size[0] * arcsec
         if max(extents) > OTHER_FIELD * min(extents):
             raise InputError(
-                f"covers {extents[0] / 60:.3g} arcmin by its size and CD matrix, and {chip.name} "
-                f"sees {extents[1] / 60:.3g}",
+                f"covers {extents[0] / 60:.3g} arcmin by its size and CD matrix, but {chip.name} "
+                f"covers {extents[1] / 60:.3g}",
                 where=self.label,
-                do="give a model of the band's own field, or correct size and CD of the header",
+                do="give a model of the band's field, or correct size and CD of the header",
             )
         basis = PolynomialBasis(max(self.sip.order), size, self.sip.crpix)
         monomials = np.zeros((2, basis.n_terms))
@@ -56,7 +56,7 @@ class OpticalModel:
             for (p, q), value in terms.items():
                 if p + q <= order:
                     monomials[axis, basis.terms.index((p, q))] = value
-        # Legendre products belong to the whole array, whatever its pixels
+        # Legendre products depend only on the relative position on the array
         polynomial = basis.from_monomials(monomials) / np.array(times)[:, None]
         about = PolynomialBasis(basis.order, chip.size, chip.reference_pixel)
         return DistortionField.of(about, polynomial, np.eye(2))
@@ -65,19 +65,22 @@ class OpticalModel:
 def optical_models(
     paths: Sequence[str | Path], turn: float, bands: Sequence[str]
 ) -> dict[str, OpticalModel]:
-    """Optical models by band, turned by degrees from x towards y; one for all bands or for each."""
+    """Optical models by band, rotated by `turn` degrees from x towards y.
+
+    `paths` is one file for all bands, or one per band.
+    """
     if not paths:
         return {}
     if len(paths) not in (1, len(bands)):
         raise InputError(
             f"{len(paths)} optical models are given for {len(bands)} runs",
             where="--optical",
-            do="give one for all runs, or one for each",
+            do="give one for all runs, or one per run",
         )
-    several = [*paths] * (len(bands) if len(paths) == 1 else 1)
+    path_by_band = [*paths] * (len(bands) if len(paths) == 1 else 1)
     out = {}
-    for band, path in zip(bands, several, strict=True):
-        label = f"{Path(path).name}, turned by {turn:g}°" if turn % 360 else Path(path).name
+    for band, path in zip(bands, path_by_band, strict=True):
+        label = f"{Path(path).name}, rotated by {turn:g}°" if turn % 360 else Path(path).name
         out[band] = OpticalModel(label, rotated_sip(_sip_of(Path(path), band), turn))
     return out
 
@@ -87,11 +90,11 @@ def _sip_of(path: Path, band: str) -> SipHeader:
         raise InputError(
             "there is no such file",
             where=f"--optical {path}",
-            do="name a SIP header, or WISE meta-data that hold this band",
+            do="give a SIP header, or WISE meta-data that contain this band",
         )
     if open_document(path).format.key != "wise_meta":
         return read_sip(path)
-    entries = {f"W{one.band}": one.sip for one in read_wise_meta(path)}
+    entries = {f"W{entry.band}": entry.sip for entry in read_wise_meta(path)}
     if band not in entries:
         raise InputError(
             f"there is no band {band!r}", where=str(path), do=f"choose {', '.join(entries)}"

@@ -1,4 +1,4 @@
-"""The numbers of several bands for scripts: bands.json and one table for each of the report's."""
+"""Results of several bands for scripts: bands.json and the residual tables as ECSV files."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ from bayesdist.missions.wise.bands.findings import verdict
 
 
 def record_of(inputs: BandsInput) -> dict[str, Any]:
-    """Content of bands.json beside command and versions."""
-    found = verdict(inputs)
+    """Content of bands.json, apart from the command and versions."""
+    result = verdict(inputs)
     return {
         "converged": not inputs.provisional,
-        "verdict": {"level": found.level, "headline": found.headline},
+        "verdict": {"level": result.level, "headline": result.headline},
         "n_bins": inputs.n_bins,
         "optical": inputs.optical or None,
         "bands": [_band(b) for b in inputs.bands],
@@ -37,8 +37,11 @@ def record_of(inputs: BandsInput) -> dict[str, Any]:
             for name, v in inputs.differences.items()
         ],
         "tables": {
-            name: {"unit": inputs.tables[name].unit, "rows": [_row(one) for one in several]}
-            for name, several in inputs.accounts.items()
+            name: {
+                "unit": inputs.tables[name].unit,
+                "rows": [_row(account) for account in row_accounts],
+            }
+            for name, row_accounts in inputs.accounts.items()
         },
     }
 
@@ -142,31 +145,32 @@ def _row(one: RowAccount) -> dict[str, Any]:
 
 
 def write_tables(inputs: BandsInput, folder: Path) -> tuple[str, ...]:
-    """Write table_5_1.ecsv and so on, and return their names.
+    """Write the residual tables as table_5_1.ecsv etc.; returns their names.
 
-    InputError when a file cannot be written.
+    Raises InputError if a file cannot be written.
     """
     names = []
     for name, table in inputs.tables.items():
         out = table.to_table(errors=True)
         accounts = inputs.accounts[name]
-        _add(out, "Sigma partition", [one.partition for one in accounts], table.unit)
-        _add(out, "Sigma rest", [one.rest for one in accounts], table.unit)
-        if any(one.printed is not None for one in accounts):
+        _add(out, "Sigma partition", [account.partition for account in accounts], table.unit)
+        _add(out, "Sigma rest", [account.rest for account in accounts], table.unit)
+        if any(account.printed is not None for account in accounts):
             for statistic, head in HEADS.items():
                 values = [
-                    None if one.printed is None else one.printed.value[statistic]
-                    for one in accounts
+                    None if account.printed is None else account.printed.value[statistic]
+                    for account in accounts
                 ]
                 _add(out, f"{head} printed", values, table.unit)
-            for k, which in enumerate(("least", "most")):
+            for k, limit in enumerate(("least", "most")):
                 values = [
-                    None if one.printed_noise is None else one.printed_noise[k] for one in accounts
+                    None if account.printed_noise is None else account.printed_noise[k]
+                    for account in accounts
                 ]
-                _add(out, f"Sigma printed noise, {which}", values, table.unit)
-            _add(out, "Sigma printed more", [one.remains for one in accounts], table.unit)
-            out["Account"] = [one.sentence for one in accounts]
-            out["Contradictions"] = [" ".join(one.contradictions) for one in accounts]
+                _add(out, f"Sigma printed noise, {limit}", values, table.unit)
+            _add(out, "Sigma printed more", [account.remains for account in accounts], table.unit)
+            out["Account"] = [account.sentence for account in accounts]
+            out["Contradictions"] = [" ".join(account.contradictions) for account in accounts]
         out.meta |= {"converged": not inputs.provisional, "bins": inputs.n_bins}
         path = f"table_{name.replace('-', '_')}.ecsv"
         write_table(out, folder / path)

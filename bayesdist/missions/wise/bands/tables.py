@@ -1,4 +1,4 @@
-"""Tables 5-1 to 5-3 as text, each with what its sigmas are made of."""
+"""Tables 5-1 to 5-3 as text, each with the contributions to its sigmas."""
 
 from __future__ import annotations
 
@@ -22,32 +22,34 @@ TITLES = {
 
 @BANDS.table("tables")
 def tables_of(inputs: BandsInput) -> Sequence[TextTable]:
-    """Tables 5-1 to 5-3 with their accounts."""
+    """Tables 5-1 to 5-3, each with the contributions to its sigmas."""
     return [
-        one(name, inputs) for name in inputs.tables for one in (statistics_table, account_table)
+        make_table(name, inputs)
+        for name in inputs.tables
+        for make_table in (statistics_table, account_table)
     ]
 
 
 def statistics_table(name: str, inputs: BandsInput) -> TextTable:
-    """A table of the report: found with error, without noise, and printed."""
+    """Residual table with values, errors, noise-free values, and published values."""
     table = inputs.tables[name]
     rows: list[tuple[str, ...]] = []
-    for one in inputs.accounts[name]:
-        row = one.row
-        found = [f"{rounded(row.value[s], row.error[s])}" for s in STATISTICS]
+    for account in inputs.accounts[name]:
+        row = account.row
+        values = [f"{rounded(row.value[s], row.error[s])}" for s in STATISTICS]
         errors = [f"± {number(row.error[s], 2)}" if row.error[s] else MISSING for s in STATISTICS]
         free = [rounded(row.noise_free[s], row.error[s]) for s in STATISTICS]
-        rows += [(row.label, "found", *found), ("", "error", *errors), ("", "noise-free", *free)]
-        if one.printed is not None:
-            rows.append(("", "published", *(as_printed(one.printed, s) for s in STATISTICS)))
+        rows += [(row.label, "found", *values), ("", "error", *errors), ("", "noise-free", *free)]
+        if account.printed is not None:
+            rows.append(("", "published", *(as_printed(account.printed, s) for s in STATISTICS)))
     number_of = f"Table {name}. " if inputs.wise else ""
     title = f"{number_of}{TITLES[name]}, {inputs.n_bins} × {inputs.n_bins} bins ({table.unit})"
     note = ""
-    if name != "5-3" and any(one.printed is not None for one in inputs.accounts[name]):
+    if name != "5-3" and any(account.printed is not None for account in inputs.accounts[name]):
         note = (
             "Found: the reference star minus the calibrated detection. The published tables give"
-            " WISE minus 2MASS: means and medians have the other sign, and minima and 1 % stand"
-            " for maxima and 99 %."
+            " WISE minus 2MASS: means and medians have the opposite sign, and minima and 1 %"
+            " correspond to maxima and 99 %."
         )
     return TextTable(
         title, (table.first, "", *HEADS.values()), tuple(rows), words=(0, 1), note=note
@@ -55,30 +57,30 @@ def statistics_table(name: str, inputs: BandsInput) -> TextTable:
 
 
 def as_printed(row: PrintedRow, statistic: str) -> str:
-    """A printed value with the digits it was printed with."""
+    """Published value with its published number of digits."""
     decimals = round(-np.log10(2 * row.rounding[statistic]))
     return f"{row.value[statistic]:.{max(decimals, 0)}f}".replace("-", "−")
 
 
 def account_table(name: str, inputs: BandsInput) -> TextTable:
-    """Table of the parts of each sigma, and how the printed one differs."""
+    """Table of the contributions to each sigma, and of its difference from the published one."""
     unit = inputs.tables[name].unit
-    several = inputs.accounts[name]
-    printed = any(one.printed is not None for one in several)
+    row_accounts = inputs.accounts[name]
+    printed = any(account.printed is not None for account in row_accounts)
     columns = [inputs.tables[name].first, "Sigma", "Noise", "Partition", "Remainder"]
     if printed:
         columns += ["Published", "Its noise", "Its structure", "Excess", "Likely reason"]
-    note = "sigma² = noise² + partition² + remainder²; a partition counts where one was found."
+    note = "sigma² = noise² + partition² + remainder²; the partition is included if one was found."
     if printed:
         note += (
             " The noise of a published sigma follows from the published radial mean and the number"
-            " of pairs, for errors that are normal or distributed as here; the excess is the"
-            " difference of the structures in quadrature."
+            " of pairs, for errors that are normal or distributed as in these data; the excess is"
+            " the difference of the structures in quadrature."
         )
     return TextTable(
         f"Contributions to sigma ({unit})",
         tuple(columns),
-        tuple(tuple(_account(one, printed=printed)) for one in several),
+        tuple(tuple(_account(account, printed=printed)) for account in row_accounts),
         words=(0, 9),
         note=note,
     )
@@ -107,23 +109,23 @@ def _why(one: RowAccount) -> str:
     if one.verdict == "same":
         return "structure is the same within its error"
     if one.verdict == "below noise":
-        return "published errors are distributed otherwise"
-    where = "the published set" if one.verdict == "print has more" else "this set"
+        return "published errors have another distribution"
+    larger_set = "the published set" if one.verdict == "print has more" else "this set"
     if one.row.label.endswith("/radial"):
-        return f"the scatter of stars changes more over the array in {where}"
+        return f"the scatter of stars varies more over the array in {larger_set}"
     if "-" in one.row.label:
-        return f"errors of the two bands are larger or less alike in {where}"
-    return f"{where} has systematic errors of its own"
+        return f"errors of the two bands are larger or less similar in {larger_set}"
+    return f"{larger_set} has additional systematic errors"
 
 
 @BANDS.table("tables")
 def contradiction_table(inputs: BandsInput) -> TextTable | None:
-    """Table of contradictions within and between printed rows; None where nothing is printed."""
+    """Table of contradictions within and between published rows; None if there are none."""
     rows = [
         (f"Table {name}", sentence)
-        for name, several in inputs.accounts.items()
-        for one in several
-        for sentence in one.contradictions
+        for name, row_accounts in inputs.accounts.items()
+        for account in row_accounts
+        for sentence in account.contradictions
     ]
     if not rows:
         return None

@@ -1,1 +1,1 @@
-"""The first weeks of a calibration: matching and fitting in turn, from lists of stars."""
+"""Bring-up of a calibration from unmatched star lists, by alternate matching and fitting."""

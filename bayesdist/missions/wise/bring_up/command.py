@@ -1,4 +1,4 @@
-"""`bayesdist wise bring-up`: pairs and distortion from lists of stars that nobody has paired."""
+"""`bayesdist wise bring-up`: pairs and distortion from unmatched star lists."""
 
 from __future__ import annotations
 
@@ -48,18 +48,20 @@ def bring_up_files(
     rotation: float,
     command: str,
 ) -> str:
-    """Text to print, once the pairs that matching and fitting in turn arrive at are written.
+    """Match and fit star lists, and write the resulting pairs; returns text to print.
 
-    The reference stars stand where an array without distortion would see them in the frame, in
-    pixels. The new folder has pairs/ for `format = "rvb"`, and rounds.ecsv.
+    Positions of the reference stars are those on an undistorted array in the frame, in pixels.  The
+    new folder contains pairs/ for `format = "rvb"`, and rounds.ecsv.
     """
     band = band_name(band)
     array = WISE_ARRAYS[band]
     model = DistortionModel(order, (Chip(1, band, array.size, array.centre),))
     start = None if optical is None else _start(model, band, optical, rotation)
-    stars, others = _read_lists(Path(detections), Path(reference))
-    up = bring_up(stars, others, model, start, acceptance=RadialLimit(radius, corner_radius))
-    rows = [{"round": k, **asdict(one)} for k, one in enumerate(up.rounds, 1)]
+    stars, reference_stars = _read_lists(Path(detections), Path(reference))
+    up = bring_up(
+        stars, reference_stars, model, start, acceptance=RadialLimit(radius, corner_radius)
+    )
+    rows = [{"round": k, **asdict(bring_up_round)} for k, bring_up_round in enumerate(up.rounds, 1)]
     rows = [{name: row[name] for name in ("round", *_SHOWN)} for row in rows]
     with record_folder(Path(output), "bring_up.json", command) as (folder, record):
         write_rvb([_pairs(up, band)], folder / "pairs")
@@ -71,42 +73,42 @@ def bring_up_files(
 def _start(model: DistortionModel, band: str, optical: str | Path, rotation: float) -> Float:
     """Parameters of an optical model, without terms beyond the order of the model."""
     chip = model.chips[0]
-    found = optical_models([optical], rotation, [band])[band].field(chip, WISE_ARRAYS[band].scale)
+    field = optical_models([optical], rotation, [band])[band].field(chip, WISE_ARRAYS[band].scale)
     basis = model.basis()
     coefficients = np.zeros((2, basis.n_terms))
-    n = min(basis.n_terms, found.polynomial.shape[1])
-    coefficients[:, :n] = found.polynomial[:, :n]
-    # the pixels themselves
+    n = min(basis.n_terms, field.polynomial.shape[1])
+    coefficients[:, :n] = field.polynomial[:, :n]
+    # add the pixel positions to the distortion
     coefficients[:, 0] += chip.reference_pixel
     coefficients[:, 1:3] += np.diag(basis.half_size)
     return coefficients.ravel()
 
 
 def _read_lists(*paths: Path) -> list[Detections]:
-    """Lists of stars with one numbering of their frames."""
+    """Read star lists and number their frames consistently."""
     columns, frames = [], []
     for path in paths:
         table = read_table(path)
-        found = find_columns(table.colnames, None, _COLUMNS, source=str(path))
-        missing = [name for name in _COLUMNS if name not in found]
+        column_of = find_columns(table.colnames, None, _COLUMNS, source=str(path))
+        missing = [name for name in _COLUMNS if name not in column_of]
         if missing:
             raise InputError(
                 f"has no column {missing[0]!r} among {', '.join(table.colnames)}",
                 where=str(path),
                 do="give x, y, sigma and frame",
             )
-        one = {name: SourceColumn(table[key], str(path), key) for name, key in found.items()}
-        columns.append([one[name].numbers() for name in ("x", "y", "sigma")])
-        codes, names = one["frame"].labels()
+        column = {name: SourceColumn(table[key], str(path), key) for name, key in column_of.items()}
+        columns.append([column[name].numbers() for name in ("x", "y", "sigma")])
+        codes, names = column["frame"].labels()
         pair = first_duplicate([*columns[-1], codes])
         if pair is not None:
             first, second = map(row_number, pair)
             raise InputError(
-                f"repeats {first}", where=f"{path}, {second}", do="keep each detection once"
+                f"repeats {first}", where=f"{path}, {second}", do="list each detection once"
             )
         frames.append(np.array(names, str)[codes])
     unique, code = np.unique(np.concatenate(frames), return_inverse=True)
-    parts = np.split(code, np.cumsum([len(one) for one in frames])[:-1])
+    parts = np.split(code, np.cumsum([len(column) for column in frames])[:-1])
     numbers = tuple(map(str, range(len(unique))))
     return [
         Detections(x, y, part, numbers, sigma=sigma, source=str(path))
@@ -115,5 +117,5 @@ def _read_lists(*paths: Path) -> list[Detections]:
 
 
 def _pairs(up: BringUp, band: str) -> RvbPairs:
-    """The believed pairs of the last round."""
+    """Accepted pairs of the last round."""
     return RvbPairs(replace(up.matches, filter_names=(band,)))

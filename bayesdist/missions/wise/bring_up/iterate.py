@@ -1,9 +1,10 @@
-"""Bring-up of a calibration: match, fit and match again, until the corners are covered too.
+"""Bring-up of a calibration: alternate matching and fitting until the corners are covered.
 
-WSDC D-T033, sections 2 and 3: with a distortion that is hardly known, matches are found near the
-centre only; each fit brings more of the detector within reach. Three rules stop the loop from
-following false matches: a part of the detector counts only where there are more matches than chance
-gives, matches elsewhere are left out, and the polynomial's order rises as that part does.
+See WSDC D-T033, sections 2 and 3.  If the distortion is poorly known, matches are found only near
+the centre; each fit extends the area in which they can be found.  Three rules prevent the iteration
+from following false matches.  A bin of the detector counts as covered only if it has more matches
+than expected by chance.  Matches in other bins are not used.  The order of the polynomial increases
+as the covered area grows.
 """
 
 from __future__ import annotations
@@ -23,38 +24,37 @@ from bayesdist.utils.arrays import Bool, Float, Int
 
 __all__ = ["BringUp", "bring_up"]
 
-BINS = 12  # of the coverage, on each axis
-FIRST_ORDER = 2  # polynomial order of the first fit; each round may take one order more
-GROWS = 0.01  # fraction of the bins by which the coverage must rise to count as growing
-SETTLED = 0.005  # fraction of the radius in the centre by which the model may still change
+BINS = 12  # number of bins per axis for the coverage
+FIRST_ORDER = 2  # polynomial order of the first fit; it increases by at most one per round
+GROWS = 0.01  # smallest increase of the covered fraction that counts as growth
+SETTLED = 0.005  # convergence: largest change of the model, relative to the radius in the centre
 
 
 @dataclass(frozen=True, eq=False)
 class Round:
-    """One round of the bring-up: the matches and the fit to them."""
+    """Round of the bring-up: statistics of the matches and the fit."""
 
     order: int  # polynomial order of the fit
-    acceptance: RadialLimit  # matching radius, centre to corners
-    n_pairs: int  # all matches
-    n_believed: int  # matches in covered bins, which were fitted
-    # expected number of false matches among those fitted, from what displaced detections find
-    n_false: float
-    # fraction of the detector's bins with detections that have enough more matches than chance
-    coverage: float
-    rms: float  # rms residual of the matches that the fit used, one axis
+    acceptance: RadialLimit  # matching radius, from the centre to the corners
+    n_pairs: int  # number of all matches
+    n_believed: int  # number of matches in covered bins, which were fitted
+    n_false: float  # expected number of false matches among those, from displaced detections
+    coverage: float  # fraction of the bins with detections that are covered
+    rms: float  # rms residual per axis of the matches that the fit used
     moved: float  # largest change of the model over the detector
-    theta: Float  # (n_params,), the model after the fit; terms beyond its order are zero
+    theta: Float  # (n_params,), parameters after the fit; terms above its order are zero
 
 
 @dataclass(frozen=True, eq=False)
 class BringUp:
-    """Result of a bring-up: its rounds, the last fit and the matches of that fit.
+    """Result of a bring-up.
 
     Parameters
     ----------
     rounds : tuple of Round
+        Statistics of all rounds.
     fit : LinearFit
-        Of the last round.
+        Fit of the last round.
     matches : Matches
         Matches fitted in the last round; exposures are the frames.
     index, reference_index : ndarray of int, shape (n_believed,)
@@ -62,7 +62,7 @@ class BringUp:
     covered : ndarray of bool, shape (BINS, BINS)
         Bins [iy, ix] of the detector that are covered in the last round.
     settled : bool
-        True if the last fit changed the model no more.
+        True if the iteration converged: the last fit did not change the model.
     """
 
     rounds: tuple[Round, ...]
@@ -75,19 +75,19 @@ class BringUp:
 
     @property
     def sentence(self) -> str:
-        """Sentence for reports: convergence, coverage, number of matches and their rms."""
+        """Convergence, coverage, number of matches and their rms as sentences for reports."""
         first, last = self.rounds[0], self.rounds[-1]
-        end = "settled" if self.settled else "has NOT settled"
+        end = "converged" if self.settled else "has NOT converged"
         out = (
-            f"The calibration {end} in {len(self.rounds)} rounds: coverage went from "
+            f"The calibration {end} in {len(self.rounds)} rounds: coverage rose from "
             f"{100 * first.coverage:.0f} % to {100 * last.coverage:.0f} % of the detector, "
             f"{last.n_believed} pairs with {last.rms:.3g} {self.fit.model.unit} rms, some "
             f"{last.n_false:.0f} of them false."
         )
         if last.coverage < 1.0:
             out += (
-                f" {(~self.covered).sum()} of {self.covered.size} bins are not covered: "
-                "there it is a guess."
+                f" {(~self.covered).sum()} of {self.covered.size} bins are not covered; "
+                "there it is an extrapolation."
             )
         return out
 
@@ -101,48 +101,50 @@ def bring_up(
     acceptance: RadialLimit,
     max_rounds: int = 30,
 ) -> BringUp:
-    """Match and fit in turn until the whole detector is covered and the model changes no more.
+    """Match and fit alternately until the whole detector is covered and the model converges.
 
-    As long as the coverage grows, matches are accepted within a radius that is larger in the
-    corners; then within the radius of the centre everywhere, with even weights.
+    While the coverage grows, matches are accepted within a radius that increases towards the
+    corners, and the corners have extra weight in the fit.  Then the radius of the centre and equal
+    weights are used everywhere.
 
     Parameters
     ----------
     detections : Detections
         Pixel positions on the detector, with errors; the exposures are the frames.
     reference : Detections
-        Undistorted positions in the frames, with errors in their unit.
+        Undistorted positions in the frames, with errors in the same unit.
     model : DistortionModel
-        One chip, without frames and time dependence.
+        Model with one chip, without frames and time dependence.
     start : ndarray, shape (n_params,), optional
-        First guess; without one, the detections' pixels are taken as undistorted positions.
+        Initial parameters; by default no distortion is assumed.
     acceptance : RadialLimit
-        Of the first rounds.  The radius in the centre must allow for the offset there.
+        Matching radius of the first rounds.  In the centre it must exceed the initial offset.
     max_rounds : int
+        Maximum number of rounds.
 
     Returns
     -------
     BringUp
-        Look at `settled`: False where `max_rounds` did not suffice.
+        Check `settled`, which is False if `max_rounds` was not sufficient.
 
     Raises
     ------
     InputError
-        For a model of several chips or with frames, a start of another length or of positions that
-        are not finite, stars without errors, a detection outside the detector, or when nowhere on
-        the detector more matches are found than chance gives.
+        If the model has several chips or frames, the initial parameters are invalid, stars have no
+        errors, a detection is outside of the detector, or no bin of the detector has more matches
+        than expected by chance.
     DegenerateError
-        As `fit_linear`, when in the end too little of the detector is covered.
+        If too little of the detector is covered in the end (see `fit_linear`).
     """
     if len(model.chips) > 1 or model.n_frame or model.time is not None:
         raise InputError(
-            "a calibration is brought up on one chip, without frames and time dependence",
+            "bring-up needs a model with one chip, without frames and time dependence",
             where="model",
             do="select one chip",
         )
     if start is not None and np.shape(start) != (model.n_params,):
         raise InputError(
-            f"the start has shape {np.shape(start)}, and the model {model.n_params} parameters",
+            f"the start has shape {np.shape(start)}, but the model has {model.n_params} parameters",
             where="start",
             do="give the parameters of this model",
         )
@@ -150,17 +152,19 @@ def bring_up(
     theta = None if start is None else np.asarray(start, float)
     if not np.isfinite(field.positions(theta, field.grid)).all():
         raise InputError(
-            "the positions that it begins with are not finite over the detector",
+            "the initial positions are not finite over the detector",
             where="start",
             do="check the coefficients",
         )
     rounds: list[Round] = []
-    rejection = DEFAULT_REJECTION  # with extra weight in the corners, as long as the radius has
+    rejection = (
+        DEFAULT_REJECTION  # has extra weight in the corners, while the radius is larger there
+    )
     rule, order, settled = acceptance, min(FIRST_ORDER, model.order), False
     while True:
-        found = field.match(theta, rule, len(rounds) + 1)
-        matches = field.table(found)
-        # the last fit is that of the model itself, which refuses matches that cover too little
+        accepted = field.match(theta, rule, len(rounds) + 1)
+        matches = field.table(accepted)
+        # the last fit is of the complete model, and raises an error if the coverage is too low
         last = settled or len(rounds) + 1 >= max_rounds
         order = model.order if last else order
         fit = fit_linear(matches, model, rejection=rejection) if last else None
@@ -171,24 +175,30 @@ def bring_up(
             Round(
                 order=order,
                 acceptance=rule,
-                n_pairs=found.n_pairs,
-                n_believed=len(found.index),
-                n_false=found.n_false,
-                coverage=found.coverage,
+                n_pairs=accepted.n_pairs,
+                n_believed=len(accepted.index),
+                n_false=accepted.n_false,
+                coverage=accepted.coverage,
                 rms=float(np.hypot(now.rms_u, now.rms_v) / np.sqrt(2)),
                 moved=moved,
                 theta=theta,
             )
         )
-        still = moved < SETTLED * acceptance.centre
+        unchanged = moved < SETTLED * acceptance.centre
         if fit is not None:
-            covered = found.covered.reshape(BINS, BINS)
+            covered = accepted.covered.reshape(BINS, BINS)
             return BringUp(
-                tuple(rounds), fit, matches, found.index, found.partner, covered, settled and still
+                tuple(rounds),
+                fit,
+                matches,
+                accepted.index,
+                accepted.partner,
+                covered,
+                settled and unchanged,
             )
-        grew = len(rounds) < 2 or found.coverage > rounds[-2].coverage + GROWS
+        grew = len(rounds) < 2 or accepted.coverage > rounds[-2].coverage + GROWS
         if order == model.order and not grew:
-            settled = rule.corner == rule.centre and still
+            settled = rule.corner == rule.centre and unchanged
             rule = RadialLimit(acceptance.centre, acceptance.centre)
             rejection = replace(rejection, radial_weight=1.0)
         order = min(order + 1, model.order)
@@ -197,7 +207,7 @@ def bring_up(
 def _partial_fit(
     matches: Matches, model: DistortionModel, order: int, rejection: Rejection
 ) -> LinearFit:
-    """Fit of the part of the detector that has matches, as if it were a detector of its own."""
+    """Fit to the part of the detector that has matches, treated as a smaller detector."""
     low = [max(0.0, np.floor(z.min() - 0.5)) for z in (matches.x, matches.y)]
     high = [np.ceil(z.max() + 0.5) - 1.0 for z in (matches.x, matches.y)]
     chip = model.chips[0]
@@ -212,7 +222,7 @@ def _partial_fit(
 
 
 def _in_model(fit: LinearFit, model: DistortionModel) -> Float:
-    """Parameters (n_params,) of the full model for a fit of part of the detector."""
+    """Parameters (n_params,) of the full model from a fit to a part of the detector."""
     if fit.model == model:
         return fit.mean
     basis, part = model.basis(), fit.model.basis()

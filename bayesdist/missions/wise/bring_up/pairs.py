@@ -1,4 +1,4 @@
-"""Matches for a bring-up, taken from bins of the detector with more of them than chance gives."""
+"""Matches for a bring-up, from bins of the detector with more matches than expected by chance."""
 
 from __future__ import annotations
 
@@ -16,22 +16,22 @@ from bayesdist.model import DistortionModel
 from bayesdist.model.grid import mesh
 from bayesdist.utils.arrays import Bool, Float, Int
 
-RARE = 1e-3
-DISPLACED = 10.0  # in units of the radius in the corners
-GRID = 17  # points on each axis where models are compared
-OF_THE_BEST = 0.5  # a bin has at least this fraction of the matches that good bins have
+RARE = 1e-3  # probability by chance, over all bins combined
+DISPLACED = 10.0  # displacement for chance matches, in units of the radius in the corners
+GRID = 17  # points per axis at which models are compared
+OF_THE_BEST = 0.5  # minimum fraction of matched detections, relative to that of good bins
 _DIRECTIONS = ((1.0, 0.0), (0.0, 1.0), (-1.0, 0.0), (0.0, -1.0))
 
 
 @dataclass(frozen=True, eq=False)
 class Believed:
-    """Matches in covered bins, and the statistics of the matching."""
+    """Accepted matches, which are those in covered bins, and statistics of the matching."""
 
-    index: Int  # row of each match in the detections
-    partner: Int  # row of each match in the reference
-    n_pairs: int  # all matches, outside covered bins too
-    n_false: float  # expected number of false ones in covered bins
-    covered: Bool
+    index: Int  # rows of the matches in the detections
+    partner: Int  # rows of the matches in the reference
+    n_pairs: int  # number of all matches, including those outside of covered bins
+    n_false: float  # expected number of false matches in covered bins
+    covered: Bool  # (n_bins,), True for covered bins
     coverage: float  # fraction of the bins with detections that are covered
 
 
@@ -50,10 +50,10 @@ class Field:
         if out.any():
             k = int(np.argmax(out))
             raise InputError(
-                f"detection {k + 1} lies at pixel ({detections.x[k]:.2f}, {detections.y[k]:.2f}), "
-                f"outside the {size[0]:g} x {size[1]:g} detector",
+                f"detection {k + 1} is at pixel ({detections.x[k]:.2f}, {detections.y[k]:.2f}), "
+                f"outside of the {size[0]:g} x {size[1]:g} detector",
                 where="detections",
-                do="correct the detector's size or drop the row",
+                do="correct the detector's size or remove the row",
             )
         ix, iy = (
             np.clip(((z - 0.5) / n * bins).astype(np.int64), 0, bins - 1)
@@ -64,71 +64,71 @@ class Field:
         self.grid = Detections(*mesh(*(np.linspace(1.0, n, GRID) for n in size)))
 
     def positions(self, theta: Float | None, stars: Detections) -> Float:
-        """Undistorted positions (N, 2); without parameters the pixel positions themselves."""
+        """Undistorted positions (N, 2) of stars; the pixel positions if `theta` is None."""
         return stars.points if theta is None else self.model.predict(theta, stars.x, stars.y)
 
     def distance(self, before: Float | None, now: Float) -> float:
-        """Largest difference of two models over the detector."""
+        """Largest difference between two models over the detector."""
         step = self.positions(now, self.grid) - self.positions(before, self.grid)
         return float(np.hypot(*step.T).max())
 
     def _paired(self, position: Float, radius: Float) -> tuple[Int, Int]:
-        """Rows of detections (n,) and reference stars (n,) that are each other's nearest."""
-        stars, others = self.detections, self.reference
+        """Rows (n,) of detections and reference stars that are mutual nearest neighbours."""
+        stars, reference = self.detections, self.reference
         index, partner, _ = mutual_pairs(
             position,
-            others.points,
+            reference.points,
             radius,
             frame=stars.exposure,
-            reference_frame=others.exposure,
+            reference_frame=reference.exposure,
         )
         return index, partner
 
     def match(self, theta: Float | None, rule: RadialLimit, number: int) -> Believed:
-        """Matches of a round in the bins that have more of them than chance gives."""
+        """Matches of round `number` in bins with more matches than expected by chance."""
         stars, n_bins = self.detections, self.bins**2
         position = self.positions(theta, stars)
         radius = rule.at(stars.x, stars.y, self.size)
         index, partner = self._paired(position, radius)
-        # displaced by more than the detector is distorted, detections find false matches only
+        # detections that are displaced by more than the distortion have only false matches
         chance = np.zeros(n_bins)
         for direction in _DIRECTIONS:
             moved = position + DISPLACED * rule.corner * np.array(direction)
             strangers, _ = self._paired(moved, radius)
             chance += np.bincount(self.code[strangers], minlength=n_bins) / len(_DIRECTIONS)
         count = np.bincount(self.code[index], minlength=n_bins)
-        there = np.bincount(self.code, minlength=n_bins)
-        covered = _covered(count, there, chance)
+        n_detections = np.bincount(self.code, minlength=n_bins)
+        covered = _covered(count, n_detections, chance)
         good = covered[self.code[index]]
         if not good.any():
             raise InputError(
-                f"{len(index)} pairs are found in round {number} where chance gives "
-                f"{chance.sum():.0f}, and no position on the detector stands out",
+                f"{len(index)} pairs are found in round {number} and {chance.sum():.0f} are "
+                "expected by chance, but no part of the detector has a significant excess",
                 where="bring-up",
                 do="check orientation, offset and scale of the frames, or give another start or "
                 "a larger radius",
             )
-        n, n_chance = int(there[covered].sum()), float(chance[covered].sum())
+        n, n_chance = int(n_detections[covered].sum()), float(chance[covered].sum())
         return Believed(
             index=index[good],
             partner=partner[good],
             n_pairs=len(index),
-            # only a detection without its own reference star takes another one
+            # false matches occur only for detections that have no true match
             n_false=n_chance * (n - int(good.sum())) / (n - n_chance),
             covered=covered,
-            coverage=float(covered.sum() / (there > 0).sum()),
+            coverage=float(covered.sum() / (n_detections > 0).sum()),
         )
 
     def table(self, found: Believed) -> Matches:
-        """Match table of the accepted matches, with the frames as exposures."""
-        stars, others = self.detections, self.reference
+        """Accepted matches as a table, with the frames as exposures."""
+        stars, reference = self.detections, self.reference
         sigma = np.hypot(self.sigma[0][found.index], self.sigma[1][found.partner])
         frames, exposure = np.unique(stars.exposure[found.index], return_inverse=True)
         return Matches.of_distinct_rows(  # no detection has two reference stars
             x=stars.x[found.index],
             y=stars.y[found.index],
-            u=others.x[found.partner],
-            v=others.y[found.partner],
+            u=reference.x[found.partner],
+            v=reference.y[found.partner],
             sigma_u=sigma,
             sigma_v=sigma,
             unit=self.model.unit,
@@ -140,23 +140,24 @@ class Field:
 
 
 def _errors(stars: Detections) -> Float:
-    """Errors (N,) of stars that must have them."""
+    """Errors (N,) of stars; raises InputError if there are none."""
     if stars.sigma is None:
-        raise InputError("carries no errors", where=stars.source, do="give sigma")
+        raise InputError("has no errors", where=stars.source, do="give sigma")
     return stars.sigma
 
 
 def _covered(count: Int, there: Int, chance: Float) -> Bool:
-    """Boolean mask (n_bins,) of bins with more matches than chance and not far below the best bins.
+    """Boolean mask (n_bins,) that is True for covered bins.
 
-    `count` has the matches, `there` the detections and `chance` the matches of displaced detections
-    in each bin.
+    Covered bins have more matches than expected by chance, and a fraction of matched detections
+    not far below that of the best bins.  `count`, `there` and `chance` are the numbers of matches,
+    of detections, and of matches of displaced detections in each bin.
     """
     has = there > 0
     expected = np.maximum(chance, there * (chance.sum() / there.sum()))
-    # so rare that in all bins together chance does it once in a thousand times
+    # significant: for all bins combined the probability by chance is RARE
     clear = poisson.sf(count - 1, expected) < RARE / has.sum()
-    share = np.divide(count - expected, there, out=np.zeros(len(there)), where=has)
+    excess = np.divide(count - expected, there, out=np.zeros(len(there)), where=has)
     if not clear.any():
         return np.zeros(len(there), bool)
-    return np.asarray(clear & (share > OF_THE_BEST * np.quantile(share[clear], 0.9)))
+    return np.asarray(clear & (excess > OF_THE_BEST * np.quantile(excess[clear], 0.9)))

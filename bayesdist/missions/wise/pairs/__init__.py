@@ -1,1 +1,1 @@
-"""RvB pairs: detections of WISE with stars of 2MASS, their files, and those of a run."""
+"""RvB pairs (detections of WISE matched with stars of 2MASS): files, selection, and run input."""

@@ -1,4 +1,4 @@
-"""Files of RvB pairs, by their columns and bands, and whether positions are of the stated array."""
+"""Files of RvB pairs: columns, bands, and checks that positions are on the array of the band."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ PathLike = str | os.PathLike[str]
 
 MAGNITUDES = tuple(f"mag_{band.lower()}" for band in WISE_BANDS)
 
-# lower case; the first that the file has is taken
+# column names in lower case; the first one that the file has is used
 RVB_ALIASES: dict[str, tuple[str, ...]] = {
     **{key: BASIC[key] for key in ("x", "y", "u", "v", "sigma_u", "sigma_v", "epoch", "mag")},
     "exposure": ("frame", "frame_id", "frameset", *BASIC["exposure"]),
@@ -42,27 +42,37 @@ IPAC = (".tbl", ".ipac")
 
 
 def band_name(label: object) -> str:
-    """'W1' to 'W4' of what a file or a user calls a band: W1, w1, 1.
+    """Standard name, 'W1' to 'W4', of a band given as W1, w1 or 1.
 
-    InputError for anything else.
+    Raises InputError for anything else.
     """
     text = str(label).strip().upper()
     name = text if text.startswith("W") else f"W{text.removesuffix('.0')}"
     if name not in WISE_BANDS:
-        raise InputError(f"{label!r} is no band", do=f"give one of {', '.join(WISE_BANDS)}")
+        raise InputError(f"{label!r} is not a band", do=f"give one of {', '.join(WISE_BANDS)}")
     return name
 
 
 @dataclass(frozen=True, eq=False)
 class RvbFile:
-    """A file and which of its columns is what."""
+    """File of RvB pairs, and its columns."""
 
-    source: str
+    source: str  # name of the file
     contents: Table | ParquetPart
-    found: Mapping[str, str]
+    found: Mapping[str, str]  # column name by quantity
 
     def blocks(self, keys: Sequence[str]) -> Iterator[tuple[Columns, int, Place]]:
-        """Rows of some quantities with the number of the first, counted from 0, and their names."""
+        """Read some quantities block by block.
+
+        Yields
+        ------
+        columns : Columns
+            Rows of the block.
+        first : int
+            Number of its first row, counted from 0.
+        place : callable
+            Function that returns the name of a row for messages.
+        """
         if isinstance(self.contents, Table):
             if len(self.contents):
                 yield self.contents, 0, row_number
@@ -75,12 +85,12 @@ class RvbFile:
             yield block, block.first, part.place(block.first)
 
     def column(self, table: Columns, key: str, place: Place) -> SourceColumn:
-        """One quantity of some rows."""
+        """Column of a quantity in a block."""
         name = self.found[key]
         return SourceColumn(table[name], self.source, name, place)
 
     def bands(self, table: Columns, place: Place) -> tuple[Int, tuple[str, ...]]:
-        """Code of each row's band, and the bands."""
+        """Code (N,) of the band of each row, and the names of the bands."""
         column = self.column(table, "band", place)
         codes, labels = column.labels()
         names: list[str] = []
@@ -96,7 +106,7 @@ class RvbFile:
 def open_rvb_files(
     path: PathLike | Sequence[PathLike], columns: Mapping[str, str] | None
 ) -> list[RvbFile]:
-    """RvB files of a path, a pattern or several, each with the columns that were found."""
+    """Open the RvB files of a path, pattern or list, and find their columns."""
     columns = {{"color": "colour"}.get(key, key): name for key, name in (columns or {}).items()}
     out = []
     for file in input_files(path):
@@ -104,28 +114,28 @@ def open_rvb_files(
         parquet = name.endswith(".parquet")
         contents: Table | ParquetPart = describe_part(file) if parquet else read_table(file)
         names = list(contents.colnames)
-        found = find_columns(names, columns, RVB_ALIASES, source=str(file), needed="xyuv")
-        out.append(RvbFile(str(file), contents, found))
+        column_of = find_columns(names, columns, RVB_ALIASES, source=str(file), needed="xyuv")
+        out.append(RvbFile(str(file), contents, column_of))
     return out
 
 
-# Pairs that fill no more than a quarter of the array are those of a smaller one: by chance this
-# many lie there with a probability of 4^-50.
+# Minimum number of pairs for the check that they fill more than a quarter of the array.  Pairs that
+# do not are of a smaller array: the probability by chance is 4^-50.
 _ENOUGH = 50
-# Of the longer side: reference stars in pixels of the array lie this near to their detections.
-# Distortion and frame solutions move them by less; swapped columns and other units by far more.
+# Largest distance of reference stars from detections, as a fraction of the longer side. Distortion
+# and frame solutions cause smaller distances, swapped columns and other units much larger ones.
 _NEAR = 0.05
 
 
 @dataclass
 class ArrayCheck:
-    """Positions batch by batch against the array of a band."""
+    """Check, batch by batch, that positions are on the array of a band."""
 
     band: str
     size: tuple[float, float]  # columns and rows of the array
-    n: int = 0
-    n_far: int = 0
-    reach: Float = field(default_factory=lambda: np.zeros(2))
+    n: int = 0  # number of pairs
+    n_far: int = 0  # number of pairs with a distant reference star
+    reach: Float = field(default_factory=lambda: np.zeros(2))  # largest x and y
 
     def see(
         self,
@@ -135,19 +145,25 @@ class ArrayCheck:
         *,
         reference: tuple[Float, Float] | None = None,
     ) -> None:
-        """Refuse detections that the array cannot have made.
+        """Add a batch; raises InputError if a detection is outside of the array.
 
-        `x`, `y`: (N,), FITS 1-based pixels. `where`: names file and row of a position. `reference`:
-        (N,), u and v, where these are said to be pixels of the array.
+        Parameters
+        ----------
+        x, y : ndarray, shape (N,)
+            FITS 1-based pixels.
+        where : callable
+            Function that returns the file and row of a position for messages.
+        reference : tuple of ndarray, shape (N,), optional
+            u and v, if these are in pixels of the array.
         """
         for name, values, extent in (("x", x, self.size[0]), ("y", y, self.size[1])):
-            # half a pixel beyond the edge of the outermost: centroids may fall a little outside
+            # tolerance of half a pixel, since centroids may be slightly outside of the array
             outside = (values < 0.0) | (values > extent + 1.0)
             if outside.any():
                 bad = int(np.argmax(outside))
                 raise InputError(
                     f"value is {values[bad]:g}, outside the {extent:g} pixels of {self.band}'s "
-                    f"array, as in {int(outside.sum())} of {len(values)} rows",
+                    f"array, as are {int(outside.sum())} of {len(values)} rows",
                     where=f"{where(bad)}, column {name!r}",
                     do="check the band, the array size and pixel_origin",
                 )
@@ -158,20 +174,22 @@ class ArrayCheck:
             self.n_far += int((away > _NEAR * max(self.size)).sum())
 
     def end(self, sources: str) -> None:
-        """Refuse positions that all lie in the first quarter, and references far from detections.
+        """Finish the check.
 
-        The first are those of another array, the second those of no array, or in swapped columns.
+        Raises InputError if all positions are in the first quarter of the array, which means that
+        they are of a smaller array, or if most reference stars are far from their detections, which
+        means other units or swapped columns.
         """
         if self.n >= _ENOUGH and (self.reach <= np.array(self.size) / 2 + 0.5).all():
             raise InputError(
-                f"all {self.n} pairs of {self.band} lie within x <= {self.reach[0]:.0f}, y <= "
+                f"all {self.n} pairs of {self.band} are within x <= {self.reach[0]:.0f}, y <= "
                 f"{self.reach[1]:.0f} of an array of {self.size[0]:g} x {self.size[1]:g}",
                 where=sources,
                 do="check the band and the size: these are positions of a smaller array",
             )
         if 2 * self.n_far > self.n:
             raise InputError(
-                f"in {self.n_far} of {self.n} pairs u, v lies more than "
+                f"in {self.n_far} of {self.n} pairs u, v is more than "
                 f"{_NEAR * max(self.size):.0f} pixels from x, y",
                 where=sources,
                 do="give u and v in pixels of the band frame, and check which column is which",

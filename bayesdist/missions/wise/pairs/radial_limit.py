@@ -1,8 +1,8 @@
-"""Acceptance of pairs by limits that depend on the distance from the array's centre.
+"""Limits for accepting pairs that depend on the distance from the centre of the array.
 
-WSDC D-T033, section 3: tight near the centre, where distortion is small, wide in the corners, which
-a first distortion model leaves pixels off.  With each iteration of the calibration the expected
-positions get better and the limits may shrink.
+See WSDC D-T033, section 3.  The limit is small near the centre, where the distortion is small, and
+large in the corners, where an initial distortion model is wrong by pixels.  It can be reduced as
+the calibration improves.
 """
 
 from __future__ import annotations
@@ -18,14 +18,16 @@ from bayesdist.utils.arrays import Float
 
 @dataclass(frozen=True)
 class RadialLimit:
-    """A limit that goes from one value at the array's centre to another in its corners.
+    """Limit that varies from the centre of the array to its corners.
 
-    InputError for values that are not positive.
+        limit = centre + (corner - centre) (r / r_corner)^power
+
+    Raises InputError if a value is not positive.
     """
 
-    centre: float  # positive; equal for a limit without dependence on the radius
-    corner: float
-    power: float = 2.0  # how it goes there: limit = centre + (corner - centre) (r / r_corner)^power
+    centre: float  # limit at the centre
+    corner: float  # limit in the corners
+    power: float = 2.0
 
     def __post_init__(self) -> None:
         for name in ("centre", "corner", "power"):
@@ -36,11 +38,8 @@ class RadialLimit:
                 )
 
     def at(self, x: ArrayLike, y: ArrayLike, size: tuple[float, float]) -> Float:
-        """The limit at detector positions.
-
-        `x`, `y`: (N,), FITS 1-based pixels. `size`: columns and rows of the array. Returns (N,).
-        """
+        """Limits (N,) at FITS 1-based pixels (N,) of an array with `size` columns and rows."""
         dx = np.asarray(x, float) - (size[0] + 1) / 2
         dy = np.asarray(y, float) - (size[1] + 1) / 2
-        share = np.hypot(dx, dy) / (np.hypot(*size) / 2)
-        return self.centre + (self.corner - self.centre) * share**self.power
+        radius_fraction = np.hypot(dx, dy) / (np.hypot(*size) / 2)
+        return self.centre + (self.corner - self.centre) * radius_fraction**self.power

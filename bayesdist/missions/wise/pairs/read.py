@@ -1,8 +1,8 @@
-"""RvB files: pairs of WISE detections and 2MASS stars, of one band at a time.
+"""Read RvB files: pairs of WISE detections and 2MASS stars in one band.
 
-WSDC D-T033, section 1: the detections are raw band-frame pixels; the reference stars are brought to
-the same pixels by the frame's solution without any distortion.  Files are IPAC tables, any table
-that `read_matches` knows, or Parquet, which is read batch by batch.
+As in WSDC D-T033, section 1, the detections are in raw band-frame pixels, and the reference stars
+are transformed to these pixels with the frame solution, without distortion.  Files can be IPAC
+tables, any table that `read_matches` supports, or Parquet, which is read in batches.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ PathLike = str | os.PathLike[str]
 
 
 def rvb_bands(path: PathLike | Sequence[PathLike]) -> dict[str, int]:
-    """Number of pairs of each band in some files, in the order of their wavelength."""
+    """Number of pairs by band in files, in the order of wavelength."""
     return _bands_of(open_rvb_files(path, None))
 
 
@@ -47,9 +47,9 @@ def _bands_of(files: Sequence[RvbFile]) -> dict[str, int]:
     for file in files:
         if "band" not in file.found:
             raise InputError(
-                "has no column of bands",
+                "has no column with the band",
                 where=file.source,
-                do="name it in the option 'columns', or say which band all pairs are of",
+                do="give the column in the option 'columns', or the band of all pairs",
             )
         for table, _, place in file.blocks(["band"]):
             codes, names = file.bands(table, place)
@@ -68,45 +68,45 @@ def stream_rvb(
     pixel_origin: int = 1,
     size: tuple[float, float] | None = None,
 ) -> Iterator[RvbPairs]:
-    """RvB pairs of one band, batch by batch.
+    """Read the RvB pairs of one band in batches.
 
-    Memory is that of a batch; `write_partitioned` puts them where `open_matches` finds them.
+    Only one batch is in memory.  Use `write_partitioned` to write the batches to a folder for
+    `open_matches`.
 
     Parameters
     ----------
     path : path-like or sequence of path-like
-        .tbl or .ipac (IPAC tables), .parquet, other tables as of `read_matches`; patterns and
-        folders of Parquet as there.
+        Files (.tbl or .ipac for IPAC tables, .parquet, or other tables), patterns, or folders of
+        Parquet files; see `read_matches`.
     band : str, optional
-        'W1' to 'W4'; not needed where the files hold one band.
+        'W1' to 'W4'; not needed if the files contain only one band.
     columns : mapping of str to str, optional
-        Column of each quantity: x y u v sigma_u sigma_v epoch mjd exposure mag star band, colour,
-        and mag_w1 to mag_w4, the magnitudes that make colours where there is no column of them.
-        What is not named is looked for under its usual names (`RVB_ALIASES`); an empty name leaves
-        a quantity out.  The frame is the exposure.  `mjd` is a Modified Julian Date whether or not
-        the file says so.
+        Column names of the quantities x, y, u, v, sigma_u, sigma_v, epoch, mjd, exposure (the
+        frame), mag, star, band, colour, and mag_w1 to mag_w4.  Colours are computed from these
+        magnitudes if there is no column colour.  Other quantities are looked for under their usual
+        names (`RVB_ALIASES`); an empty name excludes a quantity.  `mjd` is taken as a Modified
+        Julian Date even if the column has no unit.
     unit : str, optional
         Unit of u and v.
     sigma : {'columns', 'by_magnitude'} or float, optional
-        As `read_matches`.
+        See `read_matches`.
     pixel_origin : {0, 1}, optional
         Coordinate of the centre of the first pixel in the file.
     size : tuple of float, optional
-        Columns and rows of the array; those of the band by default.
+        Columns and rows of the array; by default those of the band.
 
     Yields
     ------
     RvbPairs
-        Not more than `BATCH` pairs, of which no two are equal.  The magnitude is the band's own
-        where the file has no other and each pair of the batch has one.
+        At most `BATCH` distinct pairs.  If the file has no other magnitude, that of the band is
+        used, provided that all pairs of the batch have one.
 
     Raises
     ------
     InputError
-        For missing columns, several bands of which none is chosen, a band that is not there,
-        positions outside the array, pairs that all lie in the array's first quarter (those of
-        another array), u, v in pixels that are mostly far from x, y, and for all that
-        `read_matches` refuses in a row.
+        If columns are missing, the band is missing or ambiguous, positions are outside of the
+        array, all pairs are in the first quarter of the array (so that they are of another array),
+        most u and v in pixels are far from x and y, or a row is invalid (see `read_matches`).
     """
     check_sigma(sigma)
     files = open_rvb_files(path, columns)
@@ -115,13 +115,13 @@ def stream_rvb(
     check = ArrayCheck(band, size)
     for file in files:
         for table, first, place in file.blocks(list(RVB_ALIASES)):
-            which = np.ones(len(table), bool)
+            selected = np.ones(len(table), bool)
             if "band" in file.found:
                 codes, names = file.bands(table, place)
-                which = codes == (names.index(band) if band in names else -1)
-            if not which.any():
+                selected = codes == (names.index(band) if band in names else -1)
+            if not selected.any():
                 continue
-            pairs = _pairs(file, table, first, place, which, band, unit, sigma, pixel_origin)
+            pairs = _pairs(file, table, first, place, selected, band, unit, sigma, pixel_origin)
             matches = pairs.matches
             check.see(
                 matches.x,
@@ -132,7 +132,7 @@ def stream_rvb(
             yield pairs
     sources = ", ".join(file.source for file in files)
     if not check.n:
-        raise InputError("holds no rows", where=sources, do="give a table with matched stars")
+        raise InputError("has no rows", where=sources, do="give a table with matched stars")
     check.end(sources)
 
 
@@ -140,12 +140,12 @@ def read_rvb(
     path: PathLike | Sequence[PathLike],
     **options: Any,
 ) -> RvbPairs:
-    r"""RvB pairs of one band in memory.
+    r"""Read the RvB pairs of one band into memory.
 
     Parameters
     ----------
     path, **options
-        As `stream_rvb`.
+        See `stream_rvb`.
 
     Returns
     -------
@@ -154,7 +154,7 @@ def read_rvb(
     Raises
     ------
     InputError
-        As `stream_rvb`.
+        See `stream_rvb`.
 
     Examples
     --------
@@ -169,24 +169,30 @@ def read_rvb(
 
 
 def chosen_band(files: Sequence[RvbFile], band: str | None) -> str:
-    """The band to be read."""
+    """Validate the requested band, or determine it if the files contain only one.
+
+    Raises InputError if the band is missing from the files, or several are there and none is
+    requested.
+    """
     sources = ", ".join(file.source for file in files)
     if band is not None:
         band = band_name(band)
         if not any("band" in file.found for file in files):
             return band
     counts = _bands_of(files)
-    found = ", ".join(f"{name} ({n} pairs)" for name, n in counts.items())
+    listed = ", ".join(f"{name} ({n} pairs)" for name, n in counts.items())
     if not counts:
-        raise InputError("holds no rows", where=sources, do="give a table with matched stars")
+        raise InputError("has no rows", where=sources, do="give a table with matched stars")
     if band is None:
         if len(counts) > 1:
             raise InputError(
-                f"holds several bands: {found}", where=sources, do="choose one of them"
+                f"contains several bands: {listed}", where=sources, do="choose one of them"
             )
         return next(iter(counts))
     if band not in counts:
-        raise InputError(f"holds no {band}, but {found}", where=sources, do="choose another band")
+        raise InputError(
+            f"does not contain {band}, but {listed}", where=sources, do="choose another band"
+        )
     return band
 
 
@@ -201,7 +207,7 @@ def _pairs(
     sigma: str | float,
     pixel_origin: int,
 ) -> RvbPairs:
-    """The chosen rows of one block."""
+    """Pairs in the rows of a block that are selected by the mask `which`."""
     unread = {"band", "mjd", "colour", *MAGNITUDES}
     if sigma != "columns":
         unread |= {"sigma_u", "sigma_v"}
@@ -219,10 +225,10 @@ def _pairs(
         if key in file.found
     }
     out = {name: v[which] if isinstance(v, np.ndarray) else v for name, v in out.items()}
-    own = magnitudes.get(f"mag_{band.lower()}")
-    if "mag" not in out and own is not None and np.isfinite(own).all():
-        out["mag"] = own
-    if "exposure" in out:  # frames of other bands need no names here
+    band_magnitude = magnitudes.get(f"mag_{band.lower()}")
+    if "mag" not in out and band_magnitude is not None and np.isfinite(band_magnitude).all():
+        out["mag"] = band_magnitude
+    if "exposure" in out:  # drop the names of frames of other bands
         used, out["exposure"] = np.unique(out["exposure"], return_inverse=True)
         out["exposure_names"] = tuple(out["exposure_names"][k] for k in used)
     matches = Matches(

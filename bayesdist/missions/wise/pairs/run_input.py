@@ -1,4 +1,4 @@
-"""RvB pairs of a run: in memory, left on disk where they are, or selected into its folder."""
+"""RvB pairs as input of a run: in memory, on disk, or selected and written to its folder."""
 
 from __future__ import annotations
 
@@ -44,10 +44,10 @@ def open_rvb(
     pixel_origin: int,
     size: tuple[float, float],
 ) -> Matches | None:
-    """RvB pairs of one band, left on disk: those that `stream_rvb` gives of these arguments.
+    """Open the RvB pairs of one band without reading them into memory; see `stream_rvb`.
 
-    None where the files are no Parquet, hold other bands beside this one, or have to be converted:
-    dates in MJD, magnitudes by band.
+    Returns None if the files are not Parquet, contain other bands, or must be converted because of
+    dates in MJD or magnitudes by band.
     """
     files = open_rvb_files(path, columns)
     band = chosen_band(files, band)
@@ -64,10 +64,10 @@ def open_rvb(
                 reference=(u, v) if unit == "pix" else None,
             )
     check.end(", ".join(file.source for file in files))
-    found = files[0].found
-    named = {key: found.get(key, "") for key in ALIASES}
-    # frames and bands may share their names with other quantities of a table of matches
-    named |= {"ra": "", "dec": "", "chip": "", "colour": "", "filter": found.get("band", "")}
+    column_of = files[0].found
+    named = {key: column_of.get(key, "") for key in ALIASES}
+    # exclude quantities that could be mistaken for columns of frames and bands
+    named |= {"ra": "", "dec": "", "chip": "", "colour": "", "filter": column_of.get("band", "")}
     return open_matches(path, columns=named, unit=unit, sigma=sigma, pixel_origin=pixel_origin)
 
 
@@ -76,17 +76,17 @@ def _row_name(file: RvbFile, place: Place, k: int) -> str:
 
 
 def _fit(files: Sequence[RvbFile]) -> bool:
-    """True if the files read as one table of matches."""
-    found = files[0].found
+    """True if the files can be read as one table of matches."""
+    column_of = files[0].found
     return (
-        all(isinstance(file.contents, ParquetPart) and file.found == found for file in files)
-        and not ("mjd" in found and "epoch" not in found)
-        and not ("mag" not in found and any(key in found for key in MAGNITUDES))
+        all(isinstance(file.contents, ParquetPart) and file.found == column_of for file in files)
+        and not ("mjd" in column_of and "epoch" not in column_of)
+        and not ("mag" not in column_of and any(key in column_of for key in MAGNITUDES))
     )
 
 
 def _only(file: RvbFile, band: str) -> bool:
-    """True if a file holds no other band."""
+    """True if a file contains no other band."""
     if "band" not in file.found:
         return True
     return all(file.bands(table, place)[1] == (band,) for table, _, place in file.blocks(["band"]))
@@ -94,11 +94,11 @@ def _only(file: RvbFile, band: str) -> bool:
 
 @dataclass
 class RvbInput:
-    """The RvB pairs that a configuration names.
+    """RvB pairs of a configuration.
 
-    What is too large for memory and has to be selected or converted is written once, as a table of
-    matches: beside the run's folder as long as nothing may be written into it, then moved there
-    whole.  The record of the run says that it is there.
+    Pairs that are too large for memory and must be selected or converted are written once, as a
+    table of matches.  They are first written next to the folder of the run, and moved into it when
+    it may be changed.  The record of the run states that they are there.
     """
 
     run: RunDirectory
@@ -108,7 +108,7 @@ class RvbInput:
     _counts: Mapping[str, Any] | None = None
 
     def load(self) -> Matches:
-        """The selected pairs."""
+        """Read or open the selected pairs."""
         data, size = self.data, self.size
         path = self.run.config.named_files(self.run.base)
         options = _options(data, size)
@@ -127,7 +127,7 @@ class RvbInput:
         return self._written(SelectedPairs(lambda: stream_rvb(path, **options), data.rvb, size))
 
     def _written(self, selected: SelectedPairs) -> Matches:
-        """The pairs as a table of matches, in the run's folder if it may be."""
+        """Write the pairs as a table of matches, in the folder of the run if possible."""
         self.close()
         place = self.run.path.resolve().parent
         while not place.is_dir():
@@ -138,9 +138,9 @@ class RvbInput:
             )
         except OSError as error:
             raise InputError(
-                f"the selected pairs cannot be written beside the run ({error.strerror})",
+                f"the selected pairs cannot be written next to the run ({error.strerror})",
                 where=str(place),
-                do="choose a folder that you may write to",
+                do="choose a writable folder",
             ) from error
         folder = Path(self._scratch.name) / PAIRS
 
@@ -158,14 +158,14 @@ class RvbInput:
 
     def _opened(self, folder: Path, counts: Mapping[str, Any]) -> Matches:
         options = _options(self.data, self.size)
-        # a number has been written into the columns
+        # errors given as a number were written to the columns
         sigma = options["sigma"] if options["sigma"] == "by_magnitude" else "columns"
         opened = open_matches(folder, unit=options["unit"], sigma=sigma)
         rejected = counts["rejected"]
         return opened.with_counts(len(opened) + sum(rejected.values()), rejected)
 
     def move_into_run(self) -> bool:
-        """Truth of pairs that were moved into the folder of the run, and have to be opened anew."""
+        """Move the pairs to the folder of the run; True if they must be opened again."""
         if self._scratch is None or self._counts is None:
             return False
         target = made_folder(self.run / PAIRS)
@@ -184,7 +184,7 @@ class RvbInput:
         return True
 
     def close(self) -> None:
-        """Remove what was not moved."""
+        """Remove temporary files that were not moved."""
         if self._scratch is not None:
             self._scratch.cleanup()
         self._scratch = self._counts = None
@@ -193,7 +193,7 @@ class RvbInput:
 def load_rvb(
     path: str | Path | Sequence[str | Path], data: RvbData, size: tuple[float, float]
 ) -> Matches:
-    """RvB pairs in memory, as a configuration reads and selects them."""
+    """Read and select the RvB pairs of a configuration into memory."""
     if data.band is not None:
         _require_array(data.band, size)
     batches = list(stream_rvb(path, **_options(data, size)))
@@ -214,7 +214,7 @@ def _options(data: RvbData, size: tuple[float, float]) -> dict[str, Any]:
 
 
 def _require_array(label: str | None, size: tuple[float, float]) -> None:
-    """Refuse a detector that has not the size of the band's array."""
+    """Raise InputError unless the detector has the size of the band's array."""
     band = band_name(label)
     if tuple(size) != WISE_ARRAYS[band].size:
         columns, rows = WISE_ARRAYS[band].size
@@ -222,12 +222,12 @@ def _require_array(label: str | None, size: tuple[float, float]) -> None:
             f"the array of {band} has {columns:g} x {rows:g} pixels, but the detector "
             f"{size[0]:g} x {size[1]:g}",
             where="detector.size",
-            do="give the size of the band's array, or choose the band that it belongs to",
+            do="give the size of the band's array, or another band",
         )
 
 
 def rvb_input(run: RunDirectory) -> RvbInput:
-    """The pairs of a run, whose configuration has the sections of this format."""
+    """Input of a run with a configuration for RvB pairs."""
     config: Any = run.config
     return RvbInput(run, config.data, config.detector.size)
 

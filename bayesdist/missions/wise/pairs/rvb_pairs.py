@@ -1,8 +1,8 @@
-"""RvB pairs of one band: the matches, their colours, the selection by colour, and as Parquet.
+"""RvB pairs of one band: matches, colours, selection by colour, and writing as Parquet.
 
-WSDC D-T033, section 3, prefers candidates whose magnitudes differ little from the shortest to the
-longest wavelength at which they are seen: stars are blue, and a colour needs two bands, which
-favours the bright.
+WSDC D-T033, section 3, prefers candidates with similar magnitudes at the shortest and longest
+wavelength at which they are detected.  This selects stars, which are blue, and favours bright
+sources, since a colour requires detections in two bands.
 """
 
 from __future__ import annotations
@@ -30,13 +30,12 @@ COLOUR = "colour"
 
 @dataclass(frozen=True, eq=False)
 class RvbPairs:
-    """Pairs of one band."""
+    """RvB pairs of one band."""
 
-    # x, y the detection, u, v the reference star as a detector without distortion would see it; the
-    # band is the filter, the frame the exposure
+    # x, y: detection; u, v: reference star on an undistorted detector; the filter is the band, and
+    # the exposure is the frame
     matches: Matches
-    # (N,), magnitudes; NaN where fewer than two bands have one.  None where the file has no
-    # magnitudes
+    # (N,), magnitudes; NaN if fewer than two bands have one.  None if the file has no magnitudes
     colour: Float | None = None
 
     def __post_init__(self) -> None:
@@ -44,7 +43,7 @@ class RvbPairs:
             raise InputError(
                 f"colour has shape {np.shape(self.colour)}, but there are {len(self)} pairs",
                 where=", ".join(self.matches.sources),
-                do="give one colour for each pair",
+                do="give one colour per pair",
             )
 
     def __len__(self) -> int:
@@ -56,25 +55,25 @@ class RvbPairs:
         return self.matches.filter_names[0]
 
     def select(self, which: ArrayLike, *, reason: str | None = None) -> RvbPairs:
-        """Some of the pairs, as `Matches.select`."""
+        """Select some of the pairs; see `Matches.select`."""
         matches = self.matches.select(which, reason=reason)
         which = np.asarray(which)
         return RvbPairs(matches, None if self.colour is None else self.colour[which])
 
     @staticmethod
     def concatenate(several: Sequence[RvbPairs]) -> RvbPairs:
-        """All pairs of several sets, in their order.
+        """Concatenate several sets of pairs.
 
-        InputError for sets of different bands, sets of which only some have colours, and as
-        `Matches.concatenate`.
+        Raises InputError if the sets are of different bands, only some have colours, or they cannot
+        be concatenated (see `Matches.concatenate`).
         """
-        bands = list(dict.fromkeys(one.band for one in several))
+        bands = list(dict.fromkeys(pairs.band for pairs in several))
         if len(bands) > 1:
             raise InputError(
-                f"the sets are of bands {', '.join(bands)}", do="join those of one band"
+                f"the sets are of bands {', '.join(bands)}", do="give sets of one band"
             )
-        matches = Matches.concatenate([one.matches for one in several])
-        colours = [one.colour for one in several if one.colour is not None]
+        matches = Matches.concatenate([pairs.matches for pairs in several])
+        colours = [pairs.colour for pairs in several if pairs.colour is not None]
         if colours and len(colours) < len(several):
             raise InputError(
                 "only some of the sets have colours",
@@ -85,11 +84,20 @@ class RvbPairs:
 
 
 def colour_of(magnitudes: ArrayLike) -> Float:
-    """Magnitude of the shortest wavelength detected minus that of the longest.
+    """Magnitude at the shortest wavelength of detection minus that at the longest.
 
-    `magnitudes`: (B, N), by rising wavelength; NaN where a source is not detected. Returns (N,),
-    NaN where fewer than two bands have a magnitude.  Colours of sources that are detected in
-    different bands are different colours: W1 - W2 of one stands beside W1 - W4 of another.
+    The bands differ between sources: the colour is W1 - W2 for one source and W1 - W4 for another,
+    depending on the bands in which they are detected.
+
+    Parameters
+    ----------
+    magnitudes : array_like, shape (B, N)
+        Magnitudes in B bands by ascending wavelength; NaN if a source is not detected.
+
+    Returns
+    -------
+    ndarray, shape (N,)
+        Colours; NaN if fewer than two bands have a magnitude.
     """
     magnitudes = np.asarray(magnitudes, float)
     detected = np.isfinite(magnitudes)
@@ -101,7 +109,7 @@ def colour_of(magnitudes: ArrayLike) -> Float:
 
 
 def bluest_rows(colour: Float, frame: Int, n: int) -> Bool:
-    """Boolean mask (N,) of the n rows of smallest colour of each frame; never one without."""
+    """Boolean mask (N,) that is True for the n bluest rows of each frame; False without colour."""
     order = np.lexsort((colour, frame))  # stable, NaN last within a frame
     first = np.searchsorted(frame[order], frame[order])
     rank = np.empty(len(colour), np.int64)
@@ -110,12 +118,12 @@ def bluest_rows(colour: Float, frame: Int, n: int) -> Bool:
 
 
 def colours_of(pairs: RvbPairs) -> Float:
-    """Colours (N,) of pairs that must have them."""
+    """Colours (N,) of pairs; raises InputError if they have none."""
     if pairs.colour is None:
         raise InputError(
-            "has no magnitudes in several bands, hence no colours",
+            "has no magnitudes in several bands, and therefore no colours",
             where=", ".join(pairs.matches.sources),
-            do="name mag_w1 and others in the option 'columns', or do not select by colour",
+            do="give mag_w1 etc. in the option 'columns', or do not select by colour",
         )
     return pairs.colour
 
@@ -124,22 +132,38 @@ _NUMBERS = ("x", "y", "u", "v", "sigma_u", "sigma_v", "mag", "epoch")
 
 
 def write_rvb(batches: Iterable[RvbPairs], folder: str | os.PathLike[str]) -> int:
-    """Write pairs as a folder of Parquet files, one for each batch.
+    """Write pairs to a folder of Parquet files, one per batch.
 
-    Reading them as RvB pairs gives the same numbers bit for bit, with bands, frames and colours.
+    If the files are read as RvB pairs, all numbers, bands, frames and colours are recovered
+    exactly.
 
-    `batches`: only one need be in memory at a time. `folder`: a new one.  When a batch cannot be
-    had or written, the folder is removed. Returns pairs written. InputError for no batches, a
-    folder that holds something, and when the system refuses to write.
+    Parameters
+    ----------
+    batches : iterable of RvbPairs
+        Batches of pairs; only one is in memory at a time.
+    folder : path-like
+        New or empty folder.  A new folder is removed if an error occurs.
+
+    Returns
+    -------
+    int
+        Number of pairs.
+
+    Raises
+    ------
+    InputError
+        If there are no batches, the folder is not empty, or it is not writable.
     """
     folder = Path(folder)
     if folder.exists() and not (folder.is_dir() and next(folder.iterdir(), None) is None):
         raise InputError("is in use", where=str(folder), do="choose a new folder")
     batches = iter(batches)
-    first = list(islice(batches, 1))  # what is wrong is mostly wrong in the first
+    first = list(
+        islice(batches, 1)
+    )  # most errors occur in the first batch, before the folder is created
     if not first:
-        raise InputError("there are no pairs to write", where=str(folder), do="give some")
-    made = not folder.exists()
+        raise InputError("there are no pairs to write", where=str(folder), do="give pairs")
+    is_new = not folder.exists()
     made_folder(folder)
     sizes: list[int] = []
 
@@ -151,7 +175,7 @@ def write_rvb(batches: Iterable[RvbPairs], folder: str | os.PathLike[str]) -> in
     try:
         write_parts(folder, parts())
     except BaseException:
-        if made:
+        if is_new:
             folder.rmdir()
         raise
     return sum(sizes)
@@ -160,7 +184,7 @@ def write_rvb(batches: Iterable[RvbPairs], folder: str | os.PathLike[str]) -> in
 def _columns(pairs: RvbPairs) -> dict[str, Any]:
     m = pairs.matches
     columns = columns_of(m, _NUMBERS) | columns_of(pairs, ["colour"]) | columns_of(m, ["star"])
-    if m.exposure_names != ("1",):  # there is a column of frames
+    if m.exposure_names != ("1",):  # the pairs have frames
         columns["frame"] = (m.exposure, m.exposure_names)
     columns["band"] = (np.zeros(len(m), np.int64), (pairs.band,))
     return columns

@@ -1,4 +1,4 @@
-"""The section [data] of RvB pairs: their band, and which of them are taken."""
+"""Configuration section [data] for RvB pairs: band and selection."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ from bayesdist.missions.wise.pairs.radial_limit import RadialLimit
 
 
 class RvbBlock(Section):
-    """Limits that pairs have to meet, all of those that are given.
+    """Limits for the selection of pairs; all limits that are given must be met.
 
-    On colour, and on offset and chi-square at the array's centre and in its corners; `bluest` is
-    how many of each frame are taken at most, those of the smallest colour.
+    There are limits on colour, and on offset and chi-square at the centre of the array and in its
+    corners.  `bluest` is the maximum number of pairs per frame; the bluest ones are selected.
     """
 
     colour: tuple[float, float] | None = None
@@ -28,38 +28,38 @@ class RvbBlock(Section):
     accept_power: PositiveFloat = 2.0
 
     def faults(self) -> Iterator[str]:
-        """Ranges without an end, or from the upper to the lower one."""
+        """Errors in the ranges: a missing or reversed limit."""
         if self.colour is not None and not self.colour[0] <= self.colour[1]:
             yield (
-                f"data.rvb.colour goes from {self.colour[0]:g} to {self.colour[1]:g}; "
+                f"data.rvb.colour is from {self.colour[0]:g} to {self.colour[1]:g}; "
                 "give the lower limit first"
             )
         for name in ("accept", "accept_chi2"):
-            given = [key for key in (f"{name}_centre", f"{name}_corner") if getattr(self, key)]
-            if len(given) == 1:
+            set_keys = [key for key in (f"{name}_centre", f"{name}_corner") if getattr(self, key)]
+            if len(set_keys) == 1:
                 yield (
-                    f"data.rvb.{given[0]} stands alone; give {name}_centre and {name}_corner, "
-                    "equal ones for a limit that is the same everywhere"
+                    f"data.rvb.{set_keys[0]} is given alone; give {name}_centre and {name}_corner, "
+                    "with equal values for a constant limit"
                 )
 
     @property
     def offset(self) -> RadialLimit | None:
-        """Limit on the distance of the reference position from the detection, in pixels."""
+        """Limit on the distance between detection and reference position, in pixels."""
         return self._limit(self.accept_centre, self.accept_corner)
 
     @property
     def chi2(self) -> RadialLimit | None:
-        """Limit on the chi-square of that distance; a pair beyond both counts under the first."""
+        """Limit on the chi-square of this distance."""
         return self._limit(self.accept_chi2_centre, self.accept_chi2_corner)
 
     @property
     def takes_all(self) -> bool:
-        """True if no limit is given."""
+        """True if no limit is given, so that all pairs are selected."""
         return not self.by_colour and self.offset is None and self.chi2 is None
 
     @property
     def by_colour(self) -> bool:
-        """True if a pair needs a colour."""
+        """True if pairs are selected by colour."""
         return self.colour is not None or self.bluest is not None
 
     def _limit(self, centre: float | None, corner: float | None) -> RadialLimit | None:
@@ -69,7 +69,7 @@ class RvbBlock(Section):
 
 
 class RvbData(Data):
-    """RvB pairs of one band."""
+    """Section [data] for RvB pairs of one band."""
 
     format: Literal["rvb"] = "rvb"
     band: str | None = None
@@ -78,13 +78,13 @@ class RvbData(Data):
     one_array: ClassVar[bool] = True
 
     def faults(self) -> Iterator[str]:
-        """Those of every table, and settings of the sky."""
+        """Errors in the settings: those of all tables, and settings for sky positions."""
         yield from super().faults()
         if self.tangent_point is not None:
             yield (
-                "data.tangent_point is given, but RvB pairs lie in pixels of the band frame; "
-                "leave it out"
+                "data.tangent_point is given, but RvB pairs are in pixels of the band frame; "
+                "omit it"
             )
         for key in ("epoch", "catalogue_epoch"):
             if getattr(self, key) is not None:
-                yield (f"data.{key} is given, and RvB pairs have no proper motions; leave it out")
+                yield (f"data.{key} is given, but RvB pairs have no proper motions; omit it")

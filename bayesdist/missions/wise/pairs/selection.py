@@ -1,7 +1,7 @@
-"""Selection of RvB pairs, batch by batch; those that it drops are counted by reason.
+"""Selection of RvB pairs in batches; rejected pairs are counted by reason.
 
-In memory or streamed, the same pairs pass: by the range of colours, then the bluest of each frame,
-then the radial limits.
+The selection does not depend on the batches.  The criteria are applied in this order: range of
+colours, bluest pairs of each frame, radial limits.
 """
 
 from __future__ import annotations
@@ -27,56 +27,55 @@ from bayesdist.utils.arrays import Bool, Float, Int
 
 OFFSET = "offset beyond the radial limit"
 CHI2 = "chi-square beyond the radial limit"
-MOST_COLOURS = 100_000_000  # rows whose colours are compared with each other, 1.6 GB of them
+MOST_COLOURS = 100_000_000  # maximum number of pairs for the selection of the bluest (1.6 GB)
 
 
 @dataclass
 class SelectedPairs:
-    """The pairs that a selection takes, to be gone through once."""
+    """Iterable over the selected pairs, which can be used once."""
 
-    # gives the pairs of one band batch by batch: once more where the bluest of each frame are asked
-    # for, which takes the colours of all
+    # function that returns the pairs of one band in batches; it is called twice if the bluest of
+    # each frame are selected, since this requires the colours of all pairs
     batches: Callable[[], Iterable[RvbPairs]]
     selection: RvbBlock
     size: tuple[float, float]  # columns and rows of the array
-    n_rows: int = 0  # pairs so far
-    # those of them that were dropped, by reason
-    rejected: dict[str, int] = field(default_factory=dict)
+    n_rows: int = 0  # number of pairs that have been read
+    rejected: dict[str, int] = field(default_factory=dict)  # number of rejected pairs by reason
 
     def __iter__(self) -> Iterator[RvbPairs]:
-        """Batches of which something is left.
+        """Yield batches of selected pairs, without empty batches.
 
-        InputError without colours where they are needed, for u, v in another unit where offsets are
-        judged, and when no pair at all is left.
+        Raises InputError if required colours are missing, u and v are not in pixels although
+        offsets are limited, or no pair is selected.
         """
         bluest = self._bluest()
         sources: dict[str, None] = {}
         for pairs in self.batches():
             sources |= dict.fromkeys(pairs.matches.sources)
             rules = self._rules(pairs, bluest).items()
-            left, counts = counted([(reason, ~good) for reason, good in rules], len(pairs))
+            selected, counts = counted([(reason, ~good) for reason, good in rules], len(pairs))
             self.rejected |= merged_counts([self.rejected, counts])
             self.n_rows += len(pairs)
-            if left.any():
-                yield pairs if left.all() else pairs.select(left)
+            if selected.any():
+                yield pairs if selected.all() else pairs.select(selected)
         if self.n_rows == sum(self.rejected.values()):
             why = ", ".join(f"{reason} ({n})" for reason, n in self.rejected.items())
             raise InputError(
-                f"no pair of {self.n_rows} is left by the selection: {why}",
+                f"none of the {self.n_rows} pairs are selected: {why}",
                 where=", ".join(sources),
-                do="widen its limits",
+                do="widen the limits of the selection",
             )
 
     def table(self) -> Matches:
-        """All of them in memory, with the counts.
+        """Selected pairs in memory, with the counts of rejected pairs.
 
-        InputError as going through them, and as `Matches.concatenate`.
+        Raises InputError as the iteration and `Matches.concatenate` do.
         """
-        found = Matches.concatenate([pairs.matches for pairs in self])
-        return found.with_counts(self.n_rows, self.rejected)
+        matches = Matches.concatenate([pairs.matches for pairs in self])
+        return matches.with_counts(self.n_rows, self.rejected)
 
     def _rules(self, pairs: RvbPairs, bluest: Bool | None) -> Mapping[str, Bool]:
-        """Boolean masks of the pairs that pass, by the reason to drop the others."""
+        """Boolean masks of the pairs that meet each criterion, by the reason for rejection."""
         rules: dict[str, Bool] = {}
         if self.selection.by_colour:
             right = self._right_colour(pairs)
@@ -84,12 +83,12 @@ class SelectedPairs:
                 right = right & bluest[self.n_rows : self.n_rows + len(pairs)]
             rules = {NO_COLOUR: ~np.isnan(colours_of(pairs)), COLOUR: right}
         offset, chi2, matches = self.selection.offset, self.selection.chi2, pairs.matches
-        where = ", ".join(matches.sources)
+        sources = ", ".join(matches.sources)
         if matches.unit != "pix" and (offset is not None or chi2 is not None):
             raise InputError(
-                f"u, v are in {matches.unit}, and offsets are judged in pixels",
-                where=where,
-                do="bring u, v to pixels of the array",
+                f"u, v are in {matches.unit}, but limits on offsets are in pixels",
+                where=sources,
+                do="convert u, v to pixels of the array",
             )
         du, dv = matches.u - matches.x, matches.v - matches.y
         if offset is not None:
@@ -98,21 +97,21 @@ class SelectedPairs:
             if matches.sigma_u is None or matches.sigma_v is None:
                 raise InputError(
                     "a limit on chi-square needs errors",
-                    where=where,
-                    do="map sigma_u and sigma_v, or limit the offset alone",
+                    where=sources,
+                    do="give columns sigma_u and sigma_v, or limit only the offset",
                 )
             value = (du / matches.sigma_u) ** 2 + (dv / matches.sigma_v) ** 2
             rules[CHI2] = value <= chi2.at(matches.x, matches.y, self.size)
         return rules
 
     def _right_colour(self, pairs: RvbPairs) -> Bool:
-        """Boolean mask (N,) of the pairs with a colour within the limits."""
+        """Boolean mask (N,) that is True for pairs with a colour within the limits."""
         colour = colours_of(pairs)
         low, high = self.selection.colour or (-np.inf, np.inf)
         return np.asarray((colour >= low) & (colour <= high))
 
     def _bluest(self) -> Bool | None:
-        """Boolean mask of the rows among the bluest of their frames; None without that rule."""
+        """Boolean mask of the bluest pairs of each frame over all batches; None if not selected."""
         if self.selection.bluest is None:
             return None
         colours: list[Float] = []
@@ -126,14 +125,14 @@ class SelectedPairs:
             frames.append(code[pairs.matches.exposure])
             if sum(map(len, colours)) > MOST_COLOURS:
                 raise InputError(
-                    f"the bluest of each frame are asked for among more than {MOST_COLOURS} pairs",
+                    f"the bluest of each frame are selected from at most {MOST_COLOURS} pairs",
                     where=", ".join(pairs.matches.sources),
                     do="select by a range of colours instead",
                 )
         if set(codes) == {"1"}:
             raise InputError(
-                "has no column of frames, of each of which the bluest are asked for",
+                "has no column of frames, which the selection of the bluest of each frame needs",
                 where=", ".join(pairs.matches.sources),
-                do="name it as 'exposure' in the option 'columns'",
+                do="give it as 'exposure' in the option 'columns'",
             )
         return bluest_rows(np.concatenate(colours), np.concatenate(frames), self.selection.bluest)

@@ -1,4 +1,4 @@
-"""The template of `bayesdist init` for RvB pairs."""
+"""Template of `bayesdist init` for RvB pairs."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from bayesdist.missions.wise.pairs.files import (
 from bayesdist.missions.wise.pairs.read import rvb_bands, stream_rvb
 from bayesdist.missions.wise.published import WISE_ARRAYS
 
-SIGMA = 0.1  # pixels, for pairs that say nothing about their errors
+SIGMA = 0.1  # default error of pairs without errors, pixels
 
 _FORMAT = """\
 format = "rvb"                  # pairs of WISE and 2MASS, u and v in pixels of the band frame
@@ -26,15 +26,15 @@ band = "{band}"                     # {found}
 """
 
 _SELECTION = """\
-# [data.rvb]                    # which pairs are taken; all by default
+# [data.rvb]                    # selection of pairs; all by default
 {colour}# accept_centre = 1.0           # largest offset of a pair at the array's centre, in pixels
-# accept_corner = 3.0           # ... and in its corners, which distortion moves most
+# accept_corner = 3.0           # ... and in its corners, where distortion is largest
 
 """
 
 _COLOUR = """\
 # colour = [-0.5, 0.5]          # magnitude at the shortest minus that at the longest wavelength
-# bluest = 100                  # of each frame at most so many, those of the smallest colour
+# bluest = 100                  # maximum number of pairs per frame; the bluest are selected
 """
 
 _DETECTOR = """\
@@ -47,40 +47,40 @@ scale_mas = {scale:.0f}
 
 
 def rvb_template(matches: str | Path) -> tuple[int, dict[str, object]] | None:
-    """Number of pairs, and what they put into the template of `init`; None for other matches.
+    """Number of RvB pairs, and the values for the template of `init`; None for other matches.
 
-    InputError as `stream_rvb`.
+    Raises InputError as `stream_rvb` does.
     """
     if not _is_rvb(matches):
         return None
     files = open_rvb_files(matches, None)
-    found = set(files[0].found)
-    if "band" in found:
+    quantities = set(files[0].found)
+    if "band" in quantities:
         counts = rvb_bands(matches)
         band = max(counts, key=counts.__getitem__)
-        comment = "the file holds " + ", ".join(f"{name} ({n})" for name, n in counts.items())
+        comment = "the file contains " + ", ".join(f"{name} ({n})" for name, n in counts.items())
     else:
         band = _guessed_band(files)
-        comment = "GUESSED from the positions: the file does not say"
-    sigma: str | float = "columns" if {"sigma_u", "sigma_v"} <= found else SIGMA
+        comment = "GUESSED from the positions: not stated in the file"
+    sigma: str | float = "columns" if {"sigma_u", "sigma_v"} <= quantities else SIGMA
     n, has_mag = 0, True
     for pairs in stream_rvb(matches, band=band, sigma=sigma):
         n += len(pairs)
         has_mag = has_mag and pairs.matches.has_mag
-    said = {
+    sigma_lines = {
         "columns": '"columns"',
-        SIGMA: '"by_magnitude"        # the table carries no errors'
+        SIGMA: '"by_magnitude"        # the table has no errors'
         if has_mag
-        else f"{SIGMA}                     # GUESSED: the table carries no errors",
+        else f"{SIGMA}                     # GUESSED: the table has no errors",
     }
-    coloured = "colour" in found or len(found.intersection(MAGNITUDES)) > 1
+    coloured = "colour" in quantities or len(quantities.intersection(MAGNITUDES)) > 1
     array = WISE_ARRAYS[band]
     (nx, ny), scale = array.size, 1000 * array.scale
     return n, {
         "format": _FORMAT.format(band=band, found=comment),
         "columns": column_lines(None, None),
         "unit_line": "",
-        "sigma": said[sigma],
+        "sigma": sigma_lines[sigma],
         "detector": _SELECTION.format(colour=_COLOUR if coloured else "")
         + _DETECTOR.format(band=band, nx=nx, ny=ny, scale=scale),
         "reference": f"# reference_pixel = [{array.centre[0]}, {array.centre[1]}]  # the centre\n",
@@ -91,7 +91,7 @@ def rvb_template(matches: str | Path) -> tuple[int, dict[str, object]] | None:
 
 
 def _is_rvb(matches: str | Path) -> bool:
-    """Truth of RvB pairs: IPAC tables with u, v, or Parquet with WISE's bands."""
+    """True if the files are RvB pairs: IPAC tables with u and v, or Parquet with WISE bands."""
     files = input_files(matches)
     if all(file.name.lower().endswith(IPAC) for file in files):
         return {"u", "v"} <= {name.lower() for name in read_table(files[0]).colnames}
@@ -107,7 +107,7 @@ def _is_rvb(matches: str | Path) -> bool:
 
 
 def _guessed_band(files: list[RvbFile]) -> str:
-    """W4 where all detections lie on its array, else W1, whose array is that of W2 and W3."""
+    """W4 if all detections are on its array, otherwise W1 (W2 and W3 have the same array)."""
     reach = 0.0
     for file in files:
         for table, _, place in file.blocks(["x", "y"]):

@@ -1,1 +1,1 @@
-"""Reference positions of RvB pairs, moved by linear transformations: TRSrvb and RERrvb."""
+"""Linear transformations of the reference positions of RvB pairs (TRSrvb and RERrvb)."""

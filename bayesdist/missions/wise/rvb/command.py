@@ -1,4 +1,4 @@
-"""`bayesdist wise rvb`: RvB pairs with transformed reference positions, frame by frame or all."""
+"""`bayesdist wise rvb`: transform the reference positions of RvB pairs, all or frame by frame."""
 
 from __future__ import annotations
 
@@ -33,34 +33,45 @@ SOLUTION_ALIASES: dict[str, tuple[str, ...]] = {
 def read_solutions(
     path: str | os.PathLike[str], *, centre: tuple[float, float]
 ) -> dict[str, RvbTransform]:
-    """Solutions of the frames of one band, solved about a centre, as `rereference` takes them.
+    """Read the solutions of the frames of one band, for `rereference`.
 
-    A parameter without a column is zero in all frames; scales are relative to one, the rotation in
-    radians unless the column has a unit.
+    Parameters
+    ----------
+    path : path-like
+        Table with one row per frame and columns for the frame and for one or more of `PARAMETERS`;
+        missing parameters are zero.  Scales are given minus 1, and the rotation is in radians
+        unless the column has a unit.
+    centre : tuple of float
+        Centre of rotation and scales, pixels.
+
+    Returns
+    -------
+    dict of str to RvbTransform
+        Solutions by frame.
     """
     file = Path(path)
     table = read_table(file)
-    found = find_columns(table.colnames, None, SOLUTION_ALIASES, source=str(file))
-    given = [name for name in PARAMETERS if name in found]
-    if "frame" not in found or not given:
-        missing = "frames" if "frame" not in found else "parameters"
+    column_of = find_columns(table.colnames, None, SOLUTION_ALIASES, source=str(file))
+    parameter_names = [name for name in PARAMETERS if name in column_of]
+    if "frame" not in column_of or not parameter_names:
+        missing = "frames" if "frame" not in column_of else "parameters"
         raise InputError(
             f"no column of {missing} among {', '.join(table.colnames)}",
             where=str(file),
             do="rename the columns",
         )
-    codes, names = SourceColumn(table[found["frame"]], str(file), found["frame"]).labels()
+    codes, names = SourceColumn(table[column_of["frame"]], str(file), column_of["frame"]).labels()
     first = np.unique(codes, return_index=True)[1]
     if len(first) < len(codes):
-        again = int(np.setdiff1d(np.arange(len(codes)), first)[0])
+        repeated = int(np.setdiff1d(np.arange(len(codes)), first)[0])
         raise InputError(
-            f"frame {names[codes[again]]!r} stands twice",
-            where=f"{file}, row {again + 1}",
-            do="give the solutions of one band, with one row for each frame",
+            f"frame {names[codes[repeated]]!r} occurs twice",
+            where=f"{file}, row {repeated + 1}",
+            do="give the solutions of one band, with one row per frame",
         )
     values = np.zeros((len(codes), len(PARAMETERS)))
-    for name in given:
-        column = SourceColumn(table[found[name]], str(file), found[name])
+    for name in parameter_names:
+        column = SourceColumn(table[column_of[name]], str(file), column_of[name])
         numbers = column.numbers()
         if name in ("rotation", "skew") and column.unit is not None:
             numbers = numbers * _radians(column)
@@ -72,13 +83,13 @@ def read_solutions(
 
 
 def _radians(column: SourceColumn) -> float:
-    """Radians in one of the column's unit."""
+    """Radians per unit of a column."""
     unit = column.unit
     try:
         return 1.0 if unit is None else float(unit.to("rad"))
     except ValueError:
         raise InputError(
-            f"unit {unit} is not one of angles", where=column.where, do="give rad or deg"
+            f"unit {unit} is not an angle", where=column.where, do="give rad or deg"
         ) from None
 
 
@@ -95,34 +106,35 @@ def transform_files(
     scale_y: float,
     fit: bool,
 ) -> str:
-    """Text to print, once pairs with all reference positions moved alike are in a new folder.
+    """Apply one transformation to all reference positions; returns text to print.
 
-    With `fit` the five parameters are those that bring reference positions to the detections.
+    With `fit` the five parameters are fitted such that the reference positions agree with the
+    detections.  The pairs are written to a new folder.
     """
     transform = RvbTransform(dx, dy, radians(rotation), scale_x, scale_y)
     if (transform == RvbTransform()) != fit:
         raise InputError(
-            "a transformation is given, and one is to be fitted"
-            if fit
-            else "no transformation is asked for",
+            "a transformation is given, but --fit is set" if fit else "no transformation is given",
             where="bayesdist wise rvb transform",
             do="give --fit, or --dx, --dy, --rotation, --scale-x or --scale-y",
         )
     columns = columns or {}
     band = _band(files, band, columns)
-    found = ""
+    fit_text = ""
     if fit:
         pieces = stream_rvb(files, band=band, columns=columns)
         best = fit_transform(
-            reduce(add, (linear_moments(one.matches, WISE_ARRAYS[band].centre) for one in pieces))
+            reduce(
+                add, (linear_moments(pairs.matches, WISE_ARRAYS[band].centre) for pairs in pieces)
+            )
         )
-        transform, found = best.transform, f"\n{best.sentence}"
+        transform, fit_text = best.transform, f"\n{best.sentence}"
     else:
         transform = replace(transform, centre=WISE_ARRAYS[band].centre)
     written = _written(
         files, output, band, columns, lambda matches: transformed(matches, transform)
     )
-    return written + found
+    return written + fit_text
 
 
 def rereference_files(
@@ -134,7 +146,7 @@ def rereference_files(
     band: str | None,
     columns: Mapping[str, str] | None,
 ) -> str:
-    """Text to print, once pairs are brought from the solutions `free` of their frames to others."""
+    """Transform pairs from the frame solutions `free` to `fixed`; returns text to print."""
     columns = columns or {}
     band = _band(files, band, columns)
     old, new = (read_solutions(path, centre=WISE_ARRAYS[band].centre) for path in (free, fixed))
@@ -155,7 +167,7 @@ def _written(
     for path in map(Path, files):
         if path.is_dir() and Path(output).resolve().is_relative_to(path.resolve()):
             raise InputError(
-                "lies inside the folder of its input",
+                "is inside the input folder",
                 where=str(output),
                 do="choose a folder outside of it",
             )

@@ -1,6 +1,6 @@
-"""The linear transformation between reference stars and detections, by least squares.
+"""Least-squares fit of a linear transformation from reference stars to detections.
 
-It takes constant and linear offsets out of a set of pairs (TRSrvb in WSDC D-T033, section 3).
+It removes constant and linear offsets from a set of pairs (TRSrvb in WSDC D-T033, section 3).
 """
 
 from __future__ import annotations
@@ -15,39 +15,51 @@ from bayesdist.infer.stars.sums import Sums
 from bayesdist.missions.wise.rvb.transform import PARAMETERS, RvbTransform
 from bayesdist.utils.arrays import Float
 
-FREE = 5  # parameters that are fitted, the first of `PARAMETERS`
-
-_RANK = 1e-12  # eigenvalues of the unit-diagonal normal matrix below this are zero
+FREE = 5  # number of fitted parameters, the first ones of `PARAMETERS`
+_RANK = 1e-12  # smallest ratio of eigenvalues of the normal matrix scaled to unit diagonal
 
 
 @dataclass(frozen=True, eq=False)
 class LinearMoments(Sums):
-    """All that pairs say about a linear transformation: sums, which add over pieces of the data."""
+    """Sums over pairs for the normal equations; those of parts of the data can be added."""
 
     SAME = ("centre",)
 
-    # (2, 3, 3), sum of w p p^T with p = (1, u - centre, v - centre), for the axes x and y
+    # (2, 3, 3), for x and y: sum of w p p^T with p = (1, u - centre_u, v - centre_v)
     weight: Float
     right: Float  # (2, 3), sum of w p times the offset of the detection, x - u or y - v
     chi2: float  # sum of w times the squared offsets
-    n: int  # pairs
+    n: int  # number of pairs
     centre: tuple[float, float]
 
 
 def linear_moments(matches: Matches, centre: tuple[float, float]) -> LinearMoments:
-    """Sums over some pairs.
+    """Sums over pairs for the fit of a linear transformation.
 
-    `matches`: with errors, and u, v in pixels of the array. `centre`: of the transformation that
-    will be fitted: the array's centre. InputError without errors, and for another unit.
+    Parameters
+    ----------
+    matches : Matches
+        Pairs with errors, and with u and v in pixels of the array.
+    centre : tuple of float
+        Centre of the transformation, usually that of the array.
+
+    Returns
+    -------
+    LinearMoments
+
+    Raises
+    ------
+    InputError
+        If the pairs have no errors, or u and v are not in pixels.
     """
-    where = ", ".join(matches.sources)
+    sources = ", ".join(matches.sources)
     if matches.sigma_u is None or matches.sigma_v is None:
-        raise InputError("the matches carry no errors", where=where, do="give sigma columns")
+        raise InputError("the matches have no errors", where=sources, do="give sigma columns")
     if matches.unit != "pix":
         raise InputError(
-            f"u, v are in {matches.unit}, and the detections in pixels",
-            where=where,
-            do="bring u, v to pixels of the array",
+            f"u, v are in {matches.unit}, but the detections in pixels",
+            where=sources,
+            do="convert u, v to pixels of the array",
         )
     design = np.stack([np.ones(len(matches)), matches.u - centre[0], matches.v - centre[1]])
     offsets = (matches.x - matches.u, matches.y - matches.v)
@@ -64,11 +76,11 @@ def linear_moments(matches: Matches, centre: tuple[float, float]) -> LinearMomen
 
 @dataclass(frozen=True, eq=False)
 class TransformFit:
-    """A fitted linear transformation from reference stars to detections."""
+    """Fitted linear transformation from reference stars to detections."""
 
     transform: RvbTransform
-    # (6, 6), formal covariance in the order of `PARAMETERS`; zero for the skew.  Distortion that is
-    # not yet corrected is no noise: where chi2 / dof is far from one it says more than this
+    # (6, 6), formal covariance in the order of `PARAMETERS`; zero for the skew.  It excludes the
+    # effect of uncorrected distortion, which increases chi2 / dof
     cov: Float
     chi2: float
     dof: int
@@ -80,34 +92,34 @@ class TransformFit:
 
     @property
     def sentence(self) -> str:
-        """The parameters with their errors, in words."""
+        """Parameters with their errors as a sentence."""
         values = zip(PARAMETERS, self.transform.values, self.sigma, strict=True)
         found = ", ".join(f"{name} {value:.6g} +- {sigma:.2g}" for name, value, sigma in values)
         return f"fitted: {found} (pixels, radians, relative); chi-square {self.chi2:.4g}/{self.dof}"
 
 
 def fit_transform(moments: LinearMoments) -> TransformFit:
-    """Weighted least squares for the five parameters, no skew, of the map from (u, v) to (x, y).
+    """Fit the five parameters, without skew, of the map from (u, v) to (x, y) by least squares.
 
-    `transformed` with its transform takes constant and linear offsets out of the pairs.
-    DegenerateError when the pairs do not determine the parameters, as when they lie on a line.
+    Use `transformed` with the result to remove constant and linear offsets from the pairs.  Raises
+    DegenerateError if the pairs do not determine the parameters, for example if they are on a line.
     """
     now = RvbTransform(centre=moments.centre)
-    # the affine coefficients of x and y in the order of `jacobian`: shift, then matrix by rows
+    # indices of the affine coefficients of x and y in `jacobian`: shift, then matrix by rows
     order = np.array([[0, 2, 3], [1, 4, 5]])
     weight, right = np.zeros((6, 6)), np.zeros(6)
     for axis in (0, 1):
         weight[np.ix_(order[axis], order[axis])] = moments.weight[axis]
         right[order[axis]] = moments.right[axis]
     for _ in range(30):
-        by = now.jacobian()[:, :FREE]
-        normal = by.T @ weight @ by
+        jacobian = now.jacobian()[:, :FREE]
+        normal = jacobian.T @ weight @ jacobian
         _require_rank(normal)
-        step = np.linalg.solve(normal, by.T @ (right - weight @ _offset(now)))
+        step = np.linalg.solve(normal, jacobian.T @ (right - weight @ _offset(now)))
         values = now.values
         values[:FREE] += step
         now = replace(now, **dict(zip(PARAMETERS, values.tolist(), strict=True)))
-        # in units of the errors: far below what matters, or what rounding leaves of the offsets
+        # converged if the step is far below the errors, or at the level of rounding
         if step @ normal @ step < max(1e-16, 1e-28 * moments.chi2):
             break
     else:
@@ -124,7 +136,7 @@ def fit_transform(moments: LinearMoments) -> TransformFit:
 
 
 def _offset(transform: RvbTransform) -> Float:
-    """Shift and matrix by rows, minus the identity: what is small keeps its digits."""
+    """Shift, and matrix minus identity by rows; small values keep their precision."""
     return np.concatenate([transform.shift, (transform.matrix - np.eye(2)).ravel()])
 
 
@@ -134,9 +146,11 @@ def _require_rank(normal: Float) -> None:
     values, vectors = np.linalg.eigh(normal / np.outer(*[np.where(dead, 1.0, scale)] * 2))
     if values[0] < _RANK * values[-1]:
         parts = np.abs(vectors[:, 0])
-        free = [n for n, part in zip(PARAMETERS, parts, strict=False) if part > 0.1 * parts.max()]
+        undetermined = [
+            n for n, part in zip(PARAMETERS, parts, strict=False) if part > 0.1 * parts.max()
+        ]
         raise DegenerateError(
-            f"the pairs do not determine {', '.join(free)}",
+            f"the pairs do not determine {', '.join(undetermined)}",
             where="linear transformation",
-            do="give pairs all over the array",
+            do="give pairs that cover the whole array",
         )

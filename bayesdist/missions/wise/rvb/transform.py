@@ -1,8 +1,9 @@
-"""Linear transformations of RvB pairs, from one set of frame solutions to another.
+"""Linear transformations of RvB pairs, also from one set of frame solutions to another.
 
-What TRSrvb and RERrvb do in WSDC D-T033, section 3: up to five parameters (two shifts, a rotation,
-two scales), and pairs brought from frame solutions with free scales to those with fixed ones.  The
-sixth parameter of a solution is the skew, which the report's gnDSTR holds at zero.
+This corresponds to TRSrvb and RERrvb in WSDC D-T033, section 3: transformations with up to five
+parameters (two shifts, a rotation, two scales), and the change from frame solutions with free
+scales to those with fixed scales.  The sixth parameter of a solution is the skew, which is zero in
+gnDSTR of the report.
 """
 
 from __future__ import annotations
@@ -19,28 +20,28 @@ from bayesdist.utils.arrays import Float, Int
 
 PARAMETERS = ("shift_u", "shift_v", "rotation", "scale_u", "scale_v", "skew")
 
-# Errors of u and v stay uncorrelated in a Matches.  A transformation that correlates them by
-# more than this cannot be represented; a rotation of 0.05 with errors 1 to 1.5 makes 0.04.
+# Errors of u and v are uncorrelated in Matches, so that a transformation that would correlate them
+# by more than this is rejected.  A rotation by 0.05 with errors 1 and 1.5 gives 0.04.
 CORRELATED = 0.1
 
 
 @dataclass(frozen=True)
 class RvbTransform:
-    """(u, v) -> centre + shift + R K S ((u, v) - centre).
+    """Linear transformation (u, v) -> centre + shift + R K S ((u, v) - centre).
 
-    R turns by `rotation` from u towards v, S scales by 1 + scale_u and 1 + scale_v, and
+    R rotates by `rotation` from u towards v, S scales by 1 + scale_u and 1 + scale_v, and
     K = [[1, skew], [0, 1]].
 
-    InputError for values that are not finite, and scales that leave nothing or mirror.
+    Raises InputError if a value is not finite or a scale is not above -1.
     """
 
-    shift_u: float = 0.0  # in the unit of u, v
+    shift_u: float = 0.0  # in the unit of u and v
     shift_v: float = 0.0
     rotation: float = 0.0  # radians
-    scale_u: float = 0.0  # relative to one, above -1
+    scale_u: float = 0.0  # scale minus 1
     scale_v: float = 0.0
     skew: float = 0.0  # radians
-    # the point that rotation and scales leave where it is; by default the centre of a W1 array
+    # fixed point of rotation and scales; by default the centre of a W1 array
     centre: tuple[float, float] = (508.5, 508.5)
 
     def __post_init__(self) -> None:
@@ -53,59 +54,57 @@ class RvbTransform:
 
     @property
     def values(self) -> Float:
-        """The six parameters, in the order of `PARAMETERS`."""
+        """The six parameters in the order of `PARAMETERS`."""
         return np.array(astuple(self)[:6], float)
 
     @property
     def matrix(self) -> Float:
-        """R K S, shape (2, 2)."""
+        """Matrix R K S, shape (2, 2)."""
         c, s = np.cos(self.rotation), np.sin(self.rotation)
         upper = np.array([[1.0, self.skew], [0.0, 1.0]])
         return np.array([[c, -s], [s, c]]) @ upper * [1 + self.scale_u, 1 + self.scale_v]
 
     @property
     def shift(self) -> Float:
-        """Both shifts, shape (2,)."""
+        """Shifts along u and v, shape (2,)."""
         return np.array([self.shift_u, self.shift_v])
 
     def __call__(self, points: ArrayLike) -> Float:
-        """Transformed points.
-
-        `points`: (..., 2).
-        """
+        """Transform points (..., 2)."""
         offset = np.asarray(points, float) - self.centre
         return offset @ self.matrix.T + self.centre + self.shift
 
     def jacobian(self) -> Float:
-        """Derivatives of shift and matrix by the parameters.
+        """Derivatives (6, 6) of shift and matrix with respect to the parameters.
 
-        Returns (6, 6), rows: both shifts, then the matrix row by row; columns in the order of
+        The rows are both shifts, then the matrix by rows; the columns are in the order of
         `PARAMETERS`.
         """
         c, s = np.cos(self.rotation), np.sin(self.rotation)
-        turn, turned = np.array([[c, -s], [s, c]]), np.array([[-s, -c], [c, -s]])
+        rotation, rotation_derivative = np.array([[c, -s], [s, c]]), np.array([[-s, -c], [c, -s]])
         scale = np.diag([1 + self.scale_u, 1 + self.scale_v])
         upper = np.array([[1.0, self.skew], [0.0, 1.0]])
         out = np.zeros((6, 6))
         out[:2, :2] = np.eye(2)
-        for column, by in enumerate(
+        for column, derivative in enumerate(
             (
-                turned @ upper @ scale,
-                turn @ upper @ np.diag([1.0, 0.0]),
-                turn @ upper @ np.diag([0.0, 1.0]),
-                turn @ np.array([[0.0, 1.0], [0.0, 0.0]]) @ scale,
+                rotation_derivative @ upper @ scale,
+                rotation @ upper @ np.diag([1.0, 0.0]),
+                rotation @ upper @ np.diag([0.0, 1.0]),
+                rotation @ np.array([[0.0, 1.0], [0.0, 0.0]]) @ scale,
             ),
             2,
         ):
-            out[2:, column] = by.ravel()
+            out[2:, column] = derivative.ravel()
         return out
 
 
 def transformed(matches: Matches, transform: RvbTransform) -> Matches:
-    """Pairs with their reference positions transformed, and the errors with them.
+    """Transform the reference positions of pairs and their errors.
 
-    InputError when errors of u and v would come out correlated by more than 0.1, which a table of
-    matches does not hold: unequal errors turned by an angle that is neither small nor a right one.
+    Raises InputError if the errors of u and v would become correlated by more than 0.1, which a
+    table of matches cannot represent.  This occurs for unequal errors and a rotation that is
+    neither small nor close to a right angle.
     """
     everywhere = np.zeros(len(matches), np.int64)
     return _moved(matches, everywhere, transform.matrix[None], transform.shift[None],
@@ -117,18 +116,31 @@ def rereference(
     free: Mapping[str, RvbTransform],
     fixed: Mapping[str, RvbTransform],
 ) -> Matches:
-    """Pairs as they would be with other solutions of their frames.
+    """Transform pairs from one set of frame solutions to another.
 
-    The reference positions of a frame are its stars' nominal pixels, brought to the band frame by
-    the frame's solution.  A solution with free scales takes up part of the distortion, another part
-    in each frame, so that linear terms of a calibration mean nothing; with scales held at one value
-    they do, and so do shifts and rotations between bands.  The pairs alone cannot tell what a free
-    solution took up: it has to be given.
+    The reference positions of a frame are the nominal pixels of its stars, transformed to the band
+    frame with the solution of the frame.  A solution with free scales absorbs a part of the
+    distortion that differs from frame to frame, so that the linear terms of a calibration are
+    meaningless.  With fixed scales they are meaningful, as are shifts and rotations between bands.
+    The pairs alone do not show what a free solution absorbed, so that both solutions must be given.
 
-    `matches`: made with the free solutions. `free`, `fixed`: solution of each frame: from nominal
-    pixels, which are common to both, to the band frame. Those of other bands than the one that is
-    solved for are its solution, then the band's translation and rotation known beforehand.
-    InputError for a frame without a solution, and as `transformed`.
+    Parameters
+    ----------
+    matches : Matches
+        Pairs that were made with the free solutions.
+    free, fixed : mapping of str to RvbTransform
+        Solutions of each frame, from the common nominal pixels to the band frame.  If the frame was
+        solved in another band, the solution must include the translation and rotation between the
+        bands.
+
+    Returns
+    -------
+    Matches
+
+    Raises
+    ------
+    InputError
+        If a frame has no solution, or errors would become correlated (see `transformed`).
     """
     moves = []
     used, code = np.unique(matches.exposure, return_inverse=True)
@@ -138,10 +150,10 @@ def rereference(
                 raise InputError(
                     f"frame {name!r} has no solution with {kind} scales",
                     where=", ".join(matches.sources),
-                    do="give the solutions of all frames, or leave its pairs out",
+                    do="give the solutions of all frames, or remove its pairs",
                 )
         old, new = free[name], fixed[name]
-        # back to nominal pixels, then on by the other solution, as one map about the first centre
+        # inverse of the old solution followed by the new one, as one map about the old centre
         matrix = new.matrix @ np.linalg.inv(old.matrix)
         away = np.subtract(old.centre, new.centre)
         moves.append(
@@ -151,12 +163,12 @@ def rereference(
 
 
 def _moved(matches: Matches, code: Int, matrix: Float, shift: Float, centre: Float) -> Matches:
-    """Pairs moved by a linear map each: that of its code."""
+    """Transform each pair with the linear map given by its code."""
 
     def moved(u: Float, v: Float) -> Float:
         points = np.stack([u, v])
         offset = points.T - centre[code]
-        # the change is added: an identity leaves every digit
+        # the change is added, so that the identity is exact
         change = np.einsum("nij,nj->ni", (matrix - np.eye(2))[code], offset) + shift[code]
         return points + change.T
 
@@ -167,14 +179,14 @@ def _moved(matches: Matches, code: Int, matrix: Float, shift: Float, centre: Flo
     if matches.sigma_u is not None and matches.sigma_v is not None:
         var = np.stack([matches.sigma_u, matches.sigma_v], axis=1) ** 2
         out = np.sqrt(np.einsum("nij,nj->ni", (matrix**2)[code], var))
-        both = np.einsum("nj,nj->n", (matrix[:, 0] * matrix[:, 1])[code], var)
-        correlation = np.abs(both / (out[:, 0] * out[:, 1]))
+        covariance = np.einsum("nj,nj->n", (matrix[:, 0] * matrix[:, 1])[code], var)
+        correlation = np.abs(covariance / (out[:, 0] * out[:, 1]))
         if correlation.max() > CORRELATED:
             worst = int(np.argmax(correlation))
             raise InputError(
                 f"the errors of u and v would be correlated by {correlation[worst]:.2f}",
                 where=f"{matches.sources[matches.source[worst]]}, row {matches.row[worst] + 1}",
-                do="give both axes the same errors before, or transform the detections instead",
+                do="give both axes the same errors first, or transform the detections instead",
             )
         columns |= {"sigma_u": out[:, 0], "sigma_v": out[:, 1]}
     return matches.with_columns(**columns)

@@ -1,4 +1,4 @@
-"""WISE: matched pairs of band-frame and 2MASS positions, from the published distortion."""
+"""Simulated WISE data: pairs of band-frame and 2MASS positions with the published distortion."""
 
 from bayesdist.missions.wise.simulate.files import write_wise_set
 from bayesdist.missions.wise.simulate.sets import PairChunk, WiseSet, wise_set

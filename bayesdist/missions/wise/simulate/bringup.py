@@ -1,4 +1,4 @@
-"""First weeks of a calibration: lists of stars that nobody has paired."""
+"""Simulated unmatched star lists, for the bring-up of a calibration."""
 
 from __future__ import annotations
 
@@ -14,19 +14,18 @@ from bayesdist.utils.arrays import Float, Int
 
 __all__ = ["simulate_unpaired"]
 
-MARGIN = 40.0  # pixels by which the reference catalogue reaches beyond the detector
-CENTROID = (0.05, 0.20)  # px, from the brightest to the faintest detection
-REFERENCE_SIGMA = 0.03  # px: 2MASS, some 80 mas
+MARGIN = 40.0  # margin of the reference catalogue around the detector, pixels
+CENTROID = (0.05, 0.20)  # centroid errors of the brightest and the faintest detection, pixels
+REFERENCE_SIGMA = 0.03  # errors of 2MASS, pixels (some 80 mas)
 
 
 @dataclass(frozen=True, eq=False)
 class UnpairedStars:
-    """Detections, reference stars, and the truth about them."""
+    """Detections, reference stars, and their truth."""
 
     detections: Detections  # on the detector, pixels; the exposures are the frames
     reference: Detections  # undistorted positions in the frames, pixels
-    # (N,), row of each detection's own reference star; -1 where the catalogue has none
-    partner: Int
+    partner: Int  # (N,), row of the reference star of each detection; -1 if there is none
     model: DistortionModel
     theta: Float  # (D,), the true distortion
 
@@ -40,21 +39,24 @@ def simulate_unpaired(
     density: float = 1e-3,
     common: float = 0.8,
 ) -> UnpairedStars:
-    """Lists of stars of many frames, unpaired.
+    """Simulate unmatched star lists of many frames.
 
-    False pairs come about as in the sky: by reference stars that happen to lie near a detection.
+    As with real data, false pairs are due to reference stars that are close to a detection by
+    chance.
 
     Parameters
     ----------
     n_frames : int
+        Number of frames.
     rng : numpy.random.Generator
     band : str
+        'W1' to 'W4'.
     per_frame : float
-        Detections in a frame, in the mean.
+        Mean number of detections per frame.
     density : float
-        Reference stars that were not detected, for each square pixel of the undistorted frame.
+        Number of undetected reference stars per square pixel of the undistorted frame.
     common : float
-        Fraction of the detections that the reference catalogue has, too.
+        Fraction of the detections that are in the reference catalogue.
 
     Returns
     -------
@@ -63,10 +65,12 @@ def simulate_unpaired(
     Raises
     ------
     InputError
-        For an unknown band, or a fraction outside 0 to 1.
+        If the band is unknown, or the fraction is not from 0 to 1.
     """
     if not 0 <= common <= 1:
-        raise InputError(f"the fraction of common stars is {common}", do="give one from 0 to 1")
+        raise InputError(
+            f"the fraction of common stars is {common}", do="give a number from 0 to 1"
+        )
     model, theta = wise_solution(band)
     nx, ny = model.chips[0].size
     n = int(rng.poisson(per_frame * n_frames))
@@ -76,17 +80,19 @@ def simulate_unpaired(
     sigma = low * (high / low) ** np.sqrt(rng.uniform(size=n))  # more faint stars than bright ones
     true = model.predict(theta, x, y)
     has = rng.uniform(size=n) < common
-    seen = true[has] + np.hypot(sigma[has], REFERENCE_SIGMA)[:, None] * rng.standard_normal(
-        (int(has.sum()), 2)
-    )
+    matched_positions = true[has] + np.hypot(sigma[has], REFERENCE_SIGMA)[
+        :, None
+    ] * rng.standard_normal((int(has.sum()), 2))
     area = (nx + 2 * MARGIN) * (ny + 2 * MARGIN)
     m = int(rng.poisson(density * area * n_frames))
-    others = rng.uniform([0.5 - MARGIN] * 2, [nx + 0.5 + MARGIN, ny + 0.5 + MARGIN], size=(m, 2))
-    points = np.concatenate([seen, others])
+    undetected = rng.uniform(
+        [0.5 - MARGIN] * 2, [nx + 0.5 + MARGIN, ny + 0.5 + MARGIN], size=(m, 2)
+    )
+    points = np.concatenate([matched_positions, undetected])
     frames = np.concatenate([frame[has], rng.integers(n_frames, size=m)])
     shuffled = rng.permutation(len(points))
     partner = np.full(n, -1, np.int64)
-    partner[has] = np.argsort(shuffled)[: len(seen)]
+    partner[has] = np.argsort(shuffled)[: len(matched_positions)]
     names = tuple(map(str, range(n_frames)))
     return UnpairedStars(
         detections=Detections(x, y, frame, names, sigma=sigma),

@@ -1,4 +1,4 @@
-"""Sets of pairs as partitioned Parquet, with their truth."""
+"""Write simulated sets of pairs as partitioned Parquet, with their truth."""
 
 from __future__ import annotations
 
@@ -25,22 +25,23 @@ UNITS["colour"] = "mag"
 def write_wise_set(
     one: WiseSet, folder: str | os.PathLike[str], *, threads: int = 2, force: bool = False
 ) -> int:
-    """Write the pairs of a band, and their truth.
+    """Write the pairs of a band and their truth.
 
-    Chunks are made and written in as many threads as are asked for; memory is that of so many
-    chunks.  The files do not depend on their number.
+    Each thread simulates and writes one chunk at a time, so that the memory is that of `threads`
+    chunks.  The files do not depend on the number of threads.
 
     Parameters
     ----------
     one : WiseSet
     folder : path-like
-        ``w1/part-00000.parquet`` and so on hold the pairs, with columns x, y, u, v, sigma, mag,
-        colour, epoch, frame, band; ``truth/w1/`` of each pair True if it is false, in the same
-        files and rows; ``truth/w1.ecsv`` the distortion; ``truth/w1_pattern.ecsv`` the partition
-        pattern, where there is one.
+        Folder for the files.  ``w1/part-00000.parquet`` etc. contain the pairs, with columns x, y,
+        u, v, sigma, mag, colour, epoch, frame and band.  The files in ``truth/w1/`` have the same
+        rows and state whether a pair is false.  ``truth/w1.ecsv`` contains the distortion, and
+        ``truth/w1_pattern.ecsv`` the partition pattern, if any.
     threads : int, optional
+        Number of threads.
     force : bool, optional
-        Replace a set of this band.
+        True to replace an existing set of this band.
 
     Returns
     -------
@@ -50,8 +51,8 @@ def write_wise_set(
     Raises
     ------
     InputError
-        When the folders of the band are in use, or cannot be made or written; the parts that were
-        written are removed then.
+        If the folders of the band contain files already, or are not writable.  Files that were
+        written are then removed.
     """
     band = one.band.lower()
     pairs, truth = Path(folder) / band, Path(folder) / "truth" / band
@@ -75,7 +76,7 @@ def _make_empty(folder: Path, force: bool) -> None:
     for path in folder.glob("*.parquet"):
         if not force:
             raise InputError(
-                "holds Parquet files already", where=str(folder), do="choose an empty folder"
+                "contains Parquet files already", where=str(folder), do="choose an empty folder"
             )
         path.unlink()
 
@@ -87,7 +88,7 @@ def _parts(one: WiseSet, folder: Path) -> list[Path]:
 def _written(
     one: WiseSet, pairs: Path, truth: Path, pool: ThreadPoolExecutor, threads: int
 ) -> Iterator[int]:
-    """Number of false matches of each part, once it is written; `threads` parts are in work."""
+    """Write the parts in `threads` threads; yields the number of false matches of each part."""
 
     def write(k: int, path: Path) -> int:
         chunk = one.chunk(k)
@@ -144,7 +145,7 @@ def _write_truth(one: WiseSet, n_false: int, folder: Path) -> None:
 
 
 def _pattern_table(pattern: PartitionPattern) -> Table:
-    """Table of the axes and blocks; the polynomial that is subtracted is in the meta-data."""
+    """Table with one row per axis and block; the subtracted polynomial is in the metadata."""
     axis, row, column = (index.ravel() for index in np.indices(pattern.local.shape[:3]))
     table = Table(
         {
@@ -160,8 +161,8 @@ def _pattern_table(pattern: PartitionPattern) -> Table:
     for name in ("offset", "tilt_x", "tilt_y"):
         table[name].unit = "pix"
     table.meta = {
-        "offset": "at the centre of a block; tilts: the change from its centre to its edge",
-        "sign": "of the WISE position: the pattern is taken from the reference position",
+        "offset": "at the centre of a block; tilts: change from its centre to its edge",
+        "sign": "of the WISE position: the pattern is subtracted from the reference position",
         "taken_off": {
             name: values.tolist() for name, values in zip("xy", pattern.smooth, strict=True)
         },

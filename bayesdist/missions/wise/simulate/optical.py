@@ -1,7 +1,8 @@
-"""A made-up optical model, as the one that the WISE report compares its bands with.
+"""Invented optical model, similar to the one in the WISE report.
 
-Like the Code V model, turned by 270 degrees it resembles the truth (WSDC D-T033, section 4: longest
-vector 3.513 px, longest difference to W2 1.658 px); as delivered it is worse than none (section 2).
+Like the Code V model of the report it resembles the true distortion if it is rotated by 270 degrees
+(WSDC D-T033, section 4: longest vector 3.513 px, longest difference from W2 1.658 px).  Without the
+rotation it is worse than no model (section 2).
 """
 
 from __future__ import annotations
@@ -20,47 +21,48 @@ from bayesdist.utils.arrays import Float
 
 __all__ = ["DELIVERED_TURN", "optical_model", "write_optical_model"]
 
-BAND = "W2"  # whose longest differences from the optical model the made-up one has
+BAND = "W2"  # band for which the longest difference agrees with the report
 DELIVERED_TURN = 270
 QUARTERS = {0: 0, 90: 1, 180: 2, 270: 3}
 
-# A field that grows as the cube of the radius, and its direction against the radius: with W2 these
-# give the two longest vectors that the report prints.
-DIFFERENCE = 1.658  # px in the corners
+# The model is the distortion plus a field that increases as the cube of the radius.  Its amplitude
+# and its direction relative to the radius give, for W2, the two longest vectors of the report.
+DIFFERENCE = 1.658  # pixels in the corners
 DIRECTION = -1.12  # radians
 
 HISTORY = (
-    "A made-up optical model: a stand-in, not the Code V model of WISE, whose",
-    "coefficients are not published. It is the distortion of W2 plus a cubic",
-    "field, so that its longest vector, and its longest difference from W2,",
-    "are those of WSDC D-T033. It must be turned by 270 degrees to fit.",
+    "An invented optical model, not the Code V model of WISE, which has not",
+    "been published. It is the distortion of W2 plus a cubic field, so that",
+    "its longest vector, and its longest difference from W2, are those of",
+    "WSDC D-T033. It must be rotated by 270 degrees to fit.",
 )
 
 
 def optical_model(band: str = "W2", turn: int = 270) -> tuple[DistortionModel, Float]:
-    """Optical model that resembles the true distortion once it is turned.
+    """Optical model that resembles the true distortion after a rotation.
 
     Parameters
     ----------
     band : str
+        'W1' to 'W4'.
     turn : int
-        Degrees, from x towards y, by which it must be turned to fit: 0, 90, 180 or 270.  270 is the
-        model as it was delivered, 0 the model already turned.
+        Rotation in degrees, from x towards y, that the model needs to fit: 0, 90, 180 or 270.  270
+        is the model as delivered, and 0 the model after the rotation.
 
     Returns
     -------
     model : DistortionModel
     theta : ndarray, shape (D,)
-        Its parameters, without constant terms.
+        Parameters without constant terms.
 
     Raises
     ------
     InputError
-        For another angle or an unknown band.
+        If the angle or the band is invalid.
     """
     if turn not in QUARTERS:
         raise InputError(
-            f"the optical model is turned by {turn} degrees",
+            f"the optical model is rotated by {turn} degrees",
             where="turn",
             do="choose 0, 90, 180 or 270",
         )
@@ -84,21 +86,23 @@ def optical_model(band: str = "W2", turn: int = 270) -> tuple[DistortionModel, F
 
 
 def _turned_back(field: Float, terms: tuple[tuple[int, int], ...]) -> Float:
-    """Field (2, K) of Legendre products over a square, turned by -90 degrees."""
-    there = np.empty_like(field)  # at the position (-y, x)
+    """Field (2, K) of Legendre products over a square, rotated by -90 degrees."""
+    at_rotated = np.empty_like(field)  # at the position (-y, x)
     for k, (i, j) in enumerate(terms):
-        there[:, terms.index((j, i))] = (-1) ** i * field[:, k]
-    return np.stack([there[1], -there[0]])
+        at_rotated[:, terms.index((j, i))] = (-1) ** i * field[:, k]
+    return np.stack([at_rotated[1], -at_rotated[0]])
 
 
 def write_optical_model(path: Path) -> None:
-    """Write the model as it was delivered: turned by 270 degrees it resembles all bands."""
+    """Write the model as delivered; rotated by 270 degrees it resembles all bands."""
     model, theta = optical_model(BAND, DELIVERED_TURN)
     array, basis = WISE_ARRAYS[BAND], model.basis()
     forward = basis.to_monomials(theta.reshape(2, -1))
     forward[:, 1:3] -= np.eye(2)
-    forward[:, 0] = 0.0  # the rest at the reference pixel is rounding
-    a, b = (dict(zip(basis.terms, map(float, one), strict=True)) for one in forward)
+    forward[:, 0] = 0.0  # rounding errors at the reference pixel
+    a, b = (
+        dict(zip(basis.terms, map(float, coefficients), strict=True)) for coefficients in forward
+    )
     nx, ny = array.size
     sip = SipHeader(
         crpix=array.centre,

@@ -1,7 +1,7 @@
-"""Pattern in the residuals by the partition of the point-spread function.
+"""Simulated pattern in the residuals due to the partition of the point-spread function.
 
-WSDC D-T033, section 5: point sources are fitted with a template that changes from block to block of
-the array; the residuals show the blocks, 5 x 5 of them in W1 and W2, 2 x 2 in W3, none in W4.
+According to WSDC D-T033, section 5, point sources are fitted with a template that differs between
+blocks of the array.  The residuals show the blocks: 5 x 5 in W1 and W2, 2 x 2 in W3, none in W4.
 """
 
 from __future__ import annotations
@@ -15,24 +15,24 @@ from bayesdist.model import PolynomialBasis
 from bayesdist.model.grid import mesh
 from bayesdist.utils.arrays import Float
 
-BLOCKS = {"W1": 5, "W2": 5, "W3": 2}  # on each axis
+BLOCKS = {"W1": 5, "W2": 5, "W3": 2}  # per axis
 
 
 @dataclass(frozen=True, eq=False)
 class PartitionPattern:
-    """Offsets that are linear within each block and jump at its edges.
+    """Offsets that are linear within blocks and discontinuous at their edges.
 
-    `smooth` is the polynomial that is subtracted, so that the truth of the coefficients is unique:
-    over the array the pattern has no part that the polynomial could follow.
+    The polynomial `smooth` is subtracted, so that the pattern is orthogonal to polynomials and the
+    true coefficients are unique.
     """
 
     basis: PolynomialBasis
-    local: Float  # (2, k, k, 3), by axis, row, column: offset, tilts on x, y; pixels
-    smooth: Float  # (2, n_terms)
+    local: Float  # (2, k, k, 3), by axis, row and column: offset, tilt along x, along y; pixels
+    smooth: Float  # (2, n_terms), Legendre coefficients along x and y
 
     @property
     def blocks(self) -> int:
-        """Blocks on each axis."""
+        """Number of blocks per axis."""
         return self.local.shape[1]
 
     def offsets(self, x: Float, y: Float) -> Float:
@@ -55,7 +55,7 @@ class PartitionPattern:
 def partition_pattern(
     basis: PolynomialBasis, blocks: int, sigma: tuple[float, float], rng: np.random.Generator
 ) -> PartitionPattern:
-    """Pattern of so many blocks on each axis, with an rms of `sigma` pixels on x and y."""
+    """Random pattern with `blocks` blocks per axis and an rms of `sigma` pixels on x and y."""
     local = rng.standard_normal((2, blocks, blocks, 3))
     raw = PartitionPattern(basis, local, np.zeros((2, basis.n_terms)))
     x, y, weight = _nodes(basis, blocks)
@@ -70,9 +70,9 @@ def partition_pattern(
 
 
 def _nodes(basis: PolynomialBasis, blocks: int) -> tuple[Float, Float, Float]:
-    """Pixels and weights of sum 1 that integrate polynomials over all blocks exactly."""
+    """Pixels x, y, and weights with sum 1 that integrate polynomials exactly in all blocks."""
     nodes, weights = legendre.leggauss(basis.order + 1)
     within = ((np.arange(blocks)[:, None] + (nodes + 1.0) / 2.0) / blocks).ravel()
-    one = np.tile(weights / (2.0 * blocks), blocks)
+    axis_weights = np.tile(weights / (2.0 * blocks), blocks)
     nx, ny = basis.size
-    return *mesh(0.5 + nx * within, 0.5 + ny * within), np.outer(one, one).ravel()
+    return *mesh(0.5 + nx * within, 0.5 + ny * within), np.outer(axis_weights, axis_weights).ravel()

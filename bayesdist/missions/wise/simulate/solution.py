@@ -1,4 +1,4 @@
-"""Published distortion of a band as a model, and pairs with the errors of W2 that follow it."""
+"""Published distortion of a band as a model, and simulated pairs with the errors of W2."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from bayesdist.simulate.matches import Truth, simulate_matches, simulate_partiti
 from bayesdist.utils.arrays import Float
 from bayesdist.utils.quantities import Random, generator_of
 
-FAINT, BRIGHT = 14.5, 7.0
+FAINT, BRIGHT = 14.5, 7.0  # magnitude limits
 
 
 def wise_solution(band: str = "W2") -> tuple[DistortionModel, Float]:
@@ -29,13 +29,14 @@ def wise_solution(band: str = "W2") -> tuple[DistortionModel, Float]:
     Returns
     -------
     model : DistortionModel
-        Order 4; u, v are distortion-free band-frame pixels.
+        Model of order 4; u and v are in distortion-free band-frame pixels.
     theta : ndarray, shape (30,)
+        Published parameters.
 
     Raises
     ------
     InputError
-        For another band.
+        If the band is unknown.
 
     Examples
     --------
@@ -52,7 +53,7 @@ def wise_solution(band: str = "W2") -> tuple[DistortionModel, Float]:
     model = DistortionModel(4, (Chip(1, band, array.size, array.centre),))
     theta = np.empty(model.n_params)
     for axis, sip in enumerate(WISE_COEFFICIENTS[band]):
-        # SIP: the corrected offset from the reference pixel is the raw one plus the polynomial
+        # SIP: corrected offset from the reference pixel = raw offset + polynomial
         monomial = np.array(sip)
         monomial[0] += array.centre[axis]
         monomial[1 + axis] += 1.0  # the terms x and y follow the constant
@@ -61,9 +62,9 @@ def wise_solution(band: str = "W2") -> tuple[DistortionModel, Float]:
 
 
 def _errors(mag: Float) -> tuple[Float, Float]:
-    """Quoted error of a pair: a floor, and photon noise towards the faint end, in pixels."""
+    """Quoted errors of pairs in pixels: a floor, and photon noise for faint stars."""
     sigma = np.hypot(0.03, 0.12 * 10 ** (0.3 * (mag - FAINT)))
-    return sigma, 1.1 * sigma  # pairs are measured a little worse along the scan
+    return sigma, 1.1 * sigma  # errors are slightly larger along the scan
 
 
 def simulate_wise(
@@ -75,24 +76,27 @@ def simulate_wise(
     jitter: float = 0.03,
     outlier_scale: float = 1.0,
 ) -> tuple[Matches, Truth]:
-    """Pairs of WISE detections and 2MASS stars, in memory.
+    """Simulate pairs of WISE detections and 2MASS stars in memory.
 
-    All bands have the magnitudes and errors of W2; sets of full size with those of each band are
-    written by `write_wise_set`.
+    All bands have the magnitudes and errors of W2.  For sets of the published size, with the
+    magnitudes and errors of each band, use `write_wise_set`.
 
     Parameters
     ----------
     n : int
+        Number of pairs.
     band : str
+        'W1' to 'W4'.
     rng : int or numpy.random.Generator
-        Seed, or source of the random numbers.
+        Seed or random generator.
     fraction : float
         Fraction of false matches.
     jitter : float
-        Error beyond the quoted ones, in pixels: the partition of the point-spread function
-        (section 5 of the report) leaves residuals of this size.
+        Error per axis in pixels that is added in quadrature to the quoted errors.  The default is
+        the size of the residuals due to the partition of the point-spread function (section 5 of
+        the report).
     outlier_scale : float
-        Standard deviation of false matches on each axis, in pixels.
+        Standard deviation per axis of the offsets of false matches, in pixels.
 
     Returns
     -------
@@ -102,7 +106,7 @@ def simulate_wise(
     Raises
     ------
     InputError
-        For another band, and as `simulate_matches`.
+        If the band is unknown or an argument is invalid (see `simulate_matches`).
 
     Examples
     --------
@@ -113,7 +117,7 @@ def simulate_wise(
     """
     rng = generator_of(rng)
     model, theta = wise_solution(band)
-    # star counts rise as 10^(0.3 m)
+    # star counts increase as 10^(0.3 m)
     p = rng.uniform(size=n)
     low, high = 10 ** (0.3 * BRIGHT), 10 ** (0.3 * FAINT)
     mag = np.log10(low + p * (high - low)) / 0.3
@@ -140,27 +144,28 @@ def simulate_wise_partitioned(
     jitter: float = 0.03,
     outlier_scale: float = 1.0,
 ) -> Truth:
-    """Pairs of WISE detections and 2MASS stars, written to a folder of Parquet files as they come.
+    """Simulate pairs of WISE detections and 2MASS stars in a folder of Parquet files.
 
-    Up to a million pairs are those of `simulate_wise`.
+    The pairs are simulated in chunks of up to a million by `simulate_wise`.
 
     Parameters
     ----------
     folder : path-like
-        As `write_partitioned`.
+        Folder for the files; see `write_partitioned`.
     n : int, optional
+        Number of pairs.
     band, rng, fraction, jitter, outlier_scale
-        As `simulate_wise`.
+        See `simulate_wise`.
 
     Returns
     -------
     Truth
-        `false` has one byte for each pair, in the order of the files.
+        Truth, with `false` for all pairs in the order of the files.
 
     Raises
     ------
     InputError
-        As `simulate_wise` and `write_partitioned`.
+        If `simulate_wise` or `write_partitioned` raise it.
 
     Examples
     --------

@@ -1,8 +1,8 @@
-"""Magnitudes, errors and colours of the pairs of a band.
+"""Simulated magnitudes, errors and colours of the pairs of a band.
 
-Errors are set so that the mean radial residual is that of Table 5-1 of WSDC D-T033.  The report
-does not say how they depend on the magnitude: that is made up, with star counts rising as
-10^(0.3 m), a floor for bright sources and centroids of faint ones limited by the background.
+The errors give the mean radial residual in Table 5-1 of WSDC D-T033.  The report does not state
+their dependence on magnitude, which is invented: star counts increase as 10^(0.3 m), bright sources
+have a constant error, and the errors of faint sources are limited by the background.
 """
 
 from __future__ import annotations
@@ -14,48 +14,48 @@ import numpy as np
 from bayesdist.missions.wise.published import WISE_ARRAYS
 from bayesdist.utils.arrays import Bool, Float
 
-COUNTS = 0.3  # slope of the logarithm of star counts by magnitude
-REFERENCE_ARCSEC = 0.08  # 2MASS positions on each axis
+COUNTS = 0.3  # slope of the logarithm of star counts with magnitude
+REFERENCE_ARCSEC = 0.08  # error per axis of 2MASS positions
 STAR_COLOUR = (0.0, 0.15)  # mean and standard deviation, magnitudes
-RED_COLOUR = (2.5, 0.8)  # galaxies and the like that 2MASS does not list
-RED = 0.5  # fraction of them among the false matches
+RED_COLOUR = (2.5, 0.8)  # of galaxies etc. that are not in 2MASS
+RED = 0.5  # fraction of these among the false matches
 
 
 @dataclass(frozen=True)
 class Population:
-    """Paired sources of a band."""
+    """Distribution of magnitudes, errors and colours of the pairs of a band."""
 
     scale: float  # arcsec per pixel
-    bright: float  # limit of saturation, mag
-    faint: float  # limit of single exposures, about, mag
-    floor: float  # centroid error of bright sources on each axis, pixels
-    at_limit: float  # centroid error by the background at the faint limit, pixels
+    bright: float  # saturation limit, mag
+    faint: float  # approximate limit of single exposures, mag
+    floor: float  # centroid error per axis of bright sources, pixels
+    at_limit: float  # centroid error per axis due to the background at the faint limit, pixels
 
     @property
     def reference(self) -> float:
-        """Error of 2MASS positions on each axis, in pixels."""
+        """Error per axis of 2MASS positions, in pixels."""
         return REFERENCE_ARCSEC / self.scale
 
     @property
     def brightest(self) -> float:
-        """Fraction of the counts that lies beyond the bright limit."""
+        """Fraction of the star counts that is brighter than the bright limit."""
         return float(10 ** (COUNTS * (self.bright - self.faint)))
 
     def magnitudes(self, counts: Float) -> Float:
-        """Magnitudes, by the fraction of the counts that is brighter."""
+        """Magnitudes from the fraction of the star counts that is brighter."""
         return self.faint + np.log10(counts) / COUNTS
 
     def sigma(self, counts: Float) -> Float:
-        """Error of pairs on each axis, pixels, WISE's and 2MASS's together.
+        """Error per axis of pairs in pixels, for WISE and 2MASS combined.
 
-        `counts`, the fraction of the counts that is brighter, is uniform from `brightest` to 1.
+        `counts` is the fraction of the star counts that is brighter, from `brightest` to 1.
         """
-        # limited by the background: the error goes with 10^(0.4 m), which is counts^(4/3)
+        # background-limited errors are proportional to 10^(0.4 m), which is counts^(4/3)
         noise = self.at_limit * counts * np.cbrt(counts)
         return np.sqrt(noise**2 + (self.floor**2 + self.reference**2))
 
     def colours(self, false: Bool, rng: np.random.Generator) -> Float:
-        """Magnitudes (N,) at the shortest wavelength less those at the longest, of pairs.
+        """Colours (N,): magnitude at the shortest minus that at the longest wavelength.
 
         Half of the false matches are red.
         """

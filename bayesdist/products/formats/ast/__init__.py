@@ -1,1 +1,1 @@
-"""AST mappings: polynomials as text dumps, as starlink-pyast and Rubin write them."""
+"""AST mappings: polynomials as text dumps, as written by starlink-pyast and Rubin."""

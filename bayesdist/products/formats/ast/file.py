@@ -1,7 +1,7 @@
 """Text file with an AST mapping from pixels to intermediate coordinates, and its calibration.
 
-Inputs are pixels counted from 0, as in Rubin's pipelines, and outputs degrees on the tangent plane.
-Comments of the form ``# bayesdist KEY VALUE`` say more, which AST passes over.
+Inputs are pixels counted from 0, as in Rubin's pipelines, and outputs are degrees on the tangent
+plane. Comments of the form ``# bayesdist KEY VALUE``, which AST ignores, hold further information.
 """
 
 from __future__ import annotations
@@ -29,25 +29,25 @@ _BEGIN = re.compile(r"(#.*\n|\s*\n)*\s*Begin\s+\w+")
 
 @dataclass(frozen=True, eq=False)
 class AstFile:
-    """Chain of mappings in a file."""
+    """Chain of mappings stored in a file."""
 
     content: Content
     steps: tuple[Step, ...]
-    remarks: dict[str, str]  # by key, of the comments
+    remarks: dict[str, str]  # values of the bayesdist comments, by key
 
     @property
     def order(self) -> int:
-        """Order of the chain."""
+        """Total polynomial order of the chain."""
         return int(np.prod([step.poly.order for step in self.steps]))
 
     @property
     def side_file(self) -> str:
-        """Name of the file with the parameters; empty where none is named."""
+        """Name of the file with the parameters; empty if none is named."""
         return self.remarks.get("parameters", "")
 
     @property
     def size(self) -> tuple[float, float] | None:
-        """Columns and rows; None where nothing says them."""
+        """Columns and rows; None if the file does not state them."""
         return self._pair("size")
 
     def _pair(self, key: str) -> tuple[float, float] | None:
@@ -63,7 +63,7 @@ class AstFile:
         return a, b
 
     def degrees(self, x: Float, y: Float) -> tuple[Float, Float]:
-        """Intermediate coordinates (N,) of FITS 1-based pixels (N,)."""
+        """Intermediate coordinates (N,) in degrees at FITS 1-based pixels (N,)."""
         u, v = np.asarray(x, float) - 1.0, np.asarray(y, float) - 1.0
         for step in self.steps:
             u, v = step.poly.at(u, v)
@@ -71,7 +71,7 @@ class AstFile:
 
 
 def ast_of(content: Content) -> AstFile | None:
-    """Mapping of a text; None for a text of another kind."""
+    """AST mapping in a text file; None for any other content."""
     if not _BEGIN.match(content.text):
         return None
     steps = steps_of(parse_dump(content.text, content.name), content.name)
@@ -80,10 +80,10 @@ def ast_of(content: Content) -> AstFile | None:
 
 
 def ast_calibration(file: AstFile, name: str, choice: Choice) -> Calibration:
-    """Calibration of the mapping, with the covariance of the file beside it if that is there.
+    """Calibration of the mapping, with the covariance of its parameter file if that exists.
 
-    As used, nothing but the mapping counts.  MissingSizeError for files without remarks where no
-    size is chosen.
+    With ``choice.as_used``, only the mapping is used. MissingSizeError if neither the comments nor
+    `choice` give the size.
     """
     order = file.order
     if order > MAX_ORDER:
@@ -96,7 +96,7 @@ def ast_calibration(file: AstFile, name: str, choice: Choice) -> Calibration:
     unit = file.remarks.get("unit", "arcsec")
     factor = 3600.0 / float(file.remarks.get("arcsec", ARCSEC.get(unit, 1.0)))
     reference = file._pair("reference") or ((size[0] + 1) / 2, (size[1] + 1) / 2)
-    one = fitted_map(
+    chip_map = fitted_map(
         lambda x, y: factor * np.stack(file.degrees(x, y)),
         name,
         order=order,
@@ -105,13 +105,13 @@ def ast_calibration(file: AstFile, name: str, choice: Choice) -> Calibration:
         unit=unit,
     )
     kind, point = file.remarks.get("plane", "free"), file._pair("point")
-    made = calibration_of_maps(
-        {int(file.remarks.get("chip", 1)): one},
+    calibration = calibration_of_maps(
+        {int(file.remarks.get("chip", 1)): chip_map},
         name,
         plane=Plane(kind, point=point),
         numbered="chip" in file.remarks,
         notes=() if file.remarks else ("pixels are counted from 0, positions in degrees",),
     )
     if choice.as_used:
-        return made
-    return with_parameters(made, file.content.beside(file.side_file), file.side_file)
+        return calibration
+    return with_parameters(calibration, file.content.beside(file.side_file), file.side_file)

@@ -1,4 +1,4 @@
-"""Format entry of AST mappings: built as dumps, one of each chip, and checked."""
+"""Format of AST mappings, built and checked as one text dump per chip."""
 
 from __future__ import annotations
 
@@ -30,14 +30,14 @@ from bayesdist.utils.text import ascii_of
 
 
 class Settings(FormatSettings):
-    """Configuration of an AST mapping, and of its iterative inverse."""
+    """Configuration of an AST mapping and its iterative inverse."""
 
     n_iter: PositiveInt = 20
     tolerance: PositiveFloat = 1e-12
 
 
 def build(calibration: Calibration, settings: Settings, options: BuildOptions) -> tuple[Built, ...]:
-    """For each chip a mapping, and the file with its covariance."""
+    """Build for each chip the mapping and the file with its covariance."""
     if calibration.before or calibration.after:
         raise InputError(
             "a PolyMap has no look-up tables",
@@ -48,12 +48,12 @@ def build(calibration: Calibration, settings: Settings, options: BuildOptions) -
     for number in calibration.numbers:
         several = len(calibration.numbers) > 1
         name = options.named(f"ast_{number}.txt" if several else "ast.txt", several=several)
-        one = calibration.only(number, options.epoch)
+        chip_calibration = calibration.only(number, options.epoch)
         side = f"{Path(name).stem}_parameters.fits"
-        text = _text(one, settings, options.scale_arcsec, side)
+        text = _text(chip_calibration, settings, options.scale_arcsec, side)
         out += [
-            Built(side, PARAMETERS, parameters_content(one), one, number),
-            Built(name, "AST", text.encode("ascii"), one, number),
+            Built(side, PARAMETERS, parameters_content(chip_calibration), chip_calibration, number),
+            Built(name, "AST", text.encode("ascii"), chip_calibration, number),
         ]
     return tuple(out)
 
@@ -61,21 +61,21 @@ def build(calibration: Calibration, settings: Settings, options: BuildOptions) -
 def _text(
     calibration: Calibration, settings: Settings, scale_arcsec: float | None, side: str
 ) -> str:
-    """Dump of a chain: pixels from 0 to -1 .. 1 over the detector, then the polynomial."""
-    [(number, one)] = calibration.at(origin="stated").items()
-    arcsec = arcsec_per(one.unit, scale_arcsec)
-    poly = one.monomials()
+    """Dump of a chain: scaling of 0-based pixels to -1 .. 1 over the detector, and a polynomial."""
+    [(number, chip_map)] = calibration.at(origin="stated").items()
+    arcsec = arcsec_per(chip_map.unit, scale_arcsec)
+    poly = chip_map.monomials()
     require_regular(poly.linear, number)
-    nx, ny = one.basis.size
-    x, y = one.basis.reference_pixel
-    # powers of w in place of those of x - xref, where x - xref = half (w - zero)
+    nx, ny = chip_map.basis.size
+    x, y = chip_map.basis.reference_pixel
+    # convert powers of x - xref to powers of w, where x - xref = half (w - zero)
     half = np.diag([nx / 2, ny / 2])
     zero = np.array([(x - 1) * 2 / nx - 1, (y - 1) * 2 / ny - 1])
-    scaled = poly.values @ substitution(one.basis.order, half).T * arcsec / 3600.0
+    scaled = poly.values @ substitution(chip_map.basis.order, half).T * arcsec / 3600.0
     values = scaled @ _moved(poly.terms, zero).T
     rows = [(c, k, i, j) for k in (0, 1) for c, (i, j) in zip(values[k], poly.terms, strict=True)]
     remarks = {
-        "unit": one.unit,
+        "unit": chip_map.unit,
         "arcsec": repr(float(arcsec)),
         "plane": calibration.plane.kind,
         "size": f"{nx!r} {ny!r}",
@@ -113,7 +113,7 @@ def _text(
 
 
 def _moved(terms: tuple[tuple[int, int], ...], zero: Float) -> Float:
-    """Matrix (K, K) whose column k has the powers of w of term k in w - zero."""
+    """Matrix (K, K) that converts powers of w - zero (column k: term k) to powers of w."""
     index = {term: k for k, term in enumerate(terms)}
     out = np.zeros((len(terms), len(terms)))
     for k, (i, j) in enumerate(terms):
@@ -145,7 +145,7 @@ def _poly_lines(rows: list[tuple[float, int, int, int]], settings: Settings) -> 
     ]
 
 
-_SKEW = 0.5  # sine of the angle between the axes, and ratio of their scales: no camera is below
+_SKEW = 0.5  # smallest plausible sine of the angle between the axes, and ratio of their scales
 
 
 # -- checks ---------------------------------------------------------------------------------------
@@ -179,7 +179,7 @@ def _inverse(kind: str, poly: PolyMap) -> Iterator[Finding]:
 
 
 def _shape(file: AstFile) -> Iterator[Finding]:
-    """Findings on the derivatives in the middle of the detector."""
+    """Findings on the derivatives at the middle of the detector."""
     nx, ny = file.size or (2.0, 2.0)
     x, y = (nx + 1) / 2, (ny + 1) / 2
     dx, dy = np.array([[0.5, -0.5, 0.0, 0.0], [0.0, 0.0, 0.5, -0.5]])
@@ -207,7 +207,7 @@ def _shape(file: AstFile) -> Iterator[Finding]:
 
 
 def _describe(file: AstFile) -> list[str]:
-    """Lines of text on the chain of mappings, and its findings."""
+    """Lines of text on the chain of mappings, followed by its findings."""
     lines = [f"{file.content.name}: AST mapping of order {file.order}, of {len(file.steps)} steps"]
     for step in file.steps:
         text = f"  {step.kind:<9}"

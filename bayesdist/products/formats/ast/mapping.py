@@ -1,8 +1,8 @@
-"""AST's dump of an object, and the mappings that it holds.
+"""Parser of AST object dumps, and the mappings that they hold.
 
-A dump is of lines ``Begin CLASS``, ``Name = value``, ``IsA CLASS`` (what follows belongs to the
-class that is named next) and ``End CLASS``; what stands after a # is a comment, and an attribute
-whose value is an object has nothing behind its equals sign.
+A dump consists of lines ``Begin CLASS``, ``Name = value``, ``IsA CLASS`` (the lines before it
+belong to this class) and ``End CLASS``. Text after a # is a comment. If the value of an attribute
+is an object, nothing follows the equals sign.
 """
 
 from __future__ import annotations
@@ -32,19 +32,19 @@ class AstObject:
     parts: dict[str, AstObject] = field(default_factory=dict)
 
     def number(self, name: str, default: float | None = None) -> float:
-        """Number of an attribute; FormatError where it is missing or none."""
+        """Numerical value of an attribute; FormatError if it is missing or not a number."""
         text = self.values.get(name)
         if text is None and default is not None:
             return default
         try:
             return number_of(str(text).strip('"'))
         except ValueError:
-            what = "is missing" if text is None else f"is {text}, no number"
-            raise FormatError(f"{name} of the {self.kind} {what}", do="write it again") from None
+            problem = "is missing" if text is None else f"is {text}, no number"
+            raise FormatError(f"{name} of the {self.kind} {problem}", do="write it again") from None
 
 
 def parse_dump(text: str, where: str) -> AstObject:
-    """First object of a dump; FormatError where it is broken."""
+    """First object of a dump; FormatError if the dump is invalid."""
     lines = iter(enumerate(text.splitlines(), start=1))
     for _, line in lines:
         if (match := _BEGIN.match(line)) is not None:
@@ -53,7 +53,7 @@ def parse_dump(text: str, where: str) -> AstObject:
 
 
 def _object(kind: str, lines: Iterator[tuple[int, str]], where: str) -> AstObject:
-    found, waiting = AstObject(kind), ""
+    parsed, waiting = AstObject(kind), ""
     for number, line in lines:
         at = f"{where}, line {number}"
         text = line.strip()
@@ -62,15 +62,15 @@ def _object(kind: str, lines: Iterator[tuple[int, str]], where: str) -> AstObjec
         if (match := _BEGIN.match(line)) is not None:
             if not waiting:
                 raise FormatError(f"a {match[1]} belongs to nothing", where=at, do="write it again")
-            found.parts[waiting], waiting = _object(match[1], lines, where), ""
+            parsed.parts[waiting], waiting = _object(match[1], lines, where), ""
         elif (match := _END.match(line)) is not None:
             if match[1] != kind:
                 raise FormatError(f"ends a {match[1]} and not the {kind}", where=at, do="check it")
-            return found
+            return parsed
         elif (match := _VALUE.match(line)) is not None:
             waiting = match[1] if not match[2] else ""
             if match[2]:
-                found.values[match[1]] = match[2]
+                parsed.values[match[1]] = match[2]
         else:
             raise FormatError("is no line of a dump", where=at, do="write it again")
     raise FormatError(f"the {kind} does not end: the file is cut", where=where, do="fetch it again")
@@ -78,22 +78,22 @@ def _object(kind: str, lines: Iterator[tuple[int, str]], where: str) -> AstObjec
 
 @dataclass(frozen=True, eq=False)
 class PolyMap:
-    """Polynomial of two inputs to two outputs."""
+    """Polynomial from two inputs to two outputs."""
 
     rows: Float  # (N, 4): coefficient, output (1 or 2), powers of the inputs
-    inverse_rows: Float  # the same of an explicit inverse; none where there is none
+    inverse_rows: Float  # rows of an explicit inverse in the same form; empty if there is none
     iter_inverse: bool = False
     n_iter: int | None = None
     tolerance: float | None = None
 
     @property
     def order(self) -> int:
-        """Largest total power with a coefficient that is not zero, at least 1."""
+        """Largest total power with a non-zero coefficient, at least 1."""
         used = self.rows[self.rows[:, 0] != 0]
         return int(max(1, used[:, 2:].sum(axis=1).max(initial=0)))
 
     def at(self, x: Float, y: Float) -> tuple[Float, Float]:
-        """Outputs (N,) of inputs (N,)."""
+        """Outputs (N,) at inputs (N,)."""
         out = np.zeros((2, np.size(x)))
         for c, k, i, j in self.rows:
             out[int(k) - 1] += c * x ** int(i) * y ** int(j)
@@ -101,7 +101,7 @@ class PolyMap:
 
     @property
     def linear(self) -> Float:
-        """Coefficients (2, 2) of the first powers."""
+        """Coefficients (2, 2) of the linear terms."""
         out = np.zeros((2, 2))
         for c, k, i, j in self.rows:
             if i + j == 1:
@@ -118,9 +118,9 @@ class Step:
 
 
 def steps_of(found: AstObject, where: str) -> tuple[Step, ...]:
-    """Mappings of a dump, one after the other.
+    """Mappings of a dump in the order in which they are applied.
 
-    InputError for a mapping that is neither a polynomial nor linear, or is inverted.
+    InputError for a mapping that is neither polynomial nor linear, or that is inverted.
     """
     if found.values.get("Invert", "0") == "1":
         raise InputError(f"the {found.kind} is inverted", where=where, do="write it forwards")

@@ -1,4 +1,4 @@
-"""FITS header cards as they stand in a file: 80 characters each, with numbers in full precision."""
+"""FITS header cards of 80 characters, with numbers in full precision."""
 
 from __future__ import annotations
 
@@ -15,29 +15,29 @@ from bayesdist.model import LookupTable
 from bayesdist.utils.arrays import Float
 from bayesdist.utils.text import ascii_of
 
-LONGEST_KEYWORD = 8  # characters; longer ones are of ESO's convention HIERARCH
+LONGEST_KEYWORD = 8  # characters; longer keywords need ESO's HIERARCH convention
 _UNPRINTABLE = re.compile(r"[^ -~]")
-# Without one of these nothing ties pixels to a world.
+# Without one of these keywords, a header does not relate pixels to world coordinates.
 _NEEDED = re.compile(r"(CTYPE|CRVAL)\d+[A-Z]?$|A_ORDER$|(T?CTYP|TCTY|TCRVL|TCRV)\d+[A-Z]?$")
 
 
 def number_card(keyword: str, value: float | int, comment: str = "") -> str:
-    """Card of a number that reads back as the same number.
+    """Card with a number that reads back as exactly the same number.
 
-    astropy cuts numbers to 20 characters, which costs small coefficients three digits; the standard
-    (FITS 4.0, section 4.2) allows free format.
+    astropy truncates numbers to 20 characters, which loses three digits of small coefficients. The
+    standard (FITS 4.0, section 4.2) allows free format.
     """
     number = repr(int(value)) if isinstance(value, int) else repr(float(value)).upper()
     return f"{keyword:<8}= {number:>20}{' / ' + comment if comment else ''}"[:80].ljust(80)
 
 
 def ascii_card(card: str) -> str:
-    """Card that was read, as long as it was, with ? for characters that no header has."""
+    """Card with ? in place of characters that are not allowed in a header; same length."""
     return _UNPRINTABLE.sub("?", card)
 
 
 def text_card(keyword: str, value: str, comment: str = "") -> str:
-    """Card of a string, or of a COMMENT or HISTORY, in ASCII as `ascii_of` has it."""
+    """Card of a string, or of COMMENT or HISTORY, converted to ASCII by `ascii_of`."""
     value = ascii_of(value)
     if keyword in ("COMMENT", "HISTORY"):
         return f"{keyword:<8}{value}"[:80].ljust(80)
@@ -45,12 +45,12 @@ def text_card(keyword: str, value: str, comment: str = "") -> str:
 
 
 def wrapped_cards(keyword: str, lines: Iterable[str], width: int = 70) -> list[str]:
-    """Cards of a COMMENT or HISTORY, as many as each line takes; an empty line is one card."""
+    """COMMENT or HISTORY cards for wrapped lines; an empty line gives one card."""
     return [text_card(keyword, part) for line in lines for part in wrap(line, width) or [""]]
 
 
 def convergence_cards(solution: Solution) -> list[str]:
-    """Cards that tell if the posterior behind a product has converged; none for a linear fit."""
+    """Cards that state if the posterior of a product has converged; empty for a linear fit."""
     convergence = solution.convergence
     if convergence is None:
         return []
@@ -72,7 +72,7 @@ def tangent_cards(
     cd: Float,
     comment: str = "",
 ) -> list[str]:
-    """Cards of world coordinates on a tangent plane in degrees, with a comment on its type."""
+    """World-coordinate cards of a tangent plane in degrees; `comment` explains the CTYPE."""
     return [
         number_card("WCSAXES", 2),
         text_card("CTYPE1", ctype[0], comment),
@@ -99,7 +99,7 @@ def solution_cards(
     size: tuple[float, float],
     epoch: float | None = None,
 ) -> list[str]:
-    """Cards of what degrees on the sky do not tell of a solution: plane, unit, chip, date, size."""
+    """Cards on plane, unit, chip, date and size, which a header in degrees does not state."""
     dated = [] if epoch is None else [("BDEPOCH", float(epoch), "[yr] date of the coefficients")]
     return [
         text_card("BDPLANE", plane, "plane of u, v"),
@@ -113,7 +113,7 @@ def solution_cards(
 
 
 def node_cards(table: LookupTable) -> list[str]:
-    """Cards of the pixels at which the nodes of a table lie."""
+    """Cards of the linear relation between table nodes and detector pixels."""
     return [
         number_card(f"{keyword}{axis + 1}", float(value), comment)
         for axis in (0, 1)
@@ -126,9 +126,10 @@ def node_cards(table: LookupTable) -> list[str]:
 
 
 def set_text(header: fits.Header, keyword: str, value: str, comment: str = "") -> None:
-    """Set a keyword to a string, in ASCII as `ascii_of` has it.
+    """Set a keyword to a string, converted to ASCII by `ascii_of`.
 
-    All text goes into headers by this function or `text_card`: astropy refuses other characters.
+    All text must be written to headers by this function or `text_card`, because astropy rejects
+    non-ASCII characters.
     """
     set_value(header, keyword, ascii_of(value), comment)
 
@@ -136,9 +137,10 @@ def set_text(header: fits.Header, keyword: str, value: str, comment: str = "") -
 def set_value(
     header: fits.Header, keyword: str, value: str | float | bool, comment: str = ""
 ) -> None:
-    """Set a keyword; a new one goes to the end of the header.
+    """Set a keyword; a new one is appended at the end of the header.
 
-    astropy itself puts it before the comments, in a time that grows with the number of cards.
+    astropy itself inserts new keywords before the comments, which takes longer the more cards there
+    are.
     """
     if keyword in header:
         header[keyword] = value, comment
@@ -148,7 +150,7 @@ def set_value(
 
 
 def append_cards(hdu: fits.hdu.base._BaseHDU, cards: Iterable[str]) -> None:
-    """Add cards to the end of a header, numbers with all their digits."""
+    """Append cards to a header; numbers keep all their digits."""
     for card in cards:
         hdu.header.append(fits.Card.fromstring(card), end=True)
 
@@ -159,7 +161,7 @@ def keyword_of(card: str) -> str:
 
 
 def named_in(header: fits.Header, keyword: str, where: str) -> str:
-    """Name that a keyword of a file gives, empty where it is missing; FormatError if it is none."""
+    """Text value of a keyword, empty if it is missing; FormatError if it is NaN or infinite."""
     value = header.get(keyword, "")
     if isinstance(value, float) and not math.isfinite(value):
         raise FormatError(f"is {value}", where=f"{where}, keyword {keyword}", do="give a name")
@@ -172,11 +174,11 @@ def header_of(cards: Iterable[str]) -> fits.Header:
 
 
 def card_images(header: fits.Header) -> tuple[str, ...]:
-    """Cards of a header, verbatim; a long string takes several."""
+    """Cards of a header, verbatim; a long string spans several cards."""
     text = header.tostring(sep="", endcard=False, padding=False)
     return tuple(text[k : k + 80] for k in range(0, len(text), 80))
 
 
 def holds_wcs(header: fits.Header) -> bool:
-    """True where a header ties its pixels to a world."""
+    """True if a header relates its pixels to world coordinates."""
     return any(_NEEDED.match(keyword) for keyword in header)

@@ -1,9 +1,9 @@
 """World coordinates of a FITS header, reduced to a tangent plane with north up.
 
 `astropy.wcs` interprets the header: projection, axis order, units, PC, CD or CROTA2, LONPOLE and
-celestial system.  A TAN projection is brought exactly to degrees with xi to the east and eta to the
-north, about a point of the equatorial system; every other projection is refused.  What a reader
-makes of the distortion is then compared with astropy.wcs on a grid of pixels.
+celestial system. A TAN projection is converted exactly to xi (east) and eta (north) in degrees,
+around a tangent point in the equatorial system; every other projection is refused. Positions
+computed from the parsed distortion are then compared with those of astropy.wcs on a grid of pixels.
 """
 
 from __future__ import annotations
@@ -28,14 +28,14 @@ from bayesdist.utils.arrays import Float
 if TYPE_CHECKING:
     from astropy.wcs import WCS
 
-TOLERANCE_MAS = 0.01  # largest distance between positions read here and those by astropy.wcs
-_GRID = 17  # points of each axis at which these are compared
-# Look-up tables are passed on only where they are read; inverses do not change positions.
+TOLERANCE_MAS = 0.01  # largest allowed distance between positions computed here and by astropy.wcs
+_GRID = 17  # points per axis at which positions are compared
+# Look-up tables need the opened file; inverses do not change positions.
 _TABLES = re.compile(r"(D2IM\w*|CPDIS\d|CPERR\d|CQDIS\d|CQERR\d|DP\d|DQ\d)$")
-# Keywords with the square of which memory grows
+# Largest values of keywords for which astropy.wcs allocates memory that grows with their square.
 _LARGEST = {
     **dict.fromkeys(("A_ORDER", "B_ORDER", "AP_ORDER", "BP_ORDER"), MAX_ORDER),
-    "WCSAXES": 99,  # as many as keywords such as CTYPEn can number with CDi_j (FITS 4.0, 8.2)
+    "WCSAXES": 99,  # largest number of axes that CDi_j and CTYPEn can address (FITS 4.0, 8.2)
 }
 _INVERSE = re.compile(r"(AP|BP)_")
 _SAMPLE = (
@@ -52,11 +52,11 @@ HELD_PROJECTIONS = ("TAN", "TPV")
 
 @dataclass(frozen=True, eq=False)
 class TangentForm:
-    """Linear part of a header, and the way from its coordinates to a tangent plane."""
+    """Linear part of a header, and the transformation from its coordinates to a tangent plane."""
 
     wcs: WCS  # without look-up tables
-    cd: Float  # (2, 2), degrees in a pixel, along the axes of the header
-    native_turn: Float  # (2, 2), from these axes to east and north in the system of the header
+    cd: Float  # (2, 2), degrees per pixel, along the axes of the header
+    native_turn: Float  # (2, 2), from these axes to east and north in the header's celestial system
     system_turn: Float  # (2, 2), from east and north in that system to those of RA and Dec
     native_point: tuple[float, float]  # longitude and latitude of the tangent point, degrees
     point: tuple[float, float]  # RA and Dec of the tangent point, degrees
@@ -74,24 +74,25 @@ class TangentForm:
         where: str,
         opened: fits.HDUList | None = None,
     ) -> None:
-        """Compare positions with those by astropy.wcs on a grid over the image.
+        """Compare positions with those of astropy.wcs on a grid over the image.
 
         Parameters
         ----------
         positions : callable
-            Returns xi and eta (2, N) in degrees of FITS 1-based pixels x and y (N,).
+            ``positions(x, y)`` returns xi and eta (2, N) in degrees for FITS 1-based pixels (N,).
         size : tuple of float
             Columns and rows of the image.
         header : Header
+            Header of the image.
         where : str
-            Name of the file, for errors.
+            Name of the file, for error messages.
         opened : HDUList, optional
-            The file with the look-up tables of the header; without it these are left out.
+            The file with the look-up tables of the header. If None, tables are left out.
 
         Raises
         ------
         InputError
-            If they differ by more than 0.01 mas anywhere.
+            If any position differs by more than 0.01 mas.
         """
         wcs = wcs_of(
             _without(header, _INVERSE, *([_TABLES] if opened is None else [])), where, opened
@@ -120,9 +121,9 @@ def tangent_form(header: fits.Header, where: str) -> TangentForm | None:
     Parameters
     ----------
     header : Header
-        Cards of the header; its look-up tables are not looked at.
+        Header of the image; its look-up tables are ignored.
     where : str
-        Name of the file, for errors.
+        Name of the file, for error messages.
 
     Returns
     -------
@@ -135,7 +136,7 @@ def tangent_form(header: fits.Header, where: str) -> TangentForm | None:
         If the projection is not TAN, if the celestial system is neither equatorial nor galactic, or
         if astropy.wcs cannot read the header.
     FormatError
-        If CRVAL is no position, or the linear part is singular.
+        If CRVAL is not a position on the sky, or if the linear part is singular.
     """
     code = projection_code(header)
     if code and code not in HELD_PROJECTIONS:
@@ -155,7 +156,8 @@ def tangent_form(header: fits.Header, where: str) -> TangentForm | None:
     cd = np.asarray(w.get_cdelt()[:, None] * w.get_pc(), float)
     angle = np.radians(w.lonpole - 180.0)
     c, s = np.cos(angle), np.sin(angle)
-    # A native longitude phi is atan2(x, -y), and LONPOLE is that of the celestial pole.
+    # The native longitude phi is atan2(x, -y); LONPOLE is the native longitude of the celestial
+    # pole.
     native = np.array([[c, s], [-s, c]]) @ np.eye(2)[[w.lng, w.lat]]
     lon, lat = float(w.crval[w.lng]), float(w.crval[w.lat])
     _refuse_point(lon, lat, where)
@@ -166,14 +168,14 @@ def tangent_form(header: fits.Header, where: str) -> TangentForm | None:
 def refuse_singular(cd: Float, where: str) -> None:
     """Raise FormatError if the linear part (2, 2) of a header is singular.
 
-    wcslib takes a unit matrix for a row of zeros.
+    wcslib replaces a row of zeros by that of a unit matrix, so it does not notice.
     """
     if np.linalg.det(cd) == 0:
         raise FormatError(_NO_AREA, where=where, do="correct the header")
 
 
 def _refuse_point(lon: float, lat: float, where: str) -> None:
-    """Raise FormatError for degrees that are no position."""
+    """Raise FormatError if longitude and latitude are not a position on the sky."""
     if not (abs(lon) <= 360 and abs(lat) <= 90):
         raise FormatError(
             f"the plane touches the sky at ({lon:g}, {lat:g}) degrees: on no sphere",
@@ -183,7 +185,7 @@ def _refuse_point(lon: float, lat: float, where: str) -> None:
 
 
 def projection_code(header: fits.Header) -> str:
-    """Three letters of the projection as CTYPE has it, DSS for a plate solution; else empty."""
+    """Three-letter projection code in CTYPE, DSS for a plate solution, or an empty string."""
     types = [str(header.get(f"CTYPE{k}", "")).strip().upper() for k in (1, 2)]
     for text in types:
         match = re.match(r".{4}-(\w{3})(-|$)", text)
@@ -193,13 +195,13 @@ def projection_code(header: fits.Header) -> str:
 
 
 def refuse_projection(code: str, where: str) -> None:
-    """Raise the InputError of a projection that is not held."""
+    """Raise the InputError for a projection that is not supported."""
     name = _NAMES.get(code, f"{_article(code)} {code} projection")
     raise InputError(f"is {name}, and bayesdist holds TAN alone", where=where, do=_SAMPLE)
 
 
 def _article(code: str) -> str:
-    """Indefinite article of a name that is spoken letter by letter or as a word."""
+    """Indefinite article of a projection code."""
     return "an" if code[0] in "AEIO" else "a"
 
 
@@ -213,31 +215,32 @@ def _without(header: fits.Header, *patterns: re.Pattern[str]) -> fits.Header:
 
 
 def refuse_oversized(header: fits.Header, where: str) -> None:
-    """Refuse orders and axes for which astropy.wcs makes room that no header needs.
+    """Raise FormatError for orders and numbers of axes that no header needs.
 
-    It takes as much memory as the square of the number, and reads it from texts as well.
+    astropy.wcs allocates memory that grows with their square. It accepts these numbers as strings
+    as well.
     """
-    for keyword, most in _LARGEST.items():
+    for keyword, largest in _LARGEST.items():
         try:
             stated = float(str(header.get(keyword, 0)))
         except (ValueError, fits.VerifyError):
-            continue  # which astropy.wcs refuses
-        if stated > most:
+            continue  # astropy.wcs refuses it later
+        if stated > largest:
             raise FormatError(
-                f"is {stated:g}, and at most {most} is read",
+                f"is {stated:g}, and at most {largest} is read",
                 where=f"{where}, keyword {keyword}",
                 do="correct the keyword",
             )
 
 
 def wcs_of(header: fits.Header, where: str, opened: fits.HDUList | None = None) -> WCS:
-    """World coordinates by astropy.wcs; InputError if the header is refused."""
+    """WCS of a header by astropy.wcs; InputError if astropy.wcs refuses it."""
     from astropy import log
     from astropy.wcs import WCS, SingularMatrixError  # slow to import
 
     refuse_oversized(header, where)
     before = log.level
-    log.setLevel("ERROR")  # astropy remarks on CTYPE without -SIP there
+    log.setLevel("ERROR")  # astropy logs a remark on CTYPE without -SIP
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
@@ -245,7 +248,7 @@ def wcs_of(header: fits.Header, where: str, opened: fits.HDUList | None = None) 
             wcs.wcs.set()
     except SingularMatrixError as error:
         raise FormatError(_NO_AREA, where=where, do="correct the header") from error
-    except Exception as error:  # astropy.wcs raises all kinds on headers that it refuses
+    except Exception as error:  # astropy.wcs raises many kinds of exceptions
         lines = [line for line in str(error).splitlines() if not line.startswith("ERROR")]
         reason = lines[0].rstrip(".") if lines else reason_of(error)
         raise InputError(
@@ -289,7 +292,8 @@ def _from_galactic(lon: float, lat: float) -> tuple[Float, tuple[float, float]]:
     from astropy.coordinates import CartesianRepresentation, Galactic, SkyCoord
 
     axes = SkyCoord(Galactic(CartesianRepresentation(np.eye(3))))
-    matrix = np.asarray(axes.icrs.cartesian.xyz.value, float)  # columns are images of the axes
+    # columns are the galactic axes in ICRS
+    matrix = np.asarray(axes.icrs.cartesian.xyz.value, float)
     east, north, outwards = plane_axes((lon, lat))
     x, y, z = matrix @ outwards
     ra, dec = np.degrees(np.arctan2(y, x)) % 360.0, np.degrees(np.arctan2(z, np.hypot(x, y)))

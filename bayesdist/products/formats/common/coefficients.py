@@ -2,17 +2,17 @@
 
 This is the only module that knows which coefficient of a format multiplies which powers of x and y:
 
-=========  =======================  =====================================
+=========  =======================  ========================================
 format     coefficient              multiplies
-=========  =======================  =====================================
+=========  =======================  ========================================
 bayesdist  term (i, j)              x^i y^j
 SIP        A_p_q, B_p_q, AP_, BP_   x^p y^q
-IDCTAB     CXnj, CYnj               x^j y^(n-j): CX11 goes with x, CX10 with y
+IDCTAB     CXnj, CYnj               x^j y^(n-j): CX11 multiplies x, CX10 y
 SIAF       Sci2IdlXnj, Sci2IdlYnj   x^(n-j) y^j: the mirror image of IDCTAB
-=========  =======================  =====================================
+=========  =======================  ========================================
 
-x and y are pixel offsets from the reference pixel.  IDCTAB is as stwcs reads it, SIP as in Shupe et
-al. 2005 (ASP Conf. 347, 491).
+x and y are pixel offsets from the reference pixel. The IDCTAB convention is that of stwcs, the SIP
+convention that of Shupe et al. 2005 (ASP Conf. 347, 491).
 """
 
 from __future__ import annotations
@@ -35,10 +35,10 @@ SINGULAR = 1e-12  # determinant over the largest coefficient squared
 
 _IDCTAB = re.compile(r"(CX|CY|A|B)(\d)(\d)")
 _SIP = re.compile(r"(A|B|AP|BP|AE|BE)_(\d)_(\d)")
-# Starting points of the search for an extremum: the interior grid, and the best of all to refine.
+# Search for an extremum: points per axis of the starting grid, and number of points to refine.
 _GRID, _BEST = 65, 8
-_HALVINGS = 30  # of the grid's step: what is left is below rounding at a smooth maximum
-_BORDER = 2**16  # steps along an edge at most: a size may be a misprint
+_HALVINGS = 30  # of the grid step; the remaining error is below rounding at a smooth maximum
+_BORDER = 2**16  # most steps along an edge, because a stated size may be a misprint
 
 
 def idctab_column(prefix: str, i: int, j: int) -> str:
@@ -67,14 +67,14 @@ def sip_powers(keyword: str) -> tuple[str, int, int] | None:
 
 
 def coefficient_matrix(coefficients: Coefficients, order: int | None = None) -> Float:
-    """Matrix (n + 1, n + 1) whose entry [i, j] multiplies x^i y^j.
+    """Matrix (n + 1, n + 1) with element [i, j] the coefficient of x^i y^j.
 
     Terms above the total `order` are left out, as astropy.wcs does.
     """
-    kept = {k: c for k, c in coefficients.items() if order is None or sum(k) <= order}
-    n = max((max(k) for k in kept), default=0)
+    selected = {k: c for k, c in coefficients.items() if order is None or sum(k) <= order}
+    n = max((max(k) for k in selected), default=0)
     out = np.zeros((n + 1, n + 1))
-    for (i, j), c in kept.items():
+    for (i, j), c in selected.items():
         out[i, j] = c
     return out
 
@@ -82,12 +82,15 @@ def coefficient_matrix(coefficients: Coefficients, order: int | None = None) -> 
 def evaluate(
     coefficients: Coefficients, x: ArrayLike, y: ArrayLike, order: int | None = None
 ) -> Float:
-    """Values of a polynomial, without terms above the total `order`."""
+    """Values of a polynomial; terms above the total `order` are left out."""
     return polynomial_values(coefficient_matrix(coefficients, order), x, y)
 
 
 def substitution(order: int, M: Float) -> Float:
-    """Matrix (K, K) whose column k has the powers of (X, Y) of term k in (x, y) = M (X, Y)."""
+    """Matrix (K, K) that converts terms under the linear map (x, y) = M (X, Y).
+
+    Column k holds the coefficients, in powers of X and Y, of term k in powers of x and y.
+    """
     terms = polynomial_terms(order)
     index = {term: k for k, term in enumerate(terms)}
     out = np.zeros((len(terms), len(terms)))
@@ -101,13 +104,13 @@ def substitution(order: int, M: Float) -> Float:
 
 
 def propagated_sigma(jacobian: Float, cov: Float) -> Float:
-    """Standard deviations (K,) of numbers by their derivatives (K, P) and a covariance (P, P)."""
+    """Standard deviations (K,) of K quantities with this Jacobian (K, P) and covariance (P, P)."""
     variance = np.einsum("kl,lm,km->k", jacobian, cov, jacobian, optimize=True)
     return np.asarray(np.sqrt(np.maximum(variance, 0.0)))  # -1e-40 is a rounded zero
 
 
 def require_regular(linear: Float, chip: int) -> None:
-    """Refuse (DegenerateError) a linear part (2, 2) of a chip that is singular."""
+    """Raise DegenerateError if the linear part (2, 2) of a chip is singular."""
     if abs(np.linalg.det(linear)) <= SINGULAR * np.abs(linear).max() ** 2:
         raise DegenerateError(
             f"the linear part of chip {chip} is singular",
@@ -121,13 +124,19 @@ def largest_magnitude(
     y_range: tuple[float, float],
     order: int | None = None,
 ) -> float:
-    """Largest |p(x, y)| over a rectangle with its border, without terms above the total `order`.
+    """Largest |p(x, y)| over a rectangle including its border.
 
-    The border is looked at every unit step and the interior on a grid; the best points of both are
-    refined by steps that are halved, so that the result is a maximum and not a sample.
+    The border is sampled at unit steps and the interior on a grid. The best points are then refined
+    with successively halved steps, so that the result is a maximum rather than a sample.
 
-    `x_range`, `y_range`: lowest and highest values. `order`: terms above this total order are left
-    out.
+    Parameters
+    ----------
+    coefficients : mapping
+        Coefficients {(i, j): c} of x^i y^j.
+    x_range, y_range : tuple of float
+        Lowest and highest values of x and of y.
+    order : int, optional
+        Terms above this total order are left out.
     """
     c = coefficient_matrix(coefficients, order)
     low = np.array([x_range[0], y_range[0]], float)
@@ -147,7 +156,7 @@ def largest_magnitude(
 
 
 def _candidates(low: Float, high: Float) -> tuple[Float, Float]:
-    """Points of a grid over the rectangle, and at every unit step along its border."""
+    """Points on a grid over the rectangle, and at unit steps along its border."""
     gx, gy = np.meshgrid(*np.linspace(low, high, _GRID).T)
     ex, ey = (
         np.linspace(a, b, min(int(np.ceil(b - a)), _BORDER) + 1)
@@ -161,10 +170,11 @@ def _candidates(low: Float, high: Float) -> tuple[Float, Float]:
 def radial_orders(
     x: Mapping[tuple[int, int], float], y: Mapping[tuple[int, int], float]
 ) -> frozenset[int]:
-    """Orders n at which distortion along the radius gives coefficients of one value.
+    """Orders n at which the coefficients are those of a purely radial distortion.
 
-    Distortion k r^(n-1) (x, y), n odd, has k binomial((n-1)/2, j) x^(n-2j) y^2j along x, and the
-    same with x and y exchanged along y. Further terms of that order may be present.
+    A distortion k r^(n-1) (x, y), with n odd, has the coefficients k binomial((n-1)/2, j) of
+    x^(n-2j) y^2j along x, and those with x and y exchanged along y. Other terms of that order may
+    be present.
     """
     orders = {i + j for i, j in x} | {i + j for i, j in y}
     out = set()
@@ -176,7 +186,7 @@ def radial_orders(
         wanted = [comb(half, j) * k for j in range(half + 1)]
         along_x = [x.get((n - 2 * j, 2 * j), 0.0) for j in range(half + 1)]
         along_y = [y.get((2 * j, n - 2 * j), 0.0) for j in range(half + 1)]
-        both = [*along_x, *along_y]
-        if all(isclose(a, b, rel_tol=1e-9) for a, b in zip(both, 2 * wanted, strict=True)):
+        coefficients = [*along_x, *along_y]
+        if all(isclose(a, b, rel_tol=1e-9) for a, b in zip(coefficients, 2 * wanted, strict=True)):
             out.add(n)
     return frozenset(out)

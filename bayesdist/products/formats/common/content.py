@@ -1,9 +1,9 @@
-"""Content of a file: its bytes, the HDUs of a FITS file with their cards, its text.
+"""Content of a file: its bytes, the HDUs of a FITS file with their cards, and its text.
 
-Every reader uses this module, so that a file is opened once whatever its format.  Headers are often
-stored without their data, one after the other or alone: HDUs are found by their headers, and
-whether data are whole is stated.  The bytes are stored with their meaning, which makes reading and
-writing lossless.
+Every reader uses this module, so that each file is opened once whatever its format. Headers are
+often stored without their data, either several in a row or a single one. HDUs are therefore located
+by their headers, and `Hdu.state` tells if the data are complete. The bytes are kept together with
+their interpretation, which makes reading and writing lossless.
 """
 
 from __future__ import annotations
@@ -46,12 +46,12 @@ _CARD = re.compile(r"[A-Z0-9_-]{1,8} *=|(COMMENT|HISTORY| {8})")
 
 @dataclass(frozen=True, eq=False)
 class Hdu:
-    """One HDU, or the cards of one."""
+    """One HDU, or the header cards of one."""
 
     cards: tuple[str, ...]  # header cards without END, 80 characters each
-    data: bytes = b""  # as in the file, padded to whole records or not
+    data: bytes = b""  # as in the file, not necessarily padded to whole records
     number: int = 0  # index in the file, from 0
-    state: str = "whole"  # 'whole', 'none' where announced data are missing, or 'cut' within it
+    state: str = "whole"  # 'whole', 'none' if the announced data are missing, 'cut' if truncated
 
     @property
     def header(self) -> fits.Header:
@@ -65,7 +65,7 @@ class Hdu:
 
     @property
     def label(self) -> str:
-        """EXTNAME with EXTVER, as 'SCI,1'; empty where there is none."""
+        """EXTNAME with EXTVER, such as 'SCI,1'; empty if there is no EXTNAME."""
         header = self.header
         name = str(header.get("EXTNAME", "")).strip()
         return f"{name},{header.get('EXTVER', 1)}" if name else ""
@@ -77,9 +77,9 @@ class Hdu:
 
     @cached_property
     def rows(self) -> NDArray[np.void]:
-        """Rows of a binary table: native numbers, and text without trailing blanks.
+        """Rows of a binary table with native byte order and without trailing blanks in text.
 
-        FormatError when this is no binary table, or one with cards that cannot be read.
+        FormatError if this is not a binary table, or if its cards cannot be read.
         """
         if self.header.get("XTENSION", "").strip() != "BINTABLE":
             raise FormatError(f"HDU {self.name!r} is no binary table")
@@ -117,36 +117,36 @@ class Content:
 
     name: str
     raw: bytes
-    path: Path | None = None  # of a file; None in memory
-    size: int | None = None  # bytes of the file before decompression; None in memory
+    path: Path | None = None  # path of the file; None for content in memory
+    size: int | None = None  # size in bytes before decompression; None for content in memory
 
     @property
     def budget(self) -> Budget:
-        """What the file may hold."""
+        """Limits on what the file may contain."""
         return Budget(self.name, len(self.raw) if self.size is None else self.size)
 
     def beside(self, name: str) -> Content | None:
-        """Content of a file in the same folder; None in memory, or where there is none."""
+        """Content of a file in the same folder; None if there is none, or for content in memory."""
         if self.path is None or not name or Path(name).name != name:
             return None
         path = self.path.parent / name
-        return read_content(path) if os.path.lexists(path) else None  # also links to nowhere
+        return read_content(path) if os.path.lexists(path) else None  # a dangling link exists
 
     @property
     def is_fits(self) -> bool:
-        """True where it begins as a FITS file, or as an HDU of one."""
+        """True if the content begins like a FITS file or like one of its HDUs."""
         return self.raw[:9] in HDU_STARTS and b"\n" not in self.raw[:81]
 
     @cached_property
     def text(self) -> str:
-        """Text, one line below the other and without a byte order mark; empty for a FITS file."""
+        """Text with newline line ends and no byte order mark; empty for a FITS file."""
         if self.is_fits or b"\0" in self.raw[:RECORD]:
             return ""
         return self.raw.removeprefix(BOM_UTF8).decode("latin-1").replace("\r\n", "\n")
 
     @cached_property
     def hdus(self) -> tuple[Hdu, ...]:
-        """HDUs as far as they can be found, or one HDU of the cards of a text file."""
+        """HDUs as far as they can be found; for a text file of cards, one HDU with these cards."""
         if self.is_fits:
             return tuple(_walked(self.raw, self.budget))
         if not _CARD.match(self.text):
@@ -161,7 +161,7 @@ class Content:
             return (Hdu(card_images(header), state=state),)
 
     def whole(self) -> tuple[Hdu, ...]:
-        """HDUs of a FITS file that is whole; FormatError when it is none, truncated or damaged."""
+        """HDUs of a complete FITS file; FormatError if it is not FITS, truncated or damaged."""
         hdus = self.hdus if self.is_fits else ()
         if not hdus or self.raw[:9] != HDU_STARTS[0]:
             raise FormatError("is no FITS file", where=self.name, do="check the file")
@@ -178,12 +178,12 @@ class Content:
 
     @cached_property
     def tables(self) -> tuple[Hdu, ...]:
-        """HDUs of a whole FITS file; none for any other."""
+        """HDUs of a complete FITS file; empty for any other content."""
         return () if self.damage is not None or not self.is_fits else self.whole()
 
     @cached_property
     def damage(self) -> FormatError | None:
-        """Error of a file that begins as a FITS file and is not whole; None for any other."""
+        """FormatError if the content starts like FITS but is damaged, otherwise None."""
         try:
             self.whole()
         except FormatError as error:
@@ -192,7 +192,7 @@ class Content:
 
     @cached_property
     def opened(self) -> fits.HDUList | None:
-        """File by astropy, whose extensions hold tables of a distortion; None if not whole."""
+        """File opened by astropy, for extensions with distortion tables; None if incomplete."""
         if not self.is_fits or any(hdu.state != "whole" for hdu in self.hdus):
             return None
         with warnings.catch_warnings():
@@ -205,7 +205,7 @@ class Content:
 
 @contextmanager
 def readable(where: str) -> Iterator[None]:
-    """Turn any exception of a library on a damaged file into a FormatError that names the file."""
+    """Turn any exception that a library raises on a damaged file into a FormatError."""
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # of other programs' cards
@@ -221,30 +221,30 @@ def readable(where: str) -> Iterator[None]:
 
 
 def read_content(path: str | os.PathLike[str]) -> Content:
-    """Content of a file, decompressed; errors as of `read_unpacked`."""
+    """Read and decompress a file; raises the errors of `read_unpacked`."""
     raw, budget = read_unpacked(path)
     return Content(str(path), raw, Path(path), budget.size)
 
 
 def read_hdus(path: str | os.PathLike[str]) -> tuple[Hdu, ...]:
-    """HDUs of a FITS file that is whole; errors as for `read_content` and `Content.whole`."""
+    """Read the HDUs of a complete FITS file; errors as for `read_content` and `Content.whole`."""
     return read_content(path).whole()
 
 
 def fits_bytes(made: Iterable[fits.hdu.base.ExtensionHDU | fits.PrimaryHDU]) -> bytes:
-    """FITS file of HDUs that astropy made."""
+    """Bytes of a FITS file with these astropy HDUs."""
     stream = io.BytesIO()
     fits.HDUList(list(made)).writeto(stream)
     return stream.getvalue()
 
 
 def hdus_of(made: Iterable[fits.hdu.base.ExtensionHDU | fits.PrimaryHDU]) -> tuple[Hdu, ...]:
-    """HDUs that astropy made, with the bytes that it writes."""
+    """Convert astropy HDUs to `Hdu`, with the bytes that astropy writes."""
     return Content("new file", fits_bytes(made)).whole()
 
 
 def write_hdus(hdus: Iterable[Hdu], path: str | os.PathLike[str]) -> None:
-    """Write a FITS file, whole or not at all; compressed when its name ends in .gz."""
+    """Write a FITS file atomically; compressed if its name ends in .gz."""
     raw = b"".join(hdu.to_bytes() for hdu in hdus)
     if str(path).endswith(".gz"):
         raw = gzip.compress(raw, mtime=0)
@@ -253,7 +253,7 @@ def write_hdus(hdus: Iterable[Hdu], path: str | os.PathLike[str]) -> None:
 
 
 def _walked(raw: bytes, budget: Budget) -> Iterable[Hdu]:
-    """HDUs one after the other, with their data between them or not."""
+    """HDUs in the order of the file, with or without data between the headers."""
     number, at, clock = 0, 0, budget.clock()
     while raw[at : at + 9] in HDU_STARTS:
         clock()

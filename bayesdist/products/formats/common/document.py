@@ -1,8 +1,8 @@
-"""Formats, documents and findings.
+"""File formats, parsed files and findings.
 
-A format is its functions, each in a module of its own where it is long.  A file with errors has no
-calibration, and lossless reading is a property of bytes: so parsing, checks and descriptions are of
-a document, and a calibration is made from it.
+A `Format` is a record of functions: parse, describe, lint, read, build. Parsing, checks and
+descriptions work on a `Document`, because a file with errors has no valid calibration and because
+lossless reading concerns the bytes. A `Calibration` is made from a document.
 """
 
 from __future__ import annotations
@@ -23,29 +23,41 @@ from bayesdist.products.formats.common.content import Content, readable
 from bayesdist.products.formats.common.read_back import ReadBack
 
 LEVELS = ("error", "warning", "note")
-PARAMETERS = "parameters"  # kind of a file that stands beside another, with its covariance
+PARAMETERS = "parameters"  # kind of a companion file that holds the parameters and their covariance
 
 
 @dataclass(frozen=True)
 class Finding:
-    """One finding."""
+    """One finding of a format check.
 
-    # 'error': programs will fail or misplace stars; 'warning': they may; 'note': good to know
+    Parameters
+    ----------
+    level : {'error', 'warning', 'note'}
+        'error': programs will fail or misplace stars; 'warning': they may; 'note': good to know.
+    where : str
+        Keyword, column or row.
+    message : str
+        One clause.
+    """
+
     level: str
-    where: str  # keyword, column or row
-    message: str  # one clause
+    where: str
+    message: str
 
     def __str__(self) -> str:
         return f"{self.level}: {self.where}: {self.message}"
 
 
 def of_part(part: str, findings: Iterable[Finding]) -> list[Finding]:
-    """Findings in a part of a file, whose name stands before; empty for a file of one part."""
-    return [replace(one, where=f"{part}, {one.where}" if part else one.where) for one in findings]
+    """Findings with the name of the part of the file put first; unchanged if `part` is empty."""
+    return [
+        replace(finding, where=f"{part}, {finding.where}" if part else finding.where)
+        for finding in findings
+    ]
 
 
 def repeated_values(coefficients: Mapping[str, float]) -> list[tuple[str, ...]]:
-    """Groups of names whose values are equal in size and not zero.
+    """Groups of names with non-zero values of equal magnitude.
 
     Two fitted numbers never agree to the last digit: one of them has been copied over the other, as
     in tables that went through text extraction.
@@ -58,12 +70,12 @@ def repeated_values(coefficients: Mapping[str, float]) -> list[tuple[str, ...]]:
 
 
 def identity_lines(header: fits.Header) -> list[str]:
-    """Lines of text on the keywords by which a reference file is known."""
+    """Lines of text with the keywords that identify a reference file."""
     return [f"  {k:<9} {header[k]}" for k in ("DESCRIP", "USEAFTER", "PEDIGREE") if k in header]
 
 
 def missing_identity(header: fits.Header) -> list[Finding]:
-    """Findings on the keywords that a reference file should have."""
+    """Notes on missing keywords that a reference file should have."""
     message = "is missing; reference files of the observatory have it"
     keywords = ("USEAFTER", "PEDIGREE", "FILETYPE", "DESCRIP")
     return [Finding("note", keyword, message) for keyword in keywords if keyword not in header]
@@ -78,7 +90,7 @@ def finding_lines(findings: Sequence[Finding]) -> list[str]:
 
 
 class MissingSizeError(InputError):
-    """Error of a file that does not state the size of its image."""
+    """Error for a file that does not state the size of its image."""
 
 
 def required_size(
@@ -87,30 +99,39 @@ def required_size(
     name: str,
     what: str = "image",
 ) -> tuple[float, float]:
-    """Columns and rows that a file states, else those given; MissingSizeError without either."""
-    found = given if stated is None else stated
-    if found is None:
+    """Columns and rows stated by a file, or else `given`; MissingSizeError if both are None."""
+    size = given if stated is None else stated
+    if size is None:
         raise MissingSizeError(
             f"does not say how large the {what} is",
             where=name,
             do="give it (size=(NX, NY) in Python, --size NX NY on the command line)",
         )
-    return float(found[0]), float(found[1])
+    return float(size[0]), float(size[1])
 
 
 @dataclass(frozen=True)
 class Choice:
-    """Choice among the calibrations of a file, and values that the file may lack."""
+    """Selection of one calibration in a file, and values that the file may lack.
 
-    # of an IDCTAB, where names of both wheels may be joined by a comma; the band of WISE meta-data,
-    # as in "W2"
+    Parameters
+    ----------
+    filter : str, optional
+        Filter of an IDCTAB (names in two wheels may be joined by a comma), or a WISE band such as
+        "W2".
+    size : tuple of float, optional
+        Columns and rows, for a header that does not state them.
+    as_used : bool
+        True to read the file as other programs do, without its stored parameters.
+    """
+
     filter: str | None = None
-    size: tuple[float, float] | None = None  # columns and rows, for a header that lacks them
-    as_used: bool = False  # as other programs have it: without the parameters that stand beside it
+    size: tuple[float, float] | None = None
+    as_used: bool = False
 
 
 class FormatSettings(BaseModel):
-    """Configuration of a file to be built; unknown keys are errors."""
+    """Configuration of a product in one format; unknown keys are errors."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
@@ -120,18 +141,18 @@ class FormatSettings(BaseModel):
         size: tuple[float, float] | None,
         reference_pixel: tuple[float, float] | None,
     ) -> None:
-        """Refuse (ValueError) a detector that the format is not for."""
+        """Raise ValueError for a detector that the format does not support."""
 
 
 @dataclass(frozen=True)
 class BuildOptions:
-    """Options of building files of any format."""
+    """Options for building files, common to all formats."""
 
     epoch: float | None = None  # decimal years, for files that are valid at one date
-    scale_arcsec: float | None = None  # arcseconds per pixel, where configured
-    # by which pixels are corrected before the polynomials, of the detector and of the filter
+    scale_arcsec: float | None = None  # arcseconds per pixel; None if not configured
+    # look-up tables of detector and filter, which correct pixels before the polynomials
     tables: tuple[LookupTable, ...] = ()
-    file_name: str = ""  # of the file; empty for the usual name of the format
+    file_name: str = ""  # name of the file; empty for the usual name of the format
 
     def named(self, usual: str, *, several: bool = False) -> str:
         """Name of a file: the requested one, or the usual one if several files are made."""
@@ -140,59 +161,60 @@ class BuildOptions:
 
 @dataclass(frozen=True, eq=False)
 class Built:
-    """File that was built and not yet written."""
+    """File that has been built but not yet written."""
 
     file_name: str
-    kind: str  # as in summary.json
+    kind: str  # file kind as listed in summary.json
     content: bytes
-    made: Any  # source of the content, in the terms of its format
-    chip: int | None = None  # of a file of one chip
+    made: Any  # object that was written, in the class of its format
+    chip: int | None = None  # chip number of a file that holds one chip
     summary: Mapping[str, Any] = field(default_factory=dict)  # further entries of summary.json
-    warnings: tuple[str, ...] = ()  # on what programs will make of it, for the terminal
-    notes: tuple[str, ...] = ()  # good to know, such as what the settings cause
+    warnings: tuple[str, ...] = ()  # effects on programs that read the file, for the terminal
+    notes: tuple[str, ...] = ()  # useful information, such as consequences of the settings
 
 
 @dataclass(frozen=True)
 class Format:
-    """Format of files, as its functions.
+    """File format, defined by its functions.
 
     Parameters
     ----------
     key : str
-        As in the configuration and on the command line.
+        Name in the configuration and on the command line.
     title : str
-        With its article, as in "an IDCTAB".
+        Name with its article, as in "an IDCTAB".
     rank : int
-        Formats are tried in this order: the most special first.
+        Position in the order in which formats are tried; the most specific formats come first.
     parse : callable
-        From a `Content` to the parsed file; None for a file of another kind.
+        ``parse(content)`` returns the parsed file, or None if the `Content` is of another format.
     describe : callable
-        From the parsed file to lines of text, its `finding_lines` at the end.
+        ``describe(parsed)`` returns lines of text that end with the `finding_lines`.
     lint : callable, optional
-        From the parsed file to findings; of a format without checks there are none.
+        ``lint(parsed)`` returns the findings. Formats without checks omit it.
     calibration : callable, optional
-        From the parsed file, its name and a `Choice` to a `Calibration`.
+        ``calibration(parsed, name, choice)`` returns a `Calibration`; `choice` is a `Choice`.
     settings : type of FormatSettings, optional
-        Of a format that can be built.
+        Settings class of a format that can be built.
     build : callable, optional
-        From a `Calibration`, its settings and `BuildOptions` to files.
+        ``build(calibration, settings, options)`` returns the files, a tuple of `Built`.
     read_back : callable, optional
-        From files that were built, and the calibration and options that they were built from, to
-        what they say of positions, one `ReadBack` for each row of the budget.  By default they are
-        read by `calibration`, and laid on the solution.
+        ``read_back(files, calibration, options)`` evaluates files that were built from that
+        calibration with those options. It returns one `ReadBack` for each row of the error budget.
+        By default, files are read by `calibration` and aligned with the solution.
     highest_order : int
-        Of the polynomials that can be built.
+        Highest polynomial order that can be built.
     holds_tables : bool
-        True if files that are built have the look-up tables of the calibration.
+        True if files of this format can hold the look-up tables of the calibration.
     holds_time : bool
-        True if files that are built have the dependence of the calibration on time.
+        True if files of this format can hold the time dependence of the calibration.
     needs_scale : callable
-        From the settings to True if a file states angles, for which u and v in pixels need a scale.
+        ``needs_scale(settings)`` is True if the file states angles, so that u and v in pixels need
+        a pixel scale.
     asks : tuple of str
         Fields of `Choice` that `calibration` uses: "filter", "size".
     refuse : callable, optional
-        For a format without calibrations: raises the InputError that says why this file has none;
-        returns if nothing more is known than that the format has none.
+        For a format without calibrations: ``refuse(parsed, name)`` raises an InputError that
+        explains why this file has none, or returns if there is nothing specific to say.
     """
 
     key: str
@@ -217,14 +239,16 @@ class Format:
 
 @dataclass(frozen=True, eq=False)
 class Document:
-    """File whose format was recognized.
+    """File of a recognized format.
 
     Parameters
     ----------
     name : str
+        Name of the file, for messages.
     format : Format
+        Format of the file.
     holds : object
-        Parsed file, by the format's `parse`.
+        Parsed file, as returned by the format's `parse`.
     """
 
     name: str
@@ -232,22 +256,32 @@ class Document:
     holds: Any
 
     def lint(self) -> tuple[Finding, ...]:
-        """Findings in the file."""
+        """Findings of the format's checks."""
         with readable(self.name):
             return () if self.format.lint is None else tuple(self.format.lint(self.holds))
 
     def describe(self) -> str:
-        """Text on the content of the file, its findings at the end."""
+        """Text that describes the content of the file and ends with the findings."""
         with readable(self.name):
             return "\n".join(self.format.describe(self.holds))
 
     def calibration(self, choice: Choice = Choice()) -> Calibration:
-        """Calibration of the file.
+        """Calibration that the file holds.
+
+        Parameters
+        ----------
+        choice : Choice
+            Selected filter and image size, for files that need them.
+
+        Returns
+        -------
+        Calibration
+            Calibration with plausible values.
 
         Raises
         ------
         InputError
-            For a format that holds none, or whatever the format misses in the choice.
+            If the format holds no calibration, or if it needs a filter or size that `choice` lacks.
         """
         if self.format.calibration is None:
             if self.format.refuse is not None:
@@ -258,6 +292,6 @@ class Document:
                 do="give a file that holds one, such as an IDCTAB, a header or a run directory",
             )
         with readable(self.name):
-            found = self.format.calibration(self.holds, self.name, choice)
-            refuse_senseless(found)
-            return found
+            calibration = self.format.calibration(self.holds, self.name, choice)
+            refuse_senseless(calibration)
+            return calibration

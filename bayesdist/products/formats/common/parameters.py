@@ -1,15 +1,16 @@
-"""Parameters of a calibration with their covariance, as a FITS table beside any format.
+"""Parameters of a calibration and their covariance as a FITS table, for any format.
 
-Most formats have no room for a covariance.  This table has all of it, in doubles, at one date: one
-row for each Legendre coefficient, in an extension BDPARAM of the same file, or in a file of its own
-next to a text file that names it.  With X = (2 x - (NX + 1)) / NX, and Y alike, x and y in FITS
-1-based pixels, the position of a pixel is
+Most formats have no room for a covariance. This table holds the full covariance, in double
+precision, at one date. It has one row per Legendre coefficient. It is the extension BDPARAM of the
+product itself, or a FITS file in the same folder if the product is a text file, which then states
+its name. With X = (2 x - (NX + 1)) / NX, the corresponding Y, and FITS 1-based pixels x and y, the
+position of a pixel is
 
-    u = sum VALUE P_I(X) P_J(Y)    over the rows of its CHIP whose AXIS is 'u',
+    u = sum VALUE P_I(X) P_J(Y)    over the rows of its CHIP with AXIS 'u',
 
-and COV is the row of the covariance matrix, in the order of the rows.  Errors of positions that it
-does not hold stand in the header, each with BDNAMEn, BDKINDn and standard deviations BDSIGUn and
-BDSIGVn of u and v.  Look-up tables are not part of it: they stand in the file beside.
+and COV is the row of the covariance matrix, in the order of the table rows. Position errors that
+the covariance does not include are listed in the header: BDNAMEn, BDKINDn, and the standard
+deviations BDSIGUn and BDSIGVn of u and v. Look-up tables are not included; the product holds them.
 """
 
 from __future__ import annotations
@@ -31,20 +32,20 @@ from bayesdist.products.formats.common.cards import named_in, set_text, set_valu
 from bayesdist.products.formats.common.content import Content, Hdu, fits_bytes
 
 EXTENSION = "BDPARAM"
-AGREE = 1e-6  # pixels by which numbers that were printed may differ from the parameters
-_SLACK = 1e-9  # pixels: rounding of a check itself
-_GRID = 33  # points of each axis over which two calibrations are compared
+AGREE = 1e-6  # pixels; tolerance between the printed coefficients of a file and its parameters
+_SLACK = 1e-9  # pixels; rounding error of the check itself
+_GRID = 33  # grid points per axis at which two calibrations are compared
 _PLANES = ("free", "sky", "detector", "aperture")
 _ERRORS = ("covariance", "sigma", "none")
-# cards of the errors that COV does not hold, which are numbered
+# numbered header cards of the errors that COV does not include
 _FURTHER = {"name": "NAME", "kind": "KIND", "u": "SIGU", "v": "SIGV", "source": "FROM"}
 
 
 def parameters_hdu(calibration: Calibration, epoch: float | None = None) -> fits.BinTableHDU:
-    """Table of all parameters at a date, with their covariance."""
+    """Table of all parameters and their covariance at one date."""
     model = calibration.model
-    one = calibration.at_date(epoch)
-    mean, cov = np.asarray(one.solution.mean), np.asarray(one.solution.cov)
+    dated = calibration.at_date(epoch)
+    mean, cov = np.asarray(dated.solution.mean), np.asarray(dated.solution.cov)
     basis = model.basis()
     rows = [(c, a, i, j) for c in model.chips for a in "uv" for i, j in basis.terms]
     D = len(rows)
@@ -85,7 +86,7 @@ def parameters_hdu(calibration: Calibration, epoch: float | None = None) -> fits
         set_value(header, f"BDSIGV{k}", row.v, "standard deviation of v")
         set_text(header, f"BDFROM{k}", row.source)
         if row.correlation:
-            # fractions of the variance, each with its length in pixels
+            # fractions of the variance and their correlation lengths in pixels
             words = " ".join(f"{part:g}@{length:g}" for part, length in row.correlation)
             set_text(header, f"BDCORR{k}", words)
     header.add_comment("u = sum VALUE P_I(X) P_J(Y), P Legendre, X = (2 x - (NX + 1)) / NX")
@@ -93,24 +94,26 @@ def parameters_hdu(calibration: Calibration, epoch: float | None = None) -> fits
 
 
 def parameters_content(calibration: Calibration, epoch: float | None = None) -> bytes:
-    """FITS file with the table alone."""
+    """FITS file that holds only the parameter table."""
     return fits_bytes([fits.PrimaryHDU(), parameters_hdu(calibration, epoch)])
 
 
 def stored_in(content: Content) -> Hdu | None:
-    """HDU of the table in a file; None where there is none."""
+    """HDU of the parameter table in a file; None if the file has none."""
     return next((hdu for hdu in content.tables if hdu.name == EXTENSION), None)
 
 
 def stored_calibration(hdu: Hdu, name: str) -> Calibration:
-    """Calibration of a table; FormatError where it is not whole."""
+    """Calibration of a parameter table; FormatError if the table is incomplete or inconsistent."""
     header, rows = hdu.header, hdu.rows
-    where = f"{name}, extension {EXTENSION}"
+    location = f"{name}, extension {EXTENSION}"
     missing = {"CHIP", "AXIS", "I", "J", "VALUE", "COV", "NX", "NY", "XREF", "YREF"} - set(
         rows.dtype.names or ()
     )
     if missing:
-        raise FormatError(f"has no column {min(missing)}", where=where, do="write the file again")
+        raise FormatError(
+            f"has no column {min(missing)}", where=location, do="write the file again"
+        )
     first = np.unique(rows["CHIP"], return_index=True)[1]
     chips = tuple(
         Chip(int(r["CHIP"]), str(r["CHIP"]), (float(r["NX"]), float(r["NY"])),
@@ -119,36 +122,36 @@ def stored_calibration(hdu: Hdu, name: str) -> Calibration:
     )  # fmt: skip
     model = DistortionModel(int(header["BDORDER"]), chips, str(header["BDUNIT"]), None)
     expected = [(c.number, a, *t) for c in chips for a in "uv" for t in model.basis().terms]
-    found = [(int(r["CHIP"]), str(r["AXIS"]), int(r["I"]), int(r["J"])) for r in rows]
+    stored_terms = [(int(r["CHIP"]), str(r["AXIS"]), int(r["I"]), int(r["J"])) for r in rows]
     cov = np.asarray(rows["COV"], float).reshape(len(rows), -1)
-    if found != expected or cov.shape[0] != cov.shape[1]:
+    if stored_terms != expected or cov.shape[0] != cov.shape[1]:
         raise FormatError(
-            "has not the rows of its order and chips", where=where, do="write the file again"
+            "has not the rows of its order and chips", where=location, do="write the file again"
         )
     mean = np.asarray(rows["VALUE"], float)
     if not (np.isfinite(mean).all() and np.isfinite(cov).all()):
-        raise FormatError("holds numbers that are not finite", where=where, do="check the file")
+        raise FormatError("holds numbers that are not finite", where=location, do="check the file")
     kind, errors = str(header.get("BDPLANE", "free")), str(header.get("BDERROR", "covariance"))
     if kind not in _PLANES or errors not in _ERRORS:
-        raise FormatError(f"is of a plane {kind!r}", where=where, do="write the file again")
+        raise FormatError(f"is of a plane {kind!r}", where=location, do="write the file again")
     point = (float(header["BDTAN1"]), float(header["BDTAN2"])) if "BDTAN1" in header else None
     scale = float(header["BDSCALE"]) if "BDSCALE" in header else None
     return Calibration(
         name,
         GaussianSolution(model, mean, cov),
         plane=Plane(kind, point=point),
-        detector=named_in(header, "DETECTOR", where),
-        filter=named_in(header, "FILTER", where),
+        detector=named_in(header, "DETECTOR", location),
+        filter=named_in(header, "FILTER", location),
         errors=errors,
         numbered=bool(header.get("BDNUMB", True)),
         scale=scale,
         scale_from="" if scale is None else EXTENSION,
-        further=further_from(_further(header), where),
+        further=further_from(_further(header), location),
     )
 
 
 def _further(header: fits.Header) -> list[dict[str, Any]]:
-    """Errors beside the covariance, by their cards."""
+    """Errors that the covariance does not include, read from the numbered header cards."""
     out: list[dict[str, Any]] = []
     while f"BDNAME{len(out) + 1}" in header:
         k = len(out) + 1
@@ -160,14 +163,14 @@ def _further(header: fits.Header) -> list[dict[str, Any]]:
 
 
 def largest_difference(a: Calibration, b: Calibration, number: int, nodes: int = _GRID) -> float:
-    """Largest distance over a chip of positions by two calibrations in one unit, pixels."""
+    """Largest distance between the positions of two calibrations over a chip, in pixels."""
     x, y = detector_grid(a.model.chips[a.model.chip_code(number)].size, nodes)
     far = np.hypot(*(a.forward(x, y, chip=number) - b.forward(x, y, chip=number)).T)
     return float(far.max() / np.sqrt(abs(np.linalg.det(a.chip(number).linear))))
 
 
 def refuse_other(far: float, most: float, where: str) -> None:
-    """Refuse parameters from which a file that was read is farther than `most` pixels."""
+    """Raise FormatError if a file differs from its parameters by more than `most` pixels."""
     if not far <= most:
         raise FormatError(
             f"the parameters beside it are off by {far:.2g} pixels: one of the two was changed",
@@ -177,9 +180,9 @@ def refuse_other(far: float, most: float, where: str) -> None:
 
 
 def agreeing(stored: Calibration, read: Calibration) -> Calibration:
-    """Stored calibration, after a check that a file that was read says the same.
+    """Stored calibration, after checking that the calibration read from the product agrees.
 
-    FormatError where chips or unit are others, or positions differ.
+    FormatError if chips or units differ, or if positions differ by more than `AGREE` pixels.
     """
     chips = [(c.number, c.size) for c in stored.model.chips]
     if chips != [(c.number, c.size) for c in read.model.chips] or stored.unit != read.unit:
@@ -194,7 +197,7 @@ def agreeing(stored: Calibration, read: Calibration) -> Calibration:
 
 
 def refuse_changed(off: float, header: fits.Header, where: str) -> None:
-    """Refuse tables that are farther from the parameters of their file than its header states."""
+    """Raise FormatError if tables differ from the parameters by more than the header states."""
     if not off <= 1.5 * float(header.get("BDWORST", 0.0)) + _SLACK:
         raise FormatError(
             f"its tables are off by {off:.2g} pixels from its parameters: one was changed",
@@ -209,10 +212,18 @@ def with_parameters(
     named: str,
     agree: Callable[[Calibration, Calibration], Calibration] = agreeing,
 ) -> Calibration:
-    """Calibration with the parameters that a content holds, after a check that the two agree.
+    """Calibration with the parameters stored in `content`, after checking that they agree.
 
-    `named` is the file in which they should be: without it a note says that they are not here.
-    `agree` makes of the stored and the found calibration the one that is meant, or FormatError.
+    Parameters
+    ----------
+    found : Calibration
+        Calibration read from the product without its stored parameters.
+    content : Content or None
+        File that may hold the parameter table.
+    named : str
+        Name of the file that should hold the parameters. If it is missing, a note says so.
+    agree : callable
+        ``agree(stored, found)`` returns the calibration to use, or raises FormatError.
     """
     hdu = None if content is None else stored_in(content)
     if hdu is not None:

@@ -1,4 +1,4 @@
-"""Positions by files as they were written, to be compared with the solution they were made from."""
+"""Positions computed from written files, for comparison with the solution they were made from."""
 
 from __future__ import annotations
 
@@ -16,25 +16,24 @@ Positions = Callable[[Float, Float, int, float | None], Float]
 
 @dataclass(frozen=True, eq=False)
 class ReadBack:
-    """What a file says of pixels, by what its bytes hold."""
+    """Positions that a file yields when its bytes are read back."""
 
-    file: str  # name of the file, or of several that belong together
-    forward: Positions  # of pixels x and y (N,), the number of a chip and a date: positions (N, 2)
-    # of the same: where forward and back leads, less the pixel (N, 2); None for a file without
-    # inverse
+    file: str  # name of the file, or of several files that form one product
+    forward: Positions  # (x (N,), y (N,), chip number, date) -> positions (N, 2)
+    # same arguments -> error (N, 2) of the pixel after forward and inverse; None without an inverse
     missed: Positions | None = None
-    # whether the file lies along axes of its own and counts in a unit of its own, so that shift,
-    # rotation and scale are no errors of it. Otherwise positions are along u, v and in their unit
+    # True if the file has separate axes and unit, so that shift, rotation and scale do not
+    # count as errors; otherwise positions are along u, v in their unit
     own_axes: bool = False
 
 
 def by_calibrations(
     file: str, sets: Sequence[Calibration], time: TimeDependence | None
 ) -> ReadBack:
-    """Positions by the calibrations of a file, along axes of its own.
+    """Positions by the calibrations of a file that defines separate axes.
 
-    `sets`: one, or one for each segment of the drift. `time`: of the solution that the file was
-    made from.
+    `sets` holds one calibration, or one per segment of the drift. `time` is the time dependence of
+    the solution that the file was made from.
     """
 
     def of(epoch: float | None) -> Calibration:
@@ -47,15 +46,17 @@ def by_calibrations(
         return chip if chip in one.numbers or len(one.numbers) > 1 else one.numbers[0]
 
     def forward(x: Float, y: Float, chip: int, epoch: float | None) -> Float:
-        one = of(epoch)
-        # a file without drift would refuse a date
-        return one.forward(x, y, chip=within(one, chip), epoch=epoch if one.model.time else None)
+        calibration = of(epoch)
+        # a calibration without drift does not accept a date
+        return calibration.forward(
+            x, y, chip=within(calibration, chip), epoch=epoch if calibration.model.time else None
+        )
 
     def missed(x: Float, y: Float, chip: int, epoch: float | None) -> Float:
-        one = of(epoch)
-        its = within(one, chip)
-        about_zero = one.at(origin="chip")[its]  # at the reference date, for which the rows are
-        back = one.inverses[its].pixels(*about_zero.at(x, y))
+        calibration = of(epoch)
+        number = within(calibration, chip)
+        about_zero = calibration.at(origin="chip")[number]  # at the date of the inverse rows
+        back = calibration.inverses[number].pixels(*about_zero.at(x, y))
         return np.stack([back[0] - x, back[1] - y], axis=-1)
 
     inverses = all(one.inverses for one in sets)
@@ -63,10 +64,7 @@ def by_calibrations(
 
 
 def of_chips(parts: Mapping[int, ReadBack]) -> ReadBack:
-    """Positions by several files of one format, each of some chips, as by one file.
-
-    `parts`: by the number of the chip.
-    """
+    """Combine files of one format that hold different chips; `parts` maps chip numbers to files."""
 
     def forward(x: Float, y: Float, chip: int, epoch: float | None) -> Float:
         return parts[chip].forward(x, y, chip, epoch)
@@ -75,11 +73,11 @@ def of_chips(parts: Mapping[int, ReadBack]) -> ReadBack:
         return back[chip](x, y, chip, epoch)
 
     each = parts.values()
-    back = {n: one.missed for n, one in parts.items() if one.missed is not None}
-    names = dict.fromkeys(one.file for one in each)
+    back = {n: part.missed for n, part in parts.items() if part.missed is not None}
+    names = dict.fromkeys(part.file for part in each)
     return ReadBack(
         ", ".join(names),
         forward,
         missed if len(back) == len(parts) else None,
-        own_axes=any(one.own_axes for one in each),
+        own_axes=any(part.own_axes for part in each),
     )

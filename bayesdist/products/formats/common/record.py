@@ -1,7 +1,7 @@
 """Calibration of one chip at one date as a record of names, numbers and arrays, and back.
 
-It stands in a file beside what a pipeline reads, and holds what that cannot: the parameters as they
-were fitted, their covariance, what fixes the gauge, and where they are from.
+The record is stored in a file in addition to what a pipeline reads. It holds what the pipeline's
+format cannot: the fitted parameters, their covariance, the choice of gauge, and the provenance.
 """
 
 from __future__ import annotations
@@ -64,7 +64,7 @@ class _Provenance(BaseModel):
 
 
 class _Record(BaseModel):
-    """A record as it is read; what else it has is for people."""
+    """Fields of a record that are read; its other fields are for human readers."""
 
     parameters: _Parameters
     gauge: str
@@ -88,10 +88,10 @@ def at_date(
     *,
     where: str,
 ) -> Calibration:
-    """Calibration of one chip at one date, in arcseconds, with the tables of that chip.
+    """Calibration of one chip at one date, in arcsec, with the look-up tables of that chip.
 
-    InputError, that names the configuration `where`, for u, v in pixels without a scale, a date
-    that is missing, and tables behind the polynomial.
+    InputError, which names the configuration section `where`, if u and v are in pixels and no scale
+    is given, if a date is missing, or if there are look-up tables after the polynomial.
     """
     if calibration.model.time is not None and epoch is None and calibration.reference_date is None:
         raise InputError(
@@ -114,13 +114,13 @@ def at_date(
         )
     date = epoch if calibration.model.time is not None else None
     factor = arcsec_per(unit, scale_arcsec)
-    made = in_arcsec(calibration.only(chip, date), factor)
-    known = calibration.model.chips[calibration.model.chip_code(chip)]
-    model = replace(made.model, chips=(known,))  # with its name
+    converted = in_arcsec(calibration.only(chip, date), factor)
+    named_chip = calibration.model.chips[calibration.model.chip_code(chip)]
+    model = replace(converted.model, chips=(named_chip,))  # keep the name of the chip
     return replace(
-        made,
-        solution=GaussianSolution(model, made.solution.mean, made.solution.cov),
-        before=tuple(t for t in made.before if t.filter in ("", calibration.filter)),
+        converted,
+        solution=GaussianSolution(model, converted.solution.mean, converted.solution.cov),
+        before=tuple(t for t in converted.before if t.filter in ("", calibration.filter)),
     )
 
 
@@ -133,7 +133,8 @@ def record_of(
 ) -> dict[str, Any]:
     """Record of a calibration of one chip at one date.
 
-    `source` is what it was made from; `closure` the largest error of the inverse, pixels.
+    `source` is the calibration that it was made from, and `closure` the largest error of the
+    inverse in pixels.
     """
     model, plane = calibration.model, calibration.plane
     [chip] = model.chips
@@ -185,7 +186,7 @@ def record_of(
 
 
 def _gauge(source: Calibration) -> str:
-    """Sentence on what the covariance holds of position and orientation."""
+    """Sentence that states whether the covariance includes errors of position and orientation."""
     orientation = source.plane.orientation
     if orientation is not None:
         return f"Oriented by {orientation.source}; the error of that is in the covariance."
@@ -211,66 +212,69 @@ def _table_entry(table: LookupTable) -> dict[str, Any]:
 def calibration_from(
     record: Mapping[str, Any], name: str, table_values: Sequence[Float] = ()
 ) -> Calibration:
-    """Calibration of a record, whose tables have these values (2, ny, nx) in their order.
+    """Calibration of a record; `table_values` (2, ny, nx) are its look-up tables in order.
 
-    FormatError for a record of another version, or one that lacks a part.
+    FormatError for a record of another version or with missing parts.
     """
-    where = f"{name}, bayesdist"
+    location = f"{name}, bayesdist"
     if record.get("version") != VERSION:
         raise FormatError(
             f"the record is of version {record.get('version')}, and {VERSION} is read here",
-            where=where,
+            where=location,
             do="use the version of bayesdist that wrote it",
         )
-    known = model_of(_RECORD, record, where, do="fetch the file again")
-    given, chip = known.parameters, known.chip
+    stored = model_of(_RECORD, record, location, do="fetch the file again")
+    parameters, chip = stored.parameters, stored.chip
     number = 1 if chip.number is None else chip.number
     model = DistortionModel(
-        given.order, (Chip(number, chip.name, chip.size, chip.reference_pixel),), given.unit
+        parameters.order,
+        (Chip(number, chip.name, chip.size, chip.reference_pixel),),
+        parameters.unit,
     )
-    mean = np.array(given.values, float)
+    mean = np.array(parameters.values, float)
     cov = np.zeros((model.n_params, model.n_params))
-    if known.errors != "none":
-        cov = np.array(known.covariance, float)
+    if stored.errors != "none":
+        cov = np.array(stored.covariance, float)
     if mean.shape != (model.n_params,) or cov.shape != (model.n_params,) * 2:
         raise FormatError(
             f"{mean.size} parameters and a covariance of {' x '.join(map(str, cov.shape))} do not "
             f"go with order {model.order}",
-            where=where,
+            where=location,
             do="fetch the file again",
         )
     tables = tuple(
-        LookupTable(number, values, one.filter, one.first, one.step, one.sigma)
-        for one, values in zip(known.tables, table_values, strict=True)
+        LookupTable(number, values, table.filter, table.first, table.step, table.sigma)
+        for table, values in zip(stored.tables, table_values, strict=True)
     )
-    source = known.provenance
+    source = stored.provenance
     return Calibration(
         name,
         GaussianSolution(model, mean, cov),
-        Plane(**known.plane.model_dump()),
+        Plane(**stored.plane.model_dump()),
         instrument=source.instrument,
         detector=source.detector,
         filter=source.filter,
-        errors=known.errors,
+        errors=stored.errors,
         numbered=chip.number is not None,
         before=tables,
         notes=(*source.notes, *(["has not converged"] if source.converged is False else [])),
-        further=further_from(known.further_errors, where),
+        further=further_from(stored.further_errors, location),
     )
 
 
 def error_lines(
     read: Callable[[], Calibration] | None, source: str, more: Callable[[], list[str]] = list
 ) -> list[str]:
-    """Lines of text on the errors of a record, by what reads it; None where there is no record.
+    """Lines of text on the errors that a record states.
 
-    `more`: further lines, of a record that can be read.
+    `read` returns the calibration of the record; it is None if there is no record. `more` returns
+    further lines, which are added if the record can be read.
     """
     if read is None:
         return ["  errors    none stated"]
     try:
-        found = read()
-        [chip] = found.by_chip().values()
+        calibration = read()
+        [chip] = calibration.by_chip().values()
         cov = chip.covariance_at(*detector_grid(chip.basis.size, 65))
     except BayesdistError:
         return [f"  errors    of {source} that cannot be read"]
@@ -278,7 +282,7 @@ def error_lines(
         return ["  errors    none stated", *more()]
     sigma = 1e3 * np.sqrt((cov[:, 0, 0] + cov[:, 1, 1]) / 2)
     return [
-        f"  errors    {found.errors}: {np.median(sigma):.3g} mas per axis at the median, "
+        f"  errors    {calibration.errors}: {np.median(sigma):.3g} mas per axis at the median, "
         f"{sigma.max():.3g} at worst",
         *more(),
     ]

@@ -1,1 +1,1 @@
-"""Look-up tables by CPDIS and DP records, of FITS WCS Paper IV."""
+"""Look-up tables with CPDIS and DP records (FITS WCS Paper IV)."""

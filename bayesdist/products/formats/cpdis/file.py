@@ -1,11 +1,11 @@
-"""Images whose headers name look-up tables: CPDISi = 'LOOKUP' with DPi records.
+"""Images with look-up tables in their headers: CPDISi = 'LOOKUP' with DPi records.
 
     p' = p + (table 1, table 2)(p),    (x, y) = CD (p' - CRPIX)
 
-with tables in pixels, which are extensions WCSDVARR of the same file; node k (from 1) of axis a
-lies at pixel CRVALa + (k - CRPIXa) CDELTa.  A file of ours has in addition, where no consumer
-looks: extensions WCSDVERR, standard errors of the nodes, and BDPARAM, the parameters with their
-covariance.
+The tables are in pixels and are stored in extensions WCSDVARR of the same file. Node k (from 1) of
+axis a is at pixel CRVALa + (k - CRPIXa) CDELTa. Files written by bayesdist have further extensions,
+which other programs ignore: WCSDVERR with the standard errors of the nodes, and BDPARAM with the
+parameters and their covariance.
 """
 
 from __future__ import annotations
@@ -43,8 +43,8 @@ class CpdisImage:
     """Image with look-up tables."""
 
     hdu: Hdu
-    tables: dict[tuple[str, int], Hdu]  # of the file, by EXTNAME and EXTVER
-    place: int  # among the images of the file, from 1
+    tables: dict[tuple[str, int], Hdu]  # table extensions of the file, by EXTNAME and EXTVER
+    place: int  # position among the images of the file, from 1
     where: str  # for messages
 
     @cached_property
@@ -54,26 +54,26 @@ class CpdisImage:
 
     @property
     def number(self) -> int:
-        """Number of the chip; its place where nothing says it."""
+        """Chip number; the position of the image in the file if the header does not state it."""
         return next(
             (int(self.header[k]) for k in ("BDCHIP", "CCDCHIP") if k in self.header), self.place
         )
 
     def function(self, axis: int) -> str:
-        """CPDIS of an axis (1 or 2), in capitals; empty where there is none."""
+        """CPDIS of an axis (1 or 2), in capitals; empty if there is none."""
         return str(self.header.get(f"CPDIS{axis}", "")).strip().upper()
 
     def version(self, axis: int) -> int:
-        """EXTVER of the table of an axis; 1 where no record says it, as for astropy.wcs."""
+        """EXTVER of the table of an axis; 1 if no record states it, as in astropy.wcs."""
         return int(self.header.get(f"DP{axis}.EXTVER", 1))
 
     def axes(self, axis: int) -> tuple[int | None, ...]:
-        """Image axes of the table's, by the records; None where one is missing."""
-        found = (self.header.get(f"DP{axis}.AXIS.{k}") for k in (1, 2))
-        return tuple(None if value is None else int(value) for value in found)
+        """Image axes that the axes of the table correspond to; None for a missing record."""
+        stated = (self.header.get(f"DP{axis}.AXIS.{k}") for k in (1, 2))
+        return tuple(None if value is None else int(value) for value in stated)
 
     def plane(self, axis: int) -> TablePlane | None:
-        """Table of an axis; None where there is no such function, or no extension."""
+        """Table of an axis; None if there is no LOOKUP function or no extension."""
         if self.function(axis) != "LOOKUP":
             return None
         version = self.version(axis)
@@ -81,7 +81,7 @@ class CpdisImage:
         return None if hdu is None else TablePlane(hdu, TABLES, f"{self.where}, {TABLES},{version}")
 
     def table(self) -> LookupTable:
-        """Tables of both axes; FormatError where they cannot be read."""
+        """Tables of both axes; FormatError if they cannot be read."""
         planes = [self.plane(axis) for axis in (1, 2)]
         for axis, plane in enumerate(planes, start=1):
             function = self.function(axis)
@@ -100,15 +100,15 @@ class CpdisImage:
                     f"the records DP{axis}.AXIS are {self.axes(axis)}, which not all programs read",
                     where=self.where, do="write the table with axes 1, 2",
                 )  # fmt: skip
-        there = [p for p in planes if p is not None]
-        if not all(np.isfinite(plane.values).all() for plane in there):
+        present = [p for p in planes if p is not None]
+        if not all(np.isfinite(plane.values).all() for plane in present):
             raise FormatError(
                 "has nodes that are not finite", where=self.where, do="give the whole file"
             )
-        first = there[0]
-        for other in there[1:]:
-            same = (first.values.shape, first.first, first.step)
-            if (other.values.shape, other.first, other.step) != same:
+        first = present[0]
+        for second in present[1:]:
+            grid = (first.values.shape, first.first, first.step)
+            if (second.values.shape, second.first, second.step) != grid:
                 raise FormatError(
                     "the tables of the two axes are on different grids", where=self.where,
                     do="give both on one grid",
@@ -119,7 +119,7 @@ class CpdisImage:
         return LookupTable(self.number, np.stack(values), first=first.first, step=first.step)
 
     def _dropped(self, axis: int) -> bool:
-        """True where astropy.wcs leaves a table out."""
+        """True if astropy.wcs ignores the table because its CPERR is negative."""
         return float(self.header.get(f"CPERR{axis}", 0.0)) < 0
 
     @property
@@ -153,12 +153,12 @@ class CpdisImage:
 
     @property
     def note(self) -> str:
-        """Why there is no tangent form although the axes are celestial; empty if there is one."""
+        """Reason why celestial axes have no tangent form; empty if they have one."""
         return self._form[1]
 
     @property
     def cd(self) -> Float:
-        """Degrees of u and v in a pixel (2, 2)."""
+        """Degrees of u and v per pixel (2, 2)."""
         if self.form is not None:
             return np.asarray(self.form.turn @ self.form.cd)
         units = [str(self.header.get(f"CUNIT{k}", "deg")).strip() for k in (1, 2)]
@@ -174,7 +174,7 @@ class CpdisImage:
         return Plane("sky", point=self.form.point)
 
     def check(self, opened: fits.HDUList | None, size: tuple[float, float]) -> None:
-        """Compare positions with those by astropy.wcs; InputError if they differ."""
+        """Compare positions with those of astropy.wcs; InputError if they differ."""
         if self.form is None:
             return
         table, cd, crpix = self.table(), self.cd, np.array(self.crpix)[:, None]
@@ -187,7 +187,7 @@ class CpdisImage:
 
 @dataclass(frozen=True, eq=False)
 class CpdisFile:
-    """File with such images."""
+    """File of images with CPDIS look-up tables."""
 
     content: Content
     images: tuple[CpdisImage, ...]
@@ -199,7 +199,7 @@ class CpdisFile:
 
 
 def cpdis_of(content: Content) -> CpdisFile | None:
-    """Images of a content; None where there is none, or SIP or TPV beside the tables."""
+    """CPDIS images of a file; None if there are none, or if the file also has SIP or TPV terms."""
     hdus = content.hdus
     mine = [hdu for hdu in hdus if {"CPDIS1", "CPDIS2"} & set(hdu.header)]
     if not mine or any("A_ORDER" in hdu.header for hdu in mine):
@@ -219,11 +219,11 @@ def cpdis_of(content: Content) -> CpdisFile | None:
 
 
 def cpdis_calibration(file: CpdisFile, name: str, choice: Choice) -> Calibration:
-    """Calibration of the tables and linear parts; of a file of ours the one it was made from.
+    """Calibration of the tables and linear parts, or the stored calibration of a bayesdist file.
 
-    As used, nothing but header and tables counts.  MissingSizeError for headers without a size
-    where none is chosen; FormatError for tables that cannot be read, or that differ from the
-    parameters in the file.
+    With ``choice.as_used``, only header and tables are used. MissingSizeError if neither the header
+    nor `choice` gives the size; FormatError if tables cannot be read or differ from the stored
+    parameters.
     """
     first = file.images[0]
     unit = str(first.header.get("BDUNIT", "arcsec"))
@@ -233,11 +233,13 @@ def cpdis_calibration(file: CpdisFile, name: str, choice: Choice) -> Calibration
         raise InputError(
             "its images touch the sky at different points", where=name, do="give one by itself"
         )
-    maps = {one.number: _linear(one, name, choice.size, unit, factor) for one in file.images}
+    maps = {
+        picture.number: _linear(picture, name, choice.size, unit, factor) for picture in file.images
+    }
     for image in file.images:
         image.check(file.content.opened, required_size(image.size, choice.size, name))
     tables = tuple(image.table() for image in file.images)
-    found = calibration_of_maps(
+    calibration = calibration_of_maps(
         maps,
         name,
         plane=first.plane_of_sky,
@@ -246,14 +248,14 @@ def cpdis_calibration(file: CpdisFile, name: str, choice: Choice) -> Calibration
     )
     hdu = stored_in(file.content)
     if hdu is None or choice.as_used:
-        return found
-    return _of_ours(file, stored_calibration(hdu, name), found)
+        return calibration
+    return _of_ours(file, stored_calibration(hdu, name), calibration)
 
 
 def _linear(
     image: CpdisImage, name: str, given: tuple[float, float] | None, unit: str, factor: float
 ) -> ChipMap:
-    """Map of one image without its tables, `factor` of the unit in a degree."""
+    """Map of one image without its tables; `factor` is the size of a degree in `unit`."""
     cd, crpix = factor * image.cd, image.crpix
     return fitted_map(
         lambda x, y: cd @ np.stack([x - crpix[0], y - crpix[1]]),
@@ -267,7 +269,7 @@ def _linear(
 
 
 def _of_ours(file: CpdisFile, stored: Calibration, found: Calibration) -> Calibration:
-    """Stored calibration, after a check of the tables; what else these have is its own table."""
+    """Stored calibration, with its look-up tables taken from the file, or after a check of them."""
     header = file.images[0].header
     if header.get("BDTABLES", False) and stored.model.order == 1:
         return replace(stored, before=found.before)
@@ -280,7 +282,7 @@ def _of_ours(file: CpdisFile, stored: Calibration, found: Calibration) -> Calibr
 
 
 def _rest(stored: Calibration, found: Calibration, table: LookupTable) -> LookupTable:
-    """Table of what the polynomial leaves at the nodes, in the unit of the plane."""
+    """Table of the residuals of the polynomial at the nodes, in the unit of the plane."""
     x, y = (v.ravel() for v in np.meshgrid(*table.nodes()))
-    rest = found.forward(x, y, chip=table.chip) - stored.forward(x, y, chip=table.chip)
-    return replace(table, values=rest.T.reshape(2, *table.shape))
+    residual = found.forward(x, y, chip=table.chip) - stored.forward(x, y, chip=table.chip)
+    return replace(table, values=residual.T.reshape(2, *table.shape))

@@ -1,4 +1,4 @@
-"""Format entry of look-up tables by CPDIS and DP records, built on nodes as fine as asked for."""
+"""Format of images with CPDIS look-up tables, built on a grid as fine as requested."""
 
 from __future__ import annotations
 
@@ -37,21 +37,22 @@ from bayesdist.products.formats.cpdis.lint import lint_cpdis
 from bayesdist.products.formats.sip.format import describe_wcs
 from bayesdist.utils.arrays import Float
 
-_CLOSE = 1e-4  # pixels: error between nodes that is aimed at where no step is asked for
+_CLOSE = 1e-4  # pixels; target error between nodes if no step is requested
 _STEPS = (64.0, 32.0, 16.0, 8.0, 4.0)  # pixels
-_MOST = 1025  # nodes of an axis
-_CHECK = 397  # points of each axis at which the tables are compared with the map
+_MOST = 1025  # largest number of nodes per axis
+_CHECK = 397  # points per axis at which the tables are compared with the map
 
 
 class Settings(FormatSettings):
-    """Configuration of a file with look-up tables."""
+    """Configuration of a file with CPDIS look-up tables."""
 
-    step: PositiveFloat | None = None  # pixels between nodes; as many as leave 1e-4 pixels
+    # pixels between nodes; by default, fine enough for an error of 1e-4 pixels
+    step: PositiveFloat | None = None
     crval: tuple[float, float] | None = None
 
 
 def build(calibration: Calibration, settings: Settings, options: BuildOptions) -> tuple[Built, ...]:
-    """The file, with its largest error in pixels: of rounding, and between its nodes."""
+    """Build the file; its summary gives the largest rounding and interpolation error in pixels."""
     scale = options.scale_arcsec
     calibration = placed_at(calibration, settings.crval, scale, where="products.cpdis")
     refuse_wide_planes(calibration, options.epoch, scale, where="products.cpdis")
@@ -59,9 +60,9 @@ def build(calibration: Calibration, settings: Settings, options: BuildOptions) -
     arcsec = arcsec_per(unit, scale)
     maps = calibration.with_tables(calibration.at(options.epoch, origin="stated"))
     images, tables, worst = [], [], 0.0
-    for k, (number, one) in enumerate(maps.items()):
-        linear, crpix = _linear_part(one, number)
-        table, off = _sampled(one, linear, crpix, settings.step)
+    for k, (number, chip_map) in enumerate(maps.items()):
+        linear, crpix = _linear_part(chip_map, number)
+        table, off = _sampled(chip_map, linear, crpix, settings.step)
         worst = max(worst, off)
         versions = (2 * k + 1, 2 * k + 2)
         ctype, crval = ("RA---TAN", "DEC--TAN"), plane.point or (0.0, 0.0)
@@ -70,15 +71,15 @@ def build(calibration: Calibration, settings: Settings, options: BuildOptions) -
             cards.append(text_card("COMMENT", "CRVAL is a placeholder."))
         cards += _record_cards(table, versions)
         cards.append(number_card("BDWORST", off, "[pix] of rounding and between nodes"))
-        if one.before or one.after:
+        if chip_map.before or chip_map.after:
             cards.append(number_card("BDTABLES", 1, "look-up tables are in it"))
-        cards += solution_cards(plane.kind, unit, arcsec, number, one.basis.size)
+        cards += solution_cards(plane.kind, unit, arcsec, number, chip_map.basis.size)
         cards += wrapped_cards("COMMENT", calibration.remarks)
         cards += convergence_cards(calibration.solution)
         image = fits.ImageHDU(name="SCI", ver=k + 1)
         append_cards(image, cards)
         images.append(image)
-        sigma = _sigma(one, linear, table)
+        sigma = _sigma(chip_map, linear, table)
         for axis, version in enumerate(versions):
             tables.append(_table_hdu(TABLES, version, table.values[axis], table))
             if sigma is not None:
@@ -89,7 +90,7 @@ def build(calibration: Calibration, settings: Settings, options: BuildOptions) -
 
 
 def _linear_part(one: ChipMap, number: int) -> tuple[Float, tuple[float, float]]:
-    """Linear part (2, 2) of the polynomial, and the pixel at which it has (u, v) = 0."""
+    """Linear part (2, 2) of the polynomial, and the pixel at which it gives (u, v) = 0."""
     poly = one.monomials()
     require_regular(poly.linear, number)
     zero = np.array(one.basis.reference_pixel) - np.linalg.solve(poly.linear, poly.constant)
@@ -99,19 +100,19 @@ def _linear_part(one: ChipMap, number: int) -> tuple[Float, tuple[float, float]]
 def _sampled(
     one: ChipMap, linear: Float, crpix: tuple[float, float], step: float | None
 ) -> tuple[LookupTable, float]:
-    """Table of the shifts in single precision, and its largest error, pixels."""
+    """Table of the shifts in single precision, and its largest error in pixels."""
     if one.basis.order == 1 and len(one.before) == 1 and not one.after:
         table = one.before[0]
         return _checked(one, linear, crpix, table.first, table.step, table.shape[::-1])
     for asked in _STEPS if step is None else (step,):
         counts = [int(min(max(np.ceil(n / asked), 1), _MOST - 1)) + 1 for n in one.basis.size]
         steps = [n / (count - 1) for n, count in zip(one.basis.size, counts, strict=True)]
-        found = _checked(
+        sampled = _checked(
             one, linear, crpix, (0.5, 0.5), (steps[0], steps[1]), (counts[0], counts[1])
         )
-        if found[1] <= _CLOSE:
+        if sampled[1] <= _CLOSE:
             break
-    return found
+    return sampled
 
 
 def _checked(
@@ -135,7 +136,7 @@ def _checked(
 
 
 def _sigma(one: ChipMap, linear: Float, table: LookupTable) -> Float | None:
-    """Standard errors (2, ny, nx) of the nodes, pixels; None without errors."""
+    """Standard errors (2, ny, nx) of the nodes in pixels; None for a map without covariance."""
     cov = one.covariance_at(*(v.ravel() for v in np.meshgrid(*table.nodes())))
     if cov is None:
         return None
@@ -145,7 +146,7 @@ def _sigma(one: ChipMap, linear: Float, table: LookupTable) -> Float | None:
 
 
 def _record_cards(table: LookupTable, versions: tuple[int, int]) -> list[str]:
-    """Cards of CPDIS and of the DP records."""
+    """Cards of CPDIS, CPERR and the DP records."""
     cards = []
     for axis, version in enumerate(versions, start=1):
         largest = float(np.abs(table.values[axis - 1]).max())
@@ -170,7 +171,7 @@ def _table_hdu(name: str, version: int, plane: Float, table: LookupTable) -> fit
 
 
 def _describe(file: CpdisFile) -> list[str]:
-    """Lines of text on the images as astropy.wcs reads them, and on their tables."""
+    """Lines of text on the images as read by astropy.wcs, and on their tables."""
     first, *lines = describe_wcs(file.content, lint_cpdis(file))
     added = []
     for image in file.images:

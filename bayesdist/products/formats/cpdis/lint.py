@@ -1,4 +1,4 @@
-"""Checks of CPDIS look-up tables against what astropy.wcs makes of them."""
+"""Checks of CPDIS look-up tables against the behaviour of astropy.wcs."""
 
 from __future__ import annotations
 
@@ -22,11 +22,11 @@ from bayesdist.products.formats.cpdis.file import (
 )
 from bayesdist.products.formats.lookup.plane import Plane
 
-_TINY = 1e-3  # pixels: tables all of which are below are in another unit
-_ASKEW = 0.75  # of a step by which the nodes lie nearer to one edge than to the other
-# sign of det(CD) by CTYPE1: with north up RA grows to the left, longitude on the Sun to the right
+_TINY = 1e-3  # pixels; if all shifts are smaller, the table is probably in another unit
+_ASKEW = 0.75  # steps; half the difference between the margins at both ends that is reported
+# expected sign of det(CD) by CTYPE1: RA increases to the left, solar longitude to the right
 _HANDED = {"RA--": -1, "HPLN": 1}
-_WIDE = 180.0  # degrees: what a CD in arcseconds makes of a detector
+_WIDE = 180.0  # degrees; an image this wide means that CD is in arcseconds
 
 
 def lint_cpdis(file: CpdisFile) -> tuple[Finding, ...]:
@@ -34,8 +34,8 @@ def lint_cpdis(file: CpdisFile) -> tuple[Finding, ...]:
     out: list[Finding] = []
     for image in file.images:
         part = image.hdu.label if len(file.images) > 1 else ""
-        found = (*_records(image), *_tables(image), *_linear(image), *_alternates(image))
-        out += of_part(part, found)
+        findings = (*_records(image), *_tables(image), *_linear(image), *_alternates(image))
+        out += of_part(part, findings)
     if not [f for f in out if f.level == "error"]:
         try:
             cpdis_calibration(file, file.name, Choice())
@@ -80,8 +80,8 @@ def _records(image: CpdisImage) -> Iterator[Finding]:
             yield Finding(
                 "error", f"CPERR{axis}", "is below zero, and astropy.wcs leaves the table out"
             )
-    same = image.function(1) == image.function(2) == "LOOKUP"
-    if same and image.version(1) == image.version(2):
+    are_tables = image.function(1) == image.function(2) == "LOOKUP"
+    if are_tables and image.version(1) == image.version(2):
         yield Finding("warning", "DP2.EXTVER", "both axes have the table of one extension")
 
 
@@ -89,23 +89,23 @@ def _tables(image: CpdisImage) -> Iterator[Finding]:
     planes = {axis: p for axis in (1, 2) if (p := image.plane(axis)) is not None}
     largest = []
     for axis, plane in planes.items():
-        where = f"{TABLES},{image.version(axis)}"
+        location = f"{TABLES},{image.version(axis)}"
         values = plane.values
         if values.ndim != 2 or min(values.shape) < 2:
-            yield Finding("error", where, f"shape {values.shape} is no grid of nodes")
+            yield Finding("error", location, f"shape {values.shape} is no grid of nodes")
             return
         if not np.isfinite(values).all():
-            yield Finding("error", where, "holds nodes that are not finite")
+            yield Finding("error", location, "holds nodes that are not finite")
             return
         largest.append(float(np.abs(values).max()))
         if plane.missing:
             yield Finding(
-                "warning", where,
+                "warning", location,
                 f"{', '.join(plane.missing)} missing: the registration is then that of "
                 "astropy.wcs, another one since its version 6.1 than before",
             )  # fmt: skip
         else:
-            yield from _registration(image, plane, where)
+            yield from _registration(image, plane, location)
         sigma = image.tables.get((ERRORS, image.version(axis)))
         if sigma is not None and (
             sigma.image.shape != values.shape or not (sigma.image >= 0).all()
@@ -120,7 +120,7 @@ def _tables(image: CpdisImage) -> Iterator[Finding]:
 
 
 def _registration(image: CpdisImage, plane: Plane, where: str) -> Iterator[Finding]:
-    """Finding on nodes that lie nearer to one edge of the image than to the other."""
+    """Findings on nodes that are nearer to one edge of the image than to the other."""
     if image.size is None:
         return
     for axis, (n, first, step, size) in enumerate(
@@ -156,7 +156,7 @@ def _linear(image: CpdisImage) -> Iterator[Finding]:
 
 
 def _alternates(image: CpdisImage) -> Iterator[Finding]:
-    """Finding on further coordinate systems, to which programs apply the tables or not."""
+    """Findings on alternate coordinate systems, to which not all programs apply the tables."""
     keys = sorted({k[-1] for k in image.header if k[:5] == "CTYPE" and k[-1].isalpha()})
     without = [k for k in keys if f"CPDIS1{k}" not in image.header]
     if without:

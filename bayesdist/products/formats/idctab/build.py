@@ -1,4 +1,4 @@
-"""An IDCTAB from solutions, with the sigmas and the covariance of all its numbers."""
+"""Build an IDCTAB from solutions, with standard deviations and covariance of all its numbers."""
 
 from __future__ import annotations
 
@@ -62,70 +62,71 @@ def idctab_from_solution(
     inverse: bool = False,
     history: Sequence[str] = (),
 ) -> IdcTab:
-    """IDCTAB of all chips of a solution, or of several filters with a solution each.
+    """Build an IDCTAB from a solution, or from one solution per filter.
 
-    Frames of exposures are left out: in gauge 'first' the polynomials are the first exposure's.
-    Everything is divided by `vafactor`, since stwcs multiplies the sky by that of each exposure.
-    The constant of each chip goes to its V2REF and V3REF (and is noted in BDU0_c, BDV0_c), since
-    stwcs never uses CX00 and CY00.  A file for ACS/WFC always has TDD_DATE and TDD_CTB1, TDD_CTB2,
-    without which stwcs would apply a drift of its own.
+    The frames of exposures are not stored: in the gauge 'first', the polynomials are those of the
+    first exposure. All positions are divided by `vafactor`, because stwcs multiplies sky
+    coordinates by the factor of each exposure. The constant term of each chip is moved to its V2REF
+    and V3REF (and recorded in BDU0_c, BDV0_c), because stwcs ignores CX00 and CY00. A file for
+    ACS/WFC always has TDD_DATE, TDD_CTB1 and TDD_CTB2; without them stwcs would apply a built-in
+    drift.
 
-    stwcs applies one drift to all rows.  It is that of the first solution; the others must have the
-    same reference date and rates, or none: then their constants are those of the reference date.
+    stwcs applies one drift to all rows, which is that of the first solution. The other solutions
+    must either have the same reference date and rates, or no drift. In the latter case their
+    coefficients are those of the reference date.
 
     Parameters
     ----------
     solution : Solution or Calibration, or mapping of filter to them
-        A fit or a posterior, or the calibration of one.  The filter of a mapping is one name
-        ("F814W", whose other wheel is clear), or a tuple with those of both wheels; filters with
-        the very same solution object share its rows.
+        A fit, a posterior, or the calibration made from one. The filter of a mapping is one name
+        ("F814W", with the other wheel clear), or a tuple of the names in both wheels. Filters
+        mapped to the same solution object share its rows.
     instrument, detector : str
-        INSTRUME and DETECTOR, as "ACS" and "WFC".
+        INSTRUME and DETECTOR, such as "ACS" and "WFC".
     scale_arcsec : float, optional
-        Arcseconds per pixel: needed for u, v in pixels.  Written as SCALE; without it the mean
-        scale of all chips at their reference pixels.
+        Arcseconds per pixel; required if u and v are in pixels. It is written as SCALE. The default
+        SCALE is the mean scale of all chips at their reference pixels.
     v2ref, v3ref : float
         V2 and V3 of (u, v) = (0, 0), arcseconds.
     vafactor : float
         Velocity-aberration factor that the positions (u, v) still contain.
     filters : sequence, optional
-        Of a single solution: one combination, as ``("F606W", "CLEAR2L")``, or a sequence of such: a
-        row for each, all with the same coefficients.  Two names (ACS) make columns FILTER1 and
-        FILTER2, one makes FILTER.  Without filters there are no such columns, and the rows serve
-        every filter.
+        Only for a single solution: one combination, such as ``("F606W", "CLEAR2L")``, or a sequence
+        of combinations, which get one row each with the same coefficients. Two names (ACS) are
+        written to columns FILTER1 and FILTER2, one name to FILTER. Without filters there are no
+        such columns, and the rows are valid for every filter.
     useafter, pedigree : str, optional
-        USEAFTER ("Mar 01 2002 00:00:00") and PEDIGREE ("INFLIGHT 01/05/2006"), which only the user
-        knows.
+        USEAFTER ("Mar 01 2002 00:00:00") and PEDIGREE ("INFLIGHT 01/05/2006"); omitted by default.
     description : str
         DESCRIP.
     chips : sequence of int, optional
         Chip numbers; all by default.
     inverse : bool
-        True to add INVERSE rows; their closure is stated as BDCLOS_c.
+        True to add INVERSE rows. Their closure is written as BDCLOS_c.
     history : sequence of str
-        Lines for HISTORY.
+        Lines of HISTORY.
 
     Returns
     -------
     IdcTab
-        In doubles, with HDUs SIGMA and COVAR (see `bayesdist.products.formats.idctab.table`).
-        COVAR names the filters where there are several solutions.  Solutions turned by the same
-        orientation (`bayesdist.calibration.orientation`) have its error in common, as covariance
-        between their blocks.
+        IDCTAB in double precision, with HDUs SIGMA and COVAR (see
+        `bayesdist.products.formats.idctab.table`). With several solutions, COVAR names the filters.
+        The error of a common orientation (`bayesdist.calibration.orientation`) appears as
+        covariance between the blocks of its solutions.
 
     Raises
     ------
     InputError
-        For an unknown detector or chip, a missing scale, filters that are none, of different kinds
-        or named twice, time-dependent terms that an IDCTAB cannot store (see `check_time`), and
-        solutions of different orders or chips, or with a drift other than the first one's.
+        If the detector or a chip is unknown, if the scale is missing, if filters are invalid, of
+        different kinds or repeated, if there are time-dependent terms that an IDCTAB cannot store
+        (see `check_time`), or if the solutions differ in order, chips or drift.
     DegenerateError
-        When the linear part of a chip is singular.
+        If the linear part of a chip is singular.
 
     Notes
     -----
-    TDD_DATE is the reference date of the fit.  stwcs dates an exposure by year + day of year /
-    365.25, which is within about a day of the decimal year.
+    TDD_DATE is the reference date of the fit. stwcs dates an exposure by year + day of year /
+    365.25, which differs from the decimal year by at most about a day.
 
     Examples
     --------
@@ -144,24 +145,25 @@ def idctab_from_solution(
     parity = parity_of(instrument, detector)
     _check_positive(vafactor, "vafactor")
     acs_wfc = (instrument, detector) == ("ACS", "WFC")
-    for other, combinations in entries:
-        check_time(other.model, acs_wfc=acs_wfc)
-        if other is not first:
-            _check_alike(other, first, combinations[0])
+    for calibration, combinations in entries:
+        check_time(calibration.model, acs_wfc=acs_wfc)
+        if calibration is not first:
+            _check_alike(calibration, first, combinations[0])
     numbers = tuple(c.number for c in model.chips) if chips is None else tuple(chips)
     if not numbers:
         raise InputError("no chip is given", where="chips", do="name at least one")
     pieces = []
-    for one, combinations in entries:
-        factor = _arcsec(one.model.unit, scale_arcsec) / vafactor
+    for entry, combinations in entries:
+        factor = _arcsec(entry.model.unit, scale_arcsec) / vafactor
         fitted = tuple(
-            chip_numbers(one, n, factor=factor, parity=parity, zero=(v2ref, v3ref)) for n in numbers
+            chip_numbers(entry, n, factor=factor, parity=parity, zero=(v2ref, v3ref))
+            for n in numbers
         )
-        if one is not first:  # the file stores the first one's drift
+        if entry is not first:  # the file stores the drift of the first solution
             fitted = tuple(chip.without_rates() for chip in fitted)
-        back = tuple(chip_inverse(one, n, factor) for n in numbers) if inverse else ()
+        back = tuple(chip_inverse(entry, n, factor) for n in numbers) if inverse else ()
         pieces.append(Piece(combinations, fitted, back))
-    cov = joint_covariance([one for one, _ in entries], [piece.fitted for piece in pieces])
+    cov = joint_covariance([entry for entry, _ in entries], [piece.fitted for piece in pieces])
     scale = _mean_scale(pieces[0].fitted) if scale_arcsec is None else scale_arcsec
 
     texts = {"DESCRIP": description, "USEAFTER": useafter, "PEDIGREE": pedigree}
@@ -194,15 +196,17 @@ def _entries(
     filters: Sequence[str] | Sequence[Sequence[str]] | None,
     instrument: str,
 ) -> list[tuple[Calibration, tuple[tuple[str, ...], ...]]]:
-    """Calibrations, each with the filter combinations of its rows; () for rows of all filters."""
-    where = "products.idctab.filters"
+    """Calibrations with the filter combinations of their rows; () for rows of all filters."""
+    location = "products.idctab.filters"
     named: list[tuple[tuple[str, ...], Source]]
     if isinstance(solution, Mapping):
         if filters:
             raise InputError(
-                "the filters are given twice", where=where, do="leave them to the solutions"
+                "the filters are given twice", where=location, do="leave them to the solutions"
             )
-        named = [(combination_of(filter, instrument), one) for filter, one in solution.items()]
+        named = [
+            (combination_of(filter, instrument), source) for filter, source in solution.items()
+        ]
         if not named:
             raise InputError("no filter is given", where="solutions", do="give at least one")
     elif not filters:
@@ -213,23 +217,25 @@ def _entries(
         named = [(tuple(map(str, names)), solution) for names in filters]
     wanted = 2 if instrument == "ACS" else 1
     out: dict[int, tuple[Calibration, list[tuple[str, ...]]]] = {}
-    seen: set[tuple[str, ...]] = set()
-    for names, one in named:
+    listed: set[tuple[str, ...]] = set()
+    for names, source in named:
         if len(names) != wanted:
             raise InputError(
                 f"the filter combination {names} has {len(names)} names",
-                where=where,
+                where=location,
                 do=f"give {wanted} for {instrument}, one for each wheel",
             )
-        if names in seen:
+        if names in listed:
             raise InputError(
-                f"the filter combination {names} stands twice", where=where, do="name each one once"
+                f"the filter combination {names} stands twice",
+                where=location,
+                do="name each one once",
             )
-        seen.add(names)
-        if id(one) not in out:  # filters with the very same solution share its rows
-            out[id(one)] = as_calibration(one), []
-        out[id(one)][1].append(names)
-    return [(one, tuple(combinations)) for one, combinations in out.values()]
+        listed.add(names)
+        if id(source) not in out:  # filters with the same solution object share its rows
+            out[id(source)] = as_calibration(source), []
+        out[id(source)][1].append(names)
+    return [(source, tuple(combinations)) for source, combinations in out.values()]
 
 
 # -- checks and scales ---------------------------------------------------------------------------
@@ -243,7 +249,7 @@ def _check_positive(value: float, name: str) -> None:
 
 
 def _arcsec(unit: str, scale_arcsec: float | None) -> float:
-    """Arcseconds in one unit of u, v."""
+    """Size of one unit of u, v in arcseconds."""
     if scale_arcsec is not None:
         _check_positive(scale_arcsec, "scale_arcsec")
     if unit != "pix":
@@ -258,7 +264,7 @@ def _arcsec(unit: str, scale_arcsec: float | None) -> float:
 
 
 def _mean_scale(fitted: Sequence[ChipNumbers]) -> float:
-    """Mean arcseconds per pixel; stwcs keeps 8 decimals."""
+    """Mean pixel scale in arcseconds, rounded to the 8 decimals that stwcs keeps."""
     areas = [
         f.column("CX11") * f.column("CY10") - f.column("CX10") * f.column("CY11") for f in fitted
     ]
@@ -268,34 +274,34 @@ def _mean_scale(fitted: Sequence[ChipNumbers]) -> float:
 def _check_alike(
     calibration: Calibration, first: Calibration, combination: tuple[str, ...]
 ) -> None:
-    """Refuse calibrations of different orders, chips or drifts: a file has one of each."""
-    where = f"filters {' '.join(combination)}"
+    """Raise InputError if order, chips or drift differ from the first calibration."""
+    location = f"filters {' '.join(combination)}"
     a, b = calibration.model, first.model
     if a.order != b.order or a.chips != b.chips:
         raise InputError(
             "the solution has another order or other chips than the first one",
-            where=where,
+            where=location,
             do="fit all filters with one structure",
         )
     if a.time is None:
         return
-    same = b.time is not None and a.time.epoch0 == b.time.epoch0
-    if same:
+    alike = b.time is not None and a.time.epoch0 == b.time.epoch0
+    if alike:
         mine, theirs = (
             {
                 (chip.number, term): rate
-                for chip in one.model.chips
-                for term, rate in rates_of(one.solution, chip.number)[0].items()
+                for chip in source.model.chips
+                for term, rate in rates_of(source.solution, chip.number)[0].items()
             }
-            for one in (calibration, first)
+            for source in (calibration, first)
         )
         scale = max(map(abs, theirs.values()), default=0.0)
-        same = all(
+        alike = all(
             abs(mine.get(k, 0.0) - theirs.get(k, 0.0)) <= 1e-9 * scale for k in mine | theirs
         )
-    if not same:
+    if not alike:
         raise InputError(
             "the solution drifts otherwise than the first one, and a file stores one drift",
-            where=where,
+            where=location,
             do="give it the same reference date and rates (`drift.storable`)",
         )

@@ -1,10 +1,10 @@
 """Calibration of an IDCTAB: all chips in one plane, with drift, covariance and INVERSE rows.
 
-The plane is that of Xc and Yc of the reference chip,
+Following stwcs, chips are combined in the plane of Xc and Yc of the reference chip,
 
     Xc + p0 (V2REF - V2REF_ref),   Yc + p1 (V3REF - V3REF_ref)
 
-in arcseconds from that chip's zero point, as stwcs combines chips.
+in arcseconds from the zero point of the reference chip.
 """
 
 from __future__ import annotations
@@ -31,11 +31,11 @@ Filters = Sequence[str] | None
 
 
 def idctab_calibration(tab: IdcTab, filter: str | None = None) -> Calibration:
-    """Calibration of one filter of an IDCTAB in arcseconds, the reference chip first.
+    """Calibration of one filter of an IDCTAB in arcseconds, with the reference chip first.
 
-    It has a covariance where the file has it.  Names of both wheels may be joined by a comma; a
-    filter is needed where the rows differ.  InputError as for `IdcTab.row`, and for several chips
-    of an unknown detector.
+    It has a covariance if the file has one. The names in both wheels may be joined by a comma. A
+    filter is required if the rows differ. InputError as for `IdcTab.row`, and for an unknown
+    detector with several chips.
     """
     names = None if filter is None else [part.strip() for part in filter.split(",")]
     if not len(tab.rows):
@@ -68,7 +68,7 @@ def idctab_calibration(tab: IdcTab, filter: str | None = None) -> Calibration:
         instrument=tab.instrument,
         detector=tab.detector,
         filter=filter or "",
-        inverses={n: one for n in numbers if (one := _inverse(tab, n, names)) is not None},
+        inverses={n: inverse for n in numbers if (inverse := _inverse(tab, n, names)) is not None},
         scale=scale if scale > 0 else None,
         scale_from="SCALE",
         undated=_undated(tab, drifts=dated and any(rates.values())),
@@ -106,7 +106,7 @@ def _v2v3(record: np.void) -> tuple[float, float] | None:
 
 
 def _undated(tab: IdcTab, *, drifts: bool) -> str:
-    """Note on positions without a date."""
+    """Note on the date to which positions refer if no date is given."""
     if drifts:
         return f"at the reference date {tab.tdd['TDD_DATE']:g} of its drift"
     if tab.tdd_scheme in ("2014", "order", "default"):
@@ -115,16 +115,16 @@ def _undated(tab: IdcTab, *, drifts: bool) -> str:
 
 
 def _inverse(tab: IdcTab, number: int, names: Filters) -> ExplicitInverse | None:
-    """INVERSE row of a chip, where there is one."""
-    found = tab.matching_rows(number, names, "INVERSE")
-    if not found.size:
+    """INVERSE row of a chip; None if there is none."""
+    indices = tab.matching_rows(number, names, "INVERSE")
+    if not indices.size:
         return None
-    record = tab.rows[found[0]]
+    record = tab.rows[indices[0]]
     terms = []
-    for axis, values in enumerate(tab.coefficients_of_row(int(found[0]))):
-        own = dict(zip(tab.terms[1:], values[1:].tolist(), strict=True))
-        own[1 - axis, axis] -= 1.0  # correction that is added to the position itself
-        terms.append(own)
+    for axis, values in enumerate(tab.coefficients_of_row(int(indices[0]))):
+        corrections = dict(zip(tab.terms[1:], values[1:].tolist(), strict=True))
+        corrections[1 - axis, axis] -= 1.0  # the correction is added to the position
+        terms.append(corrections)
     return ExplicitInverse((float(record["XREF"]), float(record["YREF"])), terms[0], terms[1])
 
 
@@ -134,12 +134,12 @@ def _inverse(tab: IdcTab, number: int, names: Filters) -> ExplicitInverse | None
 def _with_covariance(
     calibration: Calibration, tab: IdcTab, names: Filters, parity: tuple[int, int]
 ) -> Calibration:
-    """Calibration with the covariance of HDU COVAR, where it has that of every chip."""
+    """Calibration with the covariance of HDU COVAR, if it covers every chip."""
     entries, model = tab.covariance, calibration.model
     if entries is None:
         return calibration
     K, reference = model.n_terms, calibration.numbers[0]
-    jacobian = np.zeros((model.n_params, len(entries)))  # of the parameters by the numbers in COVAR
+    jacobian = np.zeros((model.n_params, len(entries)))  # with respect to COVAR's numbers
     zero = _numbers_of_row(tab, entries, tab.row(reference, names), reference)
     for number in calibration.numbers:
         place = _numbers_of_row(tab, entries, tab.row(number, names), number)
@@ -151,11 +151,11 @@ def _with_covariance(
         if not by.any():
             return calibration
         if number != reference:
-            # the constant is the position of the chip's zero point from that of the reference chip
+            # the constant is the offset of the chip's zero point from that of the reference chip
             for axis, name in enumerate(("V2REF", "V3REF")):
-                for found, sign in ((place, 1.0), (zero, -1.0)):
-                    if name in found:
-                        by[axis, 0, found[name]] = sign * parity[axis]
+                for indices, sign in ((place, 1.0), (zero, -1.0)):
+                    if name in indices:
+                        by[axis, 0, indices[name]] = sign * parity[axis]
         basis = model.basis(number)
         back = basis.from_monomials(np.eye(K)).T
         for axis in (0, 1):
@@ -171,23 +171,27 @@ def _with_covariance(
 
 
 def _numbers_of_row(tab: IdcTab, entries: NDArray[np.void], row: int, chip: int) -> dict[str, int]:
-    """Indices in COVAR of the numbers of a row, by name; empty where they are missing."""
+    """Indices in COVAR of the numbers of a row, by name; empty if they are not in COVAR."""
     listed = [str(name).strip() for name in entries["PARAM"]]
     mine = np.flatnonzero(entries["DETCHIP"].astype(int) == chip)
-    own = [c for c in FILTER_COLUMNS if c in (entries.dtype.names or ())]
-    if own:
-        # numbers stand once for all filters with them: identified by their values
-        sets = {tuple(str(entries[c][k]).strip() for c in own) for k in mine}
+    filter_columns = [c for c in FILTER_COLUMNS if c in (entries.dtype.names or ())]
+    if filter_columns:
+        # COVAR lists each set of numbers once for all its filters: identify the set by its values
+        sets = {tuple(str(entries[c][k]).strip() for c in filter_columns) for k in mine}
         of_set = [
-            [int(k) for k in mine if tuple(str(entries[c][k]).strip() for c in own) == one]
-            for one in sorted(sets)
+            [
+                int(k)
+                for k in mine
+                if tuple(str(entries[c][k]).strip() for c in filter_columns) == combination
+            ]
+            for combination in sorted(sets)
         ]
-        same = [s for s in of_set if _is_of_row(tab, entries, row, listed, s)]
-        if not same:
+        matching_sets = [s for s in of_set if _is_of_row(tab, entries, row, listed, s)]
+        if not matching_sets:
             return {}
-        # the drift is common to all filters, and stands with the first one
+        # the drift is common to all filters, and is listed with the first one
         rates = [k for k in mine if listed[k].startswith("TDD")]
-        mine = np.array([*rates, *same[0]])
+        mine = np.array([*rates, *matching_sets[0]])
     return {listed[k]: int(k) for k in mine}
 
 

@@ -1,12 +1,14 @@
-"""Time-dependent terms of ACS/WFC in an IDCTAB, and the part of a drift that it can hold.
+"""Time-dependent terms of ACS/WFC in an IDCTAB, and the part of a drift that it can store.
 
     CX11 += CXB dt,  CY11 += CTB dt,  CY10 += CYB dt
 
-with dt in years from TDD_DATE (scheme of 2015), in the primary header, as stwcs reads them.
+with dt in years since TDD_DATE (scheme of 2015). The rates are in the primary header, as stwcs
+reads them.
 
-A calibration that was turned into V2 and V3 drifts in terms that a file has no keyword for: a
-change of the y scale turns into one of CX10, by the sine of 2.2 degrees for ACS/WFC. Such terms are
-left out only where their effect over the years of the file is bounded, and the bound is reported.
+A calibration that has been rotated to V2 and V3 also drifts in terms for which a file has no
+keyword: a change of the y scale causes a change of CX10, multiplied by the sine of 2.2 degrees for
+ACS/WFC. Such terms are left out only if their effect over the years of the file is below a limit,
+and that effect is reported.
 """
 
 from __future__ import annotations
@@ -26,17 +28,17 @@ from bayesdist.utils.arrays import Float
 
 Term = tuple[str, int, int]
 
-NEGLIGIBLE = 1e-3  # mas: a drift held at zero by a prior, or by the gauge, is not reported
+NEGLIGIBLE = 1e-3  # mas; a drift this small, fixed by a prior or by the gauge, is not reported
 
-# (axis, power of x, power of y) of a coefficient: the keyword of its rate, less the chip number.
+# (axis, power of x, power of y) of a coefficient: keyword of its rate without the chip number
 RATES = {("u", 1, 0): "TDD_CXB", ("v", 1, 0): "TDD_CTB", ("v", 0, 1): "TDD_CYB"}
 
 
 def scheme_of(keywords: Mapping[str, float]) -> str:
-    """Scheme that stwcs finds in the keywords TDD... of an ACS/WFC table, in its order of trial.
+    """Scheme that stwcs finds in the TDD keywords of an ACS/WFC table, in the order of its tests.
 
     '2015' (TDD_CTB1 ...), '2014' (TDD_CYB1 ...), 'order' (TDDORDER with TDD_A, TDD_B), or
-    'default': terms of 2004.5 that are written in its code.
+    'default': the terms of 2004.5 that are built into stwcs.
     """
     for keyword, scheme in (("TDD_CTB1", "2015"), ("TDD_CYB1", "2014"), ("TDDORDER", "order")):
         if keyword in keywords:
@@ -53,8 +55,8 @@ def drift(
 ) -> Float:
     """Change (2, n_terms) of the coefficients of a chip at an epoch (decimal years).
 
-    `keywords` are all that begin with TDD, `terms` the powers of the coefficients; `where` names
-    the file.  InputError for keywords of another scheme than that of 2015.
+    `keywords` are all header keywords that begin with TDD, `terms` the powers of the coefficients;
+    `where` names the file. InputError if the keywords are not of the 2015 scheme.
     """
     scheme = scheme_of(keywords)
     if scheme != "2015" or "TDD_DATE" not in keywords:
@@ -75,7 +77,7 @@ def drift(
 
 @dataclass(frozen=True)
 class Loss:
-    """Drift that a file does not hold."""
+    """Drift that a file does not store."""
 
     chip: str
     term: Term  # axis, power of x, power of y
@@ -100,17 +102,36 @@ def storable(
     limit_mas: float = 0.1,
     like: Calibration | None = None,
 ) -> tuple[Calibration, tuple[Loss, ...]]:
-    """Segment of a calibration with the drift that an IDCTAB can store, and the drifts left out.
+    """Part of a calibration that an IDCTAB can store, and the drifts that are left out.
 
-    The calibration has an angular unit and the axes of the IDCTAB (see `calibration.orientation`);
-    `years` are the first and last date for which the file is meant, `segment` counts from 0,
-    `limit_mas` bounds the sum of all terms of a chip that may be left out.  With `like`, the
-    calibration whose drift the file will hold, this one gives its coefficients at the reference
-    date, and the difference of the drifts counts as left out.
+    Parameters
+    ----------
+    calibration : Calibration
+        Calibration in an angular unit, along the axes of the IDCTAB (see
+        `calibration.orientation`).
+    years : tuple of float
+        First and last date for which the file is meant.
+    segment : int
+        Segment of the time dependence, counted from 0.
+    limit_mas : float
+        Largest sum of the effects of all terms of a chip that may be left out.
+    like : Calibration, optional
+        Calibration with the drift that the file will store. This calibration then provides its
+        coefficients at the reference date, and the difference of the two drifts counts as left out.
 
-    InputError when more than `limit_mas` would be left out, for a unit of pixels, years that do not
-    rise, no such segment, or a solution that does not depend on time, or from another date, where
-    `like` does.
+    Returns
+    -------
+    calibration : Calibration
+        Selected segment with the terms that can be stored.
+    lost : tuple of Loss
+        Drifts that are left out.
+
+    Raises
+    ------
+    InputError
+        If more than `limit_mas` would be left out, if the unit is pixels, if the years are not
+        ascending, if the segment does not exist, or if `like` depends on time and this solution
+        does not, or has another reference date.
     """
     solution = calibration.solution
     if solution.model.unit not in ARCSEC:
@@ -128,18 +149,23 @@ def storable(
     view: Solution = solution
     of_view: Callable[[Float], Float] = np.asarray
     if solution.model.time is not None:
-        own = segment_of(solution, segment)
-        view, of_view = own, own.transform
+        selected = segment_of(solution, segment)
+        view, of_view = selected, selected.transform
     model, time = view.model, view.model.time
-    kept: list[Term] = []
+    stored_terms: list[Term] = []
     if time is not None and like is None:
-        kept = [term for term in time.terms if term in RATES]
-    new = replace(model, time=TimeDependence(tuple(kept), time.epoch0) if time and kept else None)
+        stored_terms = [term for term in time.terms if term in RATES]
+    new = replace(
+        model,
+        time=TimeDependence(tuple(stored_terms), time.epoch0) if time and stored_terms else None,
+    )
     columns = list(range(model.n_polynomial))
     for chip in model.chips:
         start = model.tdd_slice(chip.number).start
-        columns += [start + k for k, t in enumerate(time.terms if time else ()) if t in kept]
-    lost = _lost(view, None if like is None else like.solution, kept, (first, last))
+        columns += [
+            start + k for k, t in enumerate(time.terms if time else ()) if t in stored_terms
+        ]
+    lost = _lost(view, None if like is None else like.solution, stored_terms, (first, last))
     _check_lost(lost, limit_mas)
 
     def transform(theta: Float) -> Float:
@@ -169,7 +195,7 @@ def _check_like(solution: Solution, like: Calibration | None, segment: int) -> N
 def _lost(
     view: Solution, like: Solution | None, kept: list[Term], years: tuple[float, float]
 ) -> tuple[Loss, ...]:
-    """Effect of each drifting term beyond the drift that is stored."""
+    """Effects of drift terms beyond the drift that is stored."""
     model = view.model
     if model.time is None:
         return ()
@@ -185,11 +211,11 @@ def _lost(
             _, i, j = term
             reach = 1.0
             for n, ref, power in zip(chip.size, chip.reference_pixel, (i, j), strict=True):
-                # in units of half the chip's size, as the model has its rates
+                # in units of half the size of the chip, like the rates of the model
                 reach *= (max(n + 0.5 - ref, ref - 0.5) / (n / 2)) ** power
             lever = factor * span * reach
             rate = rates.get(term, 0.0) - stored.get(term, 0.0)
-            # a drift that was taken over is the stored one, in every draw
+            # a drift copied from `like` equals the stored one in every draw
             sigma = lever * sigmas.get(term, 0.0) if rate or term not in stored else 0.0
             if max(lever * abs(rate), sigma) > NEGLIGIBLE and (rate or term not in stored):
                 out.append(Loss(chip.name, term, lever * abs(rate), sigma, years))
@@ -197,7 +223,7 @@ def _lost(
 
 
 def rates_of(solution: Solution, chip: int) -> tuple[dict[Term, float], dict[Term, float]]:
-    """Rates and their sigmas, for a model of one segment."""
+    """Rates of a model with one segment and their standard deviations, by term."""
     model = solution.model
     if model.time is None:
         return {}, {}

@@ -1,4 +1,4 @@
-"""Format entry of IDCTABs, and their description as text."""
+"""Format of IDCTABs, and their description as text."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ _SCHEMES = {
 
 
 def describe_idctab(tab: IdcTab) -> list[str]:
-    """Lines of text on an IDCTAB, its findings at the end."""
+    """Lines of text on an IDCTAB, with the findings at the end."""
     header = tab.header
     lines = [
         f"{tab.name}: IDCTAB of {tab.instrument}/{tab.detector or '(no DETECTOR)'}, "
@@ -47,8 +47,8 @@ def describe_idctab(tab: IdcTab) -> list[str]:
         lines.append(f"  filters   {len(filters)} combinations: {shown}")
     else:
         lines.append("  filters   no columns: the rows serve every filter")
-    kept = "standard deviations and covariance" if tab.covariance is not None else "none"
-    lines.append(f"  errors    {kept}")
+    errors = "standard deviations and covariance" if tab.covariance is not None else "none"
+    lines.append(f"  errors    {errors}")
     if "BDANGLE" in header:
         lines.append(
             f"  V2/V3     turned by {header['BDANGLE']:.6g} +- {header['BDANGSIG']:.2g} deg, "
@@ -62,10 +62,10 @@ def describe_idctab(tab: IdcTab) -> list[str]:
 def _first_rows(tab: IdcTab) -> list[int]:
     """Indices of the first row of each chip and direction."""
     names = [c for c in ("DETCHIP", "DIRECTION") if c in tab.columns]
-    seen: dict[tuple, int] = {}
+    first_rows: dict[tuple, int] = {}
     for k, row in enumerate(tab.rows):
-        seen.setdefault(tuple(row[c] for c in names), k)
-    return list(seen.values())
+        first_rows.setdefault(tuple(row[c] for c in names), k)
+    return list(first_rows.values())
 
 
 def _row_text(tab: IdcTab, row: int) -> list[str]:
@@ -82,22 +82,22 @@ def _row_text(tab: IdcTab, row: int) -> list[str]:
     if not inverse:
         lines.append(f"    non-linear part: {_non_linear(tab, row)} px at most")
     sigma = tab.sigma
-    same = None if sigma is None or len(sigma) != len(tab.rows) else sigma[row]
+    row_sigma = None if sigma is None or len(sigma) != len(tab.rows) else sigma[row]
     unit = "px/arcsec^n" if inverse else "arcsec/px^n"
-    head = f"    column        value [{unit}]" + ("       sigma" if same is not None else "")
+    head = f"    column        value [{unit}]" + ("       sigma" if row_sigma is not None else "")
     lines.append(head)
     for prefix in tab.prefixes:
         for i, j in tab.terms:
             if i + j:
                 name = idctab_column(prefix, i, j)
-                error = f"  {float(same[name]):10.3e}" if same is not None else ""
+                error = f"  {float(row_sigma[name]):10.3e}" if row_sigma is not None else ""
                 power = f"X^{i} Y^{j}" if inverse else f"x^{i} y^{j}"
                 lines.append(f"    {name:<5} {power:<8} {float(record[name]):21.13e}{error}")
     return lines
 
 
 def _non_linear(tab: IdcTab, row: int) -> str:
-    """Largest terms above order 1, in pixels of SCALE, of Xc and Yc."""
+    """Largest value of the terms above order 1 in Xc and Yc, in pixels of SCALE."""
     record = tab.rows[row]
     scale = float(record["SCALE"])
     x_range, y_range = (

@@ -1,13 +1,13 @@
-"""HDUs of an IDCTAB that is built, and the cards of its headers.
+"""HDUs of a newly built IDCTAB, and the cards of its headers.
 
-Keywords of its primary header:
+bayesdist adds these keywords to the primary header:
 
 ==================  ==========================================================================
 BDVAFAC, BDUNIT     velocity aberration that was divided out; unit of u and v in the fit
-BDU0_c, BDV0_c      constant of chip c that went into V2REF and V3REF
+BDU0_c, BDV0_c      constant term of chip c that was moved to V2REF and V3REF
 BDANGLE, BDSCALE    similarity from (u, v) to (Xc, Yc); sigmas BDANGSIG, BDSCASIG
 BDV2SIG, BDV3SIG    sigmas of V2 and V3 of (u, v) = (0, 0)
-BDAGRRMS, BDAGRMAX  distance to the reference table when the similarity is taken out
+BDAGRRMS, BDAGRMAX  distance from the reference table after a fitted similarity
 BDCLOS_c            worst closure of the INVERSE rows of chip c
 ==================  ==========================================================================
 """
@@ -35,11 +35,11 @@ from bayesdist.utils.arrays import Float
 
 @dataclass(frozen=True, eq=False)
 class Piece:
-    """Rows that one solution fills."""
+    """Rows that are filled from one solution."""
 
-    combinations: tuple[tuple[str, ...], ...]  # names of all wheels; () for all filters
-    fitted: tuple[ChipNumbers, ...]  # one for each chip
-    inverse: tuple[ChipInverse, ...] = ()  # one for each chip; empty without INVERSE rows
+    combinations: tuple[tuple[str, ...], ...]  # filter names of all wheels; () for all filters
+    fitted: tuple[ChipNumbers, ...]  # one per chip
+    inverse: tuple[ChipInverse, ...] = ()  # one per chip; empty without INVERSE rows
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,7 +51,7 @@ class _Row:
 
     @property
     def key(self) -> dict[str, Any]:
-        """Columns by which the row is known."""
+        """Columns that identify the row."""
         direction = "FORWARD" if self.inverse is None else "INVERSE"
         named = {"DETCHIP": self.numbers.chip.number, "DIRECTION": direction}
         return named | _by_wheel(self.filters)
@@ -63,13 +63,13 @@ class _Row:
 
     def sigmas(self, cov: Float) -> dict[str, float]:
         variances = np.diag(cov)[self.place]
-        sigmas = np.sqrt(np.maximum(variances, 0.0)).tolist()  # -1e-40 is a rounded zero
+        sigmas = np.sqrt(np.maximum(variances, 0.0)).tolist()  # rounding may give -1e-40
         out = dict(zip(self.numbers.names, sigmas, strict=True))
         return out if self.inverse is None else out | self.inverse.sigmas
 
 
 def _rows(pieces: Sequence[Piece]) -> Iterator[_Row]:
-    """Rows filter after filter, chip after chip; FORWARD before INVERSE."""
+    """Rows ordered by filter, then by chip, with FORWARD before INVERSE."""
     end = 0
     for piece in pieces:
         places = []
@@ -84,7 +84,7 @@ def _rows(pieces: Sequence[Piece]) -> Iterator[_Row]:
 
 
 def coefficient_hdu(pieces: Sequence[Piece], scale: float) -> fits.BinTableHDU:
-    """HDU 1: the table that pipelines read, in doubles."""
+    """HDU 1: the coefficient table that pipelines read, in double precision."""
     table = []
     for row in _rows(pieces):
         chip = row.numbers.chip
@@ -96,14 +96,14 @@ def coefficient_hdu(pieces: Sequence[Piece], scale: float) -> fits.BinTableHDU:
                 out["SCALE"] = scale
             out[name] = row.value(name)
         if out.get("CX11") == 1.0 and scale != 1.0:
-            # stwcs takes exactly 1 as a sign that coefficients are in units of SCALE
+            # in stwcs, exactly 1 means that the coefficients are in units of SCALE
             out["CX11"] = np.nextafter(1.0, 0.0)
         table.append(out)
     return _table(table)
 
 
 def sigma_hdu(pieces: Sequence[Piece], cov: Float) -> fits.BinTableHDU:
-    """HDU SIGMA: standard deviations, row by row; those of the drift are keywords."""
+    """HDU SIGMA: standard deviations of each row; those of the drift are header keywords."""
     table, drift = [], dict[str, float]()
     for row in _rows(pieces):
         sigmas = row.sigmas(cov)
@@ -115,7 +115,7 @@ def sigma_hdu(pieces: Sequence[Piece], cov: Float) -> fits.BinTableHDU:
 
 
 def covariance_hdu(pieces: Sequence[Piece], cov: Float) -> fits.BinTableHDU:
-    """HDU COVAR: every fitted number with its covariances; filters named where they differ."""
+    """HDU COVAR: every fitted number with its covariances, and its filters if solutions differ."""
     named = [
         {"DETCHIP": f.chip.number}
         | (_by_wheel(p.combinations[0]) if len(pieces) > 1 else {})
@@ -128,13 +128,13 @@ def covariance_hdu(pieces: Sequence[Piece], cov: Float) -> fits.BinTableHDU:
 
 
 def _by_wheel(filters: tuple[str, ...]) -> dict[str, str]:
-    """Names of the filters by their columns."""
+    """Filter names by the columns that hold them."""
     labels = ("FILTER1", "FILTER2") if len(filters) == 2 else ("FILTER",)
     return dict(zip(labels, filters, strict=False))
 
 
 def _table(rows: Sequence[Mapping[str, Any]], name: str | None = None) -> fits.BinTableHDU:
-    """Table of rows by column, numbers in doubles but for those that count."""
+    """Table from rows of values by column; in double precision, except for integer columns."""
     columns = []
     for column in rows[0]:
         values = np.array([row[column] for row in rows])
@@ -161,13 +161,13 @@ def _unit(column: str) -> str | None:
 
 
 def tdd_cards(fitted: Sequence[ChipNumbers], epoch: float | None, acs_wfc: bool) -> list[str]:
-    """Time-dependent terms of ACS/WFC in the scheme of 2015, zeros where none was fitted."""
+    """Cards of the ACS/WFC drift in the scheme of 2015; zeros if no drift was fitted."""
     if not acs_wfc:
         return []
     comment = "" if epoch is not None else "no time-dependent terms"
     cards = [number_card("TDD_DATE", 2004.5 if epoch is None else epoch, "[yr] reference date")]
     rates = {name: f.column(name) for f in fitted for name in f.names if name.startswith("TDD")}
-    for chip in (1, 2):  # stwcs looks for TDD_CTB1 to know the scheme, whatever the chip
+    for chip in (1, 2):  # stwcs recognizes the scheme by TDD_CTB1, whatever the chip
         rates.setdefault(f"TDD_CTB{chip}", 0.0)
     for name in sorted(rates):
         cards.append(number_card(name, rates[name], comment or "[arcsec/pix/yr]"))
@@ -211,7 +211,7 @@ def _orientation_cards(orientation: Orientation, vafactor: float) -> list[str]:
 
 
 def closure_cards(pieces: Sequence[Piece]) -> list[str]:
-    """Cards on the closure of INVERSE with FORWARD rows, the worst of all filters for each chip."""
+    """Cards with the worst closure of the INVERSE rows of each chip, over all filters."""
     worst: dict[int, float] = {}
     for piece in pieces:
         for f, back in zip(piece.fitted, piece.inverse, strict=False):

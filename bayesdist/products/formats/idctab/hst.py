@@ -1,7 +1,7 @@
-"""Constants of HST's detectors that IDCTABs lack: parities and filter wheels.
+"""Properties of HST detectors that IDCTABs lack: parities and filter wheels.
 
 V2 = V2REF + p0 Xc, V3 = V3REF + p1 Yc, with the parities p0, p1 of stwcs (wcsutil/instruments.py).
-An IDCTAB of ACS names the filters of both wheels in each row.
+An IDCTAB of ACS names the filters in both wheels in each row.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ _PARITY = {
     ("WFC3", "IR"): (-1, 1),
 }
 
-# FILTER1 and FILTER2 of real IDCTABs; ramp filters (FR...) are all in the second wheel.
+# FILTER1 and FILTER2 in actual IDCTABs; ramp filters (FR...) are all in the second wheel.
 _FIRST = (
     "F475W", "F502N", "F550M", "F555W", "F606W", "F625W", "F658N", "F775W", "F850LP", "F892N",
     "G800L", "POL0UV", "POL60UV", "POL120UV",
@@ -25,23 +25,23 @@ _SECOND = ("F435W", "F660N", "F814W", "POL0V", "POL60V", "POL120V")
 
 
 def parity_of(instrument: str, detector: str) -> tuple[int, int]:
-    """Parities (p0, p1) of a detector; an unknown one is refused."""
+    """Parities (p0, p1) of a detector; InputError if the detector is unknown."""
     try:
         return _PARITY[instrument.strip().upper(), detector.strip().upper()]
     except KeyError:
-        known = ", ".join(f"{i}/{d}" for i, d in _PARITY)
+        detectors = ", ".join(f"{i}/{d}" for i, d in _PARITY)
         raise InputError(
             f"the parity of {instrument}/{detector} is not known",
             where="products.idctab",
-            do=f"choose one of {known}",
+            do=f"choose one of {detectors}",
         ) from None
 
 
 def combination_of(filter: str | tuple[str, ...], instrument: str) -> tuple[str, ...]:
-    """Filter names of all wheels, the others being clear, as ("F606W", "CLEAR2L") for ACS.
+    """Filter names in all wheels, such as ("F606W", "CLEAR2L") for ACS, with unused wheels clear.
 
-    One name for other instruments; a tuple is returned as it is.  An ACS filter whose wheel is not
-    known is refused.
+    A single name for other instruments; a tuple is returned unchanged. InputError for an ACS filter
+    that is in neither wheel.
     """
     if not isinstance(filter, str):
         return tuple(map(str, filter))
@@ -62,9 +62,9 @@ def combination_of(filter: str | tuple[str, ...], instrument: str) -> tuple[str,
 
 
 def serves(row: tuple[str, ...], asked: tuple[str, ...]) -> bool:
-    """True where a row of an IDCTAB with these filters serves those asked for, as for stwcs.
+    """True if a row of an IDCTAB with these filters is valid for the requested ones, as in stwcs.
 
-    Every CLEAR is the same; a row without filters serves all.
+    All CLEAR positions are equivalent; a row without filters is valid for all.
     """
     if not row:
         return True
@@ -74,5 +74,7 @@ def serves(row: tuple[str, ...], asked: tuple[str, ...]) -> bool:
     )
     if len(asked) == len(row):
         return asked == row
-    others = [name for name in row if name not in asked]
-    return set(asked) - {"CLEAR"} <= set(row) and all(name in ("CLEAR", "N/A") for name in others)
+    remaining = [name for name in row if name not in asked]
+    return set(asked) - {"CLEAR"} <= set(row) and all(
+        name in ("CLEAR", "N/A") for name in remaining
+    )

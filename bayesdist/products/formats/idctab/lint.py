@@ -18,7 +18,18 @@ _SCALE_RATIO = 1.25
 
 
 def lint_idctab(tab: IdcTab) -> tuple[Finding, ...]:
-    """Findings in an IDCTAB; those of many rows are gathered in one."""
+    """Check an IDCTAB against the behaviour of stwcs.
+
+    Parameters
+    ----------
+    tab : IdcTab
+        IDCTAB to check.
+
+    Returns
+    -------
+    tuple of Finding
+        Errors, warnings and notes; a finding that concerns several rows appears once.
+    """
     finite = [*_not_finite(tab), *implausible(tab)]
     return (
         *finite,
@@ -37,8 +48,8 @@ def _not_finite(tab: IdcTab) -> list[Finding]:
             column = rows[name]
             if column.dtype.kind == "f" and not np.isfinite(column).all():
                 bad = np.unique(np.nonzero(~np.isfinite(column))[0])
-                where = f"{rows_text(bad)}{of}, column {name}"
-                out.append(Finding("error", where, "not a finite number"))
+                location = f"{rows_text(bad)}{of}, column {name}"
+                out.append(Finding("error", location, "not a finite number"))
     return out
 
 
@@ -128,7 +139,7 @@ def _table(tab: IdcTab) -> Iterator[Finding]:
 
 
 def _rounding(tab: IdcTab) -> float:
-    """Largest effect of half a unit in the last digit of every coefficient, in mas."""
+    """Largest effect in mas of rounding every coefficient by half a unit in its last digit."""
     rows = tab.rows[_forward(tab)]
     hx, hy = (np.maximum(rows[f"{a}REF"], rows[f"{a}SIZE"] - rows[f"{a}REF"]) for a in "XY")
     worst = 0.0
@@ -147,10 +158,10 @@ def _repeated_rows(tab: IdcTab) -> Iterator[Finding]:
     names = [c for c in ("DETCHIP", "DIRECTION", *FILTER_COLUMNS) if c in tab.columns]
     for k, row in enumerate(tab.rows):
         keys.setdefault(tuple(str(row[c]).strip() for c in names), []).append(k)
-    same = [group for group in keys.values() if len(group) > 1]
+    repeated = [group for group in keys.values() if len(group) > 1]
     values = [c for c in tab.columns if c not in names]
     content = tab.rows[values]
-    differ = [g for g in same if any(content[k] != content[g[0]] for k in g[1:])]
+    differ = [g for g in repeated if any(content[k] != content[g[0]] for k in g[1:])]
     if differ:
         extra = sorted(k for g in differ for k in g[1:])
         yield Finding(
@@ -158,13 +169,13 @@ def _repeated_rows(tab: IdcTab) -> Iterator[Finding]:
             rows_text(extra),
             "a row before has the same chip and filters with other values: stwcs takes the first",
         )
-    if len(same) > len(differ):
-        extra = sorted(k for g in same if g not in differ for k in g[1:])
+    if len(repeated) > len(differ):
+        extra = sorted(k for g in repeated if g not in differ for k in g[1:])
         yield Finding("note", rows_text(extra), "repeats a row before it")
 
 
 def _coefficients(tab: IdcTab) -> Iterator[Finding]:
-    """Findings on scale, index order and parity from the linear terms, and on repeated values."""
+    """Findings on scale, index order and parity of the linear terms, and on repeated values."""
     x, y = tab.prefixes
     forward = _forward(tab)
     rows = tab.rows[forward]
@@ -209,7 +220,7 @@ def _coefficients(tab: IdcTab) -> Iterator[Finding]:
 
 
 def _forward(tab: IdcTab) -> NDArray[np.intp]:
-    """Indices of the rows whose coefficients are arcseconds from pixels."""
+    """Indices of the rows that convert pixels to arcseconds."""
     return np.flatnonzero(tab.directions != "INVERSE")
 
 
@@ -221,7 +232,7 @@ def _repeated_values(tab: IdcTab) -> Iterator[Finding]:
         for group in repeated_values(dict(zip(names, row.tolist(), strict=True))):
             groups.setdefault(group, []).append(k)
     for group, rows in groups.items():
-        # a detector without rotation has CX10 = CY11 or CX11 = CY10 by construction
+        # without rotation, CX10 = CY11 or CX11 = CY10 by construction
         if all(name[2] == "1" for name in group if len(name) == 4):
             continue
         yield Finding(
@@ -231,7 +242,7 @@ def _repeated_values(tab: IdcTab) -> Iterator[Finding]:
 
 
 def _chips(tab: IdcTab) -> Iterator[Finding]:
-    """Finding on the positions of ACS/WFC's chips: chip 1 is above chip 2 in y, so at lower V3."""
+    """Findings on the chip positions of ACS/WFC: chip 1 is above chip 2 in y, so at lower V3."""
     if not tab.is_acs_wfc or "V3REF" not in tab.columns:
         return
     if 2 not in tab.stated_chips:
@@ -258,10 +269,10 @@ def _uncertainty(tab: IdcTab) -> Iterator[Finding]:
     sigma, covariance = tab.sigma, tab.covariance
     if sigma is None or covariance is None:
         return
-    where = "SIGMA, COVAR"
+    location = "SIGMA, COVAR"
     cov = covariance["COV"]
     if cov.shape != (len(covariance), len(covariance)):
-        yield Finding("error", where, f"the covariance has shape {cov.shape}")
+        yield Finding("error", location, f"the covariance has shape {cov.shape}")
         return
     worst = 0.0
     keys = [c for c in ("DETCHIP", *FILTER_COLUMNS) if c in (covariance.dtype.names or ())]
@@ -269,13 +280,13 @@ def _uncertainty(tab: IdcTab) -> Iterator[Finding]:
     for entry, variance in zip(covariance, np.diag(cov), strict=True):
         name = entry["PARAM"]
         if name in (sigma.dtype.names or ()):
-            same = np.all([sigma[key][forward] == entry[key] for key in keys], axis=0)
-            stated = sigma[name][forward][same]
+            in_row = np.all([sigma[key][forward] == entry[key] for key in keys], axis=0)
+            stated = sigma[name][forward][in_row]
             scale = max(float(np.max(np.abs(stated), initial=0.0)), np.sqrt(abs(variance)))
             if scale > 0:
                 difference = np.abs(stated - np.sqrt(abs(variance)))
                 worst = max(worst, float(np.max(difference, initial=0.0)) / scale)
     if worst > 1e-9:
         yield Finding(
-            "error", where, f"sigma and covariance differ by up to {worst:.2g} of themselves"
+            "error", location, f"sigma and covariance differ by up to {worst:.2g} of themselves"
         )

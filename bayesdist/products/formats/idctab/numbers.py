@@ -1,7 +1,7 @@
 """Numbers that an IDCTAB takes from a calibration, with their derivatives and covariance.
 
-Calibrations of different filters come from different stars, but may lie in one plane by one
-orientation.  Given the orientation p they are independent, so that
+Calibrations of different filters come from different stars, but may be placed in one plane by a
+common orientation with parameters p. Given p they are independent, so that
 
     Cov(a, b) = Cov(a, p) Cov(p)^-1 Cov(p, b)
 """
@@ -26,25 +26,25 @@ from bayesdist.products.formats.common.coefficients import (
 from bayesdist.products.formats.idctab.drift import RATES
 from bayesdist.utils.arrays import Float
 
-INVERSE_NODES = 33  # points of each axis of the fit
+INVERSE_NODES = 33  # points per axis at which the inverse is fitted
 
 
 @dataclass(frozen=True, eq=False)
 class ChipNumbers:
-    """Fitted numbers of one chip, as an IDCTAB names them."""
+    """Fitted numbers of one chip, named as in an IDCTAB."""
 
     chip: Chip
-    names: tuple[str, ...]  # V2REF, V3REF, CX10, CX11, ..., CY10, ...; keywords of fitted rates
+    names: tuple[str, ...]  # V2REF, V3REF, CX10, CX11, ..., CY10, ..., keywords of fitted rates
     values: Float  # (P,), arcsec, arcsec/pix^n, arcsec/pix/yr
-    jacobian: Float  # (P, D), by the parameters of the solution
-    constant: Float  # (Xc, Yc) of the reference pixel, in V2REF and V3REF; arcsec
+    jacobian: Float  # (P, D), derivatives with respect to the parameters of the solution
+    constant: Float  # arcsec; (Xc, Yc) of the reference pixel, included in V2REF and V3REF
 
     def column(self, name: str) -> float:
-        """Value of a name."""
+        """Value of the number with this name."""
         return float(self.values[self.names.index(name)])
 
     def without_rates(self) -> ChipNumbers:
-        """Numbers without those of the drift."""
+        """Numbers without the rates of the drift."""
         keep = [k for k, name in enumerate(self.names) if not name.startswith("TDD")]
         names = tuple(self.names[k] for k in keep)
         return ChipNumbers(self.chip, names, self.values[keep], self.jacobian[keep], self.constant)
@@ -52,18 +52,18 @@ class ChipNumbers:
 
 @dataclass(frozen=True, eq=False)
 class ChipInverse:
-    """INVERSE row of one chip, at the reference date of its drift."""
+    """INVERSE row of one chip at the reference date of its drift."""
 
     values: dict[str, float]  # by column, pixels per arcsec^n
     sigmas: dict[str, float]  # of the values
-    closure: float  # largest distance of a pixel from its image there and back, pixels
+    closure: float  # pixels; largest round-trip error over the chip
 
 
 def check_time(model: DistortionModel, *, acs_wfc: bool) -> None:
-    """Refuse time dependence that stwcs would not apply; to leave it out would be a silent error.
+    """Raise InputError for time dependence that stwcs would not apply.
 
-    Refused are time-dependent terms other than (u, 1, 0), (v, 1, 0) and (v, 0, 1), of several
-    segments, or of a detector other than ACS/WFC.
+    Leaving it out would be an unreported error. Rejected are time-dependent terms other than (u, 1,
+    0), (v, 1, 0) and (v, 0, 1), several segments, and detectors other than ACS/WFC.
     """
     if model.time is None:
         return
@@ -95,11 +95,32 @@ def chip_numbers(
     parity: tuple[int, int],
     zero: tuple[float, float],
 ) -> ChipNumbers:
-    """Numbers of one chip, at the reference date of its drift.
+    """Numbers of one chip at the reference date of its drift.
 
-    `factor` is the arcseconds in one unit of u, v, `parity` the sense of V2 and V3 against Xc and
-    Yc, `zero` V2 and V3 of (u, v) = (0, 0) in arcseconds.  InputError for an unknown chip,
-    DegenerateError when the linear part is singular.
+    Parameters
+    ----------
+    calibration : Calibration
+        Calibration of all chips.
+    chip : int
+        Chip number.
+    factor : float
+        Size of one unit of u, v in arcseconds.
+    parity : tuple of int
+        Signs of V2 and V3 relative to Xc and Yc.
+    zero : tuple of float
+        V2 and V3 of (u, v) = (0, 0), arcseconds.
+
+    Returns
+    -------
+    ChipNumbers
+        Numbers with their derivatives.
+
+    Raises
+    ------
+    InputError
+        If the chip is unknown.
+    DegenerateError
+        If the linear part is singular.
     """
     model = calibration.model
     coefficients, jacobian = calibration.coefficients(chip, reference_date(calibration))
@@ -113,7 +134,7 @@ def chip_numbers(
         for a, name in enumerate(("V2REF", "V3REF"))
     ]
     for axis, prefix in enumerate(("CX", "CY")):
-        # tables list CX10 before CX11: rising powers of x within an order
+        # tables list CX10 before CX11: ascending powers of x within an order
         for k, (i, j) in sorted(enumerate(basis.terms), key=lambda t: (sum(t[1]), t[1])):
             if i + j:
                 name = idctab_column(prefix, i, j)
@@ -130,13 +151,13 @@ def chip_numbers(
 
 
 def reference_date(calibration: Calibration) -> float | None:
-    """Date from which the drift of a single segment counts; None without drift."""
+    """Reference date of a drift with a single segment; None without drift."""
     time = calibration.model.time
     return None if time is None else time.epoch0[0]
 
 
 def _rates(calibration: Calibration, chip: int, factor: float) -> list[tuple[str, float, Float]]:
-    """Rates per pixel; the model has them per half size of the detector."""
+    """Rates per pixel, converted from the model's rates per half size of the detector."""
     model = calibration.model
     if model.time is None:
         return []
@@ -153,17 +174,17 @@ def _rates(calibration: Calibration, chip: int, factor: float) -> list[tuple[str
 
 
 def chip_inverse(calibration: Calibration, chip: int, factor: float) -> ChipInverse:
-    """Least-squares inverse of a chip's polynomials, of their order, over the whole chip.
+    """Least-squares inverse of a chip's polynomials, of the same order, over the whole chip.
 
-    There is no constant term: (0, 0) is XREF, YREF in both directions. stwcs has no use for INVERSE
-    rows (ACS handbook 4.1.5); other programs start their iterations there, so that the closure
-    matters and is stated.  InputError when the map folds the chip onto itself.
+    There is no constant term: (0, 0) corresponds to XREF, YREF in both directions. stwcs does not
+    use INVERSE rows (ACS handbook 4.1.5). Other programs start their iterations from them, so the
+    closure is reported. InputError if the map folds the chip onto itself.
     """
     stated = calibration.at(reference_date(calibration), origin="chip")[chip]
-    one: ChipMap = stated.transformed(factor * np.eye(2))
+    chip_map: ChipMap = stated.transformed(factor * np.eye(2))
     try:
         inverse = fitted_inverse(
-            one, one.basis.order, nodes=INVERSE_NODES, constant=False, linear=np.eye(2)
+            chip_map, chip_map.basis.order, nodes=INVERSE_NODES, constant=False, linear=np.eye(2)
         )
     except InputError as error:
         raise InputError(
@@ -172,14 +193,15 @@ def chip_inverse(calibration: Calibration, chip: int, factor: float) -> ChipInve
             do="lower the order, fit stars over the whole chip, or leave the inverse out",
         ) from error
     sigma = np.zeros(2 * len(inverse.x_terms))
-    if one.cov is not None and inverse.jacobian is not None:
-        sigma = propagated_sigma(inverse.jacobian, one.cov)
+    if chip_map.cov is not None and inverse.jacobian is not None:
+        sigma = propagated_sigma(inverse.jacobian, chip_map.cov)
     columns, values = [], []
     for axis, (prefix, terms) in enumerate((("CX", inverse.x_terms), ("CY", inverse.y_terms))):
         for (i, j), value in terms.items():
             columns.append(idctab_column(prefix, i, j))
-            values.append(value + ((i, j) == (1 - axis, axis)))  # the whole offset, not less (X, Y)
-    closure, _ = inverse.misses(one)
+            # add the position itself, which `inverse` leaves out
+            values.append(value + ((i, j) == (1 - axis, axis)))
+    closure, _ = inverse.misses(chip_map)
     return ChipInverse(
         dict(zip(columns, values, strict=True)),
         dict(zip(columns, sigma.tolist(), strict=True)),
@@ -190,21 +212,21 @@ def chip_inverse(calibration: Calibration, chip: int, factor: float) -> ChipInve
 def joint_covariance(
     calibrations: Sequence[Calibration], numbers: Sequence[Sequence[ChipNumbers]]
 ) -> Float:
-    """Covariance of the numbers of all calibrations and chips, with a common orientation's part."""
+    """Covariance of the numbers of all calibrations and chips, including common orientations."""
     jacobians = [np.concatenate([chip.jacobian for chip in chips]) for chips in numbers]
     ends = np.cumsum([len(j) for j in jacobians])
     places = [slice(int(e) - len(j), int(e)) for e, j in zip(ends, jacobians, strict=True)]
     out = np.zeros((int(ends[-1]), int(ends[-1])))
-    for one, jacobian, place in zip(calibrations, jacobians, places, strict=True):
-        out[place, place] = jacobian @ np.asarray(one.solution.cov, float) @ jacobian.T
+    for source, jacobian, place in zip(calibrations, jacobians, places, strict=True):
+        out[place, place] = jacobian @ np.asarray(source.solution.cov, float) @ jacobian.T
     laid = [
-        (k, one.plane.orientation, jacobians[k] @ one.with_plane)
-        for k, one in enumerate(calibrations)
-        if one.plane.orientation is not None and one.with_plane is not None
+        (k, source.plane.orientation, jacobians[k] @ source.with_plane)
+        for k, source in enumerate(calibrations)
+        if source.plane.orientation is not None and source.with_plane is not None
     ]
     for a, orientation, by_a in laid:
-        for b, other, by_b in laid:
-            if b > a and orientation is other:
+        for b, other_orientation, by_b in laid:
+            if b > a and orientation is other_orientation:
                 shared = by_a @ _inverse(orientation.cov) @ by_b.T
                 out[places[a], places[b]] = shared
                 out[places[b], places[a]] = shared.T
@@ -212,11 +234,11 @@ def joint_covariance(
 
 
 def _inverse(cov: Float) -> Float:
-    """Inverse of the orientation's covariance, whose scale may be held and so have variance 0."""
+    """Pseudo-inverse of the covariance of an orientation; a fixed scale has zero variance."""
     sigma = np.sqrt(np.diag(cov))
-    known = sigma > 0
+    free = sigma > 0
     out = np.zeros_like(cov)
-    pick = np.ix_(known, known)
-    norm = np.outer(sigma[known], sigma[known])
+    pick = np.ix_(free, free)
+    norm = np.outer(sigma[free], sigma[free])
     out[pick] = np.linalg.pinv(cov[pick] / norm, hermitian=True) / norm
     return out

@@ -1,4 +1,4 @@
-"""Sizes, scales and reference values of an IDCTAB that no detector has."""
+"""Plausible ranges of sizes, scales and reference values of an IDCTAB."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from bayesdist.errors import FormatError
 from bayesdist.products.formats.common.document import Finding
 from bayesdist.products.formats.idctab.table import IdcTab
 
-# least and most that a column may have, and what it is then
+# smallest and largest plausible value of a column, and its unit
 LIMITS = {
     "XSIZE": (1.0, 1e6, "pixels"),
     "YSIZE": (1.0, 1e6, "pixels"),
@@ -23,39 +23,39 @@ LIMITS = {
 
 
 def rows_text(indices: Iterable[int]) -> str:
-    """Row numbers from 1, the first few of them by name."""
+    """Row numbers counted from 1: the first three, and the number of further ones."""
     numbers = [int(k) + 1 for k in indices]
     shown = ", ".join(map(str, numbers[:3]))
-    more = f" and {len(numbers) - 3} more" if len(numbers) > 3 else ""
-    return f"row{'s' if len(numbers) > 1 else ''} {shown}{more}"
+    further = f" and {len(numbers) - 3} more" if len(numbers) > 3 else ""
+    return f"row{'s' if len(numbers) > 1 else ''} {shown}{further}"
 
 
 def _beyond(value: float, name: str) -> str:
-    least, most, unit = LIMITS[name]
-    return f"{value:g} is not between {least:g} and {most:g} {unit}"
+    lowest, highest, unit = LIMITS[name]
+    return f"{value:g} is not between {lowest:g} and {highest:g} {unit}"
 
 
 def implausible(tab: IdcTab) -> Iterator[Finding]:
-    """Findings on finite values that cannot be meant."""
+    """Findings on finite values that are implausible."""
     if not len(tab.rows):
         yield Finding("error", "rows", "there are none")
-    for name, (least, most, _) in LIMITS.items():
+    for name, (lowest, highest, _) in LIMITS.items():
         if name in tab.columns:
             values = tab.rows[name].astype(float)
-            bad = np.flatnonzero((values < least) | (values > most))
+            bad = np.flatnonzero((values < lowest) | (values > highest))
             if name == "SCALE":
-                bad = bad[values[bad] != 0]  # which is a finding of its own
+                bad = bad[values[bad] != 0]  # `lint` reports a zero SCALE
             if bad.size:
-                where = f"{rows_text(bad)}, column {name}"
-                yield Finding("error", where, _beyond(values[bad[0]], name))
+                location = f"{rows_text(bad)}, column {name}"
+                yield Finding("error", location, _beyond(values[bad[0]], name))
 
 
 def refuse_implausible(tab: IdcTab, rows: Iterable[int]) -> None:
-    """Refuse rows of a table that a calibration cannot be made of."""
+    """Raise FormatError if rows that a calibration needs have implausible values."""
     for row in rows:
-        for name, (least, most, _) in LIMITS.items():
-            value = float(tab.rows[name][row]) if name in tab.columns else least
-            if not least <= value <= most:
+        for name, (lowest, highest, _) in LIMITS.items():
+            value = float(tab.rows[name][row]) if name in tab.columns else lowest
+            if not lowest <= value <= highest:
                 raise FormatError(
                     _beyond(value, name),
                     where=f"{tab.name}, row {row + 1}, column {name}",

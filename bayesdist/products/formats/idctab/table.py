@@ -1,20 +1,22 @@
-"""The IDCTAB: the distortion table of HST instruments, as stwcs reads it (its distortion/mutil.py).
+"""IDCTAB: the distortion table of HST instruments, as read by stwcs (its distortion/mutil.py).
 
-    Xc ["] = sum CXnj x^j y^(n-j),  Yc ["] = sum CYnj x^j y^(n-j),   x, y from XREF, YREF;  n >= 1
+    Xc ["] = sum CXnj x^j y^(n-j),  Yc ["] = sum CYnj x^j y^(n-j),  x, y from XREF, YREF;  n >= 1
 
-Rows with DIRECTION 'INVERSE' lead back: x and y in pixels from powers of Xc and Yc in arcseconds.
+Rows with DIRECTION 'INVERSE' are the inverse: x and y in pixels as polynomials in Xc and Yc in
+arcseconds.
 
-Uncertainties stand in HDUs behind the first table, where stwcs does not look:
+Uncertainties are stored in HDUs after the first table, which stwcs does not read:
 
 SIGMA
-    A table with the rows of the coefficient table: its key columns (DETCHIP, DIRECTION, filters),
-    and the standard deviations of V2REF, V3REF and every coefficient, under the same names.  Those
-    of the time-dependent terms are keywords of its header, named as in the primary header.
+    Table with the same rows as the coefficient table: its key columns (DETCHIP, DIRECTION,
+    filters), and the standard deviations of V2REF, V3REF and every coefficient, under the same
+    names. Those of the time-dependent terms are keywords of its header, named as in the primary
+    header.
 COVAR
-    A table with one row for each fitted number of the file: DETCHIP, the filters where these have
-    numbers of their own (of the first row that holds the number), PARAM (column or keyword name),
-    VALUE, and COV, its covariances with all rows in order.  INVERSE rows follow from FORWARD ones
-    and are not in it.
+    Table with one row for each fitted number of the file: DETCHIP; the filters, if they differ in
+    their numbers (those of the first row that has the number); PARAM (name of the column or
+    keyword); VALUE; and COV, the covariances with all rows in order. INVERSE rows are derived from
+    FORWARD ones and are not included.
 """
 
 from __future__ import annotations
@@ -37,30 +39,30 @@ from bayesdist.products.formats.idctab.drift import drift, scheme_of
 from bayesdist.products.formats.idctab.hst import serves
 from bayesdist.utils.arrays import Float, Int
 
-Filter = str | Sequence[str] | None  # one name, or those of both wheels
+Filter = str | Sequence[str] | None  # one filter name, or those in both wheels
 
 FILTER_COLUMNS = ("FILTER1", "FILTER2", "FILTER", "OPT_ELEM")
-HIGHEST = 9  # order: CX and CY have one digit for each power
-# The chip to whose zero point stwcs refers both chips of ACS/WFC and of WFC3/UVIS.
+HIGHEST = 9  # highest order: column names have one digit for each power
+# Chip that defines the common zero point of ACS/WFC and of WFC3/UVIS in stwcs.
 _REFERENCE = 2
-_ANY_CHIP = -999  # stwcs lets such a row serve every chip
+_ANY_CHIP = -999  # stwcs uses such a row for every chip
 
 
 @dataclass(frozen=True, eq=False)
 class IdcTab:
-    """IDCTAB file: all its HDUs, and their meaning.
+    """IDCTAB file with all its HDUs, and its interpretation.
 
     Parameters
     ----------
     hdus : tuple of Hdu
-        All HDUs; the first table is HDU 1.
+        All HDUs; the coefficient table is HDU 1.
     name : str
-        Name of the file in errors.
+        Name of the file, for error messages.
 
     Raises
     ------
     FormatError
-        When a keyword or column is missing that stwcs cannot do without.
+        If a keyword or column is missing that stwcs requires.
 
     Examples
     --------
@@ -110,12 +112,12 @@ class IdcTab:
 
     @property
     def header(self) -> fits.Header:
-        """Primary header; a new one at each call."""
+        """Primary header; a new copy at each access."""
         return self.hdus[0].header
 
     @property
     def rows(self) -> NDArray[np.void]:
-        """Coefficient table as a structured array; FormatError where it is none."""
+        """Coefficient table as a structured array; FormatError if HDU 1 is not a table."""
         try:
             return self.hdus[1].rows
         except FormatError as error:
@@ -128,7 +130,7 @@ class IdcTab:
 
     @property
     def prefixes(self) -> tuple[str, str]:
-        """First letters of coefficient columns: CX, CY, or A, B in very old files."""
+        """First letters of the coefficient columns: CX, CY, or A, B in very old files."""
         return ("CX", "CY") if "CX10" in self.columns else ("A", "B")
 
     @cached_property
@@ -143,22 +145,22 @@ class IdcTab:
 
     @property
     def instrument(self) -> str:
-        """INSTRUME."""
+        """INSTRUME; empty if the file has none."""
         return named_in(self.header, "INSTRUME", self.name)
 
     @property
     def detector(self) -> str:
-        """DETECTOR, empty where the file has none."""
+        """DETECTOR; empty if the file has none."""
         return named_in(self.header, "DETECTOR", self.name)
 
     @property
     def is_acs_wfc(self) -> bool:
-        """True where stwcs looks for time-dependent terms."""
+        """True for ACS/WFC, the only detector for which stwcs reads time-dependent terms."""
         return self.instrument == "ACS" and self.detector == "WFC"
 
     @cached_property
     def tdd(self) -> dict[str, float]:
-        """All keywords of time-dependent terms: TDD..."""
+        """Values of all keywords of time-dependent terms, which begin with TDD."""
         return {
             k: float(v)
             for k, v in self.header.items()
@@ -167,17 +169,17 @@ class IdcTab:
 
     @property
     def tdd_scheme(self) -> str:
-        """Scheme of the drift, see `drift.scheme_of`; 'none' for detectors other than ACS/WFC."""
+        """Scheme of the drift (see `drift.scheme_of`); 'none' for detectors other than ACS/WFC."""
         return scheme_of(self.tdd) if self.is_acs_wfc else "none"
 
     @property
     def sigma(self) -> NDArray[np.void] | None:
-        """Rows of the HDU SIGMA; None where there is none."""
+        """Rows of the HDU SIGMA; None if there is no such HDU."""
         return self._rows_of("SIGMA")
 
     @property
     def covariance(self) -> NDArray[np.void] | None:
-        """Rows of the HDU COVAR; None where there is none."""
+        """Rows of the HDU COVAR; None if there is no such HDU."""
         return self._rows_of("COVAR")
 
     def _rows_of(self, name: str) -> NDArray[np.void] | None:
@@ -185,7 +187,7 @@ class IdcTab:
 
     @property
     def chips(self) -> tuple[int, ...]:
-        """Chip numbers, that one first to whose zero point stwcs refers the others."""
+        """Chip numbers; the first is the chip that defines the common zero point in stwcs."""
         numbers = {1}
         if "DETCHIP" in self.columns:
             numbers = {max(int(n), 1) for n in self.rows["DETCHIP"]}
@@ -193,14 +195,14 @@ class IdcTab:
 
     @cached_property
     def stated_chips(self) -> tuple[int, ...]:
-        """Chip numbers of DETCHIP; none where rows serve every chip."""
+        """Chip numbers in DETCHIP; empty if the rows are valid for every chip."""
         if "DETCHIP" not in self.columns:
             return ()
         return tuple(sorted({int(n) for n in self.rows["DETCHIP"] if n > 0}))
 
     @cached_property
     def directions(self) -> NDArray[np.str_]:
-        """DIRECTION of every row, in capitals; FORWARD where there is no such column."""
+        """DIRECTION of every row, in capitals; FORWARD if there is no such column."""
         if "DIRECTION" not in self.columns:
             return np.full(len(self.rows), "FORWARD")
         return np.char.upper(np.char.strip(self.rows["DIRECTION"]))
@@ -213,34 +215,38 @@ class IdcTab:
         Parameters
         ----------
         chip : int
+            Chip number.
         filter : str or sequence of str, optional
-            One name, or those of both wheels; CLEAR1L and its like are one and the same.  None will
-            do where all rows of the chip hold the same coefficients.
+            One filter name, or those in both wheels; CLEAR1L, CLEAR2L and so on are equivalent. It
+            may be omitted if all rows of the chip have the same coefficients.
         direction : str
+            "FORWARD" or "INVERSE".
 
         Returns
         -------
         int
-            0-based.
+            Row index, counted from 0.
 
         Raises
         ------
         InputError
-            When no row fits, or rows differ and no filter is given.
+            If no row matches, or if rows differ and no filter is given.
         """
-        found = self.matching_rows(chip, filter, direction)
-        where = f"{self.name}, chip {chip}, direction {direction}"
-        if not found.size:
+        indices = self.matching_rows(chip, filter, direction)
+        location = f"{self.name}, chip {chip}, direction {direction}"
+        if not indices.size:
             raise InputError(
                 f"there is no row for filter {filter!r}" if filter else "there is no row",
-                where=where,
+                where=location,
                 do="see the table's DETCHIP, DIRECTION and filter columns",
             )
-        if filter is None and not self._all_equal(found):
+        if filter is None and not self._all_equal(indices):
             raise InputError(
-                "the coefficients differ from filter to filter", where=where, do="name the filter"
+                "the coefficients differ from filter to filter",
+                where=location,
+                do="name the filter",
             )
-        return int(found[0])
+        return int(indices[0])
 
     def matching_rows(self, chip: int, filter: Filter = None, direction: str = "FORWARD") -> Int:
         """Indices of all rows of a chip, filter and direction.
@@ -253,7 +259,7 @@ class IdcTab:
         Returns
         -------
         ndarray of int
-            0-based; empty where no row fits.
+            Row indices, counted from 0; empty if no row matches.
         """
         rows, columns = self.rows, self.columns
         keep = self.directions == direction.upper()
@@ -265,7 +271,7 @@ class IdcTab:
         return np.flatnonzero(keep)
 
     def filters(self) -> list[tuple[str, ...]]:
-        """Filter names of every row; empty tuples where the table has no such columns."""
+        """Filter names of every row; empty tuples if the table has no filter columns."""
         columns = [c for c in FILTER_COLUMNS if c in self.columns]
         return [tuple(str(row[c]).strip() for c in columns) for row in self.rows]
 
@@ -274,7 +280,7 @@ class IdcTab:
         return all((self.rows[name][found] == self.rows[name][found[0]]).all() for name in names)
 
     def coefficients_of_row(self, row: int) -> tuple[Float, Float]:
-        """Coefficients of a row, as `coefficients`."""
+        """Coefficients of a row, in the form returned by `coefficients`."""
         record = self.rows[row]
         x, y = (
             np.array(
@@ -292,7 +298,7 @@ class IdcTab:
     def coefficients(
         self, chip: int, filter: Filter = None, direction: str = "FORWARD"
     ) -> tuple[Float, Float]:
-        """Coefficients of x^i y^j, for (i, j) in `terms`.
+        """Coefficients of x^i y^j for the powers (i, j) in `terms`.
 
         Parameters
         ----------
@@ -302,13 +308,14 @@ class IdcTab:
         Returns
         -------
         cx, cy : ndarray, shape (n_terms,)
-            Arcseconds per pixel^(i + j), or pixels per arcsecond^(i + j) in INVERSE rows, as they
-            stand in the table; the first is CX00, 0 where there is no such column.
+            Coefficients as stored in the table, in arcseconds per pixel^(i + j), or in pixels per
+            arcsecond^(i + j) for INVERSE rows. The first is CX00 or CY00, or 0 if there is no such
+            column.
 
         Raises
         ------
         InputError
-            As `row`.
+            As for `row`.
         """
         return self.coefficients_of_row(self.row(chip, filter, direction))
 
@@ -322,10 +329,10 @@ class IdcTab:
         direction: str = "FORWARD",
         epoch: float | None = None,
     ) -> tuple[Float, Float]:
-        """Positions in the aperture's frame, as stwcs computes them.
+        """Positions in the frame of the aperture, computed as in stwcs.
 
-        CX00 and CY00 are not used, and coefficients are multiplied by SCALE where CX11 is exactly 1
-        and SCALE is not.
+        CX00 and CY00 are ignored. Coefficients are multiplied by SCALE if CX11 is exactly 1 and
+        SCALE is not.
 
         Parameters
         ----------
@@ -334,8 +341,8 @@ class IdcTab:
         x, y : array_like
             FITS 1-based pixels.
         epoch : float, optional
-            Decimal years, for the time-dependent terms of the 2015 scheme; without it they are left
-            out.
+            Decimal year for the time-dependent terms of the 2015 scheme, which are omitted by
+            default.
 
         Returns
         -------
@@ -345,27 +352,27 @@ class IdcTab:
         Raises
         ------
         InputError
-            As `row`; for an epoch where a table of ACS/WFC has time-dependent terms of another
-            scheme than that of 2015.
+            As for `row`; also if an epoch is given and an ACS/WFC table has time-dependent terms of
+            a scheme other than that of 2015.
         """
         row = self.row(chip, filter, direction)
         record = self.rows[row]
-        both = np.stack(self.coefficients_of_row(row))
-        both[:, 0] = 0.0
+        coefficients = np.stack(self.coefficients_of_row(row))
+        coefficients[:, 0] = 0.0
         scale = round(float(record["SCALE"]), 8)
-        if both[0, self.terms.index((1, 0))] == 1.0 and scale != 1.0:
-            both *= scale
+        if coefficients[0, self.terms.index((1, 0))] == 1.0 and scale != 1.0:
+            coefficients *= scale
         if epoch is not None and self.is_acs_wfc:
-            both += drift(self.tdd, self.terms, chip, epoch, self.name)
+            coefficients += drift(self.tdd, self.terms, chip, epoch, self.name)
         dx = np.asarray(x, float) - float(record["XREF"])
         dy = np.asarray(y, float) - float(record["YREF"])
-        u, v = (evaluate(dict(zip(self.terms, c, strict=True)), dx, dy) for c in both)
+        u, v = (evaluate(dict(zip(self.terms, c, strict=True)), dx, dy) for c in coefficients)
         return u, v
 
     def invert(
         self, chip: int, Xc: ArrayLike, Yc: ArrayLike, *, filter: Filter = None
     ) -> tuple[Float, Float]:
-        """Pixels of positions in the aperture's frame, by the INVERSE row.
+        """Pixels at positions in the frame of the aperture, computed from the INVERSE row.
 
         Parameters
         ----------
@@ -382,7 +389,7 @@ class IdcTab:
         Raises
         ------
         InputError
-            As `row`.
+            As for `row`.
         """
         row = self.row(chip, filter, "INVERSE")
         record = self.rows[row]
@@ -400,17 +407,19 @@ def read_idctab(path: str | os.PathLike[str]) -> IdcTab:
     Parameters
     ----------
     path : path-like
+        FITS file, optionally compressed.
 
     Returns
     -------
     IdcTab
+        The file, which `write_idctab` writes back unchanged.
 
     Raises
     ------
     InputError
-        When the file cannot be read.
+        If the file cannot be read.
     FormatError
-        When it is no FITS file, is truncated, or lacks a part that an IDCTAB must have.
+        If it is not a FITS file, is truncated, or lacks a part that an IDCTAB must have.
 
     Examples
     --------
@@ -428,18 +437,19 @@ def read_idctab(path: str | os.PathLike[str]) -> IdcTab:
 
 
 def write_idctab(tab: IdcTab, path: str | os.PathLike[str]) -> None:
-    """Write an IDCTAB, whole or not at all; one that was read is written back bit by bit.
+    """Write an IDCTAB atomically; a file that was read is written back bit by bit.
 
     Parameters
     ----------
     tab : IdcTab
+        IDCTAB to write.
     path : path-like
-        stwcs wants a name that ends in ``_idc.fits``.
+        Output file. stwcs expects a name that ends in ``_idc.fits``.
 
     Raises
     ------
     InputError
-        When the file cannot be written.
+        If the file cannot be written.
 
     Examples
     --------

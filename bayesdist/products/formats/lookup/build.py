@@ -1,11 +1,11 @@
-"""Extensions of a D2IMFILE or NPOLFILE, so that no consumer drops or misplaces a table.
+"""Extensions of a D2IMFILE or NPOLFILE that no program drops or misplaces.
 
 **Registration.** CRPIX, CRVAL and CDELT are always written (see `lookup_file`).
 
-**Padding.** stwcs notes as the size of a correction the maximum of its table, not of the absolute
-value, and astropy.wcs leaves out a table whose maximum is below zero.  Where no node is clearly
-above zero, columns are added at the right end: copies of the last one until the detector has ended,
-so that nothing changes there, then one that is positive and that no pixel reaches.
+**Padding.** stwcs records the maximum of a table, not of its absolute value, as the size of the
+correction, and astropy.wcs ignores a table with a negative maximum. If no node is clearly positive,
+columns are therefore appended at the right end: copies of the last column up to the edge of the
+detector, so that nothing changes there, and then one positive column that no pixel reaches.
 """
 
 from __future__ import annotations
@@ -30,14 +30,14 @@ from bayesdist.products.formats.common.content import hdus_of
 from bayesdist.products.formats.lookup.file import AXES, LookupFile
 from bayesdist.utils.arrays import Float
 
-# A maximum below this fraction of the largest absolute value may turn negative on the way.
+# Fraction of the largest absolute value; a smaller maximum may become negative in processing.
 _CLEARLY = 0.01
 
 
 def one_per_chip(tables: Sequence[LookupTable], where: str) -> list[LookupTable]:
     """Tables in the order of the file: the highest chip first, so that EXTVER 1 is chip 2 of ACS.
 
-    InputError when there is none, or two of one chip.
+    InputError if there is no table, or if two tables are for the same chip.
     """
     if not tables:
         raise InputError("no look-up table is given", where=where, do="give one for each chip")
@@ -51,35 +51,35 @@ def one_per_chip(tables: Sequence[LookupTable], where: str) -> list[LookupTable]
 
 @dataclass(frozen=True, eq=False)
 class Part:
-    """Tables of one chip in the file; the consumer applies `turn` (2, 2) before it takes maxima."""
+    """Tables of one chip; the reading program applies `turn` (2, 2) before it takes maxima."""
 
-    table: LookupTable  # for its chip and grid
+    table: LookupTable  # defines chip and grid
     values: Float  # (2, ny, nx)
     sigma: Float | None  # (2, ny, nx)
     turn: Float = field(default_factory=lambda: np.eye(2))
 
     def padding(self, columns: int) -> Float:
-        """Columns to be added for a chip of so many columns, shape (2, ny, n); n is often 0."""
-        seen = np.einsum("ab,byx->ayx", self.turn, self.values)
-        largest = np.abs(seen).max(axis=(1, 2))
-        if not (seen.max(axis=(1, 2)) < _CLEARLY * largest).any():
+        """Columns to append for a chip with this many columns, shape (2, ny, n); n is often 0."""
+        transformed = np.einsum("ab,byx->ayx", self.turn, self.values)
+        largest = np.abs(transformed).max(axis=(1, 2))
+        if not (transformed.max(axis=(1, 2)) < _CLEARLY * largest).any():
             return self.values[..., :0]
         last = self.table.nodes()[0][-1]
-        # half a step more than the detector, since the pixel may have been shifted already
+        # half a step beyond the detector, because the pixel may already have been shifted
         copies = int(np.ceil((columns + 0.5 - last) / self.table.step[0] + 0.5))
         beyond = np.linalg.solve(self.turn, np.full(2, largest.max()))
         column = np.broadcast_to(beyond[:, None, None], (*self.values.shape[:2], 1))
-        same = np.repeat(self.values[..., -1:], max(copies, 1), axis=-1)
-        return np.concatenate([same, column], axis=-1)
+        copied = np.repeat(self.values[..., -1:], max(copies, 1), axis=-1)
+        return np.concatenate([copied, column], axis=-1)
 
 
 def lookup_file(
     parts: Sequence[Part], *, size: tuple[int, int], cards: Sequence[str], name: str
 ) -> LookupFile:
-    """File of all its parts, in the order of EXTVER.
+    """File of all parts, in the order of EXTVER.
 
-    `size` is the columns and rows of a chip, `cards` are of the primary header, `name` is for
-    errors.
+    `size` is the number of columns and rows of a chip, `cards` are added to the primary header, and
+    `name` is for error messages.
     """
     primary = fits.PrimaryHDU()
     append_cards(primary, cards)
@@ -95,7 +95,7 @@ def lookup_file(
             if part.sigma is not None:
                 place = _place_cards(part.table, version, size)
                 sigmas.append(_image(f"SIGMA_{name_of_axis}", part.sigma[axis], place))
-    # stwcs goes through the extensions in turn until it has found its own
+    # after the tables: stwcs searches the extensions in order until it finds a table
     return LookupFile(hdus_of([*hdus, *sigmas]), name)
 
 
@@ -106,7 +106,7 @@ def _image(name: str, plane: Float, cards: Sequence[str]) -> fits.ImageHDU:
 
 
 def _place_cards(table: LookupTable, version: int, size: tuple[int, int]) -> list[str]:
-    """Cards of the registration of a table."""
+    """Cards that register a table on the detector."""
     return [
         number_card("EXTVER", version),
         number_card("CCDCHIP", table.chip, "chip of the table"),
@@ -127,7 +127,7 @@ def reference_cards(
     pedigree: str | None,
     history: Sequence[str],
 ) -> list[str]:
-    """Cards of a reference file, those of values that only the user knows at the end."""
+    """Header cards of a reference file; values that only the user knows come last."""
     texts = {
         "TELESCOP": "HST",
         "INSTRUME": instrument,
@@ -138,7 +138,7 @@ def reference_cards(
         "CREATOR": "bayesdist",
         **filters,
     }
-    known = {"USEAFTER": useafter, "PEDIGREE": pedigree}
-    texts |= {keyword: text for keyword, text in known.items() if text}
+    user_values = {"USEAFTER": useafter, "PEDIGREE": pedigree}
+    texts |= {keyword: text for keyword, text in user_values.items() if text}
     cards = [text_card(keyword, text) for keyword, text in texts.items()]
     return cards + wrapped_cards("HISTORY", history)

@@ -1,4 +1,4 @@
-"""D2IMFILE: the detector's own look-up tables, in pixels before the polynomial."""
+"""D2IMFILE: look-up tables of the detector, in pixels before the polynomial."""
 
 from __future__ import annotations
 
@@ -33,15 +33,15 @@ def write_d2im(
     pedigree: str | None = None,
     history: Sequence[str] = (),
 ) -> LookupFile:
-    """Write the detector's tables as a D2IMFILE, whole or not at all.
+    """Write the detector's look-up tables as a D2IMFILE, atomically.
 
     Parameters
     ----------
     tables : sequence of LookupTable
-        At most one for each chip, none of a filter.  Their sigmas, where they have some, become
-        extensions SIGMA_DX, SIGMA_DY.
+        At most one table per chip, without a filter. If they have standard errors, these are
+        written to extensions SIGMA_DX and SIGMA_DY.
     path : path-like
-        Pipelines want a name that ends in ``_d2i.fits``.
+        Output file. Pipelines expect a name that ends in ``_d2i.fits``.
     instrument, detector : str
         INSTRUME and DETECTOR.
     size : tuple of int
@@ -49,20 +49,20 @@ def write_d2im(
     description : str
         DESCRIP.
     useafter, pedigree : str, optional
-        USEAFTER ("Mar 01 2002 00:00:00") and PEDIGREE ("INFLIGHT 01/05/2006"), which only the user
-        knows.
+        USEAFTER ("Mar 01 2002 00:00:00") and PEDIGREE ("INFLIGHT 01/05/2006"); omitted by default.
     history : sequence of str
         Lines of HISTORY.
 
     Returns
     -------
     LookupFile
-        Written file: single precision, as these files are.
+        The written file, in single precision as is usual for these files.
 
     Raises
     ------
     InputError
-        For no table, two tables of a chip, a table of a filter, or a file that cannot be written.
+        If there is no table, two tables for one chip, or a table of a filter, or if the file cannot
+        be written.
 
     Examples
     --------
@@ -72,15 +72,15 @@ def write_d2im(
     >>> sorted(table.chip for table in read_d2im("test_d2i.fits"))
     [1, 2]
     """
-    where = "D2IMFILE"
+    location = "D2IMFILE"
     for table in tables:
         if table.filter:
             raise InputError(
                 f"the look-up table {table.label} is not the detector's",
-                where=where,
+                where=location,
                 do="give the tables of filters to write_npol",
             )
-    chips, kind = one_per_chip(tables, where), f"{detector} D2I FILE"
+    chips, kind = one_per_chip(tables, location), f"{detector} D2I FILE"
     file = lookup_file(
         [Part(t, t.values, t.sigma) for t in chips],
         size=size,
@@ -96,26 +96,27 @@ def write_d2im(
 def read_d2im(
     path: str | os.PathLike[str], *, first: Sequence[float] | None = None
 ) -> tuple[LookupTable, ...]:
-    """Detector's tables of a D2IMFILE.
+    """Read the detector's look-up tables from a D2IMFILE.
 
     Parameters
     ----------
     path : path-like
+        D2IMFILE.
     first : sequence of float, optional
-        Pixel (x, y) of the first node, in place of the file's own: for files without CRPIX and
-        CRVAL, which older programs registered at pixel 1 and astropy.wcs since 6.1 at pixel 64.
+        Pixel (x, y) of the first node, overriding the file. It is needed for files without CRPIX
+        and CRVAL, which older programs register at pixel 1 and astropy.wcs since 6.1 at pixel 64.
 
     Returns
     -------
     tuple of LookupTable
-        One for each chip, registered as astropy.wcs does it.
+        One table per chip, registered as in astropy.wcs.
 
     Raises
     ------
     InputError
-        When the file cannot be read.
+        If the file cannot be read.
     FormatError
-        When it is no D2IMFILE, or its tables are incomplete or not finite.
+        If it is not a D2IMFILE, or if its tables are incomplete or not finite.
 
     Examples
     --------

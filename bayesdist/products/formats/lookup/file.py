@@ -1,15 +1,16 @@
 """D2IMFILE and NPOLFILE: look-up tables of the distortion, as stwcs and astropy.wcs read them.
 
-Image extensions DX and DY for each chip, identified by CCDCHIP.  Node k (from 1) of axis a lies at
-pixel CRVALa + (k - CRPIXa) CDELTa; a file without CRPIX and CRVAL has both 0, which puts the first
-node at pixel CDELT (astropy 6.1 and later; before, at pixel 1).
+The files have image extensions DX and DY for each chip, identified by CCDCHIP. Node k (from 1) of
+axis a is at pixel CRVALa + (k - CRPIXa) CDELTa. Without CRPIX and CRVAL both are taken as 0, so
+that the first node is at pixel CDELT (astropy 6.1 and later; at pixel 1 before).
 
-A file of ours has in addition, where no consumer looks:
+Files written by bayesdist have further content, which other programs ignore:
 
 SIGMA_DX, SIGMA_DY
-    Image extensions of the same shape: the standard error of each node.
+    Image extensions of the same shape with the standard error of each node.
 BDPAD
-    Columns at the right end that are no nodes (see `bayesdist.products.formats.lookup.build`).
+    Number of columns at the right end that are padding (see
+    `bayesdist.products.formats.lookup.build`).
 """
 
 from __future__ import annotations
@@ -36,9 +37,19 @@ _FILTERS = ("FILTER1", "FILTER2", "FILTER")
 
 @dataclass(frozen=True, eq=False)
 class LookupFile:
-    """D2IMFILE or NPOLFILE: all its HDUs, and their meaning.
+    """D2IMFILE or NPOLFILE with all its HDUs, and its interpretation.
 
-    FormatError when there is no image extension DX or DY.
+    Parameters
+    ----------
+    hdus : tuple of Hdu
+        All HDUs of the file.
+    name : str
+        Name of the file, for error messages.
+
+    Raises
+    ------
+    FormatError
+        If there is no image extension DX or DY.
     """
 
     hdus: tuple[Hdu, ...]  # all HDUs
@@ -59,7 +70,7 @@ class LookupFile:
 
     @property
     def kind(self) -> str:
-        """'npol' for a file that states it or names a filter, else 'd2im'."""
+        """'npol' for a file that says so in FILETYPE or names a filter, else 'd2im'."""
         filetype = str(self.header.get("FILETYPE", "")).upper()
         if "D2I" in filetype:
             return "d2im"
@@ -67,12 +78,12 @@ class LookupFile:
 
     @property
     def instrument(self) -> str:
-        """INSTRUME, empty where the file has none."""
+        """INSTRUME; empty if the file has none."""
         return named_in(self.header, "INSTRUME", self.name)
 
     @property
     def detector(self) -> str:
-        """DETECTOR, empty where the file has none."""
+        """DETECTOR; empty if the file has none."""
         return named_in(self.header, "DETECTOR", self.name)
 
     @property
@@ -107,7 +118,7 @@ class LookupFile:
     def pair(self, chip: int) -> tuple[Plane, Plane]:
         """Extensions DX and DY of a chip.
 
-        FormatError when one is missing or repeated, or when the two have no common grid.
+        FormatError if one is missing or repeated, or if their grids differ.
         """
         x, y = (self._one(chip, axis) for axis in AXES)
         if x.grid != y.grid:
@@ -119,24 +130,24 @@ class LookupFile:
         return x, y
 
     def _one(self, chip: int, axis: str) -> Plane:
-        found = [p for p in self.planes if p.chip == chip and p.name == axis]
-        if len(found) != 1:
+        matching = [p for p in self.planes if p.chip == chip and p.name == axis]
+        if len(matching) != 1:
             raise FormatError(
-                f"there are {len(found)} extensions {axis}",
+                f"there are {len(matching)} extensions {axis}",
                 where=f"{self.name}, chip {chip}",
                 do="give exactly one for each chip",
             )
-        return found[0]
+        return matching[0]
 
     def values(self, chip: int) -> Float:
-        """Node values of a chip as they stand in the file, shape (2, ny, nx); errors as `pair`."""
+        """Node values of a chip as stored, shape (2, ny, nx); errors as for `pair`."""
         return np.stack([p.nodes for p in self.pair(chip)])
 
     def sigma(self, chip: int) -> Float | None:
-        """Standard errors of the node values, shape (2, ny, nx); None where there are none."""
-        found = {p.name: p.nodes for p in self.sigma_planes if p.chip == chip}
+        """Standard errors of the node values, shape (2, ny, nx); None if the file has none."""
+        nodes = {p.name: p.nodes for p in self.sigma_planes if p.chip == chip}
         names = [_SIGMA + a for a in AXES]
-        return np.stack([found[n] for n in names]) if set(names) <= set(found) else None
+        return np.stack([nodes[n] for n in names]) if set(names) <= set(nodes) else None
 
     def table(
         self,
@@ -145,10 +156,27 @@ class LookupFile:
         filter: str = "",
         first: Sequence[float] | None = None,
     ) -> LookupTable:
-        """Tables of a chip as they stand in the file, of a filter.
+        """Look-up table of a chip with the values stored in the file.
 
-        `first` is the pixel (x, y) of the first node, in place of the file's own.  FormatError as
-        `pair`, and for values that `LookupTable` refuses.
+        Parameters
+        ----------
+        chip : int
+            Chip number.
+        filter : str
+            Filter that the table is assigned to; empty for the detector.
+        first : sequence of float, optional
+            Pixel (x, y) of the first node, overriding the file.
+
+        Returns
+        -------
+        LookupTable
+            Shifts along both axes, in the unit of the file, with standard errors if the file has
+            them.
+
+        Raises
+        ------
+        FormatError
+            As for `pair`, and for values that `LookupTable` rejects.
         """
         x, _ = self.pair(chip)
         place = x.first if first is None else (float(first[0]), float(first[1]))
@@ -161,24 +189,48 @@ class LookupFile:
 
 
 def read_lookup_file(path: str | os.PathLike[str]) -> LookupFile:
-    """Read a D2IMFILE or NPOLFILE as it stands.
+    """Read a D2IMFILE or NPOLFILE without converting its values.
 
-    InputError when the file cannot be read. FormatError when it is no FITS file, is truncated, or
-    has no tables.
+    Parameters
+    ----------
+    path : path-like
+        D2IMFILE or NPOLFILE.
+
+    Returns
+    -------
+    LookupFile
+        The file, which `write_lookup_file` writes back unchanged.
+
+    Raises
+    ------
+    InputError
+        If the file cannot be read.
+    FormatError
+        If it is not a FITS file, is truncated, or has no tables.
     """
     return LookupFile(read_hdus(path), str(path))
 
 
 def write_lookup_file(file: LookupFile, path: str | os.PathLike[str]) -> None:
-    """Write a D2IMFILE or NPOLFILE, whole or not at all; one that was read stays the same bits.
+    """Write a D2IMFILE or NPOLFILE atomically; a file that was read is written back unchanged.
 
-    InputError when the file cannot be written.
+    Parameters
+    ----------
+    file : LookupFile
+        File to write.
+    path : path-like
+        Output file.
+
+    Raises
+    ------
+    InputError
+        If the file cannot be written.
     """
     write_hdus(file.hdus, path)
 
 
 def check_kind(file: LookupFile, kind: str) -> None:
-    """Refuse (FormatError) a file of the other kind."""
+    """Raise FormatError if a D2IMFILE is given in place of an NPOLFILE, or vice versa."""
     if file.kind != kind:
         names = {"d2im": "a D2IMFILE", "npol": "an NPOLFILE"}
         raise FormatError(

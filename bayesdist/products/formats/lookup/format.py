@@ -1,4 +1,4 @@
-"""Format entry of D2IMFILE and NPOLFILE."""
+"""Format of D2IMFILE and NPOLFILE."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ def _parse(content: Content) -> LookupFile | None:
 
 
 def _describe(file: LookupFile) -> list[str]:
-    """Lines of text on a D2IMFILE or NPOLFILE, its findings at the end."""
+    """Lines of text on a D2IMFILE or NPOLFILE, with the findings at the end."""
     header = file.header
     kind, unit = {
         "d2im": ("D2IMFILE", "pixels, before the polynomial"),

@@ -16,9 +16,22 @@ _PLACE = ("CRPIX1", "CRPIX2", "CRVAL1", "CRVAL2")
 
 
 def lint_lookup_file(file: LookupFile) -> tuple[Finding, ...]:
-    """Findings in a D2IMFILE or NPOLFILE.
+    """Check a D2IMFILE or NPOLFILE against the behaviour of stwcs and astropy.wcs.
 
-    FormatError when a keyword that must be a number is none.
+    Parameters
+    ----------
+    file : LookupFile
+        File to check.
+
+    Returns
+    -------
+    tuple of Finding
+        Errors, warnings and notes.
+
+    Raises
+    ------
+    FormatError
+        If a keyword that must be numeric is not.
     """
     return (
         *_header(file),
@@ -47,34 +60,38 @@ def _header(file: LookupFile) -> Iterator[Finding]:
 
 
 def _registration(file: LookupFile) -> Iterator[Finding]:
-    """Findings on the positions of the nodes; extensions that lack the same keywords share one."""
+    """Findings on node positions, one per group of extensions with the same missing keywords."""
     groups: dict[tuple[str, ...], list[Plane]] = {}
     for plane in file.planes:
         groups.setdefault(plane.missing, []).append(plane)
     for missing, planes in groups.items():
-        where = _names(planes)
+        location = _names(planes)
         steps = [name for name in missing if name.startswith("CDELT")]
         if steps:
             yield Finding(
-                "error", where, f"{', '.join(steps)} missing: nodes are taken to be 1 pixel apart"
+                "error",
+                location,
+                f"{', '.join(steps)} missing: nodes are taken to be 1 pixel apart",
             )
         elif set(missing) == set(_PLACE):
             (x, y), (dx, dy) = planes[0].first, planes[0].step
             yield Finding(
                 "warning",
-                where,
+                location,
                 f"registration: without CRPIX and CRVAL astropy.wcs puts the first node at pixel "
                 f"({x:g}, {y:g}), before its version 6.1 at (1, 1); centres of bins would be at "
                 f"({dx / 2 + 0.5:g}, {dy / 2 + 0.5:g})",
             )
         elif missing:
-            yield Finding("warning", where, f"registration: {', '.join(missing)} missing, taken 0")
+            yield Finding(
+                "warning", location, f"registration: {', '.join(missing)} missing, taken 0"
+            )
     for plane in file.planes:
         yield from _cover(plane)
 
 
 def _cover(plane: Plane) -> Iterator[Finding]:
-    """Finding on a table that ends more than a step inside an edge: it is constant beyond."""
+    """Findings on tables that end more than a step inside an edge and are constant beyond."""
     sizes = [plane.number(f"ONAXIS{a}", 0) for a in (1, 2)]
     for axis, (n, first, step, size) in enumerate(
         zip(plane.nodes.shape[::-1], plane.first, plane.step, sizes, strict=True)
@@ -92,8 +109,10 @@ def _cover(plane: Plane) -> Iterator[Finding]:
 def _chips(file: LookupFile) -> Iterator[Finding]:
     without = [p for p in file.planes if "CCDCHIP" not in p.header]
     if without:
-        what = "stwcs stops without it" if _is_wfc(file) else "stwcs takes chip 1"
-        yield Finding("error" if _is_wfc(file) else "note", _names(without), f"no CCDCHIP: {what}")
+        consequence = "stwcs stops without it" if _is_wfc(file) else "stwcs takes chip 1"
+        yield Finding(
+            "error" if _is_wfc(file) else "note", _names(without), f"no CCDCHIP: {consequence}"
+        )
     elif _is_wfc(file):
         swapped = [p for p in file.planes if p.version != 3 - p.chip and p.chip in (1, 2)]
         if swapped:
@@ -168,5 +187,5 @@ def _sigma(file: LookupFile) -> Iterator[Finding]:
 
 
 def _names(planes: list[Plane]) -> str:
-    """Extensions in words, as DX,1."""
+    """Names of extensions, such as "DX,1"."""
     return ", ".join(f"{p.name},{p.version}" for p in planes)

@@ -1,12 +1,13 @@
-"""NPOLFILE: shifts of the pixel before the polynomial, written as shifts after it.
+"""NPOLFILE: pixel shifts before the polynomial, written as shifts after it.
 
-A filter's table F adds pixels to (x, y) before the polynomial P; an NPOLFILE holds N, in
-undistorted pixels of SCALE along Xc and Yc, that stwcs adds to the value of the polynomial:
+The table F of a filter is added to pixels (x, y) before the polynomial P. An NPOLFILE holds N, in
+undistorted pixels of SCALE along Xc and Yc, which stwcs adds to the value of the polynomial:
 
     P(x + F(x)) / SCALE = P(x) / SCALE + N(x),     N = J F / SCALE,   J = dP/dx at the node
 
-Left out are the second order in F and the change of J from node to node, of which both sides make a
-straight line.  For ACS/WFC and 0.05 px that is some 5e-5 px; every file states its own value.
+This neglects the second order in F, and the change of J between nodes, where both sides are
+interpolated linearly. For ACS/WFC and shifts of 0.05 px the error is about 5e-5 px; every file
+states its error.
 """
 
 from __future__ import annotations
@@ -47,46 +48,46 @@ def write_npol(
     pedigree: str | None = None,
     history: Sequence[str] = (),
 ) -> LookupFile:
-    """Write the tables of one filter as an NPOLFILE, whole or not at all.
+    """Write the look-up tables of one filter as an NPOLFILE, atomically.
 
     Parameters
     ----------
     tables : sequence of LookupTable
-        At most one for each chip, all of one filter, in pixels before the polynomial.  A chip of
-        the IDCTAB without table gets zeros, since stwcs stops where it finds none.
+        At most one table per chip, all for one filter, in pixels before the polynomial. A chip of
+        the IDCTAB without a table gets zeros, because stwcs stops if a table is missing.
     path : path-like
-        Pipelines want a name that ends in ``_npl.fits``.
+        Output file. Pipelines expect a name that ends in ``_npl.fits``.
     idctab : IdcTab
-        The polynomial that the file is used with.
+        IDCTAB with the polynomial that the file will be used with.
     filters : sequence of str
-        FILTER1 and FILTER2 (ACS), or FILTER alone: they choose the row of the IDCTAB.
+        FILTER1 and FILTER2 (ACS), or FILTER alone. They select the row of the IDCTAB.
     description : str
         DESCRIP.
     useafter, pedigree : str, optional
-        USEAFTER and PEDIGREE, which only the user knows.
+        USEAFTER and PEDIGREE; omitted by default.
     history : sequence of str
         Lines of HISTORY.
 
     Returns
     -------
     LookupFile
-        Written file: single precision, as these files are.  Keyword BDNPLERR of its primary
-        header is the largest difference in mas, over all chips, between the polynomial at the
-        shifted pixel and the polynomial plus the stored table: at the nodes, halfway between them
-        and at the edges of the detector.
+        The written file, in single precision as is usual for these files. The keyword BDNPLERR of
+        its primary header is the largest difference in mas, over all chips, between the polynomial
+        at the shifted pixel and the polynomial plus the stored table: at the nodes, halfway between
+        them and at the edges of the detector.
 
     Raises
     ------
     InputError
-        For no table, tables of another filter or of none, two tables of a chip, a chip or filters
-        that the IDCTAB has not, or a file that cannot be written.
+        If there is no table, a table of another filter or of none, two tables for one chip, or a
+        chip or filter that the IDCTAB does not have, or if the file cannot be written.
     DegenerateError
-        When the linear part of the IDCTAB is singular.
+        If the linear part of the IDCTAB is singular.
 
     Notes
     -----
-    The IDCTAB is taken at its own epoch: ten years of drift change an ACS/WFC shift of 0.05 px by
-    2e-5 px.
+    The IDCTAB is evaluated at its reference date: ten years of drift change an ACS/WFC shift of
+    0.05 px by 2e-5 px.
 
     Examples
     --------
@@ -102,11 +103,11 @@ def write_npol(
     >>> np.allclose(back.values, 0.1)
     True
     """
-    where = "NPOLFILE"
+    location = "NPOLFILE"
     if len(filters) not in (1, 2):
         raise InputError(
             f"the filter combination {tuple(filters)} has {len(filters)} names",
-            where=where,
+            where=location,
             do="give one for each wheel",
         )
     wanted = _one_name(filters)
@@ -114,17 +115,17 @@ def write_npol(
         if table.filter != wanted:
             raise InputError(
                 f"the look-up table {table.label} is not of {' '.join(filters)}, filter {wanted}",
-                where=where,
+                where=location,
                 do="give the tables of this filter, and those of the detector to write_d2im",
             )
-    chosen = one_per_chip(tables, where)
+    chosen = one_per_chip(tables, location)
     have = {t.chip for t in chosen}
     for chip in idctab.stated_chips:
         if chip not in have:
             like = chosen[0]
             zeros = np.zeros((2, *like.shape))
             chosen.append(LookupTable(chip, zeros, like.filter, like.first, like.step))
-    chosen = one_per_chip(chosen, where)
+    chosen = one_per_chip(chosen, location)
     parts, worst, size = [], 0.0, (0, 0)
     for table in chosen:
         local = _Local(idctab, table.chip, filters)
@@ -155,29 +156,30 @@ def read_npol(
     *,
     first: Sequence[float] | None = None,
 ) -> tuple[LookupTable, ...]:
-    """Tables of an NPOLFILE, in pixels before the polynomial.
+    """Read the look-up tables of an NPOLFILE, converted to pixels before the polynomial.
 
     Parameters
     ----------
     path : path-like
+        NPOLFILE.
     idctab : IdcTab
-        The polynomial that the file is used with.
+        IDCTAB with the polynomial that the file is used with.
     first : sequence of float, optional
-        As in `read_d2im`.
+        Pixel (x, y) of the first node, as in `read_d2im`.
 
     Returns
     -------
     tuple of LookupTable
-        One for each chip; its filter is the name that is no CLEAR (see `filter_name`).
+        One table per chip. Its filter is the name that is not CLEAR (see `filter_name`).
 
     Raises
     ------
     InputError
-        When the file cannot be read, or the IDCTAB has no row for its chips and filters.
+        If the file cannot be read, or if the IDCTAB has no row for its chips and filters.
     FormatError
-        When it is no NPOLFILE, or its tables are incomplete or not finite.
+        If it is not an NPOLFILE, or if its tables are incomplete or not finite.
     DegenerateError
-        When the linear part of the IDCTAB is singular.
+        If the linear part of the IDCTAB is singular.
 
     Examples
     --------
@@ -203,9 +205,9 @@ def read_npol(
 
 
 def filter_name(file: LookupFile) -> str:
-    """Filter of a file as data name it: without CLEAR; several are joined by '+'.
+    """Filter of a file without CLEAR; several filters are joined by '+'.
 
-    FormatError when the file names no filter at all.
+    FormatError if the file names no filter at all.
     """
     if not file.filters:
         raise FormatError(
@@ -227,12 +229,12 @@ class _Local:
         record = idctab.rows[row]
         self.size = (int(record["XSIZE"]), int(record["YSIZE"]))
         self.reference = (float(record["XREF"]), float(record["YREF"]))
-        self.scale = round(float(record["SCALE"]), 8)  # as stwcs keeps it
+        self.scale = round(float(record["SCALE"]), 8)  # rounded as in stwcs
         self._terms = [
             dict(zip(idctab.terms, c.tolist(), strict=True))
             for c in idctab.coefficients_of_row(row)
         ]
-        # stwcs takes a first coefficient of exactly 1 as a sign that all are in units of SCALE
+        # in stwcs, a first coefficient of exactly 1 means that all are in units of SCALE
         self._unit = 1.0 if self._terms[0][1, 0] == 1.0 else self.scale
         self.linear = self.jacobian(*(np.array([r]) for r in self.reference))[0]
         if self.scale == 0 or not abs(np.linalg.det(self.linear)) > 0:
@@ -243,7 +245,7 @@ class _Local:
             )
 
     def jacobian(self, x: Float, y: Float) -> Float:
-        """Derivatives (..., 2, 2) of (Xc, Yc) by (x, y) over SCALE, at pixels of any shape."""
+        """Derivatives (..., 2, 2) of (Xc, Yc) / SCALE with respect to (x, y)."""
         dx, dy = x - self.reference[0], y - self.reference[1]
         out = np.empty((*x.shape, 2, 2))
         for a, terms in enumerate(self._terms):
@@ -257,7 +259,7 @@ class _Local:
         return self.jacobian(*np.meshgrid(*table.nodes()))
 
     def part(self, table: LookupTable) -> Part:
-        """Table after the polynomial, as it is stored."""
+        """Convert a table before the polynomial to the stored form, after it."""
         jacobian = self._at_nodes(table)
         values = np.einsum("yxab,byx->ayx", jacobian, table.values)
         sigma = None
@@ -266,17 +268,17 @@ class _Local:
         return Part(table, values, sigma, np.linalg.inv(self.linear))
 
     def before(self, stored: LookupTable) -> LookupTable:
-        """Table before the polynomial, from the stored one."""
+        """Convert a stored table, after the polynomial, to one before it."""
         jacobian = self._at_nodes(stored)
         values = _solve(jacobian, stored.values)
         sigma = None
         if stored.sigma is not None:
-            # sigmas of other programs may not come from two independent ones before the polynomial
+            # sigmas of other programs may not correspond to independent ones before the polynomial
             sigma = np.sqrt(np.maximum(_solve(jacobian**2, stored.sigma**2), 0.0))
         return LookupTable(stored.chip, values, stored.filter, stored.first, stored.step, sigma)
 
     def error_mas(self, table: LookupTable, stored: Float) -> float:
-        """Largest error of the stored table at nodes, halfway between them and at the edges."""
+        """Largest error (mas) of the stored table at nodes, halfway between them and at edges."""
         axes = []
         for nodes, n in zip(table.nodes(), self.size, strict=True):
             places = np.concatenate([nodes, (nodes[1:] + nodes[:-1]) / 2, [0.5, n + 0.5]])
@@ -285,10 +287,10 @@ class _Local:
         shift = table.evaluate(x, y)
         single = stored.astype(np.float32).astype(float)
         after = LookupTable(table.chip, single, table.filter, table.first, table.step)
-        both = np.stack(self._position(x + shift[:, 0], y + shift[:, 1]), axis=1) - np.stack(
+        exact = np.stack(self._position(x + shift[:, 0], y + shift[:, 1]), axis=1) - np.stack(
             self._position(x, y), axis=1
         )
-        error = both - self.scale * after.evaluate(x, y)
+        error = exact - self.scale * after.evaluate(x, y)
         return float(np.hypot(*error.T).max()) * 1e3
 
     def _position(self, x: Float, y: Float) -> tuple[Float, Float]:
@@ -296,7 +298,7 @@ class _Local:
 
 
 def _solve(matrix: Float, values: Float) -> Float:
-    """Solutions (2, ny, nx) of (ny, nx, 2, 2) systems for values (2, ny, nx)."""
+    """Solutions (2, ny, nx) of (ny, nx, 2, 2) systems with right-hand sides (2, ny, nx)."""
     right = np.moveaxis(values, 0, -1)[..., None]
     solved = np.asarray(np.linalg.solve(matrix, right)[..., 0], float)
     return np.moveaxis(solved, -1, 0)

@@ -15,11 +15,11 @@ from bayesdist.utils.arrays import Float
 
 @dataclass(frozen=True, eq=False)
 class Plane:
-    """Image extension: the shifts along one axis of one chip, or their sigmas."""
+    """Image extension with the shifts along one axis of one chip, or their standard errors."""
 
     hdu: Hdu
     name: str  # EXTNAME: DX, DY, SIGMA_DX or SIGMA_DY
-    where: str  # name of the extension in errors
+    where: str  # name of the extension in error messages
 
     @cached_property
     def header(self) -> fits.Header:
@@ -27,7 +27,7 @@ class Plane:
         return self.hdu.header
 
     def number(self, keyword: str, default: float) -> float:
-        """Value of a keyword; FormatError when it is no finite number."""
+        """Value of a keyword; FormatError if it is not a finite number."""
         value = self.header.get(keyword, default)
         a_number = isinstance(value, int | float) and not isinstance(value, bool)
         if not a_number or not np.isfinite(value):
@@ -38,34 +38,34 @@ class Plane:
 
     @property
     def chip(self) -> int:
-        """CCDCHIP; 1 without it, as for stwcs."""
+        """CCDCHIP, or 1 without it, as in stwcs."""
         return int(self.number("CCDCHIP", 1))
 
     @property
     def version(self) -> int:
-        """EXTVER; 1 without it, as in the FITS standard."""
+        """EXTVER, or 1 without it, as in the FITS standard."""
         return int(self.number("EXTVER", 1))
 
     @property
     def values(self) -> Float:
-        """Nodes, padding included, shape (ny, nx)."""
+        """Values at the nodes including padding, shape (ny, nx)."""
         return self.hdu.image
 
     @property
     def nodes(self) -> Float:
-        """Nodes without padding, shape (ny, nx)."""
+        """Values at the nodes without padding, shape (ny, nx)."""
         pad = int(self.number("BDPAD", 0))
         return self.values[..., :-pad] if pad > 0 else self.values
 
     @property
     def missing(self) -> tuple[str, ...]:
-        """Keywords of the registration that the header lacks."""
+        """Registration keywords that are missing from the header."""
         names = ("CRPIX1", "CRPIX2", "CRVAL1", "CRVAL2", "CDELT1", "CDELT2")
         return tuple(name for name in names if name not in self.header)
 
     @property
     def first(self) -> tuple[float, float]:
-        """Pixel (x, y) of the first node, as astropy.wcs has it."""
+        """Pixel (x, y) of the first node, computed as in astropy.wcs."""
         x, y = (
             self.number(f"CRVAL{a}", 0.0) + (1.0 - self.number(f"CRPIX{a}", 0.0)) * step
             for a, step in zip((1, 2), self.step, strict=True)
@@ -79,6 +79,6 @@ class Plane:
 
     @property
     def grid(self) -> str:
-        """Grid of the nodes, in words."""
+        """Description of the grid in words."""
         (ny, nx), (x, y), (dx, dy) = self.nodes.shape, self.first, self.step
         return f"{nx} x {ny} nodes from pixel ({x:.10g}, {y:.10g}), {dx:.10g} x {dy:.10g} apart"

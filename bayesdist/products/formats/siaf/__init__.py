@@ -1,1 +1,1 @@
-"""Coefficient tables of the Science Instrument Aperture File (SIAF), as pysiaf reads them."""
+"""Coefficient tables of the Science Instrument Aperture File (SIAF), as read by pysiaf."""

@@ -1,4 +1,4 @@
-"""Format entry of SIAF tables of coefficients: described, built with their side file, read back."""
+"""Format of SIAF coefficient tables, with a companion file for the covariance."""
 
 from __future__ import annotations
 
@@ -54,14 +54,17 @@ WHERE = "products.siaf"
 
 
 class Settings(FormatSettings):
-    """Configuration of a SIAF table of coefficients."""
+    """Configuration of a SIAF coefficient table."""
 
-    aperture: str | None = None  # by default the names of the chips, or of the detector
+    aperture: str | None = None  # default: the names of the chips, or of the detector
     order: Annotated[int, Field(ge=1, le=HIGHEST)] | None = None
 
 
 def build(calibration: Calibration, settings: Settings, options: BuildOptions) -> tuple[Built, ...]:
-    """A side file and a table for each chip, in this order: whoever reads the table finds both."""
+    """Build a covariance file and a table for each chip, in this order.
+
+    The covariance file comes first so that it exists when a program reads the table.
+    """
     several = len(calibration.numbers) > 1
     out: list[Built] = []
     for chip in calibration.model.chips:
@@ -85,22 +88,22 @@ def _files(
     options: BuildOptions,
     name: str,
 ) -> tuple[Built, Built]:
-    """Side file and table of one chip, at one date; `name` is that of the table.
+    """Covariance file and table of one chip at one date; `name` is that of the table.
 
-    (u, v) are taken as Ideal coordinates of the aperture.  Look-up tables are left out.  `order` is
-    that of the rows and with it of the inverse, by default that of the polynomial; errors as for
-    `at_date` and `fit_inverse`.
+    (u, v) are taken as Ideal coordinates of the aperture. Look-up tables are left out. `order` is
+    the order of the table rows and therefore of the inverse; the default is the order of the
+    polynomial. Errors as for `at_date` and `fit_inverse`.
     """
-    one = at_date(calibration, chip, options.epoch, options.scale_arcsec, where=WHERE)
-    one = replace(one, before=())
-    known = one.chip(chip, origin="stated")
-    poly = known.monomials()
+    dated = at_date(calibration, chip, options.epoch, options.scale_arcsec, where=WHERE)
+    dated = replace(dated, before=())
+    chip_map = dated.chip(chip, origin="stated")
+    poly = chip_map.monomials()
     require_regular(poly.linear, chip)
-    rows_order = max(order or 0, known.basis.order)
-    columns = [*_forward(poly), *_inverse(known, rows_order)]
+    rows_order = max(order or 0, chip_map.basis.order)
+    columns = [*_forward(poly), *_inverse(chip_map, rows_order)]
     date = options.epoch if calibration.model.time is not None else None
     side = side_name(name)
-    size, reference = known.basis.size, known.basis.reference_pixel
+    size, reference = chip_map.basis.size, chip_map.basis.reference_pixel
     tables = any(table.chip == chip for table in calibration.before)
     head = [
         f"{aperture} distortion coefficients by bayesdist",
@@ -114,7 +117,7 @@ def _files(
     table = table_of(Content("new table", _joined(head, lines)))
     closure = required(table.closure(), "a new table states no size")
     head.append(f"Idl2Sci of Sci2Idl misses a pixel by {closure:.2g} pixels at worst.")
-    record = record_of(one, calibration, epoch=date, closure=closure)
+    record = record_of(dated, calibration, epoch=date, closure=closure)
     record["provenance"]["detector"] = aperture
     values = {SIDE: 1, "table": name} | _covariance(poly) | {"bayesdist": record}
     text = json.dumps(_listed(values), indent=1, allow_nan=False) + "\n"
@@ -129,8 +132,9 @@ def _forward(poly: Monomials) -> list[dict[tuple[int, int], float]]:
 
 
 def _inverse(chip: ChipMap, order: int) -> list[dict[tuple[int, int], float]]:
-    """Terms of the way back by powers of the Ideal coordinates."""
-    sign = float(np.sign(np.linalg.det(chip.linear)))  # the fit wants axes that are not mirrored
+    """Terms of the inverse, by powers of the Ideal coordinates."""
+    # `fit_inverse` needs axes that are not mirrored
+    sign = float(np.sign(np.linalg.det(chip.linear)))
 
     def forward(x: Float, y: Float) -> tuple[Float, Float]:
         u, v = chip.at(x, y)
@@ -140,8 +144,8 @@ def _inverse(chip: ChipMap, order: int) -> list[dict[tuple[int, int], float]]:
     out = []
     for axis, terms in enumerate(fit_inverse(forward, reference, size, order)):
         power = (1, 0) if axis == 0 else (0, 1)
-        whole = dict(terms) | {power: terms.get(power, 0.0) + 1.0}
-        out.append({(i, j): c * sign**j for (i, j), c in whole.items()})
+        with_identity = dict(terms) | {power: terms.get(power, 0.0) + 1.0}
+        out.append({(i, j): c * sign**j for (i, j), c in with_identity.items()})
     return out
 
 
@@ -172,14 +176,14 @@ def _covariance(poly: Monomials) -> dict[str, Any]:
 
 def _listed(value: Any) -> Any:
     if isinstance(value, dict):
-        return {key: _listed(one) for key, one in value.items()}
+        return {key: _listed(element) for key, element in value.items()}
     if isinstance(value, (list, tuple)):
-        return [_listed(one) for one in value]
+        return [_listed(element) for element in value]
     return value.tolist() if isinstance(value, (np.ndarray, np.generic)) else value
 
 
 def describe_siaf(table: SiafTable) -> list[str]:
-    """Lines of text on a table or a side file, its findings at the end."""
+    """Lines of text on a table or covariance file, with the findings at the end."""
     if not table.rows:
         lines = [f"{table.name}: covariance of the SIAF table of {table.aperture}"]
         return [*lines, *_uncertainty(table), "", *finding_lines(lint_siaf(table))]
@@ -208,8 +212,8 @@ def describe_siaf(table: SiafTable) -> list[str]:
 
 def _uncertainty(table: SiafTable) -> list[str]:
     record = table.record
-    found = None if record is None else lambda: calibration_from(record, table.name)
-    return error_lines(found, "a side file")
+    read = None if record is None else lambda: calibration_from(record, table.name)
+    return error_lines(read, "a side file")
 
 
 def _parse(content: Content) -> SiafTable | None:
@@ -217,11 +221,11 @@ def _parse(content: Content) -> SiafTable | None:
 
 
 def _read_back(files: Sequence[Built], *_: Any) -> list[ReadBack]:
-    """Positions and inverse by the tables alone, as pysiaf has them."""
+    """Positions and inverse computed from the tables alone, as in pysiaf."""
     parts = {
-        one.chip: siaf_read_back(table_of(Content(one.file_name, one.content)))
-        for one in files
-        if one.chip is not None
+        built.chip: siaf_read_back(table_of(Content(built.file_name, built.content)))
+        for built in files
+        if built.chip is not None
     }
     return [of_chips(parts)]
 

@@ -1,4 +1,4 @@
-"""Checks of a SIAF table against what pysiaf does with it."""
+"""Checks of a SIAF table against the behaviour of pysiaf."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ from bayesdist.products.formats.siaf.table import (
     side_name,
 )
 
-# Closure that a good inverse reaches, and one that only a wrong coefficient leaves; pixels.
+# Pixels: closure of a good inverse, and a closure that only a wrong coefficient explains.
 _CLOSURE_GOOD, _CLOSURE_BAD = 0.05, 1.0
-# Pixels of imagers are 0.03 to 0.2 arcsec wide: what is far below is in degrees or radians.
+# Pixels of imagers are 0.03 to 0.2 arcsec wide; much smaller ones are in degrees or radians.
 _SMALLEST_PIXEL = 5e-3
 
 
 def lint_siaf(table: SiafTable) -> list[Finding]:
-    """Findings in a table and its side file."""
+    """Findings in a table and its covariance file."""
     if not table.rows:
         return []
     return [*_rows(table), *_linear(table), *_inverse(table), *_record(table)]
@@ -43,9 +43,9 @@ def _rows(table: SiafTable) -> Iterator[Finding]:
             + ("the powers of x and y are exchanged" if mirrored else "the powers are others"),
         )  # fmt: skip
     counts = Counter(row.powers for row in table.rows)
-    twice = [_index(powers) for powers, n in counts.items() if n > 1]
-    if twice:
-        yield Finding("error", ", ".join(twice), "there is more than one row")
+    repeated = [_index(powers) for powers, n in counts.items() if n > 1]
+    if repeated:
+        yield Finding("error", ", ".join(repeated), "there is more than one row")
     gone = [_index(powers) for powers in polynomial_terms(table.order) if powers not in counts]
     if gone:
         yield Finding("error", ", ".join(gone), "there is no row, and pysiaf counts on all of them")
@@ -84,22 +84,22 @@ def _linear(table: SiafTable) -> Iterator[Finding]:
 
 def _inverse(table: SiafTable) -> Iterator[Finding]:
     closure = table.closure()
-    where = "Idl2SciX, Idl2SciY"
+    location = "Idl2SciX, Idl2SciY"
     if table.inverse is None and table.size is not None:
-        yield Finding("error", where, "the inverse is missing: all its coefficients are zero")
+        yield Finding("error", location, "the inverse is missing: all its coefficients are zero")
         return
     if closure is None:
-        yield Finding("note", where, "the size of the detector is not known: it is not checked")
+        yield Finding("note", location, "the size of the detector is not known: it is not checked")
         return
     if closure <= _CLOSURE_GOOD:
         return
-    left = {
+    closures = {
         blamed: replace(table, rows=tuple(_exchanged(table, columns))).closure() or 0.0
-        for columns, blamed in (((2, 3), where), ((0, 1), "Sci2IdlX, Sci2IdlY"))
+        for columns, blamed in (((2, 3), location), ((0, 1), "Sci2IdlX, Sci2IdlY"))
     }
-    # where both are exchanged they nearly agree again: the better one of the two is right
-    best = min(left, key=lambda blamed: left[blamed])
-    if left[best] < closure / 10:
+    # if powers are exchanged in both they nearly agree again, so the better one is right
+    best = min(closures, key=lambda blamed: closures[blamed])
+    if closures[best] < closure / 10:
         yield Finding(
             "error", best, "the order of coefficients: powers of x and y are exchanged "
             f"(closure {closure:.3g} px)",
@@ -111,30 +111,31 @@ def _inverse(table: SiafTable) -> Iterator[Finding]:
         without = float(np.hypot(*(residual - shift[:, None])).max())
         if without < closure / 10:
             yield Finding(
-                "error", where, f"the constant terms are off by {shift[0]:.4g} and {shift[1]:.4g} "
+                "error", location,
+                f"the constant terms are off by {shift[0]:.4g} and {shift[1]:.4g} "
                 f"px (closure {closure:.3g} px, without this shift {without:.2g} px)",
             )  # fmt: skip
             return
     if closure > _CLOSURE_BAD:
         yield Finding(
-            "error", where, f"they miss the inverse of Sci2Idl by up to {closure:.3g} px: a "
+            "error", location, f"they miss the inverse of Sci2Idl by up to {closure:.3g} px: a "
             "coefficient of one or the other is wrong",
         )  # fmt: skip
     else:
         yield Finding(
-            "warning", where, f"the inverse is wrong by up to {closure:.3g} px; raise the order"
+            "warning", location, f"the inverse is wrong by up to {closure:.3g} px; raise the order"
         )
 
 
 def _exchanged(table: SiafTable, columns: tuple[int, int]) -> Iterator[Row]:
-    """Rows with powers of x and y exchanged in two columns, those above the linear terms."""
+    """Rows with the powers of x and y exchanged in two columns, for terms above the linear ones."""
     by: Mapping[tuple[int, int], Row] = {row.powers: row for row in table.rows}
     for row in table.rows:
-        other = by.get(row.powers[::-1])
-        if other is None or sum(row.powers) < 2:
+        mirror_row = by.get(row.powers[::-1])
+        if mirror_row is None or sum(row.powers) < 2:
             yield row
             continue
-        values = [(other if k in columns else row).values[k] for k in range(4)]
+        values = [(mirror_row if k in columns else row).values[k] for k in range(4)]
         yield replace(row, values=(values[0], values[1], values[2], values[3]))
 
 

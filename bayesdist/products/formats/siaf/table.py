@@ -1,10 +1,11 @@
-"""A SIAF table of coefficients, the side file with its covariance, and the calibration of both.
+"""SIAF coefficient table, the companion file with its covariance, and their calibration.
 
     AperName , siaf_index , exponent_x , exponent_y , Sci2IdlX , Sci2IdlY , Idl2SciX , Idl2SciY
 
-A row multiplies x^exponent_x y^exponent_y, pixels from (XSciRef, YSciRef) on the way to Ideal
-coordinates in arcsec, and those on the way back.  The table has neither a size nor a reference
-pixel: ours state them in comments.
+Each row gives the coefficients of x^exponent_x y^exponent_y. For Sci2Idl, x and y are pixels from
+(XSciRef, YSciRef) and the result is in Ideal coordinates in arcsec; for Idl2Sci it is the reverse.
+The table has neither a size nor a reference pixel; tables written by bayesdist state them in
+comments.
 """
 
 from __future__ import annotations
@@ -36,14 +37,15 @@ from bayesdist.utils.text import number_of
 NAMES = ("Sci2IdlX", "Sci2IdlY", "Idl2SciX", "Idl2SciY")
 COLUMNS = ("AperName", "siaf_index", "exponent_x", "exponent_y", *NAMES)
 KEYWORDS = ("XSciSize", "YSciSize", "XSciRef", "YSciRef")
-HIGHEST = 9  # order: powers have one digit each in siaf_index
-SIDE = "siaf_covariance"  # first key of a side file
-AGREEMENT = 1e-6  # pixels: as far as table and side file may differ
+HIGHEST = 9  # highest order: each power has one digit in siaf_index
+SIDE = "siaf_covariance"  # first key of a covariance file
+AGREEMENT = 1e-6  # pixels; tolerance between a table and its covariance file
 _STATED = re.compile(r"#\s*(XSciSize|YSciSize|XSciRef|YSciRef)\s*=\s*(\S+)")
-COVARIANCE = "The covariance of Sci2Idl is in"  # before the name of the side file, in our comments
-# Size (columns, rows) and reference pixel (XSciRef, YSciRef) of apertures of full frames in the
-# SIAF, by patterns of their whole names.  Subarrays and apertures of several detectors have their
-# own; that of the imager of MIRI is not in the middle.
+# comment text before the name of the covariance file
+COVARIANCE = "The covariance of Sci2Idl is in"
+# Size (columns, rows) and reference pixel (XSciRef, YSciRef) of full-frame apertures in the SIAF,
+# by patterns of their full names. Subarrays and apertures of several detectors differ, and the
+# reference pixel of the MIRI imager is not in the middle.
 _FULL_FRAMES = {
     r"NRC[AB][1-5]_FULL(_WEDGE_(BAR|RND))?|NIS_CEN(_OSS)?|FGS[12]_FULL(_OSS)?": (
         (2048.0, 2048.0),
@@ -56,22 +58,22 @@ _FULL_FRAMES = {
 
 @dataclass(frozen=True)
 class Row:
-    """Line of a table."""
+    """Row of a table."""
 
     line: int
-    index: str  # siaf_index, as it stands
+    index: str  # siaf_index, as stored
     powers: tuple[int, int]
     values: tuple[float, float, float, float]
 
 
 @dataclass(frozen=True, eq=False)
 class SiafTable:
-    """Parsed table, or a side file alone (which has no rows)."""
+    """Parsed table, or a covariance file alone (which has no rows)."""
 
     name: str
     aperture: str
     rows: tuple[Row, ...]
-    stated: Mapping[str, float]  # KEYWORDS
+    stated: Mapping[str, float]  # values of KEYWORDS
     record: Mapping[str, Any] | None = None  # see `common.record`
     names_side_file: bool = False
 
@@ -82,31 +84,32 @@ class SiafTable:
 
     @property
     def size(self) -> tuple[float, float] | None:
-        """Columns and rows, as stated, else by the name of the aperture."""
+        """Columns and rows: as stated, or else those of the named aperture."""
         if "XSciSize" in self.stated and "YSciSize" in self.stated:
             return self.stated["XSciSize"], self.stated["YSciSize"]
         return None if self._full_frame is None else self._full_frame[0]
 
     @property
     def _full_frame(self) -> tuple[tuple[float, float], tuple[float, float]] | None:
-        """Size and reference pixel of an aperture of a full frame; None of any other."""
+        """Size and reference pixel of a full-frame aperture; None for any other aperture."""
         items = _FULL_FRAMES.items()
         return next((facts for name, facts in items if re.fullmatch(name, self.aperture)), None)
 
     @property
     def states_reference(self) -> bool:
-        """True if the table, or the name of its aperture, gives the reference pixel."""
+        """True if the table states the reference pixel or its aperture defines it."""
         stated = {"XSciRef", "YSciRef"} <= self.stated.keys()
         return stated or self._full_frame is not None
 
     def of_size(self, size: tuple[float, float] | None) -> SiafTable:
-        """Table with the size that the user gives; refused where the file states another one."""
+        """Table with the size given by the user; InputError if the file states another size."""
         if size is None:
             return self
-        known = self.size
-        if known is not None and tuple(known) != tuple(size):
+        nominal = self.size
+        if nominal is not None and tuple(nominal) != tuple(size):
             raise InputError(
-                f"the image has {known[0]:g} x {known[1]:g} pixels, and {size[0]:g} x {size[1]:g} "
+                f"the image has {nominal[0]:g} x {nominal[1]:g} pixels, and "
+                f"{size[0]:g} x {size[1]:g} "
                 "are given",
                 where=self.name,
                 do="leave the size out, or give that of the aperture",
@@ -114,44 +117,44 @@ class SiafTable:
         return replace(self, stated={**self.stated, "XSciSize": size[0], "YSciSize": size[1]})
 
     def reference_pixel(self, size: tuple[float, float]) -> tuple[float, float]:
-        """XSciRef and YSciRef: stated, or of the aperture, or else the middle of the image."""
+        """XSciRef and YSciRef: as stated, or of the aperture, or else the middle of the image."""
         x, y = (size[0] + 1) / 2, (size[1] + 1) / 2
         if self._full_frame is not None:
             x, y = self._full_frame[1]
         return self.stated.get("XSciRef", x), self.stated.get("YSciRef", y)
 
     def terms(self, name: str) -> Coefficients:
-        """Coefficients of one of NAMES by powers of x and y; of equal rows the last one counts."""
+        """Coefficients of one of NAMES by powers of x and y; the last of repeated rows is used."""
         k = NAMES.index(name)
         return {row.powers: row.values[k] for row in self.rows}
 
     def ideal(self, dx: Float, dy: Float) -> tuple[Float, Float]:
-        """Ideal coordinates (N,) in arcsec of offsets (N,) from the reference pixel."""
+        """Ideal coordinates (N,) in arcsec at offsets (N,) from the reference pixel."""
         x, y = (evaluate(self.terms(name), dx, dy) for name in NAMES[:2])
         return x, y
 
     def pixels(self, x: Float, y: Float) -> tuple[Float, Float]:
-        """Offsets (N,) from the reference pixel of Ideal coordinates (N,)."""
+        """Offsets (N,) from the reference pixel at Ideal coordinates (N,)."""
         dx, dy = (evaluate(self.terms(name), x, y) for name in NAMES[2:])
         return dx, dy
 
     @property
     def inverse(self) -> ExplicitInverse | None:
-        """Idl2Sci as an inverse; None where its columns are zero."""
+        """Idl2Sci as an inverse; None if its columns are zero or the size is unknown."""
         terms = [dict(self.terms(name)) for name in NAMES[2:]]
-        if self.size is None or not any(any(one.values()) for one in terms):
+        if self.size is None or not any(any(column.values()) for column in terms):
             return None
         for axis, power in enumerate(((1, 0), (0, 1))):
             terms[axis][power] = terms[axis].get(power, 0.0) - 1.0
         return ExplicitInverse(self.reference_pixel(self.size), terms[0], terms[1])
 
     def closure(self) -> float | None:
-        """Largest distance of pixels from where Sci2Idl and Idl2Sci take them; None if unknown."""
+        """Largest round-trip error through Sci2Idl and Idl2Sci in pixels; None if unknown."""
         residual = self.closure_residuals()
         return None if residual is None else float(np.hypot(*residual).max())
 
     def closure_residuals(self) -> Float | None:
-        """Differences (2, N) in pixels after Sci2Idl and Idl2Sci on a grid; None if unknown."""
+        """Round-trip errors (2, N) of Sci2Idl and Idl2Sci on a grid, pixels; None if unknown."""
         size = self.size
         if size is None or self.inverse is None:
             return None
@@ -165,7 +168,7 @@ class SiafTable:
 
 
 def holds_table(content: Content) -> bool:
-    """True for a table of coefficients or a side file of one, right or wrong."""
+    """True for a coefficient table or a covariance file, valid or not."""
     return _is_side(content) or any(_is_header(line) for line in content.text.splitlines())
 
 
@@ -179,14 +182,14 @@ def _is_header(line: str) -> bool:
 
 
 def side_name(name: str) -> str:
-    """Name of the side file of a table."""
+    """Name of the covariance file of a table."""
     return f"{Path(name).stem}_covariance.json"
 
 
 def table_of(content: Content) -> SiafTable:
-    """Table of a file, with the record of the side file in its folder, where there is one.
+    """Table of a file, with the record of the covariance file in its folder if there is one.
 
-    FormatError for columns or values that are missing.
+    FormatError for missing columns or invalid values.
     """
     if _is_side(content):
         record = _record_of_side(content)
@@ -206,16 +209,16 @@ def table_of(content: Content) -> SiafTable:
         if not line.strip() or line.lstrip().startswith("#"):
             continue
         cells = [cell.strip() for cell in line.split(",")]
-        where = f"{content.name}, line {number}"
+        location = f"{content.name}, line {number}"
         if len(cells) != len(names):
             raise FormatError(
                 f"has {len(cells)} values, and there are {len(names)} columns",
-                where=where,
+                where=location,
                 do="fetch the file again",
             )
-        found = dict(zip(names, cells, strict=True))
-        apertures.append(found["AperName"])
-        rows.append(_row(found, number, where))
+        cell_of = dict(zip(names, cells, strict=True))
+        apertures.append(cell_of["AperName"])
+        rows.append(_row(cell_of, number, location))
     if not rows:
         raise FormatError("there are no rows", where=content.name, do="fetch the file again")
     if len(set(apertures)) > 1:
@@ -260,7 +263,7 @@ def _number(text: str, where: str) -> float:
 
 
 def record_beside(name: str) -> Mapping[str, Any] | None:
-    """Record of the side file in the folder of a table; None where there is none."""
+    """Record of the covariance file in the folder of a table; None if there is none."""
     path = Path(name).with_name(side_name(name))
     return _record_of_side(read_content(path)) if os.path.lexists(path) else None
 
@@ -274,7 +277,7 @@ def _record_of_side(content: Content) -> Mapping[str, Any]:
             where=content.name,
             do="fetch the file again",
         ) from error
-    calibration_from(record, content.name)  # whole, or refused
+    calibration_from(record, content.name)  # raises if the record is incomplete
     return record
 
 
@@ -291,7 +294,7 @@ def departure(table: SiafTable, calibration: Calibration) -> float:
 
 
 def siaf_read_back(table: SiafTable) -> ReadBack:
-    """Ideal coordinates by a table that states its size, and where Sci2Idl and Idl2Sci lead."""
+    """Ideal coordinates and round-trip errors of a table that states its size."""
     size = required(table.size, "a new table states no size")
     x0, y0 = table.reference_pixel(size)
 
@@ -306,23 +309,23 @@ def siaf_read_back(table: SiafTable) -> ReadBack:
 
 
 def siaf_calibration(table: SiafTable, _: str, choice: Choice) -> Calibration:
-    """Calibration in Ideal coordinates, with the covariance of the side file where both agree.
+    """Calibration in Ideal coordinates, with the covariance of the companion file if both agree.
 
-    MissingSizeError for a table of an unknown aperture without a size.
+    MissingSizeError if neither the table, its aperture nor `choice` gives the size.
     """
     table = table.of_size(choice.size)
     notes: tuple[str, ...] = ()
     inverse = table.inverse if table.rows else None
     if inverse is not None:
-        # a calibration's inverse takes positions about that of the reference pixel
+        # the inverse of a calibration expects positions relative to that of the reference pixel
         cx, cy = (float(at[0]) for at in table.ideal(np.zeros(1), np.zeros(1)))
         inverse = replace(inverse, zero=(-cx, -cy))
     if table.record is not None:
-        found = calibration_from(table.record, table.name)
-        far = departure(table, found) if table.rows else 0.0
+        calibration = calibration_from(table.record, table.name)
+        far = departure(table, calibration) if table.rows else 0.0
         if far <= AGREEMENT:
-            inverses = {} if inverse is None else {found.numbers[0]: inverse}
-            return replace(found, inverses=inverses)
+            inverses = {} if inverse is None else {calibration.numbers[0]: inverse}
+            return replace(calibration, inverses=inverses)
         notes = (f"the side file is {far:.2g} px from the table: without its covariance",)
     elif table.names_side_file:
         notes = (f"its covariance is in {side_name(table.name)}, which is not here",)
@@ -340,7 +343,7 @@ def siaf_calibration(table: SiafTable, _: str, choice: Choice) -> Calibration:
     x0, y0 = table.reference_pixel(size)
     if not table.states_reference:
         notes = (*notes, f"XSciRef, YSciRef are not stated: taken as {x0:g}, {y0:g}, the middle")
-    one = fitted_map(
+    chip_map = fitted_map(
         lambda x, y: table.ideal(x - x0, y - y0),
         table.name,
         order=table.order,
@@ -349,7 +352,7 @@ def siaf_calibration(table: SiafTable, _: str, choice: Choice) -> Calibration:
         unit="arcsec",
     )
     return calibration_of_maps(
-        {1: one},
+        {1: chip_map},
         table.name,
         plane=Plane("aperture"),
         detector=table.aperture,

@@ -1,1 +1,1 @@
-"""SIP header: a distortion as FITS keywords."""
+"""SIP headers: distortion as FITS keywords."""

@@ -1,4 +1,4 @@
-"""SIP header from a solution: forward terms with their sigmas, and an inverse that is checked."""
+"""Build a SIP header from a solution: forward terms with their sigmas, and a checked inverse."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ from bayesdist.utils.arrays import Float
 if TYPE_CHECKING:
     from astropy.wcs import WCS
 
-# How far from the identity the linear part may be when it is to be a correction of pixels.
+# Largest deviation of the linear part from the identity if A and B hold the linear terms.
 _NEAR_IDENTITY = 0.5
 
 
@@ -57,59 +57,63 @@ def sip_from_solution(
     """SIP header of one chip at one epoch.
 
     (u, v) are taken as the axes (xi, eta) of the tangent plane, in the frame of the first exposure.
-    Where the sky position at which that plane touches is known, the header is right on the sky by
-    itself.
+    If the sky position of the tangent point is known, the header gives correct sky positions
+    without further adjustment.
 
     Parameters
     ----------
     solution : LinearFit, Posterior or Calibration
+        Solution of one or more chips.
     chip : int, optional
         Chip number; the first chip by default.
     epoch : float, optional
-        Decimal years; needed by a model with time dependence.
+        Decimal year; required by a model with time dependence.
     inverse_order : int, optional
-        Order of AP and BP, 2 to 9; by default one above the order of A and B, at most 9.
+        Order of AP and BP, 2 to 9. The default is one above the order of A and B, at most 9.
     linear : {'cd', 'sip'}
-        'cd': the linear part of the model is the CD matrix, A and B begin at order 2, and CRVAL
-        stands for the reference pixel.  'sip': the CD matrix is a pure scale, and A and B hold
-        constant and linear terms too, relative to u = x and v = y in pixels, as the WISE pipeline
-        has it (WSDC D-T033, Appendix B); CRVAL stands for `origin`.
+        'cd': the linear part of the model is the CD matrix, A and B begin at order 2, and CRVAL is
+        the position of the reference pixel. 'sip': the CD matrix is a pure scale, and A and B also
+        hold constant and linear terms, relative to u = x and v = y in pixels, as in the WISE
+        pipeline (WSDC D-T033, Appendix B); CRVAL is the position of `origin`.
     axes : {'sky', 'linear'}, optional
-        By default 'sky', and 'linear' for angular u, v that lie on no sky in a field so wide that a
-        tangent plane is one choice of several.
-        'linear', of u, v without a position on the sky: CTYPE is no projection, CD is in the unit
-        of u, v per pixel and CRVAL the (u, v) of CRPIX, so that a program gives u, v and no sky.
+        'sky' writes celestial axes. 'linear', for u, v without a position on the sky, writes a
+        CTYPE without projection, CD in the unit of u, v per pixel and CRVAL as the (u, v) of CRPIX,
+        so that programs compute u, v instead of sky positions. The default is 'sky', except for
+        angular u, v without sky position in a field so wide that other projections differ from a
+        tangent plane.
     crval : tuple of float, optional
-        Sky position that the header states, degrees.  With `tangent_point` that of the reference
-        pixel by default, and CRPIX is the pixel of any other one that is given; where the solution
-        has no such pixel, A_0_0 and B_0_0 follow.  Without `tangent_point` it is written as it is,
-        (0, 0) by default.
+        Sky position that the header states, degrees. With `tangent_point`, the default is the
+        position of the reference pixel; for another position, CRPIX is the pixel at that position.
+        If the solution has no such pixel, A_0_0 and B_0_0 hold the offset. Without `tangent_point`,
+        the value is written unchanged, (0, 0) by default.
     tangent_point : tuple of float, optional
-        Sky position of (u, v) = (0, 0), degrees: `Matches.tangent_point`; by default that of the
-        calibration's plane, where it is on the sky.  The polynomial is
-        brought to the plane of CRVAL, to 1e-5 pixels, with a higher order where that takes one.
+        Sky position of (u, v) = (0, 0), degrees, such as `Matches.tangent_point`. The default is
+        that of the calibration's plane, if it is on the sky. The polynomial is reprojected to the
+        tangent plane of CRVAL with an accuracy of 1e-5 pixels, which may need a higher order.
     scale_arcsec : float, optional
-        Arcseconds per pixel, for u, v in pixels; without it 1 arcsec is written and called nominal.
-        With ``linear="sip"`` also for angular u, v; without it their mean scale at the reference
-        pixel.
+        Arcseconds per pixel, for u, v in pixels; the default is a nominal 1 arcsec. With
+        ``linear="sip"`` it also applies to angular u, v; the default is then their mean scale at
+        the reference pixel.
     origin : tuple of float, optional
-        (u, v) from which ``linear="sip"`` counts, without `tangent_point`.  By default (0, 0)
-        where u, v are offsets from the reference pixel, and the reference pixel where they are
-        positions on the detector: of the two, the one that leaves the smaller constant terms.  The
-        header states it in BDU0, BDV0.
+        (u, v) of the zero point for ``linear="sip"`` without `tangent_point`. The default is (0, 0)
+        if u, v are offsets from the reference pixel, and the reference pixel if they are positions
+        on the detector: whichever gives the smaller constant terms. The header states it in BDU0,
+        BDV0.
     notes : sequence of str
         Sentences for COMMENT.
 
     Returns
     -------
     SipHeader
+        Header with standard deviations, inverse and closure.
 
     Raises
     ------
     InputError
-        For an unknown chip or `linear`, a missing epoch, an order that cannot be written, a linear
-        part that is singular ('cd') or far from the identity ('sip'), a distortion without inverse,
-        a tangent point of u, v in pixels, or a `crval` that is no position of the field.
+        If the chip or `linear` is unknown, the epoch is missing, an order cannot be written, the
+        linear part is singular ('cd') or far from the identity ('sip'), the distortion has no
+        inverse, a tangent point is given for u, v in pixels, or `crval` is not a position in the
+        field.
 
     Examples
     --------
@@ -132,13 +136,13 @@ def sip_from_solution(
         axes = "linear" if wide else "sky"
     in_frame = _is_in_frame(axes, tangent_point, crval)
     number = calibration.numbers[0] if chip is None else chip
-    one = calibration.chip(number, epoch, origin="stated")
-    poly = one.monomials()
+    chip_map = calibration.chip(number, epoch, origin="stated")
+    poly = chip_map.monomials()
     require_regular(poly.linear, number)
     unit_arcsec = arcsec_per(model.unit, scale_arcsec)
     sky = None
     if tangent_point is not None:
-        sky = reprojected(one, unit_arcsec, tangent_point, crval, *SIP_ORDERS)
+        sky = reprojected(chip_map, unit_arcsec, tangent_point, crval, *SIP_ORDERS)
         poly, crval = sky.poly, sky.crval
     order = max(SIP_ORDERS[0], *(i + j for i, j in poly.terms))  # readers ignore order 1
     inverse = _inverse_order(inverse_order, order)
@@ -153,14 +157,14 @@ def sip_from_solution(
         terms, sigma = _relative_to_identity(poly, pixel, offset)
     if in_frame:
         cd, crval = cd * 3600.0 / unit_arcsec, offset
-    kept = [k for k, (i, j) in enumerate(poly.terms) if linear == "sip" or i + j >= 2]
+    written = [k for k, (i, j) in enumerate(poly.terms) if linear == "sip" or i + j >= 2]
     if sky is not None:
         offset = sky.offset
         if linear == "cd" and poly.constant.any():  # no pixel has CRVAL: only A and B can state it
-            kept.insert(0, poly.index(0, 0))
+            written.insert(0, poly.index(0, 0))
             notes = (*notes, "No pixel of the solution has CRVAL: A_0_0 and B_0_0 hold the rest.")
-    a, b = ({poly.terms[k]: float(terms[axis, k]) for k in kept} for axis in (0, 1))
-    if not kept:
+    a, b = ({poly.terms[k]: float(terms[axis, k]) for k in written} for axis in (0, 1))
+    if not written:
         a = b = dict.fromkeys(((2, 0), (1, 1), (0, 2)), 0.0)
     cards = _cards(
         number,
@@ -185,8 +189,8 @@ def sip_from_solution(
         order=(order, order),
         a=a,
         b=b,
-        sigma_a={poly.terms[k]: float(sigma[0, k]) for k in kept},
-        sigma_b={poly.terms[k]: float(sigma[1, k]) for k in kept},
+        sigma_a={poly.terms[k]: float(sigma[0, k]) for k in written},
+        sigma_b={poly.terms[k]: float(sigma[1, k]) for k in written},
         offset=offset,
         unit=model.unit,
         size=size,
@@ -205,9 +209,10 @@ def sip_from_solution(
 
 
 def sip_wcs(calibration: Calibration, crval: tuple[float, float]) -> WCS:
-    """WCS of astropy.wcs with the SIP header of a calibration of one chip on the sky.
+    """`astropy.wcs.WCS` with the SIP header of a one-chip calibration on the sky.
 
-    `crval` is the position of the tangent point in degrees, so that the polynomial stays as it is.
+    `crval` is the sky position of the tangent point in degrees, so that the polynomial is
+    unchanged.
     """
     from astropy.wcs import WCS  # slow to import
 
@@ -225,7 +230,7 @@ def _check_options(
     tangent_point: tuple[float, float] | None,
     origin: tuple[float, float] | None,
 ) -> None:
-    """Refuse options that contradict each other or the model."""
+    """Raise InputError for options that contradict each other or the model."""
     if linear not in ("cd", "sip"):
         raise InputError(
             f"linear is {linear!r}", where="products.sip.linear", do="choose 'cd' or 'sip'"
@@ -251,7 +256,7 @@ def _is_in_frame(
     tangent_point: tuple[float, float] | None,
     crval: tuple[float, float] | None,
 ) -> bool:
-    """True for linear axes, after a check that u, v have no position on the sky."""
+    """True for linear axes, after checking that u, v have no position on the sky."""
     if axes not in ("sky", "linear"):
         raise InputError(
             f"axes is {axes!r}", where="products.sip.axes", do="choose 'sky' or 'linear'"
@@ -280,7 +285,7 @@ def _inverse_order(asked: int | None, order: int) -> int:
 
 
 def _units_per_pixel(poly: Monomials, unit: str, scale_arcsec: float | None) -> float:
-    """Units of u, v in one pixel, after a check that (u, v) runs along (x, y)."""
+    """Units of u, v per pixel, after checking that (u, v) are aligned with (x, y)."""
     if unit == "pix":
         pixel = 1.0
     elif scale_arcsec is not None:
@@ -297,7 +302,7 @@ def _units_per_pixel(poly: Monomials, unit: str, scale_arcsec: float | None) -> 
 
 
 def _relative_to_linear(poly: Monomials) -> tuple[Float, Float]:
-    """A, B = L^-1 C of every term, and their sigmas: dA = L^-1 (dC - dL A)."""
+    """A, B = L^-1 C of every term, and their sigmas from dA = L^-1 (dC - dL A)."""
     terms = np.linalg.solve(poly.linear, poly.values)
     K = len(poly.terms)
     inner = np.eye(K)
@@ -306,14 +311,14 @@ def _relative_to_linear(poly: Monomials) -> tuple[Float, Float]:
 
 
 def _sigma(by: Float, poly: Monomials) -> Float:
-    """Standard deviations (2, K) behind a linear map of the coefficients."""
+    """Standard deviations (2, K) after a linear map `by` of the coefficients."""
     if poly.cov is None:
         return np.zeros(poly.values.shape)
     return propagated_sigma(by, poly.cov).reshape(2, -1)
 
 
 def _origin(poly: Monomials, unit: str) -> tuple[float, float]:
-    """(0, 0), or the reference pixel where that is nearer to the model's constant."""
+    """(0, 0), or the reference pixel if that is nearer to the constant term of the model."""
     reference = poly.basis.reference_pixel
     from_reference = np.hypot(*(poly.constant - reference))
     positions = unit == "pix" and from_reference < np.hypot(*poly.constant)
@@ -323,7 +328,7 @@ def _origin(poly: Monomials, unit: str) -> tuple[float, float]:
 def _relative_to_identity(
     poly: Monomials, pixel: float, origin: tuple[float, float]
 ) -> tuple[Float, Float]:
-    """Model in pixels from the origin, less u = x and v = y, and its sigmas."""
+    """Model in pixels relative to the origin minus u = x and v = y, and its sigmas."""
     terms = poly.values / pixel
     for axis, power in enumerate(((1, 0), (0, 1))):
         terms[axis, poly.index(0, 0)] -= origin[axis] / pixel
@@ -340,15 +345,15 @@ def _cards(
     *,
     in_frame: bool,
 ) -> tuple[str, ...]:
-    """Cards of values that are no fields of a SipHeader; `in_frame`: the axes are linear."""
+    """Cards of values that are not fields of a SipHeader; `in_frame` is True for linear axes."""
     axes_unit = {"pix": "pixel"}.get(unit, unit) if in_frame else "deg"
-    what = {
+    convention = {
         "cd": "CD holds the linear terms; A and B begin at order 2.",
         "sip": "CD is a pure scale; A and B hold constant and linear terms.",
     }[linear]
     cards = [
         text_card("COMMENT", f"Distortion of chip {chip}, by bayesdist."),
-        text_card("COMMENT", what),
+        text_card("COMMENT", convention),
         text_card("COMMENT", "A_p_q multiplies u^p v^q; AE_p_q and BE_p_q are 1-sigma errors."),
     ]
     if unit == "pix" and scale_arcsec is None and not in_frame:

@@ -1,4 +1,4 @@
-"""Calibration of SIP headers, alone or with the parameters that stand beside them."""
+"""Calibration of SIP headers, alone or with their parameter files."""
 
 from __future__ import annotations
 
@@ -44,11 +44,12 @@ def sip_calibration(
 ) -> Calibration:
     """Calibration of a SIP header: one chip without number, with the header's sigmas if complete.
 
-    Sigmas of the non-linear terms alone are left out: errors of positions would be too small.
-    `size` is columns and rows, for a header without them (else MissingSizeError); with `pixels`,
-    for a file without CD, (u, v) are corrected pixels, else arcseconds; `notes` go to the reader.
+    Sigmas of the non-linear terms alone are not used, because position errors would be too small.
+    `size` is columns and rows, for a header that does not state them (else MissingSizeError). With
+    `pixels`, for a file without CD, (u, v) are corrected pixels, otherwise arcseconds. `notes` are
+    added to the notes of the calibration.
     """
-    found = required_size(sip.size, size, name)
+    image_size = required_size(sip.size, size, name)
     order = max(sip.order) if min(sip.order) >= SIP_ORDERS[0] else 1
     refuse_order(order, name)
     header = sip_header(sip)
@@ -66,11 +67,11 @@ def sip_calibration(
             return cd @ corrected + np.array(sip.crval)[:, None]
         return 3600.0 * (cd @ corrected)
 
-    one = fitted_map(
+    chip_map = fitted_map(
         positions,
         name,
         order=order,
-        size=found,
+        size=image_size,
         reference_pixel=sip.crpix,
         unit="pix" if pixels else sip.axes_unit if sip.linear_axes else "arcsec",
         monomial_cov=_variances(sip, linear, order),
@@ -79,14 +80,14 @@ def sip_calibration(
         notes = (*notes, NO_LINEAR_ERRORS)
     plane = Plane("detector") if pixels else Plane()
     if form is not None:
-        form.check(lambda x, y: positions(x, y) / 3600.0, found, header, name)
+        form.check(lambda x, y: positions(x, y) / 3600.0, image_size, header, name)
         plane = Plane("sky", point=form.point)
     elif not pixels and not sip.linear_axes:
         notes = (*notes, NO_SKY)
     return calibration_of_maps(
-        {1: one},
+        {1: chip_map},
         name,
-        cov=one.cov,
+        cov=chip_map.cov,
         errors="sigma",
         plane=plane,
         numbered=False,
@@ -107,7 +108,7 @@ def _variances(sip: SipHeader, linear: Float, order: int) -> Float | None:
     return (turn * np.array(sigma) ** 2) @ turn.T
 
 
-AGREE = 1e-4  # pixels: a header is brought to the plane of its CRVAL to a tenth of that
+AGREE = 1e-4  # pixels; ten times the accuracy of the reprojection to the plane of CRVAL
 _GRID = 33
 
 
@@ -117,28 +118,28 @@ def with_side_file(sip: SipHeader, name: str) -> SipHeader:
 
 
 def side_file(calibration: Calibration, chip: int, epoch: float | None, header: str) -> Built:
-    """File with the parameters of one chip at a date, to stand beside a header."""
+    """Parameter file of one chip at one date, a companion of the header file `header`."""
     date = epoch if calibration.model.time is not None else None
-    one = calibration.only(chip, date)
+    dated = calibration.only(chip, date)
     name = f"{Path(header).stem}_parameters.fits"
-    return Built(name, PARAMETERS, parameters_content(one), one, chip)
+    return Built(name, PARAMETERS, parameters_content(dated), dated, chip)
 
 
 def agreeing(stored: Calibration, found: Calibration) -> Calibration:
-    """Stored calibration of a header, after a check that what was read says the same."""
+    """Stored calibration of a header, after checking that the header agrees with it."""
     refuse_other(_difference(found, stored), AGREE, found.name)
     return replace(stored, notes=tuple(n for n in found.notes if n != NO_LINEAR_ERRORS))
 
 
 def _difference(found: Calibration, stored: Calibration) -> float:
-    """Largest distance of positions, pixels: on the sky, or after the best similarity."""
-    [here], [there] = found.numbers, stored.numbers
+    """Largest distance between positions in pixels: on the sky, or after the best similarity."""
+    [found_chip], [stored_chip] = found.numbers, stored.numbers
     if found.model.chips[0].size != stored.model.chips[0].size:
         return float("inf")
     x, y = detector_grid(found.model.chips[0].size, _GRID)
-    a = found.forward(x, y, chip=here)
-    b = stored.forward(x, y, chip=there)
-    pixel = np.sqrt(abs(np.linalg.det(stored.chip(there, origin="stated").linear)))
+    a = found.forward(x, y, chip=found_chip)
+    b = stored.forward(x, y, chip=stored_chip)
+    pixel = np.sqrt(abs(np.linalg.det(stored.chip(stored_chip, origin="stated").linear)))
     if found.plane.point is not None and stored.plane.point is not None:
         xi, eta = (ARCSEC[found.unit] * a).T
         ra, dec = sky_of_plane(xi, eta, found.plane.point)
@@ -146,5 +147,5 @@ def _difference(found: Calibration, stored: Calibration) -> float:
         return float(np.hypot(*(a - b).T).max() / pixel)
     w, z = a @ [1, 1j], b @ [1, 1j]
     design = np.stack([np.ones_like(w), w], axis=1)
-    left = design @ np.linalg.lstsq(design, z, rcond=None)[0] - z
-    return float(np.abs(left).max() / pixel)
+    residual = design @ np.linalg.lstsq(design, z, rcond=None)[0] - z
+    return float(np.abs(residual).max() / pixel)

@@ -1,4 +1,4 @@
-"""Format entry of the SIP header."""
+"""Format of SIP headers."""
 
 from __future__ import annotations
 
@@ -40,9 +40,10 @@ class Settings(FormatSettings):
 
     inverse_order: Annotated[int, Field(ge=2, le=9)] | None = None
     linear: Literal["cd", "sip"] = "cd"
-    axes: Literal["sky", "linear"] | None = None  # sky, but of wide planes that have none
+    # None: sky, except for wide fields without a sky position
+    axes: Literal["sky", "linear"] | None = None
     crval: tuple[float, float] | None = None
-    parameters: bool = True  # whether a file with the covariance is written beside
+    parameters: bool = True  # True to write a companion file with the covariance
 
 
 def _parse(content: Content) -> Content | None:
@@ -51,7 +52,7 @@ def _parse(content: Content) -> Content | None:
 
 def describe_wcs(content: Content, extra: Sequence[Finding] = ()) -> list[str]:
     """Lines of text on each world coordinate system of a file, and `extra` findings."""
-    # astropy.wcs takes longer to import than most files to read
+    # importing astropy.wcs takes longer than reading most files
     from bayesdist.products.formats.sip.wcs_text import describe_wcs as lines_on
 
     return lines_on(content, extra)
@@ -65,17 +66,17 @@ def _calibration(content: Content, name: str, choice: Choice) -> Calibration:
     sip = sip_of(content)
     stated = [k for k in ("D2IMDIS1", "D2IMDIS2", "CPDIS1", "CPDIS2") if k in header_of(sip.cards)]
     notes = (f"without the look-up tables of {', '.join(stated)}",) if stated else ()
-    found = sip_calibration(sip, name, size=choice.size, notes=notes)
+    calibration = sip_calibration(sip, name, size=choice.size, notes=notes)
     if choice.as_used:
-        return found
+        return calibration
     named = str(header_of(sip.cards).get(SIDE_FILE, ""))
-    return with_parameters(found, content.beside(named), named, agreeing)
+    return with_parameters(calibration, content.beside(named), named, agreeing)
 
 
 def _build(
     calibration: Calibration, settings: Settings, options: BuildOptions
 ) -> tuple[Built, ...]:
-    """Headers, one for each chip."""
+    """Build one header per chip."""
     out = []
     departure = _projection_matters(calibration, settings, options)
     axes = settings.axes or ("linear" if departure else "sky")
@@ -92,9 +93,9 @@ def _build(
         several = len(calibration.numbers) > 1
         name = options.named(f"sip_{number}.hdr" if several else "sip.hdr", several=several)
         if settings.parameters:
-            beside = side_file(calibration, number, options.epoch, name)
-            sip = with_side_file(sip, beside.file_name)
-            out.append(beside)
+            parameter_file = side_file(calibration, number, options.epoch, name)
+            sip = with_side_file(sip, parameter_file.file_name)
+            out.append(parameter_file)
         summary = {"closure_pix": sip.closure, "a_dmax": sip.a_dmax, "b_dmax": sip.b_dmax}
         text = sip_text(sip).encode("ascii")
         warnings = (*departure, *_warnings(sip, calibration))
@@ -104,10 +105,10 @@ def _build(
 
 
 def _notes(sip: SipHeader, calibration: Calibration) -> tuple[str, ...]:
-    """Notes on what the settings of the product cause.
+    """Notes on consequences of the product's settings.
 
-    CRVAL is a placeholder where the sky position is neither known nor given, and terms below order
-    2 are in A and B where they are asked to be.
+    A note is given if CRVAL is a placeholder because the sky position is neither known nor given,
+    and if A and B hold terms below order 2 as requested.
     """
     out = []
     if _sky_is_assumed(sip, calibration) and sip.crval == (0.0, 0.0):
@@ -128,7 +129,7 @@ def _notes(sip: SipHeader, calibration: Calibration) -> tuple[str, ...]:
 def _projection_matters(
     calibration: Calibration, settings: Settings, options: BuildOptions
 ) -> tuple[str, ...]:
-    """Warning that angular u, v may be in another projection than TAN; empty if it hardly matters.
+    """Warning that angular u, v may be in a projection other than TAN; empty if this is negligible.
 
     See `departure_from_tangent_plane`.
     """
@@ -136,7 +137,7 @@ def _projection_matters(
     if calibration.unit == "pix" or stated or calibration.plane.point is not None:
         return ()
     if calibration.model.time is not None and options.epoch is None:
-        return ()  # refused with its reason where the header is made
+        return ()  # the function that builds the header reports the missing epoch
     worst = departure_from_tangent_plane(calibration, options.epoch, None)
     if worst <= MAX_DEPARTURE:
         return ()
@@ -148,25 +149,25 @@ def _projection_matters(
 
 
 def _warnings(sip: SipHeader, calibration: Calibration) -> tuple[str, ...]:
-    """Warning on sky axes that the header has and the solution does not state."""
+    """Warning if the header has sky axes that the solution does not state."""
     if not _sky_is_assumed(sip, calibration) or sip.crval == (0.0, 0.0):
         return ()
     return (f"{_axes(sip)}: check that they are{_or_linear(calibration)}",)
 
 
 def _sky_is_assumed(sip: SipHeader, calibration: Calibration) -> bool:
-    """True if the header has sky axes although the solution does not say where the sky is."""
+    """True if the header has sky axes although the solution has no sky position."""
     return not sip.linear_axes and calibration.plane.point is None
 
 
 def _axes(sip: SipHeader) -> str:
-    """Sky directions that the header assumes for u and v, as a clause."""
+    """Clause that states the sky directions which the header assumes for u and v."""
     mirrored = ", which makes the image a mirror of the sky" if np.linalg.det(sip.cd) > 0 else ""
     return f"u is taken for east and v for north{mirrored}"
 
 
 def _or_linear(calibration: Calibration) -> str:
-    """Second remedy, which exists for u and v in pixels."""
+    """Alternative remedy, for u and v in pixels."""
     return ", or set axes = 'linear'" if calibration.unit == "pix" else ""
 
 

@@ -23,26 +23,28 @@ from bayesdist.utils.arrays import Float
 Terms = Mapping[tuple[int, int], float]
 
 SIDE_FILE = "BDPARAM"  # keyword with the name of the file that has the covariance
-# Programs ignore lower orders, and a keyword has room for one digit.
+# Programs ignore lower orders, and a keyword has only one digit for each power.
 SIP_ORDERS = (2, 9)
-LINEAR_AXES = ("U", "V")  # CTYPE of a plane of the user, which no program takes for a sky
+# CTYPE of a user-defined plane, which no program interprets as sky coordinates
+LINEAR_AXES = ("U", "V")
 
 
 @dataclass(frozen=True, eq=False)
 class SipHeader:
-    """Distortion of one image as a header states it, and every other card of the header.
+    """Distortion of one image as stated in a header, and all other cards of the header.
 
-    Mappings go from the powers (p, q) of u and v to the coefficient.
+    Mappings give the coefficient for powers (p, q) of u and v.
 
     Parameters
     ----------
     crpix : tuple of float
         Reference pixel, FITS 1-based.
     crval : tuple of float
-        Its position on the sky, degrees.
+        Sky position of the reference pixel, degrees.
     cd : ndarray, shape (2, 2)
         CD matrix, degrees per pixel.
     ctype : tuple of str
+        CTYPE1 and CTYPE2.
     order : tuple of int
         A_ORDER and B_ORDER.
     a, b : mapping
@@ -50,22 +52,22 @@ class SipHeader:
     inverse_order : tuple of int, optional
         AP_ORDER and BP_ORDER.
     ap, bp : mapping
-        Inverse coefficients; empty where the header has none.
+        Inverse coefficients; empty if the header has none.
     sigma_a, sigma_b : mapping
         Standard deviations of `a` and `b`: keywords AE_p_q and BE_p_q.
     dmax : tuple of float, optional
         A_DMAX and B_DMAX: largest ``|A|`` and ``|B|`` over the detector, pixels.
     closure : float, optional
-        Worst distance between a pixel and the inverse of its forward position: keyword BDCLOS,
+        Largest distance between a pixel and the inverse of its forward position: keyword BDCLOS,
         pixels.
     offset : tuple of float, optional
-        (u, v) of the model that CRVAL stands for: keywords BDU0 and BDV0.
+        (u, v) of the model at CRVAL: keywords BDU0 and BDV0.
     unit : str
         Unit of `offset`: keyword BDUNIT.
     size : tuple of int, optional
         Columns and rows of the image (NAXIS1/2, or IMAGEW/H in a header without data).
     cards : tuple of str
-        All cards as they were read, or those that the fields above do not stand for.
+        All cards of a header that was read, or the cards that the fields above do not cover.
 
     Examples
     --------
@@ -99,24 +101,24 @@ class SipHeader:
 
     @property
     def linear_axes(self) -> bool:
-        """True for (u, v) on no sky: `cd` is in `axes_unit` per pixel, and CRVAL is a (u, v)."""
+        """True if (u, v) are not on the sky: `cd` is in `axes_unit` per pixel, CRVAL a (u, v)."""
         return self.ctype == LINEAR_AXES
 
     @property
     def axes_unit(self) -> str:
-        """Unit of (u, v) of a header with linear axes: that of BDUNIT, or the pixel."""
+        """Unit of (u, v) in a header with linear axes: BDUNIT, or the pixel."""
         return self.unit or "pix"
 
     @property
     def has_sigmas(self) -> bool:
-        """True if standard deviations are stated, if only those of some of the terms."""
+        """True if standard deviations are stated, even if only for some terms."""
         return bool(self.sigma_a or self.sigma_b)
 
     @property
     def has_linear_sigmas(self) -> bool:
         """True if the standard deviations include those of the constant and linear terms.
 
-        Without these the errors of positions are not known.
+        Otherwise the errors of positions are unknown.
         """
         low = ((0, 0), (1, 0), (0, 1))
         return all(term in sigma for sigma in (self.sigma_a, self.sigma_b) for term in low)
@@ -133,13 +135,13 @@ class SipHeader:
 
     @property
     def has_inverse(self) -> bool:
-        """True where the header holds AP and BP."""
+        """True if the header has AP and BP."""
         return self.inverse_order is not None
 
     def forward(self, x: ArrayLike, y: ArrayLike) -> tuple[Float, Float]:
-        """Corrected offsets from CRPIX, as astropy.wcs computes them.
+        """Corrected offsets from CRPIX, computed as in astropy.wcs.
 
-        Terms above the order are left out; constant and linear ones are applied.
+        Terms above the order are left out; constant and linear terms are applied.
 
         Parameters
         ----------
@@ -149,11 +151,11 @@ class SipHeader:
         Returns
         -------
         U, V : ndarray
-            Pixels.
+            Corrected offsets from CRPIX, pixels.
         """
         u = np.asarray(x, float) - self.crpix[0]
         v = np.asarray(y, float) - self.crpix[1]
-        if min(self.order) < SIP_ORDERS[0]:  # astropy.wcs drops both axes then
+        if min(self.order) < SIP_ORDERS[0]:  # astropy.wcs then ignores both axes
             return u, v
         return (
             u + evaluate(self.a, u, v, self.order[0]),
@@ -161,7 +163,7 @@ class SipHeader:
         )
 
     def inverse(self, U: ArrayLike, V: ArrayLike) -> tuple[Float, Float]:
-        """Pixels of corrected offsets, by AP and BP.
+        """Pixels at corrected offsets, computed from AP and BP.
 
         Parameters
         ----------
@@ -176,7 +178,7 @@ class SipHeader:
         Raises
         ------
         InputError
-            When the header has no inverse.
+            If the header has no inverse.
         """
         if self.inverse_order is None:
             raise InputError(
@@ -189,12 +191,17 @@ class SipHeader:
         )
 
     def plane(self, x: ArrayLike, y: ArrayLike) -> tuple[Float, Float]:
-        """Coordinates (xi, eta) of pixels about CRVAL, degrees; with linear axes pixels.
+        """Coordinates relative to CRVAL, in degrees, or in `axes_unit` for linear axes.
 
         Parameters
         ----------
         x, y : array_like
-            FITS pixels, counted from 1.
+            FITS 1-based pixels.
+
+        Returns
+        -------
+        xi, eta : ndarray
+            Intermediate world coordinates.
         """
         U, V = self.forward(x, y)
         return self.cd[0, 0] * U + self.cd[0, 1] * V, self.cd[1, 0] * U + self.cd[1, 1] * V
@@ -203,8 +210,22 @@ class SipHeader:
 def worst_closure(sip: SipHeader, size: tuple[float, float]) -> float:
     """Largest distance between a pixel and the inverse of its forward position.
 
-    `sip`: with an inverse. `size`: columns and rows. Returns pixels, over a grid of 257 x 257
-    pixels from corner to corner. InputError when the header has no inverse.
+    Parameters
+    ----------
+    sip : SipHeader
+        Header with an inverse.
+    size : tuple of float
+        Columns and rows of the detector.
+
+    Returns
+    -------
+    float
+        Largest distance in pixels, over a grid of 257 x 257 pixels from corner to corner.
+
+    Raises
+    ------
+    InputError
+        If the header has no inverse.
     """
     x, y = detector_grid(size)
     back_x, back_y = sip.inverse(*sip.forward(x, y))

@@ -1,4 +1,4 @@
-"""Value of one coefficient of a SIP header that all other numbers of the header imply."""
+"""Value of one coefficient of a SIP header that is implied by all other numbers of the header."""
 
 from __future__ import annotations
 
@@ -26,23 +26,24 @@ from bayesdist.products.formats.sip.families import (
 from bayesdist.products.formats.sip.header import SipHeader
 from bayesdist.utils.arrays import Bool, Float
 
-# Odds of a further, independent fault, for values that a suspect leaves unexplained.
+# Odds of a second, independent error, for inconsistencies that a suspect does not explain.
 _SECOND_FAULT = 1e-2
-# Components of a closure are known to this; pixels.
+# Rounding error of the components of a closure; pixels.
 _ROUNDING = 1e-12
 _STEPS = 3
 _TAIL = 1e-9
-# Probabilities of equally probable nodes.
+# Probabilities at which equally probable nodes are placed.
 _MIDDLES = (np.arange(2000) + 0.5) / 2000
-# Points of each axis over which stated maxima are compared, and the largest part of a maximum that
-# such a sample misses.
+# Points per axis at which stated maxima are compared, and the largest relative error of a maximum
+# that is found by such sampling.
 _NODES, _SAMPLED = 129, 2e-4
 
 
 @cache
 def _student_nodes(dof: int) -> Float:
-    """Equally probable nodes of Student's t distribution of unit scale about zero."""
-    from scipy.special import stdtrit  # here, as few files need it, and all would wait for it
+    """Equally probable nodes of Student's t distribution with unit scale, centred on zero."""
+    # imported here because few files need it and it slows down the import
+    from scipy.special import stdtrit
 
     return np.asarray(stdtrit(dof, _MIDDLES), float)
 
@@ -57,17 +58,17 @@ class _Student:
 
     @property
     def nodes(self) -> Float:
-        """Equally probable nodes."""
+        """Equally probable nodes of the distribution."""
         return self.centre + self.scale * _student_nodes(self.dof)
 
     def below(self, values: ArrayLike) -> Float:
-        """Probability below each of some values."""
+        """Cumulative probability at the given values."""
         from scipy.special import stdtr
 
         return np.asarray(stdtr(self.dof, (np.asarray(values) - self.centre) / self.scale), float)
 
     def quantiles(self, probabilities: ArrayLike) -> Float:
-        """Values with these probabilities below them."""
+        """Values with the given cumulative probabilities."""
         from scipy.special import stdtrit
 
         return np.asarray(self.centre + self.scale * stdtrit(self.dof, probabilities), float)
@@ -75,15 +76,30 @@ class _Student:
 
 @dataclass(frozen=True)
 class Implied:
-    """Value of one coefficient that all other numbers of a header imply."""
+    """Value of one coefficient that is implied by all other numbers of a header.
+
+    Parameters
+    ----------
+    keyword : str
+        Keyword of the coefficient.
+    printed : float
+        Value in the header.
+    value, sigma : float
+        Mean and standard deviation of the implied value.
+    interval : tuple of float
+        Central interval that contains 95 % of the probability.
+    probability : float
+        Probability that this coefficient is wrong, if exactly one is and each may be.
+    sources : tuple of str
+        Sources of the implied value: the other pair of polynomials, and A_DMAX or B_DMAX.
+    """
 
     keyword: str
-    printed: float  # its value in the header
-    value: float  # mean and standard deviation of the implied value
+    printed: float
+    value: float
     sigma: float
-    interval: tuple[float, float]  # that holds 95 % of the probability
-    probability: float  # that this coefficient is the wrong one, if exactly one is and any might be
-    # sources that the value agrees with: the other pair of polynomials, and A_DMAX or B_DMAX
+    interval: tuple[float, float]
+    probability: float
     sources: tuple[str, ...]
 
     @property
@@ -93,21 +109,37 @@ class Implied:
 
 
 def implied_values(sip: SipHeader, size: tuple[int, int] | None = None) -> tuple[Implied, ...]:
-    """Values of each coefficient of A, B, AP and BP as if it alone were unknown.
+    """Implied value of each coefficient of A, B, AP and BP, each treated as the only unknown.
 
-    The closure (pixel, through A and B, back through AP and BP, minus pixel) is projected on
-    orthonormal Legendre products over the detector, up to the order of the inverse; what that order
-    cannot follow drops out.  A wrong coefficient moves the components along a known direction.
-    Their scatter about it is the error of the printed inverse: normal, with one variance for
-    even and one for odd total degree.  An inverse that was fitted to pairs of stars is biased by
-    their position errors towards where stars are denser, which for a centred field is an odd
-    function.  With a scale-free prior of both variances, the coefficient has a Student t
-    distribution.  A_DMAX or B_DMAX restricts it to the values that its printed digits allow.
+    Parameters
+    ----------
+    sip : SipHeader
+        Header with an inverse.
+    size : tuple of int, optional
+        Columns and rows of the detector. The default is the size in the header.
 
-    `sip`: with an inverse. `size`: columns and rows of the detector; by default those of the
-    header. Returns the most probable suspect first.  A stated maximum or a repeated value that a
-    suspect leaves unexplained costs it odds of 100 to 1. InputError without a size or an inverse,
-    or with orders that programs ignore.
+    Returns
+    -------
+    tuple of Implied
+        Implied values of all coefficients, the most probable suspect first.
+
+    Raises
+    ------
+    InputError
+        If there is no size or no inverse, or if programs ignore the orders.
+
+    Notes
+    -----
+    The closure (a pixel after A and B and back through AP and BP, minus the pixel) is projected on
+    orthonormal Legendre products over the detector, up to the order of the inverse, which removes
+    what that order cannot represent. A wrong coefficient changes the components along a known
+    direction. The scatter of the components around it is the error of the printed inverse, modelled
+    as normal with one variance for even and one for odd total degree: an inverse fitted to pairs of
+    stars is biased by their position errors towards regions with more stars, which is an odd
+    function for a centred field. With a scale-free prior on both variances, the coefficient has a
+    Student t distribution. A_DMAX or B_DMAX restricts it to values that agree with the printed
+    digits. A suspect that leaves a stated maximum or a repeated value unexplained is penalised by
+    odds of 100 to 1.
     """
     size = size or sip.size
     if size is None or not (forward_is_used(sip) and inverse_is_used(sip)):
@@ -119,7 +151,7 @@ def implied_values(sip: SipHeader, size: tuple[int, int] | None = None) -> tuple
     closure, maxima = _Closure.of(sip, size), StatedMaxima.of(sip, size)
     repeated = repeated_names(sip)
     unmet = {p for p in "AB" if maxima is not None and not maxima.met(p)}
-    found, scores = [], []
+    coefficients, scores = [], []
     for family, order, terms in families(sip):
         used = [powers for powers in terms if sum(powers) <= order]
         for powers, (posterior, score) in zip(used, closure.solved(family, used), strict=True):
@@ -132,9 +164,9 @@ def implied_values(sip: SipHeader, size: tuple[int, int] | None = None) -> tuple
                     nodes = cut
                     sources.append(f"{family}_DMAX")
             score += np.log(max(share, _SECOND_FAULT))
-            others = len(unmet - {family}) + sum(keyword not in names for names in repeated)
-            scores.append(score + others * np.log(_SECOND_FAULT))
-            found.append((keyword, terms[powers], nodes, tuple(sources)))
+            unexplained = len(unmet - {family}) + sum(keyword not in names for names in repeated)
+            scores.append(score + unexplained * np.log(_SECOND_FAULT))
+            coefficients.append((keyword, terms[powers], nodes, tuple(sources)))
     weights = np.exp(np.array(scores) - max(scores))
     weights /= weights.sum()
     implied = [
@@ -147,35 +179,35 @@ def implied_values(sip: SipHeader, size: tuple[int, int] | None = None) -> tuple
             float(p),
             sources,
         )
-        for (keyword, printed, nodes, sources), p in zip(found, weights, strict=True)
+        for (keyword, printed, nodes, sources), p in zip(coefficients, weights, strict=True)
     ]
-    return tuple(sorted(implied, key=lambda one: -one.probability))
+    return tuple(sorted(implied, key=lambda value: -value.probability))
 
 
 def _cut(t: _Student, intervals: list[tuple[float, float]]) -> tuple[float, Float]:
-    """Probability of the intervals, and equally probable nodes within them."""
+    """Total probability of the intervals, and equally probable nodes within them."""
     limits = t.below(np.reshape(intervals, (-1, 2)))
     below = np.concatenate([[0.0], np.cumsum(limits[:, 1] - limits[:, 0])])
     share = float(below[-1])
     at = share * _MIDDLES
-    which = np.clip(np.searchsorted(below, at) - 1, 0, None)
-    return share, t.quantiles(limits[which, 0] + at - below[which]) if share > 0 else _MIDDLES
+    interval = np.clip(np.searchsorted(below, at) - 1, 0, None)
+    return share, t.quantiles(limits[interval, 0] + at - below[interval]) if share > 0 else _MIDDLES
 
 
 @dataclass(frozen=True, eq=False)
 class _Closure:
-    """Projection of closures on orthonormal Legendre products, by Gauss-Legendre quadrature."""
+    """Projection of closures on orthonormal Legendre products by Gauss-Legendre quadrature."""
 
     sip: SipHeader
-    pixels: tuple[Float, Float]  # (N,)
-    forth: tuple[Float, Float]  # corrected offsets (N,) of these pixels, by A and B
+    pixels: tuple[Float, Float]  # (N,), quadrature points
+    forth: tuple[Float, Float]  # corrected offsets (N,) of these pixels from A and B
     projector: Float  # (N, K)
-    odd: Bool  # (2 K,): components of odd total degree
+    odd: Bool  # (2 K,), True for components of odd total degree
 
     @classmethod
     def of(cls, sip: SipHeader, size: tuple[int, int]) -> _Closure:
         order = max(sip.inverse_order or (0,))
-        # exact for a product of the closure's leading terms and a basis function
+        # exact for the product of the closure's leading terms and a basis function
         t, w = legendre.leggauss(2 * order + 4)
         X, Y = (g.ravel() for g in np.meshgrid(t, t))
         i, j = np.array(polynomial_terms(order)).T
@@ -186,23 +218,26 @@ class _Closure:
         return cls(sip, (x, y), sip.forward(x, y), values, np.tile(i + j, 2) % 2 > 0)
 
     def components(self, family: str, moves: Float) -> Float:
-        """Components (n, 2 K) of closures along x, then y; pixels.
+        """Components (n, 2 K) of closures along x, then y, in pixels.
 
-        In each of them the polynomial of a family has further values: `moves` (n, N).
+        `moves` (n, N) are values that are added to the polynomial of one family.
         """
-        more: dict[str, Float | float] = dict.fromkeys(("A", "B", "AP", "BP"), 0.0)
-        more[family] = moves
-        x, y = self.sip.inverse(self.forth[0] + more["A"], self.forth[1] + more["B"])
-        backs = (x + more["AP"] - self.pixels[0], y + more["BP"] - self.pixels[1])
+        added: dict[str, Float | float] = dict.fromkeys(("A", "B", "AP", "BP"), 0.0)
+        added[family] = moves
+        x, y = self.sip.inverse(self.forth[0] + added["A"], self.forth[1] + added["B"])
+        backs = (x + added["AP"] - self.pixels[0], y + added["BP"] - self.pixels[1])
         return np.concatenate(
             [np.broadcast_to(back, moves.shape) @ self.projector for back in backs], axis=1
         )
 
     def solved(self, family: str, powers: list[tuple[int, int]]) -> list[tuple[_Student, float]]:
-        """Distribution of each coefficient of a family, and the logarithm of its evidence."""
+        """Distribution of each coefficient of a family, and its log-evidence."""
         from scipy.special import betaln
 
-        pixels = [one - middle for one, middle in zip(self.pixels, self.sip.crpix, strict=True)]
+        pixels = [
+            coordinate - middle
+            for coordinate, middle in zip(self.pixels, self.sip.crpix, strict=True)
+        ]
         i, j = np.reshape(powers, (-1, 2)).T
         u, v = self.forth if family in ("AP", "BP") else pixels
         monomials = u ** i[:, None] * v ** j[:, None]
@@ -210,25 +245,26 @@ class _Closure:
         def components(changes: Float) -> Float:
             return self.components(family, changes[:, None] * monomials)
 
-        width, height = (np.ptp(one) / 2 for one in self.pixels)
+        width, height = (np.ptp(coordinate) / 2 for coordinate in self.pixels)
         step = 0.1 / (width**i * height**j)  # a tenth of a pixel
         mask = self.odd == ((i + j) % 2 > 0)[:, None]
         changes = np.zeros(len(powers))
-        rest = components(changes)
-        d = np.where(mask, components(step) - rest, 0.0) / step[:, None]
+        residual = components(changes)
+        d = np.where(mask, components(step) - residual, 0.0) / step[:, None]
         norm = (d**2).sum(axis=1)
-        for _ in range(_STEPS):  # with one slope: a distortion is nearly linear in its coefficients
-            changes -= (d * rest).sum(axis=1) / norm
-            rest = components(changes)
+        # with a constant slope: the closure is nearly linear in the coefficients
+        for _ in range(_STEPS):
+            changes -= (d * residual).sum(axis=1) / norm
+            residual = components(changes)
         n_inside, n_outside = mask.sum(axis=1), (~mask).sum(axis=1)
         dof = n_inside - 1
-        inside = np.where(mask, rest**2, 0.0).sum(axis=1) + n_inside * _ROUNDING**2
-        outside = np.where(mask, 0.0, rest**2).sum(axis=1) + n_outside * _ROUNDING**2
+        inside = np.where(mask, residual**2, 0.0).sum(axis=1) + n_inside * _ROUNDING**2
+        outside = np.where(mask, 0.0, residual**2).sum(axis=1) + n_outside * _ROUNDING**2
         score = betaln(0.5, dof / 2) - dof / 2 * np.log(inside) - n_outside / 2 * np.log(outside)
         printed = getattr(self.sip, family.lower())
         return [
-            (_Student(int(n), printed[k] + float(change), float(scale)), float(one))
-            for k, n, change, scale, one in zip(
+            (_Student(int(n), printed[k] + float(change), float(scale)), float(log_evidence))
+            for k, n, change, scale, log_evidence in zip(
                 powers, dof, changes, np.sqrt(inside / dof / norm), score, strict=True
             )
         ]
@@ -236,7 +272,7 @@ class _Closure:
 
 @dataclass(frozen=True, eq=False)
 class StatedMaxima:
-    """A_DMAX and B_DMAX, and the points of the detector over which they were taken."""
+    """A_DMAX and B_DMAX, and the detector points over which the maxima are taken."""
 
     sip: SipHeader
     u: Float
@@ -244,7 +280,7 @@ class StatedMaxima:
 
     @classmethod
     def of(cls, sip: SipHeader, size: tuple[int, int]) -> StatedMaxima | None:
-        """Stated maxima of a header; None where none are stated, or they fit no set of points."""
+        """Stated maxima of a header; None if none are stated, or if no set of points fits them."""
         if None in sip.dmax:
             return None
         for margin in (0.0, EDGE):
@@ -256,18 +292,18 @@ class StatedMaxima:
         return None
 
     def with_value(self, keyword: str, value: float) -> StatedMaxima:
-        """Stated maxima with another coefficient."""
+        """Stated maxima with one coefficient replaced."""
         return replace(self, sip=with_coefficient(self.sip, keyword, value))
 
     def met(self, prefix: str) -> bool:
-        """True where the printed coefficients of an axis reach the stated maximum."""
+        """True if the printed coefficients of an axis reproduce the stated maximum."""
         low, high = self._limits(prefix)
         return bool(low <= np.abs(self._values(prefix)).max() <= high)
 
     def allowed(
         self, prefix: str, powers: tuple[int, int], t: _Student
     ) -> list[tuple[float, float]]:
-        """Intervals of a coefficient within which the stated maximum is reached."""
+        """Intervals of a coefficient in which the stated maximum is reproduced."""
         base, monomial = self._values(prefix), self.u ** powers[0] * self.v ** powers[1]
         printed = getattr(self.sip, prefix.lower())[powers]
 
@@ -280,7 +316,7 @@ class StatedMaxima:
 
         from scipy.optimize import minimize_scalar
 
-        # the largest |p| is a convex function of each coefficient
+        # the maximum of |p| is a convex function of each coefficient
         lowest, highest = self._limits(prefix)
         bottom = float(minimize_scalar(beyond, bounds=(-1, 1), args=(0.0,), method="bounded").x)
         out = []
@@ -305,7 +341,7 @@ class StatedMaxima:
 def _crossing(
     beyond: Callable[[float, float], float], start: float, end: float, limit: float
 ) -> float:
-    """Point where a function that rises from `start` to `end` meets a limit, or the nearer end."""
+    """Point where a function that rises from `start` to `end` equals `limit`, or the nearer end."""
     if beyond(start, limit) >= 0:
         return start
     if beyond(end, limit) <= 0:
@@ -316,7 +352,7 @@ def _crossing(
 
 
 def with_error(one: Implied) -> str:
-    """Value and standard deviation, to two digits of the latter."""
+    """Text of value and standard deviation, with two digits of the latter."""
     largest = max(abs(one.value), one.sigma)
     digits = int(np.floor(np.log10(largest)) - np.floor(np.log10(one.sigma))) + 1
     return f"{one.value:+.{min(digits, 15)}e} +- {one.sigma:.1e}"

@@ -24,27 +24,37 @@ from bayesdist.products.formats.sip.families import (
 from bayesdist.products.formats.sip.header import SIDE_FILE, SIP_ORDERS, SipHeader, worst_closure
 from bayesdist.products.formats.sip.implied import implied_values, with_error
 
-# Closure that a good inverse reaches, and one that only a wrong coefficient leaves; pixels.
+# Pixels: closure of a good inverse, and a closure that only a wrong coefficient explains.
 _CLOSURE_GOOD, _CLOSURE_BAD = 0.01, 0.5
-# How much a stated value may differ from the measured one: headers print three decimals.
+# Tolerance between a stated value and the computed one: headers print three decimals.
 _DMAX_ABSOLUTE, _DMAX_RELATIVE = 1e-3, 1e-3
 _CLOSURE_RELATIVE = 1e-2
-# No program computes with A_DMAX: a rough value does no harm, one that is wrong indicates another
-# header.
+# No program computes with A_DMAX, so a rough value does no harm; a wrong one suggests that it
+# belongs to another header.
 _DMAX_ROUGH = 0.1
-# One wrong coefficient is to blame where its right value leaves this part of the closure at most.
+# A single coefficient is blamed if its correct value reduces the closure to this fraction.
 _EXPLAINED = 0.2
-# Suspects that are named after the first one.
+# Smallest probability of further suspects that are named after the first one.
 _WORTH_NAMING = 0.05
-# How far two numbers of one size may differ that are the same but for a slip.
+# Relative tolerance at which two numbers count as equal except for a mistyped sign.
 _SAME_SIZE = 0.05
 
 
 def lint_sip(sip: SipHeader, size: tuple[int, int] | None = None) -> tuple[Finding, ...]:
-    """Findings in a SIP header.
+    """Check a SIP header against the behaviour of astropy.wcs, stwcs and gwcs.
 
-    `size`: columns and rows of the detector; by default those of the header.  Without either, the
-    checks that need a detector are left out, with a note.
+    Parameters
+    ----------
+    sip : SipHeader
+        Header to check.
+    size : tuple of int, optional
+        Columns and rows of the detector. The default is the size in the header. Without either,
+        checks that need the size are left out, with a note.
+
+    Returns
+    -------
+    tuple of Finding
+        Errors, warnings and notes.
     """
     size = size or sip.size
     findings = [
@@ -66,8 +76,8 @@ def lint_sip(sip: SipHeader, size: tuple[int, int] | None = None) -> tuple[Findi
 
 
 def _sigmas(sip: SipHeader) -> Iterator[Finding]:
-    beside = any(card.startswith(SIDE_FILE) for card in sip.cards)
-    if sip.has_sigmas and not sip.has_linear_sigmas and not beside:
+    has_side_file = any(card.startswith(SIDE_FILE) for card in sip.cards)
+    if sip.has_sigmas and not sip.has_linear_sigmas and not has_side_file:
         yield Finding(
             "note",
             "AE, BE",
@@ -105,18 +115,18 @@ def _frame(sip: SipHeader) -> Iterator[Finding]:
 def _orders(sip: SipHeader) -> Iterator[Finding]:
     low, high = SIP_ORDERS
     for prefix, order, terms in families(sip):
-        where = f"{prefix}_ORDER"
+        keyword = f"{prefix}_ORDER"
         if order < low:
             yield Finding(
                 "warning",
-                where,
+                keyword,
                 f"is {order}: astropy ignores orders below {low}, all terms with them",
             )
         if order > high:
-            yield Finding("error", where, f"is {order}: the convention ends at {high}")
+            yield Finding("error", keyword, f"is {order}: the convention ends at {high}")
         above = [sip_keyword(prefix, *k) for k, c in terms.items() if sum(k) > order and c != 0]
         if above:
-            yield Finding("warning", ", ".join(above), f"above {where} {order}, so ignored")
+            yield Finding("warning", ", ".join(above), f"above {keyword} {order}, so ignored")
 
 
 def _low_terms(sip: SipHeader, size: tuple[int, int] | None) -> Iterator[Finding]:
@@ -182,11 +192,11 @@ def _inverse(sip: SipHeader, size: tuple[int, int]) -> Iterator[Finding]:
         ap={(j, i): c for (i, j), c in sip.ap.items()},
         bp={(j, i): c for (i, j), c in sip.bp.items()},
     )
-    where = "AP, BP"
+    keywords = "AP, BP"
     if closure > _CLOSURE_GOOD and worst_closure(mirrored, size) < closure / 10:
         yield Finding(
             "error",
-            where,
+            keywords,
             f"index order: p and q are exchanged against A and B (closure {closure:.3g} px)",
         )
     elif closure > _CLOSURE_GOOD:
@@ -194,7 +204,7 @@ def _inverse(sip: SipHeader, size: tuple[int, int]) -> Iterator[Finding]:
         yield from accused
         if closure > _CLOSURE_BAD:
             yield Finding(
-                "error", where, f"they miss the inverse of A, B by up to {closure:.3g} px: "
+                "error", keywords, f"they miss the inverse of A, B by up to {closure:.3g} px: "
                 "a coefficient of one or the other is wrong",
             )  # fmt: skip
         elif not accused:
@@ -202,7 +212,9 @@ def _inverse(sip: SipHeader, size: tuple[int, int]) -> Iterator[Finding]:
                 "raise AP_ORDER" if max(sip.inverse_order) < SIP_ORDERS[1] else "better iterate"
             )
             yield Finding(
-                "warning", where, f"the inverse is wrong by up to {closure:.3g} px; {advice}"
+                "warning",
+                keywords,
+                f"the inverse is wrong by up to {closure:.3g} px; {advice}",
             )
     if sip.closure is not None and closure > sip.closure * (1 + _CLOSURE_RELATIVE) + 1e-9:
         yield Finding(
@@ -211,26 +223,26 @@ def _inverse(sip: SipHeader, size: tuple[int, int]) -> Iterator[Finding]:
 
 
 def _accused(sip: SipHeader, size: tuple[int, int], closure: float) -> Iterator[Finding]:
-    """Coefficient that is wrong, where its right value alone makes A, B and AP, BP agree."""
+    """Findings on a wrong coefficient, if its correct value alone makes A, B and AP, BP agree."""
     suspects = implied_values(sip, size)
     first = suspects[0]
-    left = worst_closure(with_coefficient(sip, first.keyword, first.value), size)
-    if left > _EXPLAINED * closure:
+    remaining = worst_closure(with_coefficient(sip, first.keyword, first.value), size)
+    if remaining > _EXPLAINED * closure:
         return
     low, high = first.interval
     message = (
         f"is {first.printed:.7g}, and {' and '.join(first.sources)} imply {with_error(first)} "
-        f"(95 %: {low:.7g} to {high:.7g}; closure then {left:.2g} px)"
+        f"(95 %: {low:.7g} to {high:.7g}; closure then {remaining:.2g} px)"
     )
     if abs(first.printed + first.value) < _SAME_SIZE * abs(first.value):
         message += "; the sign is wrong"
     for names in repeated_names(sip):
         if first.keyword in names:
-            others = " and ".join(n for n in names if n != first.keyword)
-            message += f"; what stands there is the value of {others}"
-    rivals = [one for one in suspects[1:] if one.probability > _WORTH_NAMING]
-    for one in rivals:
-        message += f"; or {one.keyword} should be {with_error(one)}"
+            repeated = " and ".join(n for n in names if n != first.keyword)
+            message += f"; what stands there is the value of {repeated}"
+    rivals = [suspect for suspect in suspects[1:] if suspect.probability > _WORTH_NAMING]
+    for rival in rivals:
+        message += f"; or {rival.keyword} should be {with_error(rival)}"
     if rivals:
         message += "; these numbers alone do not tell which"
     yield Finding("error", first.keyword, message)

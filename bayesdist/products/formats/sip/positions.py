@@ -1,4 +1,4 @@
-"""Positions of pixels as the users of SIP headers get them."""
+"""Positions of pixels as users of SIP headers obtain them."""
 
 from __future__ import annotations
 
@@ -30,11 +30,11 @@ def sip_positions(
     like: SipHeader | None = None,
     tangent_point: tuple[float, float] | None = None,
 ) -> Float:
-    """(u, v) of FITS 1-based pixels (N,) by the forward terms of a header, shape (N, 2).
+    """(u, v) of FITS 1-based pixels (N,) computed from the forward terms of a header, shape (N, 2).
 
-    `scale_arcsec` is that of a pixel as the header was made with, for u and v in pixels; CD and
-    zero point of `like` hold for a file that states neither; with a `tangent_point` (sky position
-    of u, v = 0) the way is over the sky, as astropy.wcs has it.
+    For u and v in pixels, `scale_arcsec` is the pixel scale with which the header was made. `like`
+    provides CD and zero point for a file that states neither. With a `tangent_point` (sky position
+    of u, v = 0), positions are computed through the sky, as in astropy.wcs.
     """
     if tangent_point is not None:
         plane = tangent_plane(*sky_of_header(sip_header(sip), x, y), tangent_point)
@@ -48,7 +48,7 @@ def sip_positions(
 
 
 def sky_of_header(header: fits.Header, x: Float, y: Float) -> tuple[Float, Float]:
-    """RA and Dec (N,) in degrees of pixels by a header, as astropy.wcs has them."""
+    """RA and Dec (N,) in degrees of FITS 1-based pixels, computed by astropy.wcs."""
     from astropy.wcs import WCS, FITSFixedWarning
 
     with warnings.catch_warnings():
@@ -60,13 +60,13 @@ def sky_of_header(header: fits.Header, x: Float, y: Float) -> tuple[Float, Float
 def sip_read_back(
     files: Sequence[Built], calibration: Calibration, options: BuildOptions
 ) -> list[ReadBack]:
-    """Positions by headers of the chips, on the sky where the calibration's plane touches it."""
+    """Positions from the headers of the chips, on the sky if the calibration has a sky plane."""
     headers = {
-        one.chip: sip_of(Content(one.file_name, one.content))
-        for one in files
-        if one.chip is not None and one.kind != PARAMETERS
+        built.chip: sip_of(Content(built.file_name, built.content))
+        for built in files
+        if built.chip is not None and built.kind != PARAMETERS
     }
-    names = ", ".join(one.file_name for one in files if one.kind != PARAMETERS)
+    names = ", ".join(built.file_name for built in files if built.kind != PARAMETERS)
     point = calibration.plane.point
     return [headers_read_back(names, headers, calibration, options, tangent_point=point)]
 
@@ -80,7 +80,7 @@ def headers_read_back(
     like: SipHeader | None = None,
     tangent_point: tuple[float, float] | None = None,
 ) -> ReadBack:
-    """Positions by headers, one for each chip; `like` and `tangent_point` as of `sip_positions`."""
+    """Positions from one header per chip; for `like` and `tangent_point` see `sip_positions`."""
     unit = calibration.model.unit
 
     def forward(x: Float, y: Float, chip: int, _: float | None) -> Float:

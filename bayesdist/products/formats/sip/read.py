@@ -1,4 +1,4 @@
-"""Reading of SIP headers: FITS files, and text files of header cards."""
+"""Read SIP headers from FITS files and from text files of header cards."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from bayesdist.products.formats.sip.header import SipHeader
 from bayesdist.utils.arrays import Float
 
 CD_KEYWORDS = ("CD1_1", "CD1_2", "CD2_1", "CD2_2")
-# Keywords in place of a CD matrix in other headers.
+# Keywords that other headers have instead of a CD matrix.
 LINEAR_KEYWORDS = (
     *("PC1_1", "PC1_2", "PC2_1", "PC2_2"),
     *("CDELT1", "CDELT2", "CROTA1", "CROTA2"),
@@ -29,20 +29,21 @@ def read_sip(path: str | os.PathLike[str], *, ext: int | str | None = None) -> S
     Parameters
     ----------
     path : path-like
-        A FITS file, or a text file of header cards (one a line, or 80 characters each).
+        FITS file, or text file of header cards (one per line, or 80 characters each).
     ext : int or str, optional
-        HDU of a FITS file; by default the first one with A_ORDER.
+        HDU of a FITS file. The default is the first HDU with A_ORDER.
 
     Returns
     -------
     SipHeader
+        Header with all its cards, which `write_sip` writes back unchanged.
 
     Raises
     ------
     FormatError
-        When the file is neither, has no A_ORDER, or a keyword is missing or no number.
+        If the file is neither, has no A_ORDER, or if a keyword is missing or not a number.
     InputError
-        When the file cannot be read.
+        If the file cannot be read.
 
     Examples
     --------
@@ -58,14 +59,14 @@ def read_sip(path: str | os.PathLike[str], *, ext: int | str | None = None) -> S
 
 
 def sip_of(content: Content, *, ext: int | str | None = None) -> SipHeader:
-    """SIP header of a file's content; as `read_sip`."""
+    """SIP header in the content of a file; see `read_sip`."""
     with readable(content.name):
         header = _chosen(content, ext)
     return parsed(header, content.name)
 
 
 def holds_sip(content: Content) -> bool:
-    """True where there is a header with A_ORDER, right or wrong."""
+    """True if there is a header with A_ORDER, valid or not."""
     return any("A_ORDER" in hdu.header for hdu in content.hdus)
 
 
@@ -73,7 +74,7 @@ def holds_sip(content: Content) -> bool:
 
 
 def _chosen(content: Content, ext: int | str | None) -> fits.Header:
-    """Header of an HDU; by default the first one with A_ORDER."""
+    """Header of the selected HDU; by default the first one with A_ORDER."""
     if not content.hdus:
         raise FormatError(
             "is not a header that can be read: there is no A_ORDER",
@@ -81,8 +82,8 @@ def _chosen(content: Content, ext: int | str | None) -> fits.Header:
             do="give a FITS file or cards of a header",
         )
     if ext is None:
-        found = [hdu for hdu in content.hdus if "A_ORDER" in hdu.header]
-        return (found or content.hdus)[0].header
+        with_sip = [hdu for hdu in content.hdus if "A_ORDER" in hdu.header]
+        return (with_sip or content.hdus)[0].header
     if not content.is_fits:
         raise InputError("is a text file and has no HDUs", where=content.name, do="leave out ext")
     key = ext.upper() if isinstance(ext, str) else ext
@@ -96,11 +97,11 @@ def _chosen(content: Content, ext: int | str | None) -> fits.Header:
     )
 
 
-# -- from a header to the noun -------------------------------------------------------------------
+# -- from a header to a SipHeader ----------------------------------------------------------------
 
 
 def parsed(header: fits.Header, where: str) -> SipHeader:
-    """SIP header of these cards; `where` names them in errors."""
+    """SIP header from a FITS header; `where` names it in error messages."""
     with readable(where):
         return _parsed(header, where)
 
@@ -173,9 +174,9 @@ def _order(header: fits.Header, keyword: str, where: str) -> int:
 
 
 def cd_matrix(header: fits.Header, where: str) -> Float:
-    """CD matrix (2, 2), also of a header with PC and CDELT or CROTA2 (FITS 4.0, section 8.1).
+    """CD matrix (2, 2), also from PC and CDELT or from CROTA2 (FITS 4.0, section 8.1).
 
-    As for wcslib, CD replaces PC, and PC replaces CROTA2.
+    As in wcslib, CD takes precedence over PC, and PC over CROTA2.
     """
     if any(keyword in header for keyword in CD_KEYWORDS):
         return np.array([_number(header, k, where, 0.0) for k in CD_KEYWORDS]).reshape(2, 2)
@@ -192,10 +193,10 @@ def cd_matrix(header: fits.Header, where: str) -> Float:
 
 
 def image_size(header: fits.Header) -> tuple[int, int] | None:
-    """Columns and rows that a header states; a side of one pixel is a placeholder.
+    """Columns and rows stated in a header; a side of one pixel counts as a placeholder.
 
-    A compressed image is a table, and its size stands in ZNAXIS; HST writes NPIX where all pixels
-    have one value and no data follow.
+    A compressed image is a table with its size in ZNAXIS. HST headers have NPIX if all pixels have
+    one value and there are no data.
     """
     pairs = [("ZNAXIS1", "ZNAXIS2"), ("IMAGEW", "IMAGEH"), ("NPIX1", "NPIX2")]
     if "TABLE" not in str(header.get("XTENSION", "")):

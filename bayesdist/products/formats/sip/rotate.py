@@ -1,13 +1,14 @@
-"""SIP header in rotated or mirrored pixels: forward and inverse terms, CD and CRPIX together.
+"""SIP header in rotated or mirrored pixels: forward and inverse terms, CD and CRPIX.
 
 With pixel offsets w = (u, v) from the reference pixel and an orthogonal matrix M, the new offsets
 are w' = M w, and a distortion f = (A, B) becomes
 
     f'(w') = M f(M^-1 w')
 
-which is linear in the coefficients of both axes together.  At 90, 180 and 270 degrees every
-coefficient becomes one other one or its negative: the table of WSDC D-T033 ("WISE IOC Distortion
-Calibration"), Appendix A. As there, a frame rotates by +90 degrees when u' = -v and v' = u.
+which is linear in the coefficients of both axes together. At 90, 180 and 270 degrees every
+coefficient becomes another coefficient or its negative: the table of WSDC D-T033 ("WISE IOC
+Distortion Calibration"), Appendix A. As in that document, a frame rotates by +90 degrees if u' = -v
+and v' = u.
 """
 
 from __future__ import annotations
@@ -26,26 +27,45 @@ from bayesdist.utils.arrays import Float
 
 Terms = Mapping[tuple[int, int], float]
 
-# Cards that describe the shape of an image, which after a rotation by any angle is no rectangle.
+# Cards on the shape of an image, which after an arbitrary rotation is no longer a rectangle.
 _SHAPE = ("NAXIS1", "NAXIS2", "IMAGEW", "IMAGEH")
-# Exact, as cosines and sines are not.
+# Exact cosines and sines, which numpy gives only to rounding.
 _QUARTERS = {0.0: (1.0, 0.0), 90.0: (0.0, 1.0), 180.0: (-1.0, 0.0), 270.0: (0.0, -1.0)}
 
 
 def rotated_sip(sip: SipHeader, degrees: float, *, mirror: bool = False) -> SipHeader:
     """Header of an image in rotated or mirrored pixels.
 
-    The sky stays where it is: forward terms, inverse terms, CD and CRPIX change together, so that
-    every star has the same position as before at its new pixel.
+    Forward terms, inverse terms, CD and CRPIX change together, so that every star has the same sky
+    position as before at its new pixel.
 
-    `degrees`: rotation of the pixel frame from u towards v.  At multiples of 90 degrees
-    coefficients only change places and signs, to the last bit. `mirror`: change the sign of u
-    first. The result is at multiples of 90 degrees A_DMAX, B_DMAX, the standard deviations and the
-    size follow, and CRPIX is that of the rotated image, whose first pixel is (1, 1) again.  Without
-    a size, and at any other angle, CRPIX stays, about which the frame is rotated.  At any other
-    angle the image is no rectangle along the axes, so that size, A_DMAX and B_DMAX are left out;
-    standard deviations are too, because they then need the covariance: see `coefficient_map`.
-    InputError when the angle is no finite number.
+    Parameters
+    ----------
+    sip : SipHeader
+        Header in the original pixels.
+    degrees : float
+        Rotation of the pixel frame from u towards v.
+    mirror : bool
+        True to change the sign of u before the rotation.
+
+    Returns
+    -------
+    SipHeader
+        Header in the new pixels.
+
+    Raises
+    ------
+    InputError
+        If the angle is not a finite number.
+
+    Notes
+    -----
+    At multiples of 90 degrees, coefficients only change places and signs, without rounding. A_DMAX,
+    B_DMAX, standard deviations and size are converted, and CRPIX is that of the rotated image, with
+    its first pixel at (1, 1) again. At any other angle, or without a size, the frame is rotated
+    about CRPIX, which does not change. At any other angle the image is no longer a rectangle along
+    the axes, so size, A_DMAX and B_DMAX are left out. Standard deviations are left out too, because
+    they would require the covariance: see `coefficient_map`.
     """
     M = pixel_matrix(degrees, mirror=mirror)
     exact = is_exact(M)
@@ -60,7 +80,7 @@ def rotated_sip(sip: SipHeader, degrees: float, *, mirror: bool = False) -> SipH
     sigma_b: Terms = {}
     dmax: tuple[float | None, float | None] = (None, None)
     if exact:
-        # a permutation: the same one for standard deviations, without its signs
+        # a permutation: standard deviations change places like the coefficients, without signs
         sigma_a, sigma_b = (
             {k: abs(s) for k, s in terms.items()}
             for terms in _pair(sip.sigma_a, sip.sigma_b, sip.order, M)[1:]
@@ -96,15 +116,15 @@ def rotated_sip(sip: SipHeader, degrees: float, *, mirror: bool = False) -> SipH
 def _pair(
     a: Terms, b: Terms, order: tuple[int, int], M: Float
 ) -> tuple[tuple[int, int], dict[tuple[int, int], float], dict[tuple[int, int], float]]:
-    """Orders and terms of both axes after the change, without terms above their order."""
+    """Transformed orders and terms of both axes, without terms above their order."""
     low = [{k: c for k, c in t.items() if sum(k) <= n} for t, n in zip((a, b), order, strict=True)]
     terms = polynomial_terms(max(order))
     old = np.array([[t.get(k, 0.0) for k in terms] for t in low])
     R = coefficient_map(max(order), M)
     new = (R @ old.ravel()).reshape(2, -1) + 0.0
-    # a term is written where any old one goes to it, be its value zero or not
-    there = np.array([[k in t for k in terms] for t in low], float).ravel()
-    written = (np.abs(R) @ there).reshape(2, -1) > 0
+    # write a term if any original term contributes to it, even if the value is zero
+    stated = np.array([[k in t for k in terms] for t in low], float).ravel()
+    written = (np.abs(R) @ stated).reshape(2, -1) > 0
     out = [
         {k: float(c) for k, c, w in zip(terms, values, mask, strict=True) if w}
         for values, mask in zip(new, written, strict=True)
@@ -116,7 +136,7 @@ def _pair(
 
 
 def _kept_cards(sip: SipHeader, size: tuple[int, int] | None) -> tuple[str, ...]:
-    """Cards of the old header but for its shape, where that has changed."""
+    """Cards of the original header, without those on the shape if it has changed."""
     if size == sip.size:
         return sip.cards
     names = set(header_of(sip.cards)) & set(_SHAPE)
@@ -124,9 +144,9 @@ def _kept_cards(sip: SipHeader, size: tuple[int, int] | None) -> tuple[str, ...]
 
 
 def pixel_matrix(degrees: float, *, mirror: bool = False) -> Float:
-    """Matrix M (2, 2) of pixel offsets, w' = M w: a rotation from u towards v, after a mirror of u.
+    """Matrix M (2, 2) of pixel offsets, w' = M w: optional mirror of u, then rotation from u to v.
 
-    Whole numbers at multiples of 90 degrees; InputError when the angle is no finite number.
+    Whole numbers at multiples of 90 degrees; InputError if the angle is not finite.
     """
     if not np.isfinite(degrees):
         raise InputError(f"the angle is {degrees}", where="degrees", do="give a finite number")
@@ -136,19 +156,19 @@ def pixel_matrix(degrees: float, *, mirror: bool = False) -> Float:
     matrix = np.array([[c, -s], [s, c]])
     if mirror:
         matrix[:, 0] *= -1
-    return matrix + 0.0  # no negative zeros
+    return matrix + 0.0  # avoids negative zeros
 
 
 def coefficient_map(order: int, M: Float) -> Float:
-    """Matrix R (2 K, 2 K) from the coefficients of (A, B) to those in a changed pixel frame.
+    """Matrix R (2 K, 2 K) from the coefficients of (A, B) to those in another pixel frame.
 
-    New coefficients are R c, with c those of A followed by those of B in the order of
-    `polynomial_terms`; their covariance is R cov R^T.  `M` is orthogonal, as of `pixel_matrix`: at
+    New coefficients are R c, where c holds those of A followed by those of B in the order of
+    `polynomial_terms`; their covariance is R cov R^T. `M` is orthogonal, see `pixel_matrix`. At
     multiples of 90 degrees R is a signed permutation.
     """
     return np.asarray(np.kron(M, substitution(order, M.T)), float)
 
 
 def is_exact(M: Float) -> bool:
-    """True where the rotated axes lie along axes again."""
+    """True if the rotated axes are parallel to the original axes."""
     return bool(np.all(np.round(M) == M))

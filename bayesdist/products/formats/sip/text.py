@@ -1,4 +1,4 @@
-"""Text on a SIP header."""
+"""Description of a SIP header as text."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from bayesdist.products.formats.sip.header import SIP_ORDERS, SipHeader, worst_c
 
 
 def sip_lines(sip: SipHeader, name: str) -> list[str]:
-    """Lines of text on a header, but for its coefficients."""
+    """Lines of text on a header, without its coefficients."""
     size = "unknown" if sip.size is None else f"{sip.size[0]} x {sip.size[1]} px"
     scale = np.sqrt(abs(np.linalg.det(sip.cd)))
     unit = place = {"pix": "px"}.get(sip.axes_unit, sip.axes_unit)
@@ -37,7 +37,7 @@ def sip_lines(sip: SipHeader, name: str) -> list[str]:
 
 
 def _closure(sip: SipHeader) -> str:
-    """Line on the stated closure of AP and BP, and on the measured one."""
+    """Clause on the stated and the computed closure of AP and BP."""
     stated = "not stated" if sip.closure is None else f"stated {sip.closure:.3g} px"
     if sip.size is None:
         return f"{stated}; not computed, for the image size is not known"
@@ -47,7 +47,7 @@ def _closure(sip: SipHeader) -> str:
 
 
 def coefficient_lines(sip: SipHeader) -> list[str]:
-    """Lines of all coefficients, each family after an empty one."""
+    """Lines with all coefficients; an empty line precedes each family."""
     lines = []
     for prefix, terms, sigma in (
         ("A", sip.a, sip.sigma_a), ("B", sip.b, sip.sigma_b), ("AP", sip.ap, {}), ("BP", sip.bp, {})

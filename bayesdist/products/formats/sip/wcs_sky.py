@@ -1,4 +1,4 @@
-"""Text on the position of an image on the sky and on its distortion, as astropy.wcs has them."""
+"""Text on the sky position of an image and on its distortion, as computed by astropy.wcs."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ from bayesdist.data.sky.tangent import tangent_plane
 from bayesdist.errors import InputError
 from bayesdist.products.formats.common.document import Finding
 
-_NODES = 9  # points of each axis that are projected to the sky and back
-_PV_OF_TAN = 5  # more than the standard gives a TAN: SCAMP's older headers, which are TPV
-_BACK = 1e-3  # of a pixel: largest closure error of points that count as recovered
+_NODES = 9  # points per axis that are projected to the sky and back
+_PV_OF_TAN = 5  # number of PV keywords in a standard TAN; more mean a TPV in SCAMP's older form
+_BACK = 1e-3  # pixels; largest round-trip error of points that count as recovered
 
 
 @dataclass
@@ -34,23 +34,23 @@ class HeaderText:
 
 
 def first_line(error: Exception) -> str:
-    """First line of an error of astropy.wcs, without wcslib's own heading."""
-    every = [line.strip() for line in str(error).splitlines() if line.strip()]
-    lines = [line for line in every if not line.startswith("ERROR ")] or every
+    """First line of an astropy.wcs error message, without wcslib's heading."""
+    all_lines = [line.strip() for line in str(error).splitlines() if line.strip()]
+    lines = [line for line in all_lines if not line.startswith("ERROR ")] or all_lines
     return (lines[0] if lines else type(error).__name__).rstrip(".")
 
 
 def pv_keywords(header: fits.Header, key: str) -> list[str]:
-    """Keywords PVi_m of a system, by its letter."""
+    """Keywords PVi_m of a system, which is identified by its letter."""
     return [k for k in header if re.fullmatch(rf"PV\d+_\d+{key}", k)]
 
 
 def add_sky_lines(
     wcs: WCS, header: fits.Header, size: tuple[int, int] | None, text: HeaderText
 ) -> None:
-    """Position on the sky, scale, parity and distortion, and the closure of pixels."""
+    """Add lines on sky position, scale, parity, distortion and round-trip error of pixels."""
     key = wcs.wcs.alt.strip()
-    where = f"WCS {key}".strip()
+    system = f"WCS {key}".strip()
     celestial = wcs.celestial if wcs.naxis > 2 else wcs
     n = size or (1, 1)
     centre = np.array([(k + 1) / 2 for k in n]) if size else np.asarray(celestial.wcs.crpix)
@@ -59,14 +59,14 @@ def add_sky_lines(
     ra, dec = _world(celestial, steps)
     if not np.isfinite([ra, dec]).all():
         middle = "the centre of the image" if size else "CRPIX"
-        text.add_finding("warning", where, f"astropy.wcs has no sky position at {middle}")
-        _distortion(celestial, header, size, text, where)
+        text.add_finding("warning", system, f"astropy.wcs has no sky position at {middle}")
+        _distortion(celestial, header, size, text, system)
         return
     text.lines.append(f"  {place:<9} {_position(celestial, ra[0], dec[0])}")
     try:
         xi, eta = tangent_plane(ra[1:], dec[1:], (float(ra[0]), float(dec[0])))
     except InputError:
-        text.add_finding("warning", where, "one pixel is as large as the sky")
+        text.add_finding("warning", system, "one pixel is as large as the sky")
         return
     slope = np.array([[xi[0] - xi[1], xi[2] - xi[3]], [eta[0] - eta[1], eta[2] - eta[3]]])
     across, up = np.hypot(*slope)
@@ -78,24 +78,24 @@ def add_sky_lines(
     ]
     if size is not None:
         text.lines.append(f"  field     {_field(celestial, size)}")
-    if not key:  # astropy.wcs applies them to each of several systems
+    if not key:  # astropy.wcs applies the tables to every alternate system
         text.lines += list(_tables(wcs))
-    _distortion(celestial, header, size, text, where)
+    _distortion(celestial, header, size, text, system)
 
 
 def _world(wcs: WCS, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Longitudes and latitudes (N,) of pixels (N, 2), NaN where there is no sky."""
+    """Longitudes and latitudes (N,) of pixels (N, 2), NaN if there is no sky position."""
     with np.errstate(all="ignore"), warnings.catch_warnings():
         warnings.simplefilter("ignore")
         try:
-            found = np.asarray(wcs.all_pix2world(pixels, 1), float)
-        except Exception:  # a point beyond the map, of which astropy makes an error for all
+            world = np.asarray(wcs.all_pix2world(pixels, 1), float)
+        except Exception:  # if one point is beyond the map, astropy raises an error for all points
             return np.full(len(pixels), np.nan), np.full(len(pixels), np.nan)
-    return found[:, wcs.wcs.lng], found[:, wcs.wcs.lat]
+    return world[:, wcs.wcs.lng], world[:, wcs.wcs.lat]
 
 
 def _position(wcs: WCS, lon: float, lat: float) -> str:
-    """A position in degrees, and as right ascension and declination where it is one."""
+    """Position in degrees, and in sexagesimal form if it is in RA and Dec."""
     names = [wcs.wcs.ctype[k][:4].rstrip("-") for k in (wcs.wcs.lng, wcs.wcs.lat)]
     text = f"{names[0]} {lon:.8g}, {names[1]} {lat:.8g} deg"
     if names == ["RA", "DEC"]:
@@ -105,7 +105,7 @@ def _position(wcs: WCS, lon: float, lat: float) -> str:
 
 
 def _field(wcs: WCS, size: tuple[int, int]) -> str:
-    """Width and height through the centre, as the sum of steps along the sky."""
+    """Width and height through the centre, as sums of steps on the sky."""
     out = []
     for axis in (0, 1):
         pixels = np.tile([(k + 1) / 2 for k in size], (_NODES, 1))
@@ -139,7 +139,7 @@ def _tables(wcs: WCS) -> Iterator[str]:
 def _distortion(
     wcs: WCS, header: fits.Header, size: tuple[int, int] | None, text: HeaderText, where: str
 ) -> None:
-    """Lines on the distortion in pixels, and on its closure."""
+    """Add lines on the distortion in pixels and on its round-trip error."""
     if size is None:
         return
     x, y = np.meshgrid(*(np.linspace(1, n, _NODES) for n in size))
@@ -153,12 +153,12 @@ def _distortion(
         flat = plain.wcs_world2pix(np.column_stack([lon, lat]), 1)
         moved = np.nanmax(np.hypot(*(flat - pixels).T), initial=0.0)
         text.lines.append(f"  moves     pixels by up to {moved:.4g} px, by the PV terms")
-    seen = np.isfinite(lon) & np.isfinite(lat)
-    if not seen.all():
-        text.add_finding("note", where, f"{(~seen).mean():.0%} of the image is beyond the sky")
-    if not seen.any():
+    on_sky = np.isfinite(lon) & np.isfinite(lat)
+    if not on_sky.all():
+        text.add_finding("note", where, f"{(~on_sky).mean():.0%} of the image is beyond the sky")
+    if not on_sky.any():
         return
-    world = np.column_stack([lon, lat] if wcs.wcs.lng == 0 else [lat, lon])[seen]
+    world = np.column_stack([lon, lat] if wcs.wcs.lng == 0 else [lat, lon])[on_sky]
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
@@ -169,17 +169,17 @@ def _distortion(
             "on the distortion, which does not converge",
         )  # fmt: skip
         return
-    except Exception as error:  # as above: astropy.wcs's finding
+    except Exception as error:  # as above: report what astropy.wcs raises
         text.add_finding("warning", where, f"astropy.wcs has no way back: {first_line(error)}")
         return
-    off = float(np.hypot(*(back - pixels[seen]).T).max())
+    off = float(np.hypot(*(back - pixels[on_sky]).T).max())
     text.lines.append(f"  to sky and back  {off:.2g} px at most, by astropy.wcs")
     if not off <= _BACK:
         text.add_finding("warning", where, f"pixels come back from the sky up to {off:.3g} px off")
 
 
 def _without_pv_terms(header: fits.Header, wcs: WCS) -> WCS | None:
-    """System without TPV's distortion; None where it is of another kind."""
+    """WCS without the distortion of TPV; None for a WCS of another kind."""
     types = [str(header.get(f"CTYPE{k}", "")) for k in (1, 2)]
     scamp = all(t.endswith("-TAN") for t in types) and len(pv_keywords(header, "")) > _PV_OF_TAN
     if wcs.wcs.alt.strip() or wcs.sip is not None or wcs.naxis != 2 or wcs.wcs.lng != 0:

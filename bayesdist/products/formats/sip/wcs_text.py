@@ -1,4 +1,4 @@
-"""Text on the WCS of a FITS file or a text file of cards, a SIP header above all."""
+"""Text on the WCS of a FITS file or a text file of cards, in particular on SIP headers."""
 
 from __future__ import annotations
 
@@ -32,40 +32,39 @@ _WCS = re.compile(
     r"(A|B|AP|BP)_(ORDER|\d_\d)$|(CPDIS|CPERR|D2IMDIS|D2IMERR)\d$|(DP|DQ|D2IM)\d$|(LON|LAT)POLE"
 )
 
-# keywords that drizzling adds to the image that it makes
+# keywords that drizzling adds to its output image
 _DRIZZLED = ("NDRIZIM", "D001DATA", "D001SCAL", "D001PIXF")
 _TABLE_HDUS = ("D2IMARR", "WCSDVARR")
 _TABLES = ("CPDIS1", "CPDIS2", "D2IMDIS1", "D2IMDIS2", "AXISCORR")
 
 
 def _wcs_cards(header: fits.Header) -> tuple[tuple[str, str], ...]:
-    """Cards that the positions of a header depend on: of two with equal ones, one is shown."""
-    found = {(c.keyword, str(c.value)) for c in header.cards if _WCS.match(c.keyword)}
-    return tuple(sorted(found))
+    """Cards that determine positions; of HDUs with equal cards only one is described."""
+    cards = {(c.keyword, str(c.value)) for c in header.cards if _WCS.match(c.keyword)}
+    return tuple(sorted(cards))
 
 
 def describe_wcs(file: Content, extra: Sequence[Finding] = ()) -> list[str]:
     """Lines of text on every world coordinate system of a file, with its findings.
 
-    `extra` findings on the file are listed with those of its first system.
-
-    HDUs that repeat the system of an earlier one are named with it.  FormatError for SIP keywords
-    that are missing or no numbers.
+    `extra` findings on the file are listed with those of its first system. HDUs that repeat the
+    system of an earlier HDU are listed with that one. FormatError for SIP keywords that are missing
+    or not numbers.
     """
     extra = [*extra, *_truncated(file)]
     shown: dict[tuple[tuple[str, str], ...], list[Hdu]] = {}
-    known = sum(holds_wcs(hdu.header) for hdu in file.hdus)
+    n_wcs = sum(holds_wcs(hdu.header) for hdu in file.hdus)
     for hdu in file.hdus:
-        # the nodes of a table are described with the image that uses it
-        aside = known > 1 and hdu.label.partition(",")[0] in _TABLE_HDUS
+        # the nodes of a table are described together with the image that uses it
+        aside = n_wcs > 1 and hdu.label.partition(",")[0] in _TABLE_HDUS
         if holds_wcs(hdu.header) and not aside:
             shown.setdefault((*_wcs_cards(hdu.header), _extent(hdu.header)), []).append(hdu)
     groups = list(shown.values())
     if len(file.hdus) == 1:
         return _hdu_lines(file, groups[0][0], file.name, extra=extra)
-    out = [f"{file.name}: {known} HDUs with a WCS, {len(groups)} different"]
-    for first, *others in groups:
-        out += ["", *_hdu_lines(file, first, _label(first), others, extra)]
+    out = [f"{file.name}: {n_wcs} HDUs with a WCS, {len(groups)} different"]
+    for first, *repeats in groups:
+        out += ["", *_hdu_lines(file, first, _label(first), repeats, extra)]
         extra = ()
     return out
 
@@ -89,16 +88,16 @@ def _left_over(header: fits.Header) -> Iterator[Finding]:
 
 def _truncated(file: Content) -> Iterator[Finding]:
     last = file.hdus[-1]
-    where = f"HDU {last.number}"
+    location = f"HDU {last.number}"
     # headers alone may be kept in a file, whole records of each, and then none has data
     headers = last.state == "none" and len(file.hdus) > 1
     if headers and (len(file.raw) % RECORD or any(hdu.data for hdu in file.hdus)):
-        yield Finding("error", where, "the file ends after this header: it is truncated")
+        yield Finding("error", location, "the file ends after this header: it is truncated")
     elif last.state == "cut":
-        yield Finding("error", where, "the file ends before this HDU does: it is truncated")
+        yield Finding("error", location, "the file ends before this HDU does: it is truncated")
     elif file.is_fits and last.state == "whole" and len(file.raw) % RECORD:
         yield Finding(
-            "warning", where,
+            "warning", location,
             f"the file ends within a record of {RECORD} bytes: it is truncated, and what "
             "followed is lost",
         )  # fmt: skip
@@ -115,7 +114,7 @@ def _hdu_lines(
     others: Sequence[Hdu] = (),
     extra: Sequence[Finding] = (),
 ) -> list[str]:
-    """Lines of one HDU."""
+    """Lines of text on one HDU."""
     header, text, terms = hdu.header, HeaderText(findings=list(extra)), list[str]()
     size = image_size(header)
     if "A_ORDER" in header:
@@ -134,7 +133,7 @@ def _hdu_lines(
                 "those of the linear part, and the distortion may be lost",
             )
     if others:
-        text.lines.append(f"  same in   {', '.join(_label(other) for other in others)}")
+        text.lines.append(f"  same in   {', '.join(_label(repeat) for repeat in others)}")
     if hdu.state == "none":
         text.lines.append("  data      none: a header alone")
     systems = _systems(file, hdu, text)
@@ -153,7 +152,7 @@ def _hdu_lines(
 
 
 def _systems(file: Content, hdu: Hdu, text: HeaderText) -> list[WCS]:
-    """Systems of a header that astropy.wcs can make."""
+    """Coordinate systems of a header that astropy.wcs can read."""
     out = []
     header = hdu.header
     primary = any(k.startswith(("CTYPE", "CRVAL")) and k[-1].isdigit() for k in header)
@@ -171,7 +170,7 @@ def _systems(file: Content, hdu: Hdu, text: HeaderText) -> list[WCS]:
 
 
 def _system(file: Content, header: fits.Header, key: str, text: HeaderText) -> WCS | None:
-    where = f"WCS {key}".strip()
+    system = f"WCS {key}".strip()
     refuse_oversized(header, file.name)
     stated = [k for k in _TABLES if k in header]
     fobj = file.opened
@@ -189,8 +188,8 @@ def _system(file: Content, header: fits.Header, key: str, text: HeaderText) -> W
         try:
             wcs = WCS(header, fobj, key=key)
             wcs.wcs.set()
-        except Exception as error:  # any of them is astropy.wcs's finding on this header
-            text.add_finding("error", where, f"astropy.wcs cannot read it: {first_line(error)}")
+        except Exception as error:  # report whatever astropy.wcs raises on this header
+            text.add_finding("error", system, f"astropy.wcs cannot read it: {first_line(error)}")
             return None
     old = []
     for message in dict.fromkeys(str(w.message) for w in caught if _is_on_positions(w)):
@@ -198,16 +197,16 @@ def _system(file: Content, header: fits.Header, key: str, text: HeaderText) -> W
             old.append(message.partition("=")[0].strip())
             continue
         level = "warning" if message.startswith("Removed redundant") else "note"
-        text.add_finding(level, where, f"astropy.wcs: {' '.join(message.split())}")
+        text.add_finding(level, system, f"astropy.wcs: {' '.join(message.split())}")
     if old:
         text.add_finding("note", ", ".join(old), "a deprecated form, which astropy.wcs still reads")
-    wcs.pixel_shape = None  # the size is that of `image_size`, also where NAXIS says none
+    wcs.pixel_shape = None  # `image_size` gives the size, even if NAXIS is zero
     return wcs
 
 
 @contextmanager
 def _quiet_log() -> Iterator[None]:
-    """Context without astropy's own remarks on CTYPE, which the findings repeat."""
+    """Suppress astropy's log messages on CTYPE, which the findings repeat."""
     before = log.level
     log.setLevel("ERROR")
     try:
@@ -217,7 +216,7 @@ def _quiet_log() -> Iterator[None]:
 
 
 def _is_on_positions(warning: warnings.WarningMessage) -> bool:
-    """True for a warning on positions: those on dates and on the lint of units are left out."""
+    """True for a warning about positions, but not about dates or the style of units."""
     message = str(warning.message)
     return issubclass(warning.category, FITSFixedWarning) and not message.startswith(
         ("'datfix'", "'obsfix'", "RADECSYS", "The WCS transformation has more axes")
@@ -225,12 +224,12 @@ def _is_on_positions(warning: warnings.WarningMessage) -> bool:
 
 
 def _axes(wcs: WCS, header: fits.Header, key: str, *, above: bool) -> list[str]:
-    """Lines on every axis; `above` where SIP's lines have given a part."""
+    """Lines on every axis; `above` is True if CRPIX and CRVAL have been given already."""
     w = wcs.wcs
     frame = f", {w.radesys}" if w.radesys else ""
     if w.radesys and np.isfinite(w.equinox) and w.radesys.startswith("FK"):
         frame += f" {w.equinox:g}"
-    # as the header has it: wcslib takes TPV for TAN with a distortion
+    # as in the header: wcslib changes TPV to TAN with a distortion
     types = [str(header.get(f"CTYPE{k + 1}{key}", c)) for k, c in enumerate(w.ctype)]
     lines = [f"  axes      {', '.join(t.strip() or 'linear' for t in types)}{frame}"]
     if not above:

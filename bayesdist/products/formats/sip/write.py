@@ -1,4 +1,4 @@
-"""Writing of SIP headers: cards that were read stay, and numbers keep all their digits."""
+"""Write SIP headers: cards that were read are kept, and numbers keep all their digits."""
 
 from __future__ import annotations
 
@@ -24,9 +24,9 @@ _STRUCTURE = (
     *("SIMPLE", "XTENSION", "BITPIX", "NAXIS", "NAXIS1", "NAXIS2"),
     *("EXTEND", "PCOUNT", "GCOUNT"),
 )
-# Keywords that only a field of the header stands for: without the field they go.
+# Keywords that are removed if the corresponding field of the header is empty.
 _OWNED = ("AP_ORDER", "BP_ORDER", "A_DMAX", "B_DMAX", "BDCLOS", "BDU0", "BDV0", "BDUNIT")
-# Values that readers assume for missing keywords.
+# Values that programs assume for missing keywords.
 _DEFAULTS: dict[str, float | str] = {
     **dict.fromkeys(("CRVAL1", "CRVAL2", *CD_KEYWORDS), 0.0),
     **dict.fromkeys(("CTYPE1", "CTYPE2", "BDUNIT"), ""),
@@ -34,22 +34,24 @@ _DEFAULTS: dict[str, float | str] = {
 
 
 def write_sip(sip: SipHeader, path: str | os.PathLike[str]) -> None:
-    """Write a SIP header, whole or not at all.
+    """Write a SIP header atomically.
 
-    A path that ends in .fits gives a FITS file without data, whose structural keywords are its own
-    (the image size goes to IMAGEW and IMAGEH); any other path a text file with one card a line,
-    which ``astropy.io.fits.Header.fromtextfile`` reads.  A header that was read is written back
-    card by card.
+    A path that ends in .fits gives a FITS file without data; its structural keywords are those of
+    the new file, and the image size is written to IMAGEW and IMAGEH. Any other path gives a text
+    file with one card per line, which ``astropy.io.fits.Header.fromtextfile`` can read. A header
+    that was read is written back card by card.
 
     Parameters
     ----------
     sip : SipHeader
+        Header to write.
     path : path-like
+        Output file.
 
     Raises
     ------
     InputError
-        When the file cannot be written.
+        If the file cannot be written.
 
     Examples
     --------
@@ -74,20 +76,28 @@ def write_sip(sip: SipHeader, path: str | os.PathLike[str]) -> None:
 
 
 def sip_text(sip: SipHeader) -> str:
-    """Header as text, one card a line."""
+    """Header as text with one card per line."""
     return "\n".join(map(ascii_card, _cards(sip))) + "\n"
 
 
 def sip_header(sip: SipHeader) -> fits.Header:
-    """Whole header, as astropy.wcs.WCS takes it.
+    """Complete header, as accepted by astropy.wcs.WCS.
 
-    Returns the cards that were read, except where fields differ.
+    Parameters
+    ----------
+    sip : SipHeader
+        Distortion and other cards.
+
+    Returns
+    -------
+    astropy.io.fits.Header
+        Cards that were read, updated where fields differ from them.
     """
     return header_of(list(map(ascii_card, _cards(sip))))
 
 
 def _cards(sip: SipHeader) -> list[str]:
-    """Cards: those that were read stay as they are unless a field differs."""
+    """Cards of the header; those that were read are unchanged unless a field differs."""
     header = header_of(sip.cards)
     stated = _keywords(sip)
     drop = {
@@ -95,7 +105,7 @@ def _cards(sip: SipHeader) -> list[str]:
         for keyword in header
         if keyword not in stated and (sip_powers(keyword) or keyword in _OWNED)
     }
-    if np.array_equal(cd_matrix(header, "header"), sip.cd):  # in whatever form it stands there
+    if np.array_equal(cd_matrix(header, "header"), sip.cd):  # in any form: CD, PC or CROTA2
         stated = {k: v for k, v in stated.items() if k not in CD_KEYWORDS}
     else:
         drop |= set(LINEAR_KEYWORDS)
@@ -118,7 +128,7 @@ def _cards(sip: SipHeader) -> list[str]:
 
 
 def _keywords(sip: SipHeader) -> dict[str, tuple[float | int | str, str]]:
-    """Keywords that the fields stand for, with value and comment, in the usual order."""
+    """Keywords that represent the fields, with value and comment, in the usual order."""
     out: dict[str, tuple[float | int | str, str]] = {}
     unit, axes = "deg", "tangent plane with SIP"
     if sip.linear_axes:

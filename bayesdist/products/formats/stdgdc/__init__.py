@@ -1,1 +1,1 @@
-"""STDGDC: tables of every pixel, as hst1pass reads them."""
+"""STDGDC: tables with a value for every pixel, as read by hst1pass."""

@@ -1,21 +1,22 @@
-"""STDGDC files, the frame of the corrected positions in them, and their calibration.
+"""STDGDC files, the frame of their corrected positions, and their calibration.
 
-Extensions in this order, the primary header giving their dimensions:
+Extensions in this order, with their dimensions in the primary header:
 
-1. XGC, YGC: corrected x and y of each pixel, in FITS 1-based pixels; between pixels bilinear
-2. (as the third) MGC: what is added to magnitudes for the area of the pixel
+1. XGC, YGC: corrected x and y of each pixel, in FITS 1-based pixels, interpolated bilinearly
+2. (the third extension) MGC: correction of magnitudes for the area of the pixel
 3. XCG, YCG: pixel x and y of each corrected position: the inverse
 
-A file of ours has in addition, where no consumer looks: SXGC, SYGC, standard errors of XGC and YGC,
-CXYGC, their correlation, and BDPARAM, the parameters behind it all with their covariance.
+Files written by bayesdist have further extensions, which other programs ignore: SXGC and SYGC, the
+standard errors of XGC and YGC; CXYGC, their correlation; and BDPARAM, the parameters of the
+solution with their covariance.
 
-The corrected frame is that of the detector, without distortion:
+The corrected frame is that of a detector without distortion:
 
     corrected = reference + S^-1 ((u, v) - zero)
 
-where S is the similarity (a scale, a rotation, perhaps a mirror) nearest to the map at its
-reference pixel, so that the corrected frame lies along the detector and has its scale; the skew of
-the map stays in it.
+where S is the similarity (a scale, a rotation and possibly a mirror) closest to the map at its
+reference pixel. The corrected frame is therefore aligned with the detector and has its scale, while
+the skew of the map remains part of the distortion.
 """
 
 from __future__ import annotations
@@ -49,22 +50,22 @@ _S = ("BDS1_1", "BDS1_2", "BDS2_1", "BDS2_2")
 class CorrectedFrame:
     """Relation between positions (u, v) and corrected pixels."""
 
-    reference: tuple[float, float]  # FITS 1-based pixel that is not moved
-    zero: Float  # (2,), (u, v) there
+    reference: tuple[float, float]  # FITS 1-based pixel that does not move
+    zero: Float  # (2,), (u, v) at that pixel
     similarity: Float  # (2, 2), S
 
     def corrected(self, at: Float) -> Float:
-        """Corrected pixels (2, N) of positions (2, N)."""
+        """Corrected pixels (2, N) at positions (2, N)."""
         inside = np.linalg.solve(self.similarity, at - self.zero[:, None])
         return inside + np.array(self.reference)[:, None]
 
     def positions(self, corrected: Float) -> Float:
-        """Positions (2, N) of corrected pixels (2, N)."""
+        """Positions (2, N) at corrected pixels (2, N)."""
         inside = corrected - np.array(self.reference)[:, None]
         return self.similarity @ inside + self.zero[:, None]
 
     def keywords(self) -> dict[str, tuple[float, str]]:
-        """Keywords of a header, with their comments."""
+        """Header keywords of the frame, with their values and comments."""
         out = {
             "BDREF1": (float(self.reference[0]), "[pix] pixel that is not moved"),
             "BDREF2": (float(self.reference[1]), "[pix]"),
@@ -77,7 +78,7 @@ class CorrectedFrame:
 
     @classmethod
     def of_header(cls, header: fits.Header) -> CorrectedFrame | None:
-        """Frame that a header states; None for one that does not."""
+        """Frame stated in a header; None if the header states none."""
         names = ("BDREF1", "BDREF2", "BDZERO1", "BDZERO2", *_S)
         if not all(isinstance(header.get(name), float | int) for name in names):
             return None
@@ -86,12 +87,12 @@ class CorrectedFrame:
 
 
 def frame_of(one: ChipMap, scale: float | None) -> CorrectedFrame:
-    """Frame for a map, of a stated scale or of that of the pixel at the reference pixel."""
+    """Corrected frame of a map, with the given scale or that of the map at its reference pixel."""
     x, y = one.basis.reference_pixel
     linear = one.linear
-    left, singular, right = np.linalg.svd(linear)
+    left_vectors, singular, right = np.linalg.svd(linear)
     size = float(np.sqrt(np.prod(singular))) if scale is None else scale
-    return CorrectedFrame((x, y), one.at([x], [y])[:, 0], size * left @ right)
+    return CorrectedFrame((x, y), one.at([x], [y])[:, 0], size * left_vectors @ right)
 
 
 EXTENSIONS = ("XGC", "YGC", "MGC", "XCG", "YCG")
@@ -100,7 +101,7 @@ SIGMAS = ("SXGC", "SYGC", "CXYGC")
 
 @dataclass(frozen=True, eq=False)
 class StdGdc:
-    """Tables of one detector."""
+    """STDGDC tables of one detector."""
 
     content: Content
 
@@ -115,16 +116,16 @@ class StdGdc:
         return self.content.hdus[0].header
 
     def hdu(self, name: str) -> Hdu | None:
-        """Extension of a name; None where there is none."""
+        """Extension with this name; None if there is none."""
         return next((hdu for hdu in self.content.hdus[1:] if hdu.name == name), None)
 
     @property
     def missing(self) -> tuple[str, ...]:
-        """Extensions that are not there."""
+        """Names of missing extensions."""
         return tuple(name for name in EXTENSIONS if self.hdu(name) is None)
 
     def table(self, name: str) -> Float:
-        """Values (ny, nx) of an extension; FormatError where it is missing or no table."""
+        """Values (ny, nx) of an extension; FormatError if it is missing or not an image."""
         hdu = self.hdu(name)
         if hdu is None:
             raise FormatError(
@@ -144,7 +145,7 @@ class StdGdc:
 
 
 def stdgdc_of(content: Content) -> StdGdc | None:
-    """STDGDC file of a content; None for a file of another kind."""
+    """STDGDC file in the content of a file; None for any other content."""
     names = {hdu.name for hdu in content.tables[1:]}
     stated = bool(content.tables) and "NDIM_XGC" in " ".join(content.tables[0].cards)
     return StdGdc(content) if len(names & set(EXTENSIONS)) >= 2 or stated else None
@@ -154,9 +155,9 @@ def stdgdc_of(content: Content) -> StdGdc | None:
 
 
 def corrections(file: StdGdc) -> LookupTable:
-    """Table of corrected less detector pixels: exactly bilinear, as programs use the file.
+    """Corrected minus detector pixels as a look-up table, exactly bilinear as programs use it.
 
-    FormatError for tables of different shapes, or with numbers that are not finite.
+    FormatError if the tables differ in shape or have values that are not finite.
     """
     xgc, ygc = file.table("XGC"), file.table("YGC")
     if xgc.shape != ygc.shape:
@@ -172,10 +173,11 @@ def corrections(file: StdGdc) -> LookupTable:
 
 
 def stdgdc_calibration(file: StdGdc, name: str, choice: Choice) -> Calibration:
-    """Calibration of the tables; of a file of ours the one that it was made from.
+    """Calibration of the tables, or the stored calibration of a bayesdist file.
 
-    As used, nothing but the tables counts, brought to the plane of a file of ours.  FormatError
-    where the parameters in the file and its tables differ by more than it states.
+    With ``choice.as_used``, only the tables are used; for a bayesdist file they are converted to
+    the plane of its calibration. FormatError if the stored parameters and the tables differ by more
+    than the file states.
     """
     table = corrections(file)
     hdu, frame = stored_in(file.content), CorrectedFrame.of_header(file.header)
@@ -190,7 +192,7 @@ def stdgdc_calibration(file: StdGdc, name: str, choice: Choice) -> Calibration:
             return _of_ours(file, stored, frame, table)
         plane, unit, scale, source = stored.plane, stored.unit, stored.scale, stored.scale_from
     size = (float(file.size[0]), float(file.size[1]))
-    one = fitted_map(
+    chip_map = fitted_map(
         lambda x, y: frame.positions(np.stack([x, y])),
         name,
         order=1,
@@ -199,7 +201,7 @@ def stdgdc_calibration(file: StdGdc, name: str, choice: Choice) -> Calibration:
         unit=unit,
     )
     return calibration_of_maps(
-        {table.chip: one},
+        {table.chip: chip_map},
         name,
         plane=plane,
         numbered="BDCHIP" in file.header,
@@ -213,14 +215,14 @@ def stdgdc_calibration(file: StdGdc, name: str, choice: Choice) -> Calibration:
 def _of_ours(
     file: StdGdc, stored: Calibration, frame: CorrectedFrame, table: LookupTable
 ) -> Calibration:
-    """Stored calibration, after a check of the tables; what else these have is its own table."""
+    """Stored calibration, with its look-up tables taken from the file, or after a check of them."""
     number = stored.numbers[0]
     if file.header.get("BDTABLES", False):
         y, x = np.indices(table.shape, float)
         x, y = x.ravel() + 1, y.ravel() + 1
-        there = np.stack([x, y]) + table.values.reshape(2, -1)
-        rest = frame.positions(there) - stored.forward(x, y, chip=number).T
-        after = replace(table, chip=number, values=rest.reshape(2, *table.shape))
+        corrected = np.stack([x, y]) + table.values.reshape(2, -1)
+        residual = frame.positions(corrected) - stored.forward(x, y, chip=number).T
+        after = replace(table, chip=number, values=residual.reshape(2, *table.shape))
         return replace(stored, after=(after,))
     x, y = detector_grid(stored.model.chips[0].size, 129)
     theirs = np.stack([x, y]) + table.evaluate(x, y).T

@@ -1,4 +1,4 @@
-"""Format entry of STDGDC files: built with the position of every pixel and its error."""
+"""Format of STDGDC files, built with the corrected position of every pixel and its error."""
 
 from __future__ import annotations
 
@@ -42,8 +42,8 @@ from bayesdist.products.formats.stdgdc.file import (
 from bayesdist.products.formats.stdgdc.lint import lint_stdgdc
 from bayesdist.utils.arrays import Float
 
-_BETWEEN = 997  # points along each axis at most, between pixels, at which the tables are checked
-_LARGEST = 2**26  # pixels: beyond it a detector is a misprint
+_BETWEEN = 997  # largest number of points per axis, between pixels, at which the tables are checked
+_LARGEST = 2**26  # pixels; a larger detector is a misprint
 
 
 class Settings(FormatSettings):
@@ -53,7 +53,7 @@ class Settings(FormatSettings):
 
 
 def build(calibration: Calibration, settings: Settings, options: BuildOptions) -> tuple[Built, ...]:
-    """The file, with its largest error in pixels: of rounding, and between its nodes."""
+    """Build the file; its summary gives the largest rounding and interpolation error in pixels."""
     if len(calibration.numbers) > 1:
         raise InputError(
             f"an STDGDC file is of one detector, and this one has the chips "
@@ -62,17 +62,19 @@ def build(calibration: Calibration, settings: Settings, options: BuildOptions) -
             do="write them one by one (Calibration.only in Python, --chip of convert)",
         )
     number = calibration.numbers[0]
-    one = calibration.with_tables(calibration.at(options.epoch, origin="stated"))[number]
-    nx, ny = (int(n) for n in one.basis.size)
+    chip_map = calibration.with_tables(calibration.at(options.epoch, origin="stated"))[number]
+    nx, ny = (int(n) for n in chip_map.basis.size)
     if nx * ny > _LARGEST:
         raise InputError(f"the detector has {nx} x {ny} pixels", where="products.stdgdc")
-    x, y = detector_grid(one.basis.size, 65)
-    areas = np.linalg.det(one.slope(x, y)) / np.linalg.det(one.linear)
-    U, V = one.at(x, y)
+    x, y = detector_grid(chip_map.basis.size, 65)
+    areas = np.linalg.det(chip_map.slope(x, y)) / np.linalg.det(chip_map.linear)
+    U, V = chip_map.at(x, y)
     check_one_to_one(U, V, 65, areas)
-    frame = frame_of(one, calibration.scale)
-    planes = _planes(one, frame, (nx, ny), settings.precision)
-    worst = _error(one, frame, np.asarray(planes["XGC"], float), np.asarray(planes["YGC"], float))
+    frame = frame_of(chip_map, calibration.scale)
+    planes = _planes(chip_map, frame, (nx, ny), settings.precision)
+    worst = _error(
+        chip_map, frame, np.asarray(planes["XGC"], float), np.asarray(planes["YGC"], float)
+    )
     primary = fits.PrimaryHDU()
     header = primary.header
     for name in ("XGC", "YGC", "XCG", "YCG"):
@@ -80,7 +82,7 @@ def build(calibration: Calibration, settings: Settings, options: BuildOptions) -
     for name in ("XGC", "YGC"):
         header[f"HIERARCH {name}_0"] = 0
     header["BDCHIP"] = number, "chip number"
-    if one.before or one.after:
+    if chip_map.before or chip_map.after:
         header["BDTABLES"] = True, "XGC and YGC hold look-up tables, too"
     for keyword, text in (("DETECTOR", calibration.detector), ("FILTER", calibration.filter)):
         if text:
@@ -97,17 +99,17 @@ def build(calibration: Calibration, settings: Settings, options: BuildOptions) -
 def _planes(
     one: ChipMap, frame: CorrectedFrame, size: tuple[int, int], precision: str
 ) -> dict[str, NDArray[Any]]:
-    """Values of all extensions (ny, nx), the errors in single precision."""
+    """Values (ny, nx) of all extensions; standard errors are in single precision."""
     shape = size[::-1]
     rows, columns = np.indices(shape, float)
     x, y = columns.ravel() + 1, rows.ravel() + 1
-    there = frame.corrected(one.at(x, y)).reshape(2, *shape)
+    corrected = frame.corrected(one.at(x, y)).reshape(2, *shape)
     area, _ = pixel_areas(one, np.arange(1.0, size[0] + 1), np.arange(1.0, size[1] + 1))
     area = area / abs(np.linalg.det(frame.similarity))
     back, _ = one.pixels(frame.positions(np.stack([x, y])))
-    # beyond the image of the detector a map may have no inverse
+    # outside of the detector's image the map may have no inverse
     back = np.where(np.isfinite(back), back, np.stack([x, y]))
-    tables = (*there, -2.5 * np.log10(area), *np.reshape(back, (2, *shape)))
+    tables = (*corrected, -2.5 * np.log10(area), *np.reshape(back, (2, *shape)))
     kind = np.float32 if precision == "single" else np.float64
     planes: dict[str, NDArray[Any]] = dict(
         zip(EXTENSIONS, (np.asarray(t, kind) for t in tables), strict=True)
@@ -119,20 +121,22 @@ def _planes(
     cov = turn @ cov @ turn.T
     sx, sy = np.sqrt(cov[:, 0, 0]), np.sqrt(cov[:, 1, 1])
     product = sx * sy
-    both = np.divide(cov[:, 0, 1], product, out=np.zeros_like(product), where=product > 0)
-    sigmas = (np.asarray(t.reshape(shape), np.float32) for t in (sx, sy, np.clip(both, -1.0, 1.0)))
+    correlation = np.divide(cov[:, 0, 1], product, out=np.zeros_like(product), where=product > 0)
+    sigmas = (
+        np.asarray(t.reshape(shape), np.float32) for t in (sx, sy, np.clip(correlation, -1.0, 1.0))
+    )
     return planes | dict(zip(SIGMAS, sigmas, strict=True))
 
 
 def _error(one: ChipMap, frame: CorrectedFrame, xgc: Float, ygc: Float) -> float:
-    """Largest distance of what the tables give from the map, at nodes and between them, pixels."""
+    """Largest distance between the tables and the map, at nodes and between them, in pixels."""
     x, y = detector_grid(one.basis.size, min(_BETWEEN, 3 * int(max(one.basis.size))))
     table = LookupTable(1, np.stack([xgc, ygc]), first=(1.0, 1.0), step=(1.0, 1.0))
     return float(np.hypot(*(table.evaluate(x, y).T - frame.corrected(one.at(x, y)))).max())
 
 
 def _describe(file: StdGdc) -> list[str]:
-    """Lines of text on the tables, their findings at the end."""
+    """Lines of text on the tables, with the findings at the end."""
     findings = lint_stdgdc(file)
     lines = [f"{file.name}: STDGDC"]
     if not {"XGC", "YGC"} & set(file.missing):

@@ -1,4 +1,4 @@
-"""Checks of an STDGDC file against what programs make of it."""
+"""Checks of an STDGDC file against the behaviour of programs that read it."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ from bayesdist.products.formats.stdgdc.file import (
 )
 from bayesdist.utils.arrays import Float
 
-_CLOSE = 0.3  # pixels: an inverse that closes worse is counted from another pixel
-_TOO_FAR = 0.5  # of the detector: no camera moves pixels so far
-_AREA = 0.02  # magnitudes by which MGC may differ from the area of the pixels
-_INSIDE = 0.95  # of the pixels are looked at for the inverse: others lie outside of its table
+_CLOSE = 0.3  # pixels; an inverse with a larger closure is counted from another pixel
+_TOO_FAR = 0.5  # fraction of the detector; no camera moves pixels that far
+_AREA = 0.02  # magnitudes; tolerance between MGC and the area of the pixels
+_INSIDE = 0.95  # quantile of the closure that is checked: some pixels are outside the inverse table
 
 
 def lint_stdgdc(file: StdGdc) -> tuple[Finding, ...]:
@@ -92,7 +92,7 @@ def _tables(file: StdGdc) -> Iterator[Finding]:
 
 
 def _inverse(file: StdGdc, xgc: Float, ygc: Float) -> Iterator[Finding]:
-    """Finding on pixels that do not come back."""
+    """Findings on an inverse that does not return to the original pixels."""
     if "XCG" in file.missing or "YCG" in file.missing:
         return
     back = file.table("XCG"), file.table("YCG")
@@ -110,10 +110,10 @@ def _inverse(file: StdGdc, xgc: Float, ygc: Float) -> Iterator[Finding]:
     inside = (X > 1) & (mx > X) & (Y > 1) & (my > Y)
     if not inside.any():
         return
-    found = inverse.evaluate(X[inside], Y[inside]) - np.stack([x[inside], y[inside]], axis=-1)
-    off = float(np.quantile(np.hypot(*found.T), _INSIDE))
+    closure = inverse.evaluate(X[inside], Y[inside]) - np.stack([x[inside], y[inside]], axis=-1)
+    off = float(np.quantile(np.hypot(*closure.T), _INSIDE))
     if off > _CLOSE:
-        mean = found.mean(axis=0)
+        mean = closure.mean(axis=0)
         yield Finding(
             "error", "XCG, YCG",
             f"are off by {off:.3g} pixels as the inverse of XGC, YGC, on average by "

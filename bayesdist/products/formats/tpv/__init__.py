@@ -1,1 +1,1 @@
-"""TPV headers: polynomials of intermediate world coordinates, as SCAMP writes them."""
+"""TPV headers: polynomials of intermediate world coordinates, as written by SCAMP."""

@@ -1,4 +1,4 @@
-"""Format entry of TPV headers: built from a calibration by exact algebra, without a fit."""
+"""Format of TPV headers, built from a calibration by exact algebra, without a fit."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ from bayesdist.products.formats.tpv.head import (
 from bayesdist.products.formats.tpv.lint import lint_tpv
 
 NAME = "tpv.head"
-_GRID = 33  # points of each axis over which CRDER is the rms error
+_GRID = 33  # points per axis over which CRDER is the rms error
 
 
 class Settings(FormatSettings):
@@ -56,31 +56,32 @@ class Settings(FormatSettings):
 
 
 def build(calibration: Calibration, settings: Settings, options: BuildOptions) -> tuple[Built, ...]:
-    """One text file with the headers of all chips, and the file with their covariance.
+    """Build one text file with the headers of all chips, and the file with their covariance.
 
-    CD is the linear part at the reference pixel, and PV hold the rest, the constants too: so CRVAL
-    is the point at which the plane touches the sky, whatever pixel lies there.  Without it CRVAL is
-    (0, 0), a placeholder.  InputError for an order above 7, or a calibration with look-up tables.
+    CD is the linear part at the reference pixel, and PV hold all other terms including the
+    constants. CRVAL is therefore the tangent point, wherever it is in the image. If the tangent
+    point is unknown, CRVAL is (0, 0) as a placeholder. InputError for an order above 7, or for a
+    calibration with look-up tables.
     """
-    where = "products.tpv"
-    calibration = placed_at(calibration, settings.crval, options.scale_arcsec, where=where)
+    location = "products.tpv"
+    calibration = placed_at(calibration, settings.crval, options.scale_arcsec, where=location)
     model = calibration.model
     if model.order > HIGHEST:
         raise InputError(
             f"TPV holds polynomials up to order {HIGHEST}, and this one has order {model.order}",
-            where=where,
+            where=location,
             do="fit a lower order, or write it with order 7 (--order 7 of convert)",
         )
     if calibration.before or calibration.after:
         raise InputError(
             "TPV has no look-up tables",
-            where=where,
+            where=location,
             do="give the order of a polynomial that replaces them",
         )
-    refuse_wide_planes(calibration, options.epoch, options.scale_arcsec, where=where)
+    refuse_wide_planes(calibration, options.epoch, options.scale_arcsec, where=location)
     arcsec = arcsec_per(model.unit, options.scale_arcsec)
     maps = calibration.at(options.epoch, origin="stated")
-    heads = tuple(_head(one, number, arcsec, calibration) for number, one in maps.items())
+    heads = tuple(_head(chip_map, number, arcsec, calibration) for number, chip_map in maps.items())
     name = options.named(NAME)
     side = f"{Path(name).stem}_parameters.fits"
     named = text_card(SIDE_FILE, side, "file with the covariance")
@@ -93,14 +94,14 @@ def build(calibration: Calibration, settings: Settings, options: BuildOptions) -
 
 
 def _head(one: ChipMap, number: int, arcsec: float, calibration: Calibration) -> TpvHead:
-    """Header of a chip, `arcsec` in one unit of its map."""
+    """Header of a chip; `arcsec` is the size of one unit of its map."""
     poly = one.monomials()
     require_regular(poly.linear, number)
     cd = poly.linear * arcsec / 3600.0
     values = poly.values * arcsec / 3600.0
     back = np.asarray(np.linalg.inv(cd), float)
     in_plane = np.asarray(values @ substitution(one.basis.order, back).T, float)
-    in_plane[:, 1:3] = np.eye(2)  # by the choice of CD, but for rounding
+    in_plane[:, 1:3] = np.eye(2)  # identity by the choice of CD, except for rounding
     pv = [pv_values_of(axis, poly.terms, in_plane[axis]) for axis in (0, 1)]
     size = (int(one.basis.size[0]), int(one.basis.size[1]))
     crval = calibration.plane.point or (0.0, 0.0)
@@ -139,21 +140,21 @@ def _cards(head: TpvHead, one: ChipMap, arcsec: float, calibration: Calibration)
 
 
 def _describe(file: TpvFile) -> list[str]:
-    """Lines of text on each chip by astropy.wcs, and the findings of all."""
+    """Lines of text on each chip by astropy.wcs, followed by all findings."""
     content, findings = file.content, lint_tpv(file)
     orders = sorted({head.order for head in file.heads})
     order = " to ".join(str(n) for n in dict.fromkeys((orders[0], orders[-1])))
     radial = ", and powers of r" if any(head.radial for head in file.heads) else ""
-    beside = f"; covariance in {file.side_file}" if file.side_file else ""
-    title = f"TPV of order {order}{radial}{beside}"
+    covariance_note = f"; covariance in {file.side_file}" if file.side_file else ""
+    title = f"TPV of order {order}{radial}{covariance_note}"
     if content.is_fits or len(file.heads) == 1:
         first, *lines = describe_wcs(content, findings)
         return [first, f"  {title}", *lines]
     lines = [f"{content.name}: {len(file.heads)} chips, {title}"]
     for head in file.heads:
         text = head.header.tostring(sep="\n", endcard=False, padding=False)
-        one = Content(f"chip {head.number}", text.encode("ascii", "replace"))
-        lines += ["", *describe_wcs(one)]
+        chip_content = Content(f"chip {head.number}", text.encode("ascii", "replace"))
+        lines += ["", *describe_wcs(chip_content)]
     return [*lines, "", f"{content.name}, all chips", *finding_lines(findings)]
 
 

@@ -1,10 +1,11 @@
-"""Headers with CTYPE TPV, one of each chip, the powers that PVi_m multiply, and the calibration.
+"""Headers with CTYPE TPV, one per chip, the powers that PVi_m multiply, and their calibration.
 
 With (X, Y) = CD (p - CRPIX) in degrees and r its length, PV1_m multiplies the m-th of
 
     1, X, Y, r, X^2, XY, Y^2, X^3, ..., Y^3, r^3, X^4, ...
 
-(after each odd order n comes r^n, up to the 7th order), and PV2_m the same with X and Y exchanged.
+(each odd order n is followed by r^n, up to order 7), and PV2_m the same term with X and Y
+exchanged.
 """
 
 from __future__ import annotations
@@ -32,12 +33,12 @@ from bayesdist.utils.arrays import Float
 
 Powers = tuple[int, int]
 
-HIGHEST = 7  # order of a TPV
+HIGHEST = 7  # highest order of a TPV
 KEYWORD = re.compile(r"PV([12])_(\d+)$")
 
 
 def _numbers() -> tuple[dict[int, Powers], dict[int, int]]:
-    """Powers of X and Y, and powers of r, each by m."""
+    """Powers of X and Y by m, and powers of r by m."""
     powers, radial, m = {}, {}, 0
     for n in range(HIGHEST + 1):
         for term in polynomial_terms(n)[-(n + 1) :]:
@@ -54,7 +55,7 @@ _NUMBER_OF = {term: m for m, term in POWERS.items()}
 
 
 def pv_value(axis: int, pv: Mapping[int, float], X: ArrayLike, Y: ArrayLike) -> Float:
-    """Value of the polynomial of an axis (0 or 1) at intermediate coordinates, degrees."""
+    """Polynomial of an axis (0 or 1) at intermediate coordinates X and Y, degrees."""
     first, second = (np.asarray(v, float) for v in ((X, Y) if axis == 0 else (Y, X)))
     r = np.hypot(first, second)
     out = np.zeros(first.shape)
@@ -68,7 +69,7 @@ def pv_value(axis: int, pv: Mapping[int, float], X: ArrayLike, Y: ArrayLike) -> 
 
 
 def pv_values_of(axis: int, terms: tuple[Powers, ...], values: Float) -> dict[int, float]:
-    """PVi_m of an axis, by m, from the coefficients (K,) of powers of X and Y."""
+    """PVi_m of an axis by m, from the coefficients (K,) of powers of X and Y."""
     named = {
         _NUMBER_OF[term if axis == 0 else term[::-1]]: float(value)
         for term, value in zip(terms, values, strict=True)
@@ -77,7 +78,8 @@ def pv_values_of(axis: int, terms: tuple[Powers, ...], values: Float) -> dict[in
 
 
 SIDE_FILE = "BDPARAM"  # keyword with the name of the file that has the covariance
-_BEYOND_TAN = 5  # the m from which on wcslib and astropy.wcs take the PV of a TAN for those of TPV
+# from this m on, wcslib and astropy.wcs interpret the PV of a TAN as those of a TPV
+_BEYOND_TAN = 5
 _CHIP = ("BDCHIP", "CCDNUM", "CCDCHIP", "EXTVER")
 
 
@@ -85,62 +87,62 @@ _CHIP = ("BDCHIP", "CCDNUM", "CCDCHIP", "EXTVER")
 class TpvHead:
     """World coordinates of one chip."""
 
-    number: int  # of the chip; by its place in the file where nothing says it
+    number: int  # chip number; the position in the file if no keyword states it
     numbered: bool
     ctype: tuple[str, str]
     crpix: tuple[float, float]
     crval: tuple[float, float]  # degrees
-    cd: Float  # (2, 2), degrees in a pixel
+    cd: Float  # (2, 2), degrees per pixel
     pv: tuple[Mapping[int, float], Mapping[int, float]]  # PV1_m and PV2_m by m
     size: tuple[int, int] | None = None
     header: fits.Header = field(default_factory=fits.Header)
 
     @property
     def order(self) -> int:
-        """Largest total power with a coefficient that is not zero, at least 1."""
-        found = [sum(POWERS[m]) for pv in self.pv for m, c in pv.items() if c and m in POWERS]
-        return max(1, *found) if found else 1
+        """Largest total power with a non-zero coefficient, at least 1."""
+        orders = [sum(POWERS[m]) for pv in self.pv for m, c in pv.items() if c and m in POWERS]
+        return max(1, *orders) if orders else 1
 
     @property
     def radial(self) -> bool:
-        """True where a power of r has a coefficient that is not zero."""
+        """True if a power of r has a non-zero coefficient."""
         return any(pv.get(m, 0.0) for pv in self.pv for m in RADIAL)
 
     def intermediate(self, x: ArrayLike, y: ArrayLike) -> Float:
-        """Intermediate coordinates (2, N) of pixels (N,), degrees."""
+        """Intermediate coordinates (2, N) of FITS 1-based pixels (N,), degrees."""
         offset = np.stack([np.asarray(x, float), np.asarray(y, float)])
         offset = offset - np.array(self.crpix)[:, None]
         return np.asarray(self.cd @ offset)
 
     def plane(self, x: ArrayLike, y: ArrayLike) -> tuple[Float, Float]:
-        """Positions xi, eta (N,) of pixels on the tangent plane of CRVAL, degrees."""
+        """Positions xi, eta (N,) of FITS 1-based pixels on the tangent plane of CRVAL, degrees."""
         at = self.intermediate(x, y)
         return pv_value(0, self.pv[0], *at), pv_value(1, self.pv[1], *at)
 
 
 @dataclass(frozen=True, eq=False)
 class TpvFile:
-    """Headers of a file, one for each chip, with what is beside it."""
+    """Headers of a file, one per chip."""
 
     content: Content
     heads: tuple[TpvHead, ...]
 
     @property
     def side_file(self) -> str:
-        """Name of the file with the parameters; empty where none is named."""
+        """Name of the file with the parameters; empty if none is named."""
         return str(self.heads[0].header.get(SIDE_FILE, "")).strip()
 
 
 def tpv_of(content: Content) -> TpvFile | None:
-    """TPV headers of a content; None where there is none."""
+    """TPV headers in the content of a file; None if there are none."""
     headers = [h for h in _headers(content) if holds_tpv(h)]
     if not headers:
         return None
     heads = []
     for place, header in enumerate(headers, start=1):
-        where = content.name if len(headers) == 1 else f"{content.name}, TPV header {place}"
-        with readable(where):
-            heads.append(_head(header, place, where))
+        location = content.name if len(headers) == 1 else f"{content.name}, TPV header {place}"
+        with readable(location):
+            heads.append(_head(header, place, location))
     numbers = [head.number for head in heads]
     if len(set(numbers)) < len(numbers):
         raise FormatError(
@@ -152,7 +154,7 @@ def tpv_of(content: Content) -> TpvFile | None:
 
 
 def holds_tpv(header: fits.Header) -> bool:
-    """True for a header whose celestial axes are TPV, or TAN with SCAMP's PV."""
+    """True for a header with celestial axes of type TPV, or TAN with SCAMP's PV."""
     types = [str(header.get(f"CTYPE{k}", "")) for k in (1, 2)]
     if "A_ORDER" in header or "CPDIS1" in header or "CPDIS2" in header:
         return False
@@ -163,14 +165,15 @@ def holds_tpv(header: fits.Header) -> bool:
 
 
 def _headers(content: Content) -> list[fits.Header]:
-    """Headers of a FITS file, or of a text file whose headers end with END each."""
+    """Headers of a FITS file, or of a text file with an END after each header."""
     lines = content.text.splitlines()
     if content.is_fits or len(lines) < 2 or "CTYPE1" not in content.text:
         return [hdu.header for hdu in content.hdus]
     out, cards = [], list[str]()
     for line in [*lines, "END"]:
         if line.strip() != "END":
-            cards.append(line.encode("ascii", "replace").decode())  # of comments in Latin-1
+            # replaces Latin-1 characters in comments
+            cards.append(line.encode("ascii", "replace").decode())
         elif any(cards):
             with readable(content.name):
                 out.append(fits.Header.fromstring("\n".join(cards), sep="\n"))
@@ -207,24 +210,24 @@ def _head(header: fits.Header, place: int, where: str) -> TpvHead:
 def _number(header: fits.Header, keyword: str, where: str) -> float:
     value = header.get(keyword)
     if isinstance(value, bool) or not isinstance(value, int | float) or not np.isfinite(value):
-        what = "is missing" if value is None else f"value {value!r} is no finite number"
-        raise FormatError(what, where=f"{where}, keyword {keyword}", do="correct the header")
+        problem = "is missing" if value is None else f"value {value!r} is no finite number"
+        raise FormatError(problem, where=f"{where}, keyword {keyword}", do="correct the header")
     return float(value)
 
 
 # -- calibration ----------------------------------------------------------------------------------
 
-_RADIAL_ORDER = 9  # of the polynomial that stands for odd powers of r
-_EXACT = 1e-9  # pixels: below it a map is the polynomial that it was taken for
+_RADIAL_ORDER = 9  # order of the polynomial that approximates odd powers of r
+_EXACT = 1e-9  # pixels; with a smaller difference the map counts as exactly polynomial
 
 
 def tpv_calibration(file: TpvFile, name: str, choice: Choice) -> Calibration:
-    """Calibration of the headers, with the covariance of the file beside them where it is there.
+    """Calibration of the headers, with the covariance of their parameter file if that exists.
 
-    As used, nothing but the headers counts.  Powers of r are no polynomials: a note says how well
-    they are followed.  MissingSizeError for headers without a size where none is chosen;
-    FormatError for headers without PV1_1 or PV2_1, or about several points of the sky; and where
-    the parameters beside them are others.
+    With ``choice.as_used``, only the headers are used. Odd powers of r are not polynomials; a note
+    states how well they are approximated. MissingSizeError if neither the headers nor `choice` give
+    the size; FormatError for headers without PV1_1 or PV2_1, for headers with several tangent
+    points, and if the stored parameters disagree with the headers.
     """
     _check(file, name)
     maps, notes = {}, list[str]()
@@ -234,8 +237,8 @@ def tpv_calibration(file: TpvFile, name: str, choice: Choice) -> Calibration:
     unit = str(header.get("BDUNIT", "arcsec"))
     factor = 3600.0 / float(header.get("BDARCS", ARCSEC.get(unit, 1.0)))
     for head in file.heads:
-        one, worst = _map(head, name, order, choice.size, unit, factor, forms[head.number])
-        maps[head.number] = one
+        chip_map, worst = _map(head, name, order, choice.size, unit, factor, forms[head.number])
+        maps[head.number] = chip_map
         if head.radial:
             notes.append(
                 f"powers of r of chip {head.number} are followed by a polynomial of order "
@@ -243,13 +246,15 @@ def tpv_calibration(file: TpvFile, name: str, choice: Choice) -> Calibration:
             )
     kind = str(header.get("BDPLANE", "sky"))
     plane = Plane(kind, point=forms[file.heads[0].number].point if kind == "sky" else None)
-    found = calibration_of_maps(
+    calibration = calibration_of_maps(
         maps, name, plane=plane, numbered=all(h.numbered for h in file.heads), notes=tuple(notes)
     )
     if choice.as_used:
-        return found
-    beside = file.content if file.content.is_fits else file.content.beside(file.side_file)
-    return with_parameters(found, beside, file.side_file)
+        return calibration
+    parameter_content = (
+        file.content if file.content.is_fits else file.content.beside(file.side_file)
+    )
+    return with_parameters(calibration, parameter_content, file.side_file)
 
 
 def _form(head: TpvHead, name: str) -> TangentForm:
@@ -303,7 +308,7 @@ def _map(
     factor: float,
     form: TangentForm,
 ) -> tuple[ChipMap, float]:
-    """Map of one chip in the unit, `factor` of them in a degree, and its miss in pixels."""
+    """Map of one chip and its largest error in pixels; `factor` is a degree in `unit`."""
     size = required_size(head.size, given, name)
 
     def positions(x: Float, y: Float) -> Float:
@@ -312,8 +317,10 @@ def _map(
         return np.asarray(factor * (form.turn @ plane))
 
     form.check(lambda x, y: positions(x, y) / factor, size, head.header, name)
-    one = fitted_map(positions, name, order=order, size=size, reference_pixel=head.crpix, unit=unit)
+    chip_map = fitted_map(
+        positions, name, order=order, size=size, reference_pixel=head.crpix, unit=unit
+    )
     x, y = detector_grid(size, 65)
-    far = np.hypot(*(one.at(x, y) - positions(x, y)))
+    far = np.hypot(*(chip_map.at(x, y) - positions(x, y)))
     worst = float(far.max() / np.sqrt(abs(np.linalg.det(factor * form.cd))))
-    return one, 0.0 if worst < _EXACT else worst
+    return chip_map, 0.0 if worst < _EXACT else worst

@@ -1,4 +1,4 @@
-"""Checks of TPV headers against the behaviour of the programs that read them."""
+"""Checks of TPV headers against the behaviour of programs that read them."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ from bayesdist.calibration.inverse import detector_grid
 from bayesdist.products.formats.common.document import Finding, of_part, repeated_values
 from bayesdist.products.formats.tpv.head import POWERS, TpvFile, TpvHead, pv_value
 
-_LARGE = 0.3  # of the distance from CRPIX: no camera is distorted so much
-_WIDE = 180.0  # degrees: what a CD in arcseconds makes of a detector
-_ROUGH = 4096  # pixels, for a header without a size
+_LARGE = 0.3  # fraction of the distance from CRPIX; no camera has a larger distortion
+_WIDE = 180.0  # degrees; an image this wide means that CD is in arcseconds
+_ROUGH = 4096  # pixels; size assumed for a header without one
 
 
 def lint_tpv(file: TpvFile) -> tuple[Finding, ...]:
@@ -20,8 +20,8 @@ def lint_tpv(file: TpvFile) -> tuple[Finding, ...]:
     out: list[Finding] = []
     several = len(file.heads) > 1
     for head in file.heads:
-        found = (*_types(head), *_first_terms(head), *_scale(head), *_copies(head))
-        out += of_part(f"chip {head.number}" if several else "", found)
+        findings = (*_types(head), *_first_terms(head), *_scale(head), *_copies(head))
+        out += of_part(f"chip {head.number}" if several else "", findings)
     out += list(_mosaic(file))
     if file.side_file and file.content.path and file.content.beside(file.side_file) is None:
         out.append(
@@ -87,11 +87,11 @@ def _scale(head: TpvHead) -> Iterator[Finding]:
     if 1 not in head.pv[0] or 1 not in head.pv[1]:
         return
     x, y = detector_grid((float(size[0]), float(size[1])), 17)
-    at, found = head.intermediate(x, y), np.stack(head.plane(x, y))
+    at, in_plane = head.intermediate(x, y), np.stack(head.plane(x, y))
     constant = np.array([pv.get(0, 0.0) for pv in head.pv])[:, None]
     first = [{m: pv.get(m, 0.0) for m in (1, 2)} for pv in head.pv]
     linear = np.stack([pv_value(axis, first[axis], *at) for axis in (0, 1)])
-    bend = float(np.hypot(*(found - constant - linear)).max())
+    bend = float(np.hypot(*(in_plane - constant - linear)).max())
     half = float(np.hypot(*at).max())
     if bend > _LARGE * half:
         yield Finding(

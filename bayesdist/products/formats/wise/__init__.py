@@ -1,1 +1,1 @@
-"""Distortion entries of WISE meta-data."""
+"""Distortion entries in WISE meta-data files."""

@@ -1,7 +1,7 @@
-"""Writing of the distortion entries of WISE meta-data: WSDC D-T033, Appendix B.
+"""Write the distortion entries of WISE meta-data: WSDC D-T033, Appendix B.
 
-The layout cannot hold uncertainties.  They stand in comment lines, which begin with a backslash:
-readers of the layout skip them, and `read_wise_meta` reads them.
+The layout cannot hold uncertainties. They are written as comment lines, which begin with a
+backslash: other programs skip them, and `read_wise_meta` reads them.
 """
 
 from __future__ import annotations
@@ -21,8 +21,8 @@ from bayesdist.products.formats.sip.families import EDGE, families, offset_range
 from bayesdist.products.formats.sip.header import SIP_ORDERS, SipHeader, worst_closure
 from bayesdist.products.formats.wise.meta import ARRAYS, monomial
 
-# How far A_DMAX and B_DMAX look beyond the centres of the outermost pixels: the printed ones do so
-# in W4 alone.
+# Distance beyond the centres of the outermost pixels to which A_DMAX and B_DMAX extend; in the
+# printed tables only those of W4 extend to the edge.
 _MARGIN = {1: 0.0, 2: 0.0, 3: 0.0, 4: EDGE}
 
 
@@ -32,18 +32,31 @@ def write_wise_meta(
     *,
     skew: Mapping[int, float] | None = None,
 ) -> None:
-    """Write the distortion entries of a WISE meta-data file, whole or not at all.
+    """Write the distortion entries of a WISE meta-data file atomically.
 
-    Coefficients have the seven digits of WSDC D-T033, Appendix B, maxima its three decimals.
-    Maxima and closure are those of the numbers as written: A_DMAX and B_DMAX over the centres of
-    the pixels in W1 to W3 (u, v within +-507.5), to the edges of the array in W4 (+-254).  In
-    comment lines stand standard deviations (AE_p_q, BE_p_q) and the worst error of AP, BP (BDCLOS).
+    Parameters
+    ----------
+    path : path-like
+        Output file.
+    bands : mapping of int to SipHeader
+        Headers by band number. CD must be a pure scale and the reference pixel the middle of the
+        array, as made by ``sip_from_solution(..., linear="sip")``, because the file states neither.
+    skew : mapping of int to float, optional
+        SKEW of each band, radians; zero by default.
 
-    `bands`: by the number of the band.  CD is a pure scale and the reference pixel the middle of
-    the array, as ``sip_from_solution(..., linear="sip")`` has it: the file states neither. `skew`:
-    SKEW of each band, radians; zero by default. InputError for no band or an unknown one, a header
-    that has no inverse, another array, a CD that holds more than a scale, a number that is not
-    finite, or a file that cannot be written.
+    Raises
+    ------
+    InputError
+        If there is no band or an unknown one, if a header has no inverse, another array size or a
+        CD that is more than a scale, if a number is not finite, or if the file cannot be written.
+
+    Notes
+    -----
+    Coefficients have seven digits as in WSDC D-T033, Appendix B, and maxima three decimals. Maxima
+    and closure are computed from the numbers as written. A_DMAX and B_DMAX are taken over the
+    centres of the pixels in W1 to W3 (u, v within +-507.5), and to the edges of the array in W4
+    (+-254). Comment lines give the standard deviations (AE_p_q, BE_p_q) and the largest error of
+    AP, BP (BDCLOS).
     """
     text = wise_text(bands, skew)
     with atomic_path(path) as temporary:
@@ -51,7 +64,7 @@ def write_wise_meta(
 
 
 def wise_text(bands: Mapping[int, SipHeader], skew: Mapping[int, float] | None = None) -> str:
-    """Text of the file that `write_wise_meta` writes."""
+    """Text of the file written by `write_wise_meta`."""
     if not bands:
         raise InputError("there is no band to write", do="give a header for each band")
     skew = {} if skew is None else skew
@@ -104,7 +117,7 @@ def _lines(band: int, sip: SipHeader, skew: float) -> list[str]:
 
 
 def _as_written(sip: SipHeader) -> SipHeader:
-    """Header with the digits of the file, every term of its orders there."""
+    """Header with coefficients rounded as in the file, and with every term of its orders."""
     terms: dict[str, Any] = {
         prefix.lower(): {k: float(f"{values.get(k, 0.0):.6E}") for k in _powers(order)}
         for prefix, order, values in families(sip)
@@ -121,7 +134,7 @@ def _powers(order: int) -> list[tuple[int, int]]:
 def _check(band: int, sip: SipHeader, skew: float) -> None:
     if band not in ARRAYS:
         raise InputError(f"band {band} is none of 1 to 4", where="bands", do="correct the band")
-    where = f"W{band}"
+    location = f"W{band}"
     side, _ = ARRAYS[band]
     middle = (side + 1) / 2
     if sip.size != (side, side) or sip.crpix != (middle, middle):
@@ -129,17 +142,19 @@ def _check(band: int, sip: SipHeader, skew: float) -> None:
         raise InputError(
             f"the image size is {size} and CRPIX {sip.crpix[0]:g}, {sip.crpix[1]:g}, and the array "
             f"of this band has {side} x {side} pixels about {middle:g}, {middle:g}",
-            where=where,
+            where=location,
             do="give a header of that array, its reference pixel in the middle",
         )
     if not sip.has_inverse:
-        raise InputError("the header has no AP and BP", where=where, do="write it with an inverse")
+        raise InputError(
+            "the header has no AP and BP", where=location, do="write it with an inverse"
+        )
     orders = {f"{prefix}_ORDER": order for prefix, order, _ in families(sip)}
     for keyword, order in orders.items():
         if not SIP_ORDERS[0] <= order <= SIP_ORDERS[1]:
             raise InputError(
                 f"is {order}",
-                where=f"{where}, keyword {keyword}",
+                where=f"{location}, keyword {keyword}",
                 do=f"choose an order from {SIP_ORDERS[0]} to {SIP_ORDERS[1]}",
             )
     gram = sip.cd.T @ sip.cd
@@ -148,10 +163,10 @@ def _check(band: int, sip: SipHeader, skew: float) -> None:
     if not along_axes or np.abs(gram - scale2 * np.eye(2)).max() > 1e-9 * scale2:
         raise InputError(
             "the CD matrix holds more than a scale, and the file cannot hold it",
-            where=where,
+            where=location,
             do='make the header with linear = "sip", whose A and B hold all linear terms',
         )
     numbers = [*(c for _, _, t in families(sip) for c in t.values()), skew]
     numbers += [*sip.sigma_a.values(), *sip.sigma_b.values()]
     if not np.isfinite(numbers).all():
-        raise InputError("a number is not finite", where=where, do="check the solution")
+        raise InputError("a number is not finite", where=location, do="check the solution")

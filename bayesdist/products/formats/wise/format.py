@@ -1,4 +1,4 @@
-"""Format entry of WISE meta-data."""
+"""Format of WISE meta-data files."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ class Settings(FormatSettings):
         size: tuple[float, float] | None,
         reference_pixel: tuple[float, float] | None,
     ) -> None:
-        """Refuse a chip that is not the whole array of a band, its middle the reference pixel."""
+        """Raise ValueError unless the chip is a full array with its middle as reference pixel."""
         band = _band(detector)
         if band is None:
             raise ValueError(
@@ -61,7 +61,7 @@ class Settings(FormatSettings):
 
 
 def _band(detector: str) -> int | None:
-    """Number of the band that a detector is named after."""
+    """Number of the band that a detector is named after; None for other names."""
     return next((band for band in ARRAYS if detector == f"W{band}"), None)
 
 
@@ -70,22 +70,22 @@ def _parse(content: Content) -> tuple[str, Bands] | None:
 
 
 def _describe(named: tuple[str, Bands]) -> list[str]:
-    """Lines of text on the bands, each with its contradictions."""
+    """Lines of text on the bands, each with its findings."""
     name, bands = named
-    lines = [f"{name}: WISE meta-data, {', '.join(f'W{one.band}' for one in bands)}"]
-    for one in bands:
-        sip, (side, _) = one.sip, ARRAYS[one.band]
+    lines = [f"{name}: WISE meta-data, {', '.join(f'W{band.band}' for band in bands)}"]
+    for band in bands:
+        sip, (side, _) = band.sip, ARRAYS[band.band]
         size = sip.size or (side, side)
-        lines += ["", f"W{one.band}: {size[0]} x {size[1]} px, A_ORDER {sip.order[0]}, "
-                  f"B_ORDER {sip.order[1]}, SKEW {one.skew:g} rad"]  # fmt: skip
+        lines += ["", f"W{band.band}: {size[0]} x {size[1]} px, A_ORDER {sip.order[0]}, "
+                  f"B_ORDER {sip.order[1]}, SKEW {band.skew:g} rad"]  # fmt: skip
         lines += [
-            f"  {prefix}_DMAX    {one.printed[f'{prefix}_DMAX']} px"
+            f"  {prefix}_DMAX    {band.printed[f'{prefix}_DMAX']} px"
             for prefix in "AB"
-            if f"{prefix}_DMAX" in one.printed
+            if f"{prefix}_DMAX" in band.printed
         ]
         if sip.has_inverse:
             lines.append(f"  closure   {worst_closure(sip, size):.2g} px at worst")
-        lines += [*coefficient_lines(sip), "", *finding_lines(lint_wise_band(one))]
+        lines += [*coefficient_lines(sip), "", *finding_lines(lint_wise_band(band))]
     return lines
 
 
@@ -96,17 +96,19 @@ def _lint(named: tuple[str, Bands]) -> list[Finding]:
 def _read_back(
     files: Sequence[Built], calibration: Calibration, options: BuildOptions
 ) -> list[ReadBack]:
-    """Positions by the entries, with CD and zero point, which they lack, as they were made."""
+    """Positions from the entries, with the CD and zero point of the original header."""
     out = []
-    for one in files:
-        [band] = bands_of(Content(one.file_name, one.content))
+    for built in files:
+        [band] = bands_of(Content(built.file_name, built.content))
         headers = {calibration.numbers[0]: band.sip}
-        out.append(headers_read_back(one.file_name, headers, calibration, options, like=one.made))
+        out.append(
+            headers_read_back(built.file_name, headers, calibration, options, like=built.made)
+        )
     return out
 
 
 def _build(calibration: Calibration, _: Settings, options: BuildOptions) -> tuple[Built, ...]:
-    """WISE's form: all linear terms in A and B, and an inverse of equal order."""
+    """Build entries in WISE's form: linear terms in A and B, and an inverse of the same order."""
     band = _band(calibration.detector)
     if band is None:
         raise InputError(
@@ -122,7 +124,7 @@ def _build(calibration: Calibration, _: Settings, options: BuildOptions) -> tupl
         scale_arcsec=options.scale_arcsec,
     )
     name, content = f"w{band}.meta", wise_text({band: sip}).encode("ascii")
-    [written] = bands_of(Content(name, content))  # numbers are those of the digits as written
+    [written] = bands_of(Content(name, content))  # the summary describes the rounded numbers
     summary = {
         "closure_pix": written.sip.closure,
         "a_dmax": written.sip.a_dmax,

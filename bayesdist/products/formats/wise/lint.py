@@ -1,4 +1,4 @@
-"""Checks of the distortion entries of a WISE meta-data file."""
+"""Checks of the distortion entries in a WISE meta-data file."""
 
 from __future__ import annotations
 
@@ -27,18 +27,25 @@ from bayesdist.products.formats.wise.meta import WiseBand, monomial
 
 _NUMBER = re.compile(r"([+-]?)([0-9]+)\.([0-9]+)([EeDd][+-]?[0-9]+)")
 _MONOMIAL = re.compile(r"coefficient of (\S+)")
-# Farther from the implied value a number counts as excluded.
+# A number farther than this from the implied value is excluded; standard deviations.
 _ALLOWED_SIGMAS = 4.0
 
 
 def lint_wise_band(band: WiseBand) -> tuple[Finding, ...]:
-    """Findings in the entries of one band of a WISE meta-data file.
+    """Check the distortion entries of one band of a WISE meta-data file.
 
-    Returns findings of `lint_sip`, and on the text itself: coefficients that are missing, numbers
-    with another count of digits than the rest, comments that name another monomial than the
-    keyword.
+    Parameters
+    ----------
+    band : WiseBand
+        Entries of one band.
+
+    Returns
+    -------
+    tuple of Finding
+        Findings of `lint_sip`, and findings on the text: missing coefficients, numbers with an
+        unusual count of digits, and comments that name a monomial other than that of the keyword.
     """
-    # a finding on parity would be on the nominal CD, which is not in the file
+    # findings on CD would be about its nominal value, which is not in the file
     findings = [f for f in lint_sip(band.sip) if f.where != "CD"]
     return (*findings, *_absent(band.sip), *_digits(band), *_comments(band), *_skew(band))
 
@@ -51,7 +58,7 @@ def _absent(sip: SipHeader) -> Iterator[Finding]:
 
 
 def _digits(band: WiseBand) -> Iterator[Finding]:
-    """Finding on a number with a digit too many or too few, and which digit that may be."""
+    """Findings on numbers with a digit too many or too few, and which digit that may be."""
     numbers = {
         k: m for k, v in band.printed.items() if sip_powers(k) and (m := _NUMBER.fullmatch(v))
     }
@@ -62,30 +69,32 @@ def _digits(band: WiseBand) -> Iterator[Finding]:
             continue
         message = f"is printed with {count} digits ({band.printed[keyword]}), others with {usual}"
         if count == usual + 1:
-            kept = _without_a_digit(band.sip, keyword, numbers[keyword])
+            candidates = _without_a_digit(band.sip, keyword, numbers[keyword])
             message += ": one is too many"
-            if kept:
+            if candidates:
                 spread = largest_magnitude(
-                    {powers_of(keyword): max(kept.values()) - min(kept.values())},
+                    {powers_of(keyword): max(candidates.values()) - min(candidates.values())},
                     *offset_ranges(band.sip, band.sip.size or (1, 1)),
                 )
                 message += (
-                    f"; without one, {', '.join(kept)} agree with the other numbers"
+                    f"; without one, {', '.join(candidates)} agree with the other numbers"
                     f" (they differ by at most {spread:.1g} px)"
                 )
         yield Finding("warning", keyword, message)
 
 
 def _without_a_digit(sip: SipHeader, keyword: str, number: re.Match[str]) -> dict[str, float]:
-    """Numbers with one decimal left out that the closure and the stated maxima allow."""
-    sign, whole, decimals, exponent = number.groups()
+    """Numbers with one decimal removed that agree with the closure and the stated maxima."""
+    sign, integer, decimals, exponent = number.groups()
     texts = {
-        f"{sign}{whole}.{decimals[:k]}{decimals[k + 1 :]}{exponent}" for k in range(len(decimals))
+        f"{sign}{integer}.{decimals[:k]}{decimals[k + 1 :]}{exponent}" for k in range(len(decimals))
     }
     values = {text: float(text.upper().replace("D", "E")) for text in sorted(texts)}
     if sip.size is None or not (forward_is_used(sip) and inverse_is_used(sip)):
         return values
-    [implied] = [one for one in implied_values(sip) if one.keyword == keyword]
+    [implied] = [
+        value_implied for value_implied in implied_values(sip) if value_implied.keyword == keyword
+    ]
     near = {
         text: value
         for text, value in values.items()
@@ -101,12 +110,12 @@ def _without_a_digit(sip: SipHeader, keyword: str, number: re.Match[str]) -> dic
 def _comments(band: WiseBand) -> Iterator[Finding]:
     wrong: dict[tuple[str, str], list[str]] = {}
     for keyword, comment in band.comments.items():
-        said = _MONOMIAL.search(comment)
-        if said is None or sip_powers(keyword) is None:
+        match = _MONOMIAL.search(comment)
+        if match is None or sip_powers(keyword) is None:
             continue
         right = monomial(*powers_of(keyword))
-        if said[1].lower() != right:
-            wrong.setdefault((said[1].lower(), right), []).append(keyword)
+        if match[1].lower() != right:
+            wrong.setdefault((match[1].lower(), right), []).append(keyword)
     for (said_there, right), keywords in wrong.items():
         yield Finding(
             "note", ", ".join(keywords), f"the comment says {said_there}, the indices say {right}"

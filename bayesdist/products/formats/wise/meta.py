@@ -1,4 +1,4 @@
-"""Reading of the distortion entries of WISE meta-data: WSDC D-T033, Appendix B."""
+"""Read the distortion entries of WISE meta-data: WSDC D-T033, Appendix B."""
 
 from __future__ import annotations
 
@@ -19,23 +19,36 @@ from bayesdist.products.formats.sip.read import parsed
 _ENTRY = re.compile(r"\S*distort_(?:skew|(?:a|b|ap|bp)_)\S*")
 _ENTRY_LINE = re.compile(r"\S*distort_(\S+)\s+(\d+)\s+(\S+)\s+([ir])\s+(\S+)\s*(.*)")
 _KEYWORD = re.compile(r"SKEW|[AB]P?_(?:ORDER|\d_\d)|[AB]_DMAX")
-# Entries of `write_wise_meta` in comment lines, which other readers skip.
+# Entries that `write_wise_meta` writes as comment lines, which other programs skip.
 _LIKE_ASIDE = re.compile(r"\\.*\s([AB]E_\d_\d|BDCLOS)\s+r\s.*")
 _ASIDE = re.compile(r"\\\s+(\d+)\s+([AB]E_\d_\d|BDCLOS)\s+r\s+(\S+).*")
-# Columns and rows of the arrays, and arcseconds in a pixel: those of W4 are twice as wide.
+# Columns (and rows) of the arrays, and pixel scale in arcsec; W4 has pixels twice as wide.
 ARRAYS = {1: (1016, 2.75), 2: (1016, 2.75), 3: (1016, 2.75), 4: (508, 5.5)}
 
 
 @dataclass(frozen=True, eq=False)
 class WiseBand:
-    """Distortion entries of one band in a WISE meta-data file."""
+    """Distortion entries of one band in a WISE meta-data file.
+
+    Parameters
+    ----------
+    band : int
+        Number of the band, 1 to 4.
+    sip : SipHeader
+        Distortion. The reference pixel is the middle of the array. Because the file has no sky
+        position, CRVAL is zero and CD has the nominal scale.
+    skew : float
+        SKEW of the CD matrix, radians.
+    printed : mapping of str to str
+        Numbers as printed in the file, by keyword.
+    comments : mapping of str to str
+        Comments of the entries, by keyword.
+    """
 
     band: int
-    # the reference pixel is the middle of the array.  The file has no sky position: CRVAL is zero,
-    # and CD has the nominal scale
     sip: SipHeader
-    skew: float  # of the CD matrix, radians
-    printed: Mapping[str, str]  # numbers as they stand in the file, by keyword
+    skew: float
+    printed: Mapping[str, str]
     comments: Mapping[str, str]
 
 
@@ -43,27 +56,42 @@ def read_wise_meta(path: str | os.PathLike[str]) -> tuple[WiseBand, ...]:
     """Read the distortion entries of a WISE meta-data file.
 
     The layout is that of WSDC D-T033 ("WISE IOC Distortion Calibration"), Appendix B: name, band,
-    keyword, type, value, comment.  Entries of other kinds are passed over, and comment lines but
-    for the standard deviations and the closure that `write_wise_meta` puts there.
+    keyword, type, value, comment. Other entries are skipped. So are comment lines, except for the
+    standard deviations and the closure written by `write_wise_meta`.
 
-    The result is in the order of the bands. FormatError when there is no such entry, or one is
-    broken, contradicts itself, comes twice or is missing. InputError when the file cannot be read.
+    Parameters
+    ----------
+    path : path-like
+        WISE meta-data file.
+
+    Returns
+    -------
+    tuple of WiseBand
+        Entries in the order of the bands.
+
+    Raises
+    ------
+    FormatError
+        If there are no such entries, or if an entry is malformed, inconsistent, repeated or
+        missing.
+    InputError
+        If the file cannot be read.
     """
     return bands_of(read_content(path))
 
 
 def bands_of(content: Content) -> tuple[WiseBand, ...]:
-    """Bands of a file's content; as `read_wise_meta`."""
-    where, lines = content.name, content.text.splitlines()
+    """Bands in the content of a file; see `read_wise_meta`."""
+    name, lines = content.name, content.text.splitlines()
     entries: dict[int, dict[str, tuple[str, str]]] = {}
     asides: dict[int, dict[str, str]] = {}
     for number, line in enumerate(lines, start=1):
         if _ENTRY.match(line):
-            band, keyword, value, comment = _entry(line, f"{where}, line {number}")
+            band, keyword, value, comment = _entry(line, f"{name}, line {number}")
             if keyword in entries.setdefault(band, {}):
                 raise FormatError(
                     f"{keyword} of band {band} comes a second time",
-                    where=f"{where}, line {number}",
+                    where=f"{name}, line {number}",
                     do="remove one",
                 )
             entries[band][keyword] = value, comment
@@ -72,25 +100,25 @@ def bands_of(content: Content) -> tuple[WiseBand, ...]:
         elif _LIKE_ASIDE.fullmatch(line.rstrip()):
             raise FormatError(
                 "is not band, keyword, type, value of an error",
-                where=f"{where}, line {number}",
+                where=f"{name}, line {number}",
                 do="correct the line",
             )
     if not entries:
         raise FormatError(
-            "there are no distortion entries", where=where, do="give a WISE meta-data file"
+            "there are no distortion entries", where=name, do="give a WISE meta-data file"
         )
     lost = asides.keys() - entries.keys()
     if lost:
         raise FormatError(
-            f"errors are of band {min(lost)}, which has no entries", where=where, do="correct them"
+            f"errors are of band {min(lost)}, which has no entries", where=name, do="correct them"
         )
     return tuple(
-        _wise_band(band, entries[band], asides.get(band, {}), where) for band in sorted(entries)
+        _wise_band(band, entries[band], asides.get(band, {}), name) for band in sorted(entries)
     )
 
 
 def holds_wise_meta(content: Content) -> bool:
-    """True where there are distortion entries of WISE meta-data, right or wrong."""
+    """True if there are distortion entries of WISE meta-data, valid or not."""
     return any(_ENTRY.match(line) for line in content.text.splitlines())
 
 
@@ -114,7 +142,7 @@ def _entry(line: str, where: str) -> tuple[int, str, str, str]:
 
 
 def monomial(p: int, q: int) -> str:
-    """Name of u^p v^q, as the comments have it: u2.v, u.v, v3, and v0 for the constant."""
+    """Name of u^p v^q as in the comments: u2.v, u.v, v3, and v0 for the constant."""
     if p == 0:
         return f"v{q}"
     if q == 0:
@@ -153,24 +181,26 @@ def _wise_band(
 
 
 def wise_calibration(bands: Sequence[WiseBand], name: str, band: str | None = None) -> Calibration:
-    """Calibration of one band, as "W2": (u, v) in corrected pixels about the middle of the array.
+    """Calibration of one band, such as "W2": (u, v) in corrected pixels from the array centre.
 
-    `name` is the file, for messages.  InputError for a band that the file lacks, or that has to be
-    named.
+    `name` is the file, for error messages. InputError if the file does not have the band, or if it
+    has several bands and none is named.
     """
-    known = {f"W{one.band}": one for one in bands}
+    by_name = {f"W{entry.band}": entry for entry in bands}
     chosen = (band or "").upper()
-    if band is not None and chosen not in known:
+    if band is not None and chosen not in by_name:
         raise InputError(
-            f"there is no band {band}", where=name, do=f"choose one of {', '.join(known)}"
+            f"there is no band {band}", where=name, do=f"choose one of {', '.join(by_name)}"
         )
-    if band is None and len(known) > 1:
+    if band is None and len(by_name) > 1:
         raise InputError(
-            f"holds the bands {', '.join(known)}",
+            f"holds the bands {', '.join(by_name)}",
             where=name,
             do="name one by filter (--filter W1, or W1:W2 for two files, on the command line)",
         )
-    one = known[chosen] if band is not None else next(iter(known.values()))
-    notes = ("without the SKEW of its CD matrix",) if one.skew else ()
-    found = sip_calibration(one.sip, f"{name}, W{one.band}", pixels=True, notes=notes)
-    return replace(found, detector=f"W{one.band}")
+    selected = by_name[chosen] if band is not None else next(iter(by_name.values()))
+    notes = ("without the SKEW of its CD matrix",) if selected.skew else ()
+    calibration = sip_calibration(
+        selected.sip, f"{name}, W{selected.band}", pixels=True, notes=notes
+    )
+    return replace(calibration, detector=f"W{selected.band}")

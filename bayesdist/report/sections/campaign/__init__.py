@@ -1,1 +1,1 @@
-"""Sections of runs that began with star lists."""
+"""Sections of runs on star lists."""

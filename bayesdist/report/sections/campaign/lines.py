@@ -1,4 +1,4 @@
-"""Tables of the linear terms against time, with published lines as missions know them."""
+"""Tables of the linear terms against time, with published lines supplied by missions."""
 
 from __future__ import annotations
 
@@ -14,16 +14,16 @@ from bayesdist.utils.numbers import MISSING, count, display_scale, interval, num
 
 Row = tuple[str, ...]
 
-TERMS = ("A_2", "B_3", "B_2", "B_1", "A_3")  # in the order of their tables
+TERMS = ("A_2", "B_3", "B_2", "B_1", "A_3")  # in the order of the tables
 _SIGNIFICANT = 3.0  # sigmas
-FIXED = 5e-3  # 10^-6, or 10^-3 of a length: a term with errors below it is held
+FIXED = 5e-3  # 10^-6, or 10^-3 of a length; a term with a smaller error is held fixed
 
 
 @REPORT.table("campaign-time", needs=("campaign",))
 def time_tables(r: ReportInput) -> Iterator[TextTable]:
     """Tables of the gauge, lines of each term, changes at the breaks, scatter and claims."""
     c = needed(r.campaign)
-    found, joint = c.section("time_dependence"), c.summary.get("lines") or []
+    section, joint = c.section("time_dependence"), c.summary.get("lines") or []
     names = {chip.number: chip.name for chip in c.chips}
     published = published_terms(c.config, c.filter, tuple(names.values()))
     if c.section("gauge"):
@@ -31,7 +31,7 @@ def time_tables(r: ReportInput) -> Iterator[TextTable]:
     terms = dict.fromkeys(row["term"] for row in joint)
     alone = {
         (row["term"], row["segment"]): row
-        for row in found.get("lines", ())
+        for row in section.get("lines", ())
         if row["alpha"] is not None
     }
     note = _why_errors_differ(c) if alone else ""
@@ -42,12 +42,12 @@ def time_tables(r: ReportInput) -> Iterator[TextTable]:
             table = _line_table(term, rows, names, alone, published.get(term), c)
             yield replace(table, note=" ".join(text for text in (table.note, note) if text))
             note = ""  # shown once, under the first of them
-    if found.get("breaks"):
-        yield _changes(found["breaks"], c.unit)
+    if section.get("breaks"):
+        yield _changes(section["breaks"], c.unit)
     if c.section("scatter"):
         yield _scatter(c)
-    if found.get("verdicts"):
-        rows_of = tuple((v["term"], v["claim"], v["text"]) for v in found["verdicts"])
+    if section.get("verdicts"):
+        rows_of = tuple((v["term"], v["claim"], v["text"]) for v in section["verdicts"])
         yield TextTable(
             "Time dependence of each term, selected by held-out exposures",
             ("Term", "Claim", "Why"),
@@ -90,12 +90,14 @@ def _line_table(
     published: Published | None,
     c: CampaignResults,
 ) -> TextTable:
-    """Table of alpha and beta of a term: joint, exposure by exposure, and published."""
+    """Table of alpha and beta of a term: joint fit, single exposures, and published values."""
     factor, unit = _scale(term, c.unit)
-    own = [row for row in (*joint, *alone.values()) if row["term"].rpartition(".")[2] == term]
-    # as many digits for all of this run's, so that they can be compared; others as printed
+    rows_of_term = [
+        row for row in (*joint, *alone.values()) if row["term"].rpartition(".")[2] == term
+    ]
+    # all values of this run have the same digits for comparison; published ones are as printed
     digits = {
-        key: min((row[key] for row in own if row[key] * factor > FIXED), default=0.0)
+        key: min((row[key] for row in rows_of_term if row[key] * factor > FIXED), default=0.0)
         for key in ("sigma_alpha", "sigma_beta")
     }
     lines: tuple[PublishedLine, ...] = ()
@@ -112,9 +114,11 @@ def _line_table(
         if (label, row["segment"]) in alone:
             numbers = _numbers(alone[label, row["segment"]], factor, digits)
             rows.append((*head, "exposures, then line", *numbers))
-        for one in lines:
-            if one.chip == chip and abs(one.rdate - row["epoch0"]) < 1e-6:
-                rows.append((*head, source, *_numbers(vars(one), factor, vars(one))))
+        for published_line in lines:
+            if published_line.chip == chip and abs(published_line.rdate - row["epoch0"]) < 1e-6:
+                rows.append(
+                    (*head, source, *_numbers(vars(published_line), factor, vars(published_line)))
+                )
     system = ""
     if c.section("gauge"):
         system = f", in the system of {c.chip_name(c.section('gauge')['chip'])}"
@@ -129,7 +133,7 @@ def _line_table(
 
 
 def _why_errors_differ(c: CampaignResults) -> str:
-    """Note on why two fits of the same stars give two errors."""
+    """Note on why two fits of the same stars have different errors."""
     n = count(len(c.matching) if c.series is None else len(c.series.exposures))
     return (
         "The two σ of this run may differ, here and in the tables below. An exposure that is fitted"
@@ -141,12 +145,12 @@ def _why_errors_differ(c: CampaignResults) -> str:
 
 
 def _scale(term: str, unit: str) -> tuple[float, str]:
-    """Unit in which errors and rates of a term are read: constants are lengths."""
+    """Unit for errors and rates of a term: constant terms are lengths."""
     return (1e3, f"10⁻³ {unit}") if term.endswith("_1") else (1e6, "10⁻⁶")
 
 
 def _is_free(row: Mapping[str, Any], unit: str) -> bool:
-    """True where the data constrain the term: the gauge fixes terms of the reference chip."""
+    """True if the data constrain the term; the gauge fixes terms of the reference chip."""
     return bool(row["sigma_alpha"] * _scale(row["term"], unit)[0] > FIXED)
 
 
@@ -212,7 +216,7 @@ def _scatter(c: CampaignResults) -> TextTable:
 
 @dataclass(frozen=True)
 class PublishedLine:
-    """Line alpha + beta (TIME - RDATE), with formal errors; for a constant term beta is 0."""
+    """A line alpha + beta (TIME - RDATE) with formal errors; beta is 0 for a constant term."""
 
     chip: str
     rdate: float
@@ -224,10 +228,10 @@ class PublishedLine:
 
 @dataclass(frozen=True)
 class Published:
-    """Lines of one term."""
+    """Published lines of one term."""
 
-    source: str  # the publication
-    where: str  # in it
+    source: str  # publication
+    where: str  # location in the publication
     lines: tuple[PublishedLine, ...]
 
 
@@ -236,7 +240,7 @@ _SOURCES: list[Source] = []
 
 
 def publishes(source: Source) -> Source:
-    """Decorator of a function that gives published terms, of the arguments of `published_terms`."""
+    """Decorator that registers a source of published terms, called like `published_terms`."""
     _SOURCES.append(source)
     return source
 
@@ -244,9 +248,9 @@ def publishes(source: Source) -> Source:
 def published_terms(
     config: Mapping[str, Any], filter: str, chips: tuple[str, ...]
 ) -> dict[str, Published]:
-    """Published lines of the detector and filter of a run, by term.
+    """Published lines for the detector and filter of a run, by term.
 
-    `config`: the resolved configuration: the release names instrument and detector. `chips`: their
-    names.
+    `config`: resolved configuration, which contains instrument and detector. `chips`: names of the
+    chips.
     """
     return {k: v for source in _SOURCES for k, v in source(config, filter, chips).items()}

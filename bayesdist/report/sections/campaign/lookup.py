@@ -1,4 +1,4 @@
-"""Look-up tables: the residuals without and with them, and the errors of their nodes."""
+"""Look-up tables: residuals without and with them, and errors of their nodes."""
 
 from __future__ import annotations
 
@@ -25,12 +25,12 @@ if TYPE_CHECKING:
     from bayesdist.diagnose.residuals.binned import BinnedResiduals
 
 WITHOUT, WITH = PALETTE["vermilion"], PALETTE["blue"]
-_REACH = 4.5  # times the robust width of the residuals without tables: where axes end
+_REACH = 4.5  # limit of the axes, in robust standard deviations of the residuals without tables
 
 
 @REPORT.table("campaign-tables", needs=("campaign",))
 def lookup_table(r: ReportInput) -> TextTable:
-    """Table of the look-up tables of each chip."""
+    """Table that describes the look-up tables of each chip."""
     c = needed(r.campaign)
     t = c.section("tables")
     if not t.get("chips"):
@@ -69,11 +69,11 @@ def table_residuals(r: ReportInput) -> Plot:
 
     Figures 6 and 7 of ACS ISR 2015-06.
     """
-    found = needed(r.campaign)
-    order = sorted(range(len(found.residuals)), key=lambda k: r.mosaic.places[k])
-    chips = [found.residuals[k] for k in order]  # from the top
-    every = np.concatenate([c.without for c in chips])
-    reach = _REACH * 1.4826 * float(np.median(np.abs(every)))
+    results = needed(r.campaign)
+    order = sorted(range(len(results.residuals)), key=lambda k: r.mosaic.places[k])
+    chips = [results.residuals[k] for k in order]  # from top to bottom
+    residuals = np.concatenate([c.without for c in chips])
+    reach = _REACH * 1.4826 * float(np.median(np.abs(residuals)))
     scale = display_scale("pix", reach)
     fig = new_figure(WIDTH, 2.35 * len(chips) + 0.35)
     grid = fig.subplots(len(chips), 3, squeeze=False)
@@ -83,24 +83,24 @@ def table_residuals(r: ReportInput) -> Plot:
             (chip.without, "without tables", WITHOUT),
             (needed(chip.with_tables), "with", WITH),
         )
-        for ax, (residual, what, color) in zip(axes, parts, strict=False):
+        for ax, (residual, words, color) in zip(axes, parts, strict=False):
             _cloud(ax, residual * scale.factor, reach * scale.factor, color)
-            ax.set_title(f"{name}, {what}")
+            ax.set_title(f"{name}, {words}")
             ax.set_xlabel(f"residual in x [{scale.unit}]")
         axes[0].set_ylabel(f"residual in y [{scale.unit}]")
         axes[1].tick_params(labelleft=False)
         edges = np.linspace(-reach, reach, 91) * scale.factor
-        for residual, what, color in parts:
+        for residual, words, color in parts:
             for k, style in enumerate(("-", ":")):
                 counts, _ = np.histogram(residual[:, k] * scale.factor, edges)
-                label = f"{'xy'[k]}, {what.split()[0]}"
+                label = f"{'xy'[k]}, {words.split()[0]}"
                 axes[2].stairs(counts, edges, color=color, ls=style, lw=1.0, label=label)
         axes[2].set_xlim(edges[0], edges[-1])
         axes[2].set_title(f"{name}, histograms")
         axes[2].set_xlabel(f"residual [{scale.unit}]")
         axes[2].set_ylabel("stars drawn per bin")
     grid[0, 2].legend(loc="upper left", fontsize=6.5, handlelength=1.5, borderaxespad=0.2)
-    t = found.section("tables")
+    t = results.section("tables")
     drawn = sum(len(c.without) for c in chips)
     text = (
         "Each point is a star in one exposure, after the best polynomial and a linear map of the"
@@ -116,7 +116,7 @@ def table_residuals(r: ReportInput) -> Plot:
     )
     return Plot(
         fig,
-        f"Residuals {_base(found)} and with all look-up tables",
+        f"Residuals {_base(results)} and with all look-up tables",
         text,
         "Clouds of residuals of each chip, narrower with the tables than before, and histograms.",
     )
@@ -132,7 +132,7 @@ def _cloud(ax: Axes, residual: Float, reach: float, color: str) -> None:
 
 
 def _base(c: CampaignResults) -> str:
-    """Words on the fit that residuals with tables are compared with."""
+    """Clause on the fit with which residuals with tables are compared."""
     return "with the detector's tables alone" if any(c.table_filters) else "without"
 
 
@@ -151,10 +151,15 @@ def residual_map(r: ReportInput, which: str) -> Plot:
     """
     c = needed(r.campaign)
     binned = binned_of(c.residuals, which)
-    # one scale for both maps, at which the vectors without tables are seen well
-    length = np.concatenate([_lengths(one.binned_without) for one in c.residuals])
+    # common scale for both maps, chosen for the vectors without tables
+    length = np.concatenate(
+        [_lengths(chip_residuals.binned_without) for chip_residuals in c.residuals]
+    )
     typical = float(np.quantile(length, 0.95)) if length.size else 1.0
-    step = min(spacing(one.binned_without.x, one.binned_without.y) for one in c.residuals)
+    step = min(
+        spacing(chip_residuals.binned_without.x, chip_residuals.binned_without.y)
+        for chip_residuals in c.residuals
+    )
     M = nice_below(1.6 * step / typical) if typical > 0 else 1.0
     key = nice_below(float(length.max(initial=0.0)) / 1.5)
     panels = residual_panels(binned, r.mosaic, unit="pix", magnification=M, key=key)
@@ -182,9 +187,9 @@ def residual_map(r: ReportInput, which: str) -> Plot:
 
 
 def binned_of(chips: Sequence[ChipResiduals], which: str) -> list[BinnedResiduals]:
-    """Binned residuals of all chips, 'without' the tables or 'with' them."""
-    found = [c.binned_without if which == "without" else c.binned_with for c in chips]
-    return [one for one in found if one is not None]
+    """Binned residuals of all chips, 'without' or 'with' the tables."""
+    all_binned = [c.binned_without if which == "without" else c.binned_with for c in chips]
+    return [binned for binned in all_binned if binned is not None]
 
 
 def _lengths(binned: BinnedResiduals) -> Float:
@@ -198,7 +203,7 @@ def largest_cell(*binned: BinnedResiduals) -> float:
 
 
 def rms_of_cells(*binned: BinnedResiduals) -> tuple[float, float]:
-    """Rms of the cells' means on an axis, and that of the scatter in the cells alone."""
+    """Rms per axis of the means of the cells, and the value expected from their scatter."""
     mean, noise = [], []
     for b in binned:
         full = np.isfinite(b.mean_u) & np.isfinite(b.sem_u) & np.isfinite(b.sem_v)
@@ -210,13 +215,13 @@ def rms_of_cells(*binned: BinnedResiduals) -> tuple[float, float]:
 
 
 def _figures_by_filter(r: ReportInput, name: str, *, known: bool) -> Mapping[str, str]:
-    """Names of figures by filter, '' the detector's own; only with known errors where asked."""
+    """Names of figures by filter ('' for the detector); with `known`, only with known errors."""
     tables = [t for t in needed(r.campaign).tables if t.sigma is not None or not known]
     return {f"{name}_{t.filter}" if t.filter else name: t.filter for t in tables}
 
 
 def _by_chip(c: CampaignResults, filter: str) -> list[LookupTable | None]:
-    """Table of each chip, None where there is none."""
+    """Table of each chip; None for chips without a table."""
     of = {table.chip: table for table in c.tables if table.filter == filter}
     return [of.get(chip.number) for chip in c.chips]
 
@@ -236,13 +241,13 @@ def table_nodes(r: ReportInput, filter: str) -> Plot:
     panels.frame(0.03 * r.mosaic.longest_side)
     arrows, titles = [], []
     for k, table in enumerate(chips):
-        one, text = None, "no table"
+        chip_arrows, text = None, "no table"
         if table is not None:
             x, y = (a.ravel() for a in np.meshgrid(*table.nodes()))
             du, dv = (a.ravel() for a in table.values)
-            one = Arrows(x, y, du, dv, min(table.step))
+            chip_arrows = Arrows(x, y, du, dv, min(table.step))
             text = f"largest shift {np.hypot(*table.values).max():.3g} pix"
-        arrows.append(one)
+        arrows.append(chip_arrows)
         titles.append(panels.title(k, text))
     vector_map(
         panels,
@@ -280,9 +285,9 @@ def table_errors(r: ReportInput, filter: str) -> Plot:
     c = needed(r.campaign)
     chips = _by_chip(c, filter)
     tables = [t for t in c.tables if t.filter == filter]
-    every = np.concatenate([t.sigma.ravel() for t in tables if t.sigma is not None])
-    # a few nodes without stars must not flatten all others
-    low, high = float(every.min()), float(np.quantile(every, 0.995))
+    errors = np.concatenate([t.sigma.ravel() for t in tables if t.sigma is not None])
+    # a few nodes without stars must not dominate the colour scale
+    low, high = float(errors.min()), float(np.quantile(errors, 0.995))
     scale = display_scale("pix", high)
     panels = ChipPanels(r.mosaic, 2, colorbar=True)
     panels.frame()
@@ -305,12 +310,12 @@ def table_errors(r: ReportInput, filter: str) -> Plot:
         norm=Normalize(low * scale.factor, high * scale.factor),
     )
     rows = c.section("tables").get("chips", ())
-    known = {(row["chip"], row.get("filter") or ""): row for row in rows}
+    row_by_chip_and_filter = {(row["chip"], row.get("filter") or ""): row for row in rows}
     parts, worst = [], 0.0
     for t in tables:
         if t.sigma is None:
             continue
-        row = known.get((t.chip, filter), {})
+        row = row_by_chip_and_filter.get((t.chip, filter), {})
         median = row.get("sigma_median") or float(np.median(t.sigma))
         parts.append(f"{c.chip_name(t.chip)} {size_of(median)}")
         worst = max(worst, float(t.sigma.max()))

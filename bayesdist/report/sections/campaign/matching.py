@@ -28,7 +28,7 @@ _LEFT_OUT = PALETTE["vermilion"]
 
 @REPORT.table("campaign-matching", needs=("campaign",))
 def matching_table(r: ReportInput) -> TextTable:
-    """Table of detections that were matched, and that were left out."""
+    """Table of matched detections, and of those that were left out."""
     c = needed(r.campaign)
     m = c.section("matching")
     left_out = {
@@ -58,15 +58,17 @@ def catalogue_errors(r: ReportInput) -> Plot:
     Figure 3 of ACS ISR 2015-06.
     """
     c = needed(r.campaign)
-    catalog, centroids, found = needed(c.catalog), c.centroids, c.section("matching")
+    catalog, centroids, section = needed(c.catalog), c.centroids, c.section("matching")
     fig = new_figure(WIDTH, 3.3)
-    left, right = fig.subplots(1, 2)
+    position_axes, right = fig.subplots(1, 2)
     if catalog.sigma is not None:
-        left.plot(catalog.mag, catalog.sigma, ".", ms=1.2, color=_DOT, label="catalogue, quoted")
+        position_axes.plot(
+            catalog.mag, catalog.sigma, ".", ms=1.2, color=_DOT, label="catalogue, quoted"
+        )
     if centroids is not None:
         points = np.hypot(centroids.scatter_u, centroids.scatter_v)
         line = np.hypot(centroids.sigma_u, centroids.sigma_v)
-        left.plot(
+        position_axes.plot(
             centroids.mag,
             points,
             "o",
@@ -74,9 +76,9 @@ def catalogue_errors(r: ReportInput) -> Plot:
             color=PALETTE["blue"],
             label="residuals, scatter",
         )
-        left.plot(centroids.mag, line, color=INK, label="one detection, fitted")
-    left.set_ylabel(rf"error of the position, $\sigma_{{uv}}$ [{catalog.unit}]")
-    left.set_title("Positions")
+        position_axes.plot(centroids.mag, line, color=INK, label="one detection, fitted")
+    position_axes.set_ylabel(rf"error of the position, $\sigma_{{uv}}$ [{catalog.unit}]")
+    position_axes.set_title("Positions")
     if catalog.sigma_motion is not None:
         _motions(right, catalog, catalog.sigma_motion)
     else:
@@ -87,7 +89,7 @@ def catalogue_errors(r: ReportInput) -> Plot:
         ax.grid(True, which="major", lw=0.4, color=GUIDE, zorder=0)
         legend = ax.legend(loc="upper center", markerscale=2.2, handlelength=1.6)
         legend.set_zorder(6)
-    n = int(found["n_catalog"])
+    n = int(section["n_catalog"])
     text = "Left: errors of the positions, both axes together."
     if catalog.sigma is not None:
         text += " Grey: those that the catalogue quotes."
@@ -101,7 +103,7 @@ def catalogue_errors(r: ReportInput) -> Plot:
     if catalog.limit is not None:
         text += (
             " Right: errors of the proper motions; stars above the line are left out, and"
-            f" {count(found['n_catalog_used'])} of {count(n)} are used."
+            f" {count(section['n_catalog_used'])} of {count(n)} are used."
         )
     elif catalog.sigma_motion is not None:
         text += f" Right: errors of the proper motions; all {count(n)} stars are used."
@@ -224,14 +226,14 @@ def footprints(r: ReportInput) -> Plot:
     fig = new_figure(0.85 * WIDTH, 0.78 * WIDTH, layout="compressed")
     ax = fig.subplots()
     ax.plot(field.u, field.v, ".", ms=1.3, color="#9AA7B4", mec="none", zorder=1)
-    # so many outlines hide each other: three of them are drawn boldly
+    # many outlines would obscure each other, so only three of them are bold
     dates = np.unique(field.epoch)
     strong = np.isin(field.epoch, dates[[0, len(dates) // 2, -1]])
-    for some, style in (
+    for selected, style in (
         (~strong, {"lw": 0.4, "alpha": 0.35, "zorder": 2}),
         (strong, {"lw": 1.6, "alpha": 1.0, "zorder": 3}),
     ):
-        rows = np.flatnonzero(some)
+        rows = np.flatnonzero(selected)
         shown = [field.outlines[k] for k in rows]
         lines = LineCollection(shown, array=field.epoch[rows], cmap=SEQUENTIAL, **style)
         lines.set_clim(dates[0], dates[-1])

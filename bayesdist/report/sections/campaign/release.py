@@ -1,4 +1,4 @@
-"""Released files, and two exposures aligned through the old files and the new ones."""
+"""Released files, and the alignment of two exposures with the old and the new files."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from bayesdist.report.figures.style import WIDTH, new_figure, nice_below
 from bayesdist.report.texttable import TextTable, tabulated
 from bayesdist.utils.numbers import count, number, size_of
 
-MIN_STARS_PER_CELL = 5  # for a cell that is drawn and counted
+MIN_STARS_PER_CELL = 5  # of a cell that is drawn and counted
 
 _KINDS = {
     "IDCTAB": "IDCTAB: polynomial and its drift",
@@ -26,7 +26,7 @@ _KINDS = {
 
 @REPORT.table("campaign-release", needs=("campaign",))
 def released_files(r: ReportInput) -> TextTable | None:
-    """Table of files for pipelines, with their dates; None where none were written."""
+    """Table of files for pipelines with their dates; None if no files were written."""
     c = needed(r.campaign)
     files = [p for p in c.summary.get("products") or () if p["kind"] in _KINDS]
     if not files:
@@ -37,7 +37,7 @@ def released_files(r: ReportInput) -> TextTable | None:
     for p in files:
         period = p.get("period")
         dates = "all" if period is None else "{:g} to {:g}".format(*years.get(period, (0, 0)))
-        lost = max((abs(one["mas"]) for one in p.get("lost", ())), default=None)
+        lost = max((abs(loss["mas"]) for loss in p.get("lost", ())), default=None)
         rows.append(
             {
                 "File": p["path"],
@@ -58,14 +58,14 @@ def overlap(r: ReportInput) -> Plot:
     t = needed(needed(r.campaign).overlap)
     states = {"old": (t.binned_old, t.old), "new": (t.binned_new, t.new)}
     panels, arrows, titles, largest = _panels(t), [], [], {}
-    for which, (binned, found) in states.items():
-        one = Arrows.of_cells(binned, MIN_STARS_PER_CELL)
-        largest[which] = float(one.length.max(initial=0.0))
-        x, y = one.x - 0.5 + t.corner[0], one.y - 0.5 + t.corner[1]
-        arrows.append(replace(one, x=x, y=y, clear=np.ones(one.x.size, bool)))
-        name = "known distortion" if which == "old" else "this run"
-        rms = float(np.sqrt(np.mean(found.rms**2)))
-        titles.append(f"{name}: largest {largest[which]:.3f}, rms {rms:.3f} pix")
+    for state, (binned, test_result) in states.items():
+        cells = Arrows.of_cells(binned, MIN_STARS_PER_CELL)
+        largest[state] = float(cells.length.max(initial=0.0))
+        x, y = cells.x - 0.5 + t.corner[0], cells.y - 0.5 + t.corner[1]
+        arrows.append(replace(cells, x=x, y=y, clear=np.ones(cells.x.size, bool)))
+        name = "known distortion" if state == "old" else "this run"
+        rms = float(np.sqrt(np.mean(test_result.rms**2)))
+        titles.append(f"{name}: largest {largest[state]:.3f}, rms {rms:.3f} pix")
     length = arrows[0].length
     typical = float(np.quantile(length, 0.95)) if length.size else 1.0
     vector_map(
@@ -105,7 +105,7 @@ def overlap(r: ReportInput) -> Plot:
 
 
 def _panels(t: OverlapTest) -> Panels:
-    """Panels of the area that both exposures see."""
+    """Panels of the area covered by both exposures."""
     size = np.ptp(t.new.position, axis=0)
     middle, half = np.array(t.corner) + size / 2, 0.56 * size
     aspect = float(np.clip(size[1] / size[0], 0.5, 1.6))

@@ -1,4 +1,4 @@
-"""Self-calibration: its gauge, the matching of exposures and stars, the stars."""
+"""Self-calibration: its gauge, the matching of exposures and stars, and the stars."""
 
 from __future__ import annotations
 
@@ -19,15 +19,15 @@ from bayesdist.utils.numbers import MISSING, count, display_scale, number, perce
 if TYPE_CHECKING:
     from astropy.table import Table
 
-MAX_STARS_DRAWN = 20_000  # more only hide each other
-ONE_AXIS = 0.5**0.5  # of a radius hypot(sigma_u, sigma_v)
+MAX_STARS_DRAWN = 20_000  # more would overlap
+ONE_AXIS = 0.5**0.5  # converts a radius hypot(sigma_u, sigma_v) to an error per axis
 
 
 @REPORT.table("selfcal", needs=("selfcal",))
 def selfcal_tables(r: ReportInput) -> tuple[TextTable, ...]:
-    """Tables of gauge, detections, exposures and stars."""
-    found = needed(r.selfcal)
-    return (_gauge(found), _detections(found), _exposures(found, r), _stars(found, r))
+    """Tables of the gauge, the detections, the exposures and the stars."""
+    results = needed(r.selfcal)
+    return (_gauge(results), _detections(results), _exposures(results, r), _stars(results, r))
 
 
 def _gauge(found: SelfcalResults) -> TextTable:
@@ -52,7 +52,7 @@ def _gauge(found: SelfcalResults) -> TextTable:
 
 
 def _property(name: str) -> str:
-    """Name of a direction as words; those of coefficients stay as they are."""
+    """Name of a direction in words; names of coefficients are unchanged."""
     return name if re.search(r"_\d", name) else name.replace("_", " ")
 
 
@@ -130,24 +130,24 @@ def _stars(found: SelfcalResults, r: ReportInput) -> TextTable:
 @REPORT.figure("selfcal", needs=("selfcal",))
 def selfcal(r: ReportInput) -> Plot:
     """The field with its exposures, and the errors of the stars."""
-    found = needed(r.selfcal)
-    stars = found.stars[:: max(1, -(-len(found.stars) // MAX_STARS_DRAWN))]
+    results = needed(r.selfcal)
+    stars = results.stars[:: max(1, -(-len(results.stars) // MAX_STARS_DRAWN))]
     fig = new_figure(WIDTH, 0.5 * WIDTH)
     field, errors = fig.subplots(1, 2)
     field.plot(stars["u"], stars["v"], ".", ms=1.5, color=PALE, mec="none", zorder=1)
-    strong = (0.4, 0.5) if len(found.outlines) > 30 else (0.9, 0.9)
+    strong = (0.4, 0.5) if len(results.outlines) > 30 else (0.9, 0.9)
     field.add_collection(
-        LineCollection(found.outlines, colors=CYCLE[0], linewidths=strong[0], alpha=strong[1])
+        LineCollection(results.outlines, colors=CYCLE[0], linewidths=strong[0], alpha=strong[1])
     )
     field.set_aspect("equal")
     field.autoscale_view()
     field.set_xlabel(f"u [{r.unit}]")
     field.set_ylabel(f"v [{r.unit}]")
-    field.set_title(f"{count(len(found.matching))} exposures")
+    field.set_title(f"{count(len(results.matching))} exposures")
     _errors(errors, stars, r.unit)
     for ax in (field, errors):
         ax.tick_params(colors=INK)
-    s = found.summary["stars"]
+    s = results.summary["stars"]
     size = with_mas(ONE_AXIS * s["radius_median"], s["unit"], r.scale_mas)
     return Plot(
         fig,
@@ -159,14 +159,14 @@ def selfcal(r: ReportInput) -> Plot:
 
 
 def _errors(ax: Axes, stars: Table, unit: str) -> None:
-    whole = per_axis(stars["sigma_u"], stars["sigma_v"])
-    own = per_axis(stars["sigma_own_u"], stars["sigma_own_v"])
-    scale = display_scale(unit, float(np.median(whole)))
+    total = per_axis(stars["sigma_u"], stars["sigma_v"])
+    measured = per_axis(stars["sigma_own_u"], stars["sigma_own_v"])
+    scale = display_scale(unit, float(np.median(total)))
     by_mag = "mag" in stars.colnames
     x = np.asarray(stars["mag"] if by_mag else stars["n"], float)
     for values, color, label in (
-        (whole, CYCLE[0], "with distortion and frames"),
-        (own, CYCLE[1], "of a known distortion"),
+        (total, CYCLE[0], "with distortion and frames"),
+        (measured, CYCLE[1], "of a known distortion"),
     ):
         ax.plot(
             x, np.asarray(values) * scale.factor, ".", ms=2, mec="none", color=color, label=label

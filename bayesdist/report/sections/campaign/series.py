@@ -18,7 +18,7 @@ from bayesdist.utils.arrays import Bool, Float
 from bayesdist.utils.numbers import count, display_scale, number, size_of
 
 TERM_ORDER = ("A_2", "B_3", "B_2", "A_3", "B_1", "A_1")  # as in the published report
-_FEWEST = 3  # dates in a segment that fix a parabola
+_FEWEST = 3  # number of dates in a segment that determine a parabola
 
 _TERMS = {
     "A_1": "A_1 (constant of u)",
@@ -38,12 +38,12 @@ _SCATTER = {
 
 
 def name_of_term(term: str) -> str:
-    """Name of a linear term with its meaning, as ACS ISR 2015-06 (Section 4.2) gives it."""
+    """Name of a linear term with its meaning, as in Section 4.2 of ACS ISR 2015-06."""
     return _TERMS.get(term, term)
 
 
 def name_of_scatter(kind: str) -> str:
-    """Name of a term in which the exposures scatter; a single chip's name comes first."""
+    """Name of a term that varies between exposures, with the name of a single chip first."""
     chip, _, bare = kind.rpartition(".")
     text = _SCATTER.get(bare, bare.replace("_", " "))
     return f"{chip} against the others: {text}" if chip else f"all chips together: {text}"
@@ -51,27 +51,27 @@ def name_of_scatter(kind: str) -> str:
 
 @dataclass(frozen=True, eq=False)
 class TermCourse:
-    """Term of one chip: its values in the exposures, and the lines through them."""
+    """A term of one chip: its values in the exposures, and the lines fitted to them."""
 
-    label: str  # with the chip's name, 'WFC1.A_2'
-    value: Float  # (E,), free of aberration
+    label: str  # with the name of the chip, 'WFC1.A_2'
+    value: Float  # (E,), corrected for velocity aberration
     sigma: Float  # (E,), formal
-    raw: Float  # (E,), as measured: times VAFACTOR
-    line: Float  # (E,), of the exposure's segment at its date
+    raw: Float  # (E,), as measured, that is multiplied by VAFACTOR
+    line: Float  # (E,), line of the exposure's segment at its date
     drift: Float  # (E,), rate times time since the reference date
     alpha: Float  # (S,)
     beta: Float  # (S,)
     epoch0: Float  # (S,)
-    good: Bool  # (E,), exposures that are not off
+    good: Bool  # (E,), True for exposures that are not outliers
 
     @property
     def chip(self) -> str:
-        """Name of the chip; empty where there is one only."""
+        """Name of the chip; empty if there is only one."""
         return self.label.rpartition(".")[0]
 
     @property
     def reference(self) -> float:
-        """Round value near all of them."""
+        """Round value close to all values."""
         digits = 3 if self.is_constant else 5
         return round(float(self.alpha[0]), digits)
 
@@ -82,26 +82,26 @@ class TermCourse:
 
     @property
     def rms_raw(self) -> float:
-        """Scatter about the lines before VAFACTOR, its mean taken out."""
+        """Scatter about the lines before correction for VAFACTOR, without its mean."""
         return float(np.std((self.raw - self.line)[self.good]))
 
     @property
     def rms(self) -> float:
-        """Scatter about the lines after VAFACTOR."""
+        """Scatter about the lines after correction for VAFACTOR."""
         return float(np.std((self.value - self.line)[self.good]))
 
 
 def terms_of(series: LinearSeries) -> dict[str, tuple[str, ...]]:
-    """Labels by term, in the order of the report; chips as the file has them, by name."""
-    found: dict[str, list[str]] = {}
+    """Labels by term, in the order of the report; chips are ordered as in the file."""
+    labels_by_term: dict[str, list[str]] = {}
     for label in series.labels:
-        found.setdefault(label.rpartition(".")[2], []).append(label)
-    order = sorted(found, key=lambda t: TERM_ORDER.index(t) if t in TERM_ORDER else 99)
-    return {term: tuple(sorted(found[term])) for term in order}
+        labels_by_term.setdefault(label.rpartition(".")[2], []).append(label)
+    order = sorted(labels_by_term, key=lambda t: TERM_ORDER.index(t) if t in TERM_ORDER else 99)
+    return {term: tuple(sorted(labels_by_term[term])) for term in order}
 
 
 def course_of(series: LinearSeries, lines: Sequence[Mapping[str, Any]], label: str) -> TermCourse:
-    """Term of the exposures with its lines, which are `time_dependence.lines` of summary.json."""
+    """Term of the exposures with its lines; `lines`: `time_dependence.lines` of summary.json."""
     rows = sorted((r for r in lines if r["term"] == label), key=lambda r: int(r["segment"]))
     alpha, beta, epoch0 = (
         np.array([np.nan if r[k] is None else r[k] for r in rows], float)
@@ -125,30 +125,32 @@ def course_of(series: LinearSeries, lines: Sequence[Mapping[str, Any]], label: s
 
 
 def line_error(series: LinearSeries, column: str, s: int, t: Float) -> Float | None:
-    """Error of a line, or of a new exposure about it, at dates of segment `s`, or None.
+    """Error of a line, or of a new exposure about it, at dates of segment `s`.
 
-    Its square is a parabola through the values of a column of drift.ecsv, which has them at some
-    dates; None where too few of these are in the segment.
+    The square of the error is a parabola through the values of a column of drift.ecsv, which are
+    tabulated for some dates; None if too few of these are in the segment.
     """
     epoch = np.asarray(series.drift["epoch"], float)
-    here = np.searchsorted(np.asarray(series.breaks, float), epoch, side="right") == s
-    if here.sum() < _FEWEST:
+    in_segment = np.searchsorted(np.asarray(series.breaks, float), epoch, side="right") == s
+    if in_segment.sum() < _FEWEST:
         return None
-    middle = epoch[here].mean()
-    variance = np.asarray(series.drift[column], float)[here] ** 2
+    middle = epoch[in_segment].mean()
+    variance = np.asarray(series.drift[column], float)[in_segment] ** 2
     if not np.isfinite(variance).all():
         return None
     unit = variance.max()
-    square = unit * np.polyval(np.polyfit(epoch[here] - middle, variance / unit, 2), t - middle)
+    square = unit * np.polyval(
+        np.polyfit(epoch[in_segment] - middle, variance / unit, 2), t - middle
+    )
     return np.sqrt(np.maximum(square, 0.0))
 
 
-ABREAST = 2  # chips in a figure
-FALLS = 1.2  # scatter before VAFACTOR over that after it, above which the aberration is seen
+ABREAST = 2  # number of chips in a figure
+FALLS = 1.2  # ratio of the scatter before and after VAFACTOR, above which aberration is visible
 
 
 def _figures(r: ReportInput) -> Mapping[str, tuple[str, int]]:
-    """Names of figures, each with its term and chips."""
+    """Names of figures, each with its term and the number of its group of chips."""
     series = needed(needed(r.campaign).series)
     return {
         f"series_{term}" + (f"_{n + 1}" if n else ""): (term, n)
@@ -165,9 +167,9 @@ def series(r: ReportInput, which: tuple[str, int]) -> Plot:
     """
     campaign, (term, n) = needed(r.campaign), which
     series, unit = needed(campaign.series), campaign.unit
-    found = campaign.section("time_dependence")
+    section = campaign.section("time_dependence")
     labels = terms_of(series)[term][ABREAST * n : ABREAST * (n + 1)]
-    courses = [course_of(series, found.get("lines", []), label) for label in labels]
+    courses = [course_of(series, section.get("lines", []), label) for label in labels]
     first = which == next(iter(_figures(r).values()))
     with_roll = bool(np.isfinite(series.pa_v3).any())
     columns = 2 if with_roll else 1
@@ -187,24 +189,24 @@ def series(r: ReportInput, which: tuple[str, int]) -> Plot:
 
     def each(texts: Sequence[str]) -> str:
         pairs = zip(courses, texts, strict=True)
-        return "; ".join(f"{one.chip} {text}" if one.chip else text for one, text in pairs)
+        return "; ".join(f"{course.chip} {text}" if course.chip else text for course, text in pairs)
 
-    rms = each([f"from {size(one.rms_raw)} to {size(one.rms)}" for one in courses])
-    own = each([size(found.get("scatter", {}).get(one.label)) for one in courses])
-    verdicts = {row["term"]: row["claim"] for row in found.get("verdicts", ())}
-    falls = all(one.rms_raw > FALLS * one.rms for one in courses)
+    rms = each([f"from {size(course.rms_raw)} to {size(course.rms)}" for course in courses])
+    exposure_scatter = each(
+        [size(section.get("scatter", {}).get(course.label)) for course in courses]
+    )
+    verdicts = {row["term"]: row["claim"] for row in section.get("verdicts", ())}
+    falls = all(course.rms_raw > FALLS * course.rms for course in courses)
     text = _how_to_read(campaign, with_roll) if first else "As the figure before."
     text += (
         f" With VAFACTOR the scatter about the lines {'falls' if falls else 'hardly changes'}:"
-        f" {rms}. Beyond the formal errors the exposures scatter by {own}."
+        f" {rms}. Beyond the formal errors the exposures scatter by {exposure_scatter}."
     )
-    if all(one.label in verdicts for one in courses):
-        text += (
-            f" What held-out exposures support: {each([verdicts[one.label] for one in courses])}."
-        )
+    if all(c.label in verdicts for c in courses):
+        text += f" What held-out exposures support: {each([verdicts[c.label] for c in courses])}."
     off = int(series.outlying.sum())
     text += f" Crosses mark {count(off)} outlying exposures." if off else " No exposure lies off."
-    if not found.get("converged", True):
+    if not section.get("converged", True):
         text += " The sampler of the lines did not reach its targets: bands are provisional."
     return Plot(
         fig,
@@ -307,7 +309,7 @@ def _segment_name(breaks: tuple[float, ...], s: int) -> str:
 
 
 def _share_limits(*rows: Sequence[Axes]) -> None:
-    """Give the panels before and after VAFACTOR one range: their scatter is to be compared."""
+    """Use the same range in the panels before and after VAFACTOR, to compare their scatter."""
     limits = [row[0].get_ylim() for row in rows]
     low, high = min(a for a, _ in limits), max(b for _, b in limits)
     for row in rows:
@@ -318,7 +320,7 @@ def _share_limits(*rows: Sequence[Axes]) -> None:
 def _draw_lines(
     ax: Axes, series: LinearSeries, course: TermCourse, ref: float, factor: float
 ) -> None:
-    """Draw lines of the segments, their 68 % bands, and those of a new exposure."""
+    """Draw the lines of the segments, with 68 % bands for the lines and for a new exposure."""
     first, last = float(series.epoch.min()), float(series.epoch.max())
     edges = [first, *series.breaks, last]
     for s, (a, b) in enumerate(pairwise(edges)):

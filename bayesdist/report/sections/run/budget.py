@@ -37,9 +37,9 @@ from bayesdist.utils.numbers import (
 if TYPE_CHECKING:
     from bayesdist.assess.budget.budget import BudgetTerm, ErrorBudget
 
-AS_ABOVE = "as above"  # of the rows of single chips
-_LETTERS = 31  # of a label beside another one, over a narrow figure
-_MOST_PANELS = 3  # chips whose bars are shown with those of the detector
+AS_ABOVE = "as above"  # in rows of single chips
+_LETTERS = 31  # of a label next to another one, above a narrow figure
+_MOST_PANELS = 3  # chips with a panel in addition to that of the detector
 
 
 @REPORT.table("budget", needs=("budget",))
@@ -76,14 +76,14 @@ def _by_chip(r: ReportInput, table: TextTable) -> tuple[TextTable, ...]:
 
 
 def _jointly(budget: ErrorBudget) -> tuple[BudgetTerm, ...]:
-    """Terms of a budget with those of the model's parameters as one, which comes first."""
+    """Terms of a budget, with those of the model's parameters combined into the first one."""
     return (needed(budget.model), *(t for t in budget.terms if not t.of_parameters))
 
 
 def _table(
     r: ReportInput, budget: ErrorBudget, shown: ErrorBudget, names: Collection[str] = ()
 ) -> TextTable:
-    """Table of some terms of a budget; `names`: of those that are shown, all if it is empty."""
+    """Table of terms of a budget; `names`: terms to show, or empty for all."""
     unit, mas = budget.unit, r.scale_mas
     chips = {str(c.chip.number): c.chip.name for c in r.chips} | {"all": "all"}
     together = [row for row in shown.rows() if not names or row["name"] in names]
@@ -125,7 +125,7 @@ def _table(
 def _sizes(
     row: Mapping[str, Any], scale: Scale, mas: float | None, typical: float
 ) -> tuple[str, ...]:
-    """Errors of u, of v, per axis (in mas as well), CE68 and CE95, rms over the detector."""
+    """Errors of u, of v, per axis (also in mas), CE68 and CE95, rms over the detector."""
     u, v = float(row["u"]), float(row["v"])
     circles = (float(circular_error(u, v, 0.0, p)) for p in (0.68, 0.95))
     sizes = [number(scale.factor * size) for size in (u, v, row_per_axis(row), *circles)]
@@ -136,7 +136,7 @@ def _sizes(
 
 
 def _relative_uncertainty(row: Mapping[str, Any]) -> str:
-    """Words on how well a term is known itself."""
+    """Relative uncertainty of the size of a term, as text."""
     error, size = row["radial_error"], float(row["radial"])
     if error is None or not size > 0:
         return MISSING
@@ -170,7 +170,7 @@ def budget_terms(r: ReportInput) -> Plot:
     for ax, (name, part) in zip(axes, zip(parts, shown, strict=True), strict=True):
         over = "the detector" if len(parts) == 1 else name
         plot_budget(part, ax, largest=largest, over=over, names=ax is axes[0], legend=False)
-        if len(parts) > 1:  # a number beyond its bar takes more of a narrow panel
+        if len(parts) > 1:  # the number next to a bar needs more of a narrow panel
             ax.set_xlim(0, ax.get_xlim()[1] * (1.12 + 0.12 * len(parts)) / 1.2)
     handles = budget_handles(axes[0], rows)
     fig.legend(handles=handles, loc="outside upper left", ncols=len(handles))

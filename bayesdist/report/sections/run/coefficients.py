@@ -1,4 +1,4 @@
-"""Parameters: Legendre, time dependence and frames, monomial."""
+"""Parameters: Legendre coefficients, time dependence, frames, and monomial coefficients."""
 
 from __future__ import annotations
 
@@ -15,25 +15,27 @@ from bayesdist.utils.numbers import MISSING, interval, number, rounded
 
 _ON_SCREEN = ("68 %", "95 %", "R-hat", "ESS")
 MAX_PRINTED = 240  # Legendre coefficients on paper: two pages
-_WIDER = 1.05  # than the sampled one: an error that rounding or few draws do not explain
-_SMALL = 1e-3  # below it a number without a unit is shown in 10^-6
+_WIDER = 1.05  # ratio to the sampled error that rounding or few draws cannot explain
+_SMALL = 1e-3  # dimensionless numbers below it are shown in 10^-6
 
 
 @REPORT.table("coefficients")
 def coefficient_tables(r: ReportInput) -> tuple[TextTable, ...]:
     """Tables of Legendre coefficients, of time dependence and frames, of monomial coefficients.
 
-    All are folded on the screen; the Legendre coefficients are printed.
+    All are folded on screen; the Legendre coefficients are printed.
     """
     kinds = {p.name: p.kind for p in r.fit.model.parameters}
     rows = list(r.coefficients)
     mark, held = gauge_mark(r), r.held
     groups = []
     for names in (("polynomial",), ("tdd", "frame")):
-        every = [row for row in rows if kinds.get(str(row["name"])) in names]
-        free = [row for row in every if str(row["name"]) not in held]
-        groups.append((free, [str(row["name"]) for row in every if str(row["name"]) in held]))
-    (polynomial, fixed), (others, fixed_others) = groups
+        rows_of_kind = [row for row in rows if kinds.get(str(row["name"])) in names]
+        free = [row for row in rows_of_kind if str(row["name"]) not in held]
+        groups.append(
+            (free, [str(row["name"]) for row in rows_of_kind if str(row["name"]) in held])
+        )
+    (polynomial, fixed), (other_parameters, fixed_others) = groups
     legendre = _parameter_table(
         r,
         f"Legendre coefficients [{r.unit}]{mark}: formal error beside posterior error",
@@ -42,14 +44,14 @@ def coefficient_tables(r: ReportInput) -> tuple[TextTable, ...]:
     )
     notes = gauge_note(r), _common_note(r), _held_note(r, fixed)
     out = [replace(legendre, note=_notes(*notes), leading=MAX_PRINTED, folded=True)]
-    if others:
+    if other_parameters:
         table = _parameter_table(
             r,
             f"Time dependence and exposure frames{mark}",
-            others[:MAX_ROWS],
+            other_parameters[:MAX_ROWS],
             with_unit=True,
         )
-        note = _notes(_held_note(r, fixed_others), further(len(others)))
+        note = _notes(_held_note(r, fixed_others), further(len(other_parameters)))
         out.append(replace(table, note=note, detail=True, folded=True))
     out += [_monomial_table(r, chip.number) for chip in r.fit.model.chips]
     return tuple(out)
@@ -60,7 +62,7 @@ def _notes(*sentences: str) -> str:
 
 
 def _common_note(r: ReportInput) -> str:
-    """Note on posterior errors that are wider than the draws of the sampler scatter."""
+    """Note on posterior errors that are larger than the scatter of the sampler's draws."""
     if r.posterior is None or "sd" not in r.coefficients.colnames:
         return ""
     sampled = dict(zip(r.posterior.model.names, r.posterior.sigma, strict=True))
@@ -78,7 +80,7 @@ def _common_note(r: ReportInput) -> str:
 
 
 def _held_note(r: ReportInput, names: list[str]) -> str:
-    """Note on parameters that are no measurements, those of one term together."""
+    """Note on parameters that are not measurements, grouped by term."""
     if not names:
         return ""
     terms: dict[str, list[str]] = {}
@@ -101,7 +103,7 @@ def _held_note(r: ReportInput, names: list[str]) -> str:
 
 
 def _readable(row: Any) -> tuple[float, str]:
-    """Factor and unit in which a parameter is shown: small ratios and angles by the million."""
+    """Factor and unit for displaying a parameter; small ratios and angles are shown in 10^-6."""
     unit = str(row["unit"] or "")
     largest = max(abs(float(row["lsq_value"])), float(row["lsq_sigma"]))
     return (1e6, "10⁻⁶") if not unit and largest < _SMALL else (1.0, unit or "none")
@@ -110,10 +112,10 @@ def _readable(row: Any) -> tuple[float, str]:
 def _parameter_table(
     r: ReportInput, caption: str, rows: list[Any], *, with_unit: bool
 ) -> TextTable:
-    known = set(r.coefficients.colnames)
+    column_names = set(r.coefficients.colnames)
 
     def cell(row: Any, key: str, factor: float = 1.0) -> Any:
-        value = row[key] if key in known else None
+        value = row[key] if key in column_names else None
         return value if value is None or value is np.ma.masked else factor * value
 
     out = []
@@ -141,7 +143,7 @@ def _parameter_table(
                 **({"Unit": unit} if with_unit else {}),
             }
         )
-    # where an interval is that of the sd and convergence was tested as a whole, paper omits them
+    # omitted on paper: intervals that follow from sd, and convergence, which was tested as a whole
     on_paper = tuple(k for k, name in enumerate(out[0]) if name not in _ON_SCREEN)
     return tabulated(caption, out, words=(0, 10), on_paper=on_paper)
 
@@ -154,13 +156,13 @@ def _monomial_table(r: ReportInput, chip: int) -> TextTable:
     name = model.chips[model.chip_code(chip)].name if r.several else chip
     cells = []
     for axis in (0, 1):
-        where = r.fit.model.coefficient_slice(chip, axis)
+        coefficients = r.fit.model.coefficient_slice(chip, axis)
         for solution in (r.fit, r.posterior):
             if solution is None:
                 cells.append([(MISSING, MISSING)] * basis.n_terms)
                 continue
-            cov = np.asarray(solution.cov)[where, where]
-            values, covariance = basis.to_monomials(np.asarray(solution.mean)[where], cov)
+            cov = np.asarray(solution.cov)[coefficients, coefficients]
+            values, covariance = basis.to_monomials(np.asarray(solution.mean)[coefficients], cov)
             sigma = np.sqrt(np.diag(covariance))
             texts = [(rounded(c, s), number(s, 2)) for c, s in zip(values, sigma, strict=True)]
             if solution is r.posterior:

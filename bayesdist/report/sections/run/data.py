@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 
 @REPORT.table("data")
 def data_tables(r: ReportInput) -> tuple[TextTable, ...]:
-    """Tables of what was read and rejected, errors by magnitude, exposures."""
+    """Tables of rows read and rejected, errors by magnitude, and exposures."""
     m, fit, words = r.stars.table, r.fit, r.words
     partial = ", of the sample" if r.stars.partial else ""
     pairs = {
@@ -49,11 +49,15 @@ def data_tables(r: ReportInput) -> tuple[TextTable, ...]:
         pairs[f"Epochs [yr]{partial}"] = first if first == last else f"{first} to {last}"
     if m.mag is not None and np.isfinite(m.mag).any():
         pairs[f"Magnitudes{partial}"] = f"{np.nanmin(m.mag):.2f} to {np.nanmax(m.mag):.2f}"
-    given = r.setting("data", "sigma", "as given")
+    sigma_setting = r.setting("data", "sigma", "as given")
     pairs[f"Errors of the {words.rows}"] = (
         "by magnitude, see below"
         if r.magnitude_errors is not None
-        else (str(given) if isinstance(given, str) else f"{given:g} {m.unit} on each axis")
+        else (
+            str(sigma_setting)
+            if isinstance(sigma_setting, str)
+            else f"{sigma_setting:g} {m.unit} on each axis"
+        )
     )
     reasons = [(f"{k} (reading)", count(v)) for k, v in m.rejected.items()]
     reasons += [(f"{k} ({words.rejection})", count(v)) for k, v in fit.rejected.items()]
@@ -111,18 +115,20 @@ def _exposure_table(r: ReportInput) -> TextTable:
 @REPORT.figure("data", when=lambda r: bool(_magnitudes(r).any()))
 def residuals_by_magnitude(r: ReportInput) -> Plot:
     """Density of the residuals against magnitude, with the errors assigned to each magnitude."""
-    words, known = r.words, _magnitudes(r)
+    words, has_magnitude = r.words, _magnitudes(r)
     text = f"Residuals grow towards faint stars; colour counts {words.rows}."
     if r.magnitude_errors is not None:
-        more = ", or somewhat more, because the stars were fitted to them" if words.leverage else ""
+        addition = (
+            ", or somewhat more, because the stars were fitted to them" if words.leverage else ""
+        )
         text += " The lines are ±1 σ as assigned to each magnitude: about two thirds of the"
-        text += f" {words.rows} lie between them{more}."
+        text += f" {words.rows} lie between them{addition}."
     if r.sample:
         text += f" Drawn from {r.sample}."
     return Plot(
         _density(
-            needed(r.stars.table.mag)[known],
-            r.stars.residual[known],
+            needed(r.stars.table.mag)[has_magnitude],
+            r.stars.residual[has_magnitude],
             unit=r.unit,
             errors=r.magnitude_errors,
             shown=f"sampled {words.rows}" if r.stars.partial else words.rows,
@@ -159,7 +165,7 @@ def coverage(r: ReportInput) -> Plot:
 
 
 def _magnitudes(r: ReportInput) -> Bool:
-    """Boolean mask (N,) of the stars whose magnitude is known."""
+    """Boolean mask (N,) that is True for stars with a known magnitude."""
     mag = r.stars.table.mag
     return np.zeros(len(r.stars.table), bool) if mag is None else np.isfinite(mag)
 
@@ -167,7 +173,7 @@ def _magnitudes(r: ReportInput) -> Bool:
 def _density(
     mag: Float, residual: Float, *, unit: str, errors: MagnitudeErrors | None, shown: str
 ) -> Figure:
-    """Figure with hexagons that count residuals, an axis of these in each panel."""
+    """Figure with hexagons that count residuals, with a panel for each axis."""
     fig = new_figure(WIDTH, 3.2)
     axes = fig.subplots(1, 2, sharey=True)
     for ax, axis in zip(axes, "uv", strict=True):

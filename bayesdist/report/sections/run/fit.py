@@ -1,4 +1,4 @@
-"""Least-squares fit in numbers, statistics and tests of its residuals."""
+"""Numbers of the least-squares fit, statistics of its residuals, and tests."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from bayesdist.utils.numbers import MISSING, count, display_scale, number, round
 
 @REPORT.table("fit")
 def fit_tables(r: ReportInput) -> tuple[TextTable, ...]:
-    """Tables of the linear fit in numbers, and statistics of its residuals."""
+    """Tables of the numbers of the linear fit, and of statistics of its residuals."""
     fit, model, stars = r.fit, r.fit.model, r.stars
     mas, words = r.scale_mas, r.words
     pairs = {
@@ -39,8 +39,8 @@ def fit_tables(r: ReportInput) -> tuple[TextTable, ...]:
     names = ("mean", "sigma", "min", "max", "median", "p01", "p99")
     heads = ("Mean", "σ", "Min", "Max", "Median", "1 %", "99 %")
     rows = []
-    for chip, here in _chips_of_stars(r):
-        for axis, values in zip("uv", stars.fit_residual[here].T, strict=True):
+    for chip, on_chip in _chips_of_stars(r):
+        for axis, values in zip("uv", stars.fit_residual[on_chip].T, strict=True):
             if values.size:
                 s = residual_statistics(values * scale.factor)
                 rows.append((f"{chip}{axis}", *(rounded(s[k], s["sigma"] / 10) for k in names)))
@@ -131,7 +131,7 @@ def _skew_table(r: ReportInput) -> TextTable:
 
 
 def _drifting(r: ReportInput) -> str:
-    """Words on terms whose drift was fitted, and on constants that may step."""
+    """Clause on terms with a fitted drift, and on constants that may step."""
     model = r.fit.model
     time = model.time
     if time is None:
@@ -155,7 +155,7 @@ def _drifting(r: ReportInput) -> str:
 
 
 def _chips_of_stars(r: ReportInput) -> list[tuple[str, Bool]]:
-    """Row names and masks (N,) of the stars used: of all chips and, where several, of each."""
+    """Row names and masks (N,) of the stars used, for all chips and, if several, for each chip."""
     table, used = r.stars.table, r.stars.used
     if not r.several:
         return [("", used)]
@@ -166,17 +166,19 @@ def _chips_of_stars(r: ReportInput) -> list[tuple[str, Bool]]:
 
 @REPORT.table("fit", needs=("score_tests",))
 def score_test_table(r: ReportInput) -> TextTable:
-    """Table of the tests of the residuals, and of their results."""
-    seen = [t.smallest for t in r.score_tests if np.isfinite(t.smallest)]
-    scale = display_scale(r.unit, seen or [1.0])
-    size, least = f"Size [{scale.unit}]", f"Detectable [{scale.unit}]"
+    """Table of the tests of the residuals and their results."""
+    sizes = [t.smallest for t in r.score_tests if np.isfinite(t.smallest)]
+    scale = display_scale(r.unit, sizes or [1.0])
+    size, detectable = f"Size [{scale.unit}]", f"Detectable [{scale.unit}]"
     rows = [
         {
             "Test": t.name if t.unit == r.unit else f"{t.name}, per year",
             "Statistic (dof)": f"{number(t.statistic, 3)} ({t.dof:.4g})",
             "p": "< 1e-300" if t.p_value < 1e-300 else number(t.p_value, 2),
             size: number(t.size * scale.factor, 2),
-            least: number(t.smallest * scale.factor, 2) if np.isfinite(t.smallest) else MISSING,
+            detectable: number(t.smallest * scale.factor, 2)
+            if np.isfinite(t.smallest)
+            else MISSING,
             "Result": f"found: {t.remedy}" if t.significant else "nothing found",
         }
         for t in r.score_tests

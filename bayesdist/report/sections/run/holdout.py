@@ -1,4 +1,4 @@
-"""Held-out stars against their prediction."""
+"""Held-out stars compared with their prediction."""
 
 from __future__ import annotations
 
@@ -23,8 +23,8 @@ if TYPE_CHECKING:
     from bayesdist.diagnose.holdout.tests import HeldTest
 
 _WHAT = ("u", "v, given u", "distance")
-_LEAST_RANGE = 0.3  # of the factor on the errors, above 1: chance alone must not look dramatic
-_FEWEST = 20  # stars of a region that is coloured
+_LEAST_RANGE = 0.3  # least range of the error factor about 1, so that chance is not exaggerated
+_FEWEST = 20  # stars in a region that is coloured
 _MOST_TESTS = 12
 _KEY = 3.0  # length of the arrow in the key, in sigma
 
@@ -32,7 +32,7 @@ _KEY = 3.0  # length of the arrow in the key, in sigma
 @REPORT.table("holdout", needs=("held_out.coverage",))
 def holdout_coverage(r: ReportInput) -> TextTable:
     """Table of the coverage of the held-out stars along each axis."""
-    found = needed(r.held_out)
+    held_out = needed(r.held_out)
     rows = [
         {
             "Axis": c.axis,
@@ -42,7 +42,7 @@ def holdout_coverage(r: ReportInput) -> TextTable:
             "95 % interval": f"{c.interval[0]:.3f} to {c.interval[1]:.3f}",
             "Predicted": f"{c.expected:.3f}",
         }
-        for c in found.coverage
+        for c in held_out.coverage
     ]
     note = "False matches are part of the prediction; the interval is that of independent stars."
     return tabulated("Coverage of the held-out stars", rows, words=(0, 1), note=note)
@@ -51,11 +51,11 @@ def holdout_coverage(r: ReportInput) -> TextTable:
 @REPORT.table("holdout", needs=("held_out",))
 def holdout_table(r: ReportInput) -> TextTable:
     """Table of the most informative tests."""
-    found = needed(r.held_out)
-    shown = found.tests[:_MOST_TESTS]
+    stars = needed(r.held_out)
+    shown = stars.tests[:_MOST_TESTS]
     rows = [
         {
-            "Test": _question(test, found.unit),
+            "Test": _question(test, stars.unit),
             "Where": test.where,
             "Stars": count(test.n),
             "Found": number(test.value, 3),
@@ -66,7 +66,7 @@ def holdout_table(r: ReportInput) -> TextTable:
         for test in shown
     ]
     note = (
-        f"The {len(shown)} most telling of {len(found.tests)} tests, all in holdout.ecsv; corrected"
+        f"The {len(shown)} most telling of {len(stars.tests)} tests, all in holdout.ecsv; corrected"
         " for their number after Holm (1979)."
     )
     return tabulated("Tests of the held-out stars", rows, words=(0, 1), note=note)
@@ -85,7 +85,7 @@ def _question(test: HeldTest, unit: str) -> str:
 @REPORT.figure("holdout", needs=("held_out",), printed=lambda r: r.campaign is None)
 def holdout(r: ReportInput) -> Plot:
     """Predictive probabilities, and residuals by region in units of their prediction."""
-    found, mosaic = needed(r.held_out), r.mosaic
+    stars, mosaic = needed(r.held_out), r.mosaic
     rows, columns = (max(place[k] for place in mosaic.places) + 1 for k in (0, 1))
     aspect = max(ny / nx for nx, ny in mosaic.sizes)
     panel = min(0.75 * WIDTH / columns, 4.4)
@@ -94,31 +94,31 @@ def holdout(r: ReportInput) -> Plot:
     parts = fig.subfigures(2, 1, height_ratios=[1.9, height - 1.9], squeeze=False)
     top, bottom = parts[:, 0]
     for k, ax in enumerate(top.subplots(1, 3, sharey=True)):
-        _histogram(ax, found, k)
+        _histogram(ax, stars, k)
     grid = bottom.subplots(rows, columns, squeeze=False)
     panels = [grid[place] for place in mosaic.places]
-    limit = _limit(found)
+    limit = _limit(stars)
     norm = TwoSlopeNorm(1.0, 1.0 / limit, limit)
     for k, (size, name) in enumerate(zip(mosaic.sizes, mosaic.names, strict=True)):
-        drawn = _regions(panels[k], found, k, size, norm)
+        drawn = _regions(panels[k], stars, k, size, norm)
         panels[k].set_title(name or "Regions")
     for ax in grid.ravel():
         ax.set_visible(ax in panels)
     bar = bottom.colorbar(drawn, ax=panels, shrink=0.9, aspect=25)
     bar.set_label("residuals / predicted [no unit]")
-    n_tests = len(found.tests)
-    whole = f", {len(found.exposures)} whole exposures among them" if found.exposures else ""
+    n_tests = len(stars.tests)
+    clause = f", {len(stars.exposures)} whole exposures among them" if stars.exposures else ""
     return Plot(
         fig,
         "Held-out stars against their prediction",
-        f"{count(found.n)} stars that the fit has not seen{whole}. Top: where each lies in its"
+        f"{count(stars.n)} stars that the fit has not seen{clause}. Top: where each lies in its"
         " predicted distribution, false matches and the posterior's own error included; level"
         " within the band (99 % of a bin) if the prediction is right. Bottom: the residuals of"
         " each region in units of those predicted (1: as predicted), and the mean offset in its"
         f" own sigma. Of {n_tests} tests the most telling, corrected for their number:"
-        f" {found.verdict}.",
+        f" {stars.verdict}.",
         f"Histograms of predictive probabilities and a map of normalised residuals: "
-        f"{found.verdict}.",
+        f"{stars.verdict}.",
     )
 
 
@@ -138,7 +138,7 @@ def _histogram(ax: Axes, found: HoldoutValidation, k: int) -> None:
 
 
 def _limit(found: HoldoutValidation) -> float:
-    """Largest factor that the colours show."""
+    """Largest factor on the colour scale."""
     good = found.region_scale[found.region_n >= _FEWEST]
     far = np.exp(np.abs(np.log(good)).max()) if good.size else 1.0
     return float(np.clip(far, 1 + _LEAST_RANGE, 4.0))
@@ -147,7 +147,7 @@ def _limit(found: HoldoutValidation) -> float:
 def _regions(
     ax: Axes, found: HoldoutValidation, k: int, size: tuple[float, float], norm: TwoSlopeNorm
 ) -> PatchCollection:
-    """Draw regions of one chip: their colour is the factor, their arrow the offset in sigma."""
+    """Draw the regions of one chip: colour shows the factor, arrows the offset in sigma."""
     chips = list(dict.fromkeys(bin_.chip for bin_ in found.regions))
     mine = [
         b

@@ -1,4 +1,4 @@
-"""Distortion over the detector, and its uncertainty there."""
+"""Distortion over the detector, and its uncertainty."""
 
 from __future__ import annotations
 
@@ -33,8 +33,8 @@ from bayesdist.utils.numbers import display_scale, number, size_of, with_mas
 if TYPE_CHECKING:
     from bayesdist.assess import VectorMap
 
-MOST_PANELS = 4  # of chips: more are drawn in one focal plane
-MOST_ALONG = 34  # vectors along the longer side of a focal plane: more would hide each other
+MOST_PANELS = 4  # largest number of chips with separate panels; more share one focal plane
+MOST_ALONG = 34  # vectors along the longer side of a focal plane; more would overlap
 
 
 @REPORT.table("maps")
@@ -60,9 +60,9 @@ def map_table(r: ReportInput) -> TextTable:
             rows.append((whose if r.several else {"Solution": m.kind}) | row)
     first = r.chips[0].formal_map
     when = "" if first.epoch is None else f", epoch {first.epoch:.2f}"
-    which = "each chip" if r.several else f"chip {first.chip}"
+    chip_words = "each chip" if r.several else f"chip {first.chip}"
     return tabulated(
-        f"Uncertainty of the position, 1 σ, {which}{when}{gauge_mark(r)}",
+        f"Uncertainty of the position, 1 σ, {chip_words}{when}{gauge_mark(r)}",
         rows,
         note="Per axis: rms of σ u and σ v. CE68, CE95: radii of the circles that hold 68 and 95 %."
         f" {gauge_of_maps(r)}".rstrip(),
@@ -117,20 +117,22 @@ def distortion(r: ReportInput) -> Plot:
 
     As section 4 of the WISE distortion report, with the zeroth order suppressed.
     """
-    v, where = _longest(r, "displacement")
+    v, position = _longest(r, "displacement")
     notes = {c.chip.name: c.displacement.part_note for c in r.chips}
     note = v.part_note
     if len(set(notes.values())) > 2:
         note = "relative to the best similarity of each chip about its reference pixel"
     elif len(set(notes.values())) > 1:
         note = "; ".join(f"{name} {text}" for name, text in notes.items())
-    own = " Each chip is compared with its own array: gap and rotation between chips are not shown."
+    own_array_note = (
+        " Each chip is compared with its own array: gap and rotation between chips are not shown."
+    )
     return Plot(
         _flow(r, [c.displacement for c in r.chips]),
         "Distortion, zeroth order suppressed",
         f"Vectors run from the array position to where the distortion puts it, {note}; the"
-        f" largest is {r.length(v.length_max)} at {where}, ringed."
-        f"{own if r.several else ''}",
+        f" largest is {r.length(v.length_max)} at {position}, ringed."
+        f"{own_array_note if r.several else ''}",
         f"Vector-flow diagram of the distortion, largest vector {r.length(v.length_max)}.",
     )
 
@@ -162,13 +164,13 @@ def pixel_area(r: ReportInput) -> Plot:
     )
     low, high = min(a.area.min() for a in areas), max(a.area.max() for a in areas)
     sigma = max(float(a.sigma.max()) for a in areas)
-    own, between = "", ""
+    of_chip, between = "", ""
     if r.several:
-        own = " of each chip"
-        first, *others = r.chips
+        of_chip = " of each chip"
+        first, *other_chips = r.chips
         ratios = ", ".join(
             f"{c.area.reference_area / first.area.reference_area:.5f} ({c.chip.name})"
-            for c in others
+            for c in other_chips
         )
         between = (
             f" The reference pixels themselves cover, relative to that of {first.chip.name}:"
@@ -177,7 +179,7 @@ def pixel_area(r: ReportInput) -> Plot:
     return Plot(
         panels.figure,
         "Pixel area",
-        f"Relative to the reference pixel{own} the area runs from {low:.5f} to"
+        f"Relative to the reference pixel{of_chip} the area runs from {low:.5f} to"
         f" {high:.5f}, known to {number(sigma, 2)} at worst: flat-fielded"
         f" point-source photometry is to be multiplied by it.{between}",
         "Contour map of the relative pixel area.",
@@ -219,12 +221,12 @@ def pixel_scale(r: ReportInput) -> Plot:
 @REPORT.figure("maps")
 def distortion_non_linear(r: ReportInput) -> Plot:
     """Vectors of the non-linear part, as Figure 4.1 of the ACS handbook."""
-    v, where = _longest(r, "non_linear")
+    v, position = _longest(r, "non_linear")
     return Plot(
         _flow(r, [c.non_linear for c in r.chips]),
         "Distortion, non-linear part",
         f"Only {v.part_note}: what remains beyond shift, scale, rotation and skew, at most"
-        f" {r.length(v.length_max)} at {where}, ringed.",
+        f" {r.length(v.length_max)} at {position}, ringed.",
         f"Vector diagram of the non-linear part, largest vector {r.length(v.length_max)}.",
     )
 
@@ -232,7 +234,7 @@ def distortion_non_linear(r: ReportInput) -> Plot:
 def map_panels(r: ReportInput, maps: int = 1, *, colorbar: bool = True) -> Panels:
     """Panels of maps: one for each chip, or one focal plane if there are many."""
     frames = chip_frames(r.solution, epoch=r.chips[0].best_map.epoch)
-    outlines = [one.outline(c.chip.size) for one, c in zip(frames, r.chips, strict=True)]
+    outlines = [frame.outline(c.chip.size) for frame, c in zip(frames, r.chips, strict=True)]
     if len(r.chips) <= MOST_PANELS or overlap(outlines):
         panels = ChipPanels(r.mosaic, maps, colorbar=colorbar)
         panels.frame()
@@ -249,10 +251,10 @@ def map_titles(
     texts: Sequence[Callable[[float, float], str]],
     joined: str = ": ",
 ) -> list[str]:
-    """Titles of panels of `map_panels`, which state the extremes of what is in each.
+    """Titles for panels of `map_panels`, which state the extremes of each map.
 
-    `grids` are the maps of the first chip, then those of the next; `texts` make words of the lowest
-    and the highest value of each map.
+    `grids`: maps of the first chip, followed by those of the next one. `texts`: functions that make
+    a text from the lowest and the highest value of each map.
     """
     n = len(texts)
     if isinstance(panels, FocalPlane):
@@ -270,22 +272,22 @@ def map_titles(
 
 
 def _flow(r: ReportInput, vectors: Sequence[VectorMap]) -> Figure:
-    """Vectors of all chips in the focal plane, in pixels, whatever the unit of u and v.
+    """Draw the vectors of all chips in the focal plane, in pixels for any unit of u and v.
 
-    Each chip has a panel of its own where the solution does not tell the chips apart.
+    Each chip has a separate panel if the solution does not separate the chips on the sky.
     """
     lengths = [float(np.hypot(*v.on_detector).max()) for v in vectors]
     frames = chip_frames(r.solution, epoch=r.chips[0].best_map.epoch)
-    outlines = [one.outline(c.chip.size) for one, c in zip(frames, r.chips, strict=True)]
+    outlines = [frame.outline(c.chip.size) for frame, c in zip(frames, r.chips, strict=True)]
     apart = not overlap(outlines)
-    every = _every(vectors, np.ptp(np.concatenate(outlines), axis=0).max()) if apart else 1
-    chips = [Arrows.of_map(v, every) for v in vectors]
-    M = cell_magnification(min(one.step for one in chips), max(lengths))
+    step = _every(vectors, np.ptp(np.concatenate(outlines), axis=0).max()) if apart else 1
+    chips = [Arrows.of_map(v, step) for v in vectors]
+    M = cell_magnification(min(arrows.step for arrows in chips), max(lengths))
     key = nice_below(max(lengths) / 1.5)
     border = BORDER * r.mosaic.longest_side
     look: dict[str, Any] = {"magnification": M, "key": key, "colored": True}
     if not apart:
-        reach = max(one.reach(M, c.chip.size) for one, c in zip(chips, r.chips, strict=True))
+        reach = max(arrows.reach(M, c.chip.size) for arrows, c in zip(chips, r.chips, strict=True))
         separate = ChipPanels(r.mosaic, colorbar=True)
         separate.frame(reach + border)
         titles = [
@@ -298,8 +300,8 @@ def _flow(r: ReportInput, vectors: Sequence[VectorMap]) -> Figure:
     placed = chips
     if r.several:
         placed = [
-            one.placed(frame, ringed=k == worst)
-            for k, (one, frame) in enumerate(zip(chips, frames, strict=True))
+            arrows.placed(frame, ringed=k == worst)
+            for k, (arrows, frame) in enumerate(zip(chips, frames, strict=True))
         ]
     ends = [np.stack([a.x + M * a.du, a.y + M * a.dv], axis=1) for a in placed]
     corners = np.concatenate(outlines)
@@ -319,15 +321,15 @@ def _flow(r: ReportInput, vectors: Sequence[VectorMap]) -> Figure:
 
 
 def _every(vectors: Sequence[VectorMap], extent: float) -> int:
-    """Smallest further step of the grids that leaves few enough vectors along a focal plane."""
+    """Smallest additional step of the grids that leaves few enough vectors in a focal plane."""
     step = min(spacing(v.x, v.y) for v in vectors)
     steps = math.gcd(*(len(a) - 1 for v in vectors for a in (v.x, v.y)))
-    known = [k for k in range(1, steps + 1) if steps % k == 0]
-    return next((k for k in known if extent / (k * step) <= MOST_ALONG), known[-1])
+    divisors = [k for k in range(1, steps + 1) if steps % k == 0]
+    return next((k for k in divisors if extent / (k * step) <= MOST_ALONG), divisors[-1])
 
 
 def _longest(r: ReportInput, which: str) -> tuple[VectorMap, str]:
-    """Vectors of the chip where the longest one is, and its position in words."""
+    """Vectors of the chip with the longest vector, and the position of that vector as text."""
     worst = max(r.chips, key=lambda c: getattr(c, which).length_max)
     vectors: VectorMap = getattr(worst, which)
     return vectors, f"pixel {r.position(vectors.position_of_max, worst.chip.number)}"
@@ -343,8 +345,8 @@ def formal_uncertainty(r: ReportInput) -> Plot:
     maps = [m for c in r.chips for m in c.maps]
     largest = max(m.radius_max for m in maps)
     widest = max(max(m.sigma_u_max, m.sigma_v_max) for m in maps)
-    every = max(sparse_step(maps), 2 if r.several else 1)  # panels of several chips are small
-    M = crosses_magnification(maps, every)
+    step = max(sparse_step(maps), 2 if r.several else 1)  # panels of several chips are small
+    M = crosses_magnification(maps, step)
     panels = ChipPanels(r.mosaic, len(r.chips[0].maps))
     panels.frame(M * widest + BORDER * r.mosaic.longest_side)
     titles = [
@@ -354,16 +356,18 @@ def formal_uncertainty(r: ReportInput) -> Plot:
         for k, c in enumerate(r.chips)
         for m in c.maps
     ]
-    cross_map(panels, maps, titles, magnification=M, key=nice_below(largest), every=every)
+    cross_map(panels, maps, titles, magnification=M, key=nice_below(largest), every=step)
     by_kind = [
         max(maps, key=lambda m: m.radius_max)
         for maps in zip(*(c.maps for c in r.chips), strict=True)
     ]
-    found = " and ".join(f"{r.length(float(np.nanmax(m.per_axis)))} ({m.kind})" for m in by_kind)
+    largest_errors = " and ".join(
+        f"{r.length(float(np.nanmax(m.per_axis)))} ({m.kind})" for m in by_kind
+    )
     return Plot(
         panels.figure,
         "Uncertainty diagram",
         "From each position four vectors to all combinations of ±1 σ in u and v, enlarged as"
-        f" stated above the panels; the largest error per axis is {found}.",
-        f"Crosses of ±1 sigma over the detector; largest per axis {found}.",
+        f" stated above the panels; the largest error per axis is {largest_errors}.",
+        f"Crosses of ±1 sigma over the detector; largest per axis {largest_errors}.",
     )

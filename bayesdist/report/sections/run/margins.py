@@ -1,4 +1,4 @@
-"""Requirements: verdicts, each statistic against its limit, and validity periods."""
+"""Requirements: verdicts, statistics relative to limits, and validity periods."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ def margin_table(r: ReportInput) -> TextTable:
 
 
 def _judgement(m: Margin, several: bool) -> str:
-    """Words on verdict, reason, position of the largest error, and remedy."""
+    """Sentence on verdict, reason, position of the largest error, and remedy."""
     on = f" of chip {m.worst.chip}" if several else ""
     out = [
         f"{m.verdict}: {m.reason}" if m.reason else m.verdict,
@@ -75,16 +75,16 @@ def _judgement(m: Margin, several: bool) -> str:
 
 @REPORT.table("margins", needs=("margins",))
 def rests_on_table(r: ReportInput) -> TextTable | None:
-    """Table of the assumptions and measurements behind the verdicts."""
+    """Table of the assumptions and measurements on which the verdicts are based."""
     clauses: dict[str, list[str]] = {}
     for m in r.margins:
         for clause in m.rests_on:
             clauses.setdefault(clause, []).append(m.requirement.name)
     if not clauses:
         return None
-    every = len(r.margins)
+    n_margins = len(r.margins)
     rows = tuple(
-        (clause, "all" if len(of) == every else ", ".join(of)) for clause, of in clauses.items()
+        (clause, "all" if len(of) == n_margins else ", ".join(of)) for clause, of in clauses.items()
     )
     return TextTable("Basis of the verdicts", ("Basis", "Requirements"), rows, words=(0, 1))
 
@@ -123,5 +123,5 @@ def validity_period(r: ReportInput) -> Plot:
         " band is the 95 % interval of counting draws, red the date (with its interval) at which"
         " the probability falls below what is asked. This assumes that the drift continues as"
         " modelled; a change of its rate is not included.",
-        " ".join(f"{one.sentence}." for one in periods),
+        " ".join(f"{period.sentence}." for period in periods),
     )

@@ -1,4 +1,4 @@
-"""Change with time: verdict, tables of the periods, and the difference of first and last."""
+"""Change with time: verdict, tables of the periods, and difference of the last from the first."""
 
 from __future__ import annotations
 
@@ -27,18 +27,18 @@ if TYPE_CHECKING:
     from bayesdist.diagnose.periods import TimeVariation
     from bayesdist.diagnose.residuals.tables import StatisticsTable
 
-GRID = 17  # vectors along the longer side
-_CLEAR = 3.0  # sigmas beyond which a coefficient counts
+GRID = 17  # number of vectors along the longer side
+_CLEAR = 3.0  # sigmas above which a coefficient is significant
 
 
 @REPORT.table("periods", needs=("periods",))
 def period_tables(r: ReportInput) -> tuple[TextTable, ...]:
-    """Tables of verdict, periods, coefficients of first and last, and residuals."""
-    found = needed(r.periods)
-    out = [_verdict(found), _periods(found, r), _coefficients(found)]
-    for chip, table in zip(found.comparison.model.chips, found.residuals, strict=True):
+    """Tables of the verdict, the periods, coefficients of the first and last, and residuals."""
+    variation = needed(r.periods)
+    out = [_verdict(variation), _periods(variation, r), _coefficients(variation)]
+    for chip, table in zip(variation.comparison.model.chips, variation.residuals, strict=True):
         out.append(_residuals(table, r.on_chip(chip)))
-    return (*out, _patterns(found, r))
+    return (*out, _patterns(variation, r))
 
 
 def _verdict(found: TimeVariation) -> TextTable:
@@ -115,7 +115,7 @@ def _coefficients(found: TimeVariation) -> TextTable:
 
 
 def _residuals(table: StatisticsTable, on_chip: str) -> TextTable:
-    """Table C-1."""
+    """Table of residual statistics, as Table C-1 of WSDC D-T033."""
     unit = table.unit
     names = ("mean", "sigma", "min", "max", "median", "p01", "p99")
     heads = ("Mean", "σ", "Min", "Max", "Median", "1 %", "99 %")
@@ -142,10 +142,15 @@ def _residuals(table: StatisticsTable, on_chip: str) -> TextTable:
 def _patterns(found: TimeVariation, r: ReportInput) -> TextTable:
     rows = []
     for chip, several in zip(found.comparison.model.chips, found.patterns, strict=True):
-        for one in several:
-            head = f"{one.period}/{one.axis}{r.on_chip(chip)}"
-            rms = with_mas(one.rms, r.unit, r.scale_mas, 2)
-            cells = (number(one.p_value, 2), rms, number(one.correlation, 2), count(one.n_bins))
+        for pattern in several:
+            head = f"{pattern.period}/{pattern.axis}{r.on_chip(chip)}"
+            rms = with_mas(pattern.rms, r.unit, r.scale_mas, 2)
+            cells = (
+                number(pattern.p_value, 2),
+                rms,
+                number(pattern.correlation, 2),
+                count(pattern.n_bins),
+            )
             rows.append((head, *cells))
     return TextTable(
         "Patterns of the residuals: each period against all the others",
@@ -162,32 +167,32 @@ def period_differences(r: ReportInput) -> Plot:
 
     Vectors that noise would make as long at their position in more than 5 % of cases are pale.
     """
-    found = needed(r.periods)
-    comparison, unit = found.comparison, found.comparison.model.unit
+    result = needed(r.periods)
+    comparison, unit = result.comparison, result.comparison.model.unit
     longest = r.mosaic.longest_side
     chips, lengths = [], []
     for chip in comparison.model.chips:
         nx, ny = (max(3, round(GRID * side / longest)) for side in chip.size)
-        f = comparison.field(found.last, found.first, chip=chip, grid=(nx, ny))
+        f = comparison.field(result.last, result.first, chip=chip, grid=(nx, ny))
         gx, gy = (a.ravel() for a in np.meshgrid(f.x, f.y))
         clear = (f.p_value < CHANCE).ravel()
         chips.append(Arrows(gx, gy, f.du.ravel(), f.dv.ravel(), spacing(f.x, f.y), clear))
         lengths.append(float(chips[-1].length.max()))
     largest = max(lengths)
-    M = magnification_of(2.0 * min(one.step for one in chips), largest)
+    M = magnification_of(2.0 * min(arrows.step for arrows in chips), largest)
     panels = ChipPanels(r.mosaic)
     panels.frame(0.02 * longest + M * largest)
     titles = [
-        panels.title(k, f"MJD {found.last} − {found.first},\nlargest {size_of(here, unit)}")
+        panels.title(k, f"MJD {result.last} − {result.first},\nlargest {size_of(here, unit)}")
         for k, here in enumerate(lengths)
     ]
     vector_map(panels, chips, titles, magnification=M, key=nice_below(largest / 1.5), unit=unit)
-    change, mas = found.ends, r.scale_mas
+    change, mas = result.ends, r.scale_mas
     size = with_mas(change.largest, r.unit, mas)
     return Plot(
         panels.figure,
         "Difference of the latest and the earliest period",
-        f"Positions by the model of {found.last} minus those by the model of {found.first}. Dark"
+        f"Positions by the model of {result.last} minus those by the model of {result.first}. Dark"
         " vectors differ from zero beyond 2 σ at their position (both axes together); neighbours"
         f" share their coefficients and are dark together. The largest is {size} at pixel"
         f" {r.position(change.at, change.chip)}; noise alone makes up to"

@@ -39,7 +39,7 @@ _INDEPENDENCE = (
 
 @REPORT.table("outliers", needs=("posterior",))
 def outlier_table(r: ReportInput) -> TextTable:
-    """Table of the mixture's own parameters, and of the number of stars or detections it flags."""
+    """Table of the parameters of the mixture, and of the number of stars or detections flagged."""
     post, words = needed(r.posterior), r.words
     named = {
         "f": (f"Fraction of {words.false_rows}, f", ""),
@@ -96,31 +96,31 @@ def outlier_table(r: ReportInput) -> TextTable:
 
 @REPORT.table("outliers", needs=("added_errors",))
 def added_errors_table(r: ReportInput) -> TextTable:
-    """Table of errors beyond the quoted ones, by the groups that the evidence asks for."""
-    found = needed(r.added_errors)
-    scale = display_scale(r.unit, found.sigma)
+    """Table of errors in addition to the quoted ones, in the groups that the evidence supports."""
+    added = needed(r.added_errors)
+    scale = display_scale(r.unit, added.sigma)
     rows = []
-    for g, label in enumerate(found.labels):
-        for a, axis in enumerate("uv" if found.by_axis else ("u and v",)):
-            size, error = scale.factor * found.sigma[g, a], scale.factor * found.sigma_error[g, a]
+    for g, label in enumerate(added.labels):
+        for a, axis in enumerate("uv" if added.by_axis else ("u and v",)):
+            size, error = scale.factor * added.sigma[g, a], scale.factor * added.sigma_error[g, a]
             rows.append(
                 {
-                    "Stars": f"{found.by} {label}" if found.by else "all",
+                    "Stars": f"{added.by} {label}" if added.by else "all",
                     "Axis": axis,
-                    "Number": count(found.n[g, a]),
+                    "Number": count(added.n[g, a]),
                     f"Error [{scale.unit}]": rounded(size, error),
                     "σ": number(error, 2),
-                    "Added to the quoted errors": number(scale.factor * found.excess[g, a], 3),
+                    "Added to the quoted errors": number(scale.factor * added.excess[g, a], 3),
                 }
             )
-    gains = ", ".join(f"by {name} {number(gain, 3)}" for name, gain in found.evidence.items())
+    gains = ", ".join(f"by {name} {number(gain, 3)}" for name, gain in added.evidence.items())
     note = (
         "Restricted likelihood of the residuals, false matches allowed for. ln evidence over one"
         f" error for both axes: {gains}; groups are formed from {number(DECISIVE)} on."
     )
-    if found.added is not None:
+    if added.added is not None:
         note += " What is beyond the least was added to the quoted errors, and j is the least."
-    folded = found.added is None  # the errors stand as they were quoted
+    folded = added.added is None  # the errors stand as they were quoted
     return tabulated("Errors beyond the quoted ones", rows, words=(0, 1), note=note, folded=folded)
 
 
@@ -154,7 +154,7 @@ def correlations(r: ReportInput) -> Plot:
     i, j = np.unravel_index(int(upper.argmax()), upper.shape)
     sd, formal = np.sqrt(np.diag(posterior.cov)), np.sqrt(np.diag(r.fit.cov))
     ratio = number(float(np.median(sd[formal > 0] / formal[formal > 0])))
-    most = (
+    pair = (
         f"the strongest correlation is {number(float(matrix[i, j]), 2)}, of {names[i]} and"
         f" {names[j]}"
         if len(names) > 1
@@ -163,11 +163,11 @@ def correlations(r: ReportInput) -> Plot:
     return Plot(
         fig,
         "Correlations of the coefficients",
-        f"Correlations of the posterior; {most}. Coefficients that are strongly correlated must"
+        f"Correlations of the posterior; {pair}. Coefficients that are strongly correlated must"
         " not be quoted without their covariance, which posterior.nc and the products hold. Over"
         f" all parameters the posterior's sd is {ratio} times the formal σ of least squares"
         " (median).",
-        f"Matrix of correlations of {len(names)} coefficients; {most}.",
+        f"Matrix of correlations of {len(names)} coefficients; {pair}.",
     )
 
 

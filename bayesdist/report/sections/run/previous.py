@@ -20,21 +20,25 @@ ERRORS = {
 
 @REPORT.table("previous", needs=("previous",))
 def previous_table(r: ReportInput) -> TextTable:
-    """Table of the difference of each chip, of its significance, and of what was taken out."""
+    """Table of the difference of each chip, its significance, and what was removed."""
     rows = []
-    for found in r.previous:
-        mas = found.frame.pixel_mas or r.scale_mas
-        field, similarity = found.field, found.similarity
-        verdict = {True: "differs", False: "within the errors", None: "not tested"}[found.differs]
-        chip = next((c.chip for c in r.chips if c.chip.number == found.a.chip), r.chips[0].chip)
+    for comparison in r.previous:
+        mas = comparison.frame.pixel_mas or r.scale_mas
+        field, similarity = comparison.field, comparison.similarity
+        verdict = {True: "differs", False: "within the errors", None: "not tested"}[
+            comparison.differs
+        ]
+        chip = next(
+            (c.chip for c in r.chips if c.chip.number == comparison.a.chip), r.chips[0].chip
+        )
         shift = None if similarity.shift is None else float(np.hypot(*similarity.shift))
         scale = percent(similarity.scale - 1.0, 2) if similarity.same_unit else MISSING
         rows.append(
             {
                 "Chip": chip.name or str(chip.number),
-                "rms": with_mas(found.rms, "pix", mas),
-                "Largest": with_mas(found.largest, "pix", mas),
-                "At pixel": "({:.0f}, {:.0f})".format(*found.position_of_largest),
+                "rms": with_mas(comparison.rms, "pix", mas),
+                "Largest": with_mas(comparison.largest, "pix", mas),
+                "At pixel": "({:.0f}, {:.0f})".format(*comparison.position_of_largest),
                 "Chi-square (dof)": MISSING
                 if field is None
                 else f"{number(field.chi2)} ({field.dof})",

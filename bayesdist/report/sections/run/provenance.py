@@ -1,4 +1,4 @@
-"""Files that were written, and the provenance of the result."""
+"""Written files, and the provenance of the result."""
 
 from __future__ import annotations
 
@@ -17,25 +17,25 @@ from bayesdist.report.texttable import Level, TextTable, check_cells, listing, m
 from bayesdist.utils.numbers import MISSING, count, number, percent
 
 _BLANK = "_" * 24  # to be filled in on paper
-_DETAILS = ("stages", "timings", "versions")  # the margin of each page names our version
-_PRINTED = {"inputs": 4}  # rows on paper
+_DETAILS = ("stages", "timings", "versions")  # not printed; each page names the version
+_PRINTED = {"inputs": 4}  # number of rows on paper
 
 
 @REPORT.table("products", needs=("products",))
 def product_table(r: ReportInput) -> TextTable:
-    """Table of files with the checks of each as written; an outcome of several files is one row."""
-    found: dict[tuple[str, ...], list[str]] = {}  # files in which each check has the same outcome
+    """Table of files with their checks; an outcome that several files share is one row."""
+    files_by_outcome: dict[tuple[str, ...], list[str]] = {}  # by the outcome of a check
     for product in r.products:
         for check in product.checks:
-            found.setdefault((check.name, *check_cells(check)), []).append(product.path)
+            files_by_outcome.setdefault((check.name, *check_cells(check)), []).append(product.path)
     rows: list[tuple[str, ...]] = []
     for product in r.products:
-        own = [cells for cells, files in found.items() if files == [product.path]]
+        own_rows = [cells for cells, files in files_by_outcome.items() if files == [product.path]]
         head = product.path, product.what
-        for cells in own or [(MISSING, MISSING, MISSING, Level("note"))]:
+        for cells in own_rows or [(MISSING, MISSING, MISSING, Level("note"))]:
             rows.append((*head, *cells))
             head = "", ""
-    for cells, files in found.items():
+    for cells, files in files_by_outcome.items():
         if len(files) > 1:
             rows.append((", ".join(files), MISSING, *cells))
     heads = ("File", "Format", "Check", "Found", "Limit", "Status")
@@ -44,7 +44,7 @@ def product_table(r: ReportInput) -> TextTable:
 
 @REPORT.table("provenance")
 def document_tables(r: ReportInput) -> tuple[TextTable, ...]:
-    """Tables by which a copy is identified and released: document id, hash, signatures."""
+    """Tables that identify and release a copy: document id, hash, signatures."""
     digest = config_hash(r)
     document = {"Document id": document_id(r), "SHA-256 of the resolved configuration": digest}
     rows = tuple((role, _BLANK, _BLANK, _BLANK) for role in ("Prepared", "Reviewed", "Approved"))
@@ -56,15 +56,15 @@ def document_tables(r: ReportInput) -> tuple[TextTable, ...]:
 
 
 def config_hash(r: ReportInput) -> str:
-    """SHA-256 of the resolved configuration, whatever the order of its keys."""
+    """SHA-256 of the resolved configuration, independent of the order of its keys."""
     text = json.dumps(r.config, sort_keys=True, default=str)
     return hashlib.sha256(text.encode("utf-8")).hexdigest()
 
 
 def document_id(r: ReportInput) -> str:
-    """Name of the calibration, day of the run, and eight digits of configuration and start.
+    """Name of the calibration, day of the run, and eight digits from configuration and start.
 
-    Another run has another id, and a report that is drawn again has that of its run.
+    Every run has a different id, and all reports of a run have the same one.
     """
     began = str(r.provenance.get("created", ""))
     digest = hashlib.sha256(f"{config_hash(r)} {began}".encode()).hexdigest()[:8]
@@ -74,7 +74,7 @@ def document_id(r: ReportInput) -> str:
 
 @REPORT.table("provenance")
 def provenance_tables(r: ReportInput) -> tuple[TextTable, ...]:
-    """Tables of the provenance: single values first, then one table for each group."""
+    """Tables of the provenance: single values, followed by a table for each group."""
     single = {k: _plain(v) for k, v in r.provenance.items() if not isinstance(v, Mapping)}
     if r.posterior is not None:
         s = r.posterior.sampler
@@ -120,7 +120,7 @@ def _plain(value: Any) -> str:
 
 @REPORT.table("provenance")
 def config_table(r: ReportInput) -> TextTable | None:
-    """Table of the resolved configuration, one key a row."""
+    """Table of the resolved configuration, with one row per key."""
     pairs: dict[str, str] = {}
     for section, value in r.config.items():
         if isinstance(value, Mapping):

@@ -1,4 +1,4 @@
-"""Residuals against their distribution under the fitted mixture, and over the detector."""
+"""Residuals relative to their distribution under the fitted mixture, and over the detector."""
 
 from __future__ import annotations
 
@@ -74,7 +74,7 @@ def _histograms(
     sampled: bool,
     rows: str,
 ) -> Figure:
-    """Figure with two rows of panels: the core, and everything."""
+    """Figure with two rows of panels: the core, and all residuals."""
     core, tail = histogram_reach(residual, curves)
     everything = "whole sample" if sampled else f"all {rows}"
     fig = new_figure(WIDTH, 4.9)
@@ -106,20 +106,20 @@ def residual_vectors(r: ReportInput) -> Plot:
     filled = sum(int((np.asarray(c.binned.count) > 0).sum()) for c in r.chips)
     significant = sum(int(significant_cells(c.binned).sum()) for c in r.chips)
     chance = CHANCE * filled
-    axes, which, cannot = "", "", "the polynomial cannot follow"
+    axes, note, cannot = "", "", "the polynomial cannot follow"
     if r.fit.model.frames not in ("none", "shift"):  # they turn u and v
         axes = ", along the axes of the polynomials, before the exposures' frames turn them"
     if r.campaign is not None:
-        which = (
+        note = (
             " These are the residuals of the joint fit, with all tables, in the cells of the test"
             " for structure (see the status)."
         )
         if r.campaign.tables:
             cannot = "neither tables nor polynomial follow"
             if significant < chance / 2:
-                which += " They are fewer than by chance, as the tables follow these very stars."
+                note += " They are fewer than by chance, as the tables follow these very stars."
     if r.words.leverage:
-        which = (
+        note = (
             " Stars were fitted to these detections, so that fewer may do so than by chance; the"
             " status has the test that allows for it."
         )
@@ -129,7 +129,7 @@ def residual_vectors(r: ReportInput) -> Plot:
         f"Mean residual of each cell{axes}; dark arrows differ from zero by more than 2 σ."
         f" {significant} of {filled} cells do, and chance alone would give {chance:.0f}:"
         " neighbouring dark arrows that point the same way would be structure that"
-        f" {cannot}.{which}",
+        f" {cannot}.{note}",
         f"Map of binned residual vectors; {significant} of {filled} cells are significant.",
     )
 
@@ -137,12 +137,12 @@ def residual_vectors(r: ReportInput) -> Plot:
 def _in_plane(binned: Sequence[BinnedResiduals], plane: FocalPlane, *, unit: str) -> Panels:
     """Panel with the mean residual of each cell of all chips in a focal plane."""
     chips = []
-    for one, frame in zip(map(Arrows.of_cells, binned), plane.frames, strict=True):
-        x, y = frame(one.x, one.y)
-        chips.append(replace(one, x=x, y=y))  # u and v are the same on all chips
+    for arrows, frame in zip(map(Arrows.of_cells, binned), plane.frames, strict=True):
+        x, y = frame(arrows.x, arrows.y)
+        chips.append(replace(arrows, x=x, y=y))  # u and v are the same on all chips
     magnification, key = vector_scale(chips)
-    clear, every = sum(one.n_clear for one in chips), sum(one.x.size for one in chips)
-    title = f"{clear} of {every} significant, {CHANCE * every:.0f} by chance"
+    clear, total = sum(arrows.n_clear for arrows in chips), sum(arrows.x.size for arrows in chips)
+    title = f"{clear} of {total} significant, {CHANCE * total:.0f} by chance"
     vector_map(
         plane, chips, [title], magnification=magnification, key=key, unit=unit, pad=VECTOR_PAD
     )
@@ -157,11 +157,11 @@ def residual_panels(
     magnification: float | None = None,
     key: float | None = None,
 ) -> Panels:
-    """Panels with the mean residual of each cell, all chips on one scale; empty cells stay empty.
+    """Panels with the mean residual of each cell, at the same scale for all chips.
 
-    `magnification` is in pixels of the axes for one `unit` of the vectors, a round number by
-    default; `key` is the length of the arrow that states the scale, that of a typical vector by
-    default.
+    `magnification`: pixels of the axes per `unit` of the vectors; a round number by default. `key`:
+    length of the arrow that states the scale; that of a typical vector by default. Empty cells stay
+    empty.
     """
     chips = [Arrows.of_cells(b) for b in binned]
     default_magnification, default_key = vector_scale(chips)

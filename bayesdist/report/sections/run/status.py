@@ -1,4 +1,4 @@
-"""Status on top of the report: each criterion with its number and limit, and a verdict."""
+"""Status at the top of the report: criteria with values and limits, and a verdict."""
 
 from __future__ import annotations
 
@@ -25,31 +25,31 @@ if TYPE_CHECKING:
 
 
 def validity_checks(r: ReportInput) -> tuple[Check, ...]:
-    """Check of each validity period: that it has not ended before the run began."""
+    """Check of each validity period: it must not end before the start of the run."""
     began = _began(r)
-    return tuple(_validity_check(one, began) for one in r.validity)
+    return tuple(_validity_check(period, began) for period in r.validity)
 
 
 def _validity_check(one: ValidityPeriod, began: float | None) -> Check:
     name = f"{one.requirement.name}: the limit is met with probability"
     last, start = float(one.epoch[-1]), float(one.epoch[0])
     if one.date is None:
-        found = f"at least until {last:.1f}"
+        outcome = f"at least until {last:.1f}"
     elif one.date == start:
-        found = f"not at {start:.1f}, the end of the data"
+        outcome = f"not at {start:.1f}, the end of the data"
     else:
         early, late = one.interval
         first = start if early is None else early
         end = f"after {last:.1f}" if late is None else f"{late:.1f}"
-        found = f"until {one.date:.1f} ({first:.1f} to {end})"
+        outcome = f"until {one.date:.1f} ({first:.1f} to {end})"
     over = one.date is not None and one.date <= (start if began is None else max(start, began))
     limit = "beyond the data" if began is None else f"beyond {began:.1f}, when this run began"
     asked = f"{one.requirement.probability:g}"
-    return Check("Validity", f"{name} {asked}", found, limit, "warn" if over else "pass")
+    return Check("Validity", f"{name} {asked}", outcome, limit, "warn" if over else "pass")
 
 
 def validity_clause(r: ReportInput) -> str:
-    """Clause on the validity period: that of the requirement that is the first to fail."""
+    """Clause on the validity period of the requirement that is the first to fail."""
     if r.fit.model.time is None:
         return "no validity period, as the model does not depend on time"
     if not r.validity:
@@ -65,7 +65,7 @@ def validity_clause(r: ReportInput) -> str:
 
 
 def epoch_clause(r: ReportInput) -> str:
-    """' at epoch 2010.30', the date that verdicts or, without them, the maps are of."""
+    """' at epoch 2010.30', the date of the verdicts or, without verdicts, of the maps."""
     judged = {m.epoch for m in r.margins if m.epoch is not None}
     if len(judged) > 1:
         return f" at the epochs {min(judged):.2f} to {max(judged):.2f}"
@@ -76,7 +76,7 @@ def epoch_clause(r: ReportInput) -> str:
 
 
 def _began(r: ReportInput) -> float | None:
-    """Decimal year in which the run began; None where that is not known."""
+    """Decimal year in which the run began; None if unknown."""
     created = r.provenance.get("created")
     if not created:
         return None
@@ -86,17 +86,17 @@ def _began(r: ReportInput) -> float | None:
     return date.year + (date - start) / (end - start)
 
 
-_OWN_CLAUSE = ("Requirements", "Validity")  # of the headline
+_OWN_CLAUSE = ("Requirements", "Validity")  # groups with a clause of the headline
 _UNSAMPLED = "least squares only, no posterior was sampled"
 _NAMED = 2  # rows of the status table that the headline names
-# groups of the status table by their importance for a reader; the others follow as in GROUPS
+# groups of the status table by importance for a reader; the others follow as in GROUPS
 _FIRST = ("Requirements", "Validity", "Assumptions", "Errors", "Held-out truth", "Fit")
 _ORDER = (*_FIRST, *sorted(set(GROUPS) - set(_FIRST), key=("Score tests", *GROUPS).index))
 
 
 @dataclass(frozen=True)
 class RequirementLine:
-    """Verdict on one requirement as a line on top of the report."""
+    """Verdict on one requirement, as a line at the top of the report."""
 
     level: str  # 'pass', 'warn' or 'fail'
     verdict: str  # in capitals: 'MET'
@@ -114,9 +114,9 @@ class Verdict:
 
 
 def status_checks(r: ReportInput) -> dict[str, tuple[Check, ...]]:
-    """Criteria by subject; empty groups are left out.
+    """Criteria by group; empty groups are left out.
 
-    Requirements come first, then what they rest on, then how the numbers were made.
+    Requirements come first, followed by their assumptions, and by how the numbers were obtained.
     """
     groups = {
         **{name: tuple(c for c in r.checks if c.group == name) for name in GROUPS},
@@ -145,8 +145,8 @@ def status_table(r: ReportInput) -> TextTable:
 
 
 def _margin_checks(r: ReportInput) -> tuple[Check, ...]:
-    """Checks of requirements; those undecided name the rows that are the reason."""
-    doubts = "; ".join(f"“{one.name}”" for one in doubts_of(r.checks))
+    """Checks of requirements; undecided ones name the rows that cause the doubt."""
+    doubts = "; ".join(f"“{doubt.name}”" for doubt in doubts_of(r.checks))
 
     def why(m: Margin) -> str:
         if m.verdict not in ("undecided", "not shown"):
@@ -171,7 +171,7 @@ def _margin_checks(r: ReportInput) -> tuple[Check, ...]:
 def verdict(r: ReportInput) -> Verdict:
     """Verdict on the run: the worst of all rows of the status table and of all warnings.
 
-    The headline says what is worst first, for which epoch, and until when it holds.
+    The headline begins with what is worst, and states its epoch and the end of its validity.
     """
     groups = status_checks(r)
     lines = requirement_lines(r)
@@ -181,23 +181,23 @@ def verdict(r: ReportInput) -> Verdict:
             numbers = ("No requirement was stated.", *numbers)
         reasons = needed(r.posterior).convergence.reasons
         why = f"Why: {'; '.join(reasons) or 'no reason was recorded'}."
-        remarks = warnings_of(c for c in r.checks if c.name != "Converged")  # it says the same
+        remarks = warnings_of(c for c in r.checks if c.name != "Converged")  # repeats the reason
         sentences = (why, *(f"{text}." for text in remarks), *numbers)
         headline = "NOT CONVERGED: do not rely on these numbers"
         return Verdict("fail", headline, sentences, lines)
     sentences = (*(f"{text}." for text in r.warnings), *numbers)
     clauses = [(worst(groups.get("Requirements", ())), _requirements_clause(r))]
-    own: tuple[str, ...] = _OWN_CLAUSE
+    own_clauses: tuple[str, ...] = _OWN_CLAUSE
     if r.posterior is None:
         clauses.append(("warn", _UNSAMPLED))
-        own = (*own, "Sampling")
-    others = [c for name, rows in groups.items() if name not in own for c in rows]
+        own_clauses = (*own_clauses, "Sampling")
+    other_checks = [c for name, rows in groups.items() if name not in own_clauses for c in rows]
     for level, verb in (("fail", "fails"), ("warn", "warns")):
-        names = [c.name for c in others if c.level == level]
+        names = [c.name for c in other_checks if c.level == level]
         if names:
             clauses.append((level, _rows_clause(names, verb)))
     clauses.append((worst(groups.get("Validity", ())), validity_clause(r)))
-    # the kind of solution first, then what is worst
+    # the kind of solution comes first, followed by what is worst
     clauses.sort(key=lambda one: (one[1] == _UNSAMPLED, LEVELS.index(one[0])), reverse=True)
     level = max((level for level, _ in clauses), key=LEVELS.index)
     headline = "; ".join(text for _, text in clauses)
@@ -205,7 +205,7 @@ def verdict(r: ReportInput) -> Verdict:
 
 
 def _requirements_clause(r: ReportInput) -> str:
-    """Clause on the requirements that are met, and the epoch for which that is said."""
+    """Clause on the requirements that are met, and the epoch of this statement."""
     at, n = epoch_clause(r), len(r.margins)
     if not n:
         return (
@@ -217,9 +217,9 @@ def _requirements_clause(r: ReportInput) -> str:
     if counts["met"] == n:
         return f"every requirement is met{at}"
     del counts["met"]
-    (first, k), *others = [(v, counts[v]) for v in reversed(VERDICT_LEVELS) if counts.get(v)]
+    (first, k), *other_counts = [(v, counts[v]) for v in reversed(VERDICT_LEVELS) if counts.get(v)]
     of = f"{k} of {n} requirements {'is' if k == 1 else 'are'}" if n > 1 else "the requirement is"
-    return " and ".join([f"{of} {first}", *(f"{more} {v}" for v, more in others)]) + at
+    return " and ".join([f"{of} {first}", *(f"{number} {v}" for v, number in other_counts)]) + at
 
 
 def _rows_clause(names: Sequence[str], verb: str) -> str:
@@ -229,8 +229,8 @@ def _rows_clause(names: Sequence[str], verb: str) -> str:
     different = tuple(  # a file may have several findings
         name if n == 1 else f"{name}, {n} findings" for name, n in Counter(names).items()
     )
-    shown, more = different[:_NAMED], len(different) - _NAMED
-    named = "; ".join((*shown, f"and {more} more") if more > 0 else shown)
+    shown, n_more = different[:_NAMED], len(different) - _NAMED
+    named = "; ".join((*shown, f"and {n_more} more") if n_more > 0 else shown)
     return f"{len(names)} criteria {verb[:-1]} ({named})"
 
 
@@ -311,7 +311,7 @@ def _accuracy_sentence(r: ReportInput) -> str:
 
 
 def _with_shift(r: ReportInput) -> str:
-    """Words on the part of a common shift and rotation in the errors of positions."""
+    """Clause on whether errors of positions include a common shift and rotation."""
     if r.selfcal is not None:
         return ", in the gauge of the solution"
     return ", shift and rotation included" if r.fit.model.n_frame else ""

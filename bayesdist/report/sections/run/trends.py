@@ -20,15 +20,15 @@ from bayesdist.report.plots.trends import (
 )
 from bayesdist.utils.numbers import count, display_scale, number
 
-_FINE_BINS = 100  # most bins along an axis
+_FINE_BINS = 100  # largest number of bins along an axis
 
 
 def _against_pixels(r: ReportInput, most: int, *, points: bool) -> tuple[Figure, float]:
-    """Figure of u and v against x and y; and the largest mean in units of its error."""
+    """Figure of u and v against x and y, and the largest mean in units of its error."""
     residuals = TrueResiduals.of(r.stars, r.solution)
-    means = {which: residuals.by_pixel(which, most) for which in "xy"}
-    every = [mean for by_chip in means.values() for mean in by_chip.values()]
-    largest = max((mean.reach for mean in every), default=0.0) or 1.0
+    means = {pixel_axis: residuals.by_pixel(pixel_axis, most) for pixel_axis in "xy"}
+    all_means = [mean for by_chip in means.values() for mean in by_chip.values()]
+    largest = max((mean.reach for mean in all_means), default=0.0) or 1.0
     reach = 4.0 * residuals.scatter if points else 1.1 * largest
     scale = display_scale(r.unit, reach)
     fig = new_figure(WIDTH, 2.4)
@@ -45,7 +45,7 @@ def _against_pixels(r: ReportInput, most: int, *, points: bool) -> tuple[Figure,
     axes[0, 0].set_ylim(-reach * scale.factor, reach * scale.factor)
     if r.several:
         legend_above(fig, axes[0, 0])
-    return fig, max((mean.largest_pull for mean in every), default=0.0)
+    return fig, max((mean.largest_pull for mean in all_means), default=0.0)
 
 
 def _sample_words(r: ReportInput) -> str:
@@ -56,12 +56,12 @@ def _sample_words(r: ReportInput) -> str:
 @REPORT.figure("residuals", when=lambda r: r.stars.by_exposure is not None, printed=True)
 def chi_square_by_exposure(r: ReportInput) -> Plot:
     """Chi-square per degree of freedom of each exposure, with the range that chance gives."""
-    found = needed(r.stars.by_exposure)
-    n, mean = len(found.names), found.of_all
-    width = 2 * mean * found.chance
+    sums = needed(r.stars.by_exposure)
+    n, mean = len(sums.names), sums.of_all
+    width = 2 * mean * sums.chance
     fig = new_figure(WIDTH, 1.5)
-    plot_exposures(found, fig.subplots())
-    away = np.abs(found.ratio - mean) / width
+    plot_exposures(sums, fig.subplots())
+    away = np.abs(sums.ratio - mean) / width
     worst, beyond = int(np.argmax(away)), int((away > 1).sum())
     return Plot(
         fig,
@@ -70,7 +70,7 @@ def chi_square_by_exposure(r: ReportInput) -> Plot:
         f" included. The line is that of all exposures, {number(mean)}: below 1 where many"
         f" parameters were fitted to few {r.words.rows}. The band about it holds 95 % by chance;"
         f" {count(beyond)} of {count(n)} exposures lie outside it, and the farthest is"
-        f" {found.names[worst]}, with {number(float(found.ratio[worst]))}. Exposures above the band"
+        f" {sums.names[worst]}, with {number(float(sums.ratio[worst]))}. Exposures above the band"
         " have larger errors than the others (guiding, focus, breathing); the status says whether"
         f" that is more than a trifle.{_sample_words(r)}",
         f"Chi-square per degree of freedom of {n} exposures; {beyond} lie outside the band of"
@@ -137,5 +137,5 @@ def residuals_by_property(r: ReportInput) -> Plot:
 
 
 def _listed(names: Sequence[str]) -> str:
-    *others, last = names
-    return f"{', '.join(others)} and {last}" if others else last
+    *first_names, last = names
+    return f"{', '.join(first_names)} and {last}" if first_names else last

@@ -1,4 +1,4 @@
-"""Distortion reference files in ASDF: a transform from pixels to V2, V3, with our covariance.
+"""Distortion reference files in ASDF: transforms from pixels to V2, V3 with their covariance.
 
-Formats of JWST and of Roman differ in the tree around that transform, and share all else.
+The formats of JWST and Roman differ only in the tree around the transform.
 """

@@ -1,4 +1,4 @@
-"""Transform, inverse and record of a distortion reference file from a calibration."""
+"""Transform, inverse and record of a distortion reference file, built from a calibration."""
 
 from __future__ import annotations
 
@@ -25,45 +25,45 @@ from bayesdist.utils.arrays import Float
 
 @dataclass(frozen=True, eq=False)
 class ChipTransform:
-    """Transform of one chip, with all that its file says of it."""
+    """Transform of one chip with everything else that its file states."""
 
-    calibration: Calibration  # of the chip, in its aperture
+    calibration: Calibration  # calibration of the chip, in the frame of its aperture
     chip: int
     chip_name: str
-    model: Model  # with its inverse
+    model: Model  # pixels to V2, V3, with its inverse
     record: dict[str, Any]
-    closure: float  # pixels
+    closure: float  # pixels; largest error of the inverse
 
     @property
     def table_arrays(self) -> list[Float]:
-        """Arrays of the look-up tables, forward and back."""
-        both = [*tables_of(self.model), *tables_of(self.model.inverse)]
-        return [array for one in both for array in (one.lookup_table, *one.points)]
+        """Arrays of the look-up tables of the transform and of its inverse."""
+        tables = [*tables_of(self.model), *tables_of(self.model.inverse)]
+        return [array for table in tables for array in (table.lookup_table, *table.points)]
 
 
 def chip_transforms(
     calibration: Calibration, settings: PlacedSettings, options: BuildOptions, where: str
 ) -> Iterator[ChipTransform]:
-    """Transforms of all chips; `where` is the section of the configuration, for messages.
+    """Transforms of all chips; `where` is the configuration section named in messages.
 
-    InputError for a position or orientation that nothing states, and as for `at_date` and
-    `fitted_inverse`.
+    InputError if neither the settings nor the calibration give the position or orientation in V2,
+    V3, and for the reasons given in `at_date` and `fitted_inverse`.
     """
     plane = _placed(calibration.plane, settings, where)
     matrix = required(plane.to_v2v3, "the plane of an aperture has no axes along V2 and V3")
     v2v3 = required(plane.v2v3, "the plane of an aperture has no position in V2 and V3")
-    for known in calibration.model.chips:
-        number = known.number
-        one = at_date(calibration, number, options.epoch, options.scale_arcsec, where=where)
-        one = replace(one, plane=plane)
-        chip = one.chip(number, origin="stated")
+    for nominal in calibration.model.chips:
+        number = nominal.number
+        dated = at_date(calibration, number, options.epoch, options.scale_arcsec, where=where)
+        dated = replace(dated, plane=plane)
+        chip = dated.chip(number, origin="stated")
         poly = chip.monomials()
         require_regular(poly.linear, number)
-        model = forward_transform(poly, matrix, v2v3, one.before)
+        model = forward_transform(poly, matrix, v2v3, dated.before)
         back = inverse_transform(
-            fitted_inverse(chip, settings.inverse_order), matrix, v2v3, one.before
+            fitted_inverse(chip, settings.inverse_order), matrix, v2v3, dated.before
         )
-        closure = closure_of(model, back, *detector_grid(known.size))
+        closure = closure_of(model, back, *detector_grid(nominal.size))
         if not np.isfinite(closure):
             raise InputError(
                 "the inverse of its look-up tables does not converge",
@@ -72,12 +72,12 @@ def chip_transforms(
             )
         model.inverse = back
         date = options.epoch if calibration.model.time is not None else None
-        record = record_of(one, calibration, epoch=date, closure=closure)
-        yield ChipTransform(one, number, known.name, model, record, closure)
+        record = record_of(dated, calibration, epoch=date, closure=closure)
+        yield ChipTransform(dated, number, nominal.name, model, record, closure)
 
 
 def refuse_larger(one: ChipTransform, name: str, known: Detector | None, where: str) -> None:
-    """Refuse a chip with more pixels than the detector that it is said to be."""
+    """Raise InputError if a chip has more pixels than the named detector."""
     [chip] = one.calibration.model.chips
     if known is not None and any(a > b for a, b in zip(chip.size, known.size, strict=True)):
         (nx, ny), (most_x, most_y) = chip.size, known.size
@@ -89,7 +89,7 @@ def refuse_larger(one: ChipTransform, name: str, known: Detector | None, where: 
 
 
 def _placed(plane: Plane, settings: PlacedSettings, where: str) -> Plane:
-    """Plane in an aperture: by the settings, else as the calibration has it; parity -1."""
+    """Plane in an aperture: from the settings, or else from the calibration; default parity -1."""
     v2v3 = plane.v2v3 or (None, None)
     values = {
         "v2ref": settings.v2ref if settings.v2ref is not None else v2v3[0],

@@ -1,4 +1,4 @@
-"""Content of a distortion reference file of any observatory, and its calibration."""
+"""Parsed distortion reference file of any observatory, and its calibration."""
 
 from __future__ import annotations
 
@@ -24,25 +24,25 @@ from bayesdist.products.formats.common.record import calibration_from
 from bayesdist.utils.arrays import Float
 
 ARCSEC = {"arcsec": 1.0, "deg": 3600.0, "mas": 1e-3, "rad": 180 / np.pi * 3600, "arcmin": 60.0}
-AGREEMENT = 1e-6  # pixels: as far as record and transform of one file may differ
-GRID = 65  # nodes of each axis, over the pixel centres from corner to corner
+AGREEMENT = 1e-6  # pixels; tolerance between the record and the transform of one file
+GRID = 65  # grid points per axis, over the pixel centres from corner to corner
 
 
 @dataclass(frozen=True, eq=False)
 class DistortionFile:
-    """Parsed file."""
+    """Parsed distortion reference file."""
 
     name: str
     observatory: str
     model: Model  # from 0-based pixels to V2, V3
     meta: Mapping[str, Any]
-    units: tuple[str, str]  # of input and output, as stated; empty where they are not
-    record: Mapping[str, Any] | None = None  # our own, see `common.record`
+    units: tuple[str, str]  # of input and output, as stated; empty if not stated
+    record: Mapping[str, Any] | None = None  # record written by bayesdist, see `common.record`
     detector: Detector | None = None  # None if unknown
 
     @property
     def inverse(self) -> Model | None:
-        """Transform back; None where there is none."""
+        """Inverse transform; None if the file has none."""
         try:
             return self.model.inverse
         except NotImplementedError:
@@ -50,41 +50,44 @@ class DistortionFile:
 
     @property
     def size(self) -> tuple[float, float] | None:
-        """Columns and rows: those of the record, else of the known detector."""
-        known = None if self.detector is None else self.detector.size
+        """Columns and rows: from the record, or else those of the known detector."""
+        nominal = None if self.detector is None else self.detector.size
         if self.record is None:
-            return known
+            return nominal
         try:
             columns, rows = self.record["chip"]["size"]
             return float(columns), float(rows)
-        except (KeyError, TypeError, ValueError):  # it is checked where it is read whole
-            return known
+        # an invalid record is reported when it is read in full
+        except (KeyError, TypeError, ValueError):
+            return nominal
 
     @property
     def stated_closure(self) -> float | None:
-        """Largest error of the inverse as the file states it, pixels."""
+        """Largest error of the inverse as stated in the file, in pixels."""
         inverse = {} if self.record is None else self.record.get("inverse", {})
         return inverse.get("closure_pix")
 
     def v2v3(self, x: ArrayLike, y: ArrayLike) -> Float:
-        """V2 and V3 (2, N) in arcsec of FITS 1-based pixels (N,)."""
+        """V2 and V3 (2, N) in arcsec at FITS 1-based pixels (N,)."""
         at = evaluated(self.model, np.asarray(x, float) - 1.0, np.asarray(y, float) - 1.0)
         return ARCSEC.get(self.units[1], 1.0) * at
 
     def grid(self) -> tuple[Float, Float]:
-        """FITS 1-based pixels over the detector; MissingSizeError where its size is not known."""
+        """FITS 1-based pixels on a grid over the detector; MissingSizeError if size is unknown."""
         if self.size is None:
             raise _no_size(self.name)
         return detector_grid(self.size, GRID)
 
 
 def transform_in(tree: Mapping[str, Any], key: str, where: str) -> Model:
-    """Transform of two coordinates to two under a key; FormatError for anything else."""
+    """Transform of two coordinates to two stored under `key`; FormatError for anything else."""
     model = tree.get(key)
     if not isinstance(model, Model):
-        what = "a list of models" if isinstance(model, (list, tuple)) else f"no model ({model!r})"
+        content = (
+            "a list of models" if isinstance(model, (list, tuple)) else f"no model ({model!r})"
+        )
         raise FormatError(
-            f"{key} holds {what}, which is no map of a detector's pixels"[:200],
+            f"{key} holds {content}, which is no map of a detector's pixels"[:200],
             where=where,
             do="give a distortion reference file of an imager",
         )
@@ -98,14 +101,14 @@ def transform_in(tree: Mapping[str, Any], key: str, where: str) -> Model:
 
 
 def closure_of(forward: Model, back: Model, x: Float, y: Float) -> float:
-    """Largest distance of FITS pixels (N,) from where forward and back take them; may be NaN."""
+    """Largest distance of pixels (N,) from where forward and inverse return them; may be NaN."""
     with np.errstate(all="ignore"):
-        there = evaluated(back, *evaluated(forward, x - 1.0, y - 1.0))
-    return float(np.hypot(there[0] - (x - 1.0), there[1] - (y - 1.0)).max())
+        returned = evaluated(back, *evaluated(forward, x - 1.0, y - 1.0))
+    return float(np.hypot(returned[0] - (x - 1.0), returned[1] - (y - 1.0)).max())
 
 
 def recorded(file: DistortionFile, record: Mapping[str, Any]) -> Calibration:
-    """Calibration as the record has it, with the tables of the transform."""
+    """Calibration stored in the record, with the look-up tables of the transform."""
     values = [table.lookup_table for table in tables_of(file.model)]
     inner = [np.asarray(v, float)[1:-1, 1:-1].T for v in values]  # without the padding
     pairs = [np.stack(inner[k : k + 2]) for k in range(0, len(inner), 2)]
@@ -113,7 +116,7 @@ def recorded(file: DistortionFile, record: Mapping[str, Any]) -> Calibration:
 
 
 def departure(file: DistortionFile, calibration: Calibration) -> float:
-    """Largest distance between a calibration and the transform of its file, in pixels."""
+    """Largest distance in pixels between a calibration and the transform of its file."""
     x, y = file.grid()
     turn, v2v3 = calibration.plane.to_v2v3, calibration.plane.v2v3
     if turn is None or v2v3 is None:
@@ -124,7 +127,7 @@ def departure(file: DistortionFile, calibration: Calibration) -> float:
 
 
 def transforms_read_back(files: Mapping[int, DistortionFile]) -> ReadBack:
-    """Positions in V2, V3 by files of one chip each, and where forward and back lead."""
+    """Positions in V2, V3 by the files of the chips, and the errors of their inverses."""
 
     def read_back(file: DistortionFile) -> ReadBack:
         back = file.inverse
@@ -145,18 +148,18 @@ def transforms_read_back(files: Mapping[int, DistortionFile]) -> ReadBack:
 
 
 def distortion_calibration(file: DistortionFile, choice: Choice) -> Calibration:
-    """Calibration in arcsec, with the covariance of the record where the transform agrees with it.
+    """Calibration in arcsec, with the covariance of the record if the transform agrees with it.
 
-    Of a file without record (u, v) are V2, V3 less their values at the middle of the detector.
-    MissingSizeError for an unknown detector without a size; InputError for a transform that is no
-    polynomial.
+    For a file without record, (u, v) are V2, V3 relative to the middle of the detector.
+    MissingSizeError if neither the file nor `choice` gives the size; InputError if the transform is
+    not a polynomial.
     """
     notes: tuple[str, ...] = ()
     if file.record is not None:
-        found = recorded(file, file.record)
-        far = departure(file, found)
+        calibration = recorded(file, file.record)
+        far = departure(file, calibration)
         if far <= AGREEMENT:
-            return found
+            return calibration
         notes = (f"the transform is {far:.2g} px from the parameters beside it: without errors",)
     size = file.size if choice.size is None else choice.size
     if size is None:
@@ -179,7 +182,7 @@ def distortion_calibration(file: DistortionFile, choice: Choice) -> Calibration:
         return u, v
 
     number = _chip_number(file)
-    one = fitted_map(
+    chip_map = fitted_map(
         positions,
         file.name,
         order=min(order, MAX_ORDER),
@@ -189,8 +192,8 @@ def distortion_calibration(file: DistortionFile, choice: Choice) -> Calibration:
         chip=number,
     )
     x, y = detector_grid(size, GRID)
-    far = float(np.abs(one.at(x, y) - np.stack(positions(x, y))).max())
-    if far > AGREEMENT * np.sqrt(abs(np.linalg.det(one.linear))):
+    far = float(np.abs(chip_map.at(x, y) - np.stack(positions(x, y))).max())
+    if far > AGREEMENT * np.sqrt(abs(np.linalg.det(chip_map.linear))):
         raise InputError(
             f"its transform is a polynomial of an order above {MAX_ORDER}",
             where=file.name,
@@ -198,7 +201,7 @@ def distortion_calibration(file: DistortionFile, choice: Choice) -> Calibration:
         )
     instrument = file.meta.get("instrument", {})
     return calibration_of_maps(
-        {number: one},
+        {number: chip_map},
         file.name,
         plane=Plane(
             "aperture", v2v3=(float(zero[0, 0]), float(zero[1, 0])), v3_angle=0.0, parity=1

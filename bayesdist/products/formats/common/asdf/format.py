@@ -1,4 +1,4 @@
-"""Format entries of the observatories whose distortion reference files are ASDF."""
+"""Formats of the observatories that use ASDF distortion reference files."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from bayesdist.products.formats.common.document import (
 )
 from bayesdist.products.formats.common.read_back import ReadBack
 
-# astropy.modeling, which these need, takes longer to import than other files to read
+# these need astropy.modeling, which takes longer to import than other files take to read
 if TYPE_CHECKING:
     from astropy.modeling import Model
 
@@ -35,23 +35,23 @@ Settings = TypeVar("Settings", bound=PlacedSettings)
 
 @dataclass(frozen=True)
 class Observatory(Generic[Settings]):
-    """What the files of one observatory have of their own."""
+    """Properties that distinguish the files of one observatory."""
 
-    key: str  # as of `Format`
+    key: str  # key of the `Format`
     name: str  # as in "JWST"
-    # from a file to the node with meta and transform, and to the key of the transform; None for a
-    # file of another kind, FormatError for one without these
+    # returns the node with meta and transform, and the key of the transform; None for a file of
+    # another format, FormatError if these nodes are missing
     node: Callable[[Content], tuple[Mapping[str, Any], str] | None]
-    detector: Callable[[Mapping[str, Any]], Detector | None]  # from the node meta.instrument
-    lint_meta: Callable[[Mapping[str, Any]], Iterable[Finding]]  # from the node meta to findings
-    # from the name of the detector and settings to the node meta; InputError for unknown values
+    detector: Callable[[Mapping[str, Any]], Detector | None]  # takes the node meta.instrument
+    lint_meta: Callable[[Mapping[str, Any]], Iterable[Finding]]  # takes the node meta
+    # (detector name, settings) -> node meta; InputError for unknown values
     meta: Callable[[str, Settings], dict[str, Any]]
-    # from meta, transform, record and the name of the file to the tree of the file
+    # (meta, transform, record, file name) -> tree of the file
     tree: Callable[[dict[str, Any], Model, dict[str, Any], str], dict[str, Any]]
-    units: tuple[str, str] = ("", "")  # of pixels and positions, where a file states none
+    units: tuple[str, str] = ("", "")  # of pixels and positions if a file states none
 
     def format(self, title: str, rank: int, settings: type[Settings]) -> Format:
-        """Format entry; title, rank and settings are as of `Format`."""
+        """`Format` of the observatory's files; title, rank and settings are passed on to it."""
         return Format(
             self.key,
             title,
@@ -68,12 +68,12 @@ class Observatory(Generic[Settings]):
         )
 
     def _parse(self, content: Content) -> DistortionFile | None:
-        found = self.node(content) if is_asdf(content) else None
-        if found is None:
+        node = self.node(content) if is_asdf(content) else None
+        if node is None:
             return None
         from bayesdist.products.formats.common.asdf.distortion import DistortionFile, transform_in
 
-        tree, key = found
+        tree, key = node
         meta, record = plain(tree["meta"]), tree.get("bayesdist")
         instrument = meta.setdefault("instrument", {})
         stated = zip(("input_units", "output_units"), self.units, strict=True)
@@ -101,30 +101,32 @@ class Observatory(Generic[Settings]):
     def _build(
         self, calibration: Calibration, settings: Settings, options: BuildOptions
     ) -> tuple[Built, ...]:
-        """A file for each chip."""
+        """Build one file per chip."""
         from bayesdist.products.formats.common.asdf.build import chip_transforms, refuse_larger
 
         out = []
-        several, where = len(calibration.numbers) > 1, f"products.{self.key}"
-        for one in chip_transforms(calibration, settings, options, where):
-            detector = (one.chip_name if several else settings.detector) or calibration.detector
+        several, location = len(calibration.numbers) > 1, f"products.{self.key}"
+        for transform in chip_transforms(calibration, settings, options, location):
+            detector = (
+                transform.chip_name if several else settings.detector
+            ) or calibration.detector
             meta = self.meta(detector, settings)
-            refuse_larger(one, detector, self.detector(meta["instrument"]), where)
+            refuse_larger(transform, detector, self.detector(meta["instrument"]), location)
             instrument = meta["instrument"]["name"]
-            one.record["provenance"] |= {"instrument": instrument, "detector": detector}
+            transform.record["provenance"] |= {"instrument": instrument, "detector": detector}
             usual = f"{self.key}_{instrument}_{detector}_distortion.asdf".lower()
             file = options.named(usual, several=several)
-            tree = self.tree(meta, one.model, one.record, file)
-            content = packed(tree, file, one.table_arrays)
-            kind, found = f"{self.name} distortion", {"closure_pix": one.closure}
-            out.append(Built(file, kind, content, one.model, one.chip, found))
+            tree = self.tree(meta, transform.model, transform.record, file)
+            content = packed(tree, file, transform.table_arrays)
+            kind, summary = f"{self.name} distortion", {"closure_pix": transform.closure}
+            out.append(Built(file, kind, content, transform.model, transform.chip, summary))
         return tuple(out)
 
     def _read_back(self, files: Sequence[Built], *_: Any) -> list[ReadBack]:
-        """Positions and inverse by the transforms, as pipelines have them."""
+        """Positions and inverse evaluated by the transforms of the files, as pipelines do."""
         from bayesdist.products.formats.common.asdf.distortion import transforms_read_back
 
-        parsed = {one.chip: self._parse(Content(one.file_name, one.content)) for one in files}
+        parsed = {part.chip: self._parse(Content(part.file_name, part.content)) for part in files}
         return [transforms_read_back({n: f for n, f in parsed.items() if n is not None and f})]
 
 

@@ -21,16 +21,16 @@ from bayesdist.products.formats.common.record import error_lines
 from bayesdist.utils.arrays import Float
 
 PIXEL, SKY = ("pix", "pixel"), ("arcsec",)
-# Closure that a good inverse reaches, and one that only a wrong coefficient leaves; pixels.
+# Pixels: closure of a good inverse, and a closure that only a wrong coefficient explains.
 _CLOSURE_GOOD, _CLOSURE_BAD = 0.01, 0.5
 _CLOSURE_RELATIVE = 1e-2
-# How far the scale of an imager may be from its nominal one: filters and corners change it by less.
+# Largest ratio of a pixel scale to its nominal value: filters and position change it by less.
 _SCALE_RATIO = 1.2
 _PER_DEGREE = 3600.0
 
 
 def lint_distortion(file: DistortionFile) -> list[Finding]:
-    """Findings in the transform of a file, its units and its record."""
+    """Findings about the transform of a file, its units and its record."""
     findings = [*_units(file)]
     if file.size is None:
         message = "the detector is not known here: inverse, parity and scale are not checked"
@@ -62,7 +62,7 @@ def _units(file: DistortionFile) -> Iterator[Finding]:
 
 
 def _middle(file: DistortionFile, size: tuple[float, float]) -> tuple[Float, Float]:
-    """V2, V3 (2,) at the middle of the detector, and their derivatives (2, 2) by the pixel."""
+    """V2, V3 (2,) at the middle of the detector, and derivatives (2, 2) with respect to pixels."""
     x, y = ((n + 1) / 2 for n in size)
     at = file.v2v3([x, x + 0.5, x - 0.5, x, x], [y, y, y, y + 0.5, y - 0.5])
     return at[:, 0], np.stack([at[:, 1] - at[:, 2], at[:, 3] - at[:, 4]], axis=1)
@@ -122,28 +122,28 @@ def _inverse(file: DistortionFile) -> Iterator[Finding]:
 
 
 def _exchanged(model: Model, back: Model, x: Float, y: Float, closure: float) -> str:
-    """Part in which powers are exchanged, where that alone makes forward and back agree."""
-    # where both are exchanged they nearly agree again: the better one is right
-    left = closure / 10
+    """Part in which exchanging powers of x and y makes forward and inverse agree; empty if none."""
+    # if powers are exchanged in both parts they nearly agree again, so the better one is right
+    smallest = closure / 10
     blamed = ""
     for lowest in (1, 2):
-        for where, one, two in (
+        for part, forward, inverse in (
             ("inverse", model, exchanged(back, lowest)),
             ("model", exchanged(model, lowest), back),
         ):
-            one_left = closure_of(one, two, x, y)
-            if one_left < left:
-                left, blamed = one_left, where
+            remaining = closure_of(forward, inverse, x, y)
+            if remaining < smallest:
+                smallest, blamed = remaining, part
     return blamed
 
 
 def _repeated(model: Model) -> Iterator[Finding]:
-    for one in leaves(model):
-        if not isinstance(one, models.Polynomial2D) or one.degree < 2:
+    for polynomial in leaves(model):
+        if not isinstance(polynomial, models.Polynomial2D) or polynomial.degree < 2:
             continue
         values = {
             name: float(c)
-            for name, c in zip(one.param_names, one.parameters, strict=True)
+            for name, c in zip(polynomial.param_names, polynomial.parameters, strict=True)
             if sum(map(int, name[1:].split("_"))) > 1
         }
         for names in repeated_values(values):
@@ -152,16 +152,16 @@ def _repeated(model: Model) -> Iterator[Finding]:
 
 
 def _record(file: DistortionFile) -> Iterator[Finding]:
-    """Findings on our own record."""
+    """Findings about the record written by bayesdist."""
     if file.record is None:
         yield Finding("note", "bayesdist", "is not there: the file states no uncertainty")
         return
     try:
-        found = recorded(file, file.record)
+        calibration = recorded(file, file.record)
     except BayesdistError as error:
         yield Finding("error", "bayesdist", error.cause)
         return
-    far = departure(file, found)
+    far = departure(file, calibration)
     if not far <= AGREEMENT:
         yield Finding(
             "error", "bayesdist.parameters",
@@ -184,7 +184,7 @@ def describe_distortion(file: DistortionFile, findings: Sequence[Finding]) -> li
         for label, key in (("about", "description"), ("useafter",) * 2, ("pedigree",) * 2)
         if key in meta
     ]
-    kinds = [type(one).__name__ for one in leaves(file.model)]
+    kinds = [type(leaf).__name__ for leaf in leaves(file.model)]
     order, tables = order_of(file.model), tables_of(file.model)
     lines.append(
         f"  model     {len(kinds)} parts"
@@ -198,7 +198,7 @@ def describe_distortion(file: DistortionFile, findings: Sequence[Finding]) -> li
 
 
 def _measured(file: DistortionFile, size: tuple[float, float]) -> list[str]:
-    """Lines on what the transform gives."""
+    """Lines on quantities measured from the transform."""
     at, slope = _middle(file, size)
     area = float(np.linalg.det(slope))
     lines = [

@@ -1,4 +1,4 @@
-"""Transforms of others: models of astropy.modeling as distortion reference files hold them."""
+"""Models of astropy.modeling as stored in distortion reference files of other programs."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 
 from bayesdist.utils.arrays import Float
 
-# Models that leave the order of a polynomial as it is.
+# Models that do not change the order of a polynomial.
 _AFFINE = (
     models.Shift,
     models.Scale,
@@ -23,13 +23,15 @@ _AFFINE = (
 
 
 def evaluated(model: Model, x: ArrayLike, y: ArrayLike) -> Float:
-    """Values (2, N) of a transform at its own inputs (N,), without units."""
+    """Values (2, N) of a transform at inputs (N,), without units."""
     out = model(np.asarray(x, float), np.asarray(y, float))
-    return np.stack([np.asarray(getattr(one, "value", one), float) for one in out])
+    return np.stack(
+        [np.asarray(getattr(coordinate, "value", coordinate), float) for coordinate in out]
+    )
 
 
 def leaves(model: Model) -> Iterator[Model]:
-    """Elementary models of a transform from left to right."""
+    """Elementary models of a compound transform, from left to right."""
     if isinstance(model, CompoundModel):
         for part in (model.left, model.right):
             if isinstance(part, Model):
@@ -39,17 +41,17 @@ def leaves(model: Model) -> Iterator[Model]:
 
 
 def tables_of(model: Model) -> list[Model]:
-    """Look-up tables in a transform."""
-    return [one for one in leaves(model) if one.n_inputs == 2 and hasattr(one, "lookup_table")]
+    """Two-dimensional look-up tables in a transform."""
+    return [leaf for leaf in leaves(model) if leaf.n_inputs == 2 and hasattr(leaf, "lookup_table")]
 
 
 def order_of(model: Model) -> int | None:
-    """Order of the polynomial that a transform is; None where it is none."""
+    """Order of a transform that is a polynomial; None for any other transform."""
     if isinstance(model, CompoundModel):
-        left, right = order_of(model.left), order_of(model.right)
-        if left is None or right is None or model.op not in ("|", "&", "+", "-"):
+        left_order, right_order = order_of(model.left), order_of(model.right)
+        if left_order is None or right_order is None or model.op not in ("|", "&", "+", "-"):
             return None
-        return left * right if model.op == "|" else max(left, right)
+        return left_order * right_order if model.op == "|" else max(left_order, right_order)
     if isinstance(model, (models.Polynomial2D, models.Polynomial1D)):
         return max(int(model.degree), 1)
     if isinstance(model, (models.Chebyshev2D, models.Legendre2D)):
@@ -58,16 +60,17 @@ def order_of(model: Model) -> int | None:
 
 
 def exchanged(model: Model, lowest: int = 1) -> Model:
-    """Copy of a transform in which powers of x and y are exchanged in its polynomials.
+    """Copy of a transform with the powers of x and y exchanged in its polynomials.
 
-    From the total order `lowest` on; polynomials of order 1, which turn, are left as they are.
+    Only terms of total order `lowest` or higher are exchanged. Polynomials of order 1, which
+    describe rotations, are unchanged.
     """
     out = model.copy()
-    for one in leaves(out):
-        if isinstance(one, models.Polynomial2D) and one.degree > 1:
-            values = dict(zip(one.param_names, one.parameters.copy(), strict=True))
-            for name in one.param_names:
+    for leaf in leaves(out):
+        if isinstance(leaf, models.Polynomial2D) and leaf.degree > 1:
+            values = dict(zip(leaf.param_names, leaf.parameters.copy(), strict=True))
+            for name in leaf.param_names:
                 i, j = map(int, name[1:].split("_"))
                 if i + j >= lowest:
-                    setattr(one, name, values[f"c{j}_{i}"])
+                    setattr(leaf, name, values[f"c{j}_{i}"])
     return out

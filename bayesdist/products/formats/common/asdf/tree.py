@@ -1,4 +1,4 @@
-"""Trees of ASDF files, read and written, and settings that all observatories have."""
+"""Reading and writing of ASDF trees, and settings common to all observatories."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ DESCRIPTION = "Geometric distortion with its uncertainty, by bayesdist"
 
 
 class PlacedSettings(FormatSettings):
-    """Identity of the file, and position of the plane of (u, v) in V2, V3.
+    """Identity of the file, and position and orientation of the (u, v) plane in V2, V3.
 
-    V2Ref, V3Ref [arcsec], V3IdlYAngle [deg] and VIdlParity are those of (u, v) = 0 and of the axes
-    of (u, v), which are those of the aperture's Ideal system; a calibration in an aperture has its
-    own.
+    V2Ref, V3Ref [arcsec] are the position of (u, v) = 0. V3IdlYAngle [deg] and VIdlParity describe
+    the axes of (u, v), which are those of the aperture's Ideal system. A calibration made in an
+    aperture provides all of these values.
     """
 
-    detector: str | None = None  # by default the names of the chips, or of the calibration
+    detector: str | None = None  # default: the chip names, or the detector of the calibration
     useafter: str
     pedigree: str
     author: str
@@ -39,7 +39,7 @@ class PlacedSettings(FormatSettings):
     inverse_order: Annotated[int, Field(ge=1, le=12)] | None = None
 
     def identity(self) -> dict[str, str]:
-        """What every reference file says of itself."""
+        """Metadata that every reference file contains."""
         names = ("pedigree", "useafter", "author", "description")
         return {name: getattr(self, name) for name in names}
 
@@ -56,22 +56,22 @@ _START = b"#ASDF"
 
 
 def is_asdf(content: Content) -> bool:
-    """True where a file begins as an ASDF file."""
+    """True if a file begins like an ASDF file."""
     return content.raw[: len(_START)] == _START
 
 
 def tree_of(content: Content) -> Mapping[str, Any]:
-    """Tree of an ASDF file, its arrays in memory; errors as of `asdf_tree`."""
+    """Tree of an ASDF file with its arrays in memory; errors as for `asdf_tree`."""
     return asdf_tree(content.raw, content.budget, max_order=MAX_ORDER)
 
 
 def packed(
     tree: Mapping[str, Any], name: str, in_text: Iterable[NDArray[np.generic]] = ()
 ) -> bytes:
-    """Bytes of an ASDF file with this tree; InputError where asdf is not installed.
+    """Bytes of an ASDF file with this tree; InputError if asdf is not installed.
 
-    Arrays `in_text` are written as text: pipelines close the file before they evaluate a transform,
-    and arrays in binary blocks are not read until then.
+    Arrays in `in_text` are written as text: pipelines close the file before they evaluate a
+    transform, and arrays in binary blocks are not read until then.
     """
     stream = io.BytesIO()
     file = asdf_with_transforms(name).AsdfFile(dict(tree))
@@ -82,7 +82,7 @@ def packed(
 
 
 def tagged(node: Mapping[str, Any], tag: str, name: str) -> Any:
-    """Node with a tag, which needs no converter of its own; errors as for `packed`."""
+    """Node with a tag that needs no converter; errors as for `packed`."""
     asdf_with_transforms(name)
     from asdf.tagged import TaggedDict
 
@@ -90,7 +90,7 @@ def tagged(node: Mapping[str, Any], tag: str, name: str) -> Any:
 
 
 def plain(node: Any) -> Any:
-    """Node with arrays of numpy, lists and dictionaries in place of asdf's own."""
+    """Node with numpy arrays, lists and dictionaries in place of asdf's classes."""
     if isinstance(node, Mapping):
         return {str(key): plain(value) for key, value in node.items()}
     if isinstance(node, (list, tuple)):
