@@ -203,7 +203,7 @@ REPORT = Registry(
 
 # documentation page and heading that explain a section of the report
 EXPLAINED = {
-    "status": ("report", "On top"),
+    "status": ("report", "Summary"),
     "data": ("your_table", ""),
     "campaign": ("campaign", ""),
     "campaign-matching": ("campaign", "The catalogue"),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import chdir
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -66,7 +67,8 @@ def carried(truth: Truth, folder: Path, seed: int) -> Steps:
     """Stars of a truth fitted, sampled and diagnosed by the functions of the Python interface."""
     config, path = truth.config, folder / "stars.parquet"
     Table(truth.stars).write(path, overwrite=True)
-    matches = bd.read_matches(path, unit="pix")
+    with chdir(folder):  # a run names its files relative to its configuration
+        matches = bd.read_matches(path.name, unit="pix")
     drift = config["model"].get("tdd")
     model = bd.build_model(
         matches,

@@ -79,7 +79,7 @@ def test_a_star_outside_its_circle(tmp_path):
     table, _ = in_circles()
     table["v_nominal"][11] += 1.0
     config = write_job(tmp_path, table, outliers={"match_radius": RADIUS})
-    words = ["stars.ecsv, row 12: lies ", "outside the match circle of radius 0.05", "match_radius"]
+    words = ["stars.ecsv, row 12: is ", "outside the match circle of radius 0.05", "match_radius"]
     refused(tmp_path, "check", config, words=words)
 
 

@@ -401,7 +401,7 @@ def test_errors_of_prediction():
         model.predict(theta, x, y, epoch=2005.0, chip=7)
     with pytest.raises(InputError, match="no exposure 'z'"):
         model.predict(theta, x, y, epoch=2005.0, exposure="z")
-    with pytest.raises(InputError, match=r"0\.\.2"):
+    with pytest.raises(InputError, match="from 0 to 2"):
         model.predict(theta, x, y, epoch=2005.0, exposure=3)
     for wrong in (theta[:-1], np.append(theta, 0.0), np.float64(1.0)):
         with pytest.raises(InputError, match="parameters"):

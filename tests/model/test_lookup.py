@@ -169,5 +169,5 @@ def test_two_tables_of_one_place_and_a_lost_pixel_are_refused(rng) -> None:
     table = rough(rng)
     with pytest.raises(InputError, match="2 look-up tables of chip 1"):
         corrected([table, table], 1.0, 1.0, chip=1)
-    with pytest.raises(InputError, match="pixel y is not finite"):
+    with pytest.raises(InputError, match="pixel coordinate y is not finite"):
         table.evaluate(1.0, np.nan)

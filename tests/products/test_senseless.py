@@ -36,7 +36,7 @@ def test_a_header_that_makes_sense(tmp_path):
         ({"A_2_0": 1e9}, "linear terms"),
         ({"CD1_1": 0.0}, "without an area|linear terms"),
         ({"NAXIS1": 10**9}, "has 1e\\+09 x 800 pixels"),
-        ({"A_ORDER": 10**9, "B_ORDER": 10**9}, "order of its polynomials is 1000000000"),
+        ({"A_ORDER": 10**9, "B_ORDER": 10**9}, "A_ORDER: is 1e\\+09, and at most 12 is read"),
     ],
 )
 def test_a_header_that_makes_none(tmp_path, changed, words):

@@ -251,7 +251,7 @@ IN_PIXELS = calibration_of(some_solution(4), "camera")
         ("tpv", {"scale_mas": 1 * u.s}, "scale_mas is given in s, which cannot be con"),
         ("tpv", {"scale_mas": "big"}, "scale_mas is 'big', which is not a number"),
         ("tpv", {"scale_mas": 50, "order": 9}, "order: the order is 9; choose one from 1 to 7"),
-        ("tpv", {"scale_mas": 50, "epoch": np.nan}, "epoch is nan, which is no "),
+        ("tpv", {"scale_mas": 50, "epoch": np.nan}, "epoch is nan, which is not a year"),
         ("wise_meta", {}, "no band of WISE"),
     ],
 )  # fmt: skip

@@ -190,7 +190,7 @@ def test_every_product_names_the_gauge(three_rolls):
         words = Table.read(run / f"{name}.ecsv").meta["gauge"]
         assert all(one in words for one in held), name
     with fits.open(run / "maps.fits") as file:
-        words = "".join(file[0].header["COMMENT"])
+        words = " ".join(file[0].header["COMMENT"])
         assert "scale, rotation by convention" in words
         assert {"MIX_SIGMA_U", "REL_SIGMA_U", "REL_SIGMA_V", "REL_CORR"} <= {h.name for h in file}
     assert "Gauge of a self-calibration" in (run / "sip.hdr").read_text(encoding="ascii")

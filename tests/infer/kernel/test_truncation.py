@@ -412,7 +412,7 @@ def test_a_star_outside_its_circle_is_named():
     with pytest.raises(InputError) as error:
         sample(fit, far, outliers=OutlierMixture("gaussian", match_radius=RADIUS))
     said = str(error.value)
-    assert said.startswith("stars.ecsv, row 18: lies ")
+    assert said.startswith("stars.ecsv, row 18: is ")
     assert "outside the match circle of radius 0.2; set outliers.match_radius to the radius" in said
     # without a radius, nothing is said of a selection
     Target(load(model, far), OutlierMixture(), GaussianPriors.none(model))

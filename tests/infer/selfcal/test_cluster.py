@@ -289,7 +289,7 @@ def test_scratch_folder_that_workers_do_not_see(solution, compute, tmp_path, mon
     with pytest.raises(InputError, match=message), in_pieces(*given, unseen):
         pass
     assert not list(tmp_path.iterdir())
-    message = r"compute\.scratch: .*nowhere.*name a folder"
+    message = r"compute\.scratch: .*nowhere.*name a writable folder"
     with pytest.raises(InputError, match=message), in_pieces(*given, missing):
         pass
 

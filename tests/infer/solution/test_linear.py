@@ -467,5 +467,5 @@ def test_draws_take_a_seed_as_well_as_a_generator():
     fit = fit_linear(matches, model)
     by_seed, by_generator = fit.draws(5, 1), fit.draws(5, np.random.default_rng(1))
     np.testing.assert_array_equal(by_seed, by_generator)
-    with pytest.raises(InputError, match="whole number"):
+    with pytest.raises(InputError, match="neither a seed nor a generator"):
         fit.draws(5, "one")

@@ -152,4 +152,4 @@ def test_less_there_and_the_same():
 
 def test_a_printed_sigma_below_its_noise_is_said():
     one = account(0.7, 0.6, 0.3, (0.4, 0.5))
-    assert one.verdict == "below noise" and "distributed otherwise" in one.sentence
+    assert one.verdict == "below noise" and "another distribution" in one.sentence

@@ -183,7 +183,7 @@ def test_bands_mixed_up_are_seen_by_the_array(rng, tmp_path, suffix):
     table = rvb_table(rng, n=400, bands=("W1", "W4"))
     table["band"] = np.where(table["band"] == "W1", "W4", "W1")
     path = write(table, tmp_path / f"a{suffix}")
-    sentence = refused(r"outside the 508 pixels of W4's array, as in \d+ of \d+ rows", path,
+    sentence = refused(r"outside the 508 pixels of W4's array, as are \d+ of \d+ rows", path,
                        band="W4")  # fmt: skip
     first = np.flatnonzero((table["band"] == "W4") & (table["x"] > 509.0))[0]
     assert f"row {first + 1}, column 'x'" in sentence

@@ -245,7 +245,7 @@ def test_the_command_writes_jobs_that_check_accepts(tmp_path):
 def test_what_cannot_be_simulated_is_refused(tmp_path):
     with pytest.raises(InputError, match=r"no band 'W9'.*W1"):
         simulated(tmp_path, bands=["W9"])
-    with pytest.raises(InputError, match="named twice"):
+    with pytest.raises(InputError, match="given twice"):
         simulated(tmp_path, bands=["W1", "W1"])
     with pytest.raises(InputError, match="pairs is 0"):
         simulated(tmp_path, pairs=0)
@@ -255,7 +255,7 @@ def test_what_cannot_be_simulated_is_refused(tmp_path):
     assert not list(tmp_path.iterdir())
     simulated(tmp_path, bands=["W4"])
     before = {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*.*")}
-    with pytest.raises(InputError, match=r"holds w4 already.*--force"):  # before W1 is begun
+    with pytest.raises(InputError, match=r"contains w4 already.*--force"):  # before W1 is begun
         simulated(tmp_path)
     with pytest.raises(InputError, match="contains Parquet files already"):
         write_wise_set(wise_set("W4", pairs=10), tmp_path)

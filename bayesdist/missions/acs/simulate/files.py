@@ -26,7 +26,6 @@ CATALOG_UNITS = (
 
 README = """\
 A simulated campaign of ACS/WFC on a field near 47 Tucanae, after ACS ISR 2015-06.
-
 {settings}
 
 Input of a calibration
