@@ -6,6 +6,7 @@ import math
 import signal
 import struct
 import sys
+import threading
 import time
 import warnings
 from collections.abc import Iterator
@@ -44,11 +45,15 @@ class InterruptHandler:
     def __init__(self, again: float = 2.0) -> None:
         self.again = again
         self.n = 0  # interrupts so far
+        self.deferring = self.deferred = False
         self._last = -math.inf
 
     def __call__(self, *_: object) -> None:
         """Raise the interrupt, unless it follows another one soon."""
         self.n += 1
+        self.deferred = self.deferring
+        if self.deferring:
+            return
         now = time.monotonic()
         if now - self._last > self.again:
             self._last = now
@@ -68,6 +73,27 @@ def _comes_of_interrupt(error: BaseException, before: BaseException | None) -> b
         visited.add(id(cause))
         open_ends += [cause.__cause__, cause.__context__]
     return False
+
+
+@contextmanager
+def deferred_interrupts() -> Iterator[None]:
+    """Let an interrupt of a program wait for the end of the block.
+
+    HDF5 prints a traceback if a callback is interrupted.
+    """
+    handler = signal.getsignal(signal.SIGINT)
+    main = threading.current_thread() is threading.main_thread()
+    if not main or not isinstance(handler, InterruptHandler) or handler.deferring:
+        yield
+        return
+    handler.deferring = True
+    try:
+        yield
+    finally:
+        handler.deferring = False
+        if handler.deferred:
+            handler.deferred = False
+            raise KeyboardInterrupt
 
 
 @contextmanager

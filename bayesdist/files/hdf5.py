@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from bayesdist.errors import FormatError, InputError
 from bayesdist.files.atomic import atomic_path
 from bayesdist.files.budget import DAMAGED, LIMITS, Budget, Limits
-from bayesdist.files.faults import restoring
+from bayesdist.files.faults import deferred_interrupts, restoring
 from bayesdist.files.regular import opened
 from bayesdist.utils.memory import size_text
 
@@ -283,6 +283,7 @@ def write_arrays(path: Path, fingerprint: str, arrays: Mapping[str, NDArray[Any]
     import h5py
 
     with (
+        deferred_interrupts(),
         atomic_path(path) as temporary,
         _Written(temporary, "w+") as stream,
         h5py.File(stream, "w") as file,

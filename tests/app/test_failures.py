@@ -15,7 +15,7 @@ import click
 import pytest
 
 from bayesdist.app import cli as commands
-from bayesdist.files.faults import InterruptHandler, raising_interrupts
+from bayesdist.files.faults import InterruptHandler, deferred_interrupts, raising_interrupts
 from tests.app.support import cli
 
 ERRORS = [
@@ -102,6 +102,22 @@ def test_a_second_interrupt_leaves_the_first_one_to_its_end():
         for _ in range(2):
             with pytest.raises(KeyboardInterrupt):
                 signal.raise_signal(signal.SIGINT)
+
+
+def test_an_interrupt_waits_for_what_cannot_be_interrupted():
+    ends = list[str]()
+
+    def write() -> None:
+        with deferred_interrupts():
+            signal.raise_signal(signal.SIGINT)
+            ends.append("written")
+
+    with _handled(InterruptHandler()):
+        with pytest.raises(KeyboardInterrupt):
+            write()
+        with deferred_interrupts():
+            ends.append("again")
+    assert ends == ["written", "again"]
 
 
 def test_an_interrupt_while_python_ends_is_silent():
