@@ -8,11 +8,12 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
+from bayesdist.calibration.plane import ARCSEC
 from bayesdist.model import Chip, LookupTable
 from bayesdist.report.figures.mosaic import Mosaic
 from bayesdist.utils.arrays import Bool, Float, Int
 from bayesdist.utils.checks import Check, warnings_of
-from bayesdist.utils.numbers import MISSING, count, with_mas
+from bayesdist.utils.numbers import MISSING, count, number, with_mas
 
 if TYPE_CHECKING:
     from astropy.table import Table
@@ -200,9 +201,20 @@ class ReportInput:
         """True if the detector has more than one chip."""
         return len(self.chips) > 1
 
-    def length(self, value: float) -> str:
-        """Length in the unit of u and v, and in mas if the size of a pixel is known."""
-        return with_mas(value, self.unit, self.scale_mas)
+    def length(self, value: float, *, like: float | None = None) -> str:
+        """Length in the unit of u and v, and in mas or micrometres if these scales are known.
+
+        `like`: length that determines the display unit (default: `value`).
+        """
+        text = with_mas(value, self.unit, self.scale_mas, like=like)
+        return text if text == MISSING else text + self.on_focal_plane(value, self.unit)
+
+    def on_focal_plane(self, value: float, unit: str) -> str:
+        """' (1.20 µm)' of an angle if the plate scale is known, else empty."""
+        plate_scale = self.setting("data", "plate_scale", None)  # arcsec per mm
+        if plate_scale is None or unit not in ARCSEC:
+            return ""
+        return f" ({number(1e3 * value * ARCSEC[unit] / float(plate_scale))}\u202fµm)"
 
     def marked(self, text: str) -> str:
         """Number that depends on the sampler, with a dagger if the sampler did not converge."""

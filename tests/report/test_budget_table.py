@@ -49,6 +49,12 @@ def test_the_model_comes_first_and_its_correlated_parts_are_folded(anti_correlat
     assert [cell.text_content() for cell in folded] == ["fast", "slow"]
 
 
+def test_the_size_of_a_milliarcsecond_on_a_focal_plane_is_stated(anti_correlated):
+    run = replace(anti_correlated, config={"data": {"plate_scale": 20.0}})
+    assert "On the focal plane 1\u202fmas is 0.0500\u202fµm." in budget_table(run)[0].note
+    assert "focal plane" not in budget_table(anti_correlated)[0].note
+
+
 def test_a_single_part_of_the_model_is_a_row_as_it_is(anti_correlated):
     fast, _, catalogue = anti_correlated.budget.terms
     budget = replace(anti_correlated.budget, terms=(fast, catalogue))

@@ -5,12 +5,18 @@ from __future__ import annotations
 import re
 from dataclasses import replace
 
+import numpy as np
 import pytest
 from lxml import html as lxml_html
 
 from bayesdist.report.drawing import Drawing
 from bayesdist.report.run_report import render_report
-from bayesdist.report.sections.run.status import facts_line, requirement_lines, status_table
+from bayesdist.report.sections.run.status import (
+    facts_line,
+    requirement_lines,
+    status_table,
+    verdict,
+)
 from bayesdist.utils.checks import Check
 
 
@@ -29,6 +35,31 @@ def test_each_requirement_has_value_limit_and_probability_in_the_unit_of_its_lim
         assert in_mas == pytest.approx(2750 * m.value, rel=0.01)
         assert limit == m.requirement.limit
         assert line.text.startswith(f"{m.requirement.name}: {m.requirement.statistic} ")
+
+
+def test_lengths_on_a_focal_plane_are_given_in_micrometres(converged):
+    """Angles over the plate scale; a pixel has none, and stays as it is."""
+    run = replace(converged, config={"data": {"plate_scale": 20.0}})
+    angles = tuple(replace(m, unit="mas", value=3.0) for m in run.margins)
+    for line in requirement_lines(replace(run, margins=angles)):
+        assert "\u202fmas (0.150\u202fµm), limit" in line.text  # 3 mas / (20 arcsec / mm)
+    assert not any("µm" in line.text for line in requirement_lines(run))
+
+
+def test_positions_off_the_field_are_left_out_of_the_first_sentence(converged):
+    """The map is NaN there: the errors are those of the positions that see the sky."""
+    chip = converged.chips[0]
+    kept = np.zeros(chip.best_map.sigma_u.shape, bool)
+    kept[1, 2] = True
+    names = ("sigma_u", "sigma_v", "correlation")
+    whole = chip.best_map
+    seen = replace(whole, **{name: np.where(kept, getattr(whole, name), np.nan) for name in names})
+    field = replace(converged, chips=[replace(chip, posterior_map=seen)])
+    (size,) = np.hypot(whole.sigma_u[kept], whole.sigma_v[kept]) / np.sqrt(2)
+    sentence = verdict(field).sentences[-1]
+    found = re.search(r"is ([\d.]+)\u202fpix .*? at most ([\d.]+)\u202fpix", sentence)
+    assert found, sentence
+    assert [float(text) for text in found.groups()] == pytest.approx([size, size], rel=0.01)
 
 
 def test_probability_near_one_is_a_bound(converged):

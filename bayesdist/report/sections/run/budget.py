@@ -118,8 +118,15 @@ def _table(
         note="Per axis: rms of u and v; CE68, CE95: circles that hold 68 and 95 % of errors of that"
         " size, if Gaussian. The parts of the model are correlated and enter the total jointly, by"
         " draws; independent terms add in quadrature. The total therefore need not be the root"
-        f" of the sum of squares.{_of_products(rows)} {gauge_of_new_exposure(r)}".rstrip(),
+        f" of the sum of squares.{_of_products(rows)} {gauge_of_new_exposure(r)}".rstrip()
+        + _focal_plane(r),
     )
+
+
+def _focal_plane(r: ReportInput) -> str:
+    """Sentence on the size of a milliarcsecond on the focal plane, if the plate scale is known."""
+    size = r.on_focal_plane(1.0, "mas").strip(" ()")
+    return f" On the focal plane 1\u202fmas is {size}." if size else ""
 
 
 def _sizes(

@@ -241,6 +241,7 @@ def requirement_lines(r: ReportInput) -> tuple[RequirementLine, ...]:
         value = f"{rounded(m.value, (m.interval[1] - m.interval[0]) / 4)}\u202f{m.unit}"
         if m.unit == "pix" and r.scale_mas is not None:
             value += f" ({with_mas(m.value * r.scale_mas, 'mas', None)})"
+        value += r.on_focal_plane(m.value, m.unit)
         met = counted(m.probability_met, m.mc_error, m.n_effective)
         probability = f"P {met}" if met[:1] in "<>" else f"P = {met}"
         text = (
@@ -279,14 +280,15 @@ def _accuracy_sentence(r: ReportInput) -> str:
     worst = max(r.chips, key=lambda c: c.best_map.radius_max)  # where per-axis errors are largest
     best = worst.best_map
     maps = [c.best_map for c in r.chips]
-    median = float(np.median(np.concatenate([m.per_axis.ravel() for m in maps])))
-    like = float(best.per_axis.max())
+    # NaN off the field of the detector
+    median = float(np.nanmedian(np.concatenate([m.per_axis.ravel() for m in maps])))
+    like = float(np.nanmax(best.per_axis))
 
     def length(value: float) -> str:
-        return with_mas(value, r.unit, r.scale_mas, like=like)
+        return r.length(value, like=like)
 
     circles = " and ".join(
-        f"CE{p} {length(max(float(m.circular_error(p / 100).max()) for m in maps))}"
+        f"CE{p} {length(max(float(np.nanmax(m.circular_error(p / 100))) for m in maps))}"
         for p in (68, 95)
     )
     text = (
