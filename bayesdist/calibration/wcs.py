@@ -214,7 +214,7 @@ class CalibrationWCS(BaseLowLevelWCS, HighLevelWCSMixin):
 
     @property
     def pixel_bounds(self) -> tuple[tuple[float, float], tuple[float, float]]:
-        """Edges of the chip in x and in y."""
+        """Edges (min, max) of the chip in x and in y, in 0-based pixels (APE 14)."""
         nx, ny = self.chip_map.basis.size
         return (-0.5, nx - 0.5), (-0.5, ny - 0.5)
 

@@ -77,7 +77,7 @@ def _comes_of_interrupt(error: BaseException, before: BaseException | None) -> b
 
 @contextmanager
 def deferred_interrupts() -> Iterator[None]:
-    """Let an interrupt of a program wait for the end of the block.
+    """Delay Ctrl-C until the end of the block, if an `InterruptHandler` is installed.
 
     HDF5 prints a traceback if a callback is interrupted.
     """

@@ -339,7 +339,7 @@ class ParameterLayout:
         return slice(start, start + self.n_terms)
 
     def tdd_slice(self, chip: int | None = None) -> slice:
-        """Slice of theta with the time-dependent parameters of a chip number.
+        """Slice of theta with the time-dependent parameters of a chip number (default: first chip).
 
         Rates are per year.  They refer to monomials in units of half the size of the chip.
         """

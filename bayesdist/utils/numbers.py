@@ -166,7 +166,7 @@ class Scale:
     unit: str
 
     def text(self, value: float, digits: int = 3) -> str:
-        """Number, given in the native unit, as text in this unit."""
+        """Convert a value from the native unit, and write it with this unit."""
         times = "\u202f×\u202f" if self.unit.startswith("10") else "\u202f"
         return f"{value * self.factor:.{digits}g}{times}{self.unit}".replace("-", "−")
 

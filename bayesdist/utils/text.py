@@ -20,8 +20,8 @@ _CONTROLS = re.compile(r"[\x00-\x1f\x7f-\x9f\u2028\u2029\ud800-\udfff]")
 def ascii_of(text: str) -> str:
     """Text in printable ASCII, as FITS headers have it.
 
-    Accents are dropped, Greek letters are spelled out, dashes become "-"; any other character,
-    control characters among them, becomes "?".
+    Accents are dropped, Greek letters are spelled out, dashes become "-"; compatibility characters
+    are replaced ("²" by "2"), and any other character, including control characters, becomes "?".
 
     Parameters
     ----------

@@ -73,7 +73,7 @@ class CampaignConfig(RunConfig):
     products: CampaignProducts = CampaignProducts()
 
     def faults(self) -> Iterator[str]:
-        """Faults of any run, and missing chips."""
+        """Configuration errors that any run can have, and one if there are no [[chip]] blocks."""
         yield from super().faults()
         if not self.chip:
             yield "a [campaign] has no [[chip]] blocks; give them, one as the reference"

@@ -247,7 +247,7 @@ def rates_file(folder: Path) -> Path:
 
 
 def calibration_file(path: Path) -> Path:
-    """File of an earlier calibration: the file itself, or the posterior of a run."""
+    """Path of an earlier calibration: a file, or the posterior in the folder of a run."""
     return path if path.is_file() else _file_of_run(path, POSTERIOR, "prior_calibration.source")
 
 

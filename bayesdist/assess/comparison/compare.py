@@ -129,7 +129,7 @@ class Comparison:
 
     @property
     def noise_rms(self) -> float | None:
-        """Rms length of the difference expected from the errors alone."""
+        """Rms length (pixels) of the difference expected from the errors; None without errors."""
         if self.sigma_u is None or self.frame.cov is None:
             return None
         return float(np.sqrt(self.frame.norm @ np.diag(self.frame.cov)))

@@ -41,7 +41,7 @@ class ReferenceSky:
 
 
 def sky_columns(quantities: Quantities) -> tuple[Float, Float]:
-    """Right ascension and declination (N,) in degrees, as stored in the rows of a table."""
+    """Right ascension and declination (N,) of the rows of a table, converted to degrees."""
     ra, dec = (_degrees(quantities[key], key) for key in ("ra", "dec"))
     beyond = np.abs(dec) > 90.0
     if beyond.any():

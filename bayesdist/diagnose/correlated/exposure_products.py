@@ -71,7 +71,7 @@ class ExposureProducts:
         return _expected(self.size, length)[self.bins]
 
     def amplitude(self, length: float) -> tuple[float, float]:
-        """Best-fitting variance of a field of this length, and its error without a field."""
+        """Best-fitting variance of a field of this length, and its standard error without one."""
         expected = self.expected(length)
         weight = float(np.sum(expected**2 / self.variance))
         return float(np.sum(expected * self.covariance / self.variance)) / weight, weight**-0.5

@@ -22,7 +22,7 @@ MIN_FREE = 0.1
 
 @dataclass(frozen=True, eq=False)
 class SquaredScores:
-    """Sums over the stars of products of their scores, and the likelihood's prediction of them.
+    """Information from the scores of the stars, and that expected from the likelihood.
 
     X : Y below is the sum over stars of trace(A^-1 X_i A^-1 Y_i), where X_i and Y_i are a star's
     contributions to two sums and A is the information of the parameters.

@@ -49,7 +49,7 @@ class StatisticsRow:
 
     @property
     def sigma_noise(self) -> float:
-        """Contribution of noise to sigma: sigma^2 is its square plus `variance`."""
+        """Noise part of sigma, sqrt(sigma^2 - `variance`); 0 if the difference is negative."""
         return float(np.sqrt(max(self.value["sigma"] ** 2 - self.variance, 0.0)))
 
 

@@ -98,7 +98,7 @@ class HierarchicalFit(Solution):
 
     @property
     def likelihood(self) -> ClippedGaussian:
-        """Gaussian likelihood, at the mean, of the stars used in the second pass."""
+        """Gaussian likelihood at the posterior mean, for the stars that the rejection keeps."""
         return ClippedGaussian(self.mean, self.fit.clip)
 
     def uses(self, matches: Matches) -> Bool:

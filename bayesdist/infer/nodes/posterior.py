@@ -89,7 +89,7 @@ class AxisField:
 
     @classmethod
     def of(cls, evidence: Evidence, field: FittedField) -> AxisField:
-        """Posterior for the hyperparameters of `field`, which must be fitted to the same stars."""
+        """Posterior with the hyperparameters of `field`, which is of the same stars."""
         sums = evidence.sums
         n = len(sums.polynomial) + field.n_effective
         return cls(NodeCovariance(evidence.grid, sums, field.prior), field, field.mean, n)

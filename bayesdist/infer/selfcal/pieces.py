@@ -85,7 +85,7 @@ def at_modes(piece: StarPiece, theta: Float, mixture: Mixture, observed: bool) -
 
 
 def moved(piece: StarPiece, before: Float, after: Float) -> StarPiece:
-    """Piece at other parameters (D,), with stars shifted like the means of their detections."""
+    """Piece re-linearised at parameters (D,); stars move like the means of their detections."""
     p, stars = piece.problem, piece.stars.copy()
     stars[:, :2] += p.shifts(before, after)
     return StarPiece(p.at(after, stars), stars)

@@ -196,7 +196,7 @@ class Design:
         epoch : ndarray, shape (E,)
             Decimal years.
         breaks : ndarray, shape (..., B), optional
-            Dates of the breaks; the given ones by default.
+            Dates of the breaks in decimal years; those of `trend` by default.
 
         Returns
         -------

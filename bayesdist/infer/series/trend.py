@@ -78,8 +78,8 @@ class TrendModel:
     Raises
     ------
     InputError
-        If the kind is unknown, breaks are not ascending, the kind does not allow or requires
-        breaks, or the number of reference dates is wrong.
+        If the kind is unknown, breaks are not ascending, breaks are given for a kind without
+        breaks, or missing for a kind that needs them, or the number of reference dates is wrong.
     """
 
     kind: str

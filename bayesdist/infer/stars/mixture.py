@@ -217,7 +217,7 @@ class Hyper:
 
     @np.errstate(over="ignore", invalid="ignore")
     def values(self, h: Float) -> dict[str, Float]:
-        """Convert points h (..., n_hyper) to values (...) of j, f and s_out."""
+        """Convert points h (..., n_hyper) to values (...) of what is sampled of j, f and s_out."""
         out = {}
         for k, name in enumerate(self.mixture.hyper):
             t = h[..., k]

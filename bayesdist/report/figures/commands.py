@@ -47,7 +47,7 @@ _SHADES = LinearSegmentedColormap.from_list("significance", ["#FFFFFF", PALETTE[
 
 
 def gaussian_sigmas(chi2: Float) -> Float:
-    """Deviation in sigma of one axis that is as improbable as a chi-square of two axes.
+    """Two-sided Gaussian significance (sigma) of a chi-square with two degrees of freedom.
 
     NaN remains NaN; values are limited to 37, where probabilities underflow.
     """

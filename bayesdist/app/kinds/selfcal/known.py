@@ -144,7 +144,7 @@ Piece = Callable[[Float], Prior]
 
 @dataclass(frozen=True, eq=False)
 class GaugeConstraints:
-    """Constraints on the gauge in addition to the detections, each from one source."""
+    """Priors that fix the gauge with information other than the detections, by source."""
 
     pieces: Mapping[str, Piece]  # priors as functions of parameters (D,), by source
 

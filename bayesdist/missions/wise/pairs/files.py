@@ -152,7 +152,7 @@ class ArrayCheck:
         x, y : ndarray, shape (N,)
             FITS 1-based pixels.
         where : callable
-            Function that returns the file and row of a position for messages.
+            Function that maps an index into x and y to the file and row named in messages.
         reference : tuple of ndarray, shape (N,), optional
             u and v, if these are in pixels of the array.
         """

@@ -40,7 +40,7 @@ class ChipNumbers:
     constant: Float  # arcsec; (Xc, Yc) of the reference pixel, included in V2REF and V3REF
 
     def column(self, name: str) -> float:
-        """Value of the number with this name."""
+        """Fitted value of one entry of `names`, such as 'CX10' or 'V2REF'."""
         return float(self.values[self.names.index(name)])
 
     def without_rates(self) -> ChipNumbers:

@@ -116,7 +116,8 @@ class Verdict:
 def status_checks(r: ReportInput) -> dict[str, tuple[Check, ...]]:
     """Criteria by group; empty groups are left out.
 
-    Requirements come first, followed by their assumptions, and by how the numbers were obtained.
+    The order is requirements, validity and assumptions, errors, held-out data, fit, and the other
+    groups.
     """
     groups = {
         **{name: tuple(c for c in r.checks if c.group == name) for name in GROUPS},
