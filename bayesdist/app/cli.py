@@ -124,7 +124,8 @@ bayesdist = click.version_option(__version__, message="bayesdist %(version)s")(
 
 def program() -> int:
     """Run the command of the process, which ends with it."""
-    signal.signal(signal.SIGINT, InterruptHandler())
+    if signal.getsignal(signal.SIGINT) is signal.default_int_handler:  # a job in the background
+        signal.signal(signal.SIGINT, InterruptHandler())  # may have been told to ignore it
     code = main()
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Python closes what libraries have left open
     return code

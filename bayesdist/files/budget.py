@@ -30,7 +30,7 @@ class Limits:
     parts: int = 1000  # HDUs, or blocks of ASDF
     nodes: int = 50_000  # of a tree, with aliases counted each time; header cards
     header: int = 2**20  # characters of a YAML header; a column needs about a hundred
-    line: int = 2**16  # characters of a line; a thousand columns need 25,000
+    line: int = 2**18  # characters: ten thousand columns take 250,000
     depth: int = 64  # nesting of groups, elements or brackets; files of bayesdist have ten
 
 

@@ -90,7 +90,9 @@ def _checked(path: Path, limits: Limits = LIMITS) -> Iterator[h5py.File]:
 
 _DEFLATE, _DEFLATE_RATIO = 1, 1032  # filter code of gzip in HDF5, and largest compression of zlib
 _COMPRESSORS = {_DEFLATE, 4, 32000}  # szip and lzf compress by a factor of at most a hundred
-_FILTERS = {2, 3, 5, 6}  # shuffle, fletcher32, nbit and scale-offset have predictable sizes
+_FLETCHER32, _CHECKSUM = 3, 4  # filter code, and bytes that it adds to a chunk
+# shuffle, fletcher32, nbit and scale-offset, whose results have predictable sizes
+_FILTERS = {2, _FLETCHER32, 5, 6}
 
 
 class _Announced:
@@ -169,8 +171,8 @@ class _Announced:
         for name in owner.attrs:
             self._clock()
             attribute = h5py.h5a.open(owner.id, name.encode())
-            if attribute.dtype.hasobject:
-                n = math.prod(attribute.shape)
+            n = math.prod(attribute.shape)
+            if attribute.dtype.hasobject and not _lists_references(attribute.dtype, n):
                 self._budget.refuse_content(n * self._budget.size)
                 self._attributes += _length(owner.attrs[name])
                 self._budget.refuse_content(self._attributes)
@@ -196,6 +198,7 @@ class _Announced:
 
         array.id.chunk_iter(note)
         room = math.prod(array.chunks) * array.dtype.itemsize
+        room += _CHECKSUM * filters.count(_FLETCHER32)  # may be among what is compressed
         for offset in large:
             self._clock()
             _, raw = array.id.read_direct_chunk(offset)
@@ -205,6 +208,21 @@ class _Announced:
                     where=self._budget.where,
                     do=DAMAGED,
                 )
+
+
+def _lists_references(dtype: np.dtype, n: int) -> bool:
+    """True for n references to other arrays, as netCDF lists the arrays of a dimension.
+
+    A dimension of n arrays has n of them, in records, and an array one list for each of its
+    dimensions, of which HDF5 has up to 32.
+    """
+    import h5py
+
+    parts = [dtype[name] for name in dtype.names] if dtype.names else [dtype]
+    if all(not part.hasobject or h5py.check_ref_dtype(part) for part in parts):
+        return True
+    listed = h5py.check_vlen_dtype(dtype)
+    return n <= 32 and listed is not None and h5py.check_ref_dtype(listed) is not None
 
 
 def _length(value: Any) -> int:

@@ -110,7 +110,8 @@ def _page_header(stream: BinaryIO, at: int, budget: Budget) -> tuple[dict[int, i
     """Numbers in the header of a page by their fields, and the place of the byte after it."""
     n = 2**10
     while n <= _MOST_HEADER:
-        raw = os.pread(stream.fileno(), n, at)
+        stream.seek(at)
+        raw = stream.read(n)
         try:
             numbers, length = _thrift_struct(raw)
             if min(numbers[_UNCOMPRESSED], numbers[_COMPRESSED]) < 0:

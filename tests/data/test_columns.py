@@ -251,9 +251,9 @@ def test_lengths_become_arcsec_by_the_plate_scale(unit, size, stated):
     sky = read(t, unit="arcsec")
     for name in ("u", "v"):
         t[name].unit = unit if stated else None
-    t["su"], t["sv"] = 0.002 / size, 0.05
+    t["su"], t["sv"] = 2.0 if stated else 0.002 / size, 0.05
     t["sv"].unit = "arcsec"
-    t["su"].unit = unit if stated else None
+    t["su"].unit = "um" if stated else None
     columns = {"sigma_u": "su", "sigma_v": "sv"}
     given = None if stated else unit
     m = read(t, unit=given, plate_scale=12.5, columns=columns)

@@ -9,6 +9,7 @@ import lzma
 import zlib
 from pathlib import Path
 
+import h5netcdf
 import h5py
 import numpy as np
 import pyarrow as pa
@@ -537,3 +538,22 @@ def test_binary_rows_of_no_bytes(tmp_path):
     path.write_text(text.replace('datatype="double"', 'datatype="double" arraysize="0"'))
     with pytest.raises(FormatError, match="has rows of no bytes"):
         read_table(path)
+
+
+def test_arrays_of_many_that_share_a_dimension(tmp_path):
+    """A dimension refers to each of them: these references are no bomb, however large the file."""
+    path = tmp_path / "a.nc"
+    with h5netcdf.File(path, "w") as file:
+        file.dimensions = {"star": 50}
+        for k in range(40):
+            file.create_variable(f"v{k}", ("star",), float)[:] = k
+    limits = Limits(content=500_000, content_per_byte=0)
+    assert path.stat().st_size * 40 > limits.content
+    assert netcdf_groups(path, limits=limits)
+
+
+def test_a_table_of_six_thousand_columns(tmp_path):
+    path = tmp_path / "a.csv"
+    row = ",".join(["0.1234567890123456"] * 6000)
+    path.write_text(f"{','.join(f'c{k}' for k in range(6000))}\n{row}\n{row}\n")
+    assert len(read_table(path).colnames) == 6000

@@ -126,7 +126,8 @@ def _through_plate_scale(
         factor = stated if unit is None else length_in_mm(unit)
         if factor is None and key not in ("u", "v") and unit is not None:
             continue  # an angle, which needs no conversion
-        if factor is None or (stated is not None and factor != stated):
+        other = key in ("u", "v") and stated is not None and factor != stated
+        if factor is None or other:
             raise InputError(
                 f"a plate scale is given, and the unit is {unit or options.unit or 'not stated'}",
                 where=f"{source}, column {found[key]!r}",

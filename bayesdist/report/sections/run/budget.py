@@ -25,6 +25,7 @@ from bayesdist.report.plots.errors import (
 )
 from bayesdist.report.sections.gauge import gauge_of_new_exposure
 from bayesdist.report.texttable import TextTable
+from bayesdist.utils.arrays import Float
 from bayesdist.utils.numbers import (
     MISSING,
     Scale,
@@ -203,12 +204,14 @@ def budget_dominating(r: ReportInput) -> Plot:
     colors = [CYCLE[k % len(CYCLE)] for k in range(len(present))]
     panels = ChipPanels(r.mosaic)
     panels.frame()
+
+    def numbered(dominant: Float) -> Float:
+        """Numbers among the terms that are present; NaN off the field of the detector."""
+        return np.where(np.isfinite(dominant), np.searchsorted(present, dominant), np.nan)
+
     scalar_map(
         panels,
-        [
-            Grid(*b.axes, np.searchsorted(present, b.on_grid(b.dominant)).astype(float))
-            for b in budget.chips
-        ],
+        [Grid(*b.axes, numbered(b.on_grid(b.dominant))) for b in budget.chips],
         r.mosaic.names,
         norm=BoundaryNorm(np.arange(len(present) + 1) - 0.5, len(present)),
         cmap=ListedColormap(colors),
