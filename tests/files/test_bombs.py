@@ -7,6 +7,7 @@ import gzip
 import io
 import lzma
 import zlib
+from inspect import signature
 from pathlib import Path
 
 import h5netcdf
@@ -137,7 +138,10 @@ def test_chunks_of_hdf5_that_hold_more_than_a_chunk(tmp_path):
     for content, words in ((bytes(80), None), (bytes(10**8), "has a chunk of 80 bytes that holds")):
         with h5py.File(path, "w") as file:
             array = file.create_dataset("x", (10,), float, chunks=(10,), compression="gzip")
-            array.id.write_direct_chunk((0,), zlib.compress(content, 1))
+            try:
+                array.id.write_direct_chunk((0,), zlib.compress(content, 1))
+            except OSError:
+                pytest.skip("this HDF5 writes no chunk that is larger than it should be")
         if words is None:
             assert not hdf5_arrays(path)[0]["x"].any()
             continue
@@ -361,6 +365,8 @@ def test_long_text_within_cells_and_of_one_width(kind, tmp_path):
 
 def test_pages_of_parquet_that_hold_more_than_their_column_announces(tmp_path):
     """The footer announces 300 numbers in 3 kB, and the one page holds more."""
+    if "max_rows_per_page" not in signature(pq.ParquetWriter).parameters:
+        pytest.skip("this pyarrow writes no page of so many rows")
     path, n = tmp_path / "a.parquet", 6_000_000
     pq.write_table(pa.table({"x": np.zeros(n)}), path, compression="zstd", use_dictionary=False,
                    data_page_size=2**30, max_rows_per_page=n, write_batch_size=n, row_group_size=n,
