@@ -9,7 +9,7 @@ import sys
 import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
-from io import FileIO, TextIOWrapper
+from io import BufferedWriter, FileIO, TextIOWrapper
 from numbers import Integral, Real
 from pathlib import Path
 from typing import Any
@@ -80,7 +80,8 @@ class _QuietHandler(logging.FileHandler):
     def _open(self) -> TextIOWrapper:
         """Open the log for appending, without following a symbolic link."""
         descriptor = descriptor_for_writing(self.baseFilename, os.O_APPEND)
-        return TextIOWrapper(FileIO(descriptor, self.mode), encoding=self.encoding)
+        binary = BufferedWriter(FileIO(descriptor, self.mode))
+        return TextIOWrapper(binary, encoding=self.encoding)
 
 
 @contextmanager

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import os
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
 
 from bayesdist.errors import FormatError
+from bayesdist.files.regular import PathLike, opened
 from bayesdist.utils.memory import memory_limit, size_text
 
 
@@ -57,6 +59,12 @@ class Budget:
     where: str
     size: int
     limits: Limits = LIMITS
+
+    @classmethod
+    def of_file(cls, path: PathLike, limits: Limits = LIMITS) -> Budget:
+        """Budget of a regular file, by its size; raises the errors of `opened`."""
+        with opened(path) as stream:
+            return cls(str(path), os.fstat(stream.fileno()).st_size, limits)
 
     @property
     def content(self) -> int:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import io
 import math
-import os
 import zlib
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -19,7 +18,6 @@ from bayesdist.errors import FormatError, InputError
 from bayesdist.files.atomic import atomic_path
 from bayesdist.files.budget import DAMAGED, LIMITS, Budget, Limits
 from bayesdist.files.faults import deferred_interrupts, restoring
-from bayesdist.files.regular import opened
 from bayesdist.utils.memory import size_text
 
 if TYPE_CHECKING:
@@ -81,8 +79,7 @@ def _checked(path: Path, limits: Limits = LIMITS) -> Iterator[h5py.File]:
     """Context manager for an open file with arrays that are safe to read."""
     import h5py
 
-    with opened(path) as stream:
-        budget = Budget(str(path), os.fstat(stream.fileno()).st_size, limits)
+    budget = Budget.of_file(path, limits)
     with h5py.File(path, "r") as file:
         budget.refuse_content(_Announced(budget).bytes_of(file))
         yield file

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 from collections import Counter
 from collections.abc import Collection, Mapping
 from pathlib import Path
@@ -37,8 +36,7 @@ def open_parquet(
     """
     import pyarrow.parquet  # takes 0.1 s, which other formats do not need
 
-    with opened(path) as stream:
-        budget = Budget(str(path), os.fstat(stream.fileno()).st_size, limits)
+    budget = Budget.of_file(path, limits)
     stored = pyarrow.parquet.ParquetFile(
         path,
         read_dictionary=sorted(as_codes) or None,
@@ -220,9 +218,10 @@ def refuse_long_text(column: pyarrow.ChunkedArray | pyarrow.Array, budget: Budge
 
 def parquet_table(path: Path, limits: Limits = LIMITS) -> Table:
     """All rows of a Parquet file as an astropy Table; raises FormatError beyond its limits."""
-    budget = Budget(str(path), path.stat().st_size, limits)
-    with open_parquet(path, limits=limits) as plain:
-        texts = text_columns(plain.schema_arrow)
+    import pyarrow.parquet
+
+    budget = Budget.of_file(path, limits)
+    texts = text_columns(pyarrow.parquet.read_schema(path))
     with open_parquet(path, texts, limits) as stored:
         units = parquet_units(stored.schema_arrow)
         table = Table(meta=parquet_header(stored.schema_arrow))

@@ -65,8 +65,7 @@ def _whole_lines(lines: list[str], mark: str, path: Path) -> list[str]:
     Raises FormatError if the last line is cut.
     """
     if lines and lines[0].startswith("# %ECSV"):
-        head = takewhile(lambda line: line.startswith("#"), lines)
-        mark = "," if any(_COMMAS.match(line) for line in head) else " "
+        mark = _mark_of_ecsv(lines)
     bare = [line.rstrip("\r\n") for line in lines]
     refuse_missing_cells(bare, mark, where=str(path))
     refuse_cut_end(lines, mark, where=str(path))
@@ -77,14 +76,19 @@ def _is_comment(line: str) -> bool:
     return line.startswith("#")
 
 
+def _mark_of_ecsv(lines: list[str]) -> str:
+    """Separator of the cells of an ECSV file, which its header states."""
+    return "," if any(map(_COMMAS.match, takewhile(_is_comment, lines))) else " "
+
+
 def read_ecsv(path: Path, limits: Limits = LIMITS) -> Table:
     """Table of an ECSV file; for errors see `read_table`."""
     with _reading(path):
         lines = read_lines(path, limits)
-        refuse_multiplied_header(lines, _budget(path, limits))
-        lines = _whole_lines(lines, " ", path)
+        refuse_multiplied_header(lines, Budget.of_file(path, limits))
+        mark = _mark_of_ecsv(lines)
+        lines = _whole_lines(lines, mark, path)
         table = Table.read(lines, format="ascii.ecsv")
-        mark = "," if any(map(_COMMAS.match, takewhile(_is_comment, lines))) else " "
         refuse_foreign_numbers(_columns_of_ecsv(lines), lines, mark, where=str(path))
         return table
 
@@ -96,12 +100,8 @@ def _columns_of_ecsv(lines: list[str]) -> dict[str, bool]:
     return {str(one["name"]): one["datatype"] not in ("string", "bool") for one in described}
 
 
-def _budget(path: Path, limits: Limits) -> Budget:
-    return Budget(str(path), path.stat().st_size, limits)
-
-
 def _read_text(path: Path, limits: Limits) -> Table:
-    return parse_text_table(read_lines(path, limits), _budget(path, limits))
+    return parse_text_table(read_lines(path, limits), Budget.of_file(path, limits))
 
 
 def _read_separated(path: Path, limits: Limits, *, mark: str) -> Table:
@@ -115,7 +115,7 @@ def _read_separated(path: Path, limits: Limits, *, mark: str) -> Table:
     mark = detected_mark or mark
     lines = _whole_lines(without_empty_names(lines, mark), mark, path)
     cells = next(csv.reader([names], delimiter=mark), [])
-    _budget(path, limits).refuse_columns(len(cells))
+    Budget.of_file(path, limits).refuse_columns(len(cells))
     refuse_numbers_as_names(cells, where=str(path))
     # the time astropy needs for a comment grows with the square of its length
     lines = with_decimal_points([line for line in lines if line[:1] != "#"], mark, where=str(path))
