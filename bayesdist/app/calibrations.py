@@ -23,7 +23,7 @@ from bayesdist.files.documents import read_json_as
 from bayesdist.infer import LinearFit, load_fit, load_posterior
 from bayesdist.infer.solution.solution import Solution
 from bayesdist.products import registry
-from bayesdist.products.formats.common.document import Choice, MissingSizeError
+from bayesdist.products.common.document import Choice, MissingSizeError
 from bayesdist.utils.arrays import Float
 
 __all__ = ["read_calibration"]

@@ -5,43 +5,10 @@ The names in this module give access to everything that a file of one format con
 
     from bayesdist.formats import read_idctab
     table = read_idctab("acs_wfc_idc.fits")
+
+Each subpackage or module holds one format and imports none of the others.
 """
 
-from bayesdist.data import read_hst1pass, read_matchup
-from bayesdist.products import (
-    IdcTab,
-    SipHeader,
-    describe,
-    idctab_from_solution,
-    lint,
-    list_formats,
-    read_d2im,
-    read_idctab,
-    read_npol,
-    read_sip,
-    sip_from_solution,
-    write_d2im,
-    write_idctab,
-    write_npol,
-    write_sip,
-)
+import lazy_loader
 
-__all__ = [
-    "IdcTab",
-    "SipHeader",
-    "describe",
-    "idctab_from_solution",
-    "lint",
-    "list_formats",
-    "read_d2im",
-    "read_hst1pass",
-    "read_idctab",
-    "read_matchup",
-    "read_npol",
-    "read_sip",
-    "sip_from_solution",
-    "write_d2im",
-    "write_idctab",
-    "write_npol",
-    "write_sip",
-]
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

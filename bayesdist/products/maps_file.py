@@ -19,7 +19,7 @@ from bayesdist.assess.maps.uncertainty import RELATIVE
 from bayesdist.calibration.area import PixelAreaMap
 from bayesdist.errors import InputError
 from bayesdist.files.atomic import atomic_path
-from bayesdist.products.formats.common.cards import append_cards, set_text, wrapped_cards
+from bayesdist.products.common.cards import append_cards, set_text, wrapped_cards
 from bayesdist.utils.arrays import Float
 
 PREFIX = {"least squares": "LSQ", "posterior": "MIX", RELATIVE: "REL"}

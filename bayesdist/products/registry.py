@@ -1,7 +1,7 @@
 """All file formats, and functions that work on a file of any format.
 
-A format is a module of `bayesdist.products.formats`, or the module `format` of a subpackage of it,
-that defines FORMAT. New formats are discovered by this name alone.
+A format is a module of `bayesdist.formats`, or the module `format` of a subpackage of it, that
+defines FORMAT. New formats are discovered by this name alone.
 """
 
 from __future__ import annotations
@@ -18,9 +18,8 @@ from typing import TYPE_CHECKING
 from bayesdist.calibration.calibration import Calibration
 from bayesdist.errors import InputError, required
 from bayesdist.files.atomic import refuse_unsafe_name
-from bayesdist.products import formats
-from bayesdist.products.formats.common.content import Content, read_content, readable
-from bayesdist.products.formats.common.document import (
+from bayesdist.products.common.content import Content, read_content, readable
+from bayesdist.products.common.document import (
     PARAMETERS,
     BuildOptions,
     Built,
@@ -30,7 +29,7 @@ from bayesdist.products.formats.common.document import (
     Format,
     FormatSettings,
 )
-from bayesdist.products.formats.common.read_back import ReadBack, by_calibrations, of_chips
+from bayesdist.products.common.read_back import ReadBack, by_calibrations, of_chips
 
 if TYPE_CHECKING:
     from astropy.table import Table
@@ -40,9 +39,8 @@ if TYPE_CHECKING:
 def all_formats() -> tuple[Format, ...]:
     """All formats, in the order in which they are tried on a file."""
     found_formats = []
+    formats = import_module("bayesdist.formats")
     for entry in pkgutil.iter_modules(formats.__path__):
-        if entry.name == "common":
-            continue
         name = f"{formats.__name__}.{entry.name}" + (".format" if entry.ispkg else "")
         format_ = getattr(import_module(name), "FORMAT", None)
         if format_ is not None:

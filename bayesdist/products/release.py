@@ -17,13 +17,13 @@ from bayesdist.calibration.orientation import oriented
 from bayesdist.calibration.plane import Orientation
 from bayesdist.errors import InputError
 from bayesdist.files.atomic import made_folder, refuse_unsafe_name
+from bayesdist.formats.idctab.build import idctab_from_solution
+from bayesdist.formats.idctab.drift import Loss, storable
+from bayesdist.formats.idctab.hst import combination_of
+from bayesdist.formats.idctab.table import IdcTab, write_idctab
+from bayesdist.formats.lookup.d2im import write_d2im
+from bayesdist.formats.lookup.npol import write_npol
 from bayesdist.model.lookup import LookupTable
-from bayesdist.products.formats.idctab.build import idctab_from_solution
-from bayesdist.products.formats.idctab.drift import Loss, storable
-from bayesdist.products.formats.idctab.hst import combination_of
-from bayesdist.products.formats.idctab.table import IdcTab, write_idctab
-from bayesdist.products.formats.lookup.d2im import write_d2im
-from bayesdist.products.formats.lookup.npol import write_npol
 
 Filter = str | tuple[str, ...]
 

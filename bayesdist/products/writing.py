@@ -22,7 +22,7 @@ from pydantic import ValidationError
 from bayesdist.calibration.calibration import Calibration, calibration_of_maps
 from bayesdist.errors import BayesdistWarning, InputError, require_known
 from bayesdist.files.atomic import atomic_path
-from bayesdist.products.formats.common.document import (
+from bayesdist.products.common.document import (
     PARAMETERS,
     BuildOptions,
     Built,

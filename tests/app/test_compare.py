@@ -14,9 +14,10 @@ from astropy.table import Table
 from astropy.wcs import WCS
 
 from bayesdist.app.calibrations import calibration_at
+from bayesdist.formats.idctab.build import idctab_from_solution
+from bayesdist.formats.idctab.table import write_idctab
 from bayesdist.infer import LinearFit, fit_linear, save_fit
 from bayesdist.model import Chip, DistortionModel, TimeDependence
-from bayesdist.products import idctab_from_solution, write_idctab
 from bayesdist.simulate import simulate_matches
 from tests.app.support import cli, good, one_sentence, refused
 

@@ -15,7 +15,7 @@ from bayesdist.calibration.inverse import detector_grid
 from bayesdist.calibration.plane import Plane
 from bayesdist.model import LookupTable
 from bayesdist.products import registry
-from tests.products.support import some_solution
+from tests.formats.support import some_solution
 
 from .support import cli, good
 

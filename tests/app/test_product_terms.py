@@ -16,13 +16,15 @@ from bayesdist.app.results import open_results
 from bayesdist.app.store.rundir import RunDirectory
 from bayesdist.calibration.calibration import GaussianSolution, calibration_of
 from bayesdist.calibration.plane import Plane
+from bayesdist.formats.sip.build import sip_from_solution
+from bayesdist.formats.sip.positions import sip_positions
+from bayesdist.formats.wise.build import write_wise_meta
+from bayesdist.formats.wise.meta import read_wise_meta
 from bayesdist.model import Chip, DistortionModel
-from bayesdist.products import read_wise_meta, sip_from_solution, write_wise_meta
-from bayesdist.products.formats.common.document import BuildOptions
-from bayesdist.products.formats.sip.positions import sip_positions
+from bayesdist.products.common.document import BuildOptions
 from bayesdist.products.registry import product_settings
 from tests.app.support import good, summary_of, write_job
-from tests.products.support import random_pixels, some_solution
+from tests.formats.support import random_pixels, some_solution
 from tests.reduced import only_in_full
 
 SIZE, GRID, REFERENCE = (512, 256), (9, 5), (256.0, 128.0)

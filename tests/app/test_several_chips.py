@@ -23,9 +23,9 @@ from bayesdist.assess.terms.correlated import (
 )
 from bayesdist.diagnose.residuals.binned import binned_residuals
 from bayesdist.diagnose.residuals.misfit import misfit_of
+from bayesdist.formats.idctab.table import read_idctab
 from bayesdist.infer import load_fit, load_posterior, residuals
 from bayesdist.model import Chip, DistortionModel, TimeDependence
-from bayesdist.products import read_idctab
 from bayesdist.simulate import simulate_matches
 from tests.app.support import (
     EXACT,

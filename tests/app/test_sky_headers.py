@@ -19,9 +19,9 @@ from astropy.table import Table, vstack
 from astropy.wcs import WCS, FITSFixedWarning, Sip
 from astropy.wcs.utils import fit_wcs_from_points
 
+from bayesdist.formats.tpv.head import tpv_of
 from bayesdist.products import read_calibration
-from bayesdist.products.formats.common.content import read_content
-from bayesdist.products.formats.tpv.head import tpv_of
+from bayesdist.products.common.content import read_content
 from tests.app.support import EXACT, good, partly_run, summary_of, write_config, write_job
 from tests.reduced import case_in_full, only_in_full
 
@@ -119,7 +119,7 @@ def test_positions_are_those_of_the_truth(crval, parity, tmp_path, rng) -> None:
 
 
 @pytest.mark.slow
-@only_in_full("tests/products/test_write_calibration compares them with astropy")
+@only_in_full("tests/formats/test_write_calibration compares them with astropy")
 def test_headers_of_other_kinds_are_on_the_sky_of_the_truth(tmp_path, rng) -> None:
     """TPV and CPDIS by astropy.wcs; each has its own error, and the total with it."""
     truth = camera((83.8, -5.4), -1)
@@ -214,7 +214,7 @@ def test_two_chips_have_a_header_each(tmp_path, rng) -> None:
 
 def test_a_header_that_is_off_is_called_wrong(tmp_path, rng, monkeypatch) -> None:
     """CRVAL moved by ten pixels on its way to the file."""
-    from bayesdist.products.formats.sip import format, write
+    from bayesdist.formats.sip import format, write
 
     def moved(sip):
         off = replace(sip, crval=(sip.crval[0], sip.crval[1] + 10 * PIXEL / 3600))

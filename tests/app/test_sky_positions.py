@@ -20,7 +20,7 @@ from bayesdist.calibration.further import FurtherError, scaled
 from bayesdist.calibration.plane import Plane
 from bayesdist.calibration.sky_positions import sky_positions
 from bayesdist.errors import InputError
-from bayesdist.products.formats.common.document import BuildOptions
+from bayesdist.products.common.document import BuildOptions
 from bayesdist.products.registry import build, product_settings, read_calibration
 
 from .support import cli

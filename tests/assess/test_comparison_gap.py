@@ -15,9 +15,10 @@ from scipy.stats import chi2, kstest
 from bayesdist.assess.comparison.gap import gap_difference, pair_of_chips
 from bayesdist.assess.comparison.sentences import gap_lines, gap_verdict
 from bayesdist.calibration.calibration import calibration_of
+from bayesdist.formats.idctab.build import idctab_from_solution
+from bayesdist.formats.idctab.table import write_idctab
 from bayesdist.infer import Rejection, fit_linear, save_fit
 from bayesdist.model import Chip, DistortionModel
-from bayesdist.products import idctab_from_solution, write_idctab
 from bayesdist.simulate import simulate_matches
 from tests.app.support import good
 from tests.reduced import only_in_full

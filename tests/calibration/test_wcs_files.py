@@ -8,7 +8,8 @@ from astropy.io import fits
 from astropy.wcs import WCS
 from numpy.testing import assert_allclose
 
-from bayesdist.products import read_calibration, sip_header, write_sip
+from bayesdist.formats.sip.write import sip_header, write_sip
+from bayesdist.products import read_calibration
 
 from ..products.test_tpv import SCAMP_SIZE, scamp_head
 from ..real.sip_sets import SIZE, read_sets

@@ -28,7 +28,7 @@ from bayesdist.files.fits import open_fits
 from bayesdist.files.hdf5 import hdf5_arrays, netcdf_groups
 from bayesdist.files.tables import TABLE_SUFFIXES, read_table
 from bayesdist.files.unpacked import CODECS, read_unpacked, unpacked
-from bayesdist.products.formats.common.content import Content
+from bayesdist.products.common.content import Content
 
 N = 2000
 SMALL = Limits(content=10_000, content_per_byte=2)

@@ -9,7 +9,7 @@ import bayesdist as bd
 from bayesdist.calibration.calibration import calibration_of
 from bayesdist.errors import InputError
 from bayesdist.infer.solution.linear import NO_REJECTION
-from bayesdist.products.formats.common.document import BuildOptions
+from bayesdist.products.common.document import BuildOptions
 from bayesdist.products.registry import build, product_settings, read_calibration
 
 ORDER = 12

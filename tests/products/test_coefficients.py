@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 
 from bayesdist.model import polynomial_terms
-from bayesdist.products.formats.common.coefficients import (
+from bayesdist.products.common.coefficients import (
     evaluate,
     idctab_column,
     idctab_powers,

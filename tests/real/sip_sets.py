@@ -11,7 +11,7 @@ import numpy as np
 from astropy.wcs import Sip
 from numpy.typing import NDArray
 
-from bayesdist.products import SipHeader
+from bayesdist.formats.sip.header import SipHeader
 
 Float = NDArray[np.float64]
 

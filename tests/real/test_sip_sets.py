@@ -11,15 +11,12 @@ from numpy.testing import assert_allclose
 from scipy import stats
 
 from bayesdist.calibration.inverse import detector_grid, fit_inverse
+from bayesdist.formats.sip.build import sip_from_solution
+from bayesdist.formats.sip.header import worst_closure
+from bayesdist.formats.sip.read import read_sip
+from bayesdist.formats.sip.rotate import pixel_matrix, rotated_sip
+from bayesdist.formats.sip.write import sip_header, write_sip
 from bayesdist.missions.wise.simulate import wise_solution
-from bayesdist.products import (
-    read_sip,
-    sip_from_solution,
-    sip_header,
-    worst_closure,
-    write_sip,
-)
-from bayesdist.products.formats.sip.rotate import pixel_matrix, rotated_sip
 from tests.reduced import only_in_full
 
 from ..products.support import StandIn, astropy_wcs, random_pixels
@@ -88,7 +85,7 @@ def test_written_headers_come_back_and_astropy_reads_them(sets, tmp_path, full) 
 
 
 @pytest.mark.slow
-@only_in_full("tests/products/test_sip_rotate turns headers")
+@only_in_full("tests/formats/test_sip_rotate turns headers")
 def test_turned_headers_agree_with_astropy_at_turned_pixels(sets, full) -> None:
     """All sets, or one in twenty-five, each in one of the eight orientations; some in all."""
     x, y = random_pixels(SIZE, 50)

@@ -10,7 +10,7 @@ from pydantic import AfterValidator, Field, PositiveFloat, create_model
 
 from bayesdist.app.config.section import Section
 from bayesdist.errors import InputError
-from bayesdist.products.formats.common.document import FormatSettings
+from bayesdist.products.common.document import FormatSettings
 from bayesdist.products.registry import product_settings
 from bayesdist.utils.quantities import year_of
 

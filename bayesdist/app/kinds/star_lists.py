@@ -13,10 +13,10 @@ from bayesdist.app.config.campaign import StarListsBlock
 from bayesdist.calibration.calibration import Calibration
 from bayesdist.data import Detections, StarCuts, read_star_lists
 from bayesdist.errors import InputError
+from bayesdist.formats.idctab.calibration import idctab_calibration
+from bayesdist.formats.idctab.table import IdcTab, read_idctab
 from bayesdist.infer.selfcal.start import Start
 from bayesdist.model import Chip
-from bayesdist.products import IdcTab, read_idctab
-from bayesdist.products.formats.idctab.calibration import idctab_calibration
 from bayesdist.utils.arrays import Bool, Float, Int
 
 OFF_CHIP = 0.02  # fraction of a list's detections tolerated beyond the edge of a chip

@@ -28,8 +28,8 @@ from bayesdist.data.sky.tangent import sky_of_plane
 from bayesdist.diagnose.diagnostics import Diagnostics
 from bayesdist.diagnose.residuals.sample import StarSample, star_sample
 from bayesdist.files.atomic import atomic_path, path_within
+from bayesdist.formats.sip.positions import sky_of_header
 from bayesdist.infer import Posterior
-from bayesdist.products.formats.sip.positions import sky_of_header
 from bayesdist.products.registry import format_of, lint
 from bayesdist.utils.limits import FILE_ERROR, SKY_CLOSURE
 

@@ -33,7 +33,7 @@ from bayesdist.infer.solution.solution import Solution
 from bayesdist.infer.solution.transforms import reference_gauge, without_frames
 from bayesdist.model import LookupTable
 from bayesdist.products import Period, read_calibration, write_release
-from bayesdist.products.formats.common.document import BuildOptions, Built
+from bayesdist.products.common.document import BuildOptions, Built
 from bayesdist.products.registry import build, lint
 
 # rows of a budget that are included in the covariance of the exported solution, or in another row

@@ -25,10 +25,11 @@ from bayesdist.assess.terms.forms import MEASURED, PRODUCT, Known, Row
 from bayesdist.calibration.calibration import Calibration
 from bayesdist.calibration.plane import ARCSEC
 from bayesdist.errors import BayesdistError
+from bayesdist.formats.lookup.d2im import read_d2im
+from bayesdist.formats.lookup.file import read_lookup_file
 from bayesdist.model import corrected
 from bayesdist.model.grid import grid_pixels, mesh
-from bayesdist.products import read_d2im, read_lookup_file
-from bayesdist.products.formats.common.read_back import Positions, ReadBack, by_calibrations
+from bayesdist.products.common.read_back import Positions, ReadBack, by_calibrations
 from bayesdist.products.registry import read_back, read_calibration
 from bayesdist.utils.arrays import Float
 

@@ -12,10 +12,11 @@ import numpy as np
 from bayesdist.app.screen import progress_bar, table_text
 from bayesdist.app.store.record import write_text
 from bayesdist.errors import InputError
+from bayesdist.formats.idctab.build import idctab_from_solution
+from bayesdist.formats.idctab.table import IdcTab, write_idctab
 from bayesdist.infer.solution.solution import Solution
 from bayesdist.missions.acs.simulate import AcsCampaign, acs_solution, simulate_acs, write_acs
 from bayesdist.model import DistortionModel
-from bayesdist.products import IdcTab, idctab_from_solution, write_idctab
 from bayesdist.utils.arrays import Float
 from bayesdist.utils.quantities import Random
 

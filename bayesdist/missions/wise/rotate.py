@@ -7,15 +7,12 @@ from pathlib import Path
 from bayesdist.app.screen import number
 from bayesdist.app.store.output import refuse_existing
 from bayesdist.errors import InputError
-from bayesdist.products import (
-    SipHeader,
-    WiseBand,
-    read_sip,
-    read_wise_meta,
-    rotated_sip,
-    write_sip,
-    write_wise_meta,
-)
+from bayesdist.formats.sip.header import SipHeader
+from bayesdist.formats.sip.read import read_sip
+from bayesdist.formats.sip.rotate import rotated_sip
+from bayesdist.formats.sip.write import write_sip
+from bayesdist.formats.wise.build import write_wise_meta
+from bayesdist.formats.wise.meta import WiseBand, read_wise_meta
 from bayesdist.products.registry import open_document
 
 

@@ -12,12 +12,13 @@ from astropy.table import Table
 import bayesdist as bd
 from bayesdist.app.kinds.fitted import read_tables
 from bayesdist.data import read_exposures, read_matches
+from bayesdist.formats.idctab.table import read_idctab
+from bayesdist.formats.lookup.d2im import read_d2im
 from bayesdist.infer import load_posterior
 from bayesdist.infer.nodes import NodeGrid
 from bayesdist.infer.solution.transforms import reference_gauge, segment, without_frames
 from bayesdist.missions.acs.simulate import read_acs
 from bayesdist.model import corrected
-from bayesdist.products import read_d2im, read_idctab
 from tests.app.support import cli, good, one_sentence, snapshot, summary_of
 
 # ACS ISR 2015-06, Tables 1 to 3: chip, segment (RDATE 2004.5, 2012.5), alpha, beta

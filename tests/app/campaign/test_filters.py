@@ -25,6 +25,9 @@ from bayesdist.assess import LocalErrors
 from bayesdist.assess.domain import EvaluationDomain
 from bayesdist.data import read_exposures
 from bayesdist.errors import InputError
+from bayesdist.formats.idctab.table import read_idctab
+from bayesdist.formats.lookup.d2im import read_d2im
+from bayesdist.formats.lookup.file import read_lookup_file
 from bayesdist.infer import load_fit, load_posterior
 from bayesdist.infer.exposures.shared_drift import drift_priors, with_drift_of
 from bayesdist.infer.nodes.table_fit import held_sigma
@@ -32,17 +35,12 @@ from bayesdist.infer.series import Series, fit_series
 from bayesdist.infer.solution.transforms import linear_terms, lines, reference_gauge, without_frames
 from bayesdist.missions.acs.simulate import acs_solution, making, read_acs, simulate_acs
 from bayesdist.model import LookupTable, TimeDependence, corrected
-from bayesdist.products import (
-    read_d2im,
-    read_idctab,
-    read_lookup_file,
-)
 from tests.app.support import carried_out, cli, good, one_sentence, replaced, snapshot
+from tests.formats.acs_offline import Pointing, to_sky
+from tests.formats.acs_offline import corrected as corrected_by_stwcs
+from tests.formats.stwcs_offline import separation_mas
+from tests.formats.support import laid_on, turned_by
 from tests.infer.small_campaign import Truth
-from tests.products.acs_offline import Pointing, to_sky
-from tests.products.acs_offline import corrected as corrected_by_stwcs
-from tests.products.stwcs_offline import separation_mas
-from tests.products.support import laid_on, turned_by
 from tests.reduced import only_in_full
 
 FILTERS = {"F606W": ("F606W", "CLEAR2L"), "F814W": ("CLEAR1L", "F814W")}

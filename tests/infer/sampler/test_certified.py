@@ -13,7 +13,7 @@ from bayesdist.infer import OutlierMixture, fit_linear, load_posterior, sample, 
 from bayesdist.infer.density.grid import build_proposal
 from bayesdist.infer.sampler.certified import AFFORDABLE, run_certified
 from bayesdist.infer.sampler.chains import Settings
-from bayesdist.products.formats.common.cards import convergence_cards
+from bayesdist.products.common.cards import convergence_cards
 
 from ..support import simulated, target_of
 

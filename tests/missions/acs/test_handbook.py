@@ -10,10 +10,11 @@ from astropy.io import fits
 from astropy.table import Table
 from numpy.testing import assert_allclose
 
+from bayesdist.formats.idctab.build import idctab_from_solution
+from bayesdist.formats.idctab.calibration import idctab_calibration
+from bayesdist.formats.idctab.table import read_idctab, write_idctab
 from bayesdist.infer import fit_linear, save_fit
 from bayesdist.model import Chip, DistortionModel
-from bayesdist.products import idctab_from_solution, read_idctab, write_idctab
-from bayesdist.products.formats.idctab.calibration import idctab_calibration
 from bayesdist.simulate import simulate_matches
 from tests.app.support import begin_stagewise, cli, good, one_sentence, refused, write_job
 

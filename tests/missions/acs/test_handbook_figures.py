@@ -8,12 +8,12 @@ from matplotlib.quiver import Quiver
 from numpy.testing import assert_allclose
 
 from bayesdist.diagnose.residuals.binned import binned_sums
+from bayesdist.formats.idctab.calibration import idctab_calibration
+from bayesdist.formats.idctab.table import read_idctab
 from bayesdist.missions.acs.handbook.figures import area_figure, non_linear_figure, residual_figure
 from bayesdist.missions.acs.handbook.numbers import detector_numbers, handbook_rows
 from bayesdist.missions.acs.handbook.whole_detector import WholeDetector
-from bayesdist.products import read_idctab
-from bayesdist.products.formats.idctab.calibration import idctab_calibration
-from tests.products.siaf_acs import SCALE, siaf_calibration
+from tests.formats.siaf_acs import SCALE, siaf_calibration
 
 
 @pytest.fixture(scope="module")

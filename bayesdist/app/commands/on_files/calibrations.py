@@ -11,7 +11,7 @@ from bayesdist.app.calibrations import calibration_at, refuse_unused_date
 from bayesdist.calibration.calibration import Calibration
 from bayesdist.calibration.subarray import Subarray, subarray_at_corner, subarrays_of_image
 from bayesdist.errors import InputError
-from bayesdist.products.formats.common.content import read_hdus
+from bayesdist.products.common.content import read_hdus
 
 
 def calibration_of_scale(

@@ -23,7 +23,7 @@ from bayesdist.calibration.plane import ARCSEC
 from bayesdist.errors import InputError
 from bayesdist.files.atomic import made_folder
 from bayesdist.files.documents import toml_of
-from bayesdist.products.formats.common.document import (
+from bayesdist.products.common.document import (
     PARAMETERS,
     BuildOptions,
     Choice,

@@ -47,7 +47,7 @@ from bayesdist.calibration.plane import ARCSEC
 from bayesdist.data.sky.tangent import separation
 from bayesdist.errors import InputError
 from bayesdist.model.grid import DEFAULT_GRID
-from bayesdist.products.formats.common.document import MissingSizeError
+from bayesdist.products.common.document import MissingSizeError
 from bayesdist.report.drawing import save_figures
 from bayesdist.report.figures.commands import difference_vectors
 

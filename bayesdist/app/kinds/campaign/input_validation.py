@@ -15,8 +15,8 @@ from bayesdist.app.kinds.star_lists import refuse_other_chips
 from bayesdist.data.holdout import refuse_strangers
 from bayesdist.data.matching.reports import check_campaign
 from bayesdist.errors import ConfigError, DegenerateError, InputError
+from bayesdist.formats.idctab.table import read_idctab
 from bayesdist.model import TimeDependence
-from bayesdist.products import read_idctab
 from bayesdist.utils.arrays import Float, Int
 
 MIN_EXPOSURES = 3  # exposures: two do not determine a scatter

@@ -23,10 +23,10 @@ from bayesdist.data import (
 from bayesdist.data.sky.tangent import mean_direction, tangent_plane
 from bayesdist.errors import InputError
 from bayesdist.files.tables import read_table
+from bayesdist.formats.idctab.hst import parity_of
+from bayesdist.formats.idctab.table import IdcTab
 from bayesdist.infer.catalogue.star_errors import StarErrors
 from bayesdist.model import DistortionModel, LookupTable
-from bayesdist.products import IdcTab
-from bayesdist.products.formats.idctab.hst import parity_of
 
 
 @dataclass(frozen=True, eq=False)

@@ -32,9 +32,9 @@ from bayesdist.data import (
 )
 from bayesdist.data.matching.campaign import CampaignMatches
 from bayesdist.errors import InputError
+from bayesdist.formats.idctab.table import read_idctab
 from bayesdist.infer.solution.geometry import geometry_of
 from bayesdist.model import Chip
-from bayesdist.products import read_idctab
 
 log = logging.getLogger("bayesdist")
 

@@ -10,10 +10,10 @@ from bayesdist.app.config.run import TABLES, rates_file, tables_file
 from bayesdist.app.kinds.campaign.linear_terms import with_gap
 from bayesdist.app.kinds.fitted import converged_posterior, read_tables
 from bayesdist.errors import InputError
+from bayesdist.formats.lookup.d2im import read_d2im
 from bayesdist.infer import GaussianPriors
 from bayesdist.infer.exposures.shared_drift import drift_priors
 from bayesdist.model import Chip, DistortionModel, LookupTable
-from bayesdist.products import read_d2im
 
 
 def held_tables(block: TablesBlock, chips: tuple[Chip, ...], base: Path) -> tuple[LookupTable, ...]:

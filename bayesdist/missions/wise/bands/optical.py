@@ -9,9 +9,12 @@ from pathlib import Path
 import numpy as np
 
 from bayesdist.errors import InputError
+from bayesdist.formats.sip.header import SipHeader
+from bayesdist.formats.sip.read import read_sip
+from bayesdist.formats.sip.rotate import rotated_sip
+from bayesdist.formats.wise.meta import read_wise_meta
 from bayesdist.missions.wise.assess.distortion_field import DistortionField
 from bayesdist.model import Chip, PolynomialBasis
-from bayesdist.products import SipHeader, read_sip, read_wise_meta, rotated_sip
 from bayesdist.products.registry import open_document
 
 OTHER_FIELD = 1.5  # ratio of extents above which a header must be of another instrument

@@ -12,11 +12,12 @@ from pathlib import Path
 import numpy as np
 
 from bayesdist.errors import InputError
+from bayesdist.formats.sip.header import SipHeader
+from bayesdist.formats.sip.write import write_sip
 from bayesdist.missions.wise.published import WISE_ARRAYS
 from bayesdist.missions.wise.simulate import wise_solution
 from bayesdist.model import DistortionModel
-from bayesdist.products import SipHeader, write_sip
-from bayesdist.products.formats.common.cards import text_card
+from bayesdist.products.common.cards import text_card
 from bayesdist.utils.arrays import Float
 
 __all__ = ["DELIVERED_TURN", "optical_model", "write_optical_model"]

@@ -1,0 +1,195 @@
+"""Format of images with CPDIS look-up tables, built on a grid as fine as requested."""
+
+from __future__ import annotations
+
+import numpy as np
+from astropy.io import fits
+from pydantic import PositiveFloat
+
+from bayesdist.calibration.calibration import Calibration
+from bayesdist.calibration.chip_map import ChipMap
+from bayesdist.calibration.inverse import detector_grid
+from bayesdist.calibration.orientation import placed_at, refuse_wide_planes
+from bayesdist.calibration.plane import arcsec_per
+from bayesdist.formats.cpdis.file import (
+    ERRORS,
+    TABLES,
+    CpdisFile,
+    cpdis_calibration,
+    cpdis_of,
+)
+from bayesdist.formats.cpdis.lint import lint_cpdis
+from bayesdist.formats.sip.format import describe_wcs
+from bayesdist.model import LookupTable
+from bayesdist.products.common.cards import (
+    append_cards,
+    convergence_cards,
+    node_cards,
+    number_card,
+    solution_cards,
+    tangent_cards,
+    text_card,
+    wrapped_cards,
+)
+from bayesdist.products.common.coefficients import require_regular
+from bayesdist.products.common.content import fits_bytes
+from bayesdist.products.common.document import BuildOptions, Built, Format, FormatSettings
+from bayesdist.products.common.parameters import parameters_hdu
+from bayesdist.utils.arrays import Float
+
+_CLOSE = 1e-4  # pixels; target error between nodes if no step is requested
+_STEPS = (64.0, 32.0, 16.0, 8.0, 4.0)  # pixels
+_MOST = 1025  # largest number of nodes per axis
+_CHECK = 397  # points per axis at which the tables are compared with the map
+
+
+class Settings(FormatSettings):
+    """Configuration of a file with CPDIS look-up tables."""
+
+    # pixels between nodes; by default, fine enough for an error of 1e-4 pixels
+    step: PositiveFloat | None = None
+    crval: tuple[float, float] | None = None
+
+
+def build(calibration: Calibration, settings: Settings, options: BuildOptions) -> tuple[Built, ...]:
+    """Build the file; its summary gives the largest rounding and interpolation error in pixels."""
+    scale = options.scale_arcsec
+    calibration = placed_at(calibration, settings.crval, scale, where="products.cpdis")
+    refuse_wide_planes(calibration, options.epoch, scale, where="products.cpdis")
+    plane, unit = calibration.plane, calibration.unit
+    arcsec = arcsec_per(unit, scale)
+    maps = calibration.with_tables(calibration.at(options.epoch, origin="stated"))
+    images, tables, worst = [], [], 0.0
+    for k, (number, chip_map) in enumerate(maps.items()):
+        linear, crpix = _linear_part(chip_map, number)
+        table, off = _sampled(chip_map, linear, crpix, settings.step)
+        worst = max(worst, off)
+        versions = (2 * k + 1, 2 * k + 2)
+        ctype, crval = ("RA---TAN", "DEC--TAN"), plane.point or (0.0, 0.0)
+        cards = tangent_cards(ctype, crval, crpix, linear * arcsec / 3600)
+        if plane.point is None:
+            cards.append(text_card("COMMENT", "CRVAL is a placeholder."))
+        cards += _record_cards(table, versions)
+        cards.append(number_card("BDWORST", off, "[pix] of rounding and between nodes"))
+        if chip_map.before or chip_map.after:
+            cards.append(number_card("BDTABLES", 1, "look-up tables are in it"))
+        cards += solution_cards(plane.kind, unit, arcsec, number, chip_map.basis.size)
+        cards += wrapped_cards("COMMENT", calibration.remarks)
+        cards += convergence_cards(calibration.solution)
+        image = fits.ImageHDU(name="SCI", ver=k + 1)
+        append_cards(image, cards)
+        images.append(image)
+        sigma = _sigma(chip_map, linear, table)
+        for axis, version in enumerate(versions):
+            tables.append(_table_hdu(TABLES, version, table.values[axis], table))
+            if sigma is not None:
+                tables.append(_table_hdu(ERRORS, version, sigma[axis], table))
+    parameters = parameters_hdu(calibration, options.epoch)
+    content = fits_bytes([fits.PrimaryHDU(), *images, *tables, parameters])
+    return (Built("cpdis.fits", "CPDIS", content, calibration, None, {"tables_pix": worst}),)
+
+
+def _linear_part(one: ChipMap, number: int) -> tuple[Float, tuple[float, float]]:
+    """Linear part (2, 2) of the polynomial, and the pixel at which it gives (u, v) = 0."""
+    poly = one.monomials()
+    require_regular(poly.linear, number)
+    zero = np.array(one.basis.reference_pixel) - np.linalg.solve(poly.linear, poly.constant)
+    return poly.linear, (float(zero[0]), float(zero[1]))
+
+
+def _sampled(
+    one: ChipMap, linear: Float, crpix: tuple[float, float], step: float | None
+) -> tuple[LookupTable, float]:
+    """Table of the shifts in single precision, and its largest error in pixels."""
+    if one.basis.order == 1 and len(one.before) == 1 and not one.after:
+        table = one.before[0]
+        return _checked(one, linear, crpix, table.first, table.step, table.shape[::-1])
+    for asked in _STEPS if step is None else (step,):
+        counts = [int(min(max(np.ceil(n / asked), 1), _MOST - 1)) + 1 for n in one.basis.size]
+        steps = [n / (count - 1) for n, count in zip(one.basis.size, counts, strict=True)]
+        sampled = _checked(
+            one, linear, crpix, (0.5, 0.5), (steps[0], steps[1]), (counts[0], counts[1])
+        )
+        if sampled[1] <= _CLOSE:
+            break
+    return sampled
+
+
+def _checked(
+    one: ChipMap,
+    linear: Float,
+    crpix: tuple[float, float],
+    first: tuple[float, float],
+    step: tuple[float, float],
+    counts: tuple[int, int],
+) -> tuple[LookupTable, float]:
+    def shifts(x: Float, y: Float) -> Float:
+        moved = np.linalg.solve(linear, one.at(x, y)) + np.array(crpix)[:, None]
+        return moved - np.stack([x, y])
+
+    x, y = np.meshgrid(*(f + s * np.arange(n) for f, s, n in zip(first, step, counts, strict=True)))
+    values = shifts(x.ravel(), y.ravel()).reshape(2, *x.shape).astype(np.float32)
+    table = LookupTable(one.chip or 1, np.asarray(values, float), first=first, step=step)
+    x, y = detector_grid(one.basis.size, _CHECK)
+    off = np.hypot(*(table.evaluate(x, y).T - shifts(x, y)))
+    return table, float(off.max())
+
+
+def _sigma(one: ChipMap, linear: Float, table: LookupTable) -> Float | None:
+    """Standard errors (2, ny, nx) of the nodes in pixels; None for a map without covariance."""
+    cov = one.covariance_at(*(v.ravel() for v in np.meshgrid(*table.nodes())))
+    if cov is None:
+        return None
+    back = np.linalg.inv(linear)
+    moved = back @ cov @ back.T
+    return np.sqrt(moved.diagonal(axis1=1, axis2=2)).T.reshape(2, *table.shape)
+
+
+def _record_cards(table: LookupTable, versions: tuple[int, int]) -> list[str]:
+    """Cards of CPDIS, CPERR and the DP records."""
+    cards = []
+    for axis, version in enumerate(versions, start=1):
+        largest = float(np.abs(table.values[axis - 1]).max())
+        cards += [
+            text_card(f"CPDIS{axis}", "LOOKUP", "prior distortion by a table"),
+            number_card(f"CPERR{axis}", largest, "[pix] largest correction"),
+            *(
+                text_card(f"DP{axis}", f"{field}: {value:.1f}")
+                for field, value in (
+                    ("EXTVER", version), ("NAXES", 2), ("AXIS.1", 1), ("AXIS.2", 2),
+                )
+            ),
+        ]  # fmt: skip
+    return cards
+
+
+def _table_hdu(name: str, version: int, plane: Float, table: LookupTable) -> fits.ImageHDU:
+    hdu = fits.ImageHDU(np.asarray(plane, np.float32), name=name, ver=version)
+    append_cards(hdu, node_cards(table))
+    hdu.header["BUNIT"] = "pixel"
+    return hdu
+
+
+def _describe(file: CpdisFile) -> list[str]:
+    """Lines of text on the images as read by astropy.wcs, and on their tables."""
+    first, *lines = describe_wcs(file.content, lint_cpdis(file))
+    added = []
+    for image in file.images:
+        for axis in (1, 2):
+            plane = image.plane(axis)
+            if plane is not None and plane.values.ndim == 2:
+                ny, nx = plane.values.shape
+                added.append(
+                    f"  CPDIS{axis}    {nx} x {ny} nodes, first at pixel ({plane.first[0]:g}, "
+                    f"{plane.first[1]:g}), step {plane.step[0]:g} x {plane.step[1]:g}"
+                )
+        if "BDWORST" in image.header:
+            added.append(f"  precision {image.header['BDWORST']:.2g} px")
+    return [first, *added, *lines]
+
+
+FORMAT = Format(
+    "cpdis", "an image with CPDIS look-up tables", 33, cpdis_of, _describe, lint_cpdis,
+    cpdis_calibration, Settings, build, holds_tables=True, needs_scale=lambda settings: True,
+    asks=("size",),
+)  # fmt: skip

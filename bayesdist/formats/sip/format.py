@@ -1,0 +1,188 @@
+"""Format of SIP headers."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Annotated, Literal
+
+import numpy as np
+from pydantic import Field
+
+from bayesdist.calibration.calibration import Calibration
+from bayesdist.calibration.orientation import MAX_DEPARTURE, departure_from_tangent_plane
+from bayesdist.formats.sip.build import sip_from_solution
+from bayesdist.formats.sip.calibration import (
+    agreeing,
+    side_file,
+    sip_calibration,
+    with_side_file,
+)
+from bayesdist.formats.sip.header import SIDE_FILE, SIP_ORDERS, SipHeader
+from bayesdist.formats.sip.lint import lint_sip
+from bayesdist.formats.sip.positions import sip_read_back
+from bayesdist.formats.sip.read import holds_sip, sip_of
+from bayesdist.formats.sip.write import sip_text
+from bayesdist.products.common.cards import header_of
+from bayesdist.products.common.content import Content
+from bayesdist.products.common.document import (
+    BuildOptions,
+    Built,
+    Choice,
+    Finding,
+    Format,
+    FormatSettings,
+)
+from bayesdist.products.common.parameters import with_parameters
+
+
+class Settings(FormatSettings):
+    """Configuration of a SIP header."""
+
+    inverse_order: Annotated[int, Field(ge=2, le=9)] | None = None
+    linear: Literal["cd", "sip"] = "cd"
+    # None: sky, except for wide fields without a sky position
+    axes: Literal["sky", "linear"] | None = None
+    crval: tuple[float, float] | None = None
+    parameters: bool = True  # True to write a companion file with the covariance
+
+
+def _parse(content: Content) -> Content | None:
+    return content if holds_sip(content) else None
+
+
+def describe_wcs(content: Content, extra: Sequence[Finding] = ()) -> list[str]:
+    """Lines of text on each world coordinate system of a file, and `extra` findings."""
+    # importing astropy.wcs takes longer than reading most files
+    from bayesdist.formats.sip.wcs_text import describe_wcs as lines_on
+
+    return lines_on(content, extra)
+
+
+def _lint(content: Content) -> tuple[Finding, ...]:
+    return lint_sip(sip_of(content))
+
+
+def _calibration(content: Content, name: str, choice: Choice) -> Calibration:
+    sip = sip_of(content)
+    stated = [k for k in ("D2IMDIS1", "D2IMDIS2", "CPDIS1", "CPDIS2") if k in header_of(sip.cards)]
+    notes = (f"without the look-up tables of {', '.join(stated)}",) if stated else ()
+    calibration = sip_calibration(sip, name, size=choice.size, notes=notes)
+    if choice.as_used:
+        return calibration
+    named = str(header_of(sip.cards).get(SIDE_FILE, ""))
+    return with_parameters(calibration, content.beside(named), named, agreeing)
+
+
+def _build(
+    calibration: Calibration, settings: Settings, options: BuildOptions
+) -> tuple[Built, ...]:
+    """Build one header per chip."""
+    out = []
+    departure = _projection_matters(calibration, settings, options)
+    axes = settings.axes or ("linear" if departure else "sky")
+    for number in calibration.numbers:
+        sip = sip_from_solution(
+            calibration,
+            chip=number,
+            epoch=options.epoch,
+            scale_arcsec=options.scale_arcsec,
+            notes=calibration.remarks,
+            axes=axes,
+            **settings.model_dump(exclude={"parameters", "axes"}),
+        )
+        several = len(calibration.numbers) > 1
+        name = options.named(f"sip_{number}.hdr" if several else "sip.hdr", several=several)
+        if settings.parameters:
+            parameter_file = side_file(calibration, number, options.epoch, name)
+            sip = with_side_file(sip, parameter_file.file_name)
+            out.append(parameter_file)
+        summary = {"closure_pix": sip.closure, "a_dmax": sip.a_dmax, "b_dmax": sip.b_dmax}
+        text = sip_text(sip).encode("ascii")
+        warnings = (*departure, *_warnings(sip, calibration))
+        notes = _notes(sip, calibration)
+        out.append(Built(name, "SIP", text, sip, number, summary, warnings, notes))
+    return tuple(out)
+
+
+def _notes(sip: SipHeader, calibration: Calibration) -> tuple[str, ...]:
+    """Notes on consequences of the product's settings.
+
+    A note is given if CRVAL is a placeholder because the sky position is neither known nor given,
+    and if A and B hold terms below order 2 as requested.
+    """
+    out = []
+    if _sky_is_assumed(sip, calibration) and sip.crval == (0.0, 0.0):
+        remedy = f"set products.sip.crval{_or_linear(calibration)}"
+        out.append(f"CRVAL is a placeholder, and {_axes(sip)}: {remedy}")
+    low = {k: c for terms in (sip.a, sip.b) for k, c in terms.items() if sum(k) < 2 and c}
+    if low:
+        out.append(
+            "A and B hold constant or linear terms, which astropy applies and stwcs and gwcs drop: "
+            "set products.sip.linear = 'cd' for those"
+            if any(sum(k) == 1 for k in low)
+            else "A_0_0 and B_0_0 hold what CRVAL leaves, which astropy applies and stwcs and gwcs "
+            "drop"
+        )
+    return tuple(out)
+
+
+def _projection_matters(
+    calibration: Calibration, settings: Settings, options: BuildOptions
+) -> tuple[str, ...]:
+    """Warning that angular u, v may be in a projection other than TAN; empty if this is negligible.
+
+    See `departure_from_tangent_plane`.
+    """
+    stated = settings.axes is not None or settings.crval is not None
+    if calibration.unit == "pix" or stated or calibration.plane.point is not None:
+        return ()
+    if calibration.model.time is not None and options.epoch is None:
+        return ()  # the function that builds the header reports the missing epoch
+    worst = departure_from_tangent_plane(calibration, options.epoch, None)
+    if worst <= MAX_DEPARTURE:
+        return ()
+    return (
+        "the axes are linear: where u, v lie on the sky is not stated, and whether they are a "
+        f"tangent plane is worth {worst:.2g} px in so wide a field. If they are one, set "
+        "products.sip.crval or axes = 'sky'",
+    )
+
+
+def _warnings(sip: SipHeader, calibration: Calibration) -> tuple[str, ...]:
+    """Warning if the header has sky axes that the solution does not state."""
+    if not _sky_is_assumed(sip, calibration) or sip.crval == (0.0, 0.0):
+        return ()
+    return (f"{_axes(sip)}: check that they are{_or_linear(calibration)}",)
+
+
+def _sky_is_assumed(sip: SipHeader, calibration: Calibration) -> bool:
+    """True if the header has sky axes although the solution has no sky position."""
+    return not sip.linear_axes and calibration.plane.point is None
+
+
+def _axes(sip: SipHeader) -> str:
+    """Clause that states the sky directions which the header assumes for u and v."""
+    mirrored = ", which makes the image a mirror of the sky" if np.linalg.det(sip.cd) > 0 else ""
+    return f"u is taken for east and v for north{mirrored}"
+
+
+def _or_linear(calibration: Calibration) -> str:
+    """Alternative remedy, for u and v in pixels."""
+    return ", or set axes = 'linear'" if calibration.unit == "pix" else ""
+
+
+FORMAT = Format(
+    "sip",
+    "a SIP header",
+    1,
+    _parse,
+    describe_wcs,
+    _lint,
+    _calibration,
+    Settings,
+    _build,
+    sip_read_back,
+    highest_order=SIP_ORDERS[1],
+    needs_scale=lambda settings: settings.axes != "linear",
+    asks=("size",),
+)

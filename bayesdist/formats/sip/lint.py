@@ -1,0 +1,248 @@
+"""Checks of a SIP header against the behaviour of astropy.wcs, stwcs and gwcs."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+
+import numpy as np
+
+from bayesdist.calibration.plausible import FAR
+from bayesdist.formats.sip.families import (
+    EDGE,
+    families,
+    forward_is_used,
+    half_unit,
+    inverse_is_used,
+    offset_ranges,
+    repeated_names,
+    values_by_keyword,
+    with_coefficient,
+)
+from bayesdist.formats.sip.header import SIDE_FILE, SIP_ORDERS, SipHeader, worst_closure
+from bayesdist.formats.sip.implied import implied_values, with_error
+from bayesdist.products.common.coefficients import largest_magnitude, sip_keyword
+from bayesdist.products.common.document import Finding
+
+# Pixels: closure of a good inverse, and a closure that only a wrong coefficient explains.
+_CLOSURE_GOOD, _CLOSURE_BAD = 0.01, 0.5
+# Tolerance between a stated value and the computed one: headers print three decimals.
+_DMAX_ABSOLUTE, _DMAX_RELATIVE = 1e-3, 1e-3
+_CLOSURE_RELATIVE = 1e-2
+# No program computes with A_DMAX, so a rough value does no harm; a wrong one suggests that it
+# belongs to another header.
+_DMAX_ROUGH = 0.1
+# A single coefficient is blamed if its correct value reduces the closure to this fraction.
+_EXPLAINED = 0.2
+# Smallest probability of further suspects that are named after the first one.
+_WORTH_NAMING = 0.05
+# Relative tolerance at which two numbers count as equal except for a mistyped sign.
+_SAME_SIZE = 0.05
+
+
+def lint_sip(sip: SipHeader, size: tuple[int, int] | None = None) -> tuple[Finding, ...]:
+    """Check a SIP header against the behaviour of astropy.wcs, stwcs and gwcs.
+
+    Parameters
+    ----------
+    sip : SipHeader
+        Header to check.
+    size : tuple of int, optional
+        Columns and rows of the detector. The default is the size in the header. Without either,
+        checks that need the size are left out, with a note.
+
+    Returns
+    -------
+    tuple of Finding
+        Errors, warnings and notes.
+    """
+    size = size or sip.size
+    findings = [
+        *_frame(sip),
+        *_orders(sip),
+        *_low_terms(sip, size),
+        *_repeated(sip),
+        *_sigmas(sip),
+    ]
+    if size is None:
+        findings.append(
+            Finding(
+                "note", "NAXIS", "the image size is not known: A_DMAX and AP, BP are not checked"
+            )
+        )
+    elif forward_is_used(sip):
+        findings += [*_dmax(sip, size), *_inverse(sip, size)]
+    return tuple(findings)
+
+
+def _sigmas(sip: SipHeader) -> Iterator[Finding]:
+    has_side_file = any(card.startswith(SIDE_FILE) for card in sip.cards)
+    if sip.has_sigmas and not sip.has_linear_sigmas and not has_side_file:
+        yield Finding(
+            "note",
+            "AE, BE",
+            "are errors of the non-linear terms alone: errors of positions are not stated",
+        )
+
+
+def _frame(sip: SipHeader) -> Iterator[Finding]:
+    ra, dec = sip.crval
+    if not sip.linear_axes and not (abs(ra) <= 360 and abs(dec) <= 90):
+        yield Finding("error", "CRVAL1, CRVAL2", f"({ra:g}, {dec:g}) degrees lie on no sphere")
+    if not np.abs(sip.crpix).max() <= FAR:
+        yield Finding("error", "CRPIX1, CRPIX2", f"{sip.crpix[0]:g}, {sip.crpix[1]:g} is no pixel")
+    if np.linalg.det(sip.cd) == 0:
+        yield Finding("error", "CD", "the matrix is singular: no pixel has a position on the sky")
+    elif sip.linear_axes:
+        yield Finding(
+            "note", "CTYPE", "positions are u, v on a plane of their own, and not the sky; astropy "
+            "applies A and B, and remarks that CTYPE does not end in -SIP",
+        )  # fmt: skip
+        return
+    elif np.linalg.det(sip.cd) > 0:
+        yield Finding(
+            "note",
+            "CD",
+            "parity: the determinant is positive, so the image is a mirror image of the sky",
+        )
+    if not all(c.endswith("-SIP") for c in sip.ctype):
+        yield Finding(
+            "warning", "CTYPE", f"{' and '.join(map(repr, sip.ctype))} do not end in -SIP: "
+            "some programs leave the distortion out",
+        )  # fmt: skip
+
+
+def _orders(sip: SipHeader) -> Iterator[Finding]:
+    low, high = SIP_ORDERS
+    for prefix, order, terms in families(sip):
+        keyword = f"{prefix}_ORDER"
+        if order < low:
+            yield Finding(
+                "warning",
+                keyword,
+                f"is {order}: astropy ignores orders below {low}, all terms with them",
+            )
+        if order > high:
+            yield Finding("error", keyword, f"is {order}: the convention ends at {high}")
+        above = [sip_keyword(prefix, *k) for k, c in terms.items() if sum(k) > order and c != 0]
+        if above:
+            yield Finding("warning", ", ".join(above), f"above {keyword} {order}, so ignored")
+
+
+def _low_terms(sip: SipHeader, size: tuple[int, int] | None) -> Iterator[Finding]:
+    named, worst = [], []
+    for prefix, terms in (("A", sip.a), ("B", sip.b)):
+        low = {k: c for k, c in terms.items() if sum(k) < 2 and c != 0}
+        named += [sip_keyword(prefix, *k) for k in low]
+        if size is not None and low:
+            worst.append(largest_magnitude(low, *offset_ranges(sip, size)))
+    if named:
+        extent = f" (up to {max(worst):.4g} px)" if worst else ""
+        yield Finding(
+            "note", ", ".join(named),
+            f"constant or linear terms{extent}: astropy applies them, stwcs and gwcs drop them",
+        )  # fmt: skip
+
+
+def _repeated(sip: SipHeader) -> Iterator[Finding]:
+    values = values_by_keyword(sip)
+    for names in repeated_names(sip):
+        yield Finding(
+            "warning", ", ".join(names), f"the same value, {abs(values[names[0]]):.7g}: "
+            "one may have been copied over the other",
+        )  # fmt: skip
+
+
+def _dmax(sip: SipHeader, size: tuple[int, int]) -> Iterator[Finding]:
+    for prefix, order, terms in families(sip)[:2]:
+        stated = sip.dmax["AB".index(prefix)]
+        true = largest_magnitude(terms, *offset_ranges(sip, size), order)
+        if stated is None:
+            yield Finding("note", f"{prefix}_DMAX", f"is not stated; the maximum is {true:.4g} px")
+            continue
+        if abs(stated - true) <= _DMAX_ABSOLUTE + _DMAX_RELATIVE * true:
+            continue
+        to_edges = largest_magnitude(terms, *offset_ranges(sip, size, EDGE), order)
+        if abs(stated - to_edges) <= half_unit(sip) * (1 + 1e-9):
+            yield Finding(
+                "note",
+                f"{prefix}_DMAX",
+                f"says {stated:.4g} px, which is the maximum to the edges of the outermost pixels; "
+                f"over their centres it is {true:.4g} px",
+            )
+        else:
+            high = stated - true
+            yield Finding(
+                "note" if abs(high) <= _DMAX_ROUGH * true else "warning",
+                f"{prefix}_DMAX",
+                f"says {stated:.4g} px, and the maximum is {true:.4g} px"
+                + (f" ({100 * high / true:+.2g} %)" if true else ""),
+            )
+
+
+def _inverse(sip: SipHeader, size: tuple[int, int]) -> Iterator[Finding]:
+    if sip.inverse_order is None:
+        yield Finding("note", "AP_ORDER", "there is no inverse: programs must iterate")
+        return
+    if not inverse_is_used(sip):
+        return
+    closure = worst_closure(sip, size)
+    mirrored = replace(
+        sip,
+        ap={(j, i): c for (i, j), c in sip.ap.items()},
+        bp={(j, i): c for (i, j), c in sip.bp.items()},
+    )
+    keywords = "AP, BP"
+    if closure > _CLOSURE_GOOD and worst_closure(mirrored, size) < closure / 10:
+        yield Finding(
+            "error",
+            keywords,
+            f"index order: p and q are exchanged against A and B (closure {closure:.3g} px)",
+        )
+    elif closure > _CLOSURE_GOOD:
+        accused = list(_accused(sip, size, closure))
+        yield from accused
+        if closure > _CLOSURE_BAD:
+            yield Finding(
+                "error", keywords, f"they miss the inverse of A, B by up to {closure:.3g} px: "
+                "a coefficient of one or the other is wrong",
+            )  # fmt: skip
+        elif not accused:
+            advice = (
+                "raise AP_ORDER" if max(sip.inverse_order) < SIP_ORDERS[1] else "better iterate"
+            )
+            yield Finding(
+                "warning",
+                keywords,
+                f"the inverse is wrong by up to {closure:.3g} px; {advice}",
+            )
+    if sip.closure is not None and closure > sip.closure * (1 + _CLOSURE_RELATIVE) + 1e-9:
+        yield Finding(
+            "error", "BDCLOS", f"states {sip.closure:.3g} px, and AP, BP leave {closure:.3g} px"
+        )
+
+
+def _accused(sip: SipHeader, size: tuple[int, int], closure: float) -> Iterator[Finding]:
+    """Findings on a wrong coefficient, if its correct value alone makes A, B and AP, BP agree."""
+    suspects = implied_values(sip, size)
+    first = suspects[0]
+    remaining = worst_closure(with_coefficient(sip, first.keyword, first.value), size)
+    if remaining > _EXPLAINED * closure:
+        return
+    low, high = first.interval
+    message = (
+        f"is {first.printed:.7g}, and {' and '.join(first.sources)} imply {with_error(first)} "
+        f"(95 %: {low:.7g} to {high:.7g}; closure then {remaining:.2g} px)"
+    )
+    if abs(first.printed + first.value) < _SAME_SIZE * abs(first.value):
+        message += "; the sign is wrong"
+    for names in repeated_names(sip):
+        if first.keyword in names:
+            repeated = " and ".join(n for n in names if n != first.keyword)
+            message += f"; what stands there is the value of {repeated}"
+    rivals = [suspect for suspect in suspects[1:] if suspect.probability > _WORTH_NAMING]
+    for rival in rivals:
+        message += f"; or {rival.keyword} should be {with_error(rival)}"
+    if rivals:
+        message += "; these numbers alone do not tell which"
+    yield Finding("error", first.keyword, message)

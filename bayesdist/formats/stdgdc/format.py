@@ -1,0 +1,163 @@
+"""Format of STDGDC files, built with the corrected position of every pixel and its error."""
+
+from __future__ import annotations
+
+from typing import Any, Literal
+
+import numpy as np
+from astropy.io import fits
+from numpy.typing import NDArray
+
+from bayesdist.calibration.area import pixel_areas
+from bayesdist.calibration.calibration import Calibration
+from bayesdist.calibration.chip_map import ChipMap
+from bayesdist.calibration.inverse import check_one_to_one, detector_grid
+from bayesdist.errors import InputError
+from bayesdist.formats.stdgdc.file import (
+    EXTENSIONS,
+    SIGMAS,
+    CorrectedFrame,
+    StdGdc,
+    frame_of,
+    stdgdc_calibration,
+    stdgdc_of,
+)
+from bayesdist.formats.stdgdc.lint import lint_stdgdc
+from bayesdist.model import LookupTable
+from bayesdist.products.common.cards import (
+    append_cards,
+    convergence_cards,
+    number_card,
+    set_text,
+    wrapped_cards,
+)
+from bayesdist.products.common.content import fits_bytes
+from bayesdist.products.common.document import (
+    BuildOptions,
+    Built,
+    Format,
+    FormatSettings,
+    finding_lines,
+)
+from bayesdist.products.common.parameters import parameters_hdu
+from bayesdist.utils.arrays import Float
+
+_BETWEEN = 997  # largest number of points per axis, between pixels, at which the tables are checked
+_LARGEST = 2**26  # pixels; a larger detector is a misprint
+
+
+class Settings(FormatSettings):
+    """Configuration of an STDGDC file."""
+
+    precision: Literal["single", "double"] = "single"
+
+
+def build(calibration: Calibration, settings: Settings, options: BuildOptions) -> tuple[Built, ...]:
+    """Build the file; its summary gives the largest rounding and interpolation error in pixels."""
+    if len(calibration.numbers) > 1:
+        raise InputError(
+            f"an STDGDC file is of one detector, and this one has the chips "
+            f"{', '.join(map(str, calibration.numbers))}",
+            where="products.stdgdc",
+            do="write them one by one (Calibration.only in Python, --chip of convert)",
+        )
+    number = calibration.numbers[0]
+    chip_map = calibration.with_tables(calibration.at(options.epoch, origin="stated"))[number]
+    nx, ny = (int(n) for n in chip_map.basis.size)
+    if nx * ny > _LARGEST:
+        raise InputError(f"the detector has {nx} x {ny} pixels", where="products.stdgdc")
+    x, y = detector_grid(chip_map.basis.size, 65)
+    areas = np.linalg.det(chip_map.slope(x, y)) / np.linalg.det(chip_map.linear)
+    U, V = chip_map.at(x, y)
+    check_one_to_one(U, V, 65, areas)
+    frame = frame_of(chip_map, calibration.scale)
+    planes = _planes(chip_map, frame, (nx, ny), settings.precision)
+    worst = _error(
+        chip_map, frame, np.asarray(planes["XGC"], float), np.asarray(planes["YGC"], float)
+    )
+    primary = fits.PrimaryHDU()
+    header = primary.header
+    for name in ("XGC", "YGC", "XCG", "YCG"):
+        header[f"HIERARCH NDIM_{name}"] = nx if name[0] == "X" else ny
+    for name in ("XGC", "YGC"):
+        header[f"HIERARCH {name}_0"] = 0
+    header["BDCHIP"] = number, "chip number"
+    if chip_map.before or chip_map.after:
+        header["BDTABLES"] = True, "XGC and YGC hold look-up tables, too"
+    for keyword, text in (("DETECTOR", calibration.detector), ("FILTER", calibration.filter)):
+        if text:
+            set_text(header, keyword, text)
+    stated = frame.keywords() | {"BDWORST": (worst, "[pix] of rounding and between nodes")}
+    append_cards(primary, (number_card(keyword, *value) for keyword, value in stated.items()))
+    append_cards(primary, wrapped_cards("COMMENT", calibration.remarks))
+    append_cards(primary, convergence_cards(calibration.solution))
+    images = [fits.ImageHDU(plane, name=name) for name, plane in planes.items()]
+    content = fits_bytes([primary, *images, parameters_hdu(calibration, options.epoch)])
+    return (Built("stdgdc.fits", "STDGDC", content, calibration, None, {"tables_pix": worst}),)
+
+
+def _planes(
+    one: ChipMap, frame: CorrectedFrame, size: tuple[int, int], precision: str
+) -> dict[str, NDArray[Any]]:
+    """Values (ny, nx) of all extensions; standard errors are in single precision."""
+    shape = size[::-1]
+    rows, columns = np.indices(shape, float)
+    x, y = columns.ravel() + 1, rows.ravel() + 1
+    corrected = frame.corrected(one.at(x, y)).reshape(2, *shape)
+    area, _ = pixel_areas(one, np.arange(1.0, size[0] + 1), np.arange(1.0, size[1] + 1))
+    area = area / abs(np.linalg.det(frame.similarity))
+    back, _ = one.pixels(frame.positions(np.stack([x, y])))
+    # outside of the detector's image the map may have no inverse
+    back = np.where(np.isfinite(back), back, np.stack([x, y]))
+    tables = (*corrected, -2.5 * np.log10(area), *np.reshape(back, (2, *shape)))
+    kind = np.float32 if precision == "single" else np.float64
+    planes: dict[str, NDArray[Any]] = dict(
+        zip(EXTENSIONS, (np.asarray(t, kind) for t in tables), strict=True)
+    )
+    cov = one.covariance_at(x, y)
+    if cov is None:
+        return planes
+    turn = np.linalg.inv(frame.similarity)
+    cov = turn @ cov @ turn.T
+    sx, sy = np.sqrt(cov[:, 0, 0]), np.sqrt(cov[:, 1, 1])
+    product = sx * sy
+    correlation = np.divide(cov[:, 0, 1], product, out=np.zeros_like(product), where=product > 0)
+    sigmas = (
+        np.asarray(t.reshape(shape), np.float32) for t in (sx, sy, np.clip(correlation, -1.0, 1.0))
+    )
+    return planes | dict(zip(SIGMAS, sigmas, strict=True))
+
+
+def _error(one: ChipMap, frame: CorrectedFrame, xgc: Float, ygc: Float) -> float:
+    """Largest distance between the tables and the map, at nodes and between them, in pixels."""
+    x, y = detector_grid(one.basis.size, min(_BETWEEN, 3 * int(max(one.basis.size))))
+    table = LookupTable(1, np.stack([xgc, ygc]), first=(1.0, 1.0), step=(1.0, 1.0))
+    return float(np.hypot(*(table.evaluate(x, y).T - frame.corrected(one.at(x, y)))).max())
+
+
+def _describe(file: StdGdc) -> list[str]:
+    """Lines of text on the tables, with the findings at the end."""
+    findings = lint_stdgdc(file)
+    lines = [f"{file.name}: STDGDC"]
+    if not {"XGC", "YGC"} & set(file.missing):
+        nx, ny = file.size
+        lines[0] += f" of {nx} x {ny} px"
+        xgc, ygc = file.table("XGC"), file.table("YGC")
+        if xgc.shape == ygc.shape:
+            far = np.hypot(xgc - np.arange(1, nx + 1), ygc - np.arange(1, ny + 1)[:, None])
+            lines.append(f"  moves     pixels by up to {far.max():.4g} px")
+    if "MGC" not in file.missing:
+        mgc = file.table("MGC")
+        lines.append(f"  MGC       {mgc.min():.4f} to {mgc.max():.4f} mag")
+    if "BDWORST" in file.header:
+        lines.append(f"  precision {file.header['BDWORST']:.2g} px, rounding and between nodes")
+    if file.hdu(SIGMAS[0]) is not None:
+        medians = [float(np.median(file.table(name))) for name in SIGMAS[:2]]
+        lines.append(f"  errors    {medians[0]:.3g} and {medians[1]:.3g} px in the median")
+    return [*lines, "", *finding_lines(findings)]
+
+
+FORMAT = Format(
+    "stdgdc", "an STDGDC file", 32, stdgdc_of, _describe, lint_stdgdc, stdgdc_calibration,
+    Settings, build, holds_tables=True,
+)  # fmt: skip

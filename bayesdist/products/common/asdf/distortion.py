@@ -1,0 +1,226 @@
+"""Parsed distortion reference file of any observatory, and its calibration."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from astropy.modeling import Model
+from numpy.typing import ArrayLike
+
+from bayesdist.calibration.calibration import Calibration, calibration_of_maps
+from bayesdist.calibration.chip_map import fitted_map
+from bayesdist.calibration.inverse import detector_grid
+from bayesdist.calibration.plane import Plane
+from bayesdist.errors import FormatError, InputError
+from bayesdist.model.basis import MAX_ORDER
+from bayesdist.products.common.asdf.transforms import evaluated, order_of, tables_of
+from bayesdist.products.common.asdf.tree import Detector
+from bayesdist.products.common.document import Choice, MissingSizeError
+from bayesdist.products.common.read_back import ReadBack, of_chips
+from bayesdist.products.common.record import calibration_from
+from bayesdist.utils.arrays import Float
+
+ARCSEC = {"arcsec": 1.0, "deg": 3600.0, "mas": 1e-3, "rad": 180 / np.pi * 3600, "arcmin": 60.0}
+AGREEMENT = 1e-6  # pixels; tolerance between the record and the transform of one file
+GRID = 65  # grid points per axis, over the pixel centres from corner to corner
+
+
+@dataclass(frozen=True, eq=False)
+class DistortionFile:
+    """Parsed distortion reference file."""
+
+    name: str
+    observatory: str
+    model: Model  # from 0-based pixels to V2, V3
+    meta: Mapping[str, Any]
+    units: tuple[str, str]  # of input and output, as stated; empty if not stated
+    record: Mapping[str, Any] | None = None  # record written by bayesdist, see `common.record`
+    detector: Detector | None = None  # None if unknown
+
+    @property
+    def inverse(self) -> Model | None:
+        """Inverse transform; None if the file has none."""
+        try:
+            return self.model.inverse
+        except NotImplementedError:
+            return None
+
+    @property
+    def size(self) -> tuple[float, float] | None:
+        """Columns and rows: from the record, or else those of the known detector."""
+        nominal = None if self.detector is None else self.detector.size
+        if self.record is None:
+            return nominal
+        try:
+            columns, rows = self.record["chip"]["size"]
+            return float(columns), float(rows)
+        # an invalid record is reported when it is read in full
+        except (KeyError, TypeError, ValueError):
+            return nominal
+
+    @property
+    def stated_closure(self) -> float | None:
+        """Largest error of the inverse as stated in the file, in pixels."""
+        inverse = {} if self.record is None else self.record.get("inverse", {})
+        return inverse.get("closure_pix")
+
+    def v2v3(self, x: ArrayLike, y: ArrayLike) -> Float:
+        """V2 and V3 (2, N) in arcsec at FITS 1-based pixels (N,)."""
+        at = evaluated(self.model, np.asarray(x, float) - 1.0, np.asarray(y, float) - 1.0)
+        return ARCSEC.get(self.units[1], 1.0) * at
+
+    def grid(self) -> tuple[Float, Float]:
+        """FITS 1-based pixels on a grid over the detector; MissingSizeError if size is unknown."""
+        if self.size is None:
+            raise _no_size(self.name)
+        return detector_grid(self.size, GRID)
+
+
+def transform_in(tree: Mapping[str, Any], key: str, where: str) -> Model:
+    """Transform of two coordinates to two stored under `key`; FormatError for anything else."""
+    model = tree.get(key)
+    if not isinstance(model, Model):
+        content = (
+            "a list of models" if isinstance(model, (list, tuple)) else f"no model ({model!r})"
+        )
+        raise FormatError(
+            f"{key} holds {content}, which is no map of a detector's pixels"[:200],
+            where=where,
+            do="give a distortion reference file of an imager",
+        )
+    if (model.n_inputs, model.n_outputs) != (2, 2):
+        raise FormatError(
+            f"{key} takes {model.n_inputs} coordinates to {model.n_outputs}, and not 2 to 2",
+            where=where,
+            do="give a distortion reference file of an imager",
+        )
+    return model
+
+
+def closure_of(forward: Model, back: Model, x: Float, y: Float) -> float:
+    """Largest distance of pixels (N,) from where forward and inverse return them; may be NaN."""
+    with np.errstate(all="ignore"):
+        returned = evaluated(back, *evaluated(forward, x - 1.0, y - 1.0))
+    return float(np.hypot(returned[0] - (x - 1.0), returned[1] - (y - 1.0)).max())
+
+
+def recorded(file: DistortionFile, record: Mapping[str, Any]) -> Calibration:
+    """Calibration stored in the record, with the look-up tables of the transform."""
+    values = [table.lookup_table for table in tables_of(file.model)]
+    inner = [np.asarray(v, float)[1:-1, 1:-1].T for v in values]  # without the padding
+    pairs = [np.stack(inner[k : k + 2]) for k in range(0, len(inner), 2)]
+    return calibration_from(record, file.name, pairs)
+
+
+def departure(file: DistortionFile, calibration: Calibration) -> float:
+    """Largest distance in pixels between a calibration and the transform of its file."""
+    x, y = file.grid()
+    turn, v2v3 = calibration.plane.to_v2v3, calibration.plane.v2v3
+    if turn is None or v2v3 is None:
+        return float("inf")
+    [number] = calibration.numbers
+    ours = turn @ calibration.forward(x, y, chip=number).T + np.array(v2v3)[:, None]
+    return float(np.hypot(*(ours - file.v2v3(x, y))).max() / calibration.pixel()[0])
+
+
+def transforms_read_back(files: Mapping[int, DistortionFile]) -> ReadBack:
+    """Positions in V2, V3 by the files of the chips, and the errors of their inverses."""
+
+    def read_back(file: DistortionFile) -> ReadBack:
+        back = file.inverse
+
+        def forward(x: Float, y: Float, _: int, __: float | None) -> Float:
+            return file.v2v3(x, y).T
+
+        if back is None:
+            return ReadBack(file.name, forward, None, own_axes=True)
+
+        def missed(x: Float, y: Float, _: int, __: float | None) -> Float:
+            pixels = np.stack([x, y]) - 1.0
+            return (evaluated(back, *evaluated(file.model, *pixels)) - pixels).T
+
+        return ReadBack(file.name, forward, missed, own_axes=True)
+
+    return of_chips({number: read_back(file) for number, file in files.items()})
+
+
+def distortion_calibration(file: DistortionFile, choice: Choice) -> Calibration:
+    """Calibration in arcsec, with the covariance of the record if the transform agrees with it.
+
+    For a file without record, (u, v) are V2, V3 relative to the middle of the detector.
+    MissingSizeError if neither the file nor `choice` gives the size; InputError if the transform is
+    not a polynomial.
+    """
+    notes: tuple[str, ...] = ()
+    if file.record is not None:
+        calibration = recorded(file, file.record)
+        far = departure(file, calibration)
+        if far <= AGREEMENT:
+            return calibration
+        notes = (f"the transform is {far:.2g} px from the parameters beside it: without errors",)
+    size = file.size if choice.size is None else choice.size
+    if size is None:
+        raise _no_size(file.name)
+    order = order_of(file.model)
+    if order is None:
+        tables = bool(tables_of(file.model))
+        raise InputError(
+            "its look-up tables are not arranged as bayesdist does"
+            if tables
+            else "its transform is no polynomial",
+            where=file.name,
+            do="give a polynomial, or a file with a bayesdist record",
+        )
+    middle = ((size[0] + 1) / 2, (size[1] + 1) / 2)
+    zero = file.v2v3(*(np.array([m]) for m in middle))
+
+    def positions(x: Float, y: Float) -> tuple[Float, Float]:
+        u, v = file.v2v3(x, y) - zero
+        return u, v
+
+    number = _chip_number(file)
+    chip_map = fitted_map(
+        positions,
+        file.name,
+        order=min(order, MAX_ORDER),
+        size=size,
+        reference_pixel=middle,
+        unit="arcsec",
+        chip=number,
+    )
+    x, y = detector_grid(size, GRID)
+    far = float(np.abs(chip_map.at(x, y) - np.stack(positions(x, y))).max())
+    if far > AGREEMENT * np.sqrt(abs(np.linalg.det(chip_map.linear))):
+        raise InputError(
+            f"its transform is a polynomial of an order above {MAX_ORDER}",
+            where=file.name,
+            do=f"give one of order {MAX_ORDER} or less",
+        )
+    instrument = file.meta.get("instrument", {})
+    return calibration_of_maps(
+        {number: chip_map},
+        file.name,
+        plane=Plane(
+            "aperture", v2v3=(float(zero[0, 0]), float(zero[1, 0])), v3_angle=0.0, parity=1
+        ),
+        instrument=str(instrument.get("name", "")),
+        detector=str(instrument.get("detector", "")),
+        filter=str(instrument.get("filter") or instrument.get("optical_element") or ""),
+        numbered=False,
+        notes=notes,
+    )
+
+
+def _chip_number(file: DistortionFile) -> int:
+    return 1 if file.record is None else int(file.record["chip"]["number"] or 1)
+
+
+def _no_size(name: str) -> MissingSizeError:
+    return MissingSizeError(
+        "does not say how large the image is, and its detector is not known here",
+        where=name,
+        do="compare it with a file that says",
+    )

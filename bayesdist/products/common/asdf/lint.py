@@ -1,0 +1,228 @@
+"""Checks of distortion reference files in ASDF, and their description as text."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+from astropy.modeling import Model, models
+
+from bayesdist.errors import BayesdistError
+from bayesdist.products.common.asdf.distortion import (
+    AGREEMENT,
+    DistortionFile,
+    closure_of,
+    departure,
+    recorded,
+)
+from bayesdist.products.common.asdf.transforms import exchanged, leaves, order_of, tables_of
+from bayesdist.products.common.document import Finding, finding_lines, repeated_values
+from bayesdist.products.common.record import error_lines
+from bayesdist.utils.arrays import Float
+
+PIXEL, SKY = ("pix", "pixel"), ("arcsec",)
+# Pixels: closure of a good inverse, and a closure that only a wrong coefficient explains.
+_CLOSURE_GOOD, _CLOSURE_BAD = 0.01, 0.5
+_CLOSURE_RELATIVE = 1e-2
+# Largest ratio of a pixel scale to its nominal value: filters and position change it by less.
+_SCALE_RATIO = 1.2
+_PER_DEGREE = 3600.0
+
+
+def lint_distortion(file: DistortionFile) -> list[Finding]:
+    """Findings about the transform of a file, its units and its record."""
+    findings = [*_units(file)]
+    if file.size is None:
+        message = "the detector is not known here: inverse, parity and scale are not checked"
+        findings.append(Finding("note", "meta.instrument", message))
+        return findings
+    x, y = file.grid()
+    if not np.isfinite(file.v2v3(x, y)).all():
+        return [*findings, Finding("error", "model", "gives values that are not finite")]
+    return [
+        *findings,
+        *_linear(file, file.size),
+        *_inverse(file),
+        *_repeated(file.model),
+        *_record(file),
+    ]
+
+
+def _units(file: DistortionFile) -> Iterator[Finding]:
+    for name, unit, wanted in zip(
+        ("input_units", "output_units"), file.units, (PIXEL, SKY), strict=True
+    ):
+        if unit and unit not in wanted:
+            yield Finding(
+                "error", f"meta.{name}",
+                f"units are {unit!r}; pipelines take pixels to arcsec whatever stands here",
+            )  # fmt: skip
+        elif not unit:
+            yield Finding("warning", f"meta.{name}", f"is missing; it should be {wanted[0]!r}")
+
+
+def _middle(file: DistortionFile, size: tuple[float, float]) -> tuple[Float, Float]:
+    """V2, V3 (2,) at the middle of the detector, and derivatives (2, 2) with respect to pixels."""
+    x, y = ((n + 1) / 2 for n in size)
+    at = file.v2v3([x, x + 0.5, x - 0.5, x, x], [y, y, y, y + 0.5, y - 0.5])
+    return at[:, 0], np.stack([at[:, 1] - at[:, 2], at[:, 3] - at[:, 4]], axis=1)
+
+
+def _linear(file: DistortionFile, size: tuple[float, float]) -> Iterator[Finding]:
+    """Findings on parity and scale at the middle of the detector."""
+    _, slope = _middle(file, size)
+    area = float(np.linalg.det(slope))
+    if area > 0:
+        yield Finding(
+            "error", "parity",
+            "V2, V3 run as x, y do: the image is a mirror image of the sky, which no imager of "
+            f"{file.observatory} gives (VIdlParity is -1)",
+        )  # fmt: skip
+    scale = np.sqrt(abs(area))
+    if file.detector is None:
+        return
+    ratio = float(scale / file.detector.scale)
+    if not 1 / _SCALE_RATIO < ratio < _SCALE_RATIO:
+        message = f"a pixel is {scale:.4g} arcsec, and nominally {file.detector.scale:g}"
+        if 1 / _SCALE_RATIO < ratio * _PER_DEGREE < _SCALE_RATIO:
+            message += ": the transform gives degrees"
+        yield Finding("error", "scale", message)
+
+
+def _inverse(file: DistortionFile) -> Iterator[Finding]:
+    back = file.inverse
+    if back is None:
+        yield Finding(
+            "error", "inverse",
+            "is missing: gwcs cannot go from the sky to pixels, and pipelines stop where they must",
+        )  # fmt: skip
+        return
+    x, y = file.grid()
+    closure = closure_of(file.model, back, x, y)
+    if not closure <= _CLOSURE_GOOD:
+        blamed = _exchanged(file.model, back, x, y, closure)
+        if blamed:
+            yield Finding(
+                "error", blamed, "the order of coefficients: powers of x and y are exchanged "
+                f"(closure {closure:.3g} px)",
+            )  # fmt: skip
+        elif not closure <= _CLOSURE_BAD:
+            yield Finding(
+                "error", "inverse", f"misses the inverse of the model by up to {closure:.3g} px: a "
+                "coefficient of one or the other is wrong",
+            )  # fmt: skip
+        else:
+            yield Finding("warning", "inverse", f"leaves up to {closure:.3g} px; raise its order")
+    stated = file.stated_closure
+    if stated is not None and closure > stated * (1 + _CLOSURE_RELATIVE) + 1e-9:
+        yield Finding(
+            "error", "bayesdist.inverse",
+            f"states {stated:.3g} px, and the inverse leaves {closure:.3g} px",
+        )  # fmt: skip
+
+
+def _exchanged(model: Model, back: Model, x: Float, y: Float, closure: float) -> str:
+    """Part in which exchanging powers of x and y makes forward and inverse agree; empty if none."""
+    # if powers are exchanged in both parts they nearly agree again, so the better one is right
+    smallest = closure / 10
+    blamed = ""
+    for lowest in (1, 2):
+        for part, forward, inverse in (
+            ("inverse", model, exchanged(back, lowest)),
+            ("model", exchanged(model, lowest), back),
+        ):
+            remaining = closure_of(forward, inverse, x, y)
+            if remaining < smallest:
+                smallest, blamed = remaining, part
+    return blamed
+
+
+def _repeated(model: Model) -> Iterator[Finding]:
+    for polynomial in leaves(model):
+        if not isinstance(polynomial, models.Polynomial2D) or polynomial.degree < 2:
+            continue
+        values = {
+            name: float(c)
+            for name, c in zip(polynomial.param_names, polynomial.parameters, strict=True)
+            if sum(map(int, name[1:].split("_"))) > 1
+        }
+        for names in repeated_values(values):
+            message = f"the same value, {abs(values[names[0]]):.7g}: one may have been copied"
+            yield Finding("warning", ", ".join(names), f"{message} over the other")
+
+
+def _record(file: DistortionFile) -> Iterator[Finding]:
+    """Findings about the record written by bayesdist."""
+    if file.record is None:
+        yield Finding("note", "bayesdist", "is not there: the file states no uncertainty")
+        return
+    try:
+        calibration = recorded(file, file.record)
+    except BayesdistError as error:
+        yield Finding("error", "bayesdist", error.cause)
+        return
+    far = departure(file, calibration)
+    if not far <= AGREEMENT:
+        yield Finding(
+            "error", "bayesdist.parameters",
+            f"are another map than the model, by up to {far:.3g} px: one of them has been changed",
+        )  # fmt: skip
+
+
+def describe_distortion(file: DistortionFile, findings: Sequence[Finding]) -> list[str]:
+    """Lines of text on a file, its findings at the end."""
+    meta, instrument = file.meta, file.meta.get("instrument", {})
+    named = [str(instrument[k]) for k in ("name", "detector") if instrument.get(k)]
+    lines = [f"{file.name}: {file.observatory} distortion of {'/'.join(named) or '(unnamed)'}"]
+    elements = [
+        str(instrument[k]) for k in ("filter", "pupil", "optical_element") if instrument.get(k)
+    ]
+    if elements:
+        lines.append(f"  filter    {' '.join(elements)}")
+    lines += [
+        f"  {label:<9} {meta[key]}"
+        for label, key in (("about", "description"), ("useafter",) * 2, ("pedigree",) * 2)
+        if key in meta
+    ]
+    kinds = [type(leaf).__name__ for leaf in leaves(file.model)]
+    order, tables = order_of(file.model), tables_of(file.model)
+    lines.append(
+        f"  model     {len(kinds)} parts"
+        + (f", polynomial of order {order}" if order else "")
+        + (f", {len(tables)} look-up tables" if tables else "")
+    )
+    if file.size is not None:
+        lines += _measured(file, file.size)
+    lines += _uncertainty(file)
+    return [*lines, "", *finding_lines(findings)]
+
+
+def _measured(file: DistortionFile, size: tuple[float, float]) -> list[str]:
+    """Lines on quantities measured from the transform."""
+    at, slope = _middle(file, size)
+    area = float(np.linalg.det(slope))
+    lines = [
+        f"  detector  {size[0]:g} x {size[1]:g} px",
+        f"  V2, V3    {at[0]:.6f}, {at[1]:.6f} arcsec at its middle",
+        f"  pixel     {np.sqrt(abs(area)):.8f} arcsec, parity {'-1' if area < 0 else '+1'}",
+    ]
+    back = file.inverse
+    if back is not None:
+        lines.append(f"  inverse   {closure_of(file.model, back, *file.grid()):.2g} px at worst")
+    return lines
+
+
+def _uncertainty(file: DistortionFile) -> list[str]:
+    """Lines on the record."""
+    record = file.record
+    if record is None:
+        return error_lines(None, "")
+
+    def origin() -> list[str]:
+        provenance = record["provenance"]
+        return [
+            f"  gauge     {record['gauge']}",
+            f"  from      {provenance['source']} by {provenance['software']}",
+        ]
+
+    return error_lines(lambda: recorded(file, record), "a record", origin)

@@ -1,0 +1,98 @@
+"""Reading and writing of ASDF trees, and settings common to all observatories."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from typing import Annotated, Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+
+from bayesdist.files.asdf import asdf_tree, asdf_with_transforms
+from bayesdist.model.basis import MAX_ORDER
+from bayesdist.products.common.content import Content
+from bayesdist.products.common.document import FormatSettings
+
+DESCRIPTION = "Geometric distortion with its uncertainty, by bayesdist"
+
+
+class PlacedSettings(FormatSettings):
+    """Identity of the file, and position and orientation of the (u, v) plane in V2, V3.
+
+    V2Ref, V3Ref [arcsec] are the position of (u, v) = 0. V3IdlYAngle [deg] and VIdlParity describe
+    the axes of (u, v), which are those of the aperture's Ideal system. A calibration made in an
+    aperture provides all of these values.
+    """
+
+    detector: str | None = None  # default: the chip names, or the detector of the calibration
+    useafter: str
+    pedigree: str
+    author: str
+    description: str = DESCRIPTION
+    v2ref: float | None = None
+    v3ref: float | None = None
+    v3idlyangle: float | None = None
+    parity: Literal[-1, 1] | None = None
+    inverse_order: Annotated[int, Field(ge=1, le=12)] | None = None
+
+    def identity(self) -> dict[str, str]:
+        """Metadata that every reference file contains."""
+        names = ("pedigree", "useafter", "author", "description")
+        return {name: getattr(self, name) for name in names}
+
+
+@dataclass(frozen=True)
+class Detector:
+    """Known properties of a detector."""
+
+    size: tuple[float, float]
+    scale: float  # arcsec, nominal
+
+
+_START = b"#ASDF"
+
+
+def is_asdf(content: Content) -> bool:
+    """True if a file begins like an ASDF file."""
+    return content.raw[: len(_START)] == _START
+
+
+def tree_of(content: Content) -> Mapping[str, Any]:
+    """Tree of an ASDF file with its arrays in memory; errors as for `asdf_tree`."""
+    return asdf_tree(content.raw, content.budget, max_order=MAX_ORDER)
+
+
+def packed(
+    tree: Mapping[str, Any], name: str, in_text: Iterable[NDArray[np.generic]] = ()
+) -> bytes:
+    """Bytes of an ASDF file with this tree; InputError if asdf is not installed.
+
+    Arrays in `in_text` are written as text: pipelines close the file before they evaluate a
+    transform, and arrays in binary blocks are not read until then.
+    """
+    stream = io.BytesIO()
+    file = asdf_with_transforms(name).AsdfFile(dict(tree))
+    for array in in_text:
+        file.set_array_storage(array, "inline")
+    file.write_to(stream)
+    return stream.getvalue()
+
+
+def tagged(node: Mapping[str, Any], tag: str, name: str) -> Any:
+    """Node with a tag that needs no converter; errors as for `packed`."""
+    asdf_with_transforms(name)
+    from asdf.tagged import TaggedDict
+
+    return TaggedDict(dict(node), tag)
+
+
+def plain(node: Any) -> Any:
+    """Node with numpy arrays, lists and dictionaries in place of asdf's classes."""
+    if isinstance(node, Mapping):
+        return {str(key): plain(value) for key, value in node.items()}
+    if isinstance(node, (list, tuple)):
+        return [plain(value) for value in node]
+    return np.asarray(node) if hasattr(node, "__array__") else node

@@ -1,0 +1,297 @@
+"""File formats, parsed files and findings.
+
+A `Format` is a record of functions: parse, describe, lint, read, build. Parsing, checks and
+descriptions work on a `Document`, because a file with errors has no valid calibration and because
+lossless reading concerns the bytes. A `Calibration` is made from a document.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+from astropy.io import fits
+from pydantic import BaseModel, ConfigDict
+
+from bayesdist.calibration.calibration import Calibration
+from bayesdist.calibration.plausible import refuse_senseless
+from bayesdist.errors import InputError
+from bayesdist.model import LookupTable
+from bayesdist.model.basis import MAX_ORDER
+from bayesdist.products.common.content import Content, readable
+from bayesdist.products.common.read_back import ReadBack
+
+LEVELS = ("error", "warning", "note")
+PARAMETERS = "parameters"  # kind of a companion file that holds the parameters and their covariance
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One finding of a format check.
+
+    Parameters
+    ----------
+    level : {'error', 'warning', 'note'}
+        'error': programs will fail or misplace stars; 'warning': they may; 'note': good to know.
+    where : str
+        Keyword, column or row.
+    message : str
+        One clause.
+    """
+
+    level: str
+    where: str
+    message: str
+
+    def __str__(self) -> str:
+        return f"{self.level}: {self.where}: {self.message}"
+
+
+def of_part(part: str, findings: Iterable[Finding]) -> list[Finding]:
+    """Findings with the name of the part of the file put first; unchanged if `part` is empty."""
+    return [
+        replace(finding, where=f"{part}, {finding.where}" if part else finding.where)
+        for finding in findings
+    ]
+
+
+def repeated_values(coefficients: Mapping[str, float]) -> list[tuple[str, ...]]:
+    """Groups of names with non-zero values of equal magnitude.
+
+    Two fitted numbers never agree to the last digit: one of them has been copied over the other, as
+    in tables that went through text extraction.
+    """
+    groups: dict[float, list[str]] = {}
+    for name, value in coefficients.items():
+        if value != 0:
+            groups.setdefault(abs(value), []).append(name)
+    return [tuple(names) for names in groups.values() if len(names) > 1]
+
+
+def identity_lines(header: fits.Header) -> list[str]:
+    """Lines of text with the keywords that identify a reference file."""
+    return [f"  {k:<9} {header[k]}" for k in ("DESCRIP", "USEAFTER", "PEDIGREE") if k in header]
+
+
+def missing_identity(header: fits.Header) -> list[Finding]:
+    """Notes on missing keywords that a reference file should have."""
+    message = "is missing; reference files of the observatory have it"
+    keywords = ("USEAFTER", "PEDIGREE", "FILETYPE", "DESCRIP")
+    return [Finding("note", keyword, message) for keyword in keywords if keyword not in header]
+
+
+def finding_lines(findings: Sequence[Finding]) -> list[str]:
+    """Lines of text, the most severe finding first."""
+    if not findings:
+        return ["Findings: none"]
+    ordered = sorted(findings, key=lambda f: LEVELS.index(f.level))
+    return ["Findings:", *(f"  {finding}" for finding in ordered)]
+
+
+class MissingSizeError(InputError):
+    """Error for a file that does not state the size of its image."""
+
+
+def required_size(
+    stated: tuple[float, float] | None,
+    given: tuple[float, float] | None,
+    name: str,
+    what: str = "image",
+) -> tuple[float, float]:
+    """Columns and rows stated by a file, or else `given`; MissingSizeError if both are None."""
+    size = given if stated is None else stated
+    if size is None:
+        raise MissingSizeError(
+            f"does not say how large the {what} is",
+            where=name,
+            do="give it (size=(NX, NY) in Python, --size NX NY on the command line)",
+        )
+    return float(size[0]), float(size[1])
+
+
+@dataclass(frozen=True)
+class Choice:
+    """Selection of one calibration in a file, and values that the file may lack.
+
+    Parameters
+    ----------
+    filter : str, optional
+        Filter of an IDCTAB (names in two wheels may be joined by a comma), or a WISE band such as
+        "W2".
+    size : tuple of float, optional
+        Columns and rows, for a header that does not state them.
+    as_used : bool
+        True to read the file as other programs do, without its stored parameters.
+    """
+
+    filter: str | None = None
+    size: tuple[float, float] | None = None
+    as_used: bool = False
+
+
+class FormatSettings(BaseModel):
+    """Configuration of a product in one format; unknown keys are errors."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+    def check(
+        self,
+        detector: str,
+        size: tuple[float, float] | None,
+        reference_pixel: tuple[float, float] | None,
+    ) -> None:
+        """Raise ValueError for a detector that the format does not support."""
+
+
+@dataclass(frozen=True)
+class BuildOptions:
+    """Options for building files, common to all formats."""
+
+    epoch: float | None = None  # decimal years, for files that are valid at one date
+    scale_arcsec: float | None = None  # arcseconds per pixel; None if not configured
+    # look-up tables of detector and filter, which correct pixels before the polynomials
+    tables: tuple[LookupTable, ...] = ()
+    file_name: str = ""  # name of the file; empty for the usual name of the format
+
+    def named(self, usual: str, *, several: bool = False) -> str:
+        """Name of a file: the requested one, or the usual one if several files are made."""
+        return usual if several else self.file_name or usual
+
+
+@dataclass(frozen=True, eq=False)
+class Built:
+    """File that has been built but not yet written."""
+
+    file_name: str
+    kind: str  # file kind as listed in summary.json
+    content: bytes
+    made: Any  # object that was written, in the class of its format
+    chip: int | None = None  # chip number of a file that holds one chip
+    summary: Mapping[str, Any] = field(default_factory=dict)  # further entries of summary.json
+    warnings: tuple[str, ...] = ()  # effects on programs that read the file, for the terminal
+    notes: tuple[str, ...] = ()  # useful information, such as consequences of the settings
+
+
+@dataclass(frozen=True)
+class Format:
+    """File format, defined by its functions.
+
+    Parameters
+    ----------
+    key : str
+        Name in the configuration and on the command line.
+    title : str
+        Name with its article, as in "an IDCTAB".
+    rank : int
+        Position in the order in which formats are tried; the most specific formats come first.
+    parse : callable
+        ``parse(content)`` returns the parsed file, or None if the `Content` is of another format.
+    describe : callable
+        ``describe(parsed)`` returns lines of text that end with the `finding_lines`.
+    lint : callable, optional
+        ``lint(parsed)`` returns the findings. Formats without checks omit it.
+    calibration : callable, optional
+        ``calibration(parsed, name, choice)`` returns a `Calibration`; `choice` is a `Choice`.
+    settings : type of FormatSettings, optional
+        Settings class of a format that can be built.
+    build : callable, optional
+        ``build(calibration, settings, options)`` returns the files, a tuple of `Built`.
+    read_back : callable, optional
+        ``read_back(files, calibration, options)`` evaluates files that were built from that
+        calibration with those options. It returns one `ReadBack` for each row of the error budget.
+        By default, files are read by `calibration` and aligned with the solution.
+    highest_order : int
+        Highest polynomial order that can be built.
+    holds_tables : bool
+        True if files of this format can hold the look-up tables of the calibration.
+    holds_time : bool
+        True if files of this format can hold the time dependence of the calibration.
+    needs_scale : callable
+        ``needs_scale(settings)`` is True if the file states angles, so that u and v in pixels need
+        a pixel scale.
+    asks : tuple of str
+        Fields of `Choice` that `calibration` uses: "filter", "size".
+    refuse : callable, optional
+        For a format without calibrations: ``refuse(parsed, name)`` raises an InputError that
+        explains why this file has none, or returns if there is nothing specific to say.
+    """
+
+    key: str
+    title: str
+    rank: int
+    parse: Callable[[Content], Any]
+    describe: Callable[[Any], list[str]]
+    lint: Callable[[Any], Sequence[Finding]] | None = None
+    calibration: Callable[[Any, str, Choice], Calibration] | None = None
+    settings: type[FormatSettings] | None = None
+    build: Callable[[Calibration, Any, BuildOptions], tuple[Built, ...]] | None = None
+    read_back: Callable[[Sequence[Built], Calibration, BuildOptions], Sequence[ReadBack]] | None = (
+        None
+    )
+    highest_order: int = MAX_ORDER
+    holds_tables: bool = False
+    holds_time: bool = False
+    needs_scale: Callable[[Any], bool] = lambda settings: False
+    asks: tuple[str, ...] = ()
+    refuse: Callable[[Any, str], None] | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Document:
+    """File of a recognized format.
+
+    Parameters
+    ----------
+    name : str
+        Name of the file, for messages.
+    format : Format
+        Format of the file.
+    holds : object
+        Parsed file, as returned by the format's `parse`.
+    """
+
+    name: str
+    format: Format
+    holds: Any
+
+    def lint(self) -> tuple[Finding, ...]:
+        """Findings of the format's checks."""
+        with readable(self.name):
+            return () if self.format.lint is None else tuple(self.format.lint(self.holds))
+
+    def describe(self) -> str:
+        """Text that describes the content of the file and ends with the findings."""
+        with readable(self.name):
+            return "\n".join(self.format.describe(self.holds))
+
+    def calibration(self, choice: Choice = Choice()) -> Calibration:
+        """Calibration that the file holds.
+
+        Parameters
+        ----------
+        choice : Choice
+            Selected filter and image size, for files that need them.
+
+        Returns
+        -------
+        Calibration
+            Calibration with plausible values.
+
+        Raises
+        ------
+        InputError
+            If the format holds no calibration, or if it needs a filter or size that `choice` lacks.
+        """
+        if self.format.calibration is None:
+            if self.format.refuse is not None:
+                self.format.refuse(self.holds, self.name)
+            raise InputError(
+                f"is {self.format.title}, which holds no calibration by itself",
+                where=self.name,
+                do="give a file that holds one, such as an IDCTAB, a header or a run directory",
+            )
+        with readable(self.name):
+            calibration = self.format.calibration(self.holds, self.name, choice)
+            refuse_senseless(calibration)
+            return calibration

@@ -1,1 +1,0 @@
-"""Formats of calibration files, one module or subpackage per format."""
