@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from astropy.table import Table
+from lxml import html
 
 from .app.several import encoded, results_of
 from .docs_blocks import DOCS, blocks
@@ -136,8 +137,10 @@ def test_the_term_is_a_row_of_the_budget(followed, pairs):
 
 def test_the_table_is_in_the_report(followed):
     folder, _ = followed
-    report = (folder / "megacam-run" / "report.md").read_text("utf-8")
-    assert "Residuals of the least-squares fit, CCD by CCD" in report
-    used = sum(int(n) for n in re.findall(r"^\| ccd\d\d \| \d+ \| (\d+) \|", report, re.M))
+    page = html.fromstring((folder / "megacam-run" / "report.html").read_bytes())
+    assert "Residuals of the least-squares fit, CCD by CCD" in page.text_content()
+    rows = [[cell.text_content().strip() for cell in row] for row in page.xpath("//tr")]
+    numbers = [row[1:3] for row in rows if re.fullmatch(r"ccd\d\d", row[0])]
+    used = sum(int(n) for total, n in numbers if total.isdigit() and n.isdigit())
     summary = json.loads((folder / "megacam-run" / "summary.json").read_text("utf-8"))
     assert used == summary["data"]["n_used"]

@@ -18,7 +18,6 @@ from bayesdist.report.contents import Registry, explanation_of, section_of
 from bayesdist.report.drawing import Drawing
 from bayesdist.report.figures.style import HALF_WIDTH
 from bayesdist.report.texttable import Level, TextTable
-from bayesdist.utils.numbers import MISSING
 
 REPORT = "bayesdist.report"  # package with the templates that all pages share
 _AS_BROWSERS_SAY = {"svg": "svg+xml", "png": "png"}  # MIME subtypes
@@ -153,13 +152,12 @@ def template(name: str, package: str = REPORT) -> jinja2.Template:
         loader=jinja2.ChoiceLoader(
             [jinja2.PackageLoader(package_name) for package_name in packages]
         ),
-        autoescape=".html" in name,
+        autoescape=True,
         undefined=jinja2.StrictUndefined,
         trim_blocks=True,
         lstrip_blocks=True,
         finalize=_typeset,
     )
-    environment.filters["md"] = _markdown
     environment.filters["css"] = _css
     # letters and digits, which cannot end an HTML attribute
     environment.filters["base64"] = lambda text: base64.b64encode(text.encode()).decode("ascii")
@@ -169,12 +167,6 @@ def template(name: str, package: str = REPORT) -> jinja2.Template:
     environment.globals["widths_of"] = _widths
     environment.tests["level"] = lambda value: isinstance(value, Level)
     return environment.get_template(name)
-
-
-# characters with a meaning in Markdown, in texts of bayesdist or of the user's files
-_SPECIAL = str.maketrans(
-    {"|": "\\|", "*": "\\*", "`": "\\`", "[": "\\[", "<": "&lt;", "&": "&amp;", "\n": " "}
-)
 
 
 # numbers as formatted for terminals: a power of ten, a minus sign at the start of a word
@@ -195,13 +187,6 @@ def _typeset(value: object) -> object:
 def _raised(found: re.Match[str]) -> str:
     sign = "-" if found[2] == "-" else ""
     return f"{found[1]}\u202f×\u202f10{(sign + found[3]).translate(_RAISED)}"
-
-
-def _markdown(value: object) -> str:
-    """Escape a text for a line of Markdown."""
-    if isinstance(value, Level):
-        return {"pass": "pass", "warn": "**warn**", "fail": "**FAIL**", "note": MISSING}[value]
-    return str(value).translate(_SPECIAL)
 
 
 def _policy(style: str, script: str) -> str:

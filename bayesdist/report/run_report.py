@@ -1,4 +1,4 @@
-"""Report of a run, as an HTML page and as Markdown."""
+"""Report of a run, as an HTML page."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ import json
 import os
 from collections.abc import Mapping
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 from markupsafe import Markup
@@ -68,25 +67,13 @@ def _embedded(data: Any) -> Markup:
     return Markup(text.replace("<", "\\u003c"))
 
 
-def render_markdown(r: ReportInput, drawings: Mapping[str, Drawing]) -> str:
-    """Report as Markdown with all tables, figures and texts; figures are links into figures/."""
-    return template("report.md.jinja").render(**_contents(r, drawings))
-
-
 def write_report(
     path: str | os.PathLike[str], r: ReportInput, drawings: Mapping[str, Drawing]
 ) -> None:
-    """Write the report as HTML, and as Markdown with the extension .md.
-
-    Raises InputError if a file cannot be written.
-    """
-    texts = {
-        Path(path): render_report(r, drawings),
-        Path(path).with_suffix(".md"): render_markdown(r, drawings),
-    }
-    for target, text in texts.items():
-        with atomic_path(target) as temporary:
-            temporary.write_text(text, encoding="utf-8")
+    """Write the report as HTML; raises InputError if the file cannot be written."""
+    text = render_report(r, drawings)
+    with atomic_path(path) as temporary:
+        temporary.write_text(text, encoding="utf-8")
 
 
 def _with_strip(contents: dict[str, Any]) -> dict[str, Any]:
@@ -107,7 +94,7 @@ def _with_strip(contents: dict[str, Any]) -> dict[str, Any]:
 
 
 def _contents(r: ReportInput, drawings: Mapping[str, Drawing]) -> dict[str, Any]:
-    """Content that both formats of the report share."""
+    """Content of the page."""
     parts = parts_of(REPORT, r, drawings)
     status = next(part for part in parts if part.name == "status")
     other_parts: list[Part] = [part for part in parts if part is not status]

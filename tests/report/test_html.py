@@ -339,7 +339,7 @@ def test_the_file_appears_whole_or_not_at_all(converged, drawings, tmp_path):
     write_report(path, converged, {"margins": drawings["margins"]})
     first = path.read_text(encoding="utf-8")
     assert first.rstrip().endswith("</html>")
-    assert {p.name for p in tmp_path.iterdir()} == {"report.html", "report.md"}
+    assert {p.name for p in tmp_path.iterdir()} == {"report.html"}
     with pytest.raises(InputError, match="missing"):
         write_report(tmp_path / "missing" / "report.html", converged, {})
 

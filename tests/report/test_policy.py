@@ -21,7 +21,7 @@ from bayesdist.assess.budget.surface import budget_surface
 from bayesdist.assess.model import error_model
 from bayesdist.report.context import Product
 from bayesdist.report.overview import OverviewRow, write_overview
-from bayesdist.report.run_report import render_markdown, render_report, write_report
+from bayesdist.report.run_report import render_report, write_report
 from bayesdist.utils.checks import Check
 from tests.budgets import detector_budget
 
@@ -132,11 +132,6 @@ def test_names_are_shown_as_they_are(page, hostile):
     data = json.loads(tree.xpath("//script[@id='budget-data']")[0].text)
     assert [chip["name"] for chip in data["chips"]] == [SCRIPT, COMMENT]
     assert {row["name"] for row in data["given"]} == set(HOSTILE)
-
-
-def test_names_are_no_markup_in_the_other_form(hostile):
-    text = render_markdown(hostile, {})
-    assert not re.search(r"<(script|img|svg|style|!--|/)", text)
 
 
 @pytest.fixture(scope="module")

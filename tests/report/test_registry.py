@@ -16,7 +16,7 @@ from bayesdist.missions.wise.bands.context import BandsInput
 from bayesdist.report.contents import Plot, Registry, Section
 from bayesdist.report.context import CampaignResults, ReportInput
 from bayesdist.report.page import parts_of
-from bayesdist.report.run_report import STRIP, render_markdown, render_report
+from bayesdist.report.run_report import STRIP, render_report
 from bayesdist.report.sections import REPORT
 from bayesdist.report.texttable import Level, TextTable
 
@@ -46,16 +46,15 @@ def test_entries_have_names_of_their_own_and_needs_that_exist(registry):
         assert one.section in named | {""} and one.make.__doc__, one.name
 
 
-def test_figures_and_words_stand_in_the_page_and_in_markdown(campaign_plots):
+def test_figures_and_words_stand_in_the_page(campaign_plots):
     run, plots = campaign_input(), campaign_plots
     for name, plot in plots.items():
         assert plot.title and plot.text and len(plot.alt) > 20, name
     drawings = drawings_of(plots)
-    page, text = render_report(run, drawings), render_markdown(run, drawings)
+    page = render_report(run, drawings)
     on_top = [name for name in STRIP if name in plots]
     others = [name for name in plots if name not in STRIP]
     assert re.findall(r'<figure id="figure-(\w+)"', page) == on_top + others
-    assert re.findall(r"\(figures/(\w+)\.(?:png|svg)\)", text) == list(plots)
 
 
 def test_what_is_not_there_is_not_shown(converged):
