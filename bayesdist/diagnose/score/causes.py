@@ -16,6 +16,8 @@ from bayesdist.utils.distributions import f_sf
 # p-value below which a few of many functions are regarded as the common cause
 LEADING_CHANCE = 0.01
 OF_FIELD = ("orders", "edges", "jumps", "rings", "repeating pattern")
+# polynomials of missing orders resemble these, and follow them in part
+STEEP = ("jumps", "rings", "repeating pattern")
 OF_NOISE = ("noise by position", "noise by axis")
 OF_EXPOSURES = ("noise by exposure", *OF_NOISE)
 
@@ -45,6 +47,10 @@ CAUSES: dict[str, Cause] = {
     "fields of exposures": Cause(
         "fields that differ between exposures", ("pointing", *OF_EXPOSURES)
     ),
+    # causes only if larger than missing orders, and the most significant one of them
+    "jumps": Cause("the jump", ("orders", "edges", "rings", "repeating pattern", *OF_NOISE)),
+    "repeating pattern": Cause("the pattern", ("orders", "edges", "jumps", "rings", *OF_NOISE)),
+    "rings": Cause("the rings", ("orders", "edges", "jumps", "repeating pattern", *OF_NOISE)),
     # a cause only if it explains more than missing orders do
     "edges": Cause(
         "what rises towards the edges", ("orders", "jumps", "repeating pattern", *OF_NOISE)
@@ -53,7 +59,7 @@ CAUSES: dict[str, Cause] = {
         "deviations of exposures that are correlated in time", ("curvature in time",)
     ),
     "exposures": Cause("deviations of exposures", ("pointing", *OF_EXPOSURES)),
-    "orders": Cause("the missing order", OF_NOISE),
+    "orders": Cause("the missing orders", ("edges", *STEEP, *OF_NOISE)),
     "magnitude": Cause("the dependence on magnitude", ("noise by magnitude",)),
 }
 

@@ -36,8 +36,6 @@ JUMPS = Family(
     f"{LOOK_UP_TABLE}; a higher order does not help",
     "",
     "the residuals do not jump at any column or row",
-    explained_by="orders",
-    denial="the jump does not explain it",
 )
 EDGES = 31  # number of columns, and also of rows, that are tested on each chip
 HIGHER = 2  # orders above the model's to which the steps are orthogonal

@@ -10,7 +10,7 @@ from typing import Literal
 import numpy as np
 from scipy import special
 
-from bayesdist.diagnose.score.causes import CAUSES, cause_of, explains_more
+from bayesdist.diagnose.score.causes import CAUSES, STEEP, cause_of, explains_more
 from bayesdist.diagnose.significance import holm
 from bayesdist.utils.checks import LARGER
 from bayesdist.utils.distributions import chi2_isf, f_isf
@@ -212,6 +212,15 @@ def _causes(significant: Mapping[str, Family], outcomes: Sequence[Outcome]) -> d
         if name in significant
         and not all(explains_more(by_name[name], result) for result in competitors)
     }
+    # Terms of a missing order contain steps and rings that are smaller than the terms themselves,
+    # whereas polynomials follow a true step or ring only in part.
+    orders_square = sum(result.size**2 for result in outcomes if result.family.group == "orders")
+    steep = {
+        result.name: result.statistic
+        for result in outcomes
+        if result.name in STEEP and result.name in significant and result.size**2 > orders_square
+    }
+    weaker |= set(STEEP) - {max(steep, key=steep.__getitem__, default="")}
     return {name: family for name, family in significant.items() if name not in weaker}
 
 

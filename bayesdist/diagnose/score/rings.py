@@ -27,8 +27,6 @@ RINGS = Family(
     "half the distance of the rings; a higher order does not help",
     "",
     "the residuals do not form rings",
-    explained_by="orders",
-    denial="the rings do not explain it",
 )
 BINS = 128  # along each side of a chip
 PADDED = 2  # oversampling of the frequencies, so that no wave falls between them

@@ -13,23 +13,22 @@ false matches with a wide scatter. No other property of the noise is assumed. Su
 detections of a star are independent, and their variance is estimated from their own squares.
 
 Polynomial terms that the model may lack, up to two orders above its own, and low-order terms of
-each exposure are subtracted from the residuals first. If these exceed the errors, the shape is not
-tested.
+each exposure are subtracted from the residuals first. If these exceed the errors, or if still
+higher orders are missing, the shape is not tested: it is the shape of the missing terms.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.polynomial import legendre
 
 from bayesdist.diagnose.clusters import sums_over
+from bayesdist.diagnose.score.missing_orders import MIN_STARS, ChipResiduals, legendre_products
 from bayesdist.diagnose.score.result import Family, Outcome, outcome
 from bayesdist.diagnose.score.sample import ScoredSample
 from bayesdist.diagnose.significance import chi_square_of, hotelling_p
-from bayesdist.model.basis import polynomial_terms
 from bayesdist.model.grid import cell_index
 from bayesdist.utils.arrays import Float, Int
 from bayesdist.utils.distributions import beta_sf, chi2_sf, norm_isf, norm_sf
@@ -70,16 +69,9 @@ TWO_CORES = replace(
 TERMS = ((0, 0), (1, 0), (0, 1), (1, 1), (2, 0), (0, 2))
 AREA = np.array([1 / ((2 * i + 1) * (2 * j + 1)) for i, j in TERMS])  # mean squares over the field
 HIGHER = 2  # orders above the model's that are subtracted from the residuals
-STARS_PER_TERM = 6  # minimum per subtracted polynomial term
-# Largest ratio of the residuals' scatter before and after the subtraction. If the model lacks more
-# than that, the shape of the residuals is the shape of the missing terms.
+# largest ratio of the residuals' scatter before and after the subtraction
 MOST_MISSING = 1.3
-PASSES = 4  # iterations of a robust fit
-RIDGE = 1e-12  # of normal equations, relative to their mean diagonal
-TINY = 1e-300
-MIN_STARS = 100  # of a chip, for any test
 MIN_STARS_OF_EXPOSURE = 200  # of an exposure that is tested separately
-LARGEST_LEVERAGE = 0.5
 CORE, REST = (
     1.3,
     4.0,
@@ -100,100 +92,46 @@ WAVES = (
 WAVE_REACH = 2.0  # width of the weights of the test for two cores, in units of that scatter
 
 
-@dataclass(frozen=True, eq=False)
-class _Chip:
-    """Residuals of one chip in units of their errors, along the detector axes."""
-
-    X: Float  # (n,)
-    Y: Float
-    z: Float  # (2, n)
-    inlier: Float  # (n,)
-    star: Int  # (n,) codes from 0
-    exposure: Int  # (n,)
-    sigma: float  # typical error per axis, in the unit of u and v
-    size: tuple[float, float]  # pixels
-    free: float = 1.0  # degrees of freedom of the residuals divided by their number
-
-    @property
-    def n_stars(self) -> int:
-        """Number of stars."""
-        return int(self.star.max(initial=-1)) + 1
-
-    @property
-    def terms(self) -> Float:
-        """Values (n, 6) of `TERMS`."""
-        return _legendre(self.X, self.Y, TERMS)
-
-    def at(self, rows: Int) -> _Chip:
-        """Subset of the detections."""
-        return replace(
-            self,
-            X=self.X[rows],
-            Y=self.Y[rows],
-            z=self.z[:, rows],
-            inlier=self.inlier[rows],
-            star=np.unique(self.star[rows], return_inverse=True)[1],
-            exposure=self.exposure[rows],
-        )
-
-    def by_exposure(self) -> Iterator[_Chip]:
-        """Iterate over the detections of each exposure."""
-        for code in np.unique(self.exposure):
-            yield self.at(np.flatnonzero(self.exposure == code))
-
-
-def shape_tests(sample: ScoredSample) -> list[Outcome]:
+def shape_tests(sample: ScoredSample, chips: Sequence[ChipResiduals]) -> list[Outcome]:
     """Outcomes of the tests for skewness, correlation and two cores.
 
-    Chips with fewer than `MIN_STARS` stars are left out.
+    Parameters
+    ----------
+    sample : ScoredSample
+    chips : sequence of ChipResiduals
+        Residuals of the sample.  Chips that lack terms larger than the errors are not tested.
+
+    Returns
+    -------
+    list of Outcome
     """
-    chips = list(_chips(sample))
+    parts = list(_symmetric_chips(sample, chips))
     unit = sample.model.unit
     tests = (
-        _skewness(chips, unit),
-        _patch(chips, unit),
-        _correlation(chips, unit),
-        _two_cores(chips, unit),
+        _skewness(parts, unit),
+        _patch(parts, unit),
+        _correlation(parts, unit),
+        _two_cores(parts, unit),
     )
     return [test for test in tests if test is not None]
 
 
-def _chips(sample: ScoredSample) -> Iterator[_Chip]:
-    """Iterate over the residuals of the chips with enough stars."""
-    leverage = np.broadcast_to(sample.leverage, sample.score.shape)
-    usable = sample.used & (leverage.max(axis=0) < LARGEST_LEVERAGE) & (sample.inlier > 0)
+def _symmetric_chips(
+    sample: ScoredSample, chips: Sequence[ChipResiduals]
+) -> Iterator[ChipResiduals]:
+    """Iterate over the residuals of the chips that can be tested, without their missing terms."""
     free = _free_radius(sample)
-    for code, chip in enumerate(sample.model.chips):
-        rows = np.flatnonzero(usable & (sample.chip == code))
-        if len(np.unique(sample.star[rows])) < MIN_STARS:
+    for chip in chips:
+        order = chip.order_above(HIGHER)
+        if order == chip.order or chip.missing_orders is not None:
             continue
-        variance = sample.variance[:, rows] * (1.0 - leverage[:, rows])
-        # rotate to the detector axes; the scale factors of the frames are close to 1
-        z = sample.residual[:, rows] / np.sqrt(variance)
-        z = np.einsum("nji,jn->in", _rotations(sample.turn[rows]), z)
-        part = _Chip(
-            sample.X[rows],
-            sample.Y[rows],
-            z,
-            sample.inlier[rows],
-            np.unique(sample.star[rows], return_inverse=True)[1],
-            sample.exposure[rows],
-            float(np.sqrt(np.median(variance))),
-            chip.size,
-        )
-        order = _higher_order(sample.model.order, part.n_stars)
-        if order == sample.model.order:
+        part = chip.without_terms(order)
+        if chip.scatter() > MOST_MISSING * part.scatter():
             continue
-        z, before = _without_means(part, order), _scale(part.z)
-        if before > MOST_MISSING * _scale(z):
-            continue
-        part = replace(part, z=z, free=1.0 - len(polynomial_terms(order)) / part.n_stars)
-        scale = _scale(part.z, part.inlier)
-        part = replace(part, z=part.z / scale, sigma=part.sigma * scale)
-        if (
-            free is not None
-        ):  # radius of the disc about the solution that is entirely inside the match circle
-            reach = free[rows] / (scale * np.sqrt(variance.max(axis=0)))
+        part = part.in_units_of_scatter()
+        if free is not None:
+            # radius of the disc about the solution that is entirely inside the match circle
+            reach = free[part.rows] / part.error
             part = part.at(np.flatnonzero((reach > FREE) & (np.hypot(*part.z) < reach)))
         if part.n_stars >= MIN_STARS:
             yield part
@@ -209,62 +147,9 @@ def _free_radius(sample: ScoredSample) -> Float | None:
     return np.asarray(sample.match_radius - np.hypot(*(sample.from_nominal - sample.residual)))
 
 
-def _rotations(turn: Float) -> Float:
-    """Rotations (n, 2, 2) nearest to linear maps (n, 2, 2)."""
-    angle = np.arctan2(turn[:, 1, 0] - turn[:, 0, 1], turn[:, 0, 0] + turn[:, 1, 1])
-    c, s = np.cos(angle), np.sin(angle)
-    return np.stack([np.stack([c, -s], -1), np.stack([s, c], -1)], -2)
-
-
-def _legendre(X: Float, Y: Float, terms: tuple[tuple[int, int], ...]) -> Float:
-    """Values (n, K) of Legendre products."""
-    i, j = np.array(terms).T
-    return np.asarray(legendre.legvander(X, i.max())[:, i] * legendre.legvander(Y, j.max())[:, j])
-
-
-def _higher_order(order: int, n_stars: int) -> int:
-    """Highest order that `n_stars` stars constrain, at least the order of the model."""
-    for total in range(order + HIGHER, order, -1):
-        if STARS_PER_TERM * len(polynomial_terms(total)) <= n_stars:
-            return total
-    return order
-
-
-def _without_means(chip: _Chip, order: int) -> Float:
-    """Residuals (2, n) minus polynomials up to `order` and low-order terms of each exposure."""
-    z = _smoothed_away(_legendre(chip.X, chip.Y, polynomial_terms(order)), chip.z)
-    codes, of = np.unique(chip.exposure, return_inverse=True)
-    if len(codes) > 1:
-        z = z.copy()
-        for k in range(len(codes)):
-            rows = np.flatnonzero(of == k)
-            low = [n for n in (2, 1, 0) if STARS_PER_TERM * len(polynomial_terms(n)) <= len(rows)]
-            if low:
-                F = _legendre(chip.X[rows], chip.Y[rows], polynomial_terms(low[0]))
-                z[:, rows] = _smoothed_away(F, z[:, rows])
-    return z
-
-
-def _smoothed_away(F: Float, z: Float) -> Float:
-    """Residuals z (2, n) minus their robust fit with functions F (n, K)."""
-    remainder, ridge = z, RIDGE * np.eye(F.shape[1])
-    for _ in range(PASSES):
-        weight = np.exp(-(remainder**2).sum(axis=0) / (2 * (REST * _scale(remainder)) ** 2))
-        WF = F * weight[:, None]
-        normal = WF.T @ F
-        remainder = z - (F @ np.linalg.solve(normal + np.trace(normal) * ridge, WF.T @ z.T)).T
-    return np.asarray(remainder)
-
-
-def _scale(z: Float, weight: Float | None = None) -> float:
-    """Scatter per axis of residuals (2, n), from the weighted median of their squares."""
-    square = (z**2).sum(axis=0)
-    if weight is None:
-        return float(np.sqrt(max(np.median(square), TINY) / (2 * np.log(2))))
-    order = np.argsort(square)
-    total = np.cumsum(weight[order])
-    median = square[order][np.searchsorted(total, total[-1] / 2)]
-    return float(np.sqrt(max(median, TINY) / (2 * np.log(2))))
+def _terms_of(chip: ChipResiduals) -> Float:
+    """Values (n, 6) of `TERMS`."""
+    return legendre_products(chip.X, chip.Y, TERMS)
 
 
 def _displacements(z: Float) -> tuple[tuple[Float, Float], tuple[Float, Float]]:
@@ -280,7 +165,7 @@ def _displacements(z: Float) -> tuple[tuple[Float, Float], tuple[Float, Float]]:
     return out[0], out[1]
 
 
-def _skewness(chips: list[_Chip], unit: str) -> Outcome | None:
+def _skewness(chips: list[ChipResiduals], unit: str) -> Outcome | None:
     """Test whether the core is displaced from the rest of the residuals, as a function of position.
 
     The displacement is expanded in `TERMS`. If several exposures have enough stars, each is also
@@ -348,9 +233,9 @@ def _together(parts: list[_Part]) -> tuple[float, float, float | None, float]:
     return T, dof, None, float(chi2_sf(T, dof))
 
 
-def _displaced(chip: _Chip) -> _Part | None:
+def _displaced(chip: ChipResiduals) -> _Part | None:
     """Displacement of the core from the rest of a chip's residuals, expanded in `TERMS`."""
-    F, change = chip.terms, np.zeros((len(chip.X), 2 * len(TERMS)))
+    F, change = _terms_of(chip), np.zeros((len(chip.X), 2 * len(TERMS)))
     for sign, (score, derivative) in zip((1, -1), _displacements(chip.z), strict=True):
         try:
             inverse = np.linalg.inv((F * derivative[:, None]).T @ F)
@@ -361,7 +246,7 @@ def _displaced(chip: _Chip) -> _Part | None:
     return _Part.of(change * chip.sigma, chip.star, np.tile(AREA, 2))
 
 
-def _correlation(chips: list[_Chip], unit: str) -> Outcome | None:
+def _correlation(chips: list[ChipResiduals], unit: str) -> Outcome | None:
     """Test whether the product of the residuals along both axes varies with position.
 
     The product is expanded in `TERMS` without the constant: a correlation that is constant over the
@@ -378,13 +263,13 @@ def _correlation(chips: list[_Chip], unit: str) -> Outcome | None:
     )
 
 
-def _correlated(chip: _Chip) -> _Part | None:
+def _correlated(chip: ChipResiduals) -> _Part | None:
     u, v = chip.z
     weight = np.exp(-(u**2 + v**2) / (2 * REACH**2))
     product = u * v * weight
     # by a small correlation c the density changes by the factor 1 + c u v
     unit = float(np.mean(u**2 * v**2 * weight))
-    F = chip.terms[:, 1:]
+    F = _terms_of(chip)[:, 1:]
     F = F - F.mean(axis=0)
     try:
         step = np.linalg.inv(F.T @ F) * chip.sigma / (2 * unit)
@@ -398,7 +283,7 @@ def _correlated(chip: _Chip) -> _Part | None:
     return replace(part, statistic=part.statistic * chip.free)
 
 
-def _patch(chips: list[_Chip], unit: str) -> Outcome | None:
+def _patch(chips: list[ChipResiduals], unit: str) -> Outcome | None:
     """Test for a patch of a chip with lopsided residuals, as caused by a ghost.
 
     Every square of `PATCHES` cells has its statistic; the p-value of the largest is multiplied by
@@ -444,7 +329,7 @@ class _Patch:
     ]  # mean square over the field, noise included, and that of the noise
 
 
-def _worst_patch(chip: _Chip) -> _Patch:
+def _worst_patch(chip: ChipResiduals) -> _Patch:
     core, outer = _displacements(chip.z)
     lopsided = core[0] / core[1].mean() - outer[0] / outer[1].mean()
     # each star counts once, at its mean position
@@ -484,7 +369,7 @@ def _worst_patch(chip: _Chip) -> _Patch:
     return replace(worst, n_patches=n_patches)
 
 
-def _two_cores(chips: list[_Chip], unit: str) -> Outcome | None:
+def _two_cores(chips: list[ChipResiduals], unit: str) -> Outcome | None:
     """Test for residuals with two cores.
 
     For residuals t along the axis of their largest scatter, per cell of the detector, the mean of
@@ -525,7 +410,7 @@ def _two_cores(chips: list[_Chip], unit: str) -> Outcome | None:
     )
 
 
-def _along_main_axis(chip: _Chip) -> tuple[Float, Int]:
+def _along_main_axis(chip: ChipResiduals) -> tuple[Float, Int]:
     """Residuals along the axis of largest scatter in their cell, and their rows.
 
     The residuals are in units of the scatter along that axis.

@@ -9,6 +9,7 @@ from bayesdist.diagnose.score.exposure_fields import exposure_field_test
 from bayesdist.diagnose.score.exposures import exposure_tests
 from bayesdist.diagnose.score.gap import gap_test
 from bayesdist.diagnose.score.jumps import jump_test
+from bayesdist.diagnose.score.missing_orders import chip_residuals, missing_orders_test
 from bayesdist.diagnose.score.motions import motion_test
 from bayesdist.diagnose.score.noise import noise_tests
 from bayesdist.diagnose.score.pattern import pattern_test
@@ -64,11 +65,13 @@ def score_tests(
         functions_for(scored_sample(table, solution, match_radius)), mean, priors
     )
     sample = projection.scored
+    chips = chip_residuals(sample)
     outcomes = [
         truncation_test(sample, match_radius),
         radius_test(sample),
-        *shape_tests(sample),
+        *shape_tests(sample, chips),
         *regressor_tests(projection),
+        missing_orders_test(sample, chips),
         gap_test(projection),
         jump_test(sample),
         motion_test(sample),
