@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Mapping
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -123,9 +122,7 @@ def save_sampled(results: Results) -> None:
     circle = in_circle(data.matched.stars, results.config)
     run.summarise(**sample_sections(posterior, in_circle=circle))
     c, n = posterior.convergence, posterior.sampler
-    if posterior.approximation:
-        log.warning("sample: %s", posterior.approximation)
-    elif c.converged:
+    if c.converged:
         log.info("sample: converged after %d steps, %d passes", n.steps, n.passes)
     else:
         log.warning("sample: NOT CONVERGED after %d steps: %s", n.steps, "; ".join(c.reasons))
@@ -261,10 +258,7 @@ def sample_sections(posterior: Posterior, *, in_circle: bool) -> dict[str, Any]:
     """
     return {
         "outliers": _outliers(posterior, in_circle),
-        "sampler": {
-            **Sampler.row(posterior.sampler, posterior.convergence),
-            **_certificate(posterior),
-        },
+        "sampler": Sampler.row(posterior.sampler, posterior.convergence),
     }
 
 
@@ -283,14 +277,6 @@ def _outliers(posterior: Posterior, in_circle: bool) -> dict[str, object]:
     if in_circle:
         out["match_circle"] = posterior.mixture.match_radius
     return out
-
-
-def _certificate(posterior: Posterior) -> dict[str, object]:
-    """Evidence for draws that are not from the posterior itself."""
-    c = posterior.certificate
-    if c is None:
-        return {}
-    return {"certificate": asdict(c) | {"granted": c.granted, "statement": c.statement}}
 
 
 FOLDER = "stars"

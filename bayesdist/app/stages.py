@@ -258,11 +258,8 @@ def _require_converged(results: Results, strict: bool) -> None:
     """Raise NotConvergedError if `strict` and the sampler has not converged."""
     posterior = results.posterior
     if strict and convergence_check(posterior.convergence).level == "fail":
-        exact = posterior.sampler.exact
         raise NotConvergedError(
             f"the sampler has not converged ({'; '.join(posterior.convergence.reasons)})",
             where=str(results.run.path),
-            do="raise sampler.max_steps and resume, or simplify the model"
-            if exact
-            else "set sampler.second_stage = 'always' and run with --force",
+            do="raise sampler.max_steps and resume, or simplify the model",
         )

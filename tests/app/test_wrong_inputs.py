@@ -158,7 +158,6 @@ def test_check_names_the_cause(tmp_path, name, spoil, sections, words):
     data = {"matches": "stars.ecsv"} | ({} if "sigma_u" in table.colnames else {"sigma": 0.0075})
     known = {
         "detector": {"size": SIZE},
-        "sampler": {"method": "certified"},  # whose cost is told without a pilot
         "budget": None,
     }
     known |= {key: value for key, value in sections.items() if key != "data"}
@@ -175,7 +174,6 @@ def test_check_has_nothing_to_say_of_sound_stars(tmp_path):
         sound(),
         data={"matches": "stars.ecsv", "sigma": 0.0075},
         detector={"size": SIZE},
-        sampler={"method": "certified"},
     )
     done = cli("check", path)
     assert done.code == 0

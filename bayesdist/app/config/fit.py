@@ -118,18 +118,14 @@ class _Sampler(Section):
 
 
 class Sampler(_Sampler):
-    """Sampling method, stopping criteria and seed."""
+    """Stopping criteria, seed and walkers."""
 
-    method: Literal["exact", "certified"] = "exact"
-    second_stage: Literal["auto", "always", "never"] = "auto"
     walkers: Annotated[int, Field(ge=1, le=100_000)] | None = None
 
 
 class SelfcalSampler(_Sampler):
     """Stopping criteria and seed of a self-calibration."""
 
-    method: ClassVar[Literal["exact"]] = "exact"
-    second_stage: ClassVar[Literal["auto"]] = "auto"
     walkers: ClassVar[None] = None
 
 

@@ -32,10 +32,8 @@ def write_table(table: Table, path: Path) -> None:
 
 def provenance_notes(posterior: Posterior, gauge: str) -> dict[str, bool | str]:
     """Metadata on the convergence and the gauge, for the header of a file."""
-    label = posterior.approximation
     return {
         "converged": posterior.convergence.converged,
-        **({"posterior": label} if label else {}),
         **({"gauge": gauge} if gauge else {}),
     }
 

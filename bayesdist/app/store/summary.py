@@ -276,7 +276,6 @@ class Sampler(Part):
     """Sampling of the posterior, and convergence of the chains."""
 
     method: str
-    exact: bool = Field(description="false of draws that stand for the posterior")
     converged: bool
     reasons: list[str] = Field(description="why it has not converged")
     rhat_max: Number

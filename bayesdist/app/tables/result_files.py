@@ -126,7 +126,7 @@ def write_evaluation(
         run / "maps.fits",
         maps,
         found.areas,
-        notes=(solution.approximation, gauge),
+        notes=(gauge,),
         converged=solution.convergence.converged,
     )
     coefficients = coefficient_table(fit, solution)

@@ -1,5 +1,5 @@
 """Posterior draws with their diagnostics and files, and the outlier probability of each star."""
 
-from bayesdist.infer.posterior.posterior import Certificate, Posterior, SamplerInfo
+from bayesdist.infer.posterior.posterior import Posterior, SamplerInfo
 
-__all__ = ["Certificate", "Posterior", "SamplerInfo"]
+__all__ = ["Posterior", "SamplerInfo"]

@@ -178,11 +178,8 @@ def sampling_checks(posterior: Posterior | None) -> tuple[Check, ...]:
     sd = np.sqrt(np.diag(posterior.cov))
     with np.errstate(divide="ignore", invalid="ignore"):
         mcse = float(np.nanmax(np.where(sd > 0, c.mcse_mean[:D] / sd, 0.0), initial=0.0))
-    label = posterior.approximation
-    method = [Check(SAMPLING, "Method", level="warn", sentence=label)] if label else []
     # R-hat and ESS decide; the other diagnostics are advisory and only warn
     return (
-        *method,
         convergence_check(c),
         Check(
             SAMPLING,

@@ -30,7 +30,8 @@ from bayesdist.files.documents import json_of
 from bayesdist.files.faults import restoring
 from bayesdist.files.hdf5 import netcdf_groups
 from bayesdist.infer.convergence import DIAGNOSTICS, Convergence, Limits
-from bayesdist.infer.posterior import Certificate, Posterior, SamplerInfo
+from bayesdist.infer.posterior import Posterior, SamplerInfo
+from bayesdist.infer.posterior.posterior import SCHEMA
 from bayesdist.infer.posterior.groups import Group, datatree_of
 from bayesdist.infer.posterior.memberships import memberships, star_log_likelihood
 from bayesdist.infer.solution.linear import LinearFit
@@ -192,10 +193,11 @@ def load_posterior(path: str | Path) -> Posterior:
         stats = groups["sample_stats"]
         if attrs.get("creator") != "bayesdist":
             raise KeyError("creator")
+        if attrs.get("schema") != SCHEMA:
+            raise FormatError(f"schema {attrs.get('schema')} is not {SCHEMA}")
         mixture = _tree(attrs["mixture"])
         mixture["fraction_prior"] = tuple(mixture["fraction_prior"])
         info: dict[str, Any] = {str(k): _plain(v) for k, v in stats.attrs.items()}
-        info["exact"] = bool(info["exact"])
         model = DistortionModel.from_dict(_tree(attrs["model"]))
         theta, log_prob = draws["theta"], stats.arrays["lp"]
         hyper = {str(name): draws[name] for name in ("j", "f", "s_out") if name in draws}
@@ -227,7 +229,6 @@ def load_posterior(path: str | Path) -> Posterior:
                 limits=Limits(float(limits["limit_ess"]), float(limits["limit_rhat"])),
             ),
             sampler=SamplerInfo(**info),
-            certificate=_certificate(_tree(attrs["certificate"])),
             own_places=bool(attrs.get("own_places", False)),
             tangent_point=_tangent_point(attrs),
         )
@@ -237,10 +238,6 @@ def _tangent_point(attrs: Mapping[str, Any]) -> tuple[float, float] | None:
     """RA and Dec (deg) of the tangent point of u, v; None if the file does not state them."""
     point = _tree(attrs["tangent_point"]) if "tangent_point" in attrs else None
     return None if point is None else (float(point[0]), float(point[1]))
-
-
-def _certificate(fields: dict[str, Any] | None) -> Certificate | None:
-    return None if fields is None else Certificate(**fields | {"reasons": tuple(fields["reasons"])})
 
 
 def _refuse_other_shape(values: NDArray[Any], shape: tuple[int, ...]) -> None:

@@ -22,7 +22,7 @@ from bayesdist.utils.quantities import Random, generator_of
 if TYPE_CHECKING:
     import xarray
 
-SCHEMA = 2  # version of the layout of posterior.nc
+SCHEMA = 3  # version of the layout of posterior.nc
 POSTERIOR_NUMBERS = ("n_stars", "n_flagged", "n_false", "reference_sigma")
 
 
@@ -49,8 +49,6 @@ class SamplerInfo:
     wall_s : float
         Wall-clock time of this session in seconds.
     seed : int
-    exact : bool
-        False if the draws were made from a surrogate of the posterior.
     """
 
     method: str
@@ -62,80 +60,6 @@ class SamplerInfo:
     acceptance: float
     wall_s: float
     seed: int
-    exact: bool = True
-
-
-@dataclass(frozen=True)
-class Certificate:
-    """Bounds on the difference between a surrogate s and the posterior p.
-
-    They are computed from pilots (exact evaluations of the posterior at draws of the proposal q)
-    that were held out when the surrogate was built.  Each pilot takes one pass over the data.
-
-    Parameters
-    ----------
-    n_train, n_held_out : int
-        Number of pilots to which the surrogate was fitted, and number of held-out pilots.
-    n_outside : int
-        Number of pilots where the posterior density is zero.
-    raw_sd : float
-        Standard deviation of log p - log q, that is, without the surrogate.
-    remainder_sd, remainder_max : float
-        Standard deviation and largest absolute value of log p - log s over the held-out pilots,
-        with p and s normalised.
-    raw_efficiency : float
-        Effective fraction of draws of q, weighted by p / q, from all pilots.
-    efficiency : float
-        Effective fraction of draws of s, weighted by p / s, from the held-out pilots: 1 / (1 +
-        chi2).
-    pareto_k : float
-        Pareto shape of p / q; a heavy tail means that q misses a part of p.
-    chi2, chi2_upper : float
-        Estimate of the chi-square divergence chi2(p || s), and its upper limit.
-    mean_shift_bound : float
-        Bound on the error of any posterior mean in posterior standard deviations, from
-        `chi2_upper`.
-    tv_bound : float
-        Bound on the total variation distance, the error of any probability, from `chi2_upper`.
-    unseen : float
-        Upper limit (95 %) on the probability under q of a region that no pilot has hit.
-    reasons : tuple of str
-        Reasons why the certificate is refused; empty if it is granted.
-    """
-
-    n_train: int
-    n_held_out: int
-    n_outside: int
-    raw_sd: float
-    remainder_sd: float
-    remainder_max: float
-    raw_efficiency: float
-    efficiency: float
-    pareto_k: float
-    chi2: float
-    chi2_upper: float
-    mean_shift_bound: float
-    tv_bound: float
-    unseen: float
-    reasons: tuple[str, ...]
-
-    @property
-    def granted(self) -> bool:
-        """True if draws of the surrogate may represent the posterior."""
-        return not self.reasons
-
-    @property
-    def statement(self) -> str:
-        """Scope and limits of the certificate as a sentence."""
-        if not self.granted:
-            return f"certificate refused: {'; '.join(self.reasons)}"
-        return (
-            f"approximate, with certificate: by {self.n_held_out} exact evaluations that took no "
-            f"part in the approximation, no posterior mean is off by more than "
-            f"{self.mean_shift_bound:.2g} of its standard deviation; regions that hold less than "
-            f"{self.unseen:.2g} of the proposal's probability, such as a separate mode, "
-            f"may have been missed"
-        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -164,8 +88,6 @@ class Posterior(Solution):
         Median quoted error; the priors of the mixture are scaled by it.
     convergence : Convergence
     sampler : SamplerInfo
-    certificate : Certificate, optional
-        Accuracy of the surrogate; None if the draws were not made from a surrogate.
     own_places : bool
         True if the stars' positions are unknowns of the solution, as in a self-calibration. The
         positions in the matches are then those of the posterior mean, not of the single draws.
@@ -200,7 +122,6 @@ class Posterior(Solution):
     reference_sigma: float
     convergence: Convergence = field()
     sampler: SamplerInfo
-    certificate: Certificate | None = None
     own_places: bool = False
     tangent_point: tuple[float, float] | None = field(default=None)
     matches_digest: str = ""
@@ -213,13 +134,6 @@ class Posterior(Solution):
             f"flagged, {len(self.flat)} draws, {state}, R-hat {c.rhat_max:.4g}, "
             f"ESS {c.ess_bulk_min:.4g})"
         )
-
-    @property
-    def approximation(self) -> str:
-        """Warning that the draws come from a surrogate; empty if they are exact."""
-        if self.sampler.exact or self.certificate is None:
-            return ""
-        return self.certificate.statement
 
     @cached_property
     def flat(self) -> Float:
@@ -302,7 +216,6 @@ class Posterior(Solution):
                     "model": json.dumps(self.model.to_dict()),
                     "mixture": json.dumps(asdict(self.mixture)),
                     "provenance": json.dumps(dict(provenance or {}), default=str),
-                    "certificate": json.dumps(self.certificate and asdict(self.certificate)),
                     "n_parameters": len(names),
                     "own_places": int(self.own_places),
                     "tangent_point": json.dumps(self.tangent_point),
@@ -320,7 +233,7 @@ class Posterior(Solution):
             ),
             "sample_stats": Group(
                 {"lp": (("chain", "draw"), self.log_prob)},
-                attrs=asdict(self.sampler) | {"exact": int(self.sampler.exact)},
+                attrs=asdict(self.sampler),
             ),
             "diagnostics": Group(
                 {

@@ -103,11 +103,10 @@ class Chains:
         """Log posterior density (ensembles, walkers * steps stored) of the draws."""
         return np.swapaxes(self.log_prob, 1, 2).reshape(len(self.log_prob), -1)
 
-    def info(self, seed: int, started: float, *, exact: bool = True) -> SamplerInfo:
+    def info(self, seed: int, started: float) -> SamplerInfo:
         """Record of the run; `started` is its start according to `time.monotonic`."""
-        method = self.plan.method
         return SamplerInfo(
-            method=f"emcee {method}" if exact else method,
+            method=f"emcee {self.plan.method}",
             ensembles=len(self.psi),
             walkers=self.plan.walkers,
             steps=self.steps,
@@ -116,7 +115,6 @@ class Chains:
             acceptance=self.acceptance,
             wall_s=time.monotonic() - started,
             seed=seed,
-            exact=exact,
         )
 
 

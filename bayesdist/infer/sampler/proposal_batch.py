@@ -20,6 +20,7 @@ from bayesdist.infer.sampler.checkpoints import CHECKPOINT
 from bayesdist.utils.arrays import Bool, Float
 
 ROWS = 8192  # proposals evaluated at a time
+PILOT_KEY = (0,)  # spawn key of the random numbers of the pilot
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,8 +92,6 @@ def pilot_batch(
     n: int,
     folder: Path | None = None,
     fingerprint: str = "",
-    name: str = "pilot",
-    key: tuple[int, ...] = (0,),
 ) -> ProposalBatch:
     """Draw and evaluate the first batch, used to rate the proposal and to start the chains.
 
@@ -100,12 +99,12 @@ def pilot_batch(
     proposals themselves are drawn again.  Raises InputError if the file cannot be read or written,
     or belongs to other data or settings.
     """
-    path = None if folder is None else folder / f"chain-0-{name}.h5"
+    path = None if folder is None else folder / "chain-0-pilot.h5"
     if path is not None and path.exists():
         do = "delete it and resume: its proposals are evaluated again"
         stored = read_arrays(path, fingerprint, CHECKPOINT, ("log_prob", "log_q"), do=do)
-        return ProposalBatch(_drawn(proposal, seeds, key, n), **stored)
-    batch = draw_batch(target, proposal, seeds, key, n)
+        return ProposalBatch(_drawn(proposal, seeds, PILOT_KEY, n), **stored)
+    batch = draw_batch(target, proposal, seeds, PILOT_KEY, n)
     if path is not None:
         write_arrays(path, fingerprint, {"log_prob": batch.log_prob, "log_q": batch.log_q})
     return batch

@@ -12,7 +12,6 @@ from pathlib import Path
 import numpy as np
 
 from bayesdist.data.matches import Matches
-from bayesdist.errors import InputError
 from bayesdist.files.hdf5 import read_arrays, write_arrays
 from bayesdist.infer.convergence import Limits
 from bayesdist.infer.density.grid import build_proposal
@@ -22,7 +21,6 @@ from bayesdist.infer.equations.priors import GaussianPriors
 from bayesdist.infer.equations.scaled import one_thread
 from bayesdist.infer.posterior import Posterior
 from bayesdist.infer.posterior.memberships import count_outliers
-from bayesdist.infer.sampler.certified import run_certified
 from bayesdist.infer.sampler.chains import Settings, ensemble_seeds, run_chains
 from bayesdist.infer.sampler.checkpoints import CHECKPOINT
 from bayesdist.infer.solution.linear import LinearFit
@@ -35,7 +33,6 @@ from bayesdist.utils.memory import require_memory
 from bayesdist.utils.quantities import whole_number
 
 STEPS_KEPT = 100  # steps per walker assumed for the check of the available memory
-METHODS = ("exact", "certified")
 FORMAT = 3  # version of the checkpoint files
 ENGINES = ("emcee", "numba", "numpy", "scipy")  # results may depend on the versions of these
 
@@ -55,8 +52,6 @@ def sample(
     target_rhat: float = 1.01,
     max_steps: int = 20_000,
     checkpoint_every: int = 200,
-    method: str = "exact",
-    second_stage: str = "auto",
     folder: str | Path | None = None,
     progress: Callable[[int, int], None] | None = None,
     compute: Compute | None = None,
@@ -87,11 +82,6 @@ def sample(
         Maximum number of steps of each ensemble, including those before a resume.
     checkpoint_every : int
         Maximum number of steps between two checkpoints.
-    method : str
-        'exact', or 'certified' for draws from a surrogate that needs few passes over the data.
-    second_stage : str
-        For 'certified': whether exact evaluations accept or reject the draws of the surrogate:
-        'always', 'never', or 'auto' (if affordable).
     folder : path, optional
         Folder for checkpoints. Existing checkpoints are read instead of computing the steps again;
         the results are bit for bit the same.
@@ -135,12 +125,6 @@ def sample(
         do="use fewer ensembles or walkers",
     )
     seeds = ensemble_seeds(seed, ensembles)
-    if method not in METHODS:
-        raise InputError(
-            f"there is no method {method!r}",
-            where="sampler.method",
-            do=f"choose {' or '.join(METHODS)}",
-        )
     started = time.monotonic()
     with opened(fit.model, matches, compute) as shards:
         mixture = outliers or OutlierMixture()
@@ -150,7 +134,7 @@ def sample(
         priors = priors or GaussianPriors.none(fit.model)
         target = Target(shards, mixture, priors)
         folder = None if folder is None else Path(folder)
-        fingerprint = _fingerprint(target, seed, ensembles, walkers, checkpoint_every, method)
+        fingerprint = _fingerprint(target, seed, ensembles, walkers, checkpoint_every)
         proposal = _proposal(target, fit, folder, fingerprint)
         settings = Settings(
             seeds=seeds,
@@ -163,11 +147,7 @@ def sample(
             fingerprint=fingerprint,
             progress=progress,
         )
-        certificate, exact = None, True
-        if method == "exact":
-            chains = run_chains(target, proposal, settings)
-        else:
-            chains, certificate, exact = run_certified(target, proposal, settings, second_stage)
+        chains = run_chains(target, proposal, settings)
         draws, n = chains.draws, target.n_theta
         flat = draws.reshape(-1, draws.shape[-1])
         flagged, expected = count_outliers(shards, target.hyper, flat[:, :n], flat[:, n:])
@@ -182,8 +162,7 @@ def sample(
             n_false=expected,
             reference_sigma=target.hyper.scale,
             convergence=chains.verdict,
-            sampler=chains.info(seed, started, exact=exact),
-            certificate=certificate,
+            sampler=chains.info(seed, started),
             tangent_point=fit.tangent_point,
             matches_digest=matches.digest() if isinstance(matches, Matches) else "",
         )

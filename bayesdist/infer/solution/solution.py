@@ -106,11 +106,6 @@ class Solution(ABC):
         return "least squares" if self.convergence is None else "posterior"
 
     @property
-    def approximation(self) -> str:
-        """Warning that the draws come from a surrogate; empty if they are exact."""
-        return ""
-
-    @property
     def likelihood(self) -> Likelihood | None:
         """Likelihood of a star's residual at the mean; None for a transformed solution."""
         return None
@@ -201,11 +196,6 @@ class DerivedSolution(Solution):
     def convergence(self) -> Convergence | None:
         """Convergence of the source."""
         return self.source.convergence
-
-    @property
-    def approximation(self) -> str:
-        """Warning that the draws of the source come from a surrogate; empty if they are exact."""
-        return self.source.approximation
 
 
 @dataclass(frozen=True, eq=False)

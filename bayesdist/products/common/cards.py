@@ -54,12 +54,9 @@ def convergence_cards(solution: Solution) -> list[str]:
     convergence = solution.convergence
     if convergence is None:
         return []
-    approximation = solution.approximation
-    notes = wrapped_cards("COMMENT", [approximation] if approximation else [])
     if convergence.converged:
-        return [text_card("BDCONV", "YES", "has the sampler converged?"), *notes]
+        return [text_card("BDCONV", "YES", "has the sampler converged?")]
     return [
-        *notes,
         text_card("BDCONV", "NO", "has the sampler converged?"),
         text_card("COMMENT", "NOT CONVERGED: provisional, not to be released."),
     ]

@@ -172,7 +172,6 @@ def record_of(
             "epoch": None if epoch is None else float(epoch),
             "kind": source.solution.kind,
             "converged": None if convergence is None else bool(convergence.converged),
-            "approximation": source.solution.approximation,
             "notes": list(source.notes),
         },
     }

@@ -145,7 +145,7 @@ def test_a_single_exposure(truth, tmp_path):
             ["gauge.roll_sigma_deg", "selfcal.frames"],
         ),
         ({"outliers": {"model": "gaussian"}}, ["outliers.model", "uniform"]),
-        ({"sampler": {"second_stage": "never"}}, ["sampler.second_stage", "[selfcal]"]),
+        ({"sampler": {"walkers": 40}}, ["sampler.walkers", "[selfcal]"]),
         ({"data": {"matches": "stars.ecsv"}}, ["[data]", "[selfcal]", "give one"]),
         ({"prior": [{"parameter": "u_9_9", "mean": 0.0, "sigma": 1.0}]}, ["'u_9_9'"]),
         ({"products": {"idctab": SBC}, "detector": {"size": SIZE}}, ["scale"]),

@@ -20,7 +20,7 @@ from bayesdist.infer.density.target import Target
 from bayesdist.infer.kernel import circle
 from bayesdist.infer.posterior.memberships import memberships, star_log_likelihood
 from bayesdist.infer.stars.likelihood import MixtureAt
-from tests.reduced import case_in_full, only_in_full
+from tests.reduced import case_in_full
 from tests.seeds import over
 
 from ..selected import SIGMA, selected
@@ -386,18 +386,6 @@ def test_several_chips_and_frames(rng):
 
     assert chi2.sf(surprise(posterior), n) > 1e-3
     assert chi2.sf(surprise(fit), n) < 1e-12
-
-
-@pytest.mark.slow
-@only_in_full("exact sampling knows of it")
-def test_certified_sampling_knows_of_the_circle():
-    model, _, matches, radius = selected(2, 3.0, 600, order=1)
-    mixture = OutlierMixture("uniform", match_radius=radius)
-    fit = fit_linear(matches, model)
-    exact = sample(fit, matches, outliers=mixture, target_ess=1000)
-    other = sample(fit, matches, outliers=mixture, method="certified", target_ess=1000)
-    assert exact.mean == pytest.approx(other.mean, abs=0.2 * np.sqrt(np.diag(exact.cov)).min())
-    assert np.abs(fit.mean - exact.mean).max() > 2 * np.sqrt(np.diag(exact.cov)).min()
 
 
 # -- input that is wrong --------------------------------------------------------------------------

@@ -37,7 +37,7 @@ def test_all_forms_answer_the_same_questions(fitted):
     matches, fit = fitted
     for one in forms(fit):
         assert isinstance(one, Solution)
-        assert (one.convergence, one.mixture, one.approximation) == (None, None, "")
+        assert (one.convergence, one.mixture) == (None, None)
         assert one.kind == "least squares" and one.unit == fit.unit
         np.testing.assert_allclose(one.sigma, np.sqrt(np.diag(one.cov)))
         draws = one.draws(4000, np.random.default_rng(1))

@@ -362,7 +362,7 @@ def test_without_frames_is_the_head_of_theta():
 def test_a_view_of_a_posterior_says_so():
     """A transformed posterior has its convergence, a transformed fit has none."""
     assert reference_gauge(acs(kind=Judged)).convergence == "judged"
-    assert segment(reference_gauge(acs(kind=Judged)), 1).approximation == ""
+    assert segment(reference_gauge(acs(kind=Judged)), 1).convergence == "judged"
     assert reference_gauge(acs()).convergence is None
 
 

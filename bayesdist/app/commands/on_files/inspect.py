@@ -75,7 +75,6 @@ def _posterior_text(p: Posterior) -> str:
         f"sampler    {s.method}, {s.ensembles} ensembles of {s.walkers} walkers, {s.steps} steps, "
         f"acceptance {number(s.acceptance, 3)}",
         f"state      {state}",
-        *([f"           {p.approximation}"] if p.approximation else []),
         f"           R-hat <= {number(c.rhat_max, 5)}, ESS bulk >= {number(c.ess_bulk_min)}, "
         f"tail >= {number(c.ess_tail_min)}, Pareto k {number(c.pareto_k, 2)}",
         "",

@@ -16,7 +16,6 @@ from bayesdist.app.results import Results, open_results
 from bayesdist.app.screen import number
 from bayesdist.app.store.rundir import RunDirectory
 from bayesdist.infer import Limits
-from bayesdist.infer.sampler.certified import PILOTS, has_second_stage
 from bayesdist.infer.sampler.move_schedule import expected_passes
 from bayesdist.infer.sampler.prediction import predict_sampling
 from bayesdist.infer.solution.geometry import geometries
@@ -105,13 +104,8 @@ def _cost(data: FitData, config: Config) -> str:
     per_pass = dear * STAR_S * n
     over = f"over {n} stars, {number(1e3 * per_pass, 2)} ms each"
     search = dear * EXPANSIONS * EXPANSION_S * n + FIXED_S
-    passes, how, provided = expected_passes(n_params, n, limits, sampler.ensembles), "", ""
-    if sampler.method == "certified":
-        exact = has_second_stage(sampler.second_stage, passes, n)
-        passes = PILOTS + (passes if exact else 0)
-        how = "certified, with an exact second stage; " if exact else "certified, approximate; "
-        provided = " if the posterior is close to normal, which was not examined"
-    elif dear * n > MOST_STARS or n_params > MOST_PARAMS:
+    passes, provided = expected_passes(n_params, n, limits, sampler.ensembles), ""
+    if dear * n > MOST_STARS or n_params > MOST_PARAMS:
         provided = " if the posterior is close to normal, which was not examined"
     else:
         trial = predict_sampling(
@@ -136,6 +130,6 @@ def _cost(data: FitData, config: Config) -> str:
         passes = trial.passes
     total = search + passes * (per_pass + OVERHEAD_S)
     return (
-        f"cost         {how}about {passes} passes {over}: "
+        f"cost         about {passes} passes {over}: "
         f"{number(total, 2)} s to the posterior{provided}"
     )

@@ -48,9 +48,9 @@ def validate(run: str | Path, requirements: str | Path) -> tuple[str, int]:
             save_margins(directory, fit, posterior, gauge, margins, periods)
         report = directory / "report.html"
         outdated = report.exists() and not directory.done("report")
-    warnings = posterior.approximation, idle_dates(results.config, asked, str(requirements))
+    idle = idle_dates(results.config, asked, str(requirements))
     lines = [*_lines(margins), *(period.sentence for period in periods)]
-    lines += [f"WARNING: {text}" for text in warnings if text]
+    lines += [f"WARNING: {idle}"] if idle else []
     if outdated:
         lines.append(f"{report} shows earlier margins; renew it by 'bayesdist stage report {run}'")
     return "\n".join(lines), exit_code(margins)
