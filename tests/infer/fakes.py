@@ -7,15 +7,12 @@ from collections.abc import Callable
 import numpy as np
 
 from bayesdist.infer import OutlierMixture
-from bayesdist.infer.density.coordinates import Split
-from bayesdist.infer.density.laplace import Node
+from bayesdist.infer.density.laplace import Node, Split
 from bayesdist.infer.density.proposal import GridProposal
 from bayesdist.infer.equations.arrow import Arrow
-from bayesdist.infer.sampler.checkpoints import Walkers
 from bayesdist.infer.sampler.ensembles import Ensembles
-from bayesdist.infer.sampler.move_schedule import Plan, StepRange
-from bayesdist.infer.sampler.proposal_batch import ProposalBatch
-from bayesdist.infer.sampler.whitening import Whitening
+from bayesdist.infer.sampler.proposals import ProposalBatch, Walkers, Whitening
+from bayesdist.infer.sampler.schedule import Plan, StepRange
 
 
 class FakeTarget:

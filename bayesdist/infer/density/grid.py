@@ -9,16 +9,15 @@ from __future__ import annotations
 import numpy as np
 
 from bayesdist.errors import DegenerateError
-from bayesdist.infer.density.coordinates import Split
-from bayesdist.infer.density.importance import quality_of
 from bayesdist.infer.density.laplace import (
     Conditional,
     Node,
+    Split,
     conditional_mode,
     expected_mode,
     starting_point,
 )
-from bayesdist.infer.density.proposal import GridProposal
+from bayesdist.infer.density.proposal import GridProposal, quality_of
 from bayesdist.infer.density.target import Target
 from bayesdist.infer.solution.linear import LinearFit
 from bayesdist.infer.stars.mixture import TAILS

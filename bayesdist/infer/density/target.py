@@ -120,11 +120,16 @@ class Target:
         return value, gradient, matrix
 
 
-def log_likelihood(stars: Stars, theta: Float, constants: Constants) -> Float:
-    """Log-likelihood (n,) of the stars at parameter vectors theta (n, n_params)."""
+def log_likelihood(
+    stars: Stars, theta: Float, constants: Constants, scratch: int = SCRATCH
+) -> Float:
+    """Log-likelihood (n,) of the stars at parameter vectors theta (n, n_params).
+
+    The vectors are divided so that their effective coefficients take at most `scratch` bytes.
+    """
     model = stars.model
     out = np.empty(len(theta))
-    step = max(1, SCRATCH // (16 * model.n_terms * len(stars.groups)))
+    step = max(1, scratch // (16 * model.n_terms * len(stars.groups)))
     for a in range(0, len(theta), step):
         rows = slice(a, a + step)
         powers, mixture_constants = stars.powers(theta[rows]), constants.of(rows)

@@ -24,7 +24,7 @@ import numpy as np
 from scipy.optimize import minimize
 from scipy.special import logsumexp
 
-from bayesdist.infer.density.piecewise import PiecewiseExponential
+from bayesdist.infer.density.proposal import PiecewiseExponential
 from bayesdist.infer.equations.arrow import Arrow, ArrowFactor
 from bayesdist.utils.arrays import Bool, Float, Int
 

@@ -31,9 +31,9 @@ from bayesdist.files.faults import restoring
 from bayesdist.files.hdf5 import netcdf_groups
 from bayesdist.infer.convergence import DIAGNOSTICS, Convergence, Limits
 from bayesdist.infer.posterior import Posterior, SamplerInfo
-from bayesdist.infer.posterior.posterior import SCHEMA
 from bayesdist.infer.posterior.groups import Group, datatree_of
 from bayesdist.infer.posterior.memberships import memberships, star_log_likelihood
+from bayesdist.infer.posterior.posterior import SCHEMA
 from bayesdist.infer.solution.linear import LinearFit
 from bayesdist.infer.stars.likelihood import Clip
 from bayesdist.infer.stars.mixture import OutlierMixture

@@ -22,18 +22,17 @@ from bayesdist.infer.convergence import (
     Limits,
     diagnose,
 )
-from bayesdist.infer.density.importance import (
+from bayesdist.infer.density.proposal import (
+    Proposal,
     Quality,
     draws_per_effective,
     quality_of,
     warmup_steps,
 )
-from bayesdist.infer.density.proposal import Proposal
 from bayesdist.infer.density.target import Density
 from bayesdist.infer.posterior import SamplerInfo
-from bayesdist.infer.sampler.checkpoints import Block, Walkers
-from bayesdist.infer.sampler.heartbeat import Heartbeat
-from bayesdist.infer.sampler.move_schedule import (
+from bayesdist.infer.sampler.proposals import Block, ProposalBatch, Walkers, Whitening, pilot_batch
+from bayesdist.infer.sampler.schedule import (
     EFFICIENT,
     JUDGED_AFTER,
     Plan,
@@ -50,8 +49,6 @@ from bayesdist.infer.sampler.move_schedule import (
     plan_moves,
     walkers_for,
 )
-from bayesdist.infer.sampler.proposal_batch import ProposalBatch, pilot_batch
-from bayesdist.infer.sampler.whitening import Whitening
 from bayesdist.utils.arrays import Float
 from bayesdist.utils.limits import PARETO_K
 
@@ -59,14 +56,14 @@ if TYPE_CHECKING:
     from bayesdist.infer.sampler.ensembles import Ensembles
 
 log = logging.getLogger("bayesdist")
-
 LEAST_ROWS = 10  # minimum number of stored steps for convergence diagnostics
-HARDEST = 30  # number of worst parameters that are checked before all parameters are
+
+EVERY_S = 10.0  # seconds between two lines
 
 
 @dataclass(frozen=True)
-class Settings:
-    """Settings of a sampling run."""
+class ChainSettings:
+    """ChainSettings of a sampling run."""
 
     seeds: tuple[int, ...]  # one per ensemble
     n_stars: int  # number of stars, which determines the cost of a pass
@@ -77,6 +74,7 @@ class Settings:
     folder: Path | None = None  # folder of the checkpoints; None for no checkpoints
     fingerprint: str = ""  # hash of data and settings, stored in the checkpoints
     progress: Callable[[int, int], None] | None = None  # called with (steps, max_steps)
+    judged_first: int = 30  # number of worst parameters that are checked before all parameters are
 
 
 @dataclass(frozen=True, eq=False)
@@ -144,7 +142,7 @@ class _History:
         states: list[Walkers],
         schedule: Iterable[StepRange],
         rest: ProposalBatch,
-        s: Settings,
+        s: ChainSettings,
     ) -> Iterator[tuple[StepRange, list[Block]]]:
         """Advance the ensembles over a schedule; yield each range of steps with its blocks."""
         for span in schedule:
@@ -179,7 +177,7 @@ class _History:
         )
 
 
-def run_chains(density: Density, proposal: Proposal, settings: Settings) -> Chains:
+def run_chains(density: Density, proposal: Proposal, settings: ChainSettings) -> Chains:
     """Sample until the convergence criteria are met or the maximum number of steps is reached.
 
     Raises DegenerateError if hardly any proposal is inside the support, and InputError if
@@ -221,14 +219,14 @@ def run_chains(density: Density, proposal: Proposal, settings: Settings) -> Chai
     return _state_dependent(target, start(plan), s, quality, passes, steps)[0]
 
 
-def pilot_of(target: Density, proposal: Proposal, s: Settings) -> ProposalBatch:
+def pilot_of(target: Density, proposal: Proposal, s: ChainSettings) -> ProposalBatch:
     """Draw and evaluate the first batch of proposals of a run; see `pilot_batch`."""
     walkers = s.walkers or walkers_for(s.n_stars)
     n = walkers * (pilot_steps(len(s.seeds), walkers) + 1)
     return pilot_batch(target, proposal, s.seeds, n, s.folder, s.fingerprint)
 
 
-def plan_of(target: Density, quality: Quality, s: Settings) -> Plan:
+def plan_of(target: Density, quality: Quality, s: ChainSettings) -> Plan:
     """Choose the moves for a proposal of the given quality."""
     q, n_proposals = quality, len(quality.log_weights) + quality.n_outside
     return plan_moves(q.efficiency, q.k, len(target.names), s.n_stars, s.walkers, n_proposals)
@@ -267,7 +265,7 @@ def _not_converged(verdict: Convergence, reason: str) -> Convergence:
 
 
 def _drawn_ahead(
-    target: Density, runs: Ensembles, s: Settings, passes: int
+    target: Density, runs: Ensembles, s: ChainSettings, passes: int
 ) -> tuple[Chains | None, Quality, int, int]:
     """Sample with independence moves only.
 
@@ -305,7 +303,10 @@ def _drawn_ahead(
             verdict = _distrusted(verdict, quality)
         if verdict.converged or last:
             break
-        wanted, worst = next_check(n_draws, verdict, s.n_stars, total), verdict.worst(HARDEST)
+        wanted, worst = (
+            next_check(n_draws, verdict, s.n_stars, total),
+            verdict.worst(s.judged_first),
+        )
     return history.chains(dropped, verdict, passes), quality, passes, history.end
 
 
@@ -318,7 +319,7 @@ def _distrusted(verdict: Convergence, quality: Quality) -> Convergence:
 
 
 def _state_dependent(
-    target: Density, runs: Ensembles, s: Settings, quality: Quality, passes: int, begin: int
+    target: Density, runs: Ensembles, s: ChainSettings, quality: Quality, passes: int, begin: int
 ) -> tuple[Chains, bool]:
     """Sample with moves that depend on the state; the first half of the steps is warm-up.
 
@@ -355,7 +356,10 @@ def _state_dependent(
         hopeless = is_hopeless(len(target.names), s.n_stars, len(s.seeds))
         if trial and not has_mixed(ess, len(target.names), total, hopeless=hopeless):
             return history.chains(warmup, verdict, passes), False
-        wanted, worst = next_check(n_draws, verdict, s.n_stars, total), verdict.worst(HARDEST)
+        wanted, worst = (
+            next_check(n_draws, verdict, s.n_stars, total),
+            verdict.worst(s.judged_first),
+        )
     return history.chains(warmup, verdict, passes), True
 
 
@@ -390,3 +394,51 @@ def _verdict(
         if not of_worst.converged:
             return of_worst
     return of(target.names, draws)
+
+
+# -- progress in the log ---------------------------------------------------------------------------
+
+
+@dataclass(eq=False)
+class Heartbeat:
+    """Wrapper of a density that counts its evaluations and logs them every ten seconds.
+
+    Since all moves evaluate the density, progress is reported for each of them.
+    """
+
+    density: Density
+    n_stars: int
+    clock: Callable[[], float] = time.monotonic  # seconds
+    method: str = "pilot"  # moves of the current plan
+    passes: int = 0  # number of points evaluated
+    _started: float = field(init=False)
+    _last: float = field(init=False)
+
+    def __post_init__(self) -> None:
+        self._started = self._last = self.clock()
+
+    @property
+    def n_theta(self) -> int:
+        """Number of parameters in theta, that is, without the hyperparameters."""
+        return self.density.n_theta
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of psi."""
+        return self.density.names
+
+    def log_density(self, psi: Float) -> Float:
+        """Log density (n,) of points (n, D); minus infinity outside the support."""
+        values = self.density.log_density(psi)
+        self.passes += len(psi)
+        now = self.clock()
+        if now - self._last >= EVERY_S:
+            self._last = now
+            log.info(
+                "sample: %s, %d passes over %d stars in %.0f s",
+                self.method,
+                self.passes,
+                self.n_stars,
+                now - self._started,
+            )
+        return values

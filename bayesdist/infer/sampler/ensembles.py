@@ -28,10 +28,15 @@ from emcee.moves import DEMove, MHMove
 from bayesdist.errors import InputError
 from bayesdist.infer.density.proposal import Proposal
 from bayesdist.infer.density.target import Density
-from bayesdist.infer.sampler.checkpoints import Block, Walkers, block_path
-from bayesdist.infer.sampler.move_schedule import Plan, StepRange
-from bayesdist.infer.sampler.proposal_batch import ProposalBatch, draw_batch
-from bayesdist.infer.sampler.whitening import Whitening
+from bayesdist.infer.sampler.proposals import (
+    Block,
+    ProposalBatch,
+    Walkers,
+    Whitening,
+    block_path,
+    draw_batch,
+)
+from bayesdist.infer.sampler.schedule import Plan, StepRange
 from bayesdist.utils.arrays import Bool, Float, Int
 
 START_BATCHES = 20  # maximum number of additional batches drawn to find starting points

@@ -1,11 +1,11 @@
-"""Sampling of the posterior, starting from a linear fit."""
+"""Sampling of the posterior, starting from a linear fit, and a prediction of its cost."""
 
 from __future__ import annotations
 
 import hashlib
 import time
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from importlib import metadata
 from pathlib import Path
 
@@ -15,26 +15,39 @@ from bayesdist.data.matches import Matches
 from bayesdist.files.hdf5 import read_arrays, write_arrays
 from bayesdist.infer.convergence import Limits
 from bayesdist.infer.density.grid import build_proposal
-from bayesdist.infer.density.proposal import GridProposal
-from bayesdist.infer.density.target import Target
+from bayesdist.infer.density.proposal import GridProposal, Proposal, Quality, quality_of
+from bayesdist.infer.density.target import Density, Target
 from bayesdist.infer.equations.priors import GaussianPriors
 from bayesdist.infer.equations.scaled import one_thread
 from bayesdist.infer.posterior import Posterior
 from bayesdist.infer.posterior.memberships import count_outliers
-from bayesdist.infer.sampler.chains import Settings, ensemble_seeds, run_chains
-from bayesdist.infer.sampler.checkpoints import CHECKPOINT
+from bayesdist.infer.sampler.chains import (
+    ChainSettings,
+    ensemble_seeds,
+    pilot_of,
+    plan_of,
+    run_chains,
+)
+from bayesdist.infer.sampler.proposals import CHECKPOINT
+from bayesdist.infer.sampler.schedule import Plan, expected_passes
 from bayesdist.infer.solution.linear import LinearFit
 from bayesdist.infer.stars.loading import opened
 from bayesdist.infer.stars.mixture import OutlierMixture
 from bayesdist.infer.stars.shards import Compute, Shards
 from bayesdist.infer.stars.stars import Stars
 from bayesdist.utils.arguments import takes
+from bayesdist.utils.limits import PARETO_K
 from bayesdist.utils.memory import require_memory
 from bayesdist.utils.quantities import whole_number
 
 STEPS_KEPT = 100  # steps per walker assumed for the check of the available memory
 FORMAT = 3  # version of the checkpoint files
 ENGINES = ("emcee", "numba", "numpy", "scipy")  # results may depend on the versions of these
+
+# With a smaller efficiency, or Pareto k closer to its limit, more proposals may still lead to other
+# moves; the uncertainty of k is about 0.1 for 2000 proposals.
+SURE_EFFICIENCY = 0.6
+K_MARGIN = 0.1
 
 
 @takes(fit=LinearFit, matches=(Matches, Shards), outliers=OutlierMixture, compute=Compute)
@@ -136,7 +149,7 @@ def sample(
         folder = None if folder is None else Path(folder)
         fingerprint = _fingerprint(target, seed, ensembles, walkers, checkpoint_every)
         proposal = _proposal(target, fit, folder, fingerprint)
-        settings = Settings(
+        settings = ChainSettings(
             seeds=seeds,
             n_stars=len(shards),
             walkers=walkers,
@@ -208,3 +221,70 @@ def _proposal(
     if path is not None:
         write_arrays(path, fingerprint, proposal.to_arrays())
     return proposal
+
+
+# -- cost of a run, from its pilot -----------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Prediction:
+    """Predicted moves and number of passes of a run.
+
+    Parameters
+    ----------
+    plan : Plan
+        Moves and walkers of the run.
+    quality : Quality
+        Quality of the proposal.
+    passes : int or None
+        Expected number of passes over the data; None if it cannot be predicted.
+    most_passes : int
+        Number of passes if the run continues to `max_steps`.
+    """
+
+    plan: Plan
+    quality: Quality
+    passes: int | None
+    most_passes: int
+
+
+def predict(target: Density, proposal: Proposal, settings: ChainSettings) -> Prediction:
+    """Predict the cost of a run with these settings; no files are written.
+
+    The pilot is that of the run, which will therefore start with the same moves.  Passes can be
+    predicted for independence moves only, since the autocorrelation of other moves depends on the
+    shape of the posterior.
+    """
+    s, ensembles = settings, len(settings.seeds)
+    quality = quality_of(pilot_of(target, proposal, s).log_weights)
+    plan = plan_of(target, quality, s)
+    sure = quality.efficiency > SURE_EFFICIENCY and quality.k < PARETO_K.value - K_MARGIN
+    passes = None
+    if plan.independent and sure:
+        passes = expected_passes(len(target.names), s.n_stars, s.limits, ensembles)
+    most_passes = ensembles * plan.walkers * s.max_steps
+    return Prediction(plan, quality, passes, most_passes)
+
+
+@one_thread
+def predict_sampling(
+    fit: LinearFit,
+    shards: Shards,
+    *,
+    outliers: OutlierMixture,
+    priors: GaussianPriors | None,
+    seed: int,
+    ensembles: int,
+    walkers: int | None,
+    limits: Limits,
+    max_steps: int,
+) -> Prediction:
+    """Predict the cost of `sample` with the same arguments.
+
+    Raises DegenerateError if no posterior mode is found, like `sample`.
+    """
+    model = fit.model
+    target = Target(shards, outliers.in_unit(model.unit), priors or GaussianPriors.none(model))
+    seeds = ensemble_seeds(seed, ensembles)
+    settings = ChainSettings(seeds, len(shards), walkers, limits, max_steps)
+    return predict(target, build_proposal(target, fit), settings)

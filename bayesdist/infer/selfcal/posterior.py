@@ -18,14 +18,13 @@ import numpy as np
 
 from bayesdist.errors import DegenerateError
 from bayesdist.infer.convergence import Limits
-from bayesdist.infer.density.coordinates import Split
-from bayesdist.infer.density.laplace import Node
+from bayesdist.infer.density.laplace import Node, Split
 from bayesdist.infer.density.proposal import GridProposal
 from bayesdist.infer.equations.arrow import Arrow
 from bayesdist.infer.equations.priors import Prior
 from bayesdist.infer.equations.scaled import one_thread
 from bayesdist.infer.posterior import Posterior
-from bayesdist.infer.sampler.chains import Settings, ensemble_seeds, run_chains
+from bayesdist.infer.sampler.chains import ChainSettings, ensemble_seeds, run_chains
 from bayesdist.infer.selfcal.elimination import Mixture, memberships
 from bayesdist.infer.selfcal.mode import SelfCalibrationMode
 from bayesdist.infer.selfcal.pieces import in_pieces, log_density, slope, to_sample
@@ -158,7 +157,7 @@ def sample_selfcal(
     with in_pieces(solution.problem, solution.stars, compute) as pieces:
         at_mode = pieces.map(to_sample, solution.theta, solution.mixture)
         target = SelfTarget(solution, at_mode, outliers)
-        settings = Settings(
+        settings = ChainSettings(
             seeds=seeds,
             n_stars=RELATIVE_COST * len(solution.problem),
             limits=Limits(target_ess, target_rhat),

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.special import expit
 
-from bayesdist.infer.density.coordinates import from_cube_root, inside, to_cube_root
+from bayesdist.infer.density.laplace import from_cube_root, inside, to_cube_root
 
 from ..support import numerical_gradient
 

@@ -7,13 +7,21 @@ import pytest
 from scipy import integrate, stats
 
 from bayesdist.infer import GaussianPriors, OutlierMixture, Rejection
-from bayesdist.infer.density.coordinates import Split, inside
 from bayesdist.infer.density.grid import build_proposal
-from bayesdist.infer.density.importance import quality_of
-from bayesdist.infer.density.laplace import _expand, conditional_mode, expected_mode, starting_point
-from bayesdist.infer.density.marginal import Marginal
-from bayesdist.infer.density.piecewise import PiecewiseExponential
-from bayesdist.infer.density.proposal import GridProposal
+from bayesdist.infer.density.laplace import (
+    Split,
+    _expand,
+    conditional_mode,
+    expected_mode,
+    inside,
+    starting_point,
+)
+from bayesdist.infer.density.proposal import (
+    GridProposal,
+    Marginal,
+    PiecewiseExponential,
+    quality_of,
+)
 from tests.reduced import case_in_full
 
 from ..oracle import JitterOracle

@@ -14,8 +14,7 @@ from scipy.stats import chi2, ncx2
 from bayesdist.data import Matches
 from bayesdist.errors import InputError
 from bayesdist.infer import Compute, GaussianPriors, OutlierMixture, fit_linear, load, sample
-from bayesdist.infer.density.coordinates import Split
-from bayesdist.infer.density.laplace import conditional_mode, starting_point
+from bayesdist.infer.density.laplace import Split, conditional_mode, starting_point
 from bayesdist.infer.density.target import Target
 from bayesdist.infer.kernel import circle
 from bayesdist.infer.posterior.memberships import memberships, star_log_likelihood

@@ -8,7 +8,7 @@ wrong in the usual ways.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -22,8 +22,8 @@ from bayesdist.infer.density.grid import build_proposal
 from bayesdist.infer.density.proposal import GridProposal
 from bayesdist.infer.sampler import chains as sampling
 from bayesdist.infer.sampler import ensembles as sampler
-from bayesdist.infer.sampler.chains import Settings, run_chains
-from bayesdist.infer.sampler.move_schedule import mixing_steps
+from bayesdist.infer.sampler.chains import ChainSettings, run_chains
+from bayesdist.infer.sampler.schedule import mixing_steps
 from tests.reduced import case_in_full, only_in_full
 
 from ..fakes import FakeTarget, advanced, ensembles_of, gaussian_proposal
@@ -212,7 +212,7 @@ def test_many_parameters_are_sampled_from_a_proposal_that_is_worth_little():
     cov = 0.5 ** np.abs(np.subtract.outer(np.arange(n), np.arange(n)))
     precision = np.linalg.inv(cov)
     target = FakeTarget(lambda x: -0.5 * np.einsum("ni,ij,nj->n", x, precision, x), n)
-    settings = Settings(seeds=SEEDS, n_stars=5000, limits=Limits(400, 1.01))
+    settings = ChainSettings(seeds=SEEDS, n_stars=5000, limits=Limits(400, 1.01))
     chains = run_chains(target, gaussian_proposal(np.zeros(n), 1.35 * cov), settings)
     assert chains.verdict.importance_efficiency < 0.05
     assert chains.plan.method == "pCN + independence"
@@ -234,7 +234,7 @@ def test_a_funnel_of_many_parameters_is_given_up(caplog):
         return -(v**2) / 18 - 0.5 * (rest**2).sum(axis=1) * np.exp(-v) - 0.5 * (n - 1) * v
 
     target = FakeTarget(log_density, n)
-    settings = Settings(seeds=SEEDS, n_stars=stars, limits=Limits(400, 1.01))
+    settings = ChainSettings(seeds=SEEDS, n_stars=stars, limits=Limits(400, 1.01))
     proposal = gaussian_proposal(np.zeros(n), np.diag(np.append(9.0, np.ones(n - 1))))
     chains = run_chains(target, proposal, settings)
     assert chains.steps <= mixing_steps(n) + settings.checkpoint_every
@@ -248,7 +248,7 @@ def test_judging_the_worst_parameters_first_changes_no_decision(monkeypatch):
     n, judged = 60, []
     target = FakeTarget(lambda x: -0.5 * (x**2).sum(axis=1), n)
     proposal = gaussian_proposal(np.full(n, 0.02), 1.02 * np.eye(n))
-    settings = Settings(SEEDS, 25, WALKERS, Limits(400.0, 1.002))
+    settings = ChainSettings(SEEDS, 25, WALKERS, Limits(400.0, 1.002))
 
     def counted(draws, names, *args, **options):
         judged.append(len(names))
@@ -256,11 +256,10 @@ def test_judging_the_worst_parameters_first_changes_no_decision(monkeypatch):
 
     monkeypatch.setattr(sampling, "diagnose", counted)
     some = run_chains(target, proposal, settings)
-    assert sampling.HARDEST in judged
+    assert settings.judged_first in judged
     assert judged[-1] == len(some.verdict.names) == n
-    monkeypatch.setattr(sampling, "HARDEST", 0)
     judged.clear()
-    every = run_chains(target, proposal, settings)
+    every = run_chains(target, proposal, replace(settings, judged_first=0))
     assert set(judged) == {n}
     assert some.steps == every.steps
     assert some.verdict.converged and every.verdict.converged

@@ -10,10 +10,9 @@ import pytest
 from bayesdist.infer import Limits, OutlierMixture
 from bayesdist.infer.convergence import diagnose
 from bayesdist.infer.density.grid import build_proposal
-from bayesdist.infer.sampler.chains import Settings, ensemble_seeds, run_chains
-from bayesdist.infer.sampler.heartbeat import Heartbeat
-from bayesdist.infer.sampler.move_schedule import is_too_slow
-from bayesdist.infer.sampler.prediction import predict
+from bayesdist.infer.sampler.chains import ChainSettings, Heartbeat, ensemble_seeds, run_chains
+from bayesdist.infer.sampler.sample import predict
+from bayesdist.infer.sampler.schedule import is_too_slow
 
 from ..fakes import FakeTarget, gaussian_proposal
 from ..support import simulated, target_of
@@ -31,7 +30,7 @@ def test_passes_are_predicted_within_a_factor_of_three_or_are_said_to_be_unknown
     model, matches, _ = simulated(60 + n % 7, n, order=order, fraction=fraction)
     target, fit = target_of(model, matches, OutlierMixture())
     proposal = build_proposal(target, fit)
-    settings = Settings(ensemble_seeds(1, 4), n, max_steps=200)
+    settings = ChainSettings(ensemble_seeds(1, 4), n, max_steps=200)
     predicted = predict(target, proposal, settings)
     chains = run_chains(target, proposal, settings)
     assert chains.passes <= 2 * predicted.most_passes  # the pilot is counted, too
@@ -46,7 +45,7 @@ def test_passes_are_predicted_within_a_factor_of_three_or_are_said_to_be_unknown
 def test_the_cost_of_a_posterior_that_is_far_from_its_proposal_is_unknown():
     target = FakeTarget(lambda psi: -0.5 * (psi**2).sum(axis=1) / 9, 3)
     proposal = gaussian_proposal(np.zeros(3), np.eye(3))
-    predicted = predict(target, proposal, Settings(ensemble_seeds(1, 4), 10, max_steps=500))
+    predicted = predict(target, proposal, ChainSettings(ensemble_seeds(1, 4), 10, max_steps=500))
     assert predicted.passes is None
     assert predicted.most_passes == 4 * predicted.plan.walkers * 500
 
@@ -93,7 +92,7 @@ def test_a_walk_that_is_too_slow_ends_with_its_reason(caplog):
         return -0.5 * ((radius - 1000) / 0.01) ** 2
 
     proposal = gaussian_proposal(np.zeros(2), 1e6 * np.eye(2))
-    settings = Settings(ensemble_seeds(1, 4), 10, limits=Limits(20_000, 1.01), max_steps=400)
+    settings = ChainSettings(ensemble_seeds(1, 4), 10, limits=Limits(20_000, 1.01), max_steps=400)
     chains = run_chains(FakeTarget(ring, 2), proposal, settings)
     assert not chains.verdict.converged
     assert chains.steps < 400

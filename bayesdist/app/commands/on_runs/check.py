@@ -16,8 +16,8 @@ from bayesdist.app.results import Results, open_results
 from bayesdist.app.screen import number
 from bayesdist.app.store.rundir import RunDirectory
 from bayesdist.infer import Limits
-from bayesdist.infer.sampler.move_schedule import expected_passes
-from bayesdist.infer.sampler.prediction import predict_sampling
+from bayesdist.infer.sampler.sample import predict_sampling
+from bayesdist.infer.sampler.schedule import expected_passes
 from bayesdist.infer.solution.geometry import geometries
 from bayesdist.utils.checks import warnings_of
 

@@ -10,18 +10,16 @@ from scipy import optimize, stats
 
 from bayesdist.infer import Limits, OutlierMixture
 from bayesdist.infer.density.grid import build_proposal
-from bayesdist.infer.density.importance import (
+from bayesdist.infer.density.proposal import (
     draws_per_effective,
     quality_of,
     rejection,
     warmup_steps,
 )
-from bayesdist.infer.sampler import proposal_batch
-from bayesdist.infer.sampler.chains import Settings, run_chains
-from bayesdist.infer.sampler.checkpoints import Walkers
+from bayesdist.infer.sampler.chains import ChainSettings, run_chains
 from bayesdist.infer.sampler.ensembles import replay
-from bayesdist.infer.sampler.move_schedule import expected_passes
-from bayesdist.infer.sampler.proposal_batch import ProposalBatch, draw_batch
+from bayesdist.infer.sampler.proposals import ProposalBatch, Walkers, draw_batch
+from bayesdist.infer.sampler.schedule import expected_passes
 from tests.reduced import case_in_full, only_in_full
 
 from ..fakes import FakeTarget, gaussian_proposal
@@ -33,8 +31,8 @@ MANY, FEW = 10_000_000, 5_000  # stars, as far as the plan knows
 MISLED = {"n_stars": MANY, "seed": 4}  # the pilot of this seed sees nothing wrong, or too little
 
 
-def settings(n_stars=MANY, seed=1, **options) -> Settings:
-    return Settings(tuple(range(10 * seed, 10 * seed + 4)), n_stars, **options)
+def settings(n_stars=MANY, seed=1, **options) -> ChainSettings:
+    return ChainSettings(tuple(range(10 * seed, 10 * seed + 4)), n_stars, **options)
 
 
 def nearly_gaussian(n: int = 12):
@@ -76,13 +74,12 @@ def test_replay_is_metropolis_hastings_over_the_given_proposals():
 
 
 @pytest.mark.parametrize("rows", [1, 7, 100_000])
-def test_how_many_are_evaluated_at_a_time_does_not_matter(rows, monkeypatch):
+def test_how_many_are_evaluated_at_a_time_does_not_matter(rows):
     model, matches, _ = simulated(81, 400, n_exposures=3, frames="shift", fraction=0.05)
     target, fit = target_of(model, matches, OutlierMixture())
     proposal = build_proposal(target, fit)
     expected = draw_batch(target, proposal, (1, 2), (5,), 60)
-    monkeypatch.setattr(proposal_batch, "ROWS", rows)
-    batch = draw_batch(target, proposal, (1, 2), (5,), 60)
+    batch = draw_batch(target, proposal, (1, 2), (5,), 60, rows_at_once=rows)
     for name in ("psi", "log_prob", "log_q"):
         np.testing.assert_allclose(
             getattr(batch, name), getattr(expected, name), rtol=1e-12, atol=1e-9

@@ -16,7 +16,8 @@ from scipy import stats
 from bayesdist.infer import Limits, OutlierMixture
 from bayesdist.infer.density.grid import build_proposal
 from bayesdist.infer.density.proposal import GridProposal
-from bayesdist.infer.sampler.move_schedule import (
+from bayesdist.infer.sampler.proposals import Whitening
+from bayesdist.infer.sampler.schedule import (
     block_schedule,
     doubling_schedule,
     expected_passes,
@@ -27,7 +28,6 @@ from bayesdist.infer.sampler.move_schedule import (
     plan_moves,
     walkers_for,
 )
-from bayesdist.infer.sampler.whitening import Whitening
 
 from ..fakes import advanced, ensembles_of
 from ..oracle import JitterOracle
