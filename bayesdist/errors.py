@@ -69,9 +69,10 @@ class BayesdistError(Exception):
 
 
 class BayesdistWarning(UserWarning):
-    """Warning that a written file is incomplete or may be misread by other programs.
+    """Warning that a written file may be misread, or that a plugin cannot be loaded.
 
-    Functions that write files issue it, once for each message.
+    Functions that write files issue it once for each message. The command line prints it as one
+    sentence.
     """
 
 

@@ -25,8 +25,8 @@ from bayesdist import formats
 from bayesdist.app.cli import bayesdist as root
 from bayesdist.app.config import KINDS
 from bayesdist.app.config.data import data_sections
-from bayesdist.mission import load_object
 from bayesdist.missions import wise
+from bayesdist.plugin import load_object
 
 from .docs_blocks import DOCS, blocks, run_notebook, run_page
 from .reduced import only_in_full
@@ -420,7 +420,7 @@ def test_the_reference_names_all_that_is_public():
     for module, _, name in (n.rpartition(".") for n in names):
         assert hasattr(import_module(module), name), f"{module} does not offer {name}"
     public = {*bd.__all__, *formats.__all__, *wise.__all__}
-    assert listed == public - {"__version__", "MISSION"}
+    assert listed == public - {"__version__", "PLUGIN"}
     modules = re.findall(r"^   (bayesdist[\w.]+)$", api, re.MULTILINE)
     assert {p.stem for p in (DOCS / "api").glob("*.md")} == set(modules)
     for name in modules:

@@ -18,7 +18,7 @@ import bayesdist.simulate
 
 PUBLIC = {name: bd for name in bd.__all__ if name != "__version__"}
 PUBLIC |= dict.fromkeys(bayesdist.formats.__all__, bayesdist.formats)
-PUBLIC |= {n: bayesdist.missions.wise for n in bayesdist.missions.wise.__all__ if n != "MISSION"}
+PUBLIC |= {n: bayesdist.missions.wise for n in bayesdist.missions.wise.__all__ if n != "PLUGIN"}
 PUBLIC |= {
     "PolynomialBasis": bayesdist.model,
     "simulate_partitioned": bayesdist.simulate,

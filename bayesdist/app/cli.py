@@ -7,15 +7,17 @@ import os
 import shlex
 import signal
 import sys
+import warnings
 from collections.abc import Callable, Sequence
+from typing import Any
 
 import click
 
 from bayesdist.app.commands.options import LazyGroup
 from bayesdist.app.screen import open_streams
-from bayesdist.errors import BayesdistError, RenamedError
+from bayesdist.errors import BayesdistError, BayesdistWarning, RenamedError
 from bayesdist.files.faults import InterruptHandler, raising_interrupts
-from bayesdist.mission import load_mission, mission_names, missions
+from bayesdist.plugin import mission_objects, missions
 from bayesdist.version import __version__
 
 _LONGEST = 1000  # largest number of characters of a sentence
@@ -82,7 +84,7 @@ class _Root(LazyGroup):
 
     def list_commands(self, ctx: click.Context) -> list[str]:
         next_to_core = [name for mission in missions().values() for name in mission.beside_core]
-        return [*next_to_core, *super().list_commands(ctx), "simulate", *mission_names()]
+        return [*next_to_core, *super().list_commands(ctx), "simulate", *missions()]
 
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
         command = super().get_command(ctx, cmd_name)
@@ -92,16 +94,17 @@ class _Root(LazyGroup):
             return command
         if cmd_name in RENAMED:
             raise _renamed(cmd_name, RENAMED[cmd_name])
-        if cmd_name in mission_names():
-            mission = load_mission(cmd_name)
+        if cmd_name in missions():
+            mission = missions()[cmd_name]
             return LazyGroup(cmd_name, help=mission.title, lazy=mission.commands)
         if cmd_name == "simulate":
             lazy = {k: v for mission in missions().values() for k, v in mission.simulate.items()}
             lazy = SIMULATED | lazy
             return LazyGroup("simulate", help="Simulate data of known truth.", lazy=lazy)
+        beside_core = mission_objects(lambda mission: mission.beside_core, only=cmd_name)
+        if cmd_name in beside_core:
+            return self.checked(beside_core[cmd_name], cmd_name)
         for name, mission in missions().items():
-            if cmd_name in mission.beside_core:
-                return self.load(mission.beside_core[cmd_name])
             if cmd_name in mission.commands:
                 raise _renamed(cmd_name, f"{name} {cmd_name}")
         return None
@@ -126,9 +129,22 @@ def program() -> int:
     """Run the command of the process, which ends with it."""
     if signal.getsignal(signal.SIGINT) is signal.default_int_handler:  # a job in the background
         signal.signal(signal.SIGINT, InterruptHandler())  # may have been told to ignore it
+    warnings.showwarning = _shown(warnings.showwarning)
     code = main()
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Python closes what libraries have left open
     return code
+
+
+def _shown(default: Callable[..., None]) -> Callable[..., None]:
+    """Function that prints warnings of bayesdist as one sentence, and others by `default`."""
+
+    def show(message: Warning | str, category: type[Warning], *place: Any, **options: Any) -> None:
+        if issubclass(category, BayesdistWarning):
+            print(f"bayesdist: WARNING: {message}", file=sys.stderr)
+        else:
+            default(message, category, *place, **options)
+
+    return show
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -24,8 +24,8 @@ from bayesdist.calibration.plane import ARCSEC, Plane
 from bayesdist.errors import InputError
 from bayesdist.infer.solution.solution import Solution
 from bayesdist.infer.solution.transforms import at_exposure, without_frames
-from bayesdist.mission import load_object
 from bayesdist.model import Chip, DistortionModel, LookupTable, TimeDependence, corrected
+from bayesdist.plugin import load_object
 from bayesdist.utils.arrays import Float
 from bayesdist.utils.quantities import (
     Direction,

@@ -22,7 +22,7 @@ from bayesdist.calibration.sky_positions import placement_of, plane_covariances,
 from bayesdist.errors import BayesdistError, InputError
 from bayesdist.infer.solution.solution import LinearMap
 from bayesdist.infer.solution.transforms import at_exposure
-from bayesdist.mission import load_object
+from bayesdist.plugin import load_object
 from bayesdist.utils.arrays import Bool, Float
 from bayesdist.utils.numbers import number
 from bayesdist.utils.quantities import (

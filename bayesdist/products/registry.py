@@ -1,23 +1,21 @@
 """All file formats, and functions that work on a file of any format.
 
-A format is a module of `bayesdist.formats`, or the module `format` of a subpackage of it, that
-defines FORMAT. New formats are discovered by this name alone.
+Formats are those of all installed plugins (`bayesdist.plugin.Plugin.formats`).
 """
 
 from __future__ import annotations
 
 import os
-import pkgutil
 from collections.abc import Sequence
 from dataclasses import replace
 from difflib import get_close_matches
 from functools import cache
-from importlib import import_module
 from typing import TYPE_CHECKING
 
 from bayesdist.calibration.calibration import Calibration
 from bayesdist.errors import InputError, required
 from bayesdist.files.atomic import refuse_unsafe_name
+from bayesdist.plugin import objects
 from bayesdist.products.common.content import Content, read_content, readable
 from bayesdist.products.common.document import (
     PARAMETERS,
@@ -38,14 +36,8 @@ if TYPE_CHECKING:
 @cache
 def all_formats() -> tuple[Format, ...]:
     """All formats, in the order in which they are tried on a file."""
-    found_formats = []
-    formats = import_module("bayesdist.formats")
-    for entry in pkgutil.iter_modules(formats.__path__):
-        name = f"{formats.__name__}.{entry.name}" + (".format" if entry.ispkg else "")
-        format_ = getattr(import_module(name), "FORMAT", None)
-        if format_ is not None:
-            found_formats.append(format_)
-    return tuple(sorted(found_formats, key=lambda format_: format_.rank))
+    formats = objects(lambda plugin: plugin.formats).values()
+    return tuple(sorted(formats, key=lambda format_: (format_.rank, format_.key)))
 
 
 def open_document(path: str | os.PathLike[str]) -> Document:
@@ -80,11 +72,13 @@ def recognized(content: Content) -> Document:
             return Document(content.name, format_, holds)
     if content.damage is not None:
         raise content.damage
-    *titles, last_title = (format_.title for format_ in all_formats())
+    titles = [format_.title for format_ in all_formats()]
     raise InputError(
         "is of no kind that is understood here",
         where=content.name,
-        do=f"give {', '.join(titles)}, or {last_title}",
+        do=f"give {', '.join(titles[:-1])}, or {titles[-1]}"
+        if titles
+        else "install formats: none is installed, or BAYESDIST_PLUGINS excludes them",
     )
 
 

@@ -12,7 +12,7 @@ import click
 import pytest
 
 from bayesdist.app.cli import bayesdist
-from bayesdist.mission import load_object
+from bayesdist.plugin import load_object
 from tests.app.support import cli
 
 APPLY, SKY = "apply a.hdr t.csv -o o.ecsv", "apply a.hdr t.csv -o o.ecsv --sky"

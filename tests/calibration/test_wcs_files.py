@@ -11,7 +11,7 @@ from numpy.testing import assert_allclose
 from bayesdist.formats.sip.write import sip_header, write_sip
 from bayesdist.products import read_calibration
 
-from ..products.test_tpv import SCAMP_SIZE, scamp_head
+from ..formats.test_tpv import SCAMP_SIZE, scamp_head
 from ..real.sip_sets import SIZE, read_sets
 from .cameras import apart
 

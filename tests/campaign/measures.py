@@ -15,8 +15,8 @@ from bayesdist.infer.nodes import TableFit, TablePosterior, fit_with_tables
 from bayesdist.infer.series import Series, TrendModel, fit_series
 from bayesdist.infer.solution.solution import Solution, TransformedSolution
 from bayesdist.infer.solution.transforms import lines, reference_gauge, without_frames
-from bayesdist.missions.acs.simulate.pointings import SPANS
-from bayesdist.missions.acs.simulate.stars import centroid_error
+from bayesdist.missions.hst.simulate.pointings import SPANS
+from bayesdist.missions.hst.simulate.stars import centroid_error
 from bayesdist.model import corrected
 from tests.campaign.support import (
     CHIPS,

@@ -24,8 +24,8 @@ from bayesdist.infer.exposures.hierarchy import HierarchicalFit
 from bayesdist.infer.nodes import Matern, NodeGrid, TableFit
 from bayesdist.infer.series import Series
 from bayesdist.infer.solution.solution import TransformedSolution
-from bayesdist.missions.acs.simulate import AcsCampaign, acs_model, read_acs
-from bayesdist.missions.acs.simulate.pointings import OWN
+from bayesdist.missions.hst.simulate import AcsCampaign, acs_model, read_acs
+from bayesdist.missions.hst.simulate.pointings import OWN
 from bayesdist.model import LookupTable
 from tests.app.support import good
 from tests.infer.small_campaign import with_star_errors
@@ -156,7 +156,7 @@ def calibrated(setting: Setting, seed: int) -> Iterator[Calibrated]:
 
 def _simulate(setting: Setting, seed: int, folder: Path) -> None:
     with ExitStack() as stack:
-        simulate = "bayesdist.missions.acs.simulate"
+        simulate = "bayesdist.missions.hst.simulate"
         if setting.pattern == "matern":
             making = f"{simulate}.making."
             stack.enter_context(mock.patch(making + "detector_tables", _random_field))

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.stats import chi2, norm
 
-from bayesdist.missions.acs.simulate.distortion import SM4
+from bayesdist.missions.hst.simulate.distortion import SM4
 from tests.campaign.support import (
     CHIPS,
     LOOSE,

@@ -1,33 +1,23 @@
-"""What every format has to keep, and a new one that is found by its module alone."""
+"""What every format has to keep."""
 
 from __future__ import annotations
 
-import json
-import sys
-import types
-from dataclasses import dataclass
 from functools import cache
-from pathlib import Path
 
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from bayesdist import formats
-from bayesdist.calibration.calibration import Calibration, calibration_of, calibration_of_maps
-from bayesdist.calibration.chip_map import fitted_map
-from bayesdist.errors import BayesdistError, FormatError, InputError
+from bayesdist.calibration.calibration import Calibration, calibration_of
+from bayesdist.errors import BayesdistError, InputError
 from bayesdist.products import registry
 from bayesdist.products.common.content import Content
 from bayesdist.products.common.document import (
     BuildOptions,
     Built,
     Choice,
-    Finding,
-    Format,
     FormatSettings,
 )
-from tests.app.support import good
 
 from .support import StandIn, some_solution, wfc_model
 
@@ -183,91 +173,3 @@ def test_origins_of_a_table_and_of_a_solution(data_dir):
     assert_allclose(made.by_chip()[first].at(*zero), 7.0 + first, rtol=1e-12)
     assert_allclose(made.in_frame()[first].at(*zero), 0, atol=1e-12)
     assert_allclose(made.in_frame()[first].covariance_at(*map(np.array, zero)), 0, atol=1e-9)
-
-
-# -- a format of one module -----------------------------------------------------------------------
-
-
-@dataclass(frozen=True)
-class Toy:
-    """A scale and a bend, as JSON."""
-
-    scale: float
-    bend: float
-
-
-class ToySettings(FormatSettings):
-    digits: int = 17
-
-
-def toy_module() -> types.ModuleType:
-    def parse(content: Content) -> Toy | None:
-        if not content.text.startswith('{"toy"'):
-            return None
-        try:
-            return Toy(**json.loads(content.text)["toy"])
-        except (TypeError, ValueError) as error:
-            raise FormatError(f"is no toy ({error})", where=content.name, do="mend it") from error
-
-    def lint(toy: Toy) -> list[Finding]:
-        return [Finding("warning", "scale", "is negative")] if toy.scale < 0 else []
-
-    def calibration(toy: Toy, name: str, choice: Choice) -> Calibration:
-        def positions(x, y):
-            dx, dy = x - 500.0, y - 400.0
-            return toy.scale * (dx + toy.bend * dx**2), toy.scale * dy
-
-        one = fitted_map(
-            positions, name, order=2, size=choice.size or (1000.0, 800.0),
-            reference_pixel=(500.0, 400.0), unit="arcsec", chip=1,
-        )  # fmt: skip
-        return calibration_of_maps({1: one}, name)
-
-    def build(made: Calibration, settings: ToySettings, _: BuildOptions) -> tuple[Built, ...]:
-        values = made.chip(origin="stated").monomials().values
-        toy = {"scale": values[1, 2], "bend": values[0, 3] / values[0, 1]}
-        text = json.dumps({"toy": {k: round(float(v), settings.digits) for k, v in toy.items()}})
-        return (Built("toy.json", "toy", text.encode(), toy),)
-
-    module = types.ModuleType(f"{formats.__name__}.toy")
-    module.FORMAT = Format(
-        "toy", "a toy", 9, parse, lambda toy: [f"toy of scale {toy.scale:g}"], lint, calibration,
-        ToySettings, build,
-    )  # fmt: skip
-    return module
-
-
-@pytest.fixture
-def toy(monkeypatch, tmp_path) -> Path:
-    """A file of a format that is one module more."""
-    module = toy_module()
-    entries = [*registry.pkgutil.iter_modules(formats.__path__)]
-    extra = type(entries[0])(entries[0].module_finder, "toy", False)
-    monkeypatch.setitem(sys.modules, module.__name__, module)
-    monkeypatch.setattr(registry.pkgutil, "iter_modules", lambda path: [*entries, extra])
-    registry.all_formats.cache_clear()
-    path = tmp_path / "a.json"
-    path.write_text('{"toy": {"scale": 0.05, "bend": 1e-6}}')
-    yield path
-    monkeypatch.undo()
-    registry.all_formats.cache_clear()
-
-
-def test_a_new_format_is_one_module(toy, tmp_path):
-    """It is inspected, compared, applied and built without a change anywhere else."""
-    assert good("inspect", toy).out.strip() == "toy of scale 0.05"
-    other = tmp_path / "b.json"
-    other.write_text('{"toy": {"scale": 0.05, "bend": 2e-6}}')
-    assert good("compare", toy, other).out.startswith("The calibrations differ by")
-    (tmp_path / "stars.csv").write_text("x,y,chip\n500,400,1\n600,500,1\n")
-    good("apply", toy, tmp_path / "stars.csv", "-o", tmp_path / "out.csv")
-    row = (tmp_path / "out.csv").read_text().splitlines()[-1].split(",")
-    assert float(row[3]) == pytest.approx(100 + 1e-6 * 1e4, rel=1e-9)
-    good("hst", "pam", toy, "-o", tmp_path / "pam.fits")
-    settings = registry.product_settings()["toy"]()
-    [one] = registry.build("toy", registry.read_calibration(toy), settings)
-    again = registry.recognized(content_of(one))
-    assert again.holds.scale == pytest.approx(0.05) and again.holds.bend == pytest.approx(1e-6)
-    (tmp_path / "c.json").write_text('{"toy": {"scale": "x"}}')
-    with pytest.raises(FormatError, match="is no toy"):
-        registry.open_document(tmp_path / "c.json")

@@ -15,7 +15,7 @@ from bayesdist.formats.idctab.build import idctab_from_solution
 from bayesdist.formats.idctab.drift import storable
 from bayesdist.formats.idctab.table import IdcTab, read_idctab
 from bayesdist.infer.solution.transforms import lines, reference_gauge, segment
-from bayesdist.missions.acs.simulate import acs_solution
+from bayesdist.missions.hst.simulate import acs_solution
 from bayesdist.model import DistortionModel, TimeDependence
 
 from .support import (

@@ -20,8 +20,8 @@ from bayesdist.formats.idctab.hst import combination_of
 from bayesdist.formats.idctab.lint import lint_idctab
 from bayesdist.formats.idctab.table import read_idctab
 from bayesdist.infer.solution.transforms import reference_gauge
-from bayesdist.missions.acs.simulate import acs_solution
-from bayesdist.missions.acs.simulate.tables import detector_tables, filter_tables
+from bayesdist.missions.hst.simulate import acs_solution
+from bayesdist.missions.hst.simulate.tables import detector_tables, filter_tables
 from bayesdist.model.lookup import LookupTable, corrected
 from bayesdist.products.release import Period, Release, write_release
 from tests.reduced import case_in_full

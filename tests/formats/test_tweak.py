@@ -17,7 +17,7 @@ import pytest
 from bayesdist.calibration.calibration import Calibration, calibration_of
 from bayesdist.data.sky.tangent import mean_direction, tangent_plane
 from bayesdist.diagnose.overlap import Alignment, align
-from bayesdist.missions.acs.simulate.tables import detector_tables, filter_tables
+from bayesdist.missions.hst.simulate.tables import detector_tables, filter_tables
 from bayesdist.model.lookup import LookupTable, corrected
 from bayesdist.products.release import Period, write_release
 from tests.reduced import only_in_full

@@ -19,8 +19,8 @@ from bayesdist.formats.sip.write import sip_header, write_sip
 from bayesdist.missions.wise.simulate import wise_solution
 from tests.reduced import only_in_full
 
-from ..products.support import StandIn, astropy_wcs, random_pixels
-from ..products.test_sip_rotate import moved_pixels
+from ..formats.support import StandIn, astropy_wcs, random_pixels
+from ..formats.test_sip_rotate import moved_pixels
 from .sip_sets import LAST_MEASURED, SIZE, Set, curved, read_sets
 
 EXACT = 1e-9  # px

@@ -15,8 +15,8 @@ from bayesdist.app.kinds.campaign.report import held_parameters
 from bayesdist.diagnose.checks import structure_checks
 from bayesdist.diagnose.residuals.misfit import Misfit
 from bayesdist.infer import GaussianPriors, fit_linear
-from bayesdist.missions.acs.published import LINES, published_lines
-from bayesdist.missions.acs.simulate.distortion import DRIFT
+from bayesdist.missions.hst.published import LINES, published_lines
+from bayesdist.missions.hst.simulate.distortion import DRIFT
 from bayesdist.model import Chip, TimeDependence
 from bayesdist.report.run_report import render_report
 from bayesdist.report.sections import REPORT

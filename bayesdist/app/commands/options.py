@@ -12,7 +12,7 @@ import click
 
 from bayesdist.app.screen import start_logging
 from bayesdist.errors import InputError
-from bayesdist.mission import load_object
+from bayesdist.plugin import load_object
 
 
 class LazyGroup(click.Group):
@@ -66,9 +66,23 @@ class LazyGroup(click.Group):
     @staticmethod
     def load(target: str) -> click.Command:
         """Load the command at "module:object"."""
-        command = load_object(target)
+        try:
+            command = load_object(target)
+        except (ImportError, AttributeError) as error:
+            if target.startswith("bayesdist."):
+                raise
+            raise InputError(
+                f"the command cannot be imported ({error})",
+                where=target,
+                do="install its package again, or remove it",
+            ) from error
+        return LazyGroup.checked(command, target)
+
+    @staticmethod
+    def checked(command: object, where: str) -> click.Command:
+        """Return the command; InputError if the object is none."""
         if not isinstance(command, click.Command):
-            raise InputError("is no command", where=target, do="mend the package that names it")
+            raise InputError("is no command", where=where, do="mend the package that names it")
         return command
 
 

@@ -34,7 +34,7 @@ from bayesdist.data.formats.files import mission_formats
 from bayesdist.data.tables.units import length_advice
 from bayesdist.errors import InputError
 from bayesdist.infer.compare.period_dates import check_periods, mjd_periods
-from bayesdist.mission import load_object, missions
+from bayesdist.plugin import mission_objects
 
 LENGTHS = ("mm", "um")  # units that a plate scale converts to arcsec
 
@@ -100,11 +100,7 @@ def names_nominal(columns: Mapping[str, str] | None) -> bool:
 
 def data_sections() -> dict[str, type[Data]]:
     """Section classes of formats that have additional keys, by format name."""
-    return {
-        name: load_object(target)
-        for mission in missions().values()
-        for name, target in mission.data_sections.items()
-    }
+    return mission_objects(lambda mission: mission.data_sections)
 
 
 def _of_its_format(raw: Any, handler: Any, info: ValidationInfo) -> Data:

@@ -22,8 +22,8 @@ from bayesdist.assess.terms.forms import (
 from bayesdist.errors import InputError, require_known
 from bayesdist.infer.catalogue.star_errors import StarCovariance
 from bayesdist.infer.solution.solution import Solution
-from bayesdist.mission import load_object, missions
 from bayesdist.model import DistortionModel
+from bayesdist.plugin import mission_objects
 from bayesdist.utils.arrays import Float, Int
 
 CATALOGUE = "reference catalogue (shared stars)"
@@ -146,15 +146,12 @@ ONE_SIZE: dict[str, Callable[..., ErrorTerm]] = {"scale": ScaleError, "rotation"
 
 def one_size_kinds() -> tuple[str, ...]:
     """Kinds of error terms with a single size, including those that missions add."""
-    return (*ONE_SIZE, *(kind for mission in missions().values() for kind in mission.error_terms))
+    return (*ONE_SIZE, *mission_objects(lambda mission: mission.error_terms))
 
 
 def one_size_term(name: str, kind: str, sigma: float, solution: Solution, source: str) -> ErrorTerm:
     """Error term of a kind; for the parameters see `ScaleError`."""
-    added = {
-        kind: path for mission in missions().values() for kind, path in mission.error_terms.items()
-    }
-    make = ONE_SIZE[kind] if kind in ONE_SIZE else load_object(added[kind])
+    make = (ONE_SIZE | mission_objects(lambda mission: mission.error_terms))[kind]
     return make(name, kind, sigma, solution, source)
 
 

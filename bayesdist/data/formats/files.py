@@ -16,7 +16,7 @@ from bayesdist.errors import FormatError, InputError
 from bayesdist.files.tables import TABLE_SUFFIXES, is_binary, is_fits, read_table
 from bayesdist.files.text_tables import is_text_table
 from bayesdist.files.unpacked import read_lines, without_codec
-from bayesdist.mission import load_object, missions
+from bayesdist.plugin import mission_objects
 
 PathLike = str | os.PathLike[str]
 
@@ -44,11 +44,7 @@ class MatchFormat:
 
 def mission_formats() -> dict[str, MatchFormat]:
     """Formats of all installed missions, by name."""
-    return {
-        name: load_object(target)
-        for mission in missions().values()
-        for name, target in mission.match_formats.items()
-    }
+    return mission_objects(lambda mission: mission.match_formats)
 
 
 def input_files(path: PathLike | Sequence[PathLike]) -> list[Path]:

@@ -11,8 +11,8 @@ from bayesdist.formats.sip.header import SipHeader
 from bayesdist.formats.sip.read import read_sip
 from bayesdist.formats.sip.rotate import rotated_sip
 from bayesdist.formats.sip.write import write_sip
-from bayesdist.formats.wise.build import write_wise_meta
-from bayesdist.formats.wise.meta import WiseBand, read_wise_meta
+from bayesdist.missions.wise.meta_data.build import write_wise_meta
+from bayesdist.missions.wise.meta_data.meta import WiseBand, read_wise_meta
 from bayesdist.products.registry import open_document
 
 

@@ -3,9 +3,7 @@
 Modules named by missions add their sections at the end.
 """
 
-from importlib import import_module
-
-from bayesdist.mission import missions
+from bayesdist.plugin import import_reports
 from bayesdist.report.contents import REPORT
 from bayesdist.report.sections import explorer  # noqa: F401
 from bayesdist.report.sections.campaign import (  # noqa: F401
@@ -35,6 +33,4 @@ from bayesdist.report.sections.run import (  # noqa: F401
 
 __all__ = ["REPORT"]
 
-for _mission in missions().values():
-    if _mission.report:
-        import_module(_mission.report)
+import_reports()

@@ -17,7 +17,7 @@ from bayesdist.formats.lookup.d2im import read_d2im
 from bayesdist.infer import load_posterior
 from bayesdist.infer.nodes import NodeGrid
 from bayesdist.infer.solution.transforms import reference_gauge, segment, without_frames
-from bayesdist.missions.acs.simulate import read_acs
+from bayesdist.missions.hst.simulate import read_acs
 from bayesdist.model import corrected
 from tests.app.support import cli, good, one_sentence, snapshot, summary_of
 

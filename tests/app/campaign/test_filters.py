@@ -33,7 +33,7 @@ from bayesdist.infer.exposures.shared_drift import drift_priors, with_drift_of
 from bayesdist.infer.nodes.table_fit import held_sigma
 from bayesdist.infer.series import Series, fit_series
 from bayesdist.infer.solution.transforms import linear_terms, lines, reference_gauge, without_frames
-from bayesdist.missions.acs.simulate import acs_solution, making, read_acs, simulate_acs
+from bayesdist.missions.hst.simulate import acs_solution, making, read_acs, simulate_acs
 from bayesdist.model import LookupTable, TimeDependence, corrected
 from tests.app.support import carried_out, cli, good, one_sentence, replaced, snapshot
 from tests.formats.acs_offline import Pointing, to_sky

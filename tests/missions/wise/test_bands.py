@@ -16,8 +16,8 @@ from astropy.io import fits
 from astropy.table import Table
 
 from bayesdist.app.store import Record
-from bayesdist.formats.wise.meta import read_wise_meta
 from bayesdist.infer import load_fit, load_posterior
+from bayesdist.missions.wise.meta_data.meta import read_wise_meta
 from bayesdist.missions.wise.published import WISE_ARRAYS
 from bayesdist.missions.wise.simulate import wise_solution
 from bayesdist.model import Chip, DistortionModel

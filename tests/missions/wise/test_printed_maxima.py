@@ -11,9 +11,9 @@ import pytest
 
 from bayesdist.assess import distortion_vectors
 from bayesdist.formats.sip.build import sip_from_solution
-from bayesdist.formats.wise.build import write_wise_meta
-from bayesdist.formats.wise.meta import read_wise_meta
 from bayesdist.infer import Rejection, fit_linear
+from bayesdist.missions.wise.meta_data.build import write_wise_meta
+from bayesdist.missions.wise.meta_data.meta import read_wise_meta
 from bayesdist.missions.wise.published import LONGEST_VECTORS, WISE_BANDS
 from bayesdist.missions.wise.simulate import wise_set
 from bayesdist.products.common.coefficients import evaluate
@@ -56,7 +56,7 @@ def calibrated(request):
 
 
 @pytest.mark.slow
-@only_in_full("tests/formats/test_sip_wise has the longest vector")
+@only_in_full("tests/missions/wise/test_sip_wise has the longest vector")
 def test_longest_vectors(calibrated):
     """To 0.5 %; in a corner, the zeroth order suppressed."""
     band, fit = calibrated

@@ -13,8 +13,8 @@ from bayesdist.app.store.rundir import RunDirectory
 from bayesdist.data import Matches, input_files, open_matches, read_matches
 from bayesdist.data.tables.parquet import describe_part
 from bayesdist.errors import InputError
-from bayesdist.mission import load_object, missions
 from bayesdist.model import Chip
+from bayesdist.plugin import mission_objects
 
 IN_MEMORY = 1_000_000  # rows of Parquet above which tables stay on disk
 
@@ -127,19 +127,9 @@ class MatchSource:
     template: Callable[[str | Path], Template | None]
 
 
-def _sources() -> dict[str, str]:
-    """Import paths of the match sources of all missions, by format name."""
-    return {
-        name: target
-        for mission in missions().values()
-        for name, target in mission.match_sources.items()
-    }
-
-
 def _source(name: str) -> MatchSource | None:
     """Match source of a format; None for formats that are not of a mission."""
-    target = _sources().get(name)
-    return None if target is None else load_object(target)
+    return mission_objects(lambda mission: mission.match_sources, only=name).get(name)
 
 
 def input_of_run(run: RunDirectory) -> RunInput | None:
@@ -168,9 +158,8 @@ def read_configured(
 
 def mission_template(matches: str | Path) -> Template | None:
     """Number of matches and their part of a template; None if no mission reads the files."""
-    for name in _sources():
-        source = _source(name)
-        template = None if source is None else source.template(matches)
+    for source in mission_objects(lambda mission: mission.match_sources).values():
+        template = source.template(matches)
         if template is not None:
             return template
     return None

@@ -12,7 +12,6 @@ from bayesdist.app.store.output import record_folder
 from bayesdist.app.store.record import write_text
 from bayesdist.errors import InputError
 from bayesdist.formats.sip.build import sip_from_solution
-from bayesdist.formats.wise.build import write_wise_meta
 
 # importing these modules registers their tables and figures
 from bayesdist.missions.wise.bands import curves, figures, findings, tables  # noqa: F401
@@ -22,6 +21,7 @@ from bayesdist.missions.wise.bands.inputs import BandRun, open_bands
 from bayesdist.missions.wise.bands.measure import measure_bands
 from bayesdist.missions.wise.bands.optical import optical_models
 from bayesdist.missions.wise.bands.record import record_of, write_tables
+from bayesdist.missions.wise.meta_data.build import write_wise_meta
 from bayesdist.missions.wise.published import WISE_BANDS
 from bayesdist.report.drawing import draw_all, save_drawings
 from bayesdist.report.page import parts_of, template

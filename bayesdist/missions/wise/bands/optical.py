@@ -12,8 +12,8 @@ from bayesdist.errors import InputError
 from bayesdist.formats.sip.header import SipHeader
 from bayesdist.formats.sip.read import read_sip
 from bayesdist.formats.sip.rotate import rotated_sip
-from bayesdist.formats.wise.meta import read_wise_meta
 from bayesdist.missions.wise.assess.distortion_field import DistortionField
+from bayesdist.missions.wise.meta_data.meta import read_wise_meta
 from bayesdist.model import Chip, PolynomialBasis
 from bayesdist.products.registry import open_document
 
