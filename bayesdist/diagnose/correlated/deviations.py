@@ -23,7 +23,7 @@ from bayesdist.diagnose.correlated.exposure_time import (
     correlation_p,
     correlation_root,
 )
-from bayesdist.diagnose.correlated.information import GroupCells, Information
+from bayesdist.diagnose.correlated.information import Information
 from bayesdist.diagnose.correlated.priors import DiscrepancyPriors, log_half_t, log_widths
 from bayesdist.diagnose.efficient import EfficientScore
 from bayesdist.infer.exposures.hierarchy import MOST_OUTLYING
@@ -47,8 +47,9 @@ LINEAR = {
 }
 SCATTERS = {"shift": "shift", "rotation": "rotation", "scale": "shape", "shear": "shape"}
 CURVATURE = "curvature"
-# largest number with estimated deviations; if there are more, a subset represents all
-MAX_EXPOSURES = 40
+# largest number of estimated deviations of exposures (6 of each exposure without frames, 3 if shift
+# and rotation are fitted); if there are more, those of a subset of the exposures represent all
+MAX_DEVIATIONS = 240
 # number of steps in each amplitude, by the number of scatters: first on a coarse grid over the
 # whole range, then on a finer grid where the density is not negligible
 COARSE, REFINED = (12, 8, 6, 5), (30, 18, 11, 6)
@@ -57,8 +58,10 @@ MIN_OF_OTHERS = 5  # exposures; with fewer, outliers cannot be identified
 # lower limit of amplitudes, as a fraction of the prior median or of the resolution of the data, the
 # smaller of both
 LEAST = 1 / 3
-# upper limits, in units of the median and of the resolution of the data; the larger applies
-MOST, MOST_RESOLVED = 100.0, 10.0
+# upper limits, in units of the median, of the resolution of the data and of the size that the data
+# suggest; the largest applies.  Few exposures of a larger scatter would otherwise be stated to
+# scatter by exactly the limit.
+MOST, MOST_RESOLVED, MOST_SUGGESTED = 100.0, 10.0, 10.0
 MOST_CURVATURE = 10.0  # in units of the median: a few dates hardly constrain the curvature
 NEGLIGIBLE = 1e-3  # density relative to the maximum
 
@@ -186,7 +189,7 @@ def deviation_columns(
     counts: Float,
     *,
     exposures: bool = True,
-    most: int = MAX_EXPOSURES,
+    most: int | None = None,
 ) -> DeviationColumns | None:
     """Deviations that the frames of a model do not include, and curvatures of its drift.
 
@@ -194,10 +197,10 @@ def deviation_columns(
     not deviate; this is the case if a hierarchy of them was fitted.  Returns None if nothing can
     deviate, for example for a single exposure without a drift.
 
-    The deviations of at most `most` exposures are estimated.  If there are more exposures, the
-    selected ones represent all and are at most half of them: the polynomials follow the mean of all
-    exposures, including the selected ones, and the deviations of the others cannot be separated
-    from that mean.
+    The deviations of at most `most` exposures are estimated; by default as many as have
+    `MAX_DEVIATIONS` deviations.  If there are more exposures, the selected ones represent all and
+    are at most half of them: the polynomials follow the mean of all exposures, including the
+    selected ones, and the deviations of the others cannot be separated from that mean.
     """
     keys = np.column_stack([groups.exposure, groups.epoch])
     distinct, of_group = np.unique(keys, axis=0, return_inverse=True)
@@ -206,6 +209,9 @@ def deviation_columns(
     if n_all < 2 or not exposures:
         kinds = ()
     chosen = np.arange(n_all)
+    per_exposure = [SCATTERS[k] for k in kinds for _ in LINEAR.get(k, "uv")]
+    if most is None:
+        most = MAX_DEVIATIONS // max(len(per_exposure), 1)
     if kinds and n_all > most:
         n_exposures = min(most, n_all // 2)
         # one random exposure per interval of equal length, so that all dates are represented
@@ -213,7 +219,6 @@ def deviation_columns(
         chosen = ((np.arange(n_exposures) + uniform) * n_all / n_exposures).astype(int)
     number = np.full(n_all, -1)
     number[chosen] = np.arange(n_exposures)
-    per_exposure = [SCATTERS[k] for k in kinds for _ in LINEAR.get(k, "uv")]
     terms = _bending(model)
     scatter = np.array([*per_exposure * n_exposures, *[CURVATURE] * len(terms)])
     if not len(scatter):
@@ -259,22 +264,18 @@ def linear_deviations(
         [columns.positions(c.chip, c.epoch, c.phi).mean(axis=0) for c in working.groups()], axis=0
     )
 
-    def displacement(cells: GroupCells, g: int) -> Float:
-        out = np.zeros((len(cells.X), 2, total))
-        indices, values = columns.at(g, cells.chip, cells.epoch, cells.phi, centre)
-        out[:, :, indices] = values
-        return np.asarray(np.einsum("ab,cbq->caq", cells.frame, out))
-
     S, score = np.zeros((total, total)), np.zeros(total)
     crossed = [np.zeros((model.n_params, total)) for _ in range(2)]
     for source_index, source in enumerate((information, working)):
         for g, cells in enumerate(source.groups()):
-            moved = displacement(cells, g)
+            # the coefficients that displace these stars are few of all
+            at, values = columns.at(g, cells.chip, cells.epoch, cells.phi, centre)
+            moved = np.einsum("ab,cbq->caq", cells.frame, values)
             pulled = np.einsum("cab,cbq->caq", cells.curvature, moved, optimize=True)
-            crossed[source_index][cells.columns] += cells.onto_parameters(pulled)
+            crossed[source_index][np.ix_(cells.columns, at)] += cells.onto_parameters(pulled)
             if source_index == 0:
-                S += np.einsum("caq,car->qr", moved, pulled, optimize=True)
-                score += np.einsum("caq,ca->q", moved, cells.score, optimize=True)
+                S[np.ix_(at, at)] += np.einsum("caq,car->qr", moved, pulled, optimize=True)
+                score[at] += np.einsum("caq,ca->q", moved, cells.score, optimize=True)
     efficient = EfficientScore.of(information.covariance, information.score, crossed[0], S, score)
     response = working.covariance @ crossed[1]
     return deviation_draws(
@@ -306,17 +307,24 @@ def deviation_draws(
     }
     names = list(dict.fromkeys(scatter.tolist()))
     index = np.array([names.index(s) for s in scatter])
-    grids = []
+    limits = []
     for k, name in enumerate(names):
         diagonal = np.diag(S)[index == k]
         diagonal = diagonal[diagonal > 1e-8 * max(float(diagonal.max()), 1e-300)]
         resolved = 1 / np.sqrt(np.median(diagonal)) if diagonal.size else medians[name]
         low = LEAST * min(medians[name], resolved)
         high = (MOST_CURVATURE if name == CURVATURE else MOST) * medians[name]
-        high = max(high, MOST_RESOLVED * resolved if resolved < 1e-2 else 0.0)
-        grids.append(np.geomspace(low, high, COARSE[len(names) - 1]))
+        limits.append((low, max(high, MOST_RESOLVED * resolved if resolved < 1e-2 else 0.0)))
     values, vectors = np.linalg.eigh(S)
     S = (vectors * np.maximum(values, 0.0)) @ vectors.T
+    suggested, _ = _given(S, score, np.array([high for _, high in limits])[index])
+    grids = []
+    for k, (name, (low, high)) in enumerate(zip(names, limits, strict=True)):
+        if name != CURVATURE:
+            squares = suggested[index == k].reshape(columns.n_exposures, -1) ** 2
+            # robust, because a few exposures may be outlying
+            high = max(high, MOST_SUGGESTED * np.sqrt(np.median(squares.mean(axis=1))))
+        grids.append(np.geomspace(low, high, COARSE[len(names) - 1]))
     first = np.array([grid[len(grid) // 2] for grid in grids])
     loose = _outlying(columns, S, score, index, first)
     roots = _roots(columns, S, score, index, loose, first)

@@ -7,8 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from bayesdist.diagnose.correlated import estimate_discrepancy
-from bayesdist.diagnose.correlated.deviations import MAX_EXPOSURES
+from bayesdist.diagnose.correlated import deviations, estimate_discrepancy
 from bayesdist.infer import Rejection, build_model, fit_linear
 from tests.diagnose.correlated.skies import SIZE, matched
 from tests.reduced import case_in_full, only_in_full
@@ -48,12 +47,28 @@ def test_the_scatter_of_the_scales_is_found(frames):
     assert SCATTER / 3 < np.median(found.scatter["shape"]) < 1.5 * SCATTER
 
 
+def test_a_scatter_far_above_the_prior_is_found():
+    """Its posterior does not end where the prior has little probability.
+
+    One scatter is that of scale and two shears, of which only the scale scatters in E exposures. Of
+    E - 1 deviations their rms has a relative error of 1 / sqrt(2 (E - 1)), and a scatter of three
+    times as many one of 1 / sqrt(6 (E - 1)).
+    """
+    linear = breathing("shift_rotation", scatter=100 * SCATTER).linear
+    assert linear is not None
+    by_chance, width = 1 / np.sqrt(2 * (EXPOSURES - 1)), 1 / np.sqrt(6 * (EXPOSURES - 1))
+    logs = np.log(linear.scatter["shape"] / (100 * SCATTER / np.sqrt(3)))
+    assert abs(np.median(logs)) < 3 * by_chance
+    assert 0.7 * width < np.std(logs) < 1.5 * width
+
+
 @pytest.mark.parametrize(
     "frames", [case_in_full("none", instead="frames are fitted"), "shift_rotation"]
 )
-def test_of_many_exposures_some_stand_for_all(frames):
+def test_of_many_exposures_some_stand_for_all(frames, monkeypatch):
     """A future exposure scatters as they do, and the fit by one over the root of their number."""
-    n = MAX_EXPOSURES + 10
+    n, per_exposure = 50, 6 if frames == "none" else 3
+    monkeypatch.setattr(deviations, "MAX_DEVIATIONS", (n - 10) * per_exposure)
     found = breathing(frames, exposures=n, n=100)
     linear = found.linear
     assert linear is not None and linear.n_exposures == n
