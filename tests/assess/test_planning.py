@@ -15,7 +15,10 @@ from bayesdist.assess.planning.futures import (
     Scattering,
     with_more_data,
 )
+from bayesdist.diagnose.selfcal.eliminated import Columns, EvenStars, eliminated
+from bayesdist.diagnose.selfcal.scores import scores_of_detections
 from bayesdist.infer import fit_linear
+from bayesdist.infer.compare.frame_fields import mean_squares
 from bayesdist.infer.compare.planning import (
     exposure_content,
     exposure_information,
@@ -189,9 +192,24 @@ def test_scatters_follow_from_deviations_as_bayes_theorem_has_it():
     assert abs(np.mean(means) - 40 / 38) < 4 * 0.25 / np.sqrt(150)
 
 
+def effect_of_deviations(mode):
+    """Rms over the detector of the polynomials' response to deviations of unit scatter."""
+    even = EvenStars.of(mode)
+    columns = Columns(even.problem, mode.theta, {}, even.deviations)
+    scores = scores_of_detections(mode).at(even.rows)
+    information, _, _ = eliminated(columns, scores, even.stars)
+    n, model = len(mode.theta), mode.problem.model
+    response = (mode.cov @ information[:n, n:])[: model.n_polynomial]
+    return np.sqrt(mean_squares(model) @ (response**2).sum(axis=1))
+
+
 @pytest.mark.parametrize("seed", [1, case_in_full(3, instead="another seed is run")])
 def test_further_dithers_say_what_exposures_that_are_simulated_do(seed):
-    """Of the same field, 38 exposures in place of 6: more than 38 / 6 times the information."""
+    """Of the same field, 38 exposures in place of 6: more than 38 / 6 times the information.
+
+    The effect of deviations of exposures is that of the derivatives with respect to these, which
+    the diagnostics of a self-calibration use.
+    """
     few, many = (
         solution_of(field(seed + k, n, sigma=0.02, n_stars=2000)) for k, n in ((0, 6), (100, 38))
     )
@@ -211,6 +229,11 @@ def test_further_dithers_say_what_exposures_that_are_simulated_do(seed):
     assert abs(np.median(predicted) / simulated - 1) < 0.12
     assert np.ptp(predicted) > 0.01 * simulated
     assert rms(few.distortion_information * 38 / 6) > 1.15 * simulated
+    # deviations of exposures move the fit by about the inverse root of their number
+    effect = effect_of_deviations(many) / effect_of_deviations(few)
+    np.testing.assert_allclose([one.deviations(32) for one in several], effect, rtol=0.08)
+    ratio = several[0].deviations(200) / several[0].deviations(64)
+    np.testing.assert_allclose(ratio, np.sqrt((6 + 64) / (6 + 200)))
     # between the numbers for which it is computed, and beyond them
     low, middle, high = (several[0].information(k)[at] for k in (16, 24, 32))
     np.testing.assert_allclose(middle, (low + high) / 2, atol=1e-9 * np.abs(high).max())

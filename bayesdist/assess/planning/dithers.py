@@ -33,6 +33,7 @@ from bayesdist.infer.selfcal.prior import (
 )
 from bayesdist.infer.selfcal.sky_moves import POINTS, functionals, moves
 from bayesdist.model import Chip, DistortionModel
+from bayesdist.model.frames import FRAME_KINDS
 from bayesdist.model.grid import outline_pixels
 from bayesdist.simulate.dithers import dithered_model, sky_seen, stars_on_detector
 from bayesdist.simulate.patterns import DitherPattern
@@ -362,23 +363,42 @@ class FurtherDithers:
 
     def information(self, n: int) -> Float:
         """Information (D, D) of n further exposures; linear in n beyond `MOST_FURTHER`."""
-        number, values = self._known
+        number, values = self._known.number, self._known.information
         above = min(max(int(np.searchsorted(number, n)), 1), len(number) - 1)
         low, high = number[above - 1], number[above]
         return values[above - 1] + (n - low) / (high - low) * (values[above] - values[above - 1])
 
+    def deviations(self, n: int) -> float:
+        """Effect of the exposures' deviations on the polynomials with n further exposures.
+
+        The effect is an rms over the detector, for the same scatter of scale and shears, relative
+        to that at present. A power of the number of exposures between the numbers for which it is
+        computed, and the inverse of its square root beyond `MOST_FURTHER`.
+        """
+        E = len(self.mode.problem.model.exposures)
+        total = E + self._known.number
+        inside = min(E + n, int(total[-1]))
+        effect = np.exp(np.interp(np.log(inside), np.log(total), np.log(self._known.deviations)))
+        return float(effect * np.sqrt(inside / (E + n)))
+
     @cached_property
-    def _known(self) -> tuple[Int, list[Float]]:
-        """Numbers of further exposures (0 and powers of 2), and their information."""
+    def _known(self) -> _Further:
+        """Information and effects for 0 and powers of 2 of further exposures."""
         mode, E = self.mode, len(self.mode.problem.model.exposures)
         number = np.concatenate([[0], 2 ** np.arange(MOST_FURTHER.bit_length())])
         model, theta, sky = self._field
         star_detections = stars_on_detector(model, theta, sky)
         expected = [self._expected(star_detections, E + int(n)) for n in number]
+        information = [
+            of_first(*curvature, mode.problem.model.n_params) for curvature, _ in expected
+        ]
+        effects = np.array([effect for _, effect in expected])
         # scaled to the actual number of detections and their errors
         D = mode.problem.model.n_params
-        scale = np.trace(of_first(mode.expansion.curvature, mode.free, D)) / np.trace(expected[0])
-        return number, [scale * (information - expected[0]) for information in expected]
+        present = of_first(mode.expansion.curvature, mode.free, D)
+        scale = np.trace(present) / np.trace(information[0])
+        further = [scale * (values - information[0]) for values in information]
+        return _Further(number, further, effects / effects[0])
 
     @cached_property
     def _field(self) -> tuple[DistortionModel, Float, Float]:
@@ -400,8 +420,14 @@ class FurtherDithers:
         count = int(per_exposure * np.prod(high - low) / area)
         return model, theta, low + rng.uniform(size=(count, 2)) * (high - low)
 
-    def _expected(self, seen: tuple[Float, Float, Int, Int, Int], n: int) -> Float:
-        """Information (D, D) of the first n exposures, from the stars detected in them."""
+    def _expected(
+        self, seen: tuple[Float, Float, Int, Int, Int], n: int
+    ) -> tuple[tuple[Float, Int], float]:
+        """Curvature and free parameters of the first n exposures, and the effect of deviations.
+
+        `seen` are the stars detected in all exposures. The effect is the rms over the detector that
+        deviations of unit scatter have on the polynomials.
+        """
         full_model, theta, _ = self._field
         model = replace(full_model, exposures=full_model.exposures[:n])
         x, y, exposure, chip, star = seen
@@ -415,10 +441,44 @@ class FurtherDithers:
             sigma=np.full(np.count_nonzero(rows), self.mode.error),
             star=star[rows],
         )
-        curvature = expected_curvature(model, theta[: model.n_params], detections)
+        # deviations of exposures are parameters of a more general frame, which are not fitted
+        general = replace(model, frames=FRAME_KINDS[-1])
+        fitted = np.concatenate(
+            [np.arange(model.n_global), *(_places(general, model, e) for e in range(1, n))]
+        )
+        general_theta = np.zeros(general.n_params)
+        general_theta[fitted] = theta[: model.n_params]
+        every = expected_curvature(general, general_theta, detections)
+        curvature = every[np.ix_(fitted, fitted)]
         # the gauge constrains the same directions as at present
         D = self.mode.problem.model.n_params
-        return of_first(curvature, np.append(self.mode.free, np.arange(D, model.n_params)), D)
+        free = np.append(self.mode.free, np.arange(D, model.n_params))
+        deviating = np.setdiff1d(np.arange(general.n_params), fitted)
+        response = np.zeros((model.n_params, len(deviating)))
+        precision = curvature[np.ix_(free, free)]
+        scale = 1.0 / np.sqrt(np.diag(precision))
+        pull = scale[:, None] * every[np.ix_(fitted[free], deviating)]
+        scaled_precision = precision * np.outer(scale, scale)
+        response[free] = scale[:, None] * np.linalg.solve(scaled_precision, pull)
+        of_polynomials = (response[: model.n_polynomial] ** 2).sum(axis=1)
+        # the first exposure, whose frame is fixed, deviates like the others
+        square = mean_squares(model) @ of_polynomials * n / (n - 1)
+        return (curvature, free), float(np.sqrt(square))
+
+
+@dataclass(frozen=True, eq=False)
+class _Further:
+    """Information and effect of deviations for some numbers of further exposures."""
+
+    number: Int  # (m,) ascending, from 0
+    information: list[Float]  # (D, D) of the further exposures
+    deviations: Float  # (m,) effect of the deviations of all exposures, relative to the present one
+
+
+def _places(general: DistortionModel, model: DistortionModel, exposure: int) -> Int:
+    """Indices in the parameters of `general` of the frame that `model` fits to an exposure."""
+    block, names = general.frame_slice(exposure), general.free_frame_names(exposure)
+    return np.array([block.start + names.index(k) for k in model.free_frame_names(exposure)], int)
 
 
 def further_dithers(mode: SelfCalibrationMode, seed: int) -> list[FurtherDithers]:

@@ -5,6 +5,9 @@ from __future__ import annotations
 from bisect import bisect_left
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import Protocol
+
+import numpy as np
 
 from bayesdist.utils.arrays import Float
 
@@ -16,6 +19,18 @@ PROBABILITY_ERROR = 0.25
 SMALL = 0.05  # probability of meeting a limit, below which errors are called too large for it
 
 
+class Further(Protocol):
+    """Further exposures whose effects are not proportional to their number."""
+
+    def information(self, n: int) -> Float:
+        """Information (d, d) of n exposures on polynomials and drift, or (D, D) on all."""
+        ...
+
+    def deviations(self, n: int) -> float:
+        """Effect of deviations of all exposures on the polynomials, relative to the present one."""
+        ...
+
+
 @dataclass(frozen=True, eq=False)
 class Schedule:
     """Dates of planned exposures."""
@@ -24,13 +39,20 @@ class Schedule:
     # (d, d), information of one exposure on polynomials and drift, averaged over the dates
     information: Float
     single_date: bool = False  # True if all further exposures have the same date
-    # functions that return possible information (d, d) of a number of exposures, if it is not
-    # proportional to that number
-    together: Sequence[Callable[[int], Float]] = ()
+    # equally probable exposures, if their information is not proportional to their number
+    together: Sequence[Further] = ()
 
     def of(self, n: int) -> list[Float]:
         """Information (d, d) of n exposures: equally probable values."""
-        return [information_of(n) for information_of in self.together] or [n * self.information]
+        return [further.information(n) for further in self.together] or [n * self.information]
+
+    def deviations(self, n: int, n_existing: int) -> list[float]:
+        """Effect of the exposures' deviations on their mean, relative to the present one.
+
+        A list with one value for each information in `of`.
+        """
+        independent = float(np.sqrt(n_existing / (n_existing + n)))
+        return [further.deviations(n) for further in self.together] or [independent]
 
 
 @dataclass(frozen=True)

@@ -15,8 +15,8 @@ existing and the further exposures is predicted, and the requirement is judged w
   left unchanged.
 - Scatter of exposures: its draws are weighted by the likelihood of deviations drawn with the
   scatter of the truth. The effect of deviations on the mean of the exposures decreases with the
-  square root of the number of exposures (in a self-calibration, with the variance of the solution
-  times that root). The deviation of a single exposure does not decrease, but its size becomes
+  square root of the number of exposures (in a self-calibration, it is computed for the geometry of
+  the dithers). The deviation of a single exposure does not decrease, but its size becomes
   better known. A limit that is smaller than it is therefore never met, and with few exposures this
   cannot be told.
 - Everything else, such as the stated error of a catalogue, is unchanged.
@@ -46,7 +46,6 @@ from bayesdist.assess.units import convert
 from bayesdist.diagnose.correlated.deviations import LINEAR, SCATTERS, LinearDeviations
 from bayesdist.diagnose.correlated.exposure_fields import QUADRATIC
 from bayesdist.errors import required
-from bayesdist.infer.compare.frame_fields import mean_squares
 from bayesdist.infer.equations.scaled import one_thread
 from bayesdist.infer.solution.solution import Solution
 from bayesdist.utils.arrays import Bool, Float, Int
@@ -185,11 +184,7 @@ class Futures:
         """
         rho = n / self.data.n_exposures
         several = [self._of_solution(information) for information in schedule.of(n)]
-        # deviations of exposures move the solution by its variance times their sum
-        means = [1 / np.sqrt(1 + rho)] * len(several)
-        if schedule.together:
-            now = self._of_solution(0 * schedule.of(n)[0]).variance
-            means = [np.sqrt(1 + rho) * errors.variance / now for errors in several]
+        means = schedule.deviations(n, self.data.n_exposures)
         of_bends = 0.0 if schedule.single_date else rho
         reached = [
             self._probability(several[k % len(several)], means[k % len(several)], n, of_bends, k)
@@ -197,17 +192,15 @@ class Futures:
         ]
         return np.array(reached) >= self.requirement.probability
 
-    def _of_solution(self, information: Float) -> _SolutionErrors:
-        """Errors of the parameters, given additional information on them."""
+    def _of_solution(self, information: Float) -> list[Float]:
+        """Errors (DRAWS, N, 2) of the solution at each place, given additional information."""
         informed = self.solution(information)
         solution = replace(self.errors.solution, solution=informed, without=None, catalogue=())
         drawn = solution.draw(DRAWS, np.random.default_rng([self.seed, 1]))
-        square = mean_squares(informed.model) * np.diag(informed.cov)[: informed.model.n_polynomial]
-        errors = [self._evaluated(drawn, place.positions) for place in self._places]
-        return _SolutionErrors(errors, float(square.sum()))
+        return [self._evaluated(drawn, place.positions) for place in self._places]
 
     def _probability(
-        self, solution: _SolutionErrors, mean: float, n: int, of_bends: float, truth: int
+        self, solution: Sequence[Float], mean: float, n: int, of_bends: float, truth: int
     ) -> float:
         """Probability of meeting the limit that a run would state for a truth.
 
@@ -223,7 +216,7 @@ class Futures:
         width = np.exp(rng.standard_normal() * np.sqrt(np.sum(0.5 / stars)))
         chosen = [term.chosen(n, self.data, true, rng) for term in self._scattering]
         values = []
-        for place, of_solution in zip(self._places, solution.errors, strict=True):
+        for place, of_solution in zip(self._places, solution, strict=True):
             error = width * of_solution
             for z, term_rho in zip(place.resolved, rhos, strict=True):
                 error += with_more_data(z, term_rho, true, noise)
@@ -303,14 +296,6 @@ class Futures:
         shape = DRAWS, positions.size, 2
         normal = np.random.default_rng([self.seed, 4]).standard_normal(shape)
         return drawn.errors(positions)(slice(0, DRAWS), normal)
-
-
-@dataclass(frozen=True, eq=False)
-class _SolutionErrors:
-    """Errors of the parameters of a solution."""
-
-    errors: Sequence[Float]  # (DRAWS, N, 2) at each place
-    variance: float  # mean variance of the polynomials over the detector
 
 
 @dataclass(frozen=True, eq=False)

@@ -161,8 +161,7 @@ def schedules_of(
         # a single exposure is informative only about stars in other exposures
         information = solved.mode.gain * solved.mode.distortion_information / _n_exposures(results)
         further = further_dithers(solved.mode, results.config.sampler.seed)
-        together = [dithers.information for dithers in further]
-        return [Schedule("dithered like these", information, together=together)]
+        return [Schedule("dithered like these", information, together=further)]
 
     def worth(date: float | None) -> Float:
         return exposure_information(solution, content, date)
