@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import os
 from collections.abc import Collection, Iterator
 from dataclasses import dataclass, fields, replace
@@ -20,6 +21,8 @@ from bayesdist.files.atomic import atomic_path
 from bayesdist.files.tables import read_table
 from bayesdist.utils.arrays import Float
 from bayesdist.utils.text import ascii_of, refuse_control_characters
+
+log = logging.getLogger("bayesdist")
 
 _NUMBERS = ("exptime", "vafactor", "pa_v3", "ra", "dec")
 _SLOWEST = 2e-4  # for anything in orbit around the Earth, |VAFACTOR - 1| is below 1.4e-4
@@ -297,7 +300,8 @@ def read_exposures(path: str | os.PathLike[str]) -> ExposureLog:
         .ecsv, .csv, .fits or .parquet table with one row per exposure and the columns exposure
         epoch filter exptime vafactor pa_v3 ra dec. The epoch may be a decimal year, an ISO date, or
         a Modified Julian Date with the unit 'd'. Columns other than exposure and epoch are optional
-        and may have missing values.
+        and may have missing values; NaN counts as one, with a warning unless the table is FITS,
+        which has no other way to write it.
 
     Returns
     -------
@@ -324,11 +328,14 @@ def read_exposures(path: str | os.PathLike[str]) -> ExposureLog:
         "name": [labels[code] for code in codes],
         "epoch": column("epoch").years().tolist(),
     }
+    is_fits = any(suffix.lower().startswith(".fit") for suffix in path.suffixes)
     if "filter" in column_names:
         rows["filter"] = _filled(column("filter"))
     for key in _NUMBERS:
         if key in column_names:
             rows[key] = _known_numbers(column(key), _UNITS.get(key))
+            if not is_fits:
+                _warn_of_nan(column(key))
     exposures = []
     for k in range(len(table)):
         try:
@@ -356,6 +363,19 @@ def _known_numbers(column: SourceColumn, unit: str | None) -> list[float | None]
     if unit is not None and not np.isnan(numbers).all():
         numbers = numbers * column.factor(unit)
     return [None if np.isnan(value) else value for value in numbers.tolist()]
+
+
+def _warn_of_nan(column: SourceColumn) -> None:
+    """Warn of NaN, which counts as a missing value but may be a mistake of the program before."""
+    plain = getattr(column.values, "unmasked", column.values)
+    if plain.dtype.kind != "f":
+        return
+    masked = np.broadcast_to(getattr(column.values, "mask", False), len(plain))
+    n_nan = int((np.isnan(np.asarray(getattr(plain, "value", plain))) & ~masked).sum())
+    if n_nan:
+        log.warning(
+            "%s: NaN in %d of %d rows counts as a missing value", column.where, n_nan, len(plain)
+        )
 
 
 def write_exposures(log: ExposureLog, path: str | os.PathLike[str]) -> None:

@@ -22,12 +22,13 @@ _DECIMAL_COMMA = re.compile(r"[+-]?\d*,\d+([eEdD][+-]?\d+)?")
 _DECIMAL_POINT = re.compile(r"[+-]?(\d+\.\d*|\.\d+)([eEdD][+-]?\d+)?")
 _MAY_BE_THOUSANDS = re.compile(r"[+-]?[1-9]\d{0,2},\d{3}")
 # matches cells that match `_FOREIGN`, and few others
-MAYBE_FOREIGN = re.compile(r"\d_\d|0[xX][0-9a-fA-F.]|[^\x00-\x7f]")
+MAYBE_FOREIGN = re.compile(r"\d_\d|0[xX][0-9a-fA-F.]|[\x0b\x0c\x1c-\x1f]|[^\x00-\x7f]")
 MAYBE_FOREIGN_BYTES = re.compile(rb"\d_\d|[\x80-\xff]|&#")
 _FOREIGN = re.compile(
     r"[+-]?(0[xX][0-9a-fA-F.]+([pP][+-]?\d+)?"
     r"|(?=.*(_|[^\x00-\x7f]))[\d_]*\.?[\d_]*\d([eE][+-]?[\d_]+)?\.?)"
 )
+_BLANKS = " \t\r\n"  # around a number; Python strips those of Unicode, too
 _MARKS = (",", ";", "\t", None)  # None: blanks
 ROWS_ABOVE, FEWEST_ABOVE = 20, 3  # number of rows with which the last cell is compared
 _DAOPHOT = "DAOPHOT"  # lists of the original program, not tables of its IRAF version
@@ -276,24 +277,27 @@ def refuse_foreign_numbers(
 ) -> None:
     """Refuse cells that Python or C would read as numbers, but that no table format allows.
 
-    These are digits with underscores ("1_00"), hexadecimal numbers ("0x64"), and digits of other
-    scripts. `columns`: True for each column of numbers, in the order of the file. `lines`: lines of
-    the table, with cells separated by `mark`, or by blanks or the bars of an IPAC table. In text
-    columns such cells are allowed.
+    These are digits with underscores ("1_00"), hexadecimal numbers ("0x64"), digits of other
+    scripts, and numbers beside blanks that are not ASCII, such as U+00A0. `columns`: True for each
+    column of numbers, in the order of the file. `lines`: lines of the table, with cells separated
+    by `mark`, or by blanks or the bars of an IPAC table. In text columns such cells are allowed.
     """
     names = list(columns)
     for number, line in enumerate(lines, start=1):
         if not MAYBE_FOREIGN.search(line) or line[:1] in ("#", "\\", "|"):
             continue
-        cells = [cell.strip() for cell in _cells(line, mark)]
+        divided = re.split(f"[{_BLANKS}]+", line.strip(_BLANKS)) if mark is None else None
+        cells = [cell.strip(_BLANKS) for cell in divided or _cells(line, mark)]
         complete = len(cells) == len(names)
         for k, cell in enumerate(cells):
-            if _FOREIGN.fullmatch(cell) and (not complete or columns[names[k]]):
+            foreign = _FOREIGN if cell == cell.strip() else _NUMBER
+            if foreign.fullmatch(cell.strip()) and (not complete or columns[names[k]]):
                 name = f", column {names[k]!r}" if complete else ""
                 raise FormatError(
                     f"{cell[:40]!r} is no number",
                     where=f"{where}, line {number}{name}",
-                    do="write it in decimal digits, without marks between them",
+                    do="write it in decimal digits, with no marks between or blanks other than "
+                    "spaces around them",
                 )
 
 

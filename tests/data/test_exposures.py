@@ -99,6 +99,17 @@ def test_wrong_logs_are_named(tmp_path, columns, message):
         read_exposures(tmp_path / "log.csv")
 
 
+@pytest.mark.parametrize("suffix", [".csv", ".ecsv", ".fits", ".parquet"])
+def test_nan_is_a_missing_value_with_a_warning(tmp_path, caplog, suffix):
+    """FITS has no other way to write that a number is missing, and there it is no news."""
+    columns = {"exposure": ["a", "b"], "epoch": [2004.0, 2005.0], "exptime": [339.0, np.nan]}
+    Table(columns).write(tmp_path / f"log{suffix}")
+    log = read_exposures(tmp_path / f"log{suffix}")
+    assert [exposure.exptime for exposure in log] == [339.0, None]
+    warned = "column 'exptime': NaN in 1 of 2 rows counts as a missing value" in caplog.text
+    assert warned == (suffix != ".fits")
+
+
 def test_a_log_needs_exposures_and_a_known_extension(tmp_path):
     with pytest.raises(InputError, match="holds no exposures"):
         ExposureLog(())

@@ -52,6 +52,17 @@ def test_what_no_table_has_for_a_number_is_refused(tmp_path, end, cell):
         read_matches(written(tmp_path, end, cell), unit="pix", sigma=0.01)
 
 
+@pytest.mark.parametrize("end", [".csv", ".tsv", ".dat", ".ecsv", ".tbl", ".vot"])
+@pytest.mark.parametrize("cell", ["\u00a02.5", "2.5\u00a0", "\u20032.5", "2.5\u3000"])
+def test_blanks_of_other_scripts_are_no_part_of_a_number(tmp_path, end, cell):
+    """Python strips U+00A0, which spreadsheets write between thousands, as it strips spaces."""
+    with pytest.raises(InputError, match=r"no number|a number must be|cannot be read"):
+        read_matches(written(tmp_path, end, cell), unit="pix", sigma=0.01)
+    if end in (".csv", ".tsv", ".dat"):
+        spaced = read_matches(written(tmp_path, end, " 2.5 "), unit="pix", sigma=0.01)
+        assert spaced.x.tolist() == [1.5, 2.5, 7.25]
+
+
 @pytest.mark.parametrize("end", [".ecsv", ".tbl", ".vot"])  # whose columns have types
 @pytest.mark.parametrize("name", ["1_00", "１００", "0x1A"])
 def test_names_of_exposures_may_look_like_such_numbers(tmp_path, end, name):
