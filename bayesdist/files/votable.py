@@ -121,7 +121,9 @@ class _Scan:
     def _announced(self, rows: str) -> None:
         if not re.fullmatch(r"\s*[0-9]{1,18}\s*", rows):
             raise FormatError(
-                f"announces {rows[:20]} rows", where=self.budget.where, do="fetch or write it again"
+                f"its number of rows (nrows) is {rows[:20]!r}",
+                where=self.budget.where,
+                do="fetch or write it again",
             )
         self.budget.refuse_rows(int(rows))
 

@@ -108,3 +108,13 @@ def test_a_field_is_of_a_detector_of_one_chip():
     settings = {"data": {"matches": "a.csv"}, "model": {"order": 1}, "chip": chips}
     with pytest.raises(ValueError, match=r"detector\.field is of a detector of one chip"):
         MatchesConfig(**settings, detector={"field": {"centre": (5, 5), "radius": 3}})
+
+
+@pytest.mark.parametrize(
+    "field",
+    [{"centre": (1500, 400), "radius": 300}, [(1200, 1), (1300, 1), (1300, 90)]],
+)
+def test_a_field_off_the_detector_is_refused_by_its_name(field):
+    settings = {"data": {"matches": "a.csv"}, "model": {"order": 1}, "assess": {"grid": (9, 9)}}
+    with pytest.raises(ValueError, match=r"detector\.field holds 0 points of the grid of 9 x 9"):
+        MatchesConfig(**settings, detector={"size": (1000, 800), "field": field})

@@ -36,7 +36,7 @@ from bayesdist.app.config.section import (
     same_names,
 )
 from bayesdist.assess import Requirement, UserTerm
-from bayesdist.assess.domain import WHOLE, Region, check_region
+from bayesdist.assess.domain import MIN_POSITIONS, WHOLE, Region, check_region, in_region
 from bayesdist.assess.terms.forms import ErrorTerm
 from bayesdist.assess.terms.given import said_by_user
 from bayesdist.assess.terms.parameters import one_size_term
@@ -45,6 +45,7 @@ from bayesdist.errors import InputError
 from bayesdist.infer import Compute, OutlierMixture
 from bayesdist.infer.solution.solution import Solution
 from bayesdist.model import Chip, TimeDependence
+from bayesdist.model.grid import grid_pixels, mesh
 
 FREE = "free"  # rates that are not taken from another run
 TABLES, POSTERIOR = "tables.h5", "posterior.nc"
@@ -85,8 +86,22 @@ class RunConfig(Section):
                 "detector.field is of a detector of one chip, and there are [[chip]] blocks; leave "
                 "it out, and give each requirement the region of its chip"
             )
+        yield from self._field_faults()
         for settings in self.products.asked().values():
             settings.check(self.named_detector, self.detector.size, self.model.reference_pixel)
+
+    def _field_faults(self) -> Iterator[str]:
+        """Fault of a field of the detector that holds too few points of the grid."""
+        size, grid = self.detector.size, self.assess.grid
+        if size is None or self.field == WHOLE:
+            return
+        n_points = int(in_region(self.field, size, *mesh(*grid_pixels(size, grid))).sum())
+        if n_points < MIN_POSITIONS:
+            yield (
+                f"detector.field holds {n_points} points of the grid of {grid[0]} x {grid[1]} on "
+                f"the detector of {size[0]:g} x {size[1]:g} pixels; correct its pixels, enlarge "
+                "it, or refine assess.grid"
+            )
 
     @property
     def named_detector(self) -> str:
