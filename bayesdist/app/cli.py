@@ -26,6 +26,7 @@ _LONGEST = 1000  # largest number of characters of a sentence
 SELDOM = 50_000, 20, 100
 # commands use threads on all cores, which threads of the linear algebra would only slow down
 ALGEBRA = "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "BLIS_NUM_THREADS"
+INTERRUPTED, TERMINATED = 130, 143  # 128 and the number of the signal, as in a shell
 COMMANDS = "bayesdist.app.commands"
 CORE = {
     name: f"{COMMANDS}.{module}:{name.replace('-', '_')}"
@@ -49,7 +50,7 @@ EPILOG = (
     "requirement is missed; 5 none is missed, but one is neither shown to be met nor missed; 6 one "
     "cannot be judged because something is in doubt; 65 the input is nested too deep; 70 a bug of "
     "bayesdist: please report it; 71 the memory is too small; 74 a file cannot be read or written; "
-    "130 interrupted by the user."
+    "130 interrupted by the user; 143 terminated by the system or a batch queue."
 )
 
 
@@ -127,11 +128,15 @@ bayesdist = click.version_option(__version__, message="bayesdist %(version)s")(
 
 def program() -> int:
     """Run the command of the process, which ends with it."""
-    if signal.getsignal(signal.SIGINT) is signal.default_int_handler:  # a job in the background
-        signal.signal(signal.SIGINT, InterruptHandler())  # may have been told to ignore it
+    handler = InterruptHandler()
+    for number in (signal.SIGINT, signal.SIGTERM):  # a job in the background may ignore them
+        if signal.getsignal(number) in (signal.default_int_handler, signal.SIG_DFL):
+            signal.signal(number, handler)
+    sys.unraisablehook = handler.repeat_lost
     warnings.showwarning = _shown(warnings.showwarning)
     code = main()
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Python closes what libraries have left open
+    for number in (signal.SIGINT, signal.SIGTERM):  # Python closes what libraries have left open
+        signal.signal(number, signal.SIG_IGN)
     return code
 
 
@@ -178,8 +183,11 @@ def _exit_code(call: Callable[[], int | None], command: str) -> int:
         print(f"bayesdist: {sentence}", file=sys.stderr)
         return error.exit_code
     except (KeyboardInterrupt, click.Abort):
-        print("bayesdist: interrupted; resume with --resume", file=sys.stderr)
-        return 130
+        handler = signal.getsignal(signal.SIGTERM)
+        terminated = isinstance(handler, InterruptHandler) and handler.terminated
+        what, code = ("terminated", TERMINATED) if terminated else ("interrupted", INTERRUPTED)
+        print(f"bayesdist: {what}; resume with --resume", file=sys.stderr)
+        return code
     except BrokenPipeError:  # the reader of the pipe has closed it
         sys.stderr.close()
         return 0

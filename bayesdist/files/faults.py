@@ -12,8 +12,11 @@ import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 from bayesdist.errors import BayesdistError, FormatError, InputError
+
+REPEAT = 0.01  # seconds until an interrupt is repeated that was lost
 
 
 @contextmanager
@@ -36,21 +39,24 @@ def raising_interrupts() -> Iterator[None]:
 
 
 class InterruptHandler:
-    """Handler of SIGINT for a program: a second one soon after the first changes nothing.
+    """Handler of SIGINT and SIGTERM for a program, which raises KeyboardInterrupt for each of them.
 
-    What is open is closed then; an interrupt in the midst of that would leave a traceback.  After
-    `again` seconds the first one may have been lost, and another one counts.
+    A second signal soon after the first changes nothing, because what is open is closed then, and
+    an interrupt in the midst of that would leave a traceback.  After `again` seconds the first one
+    may have been lost, and another one counts.
     """
 
     def __init__(self, again: float = 2.0) -> None:
         self.again = again
         self.n = 0  # interrupts so far
+        self.terminated = False  # True after SIGTERM
         self.deferring = self.deferred = False
         self._last = -math.inf
 
-    def __call__(self, *_: object) -> None:
+    def __call__(self, number: int = signal.SIGINT, *_: object) -> None:
         """Raise the interrupt, unless it follows another one soon."""
         self.n += 1
+        self.terminated |= number == signal.SIGTERM
         self.deferred = self.deferring
         if self.deferring:
             return
@@ -58,6 +64,28 @@ class InterruptHandler:
         if now - self._last > self.again:
             self._last = now
             raise KeyboardInterrupt
+
+    def repeat_lost(self, unraisable: Any) -> None:
+        """Hook of `sys.unraisablehook`: repeat an interrupt that Python would print and ignore.
+
+        That happens to exceptions in destructors and in callbacks of weak references, which may run
+        at any time.
+        """
+        if not isinstance(unraisable.exc_value, KeyboardInterrupt):
+            sys.__unraisablehook__(unraisable)
+            return
+        self._last = -math.inf
+        number = signal.SIGTERM if self.terminated else signal.SIGINT
+        threading.Timer(REPEAT, _signal_main_thread, [number]).start()
+
+
+def _signal_main_thread(number: signal.Signals) -> None:
+    """Send a signal to the main thread, which wakes it if it waits."""
+    ident = threading.main_thread().ident
+    if hasattr(signal, "pthread_kill") and ident is not None:
+        signal.pthread_kill(ident, number)
+    else:  # Windows
+        signal.raise_signal(number)
 
 
 def _comes_of_interrupt(error: BaseException, before: BaseException | None) -> bool:
@@ -94,6 +122,23 @@ def deferred_interrupts() -> Iterator[None]:
         if handler.deferred:
             handler.deferred = False
             raise KeyboardInterrupt
+
+
+@contextmanager
+def blocked_interrupts() -> Iterator[None]:
+    """Delay Ctrl-C until the end of the block; processes that are started in it never receive one.
+
+    A terminal sends Ctrl-C to them, too, and they would print tracebacks.  Nothing is blocked where
+    the system cannot do that.
+    """
+    if not hasattr(signal, "pthread_sigmask"):  # Windows
+        yield
+        return
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT])
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 @contextmanager

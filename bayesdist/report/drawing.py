@@ -5,13 +5,14 @@ from __future__ import annotations
 import io
 import logging
 import os
+import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
-from multiprocessing import get_context
+from multiprocessing import get_context, parent_process
 from pathlib import Path
 from pickle import PickleError
 from typing import Any, Literal
@@ -25,6 +26,7 @@ from matplotlib.transforms import Bbox
 from PIL import Image
 
 from bayesdist.files.atomic import announce, atomic_path, made_folder
+from bayesdist.files.faults import blocked_interrupts
 from bayesdist.report.contents import Item, Plot, Registry
 from bayesdist.report.figures.figure_numbers import numbers_of
 from bayesdist.report.figures.style import figure_style, plain_ticks
@@ -99,13 +101,23 @@ def _drawn_together(
     with ProcessPoolExecutor(
         processes, mp_context=get_context("spawn"), initializer=_receive, initargs=(results,)
     ) as pool:
-        drawn = pool.map(partial(_drawn, pdf=pdf), items)
+        with blocked_interrupts():  # inherited by the processes, which are started here
+            drawn = pool.map(partial(_drawn, pdf=pdf), items)
         return {item.name: drawing for item, drawing in zip(items, drawn, strict=True)}
 
 
 def _receive(results: Any) -> None:
     """Store the results once per process, because they may be large."""
+    threading.Thread(target=_end_with_parent, daemon=True).start()
     _received.append(results)
+
+
+def _end_with_parent() -> None:
+    """End this process when the one that started it has ended, even if that was killed."""
+    parent = parent_process()
+    if parent is not None:
+        parent.join()
+        os._exit(1)
 
 
 def _drawn(item: Item, pdf: bool) -> Drawing:

@@ -104,6 +104,27 @@ def test_a_second_interrupt_leaves_the_first_one_to_its_end():
                 signal.raise_signal(signal.SIGINT)
 
 
+def test_an_interrupt_in_a_destructor_is_not_lost():
+    """Python prints exceptions in destructors and goes on."""
+    code = (
+        "import signal, sys, time, click\n"
+        "from bayesdist.app import cli\n"
+        "class Open:\n"
+        "    def __del__(self): signal.raise_signal(signal.{})\n"
+        "@click.command()\n"
+        "def fails():\n"
+        "    Open(); time.sleep(60)\n"
+        "cli.LazyGroup.load = staticmethod(lambda target: fails)\n"
+        "sys.argv[1:] = ['inspect']; sys.exit(cli.program())"
+    )
+    for name, exit_code, word in (("SIGINT", 130, "interrupted"), ("SIGTERM", 143, "terminated")):
+        ended = subprocess.run(
+            [sys.executable, "-c", code.format(name)], capture_output=True, text=True, timeout=50
+        )
+        said = f"bayesdist: {word}; resume with --resume\n"
+        assert (ended.returncode, ended.stderr) == (exit_code, said)
+
+
 def test_an_interrupt_waits_for_what_cannot_be_interrupted():
     ends = list[str]()
 
@@ -164,6 +185,6 @@ def test_where_the_current_folder_cannot_be_written(tmp_path, monkeypatch):
 def test_the_codes_are_in_the_documentation_and_the_help():
     root = Path(__file__).parents[2]
     text = (root / "docs" / "commands.md").read_text(encoding="utf-8")
-    for _, code, _ in [*ERRORS, (None, 65, ""), (None, 130, "")]:
+    for _, code, _ in [*ERRORS, (None, 65, ""), (None, 130, ""), (None, 143, "")]:
         assert f"\n| {code} |" in text
         assert f" {code} " in commands.EPILOG

@@ -90,7 +90,7 @@ def test_on_disk_the_pairs_are_selected_once(tmp_path, monkeypatch):
 
 
 @pytest.mark.slow
-@only_in_full("test_killed kills runs")
+@only_in_full("tests/kills kills runs")
 @pytest.mark.usefixtures("no_report", "on_disk")
 def test_half_a_set_that_a_killed_run_left_is_not_trusted(tmp_path):
     table = rvb_pairs()

@@ -234,7 +234,7 @@ class Killed(BaseException):
 
 
 @pytest.mark.slow
-@only_in_full("test_killed kills one")
+@only_in_full("tests/kills kills one")
 def test_a_run_that_was_killed_goes_on(three_rolls, tmp_path, monkeypatch, no_report):
     """Killed before each of its stages in turn, it ends bit for bit as if nothing had happened."""
     shutil.copytree(three_rolls.config.parent, tmp_path / "input")

@@ -1,0 +1,150 @@
+"""Strike runs at random moments, resume them, compare the results and count."""
+
+from __future__ import annotations
+
+import argparse
+import random
+import shutil
+import sys
+import tempfile
+import time
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from tests.app.support import good
+from tests.kills.compare import assert_same, assert_whole
+from tests.kills.jobs import JOBS
+from tests.kills.strikes import STRIKES, RunProcess, seconds_of, stage_of
+from tests.sketches import quick
+
+START = 1.5  # seconds within which a fork reads its input, or a process imports the package
+
+
+@dataclass
+class Outcome:
+    """What became of the strikes of one kind at runs of one kind."""
+
+    job: str
+    strike: str
+    struck: Counter[str] = field(default_factory=Counter)  # by stage, of runs that were under way
+    failures: list[str] = field(default_factory=list)
+
+    @property
+    def line(self) -> str:
+        stages = ", ".join(f"{name or 'between'} {n}" for name, n in self.struck.items())
+        n, bad = self.struck.total(), len(self.failures)
+        return f"{self.job:9} {self.strike:13} {n:3} struck, {bad} failed  ({stages})"
+
+
+def outcomes(
+    jobs: Sequence[str],
+    strikes: Sequence[str],
+    folder: Path,
+    *,
+    moments: int,
+    seed: int = 1,
+    real: bool = False,
+) -> Iterator[Outcome]:
+    """Outcomes of strikes at a number of random moments each, spread over the stages."""
+    for job in jobs:
+        config = JOBS[job](folder / job / "input")
+        expected = folder / job / "expected" / "run"
+        expected.parent.mkdir()
+        if real:
+            process = RunProcess(config, expected, real=True)
+            assert process.wait() == 0, process.errors
+        else:  # forks of this process need not load again what it has loaded
+            with quick():
+                good("run", config, "-o", expected, "-q")
+        for strike in strikes:
+            rng = random.Random(f"{seed} {job} {strike}")
+            outcome = Outcome(job, strike)
+            stages = ["start", *seconds_of(expected)]
+            rng.shuffle(stages)
+            for k in range(moments):
+                torn = folder / job / "torn" / "run"
+                torn.parent.mkdir()
+                stage = stages[k % len(stages)]
+                try:
+                    _strike(config, torn, strike, stage, rng, outcome, expected, real=real)
+                except AssertionError as error:
+                    outcome.failures.append(f"{job}, {strike}, {stage}: {error}")
+                    shutil.move(torn.parent, folder / job / f"failed-{time.time_ns()}")
+                shutil.rmtree(torn.parent, ignore_errors=True)
+            yield outcome
+
+
+def _strike(
+    config: Path,
+    torn: Path,
+    strike: str,
+    stage: str,
+    rng: random.Random,
+    outcome: Outcome,
+    expected: Path,
+    *,
+    real: bool,
+) -> None:
+    """Strike a run within a stage, look at what is left, resume the run and compare it.
+
+    Raises AssertionError if something is wrong.
+    """
+    blow = STRIKES[strike]
+    delay = rng.random() * ({"start": START} | seconds_of(expected))[stage]
+    process = RunProcess(config, torn, real=real)
+    while process.poll() is None and stage_of(torn) != stage:
+        time.sleep(0.002)
+    time.sleep(delay)
+    within = stage_of(torn)
+    alive = process.poll() is None
+    blow.at(process)
+    code = process.wait()
+    late = blow.code != 0 == code and "report" in seconds_of(torn)  # all had been done
+    if alive and not late:
+        outcome.struck[within] += 1
+        assert code == blow.code, (code, process.errors)
+        said = process.errors.splitlines()
+        assert not blow.says or said[-1:] == [blow.says], process.errors
+    assert "Traceback" not in process.errors, process.errors
+    if real:
+        assert "Warning" not in process.errors, process.errors
+        assert not process.survivors()
+    if torn.exists():
+        assert_whole(torn, handled=code >= 0)
+    process = RunProcess(config, torn, real=real)
+    assert process.wait() == 0, process.errors
+    assert "Traceback" not in process.errors, process.errors
+    assert_same(expected, torn)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Exit code: 1 if a run failed."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--moments", type=int, default=20)
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--jobs", nargs="+", default=list(JOBS), choices=JOBS)
+    parser.add_argument("--strikes", nargs="+", default=list(STRIKES), choices=STRIKES)
+    parser.add_argument("--real", action="store_true", help="new processes, with figures")
+    parser.add_argument("--keep", metavar="FOLDER", help="keep runs that failed here")
+    given = parser.parse_args(arguments)
+    failed = False
+    with tempfile.TemporaryDirectory(prefix="bayesdist-kills-") as temporary:
+        folder = Path(given.keep or temporary)
+        done = outcomes(
+            given.jobs,
+            given.strikes,
+            folder,
+            moments=given.moments,
+            seed=given.seed,
+            real=given.real,
+        )
+        for outcome in done:
+            print(outcome.line, *outcome.failures, sep="\n    ", flush=True)
+            failed |= bool(outcome.failures)
+    return int(failed)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
