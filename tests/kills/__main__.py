@@ -10,9 +10,13 @@ import tempfile
 import time
 from collections import Counter
 from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
+from unittest.mock import patch
 
+from bayesdist.app.store.store import ArtefactStore
 from tests.app.support import good
 from tests.kills.compare import assert_same, assert_whole
 from tests.kills.jobs import JOBS
@@ -56,7 +60,7 @@ def outcomes(
             process = RunProcess(config, expected, real=True)
             assert process.wait() == 0, process.errors
         else:  # forks of this process need not load again what it has loaded
-            with quick():
+            with quick(), _copied_at_each_stage(folder / job):
                 good("run", config, "-o", expected, "-q")
         for strike in strikes:
             rng = random.Random(f"{seed} {job} {strike}")
@@ -67,6 +71,8 @@ def outcomes(
                 torn = folder / job / "torn" / "run"
                 torn.parent.mkdir()
                 stage = stages[k % len(stages)]
+                if (begun := folder / job / stage / "run").exists():
+                    shutil.copytree(begun, torn)
                 try:
                     _strike(config, torn, strike, stage, rng, outcome, expected, real=real)
                 except AssertionError as error:
@@ -74,6 +80,22 @@ def outcomes(
                     shutil.move(torn.parent, folder / job / f"failed-{time.time_ns()}")
                 shutil.rmtree(torn.parent, ignore_errors=True)
             yield outcome
+
+
+@contextmanager
+def _copied_at_each_stage(folder: Path) -> Iterator[None]:
+    """Context in which a run is copied whenever a stage begins, to a folder of that name.
+
+    Runs that are struck begin with such a copy, and need not repeat earlier stages.
+    """
+    begin = ArtefactStore._begin
+
+    def copying(self: ArtefactStore, record: Any, name: str, *arguments: Any) -> None:
+        begin(self, record, name, *arguments)
+        shutil.copytree(self.path, folder / name / "run")
+
+    with patch.object(ArtefactStore, "_begin", copying):
+        yield
 
 
 def _strike(
@@ -94,6 +116,8 @@ def _strike(
     blow = STRIKES[strike]
     delay = rng.random() * ({"start": START} | seconds_of(expected))[stage]
     process = RunProcess(config, torn, real=real)
+    if not real and torn.exists():  # it is in that stage already
+        delay += rng.random() * START
     while process.poll() is None and stage_of(torn) != stage:
         time.sleep(0.002)
     time.sleep(delay)

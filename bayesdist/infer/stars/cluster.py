@@ -21,7 +21,7 @@ import threading
 import weakref
 from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import CancelledError
-from contextlib import ExitStack, contextmanager
+from contextlib import AbstractContextManager, ExitStack, contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -51,6 +51,7 @@ try:
     from dask.system import CPU_COUNT
     from distributed import Client, Future, KilledWorker, LocalCluster, get_worker
     from distributed.comm import resolve_address
+    from distributed.utils import silence_logging_cmgr
 except ModuleNotFoundError as error:
     raise InputError(
         "the Dask engine needs the package distributed",
@@ -62,6 +63,7 @@ log = logging.getLogger("bayesdist")
 
 CONNECT = 10.0  # timeout in seconds for connecting to the scheduler
 PATIENCE = 60.0  # seconds without any worker before giving up
+SILENCE = 5.0  # seconds without any worker before a warning
 POLL = 1.0  # seconds between two checks for workers
 ALLOWED_FAILURES = 10  # number of workers that may die while processing the same piece
 LARGE = 50_000  # larger arguments (bytes) are sent once and distributed by a worker
@@ -96,26 +98,32 @@ class ClusterPieces(MappedPieces):
         self._where = self._client.scheduler.address
         self._lease = _Lease()
         files = ExitStack()
+        files.enter_context(_without_messages(self._client))
         self._end = weakref.finalize(self._lease, _end, self._client, cluster, files)
         try:
             folder = _folder_in(compute.scratch, files) if compute.scratch is not None else None
-            places = _places(self._client)
-            self._loading = set(places)
-            _require_version(self._client)
+            with self._connection():
+                places = _places(self._client, self._where)
+                self._loading = set(places)
+                _require_version(self._client)
             # sources stay in files or in the scheduler, so that a lost piece can be made again
             with _large_graphs():
                 for k, source in enumerate(sources):
-                    self._pieces.append(
-                        self._client.submit(
-                            _made_from,
-                            make,
-                            source if folder is None else _Written.as_number(k, source, folder),
-                            workers=[places[k % len(places)]],
-                            allow_other_workers=True,
-                            pure=False,
+                    record = source if folder is None else _Written.as_number(k, source, folder)
+                    with self._connection():
+                        self._pieces.append(
+                            self._client.submit(
+                                _made_from,
+                                make,
+                                record,
+                                workers=[places[k % len(places)]],
+                                allow_other_workers=True,
+                                pure=False,
+                            )
                         )
-                    )
-            for _ in self._results(self._on_each(_made)):
+            with self._connection():
+                futures = self._on_each(_made)
+            for _ in self._results(futures):
                 pass
             self._settle()
         except BaseException:
@@ -130,18 +138,21 @@ class ClusterPieces(MappedPieces):
         with more than `BRANCHES` pieces, of a piece in the first branch that fails.
         """
         with _large_graphs():
-            parts = self._tasks(task, args)
-            while len(parts) > BRANCHES:
-                parts = [
-                    self._client.submit(total, parts[k : k + BRANCHES], pure=False)
-                    for k in range(0, len(parts), BRANCHES)
-                ]
+            with self._connection():
+                parts = self._tasks(task, args)
+                while len(parts) > BRANCHES:
+                    parts = [
+                        self._client.submit(total, parts[k : k + BRANCHES], pure=False)
+                        for k in range(0, len(parts), BRANCHES)
+                    ]
             return total(self._results(parts))
 
     def each(self, task: Task, *args: Any) -> Iterator[Any]:
         """Yield ``task(piece, *args)`` in the order of the pieces; see `sum` for exceptions."""
         with _large_graphs():
-            yield from self._results(self._tasks(task, args))
+            with self._connection():
+                futures = self._tasks(task, args)
+            yield from self._results(futures)
 
     def map(self, task: Task, *args: Any) -> Self:
         """New pieces ``task(piece, *args)``, each on the worker that has the piece.
@@ -150,9 +161,10 @@ class ClusterPieces(MappedPieces):
         exceptions.
         """
         out = copy.copy(self)
-        with _large_graphs():
+        with _large_graphs(), self._connection():
             out._pieces = self._tasks(task, args)
-        for _ in out._results(out._on_each(_made)):
+            futures = out._on_each(_made)
+        for _ in out._results(futures):
             pass
         out._settle()
         return out
@@ -196,11 +208,7 @@ class ClusterPieces(MappedPieces):
                 do="look into their logs, and give them more memory",
             ) from error
         except CancelledError as error:
-            raise InputError(
-                "the connection to the scheduler is lost",
-                where=f"cluster {self._where}",
-                do="start it and the run again",
-            ) from error
+            raise _lost_connection(self._where) from error
         finally:
             # after an error, the remaining tasks would continue as long as the traceback exists
             unfinished = [future for future in futures if not future.done()]
@@ -211,7 +219,7 @@ class ClusterPieces(MappedPieces):
         """Wait for the results of tasks as long as there are workers."""
         loop = self._client.loop.asyncio_loop
         results = asyncio.run_coroutine_threadsafe(_in_order(self._client, futures), loop)
-        last_seen = monotonic()
+        last_seen, warned = monotonic(), False
         try:
             while True:
                 try:
@@ -221,13 +229,20 @@ class ClusterPieces(MappedPieces):
                         raise
                 workers = self._workers()
                 if workers:
-                    last_seen = monotonic()
+                    last_seen, warned = monotonic(), False
                     if self._loading and not self._loading & workers:
                         raise InputError(
                             "all workers were lost while they read the stars",
                             where=f"cluster {self._where}",
                             do="look into their logs, give them more memory, and start again",
                         )
+                elif monotonic() - last_seen > SILENCE and not warned:
+                    warned = True
+                    log.warning(
+                        "cluster %s has no workers any more: waiting for %g seconds",
+                        self._where,
+                        PATIENCE,
+                    )
                 elif monotonic() - last_seen > PATIENCE:
                     raise InputError(
                         f"has had no workers for {PATIENCE:g} seconds",
@@ -236,6 +251,10 @@ class ClusterPieces(MappedPieces):
                     )
         finally:
             results.cancel()
+
+    def _connection(self) -> AbstractContextManager[None]:
+        """Context that raises InputError if the scheduler does not answer any more."""
+        return _naming_lost_connection(self._client, self._where)
 
     def _workers(self) -> set[str]:
         try:
@@ -250,7 +269,8 @@ class ClusterPieces(MappedPieces):
         forever, even though other workers are allowed.
         """
         free: dict[Any, list[str]] = {piece.key: [] for piece in self._pieces}
-        self._client.sync(self._client.scheduler.set_restrictions, worker=free)
+        with self._connection():
+            self._client.sync(self._client.scheduler.set_restrictions, worker=free)
         self._loading = set()
 
 
@@ -413,27 +433,17 @@ def _connected(compute: Compute) -> tuple[Any, LocalCluster | None]:
         raise
 
 
-def _places(client: Any) -> list[str]:
+def _places(client: Any, where: str) -> list[str]:
     """Addresses of the workers, each repeated once per thread, in round-robin order."""
     if not client.nthreads():
-        log.warning(
-            "cluster %s has no workers yet: waiting for %g seconds",
-            client.scheduler.address,
-            PATIENCE,
-        )
+        log.warning("cluster %s has no workers yet: waiting for %g seconds", where, PATIENCE)
     try:
         client.wait_for_workers(1, timeout=PATIENCE)
     except TimeoutError as error:
         raise InputError(
             f"has no workers after {PATIENCE:g} seconds",
-            where=f"cluster {client.scheduler.address}",
+            where=f"cluster {where}",
             do="start workers",
-        ) from error
-    except OSError as error:
-        raise InputError(
-            "the connection to the scheduler is lost",
-            where=f"cluster {client.scheduler.address}",
-            do="start it and the run again",
         ) from error
     threads = sorted(client.nthreads().items())
     max_threads = max(n for _, n in threads)
@@ -457,6 +467,44 @@ def _require_version(client: Any) -> None:
                 where=f"worker {address}",
                 do="install one version everywhere",
             )
+
+
+def _lost_connection(where: str) -> InputError:
+    return InputError(
+        "the connection to the scheduler is lost",
+        where=f"cluster {where}",
+        do="start it and the run again",
+    )
+
+
+@contextmanager
+def _naming_lost_connection(client: Any, where: str) -> Iterator[None]:
+    """Raise InputError if the scheduler does not answer any more; `where` is its address."""
+    try:
+        yield
+    except InputError:
+        raise
+    except (Exception, CancelledError, asyncio.CancelledError) as error:
+        closed = client.status in ("closing", "closed")  # sends nothing, with an error of its own
+        if not closed and not isinstance(error, OSError | CancelledError | asyncio.CancelledError):
+            raise
+        raise _lost_connection(where) from error
+
+
+@contextmanager
+def _without_messages(client: Any) -> Iterator[None]:
+    """Context in which distributed and its event loop print no messages and no tracebacks.
+
+    Whatever ends a run is an exception with a message of its own.
+    """
+    # of tasks that nobody awaits any more
+    client.loop.asyncio_loop.set_exception_handler(_ignore)
+    with silence_logging_cmgr(logging.CRITICAL):
+        yield
+
+
+def _ignore(*_: object) -> None:
+    """Handler of exceptions in an event loop that does nothing."""
 
 
 def _large_graphs() -> Any:
