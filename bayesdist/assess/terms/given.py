@@ -365,8 +365,8 @@ class Catalogue:
 
 
 def _everywhere(size: Float, domain: EvaluationDomain) -> Float:
-    """Standard deviation (N, 2), equal at all positions."""
-    return np.tile(size, (domain.size, 1))
+    """Standard deviation (N, 2), equal at all positions; a view, since there may be many terms."""
+    return np.broadcast_to(size, (domain.size, 2))
 
 
 def _one(chip: int, x: Float, y: Float) -> Float:
