@@ -129,6 +129,8 @@ def _child(arguments: list[str], stderr: int, *, real: bool) -> NoReturn:
         os.setsid()
         os.dup2(os.open(os.devnull, os.O_RDWR), 1)
         os.dup2(stderr, 2)
+        # shells tell jobs in the background to ignore it
+        signal.signal(signal.SIGINT, signal.default_int_handler)
         if real:
             os.execv(sys.executable, [sys.executable, "-m", "bayesdist", *arguments])
         sys.argv = ["bayesdist", *arguments]
