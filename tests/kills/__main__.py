@@ -55,14 +55,16 @@ def outcomes(
     """Outcomes of strikes at a number of random moments each, spread over the stages."""
     for job in jobs:
         config = JOBS[job](folder / job / "input")
-        expected = folder / job / "expected" / "run"
-        expected.parent.mkdir()
+        # all runs are made in the same place, because they name their files in full
+        torn, expected = (folder / job / name / "run" for name in ("torn", "expected"))
+        torn.parent.mkdir()
         if real:
-            process = RunProcess(config, expected, real=True)
+            process = RunProcess(config, torn, real=True)
             assert process.wait() == 0, process.errors
         else:  # forks of this process need not load again what it has loaded
             with quick(), _copied_at_each_stage(folder / job):
-                good("run", config, "-o", expected, "-q")
+                good("run", config, "-o", torn, "-q")
+        shutil.move(torn.parent, expected.parent)
         for strike in strikes:
             rng = random.Random(f"{seed} {job} {strike}")
             outcome = Outcome(job, strike)
@@ -71,7 +73,6 @@ def outcomes(
             for k in range(ATTEMPTS * moments):
                 if outcome.struck.total() + len(outcome.failures) >= moments:
                     break
-                torn = folder / job / "torn" / "run"
                 torn.parent.mkdir()
                 stage = stages[k % len(stages)]
                 if (begun := folder / job / stage / "run").exists():
