@@ -17,7 +17,7 @@ import tomli_w
 from bayesdist.app.config import MatchesConfig, parse_config
 from bayesdist.app.config.assess import RequirementBlock
 from bayesdist.app.kinds.fit_data import StarReader
-from bayesdist.app.kinds.kind import MATCHES
+from bayesdist.app.kinds.matches.stars import read_stars
 from bayesdist.app.pipeline import diagnose, sample
 from bayesdist.app.python_terms import in_python_terms
 from bayesdist.app.rehearsal import rehearse
@@ -210,7 +210,7 @@ def calibrate(
             do="write a configuration file, and give it to bayesdist.run",
         )
     if stars is None:
-        stars = MATCHES.read(config, Path.cwd())
+        stars = read_stars(config, Path.cwd())
     results = Results(
         RunDirectory.unsaved(config, text, files=_is_path(matches)),
         StarReader(config.resources()),

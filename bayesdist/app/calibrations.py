@@ -9,7 +9,8 @@ from pathlib import Path
 import numpy as np
 from pydantic import TypeAdapter
 
-from bayesdist.app.kinds.fitted import FIT_AGAIN, TABLES, read_tables
+from bayesdist.app.kinds.fitted import FIT_AGAIN
+from bayesdist.app.kinds.parts import TABLES, read_tables
 from bayesdist.app.products.made_files import with_facts_of_run
 from bayesdist.app.results import open_results
 from bayesdist.app.store.rundir import RunDirectory

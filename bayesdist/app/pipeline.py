@@ -179,5 +179,5 @@ def evaluate(
         solution=solution,
         checks=run_checks(data, posterior, found, config, series),
         files=file_errors(product, config, base),
-        null=None if data.fitted.solved is None else data.fitted.solved.gauge.null,
+        null=kind_of(config).null_space(data),
     )

@@ -28,8 +28,8 @@ def rehearse(results: Results) -> Results:
     """
     kind, config, base = results.kind, results.config, results.base
     kind.refuse(results.inputs)
-    if kind.outline is not None:  # matching takes long
-        outline = kind.outline(results.inputs)
+    outline = kind.outline(results.inputs)
+    if outline is not None:  # matching takes long
         rehearse_outline(outline, config, base, str(results.run.path))
         return results
     matched = results.matched

@@ -8,14 +8,10 @@ import sys
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from bayesdist.app.calibrations import difference_from_previous
 from bayesdist.app.config import Config
-from bayesdist.app.kinds.fitted import Fitted, required
 from bayesdist.app.results import Results
 from bayesdist.app.store import as_json
-from bayesdist.app.store.rundir import RunDirectory
 from bayesdist.assess.coefficients import coefficient_table
 from bayesdist.assess.comparison.compare import Comparison
 from bayesdist.assess.evaluation import Evaluation
@@ -23,10 +19,8 @@ from bayesdist.assess.solution import chip_places
 from bayesdist.assess.vectors import diagram_vectors
 from bayesdist.diagnose.diagnostics import Diagnostics
 from bayesdist.files.atomic import atomic_path
-from bayesdist.files.tables import read_ecsv
 from bayesdist.infer import Posterior
-from bayesdist.model.grid import outline_pixels
-from bayesdist.report.context import ChipResults, Product, ReportInput, SelfcalResults
+from bayesdist.report.context import ChipResults, Product, ReportInput
 from bayesdist.utils.checks import Check
 
 log = logging.getLogger("bayesdist")
@@ -82,15 +76,6 @@ def report_input(results: Results) -> ReportInput:
     run, config, fitted = results.run, results.config, results.fitted
     fit, posterior, solution = results.fit, results.posterior, results.solution
     diagnostics, evaluation, epoch = results.diagnostics, results.evaluation, results.epoch
-    campaign, selfcal = None, None
-    if fitted.scatter is not None:
-        from bayesdist.app.kinds.campaign.report import campaign_results
-
-        campaign = campaign_results(
-            run, results.inputs, results.data, posterior, diagnostics.overlap
-        )
-    if fitted.solved is not None:
-        selfcal = selfcal_results(run, fitted, posterior, epoch)
     facts, folder = run.facts, run.path.resolve().name
     products = tuple(
         Product(p["path"], p["kind"], _product_checks(p)) for p in run.summary.get("products", [])
@@ -117,11 +102,11 @@ def report_input(results: Results) -> ReportInput:
         magnitude_errors=fitted.errors.by_magnitude,
         added_errors=fitted.grouped,
         flagged=diagnostics.flagged,
-        campaign=campaign,
-        selfcal=selfcal,
+        tables=fitted.tables.tables,
         provenance={"folder": folder}
         | {k: facts[k] for k in ("command", "created", "seed", "inputs", "versions")}
         | {"stages": run.record.stages},
+        **results.kind.report_parts(run, results.data, posterior, diagnostics, epoch),
     )
 
 
@@ -144,9 +129,8 @@ def title_of(config: Config) -> str:
     block, names = config.detector, [chip.name for chip in config.chip if chip.name]
     is_short = len(names) <= MOST_NAMED
     detector = block.name or (" and ".join(names) if is_short else f"{names[0]} to {names[-1]}")
-    band = block.filter or (config.campaign and config.campaign.filter)
     named = " ".join(part for part in (block.mission, block.instrument, detector) if part)
-    return ", ".join(part for part in (named, band) if part)
+    return ", ".join(part for part in (named, config.filter_name) if part)
 
 
 def _chip_results(
@@ -197,30 +181,3 @@ def _product_checks(product: dict[str, Any]) -> tuple[Check, ...]:
         name = "reading by other programs"
         out.append(Check("Products", name, text, "", levels.get(level, "note")))
     return tuple(out)
-
-
-def selfcal_results(
-    run: RunDirectory, fitted: Fitted, posterior: Posterior, epoch: float | None
-) -> SelfcalResults:
-    """Content that a self-calibration adds to the report of its run."""
-    model, theta = fitted.linear.model, posterior.mean
-    solved = required(fitted.solved, "solution of detections")
-    outlines = []
-    for e in range(len(model.exposures)):
-        for chip in model.chips:
-            x, y = outline_pixels(chip.size)
-            when = None if model.time is None else np.full(len(x), epoch)
-            codes = np.full(len(x), e)
-            outlines.append(
-                model.predict(theta, x, y, exposure=codes, chip=chip.number, epoch=when)
-            )
-    names = model.names
-    return SelfcalResults(
-        words=solved.gauge_words,
-        gauge=read_ecsv(run / "gauge.ecsv"),
-        matching=read_ecsv(run / "matching.ecsv"),
-        stars=read_ecsv(run / "stars.ecsv"),
-        outlines=tuple(outlines),
-        held=tuple(names[k] for k in solved.gauge.held),
-        summary=run.summary["selfcal"],
-    )

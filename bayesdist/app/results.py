@@ -12,15 +12,14 @@ from typing import Any, TypeVar
 from bayesdist.app.assessment.checks import run_checks
 from bayesdist.app.assessment.diagnosing import diagnose_residuals, diagnose_run
 from bayesdist.app.assessment.error_terms import (
-    assessment_epoch,
     assessment_rng,
     errors_of_run,
     evaluation_settings,
 )
 from bayesdist.app.config import Config
-from bayesdist.app.kinds.fit_data import FitData, StarReader
+from bayesdist.app.kinds.fit_data import FitData, StarReader, assessment_epoch
 from bayesdist.app.kinds.fitted import Fitted
-from bayesdist.app.kinds.kind import Kind, kind_of
+from bayesdist.app.kinds.kind import RunKind, kind_of
 from bayesdist.app.kinds.matched import Matched
 from bayesdist.app.kinds.matches.sources import RunInput, input_of_run
 from bayesdist.app.products.made_files import ProductInput, product_of, solution_of
@@ -101,7 +100,7 @@ class Results:
         return self.run.base
 
     @cached_property
-    def kind(self) -> Kind:
+    def kind(self) -> RunKind[Any, Any, Any]:
         """Kind of the run."""
         return kind_of(self.config)
 
@@ -119,9 +118,9 @@ class Results:
         """Fitted and held-out stars."""
 
         def load() -> Matched:
-            if self.kind.load_matched is None:
-                return self.kind.match(self.inputs, self.config)
-            return self.kind.load_matched(self.run.path, self.inputs, self.run.summary)
+            folder, summary = self.run.path, self.run.summary
+            matched: Matched = self.kind.load_matched(folder, self.inputs, self.config, summary)
+            return matched
 
         return self._artefact("matched", "match", load)
 

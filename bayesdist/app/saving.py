@@ -12,27 +12,20 @@ import numpy as np
 from bayesdist.app.assessment.diagnosing import holdout_summary, holdout_table
 from bayesdist.app.assessment.error_terms import idle_dates
 from bayesdist.app.assessment.periods import periods_summary, periods_table
-from bayesdist.app.config import Config
-from bayesdist.app.kinds.fit_data import FitData
 from bayesdist.app.kinds.fitted import Fitted
 from bayesdist.app.kinds.matches.added_errors import (
     added_errors_rows,
-    grouping_sentence,
     in_circle,
 )
-from bayesdist.app.kinds.matches.plausibility import doubts_on_stars
 from bayesdist.app.rehearsal import rehearse_solution
 from bayesdist.app.results import Results
 from bayesdist.app.store.keys import attributes
-from bayesdist.app.store.output import provenance_notes, write_table
+from bayesdist.app.store.output import write_table
 from bayesdist.app.store.rundir import part_files
 from bayesdist.app.store.summary import GeometryRow, Sampler
 from bayesdist.app.tables.result_files import write_diagnostics, write_evaluation
 from bayesdist.data import Matches
 from bayesdist.data.storage.write import write_columns
-from bayesdist.diagnose.checks import frames_doubt
-from bayesdist.diagnose.residuals.epoch_shift import epoch_shift
-from bayesdist.diagnose.residuals.quoted import majority_sentence
 from bayesdist.files.atomic import made_folder, remove_leftovers
 from bayesdist.infer import LinearFit, Posterior, save_posterior
 from bayesdist.infer.posterior.memberships import memberships_of
@@ -59,23 +52,10 @@ def save_fit(results: Results) -> None:
     results.run.summarise(**fit_sections(fitted, data.placed, skew=config.fit.skew))
     log_fit(data.fit, results.kind.rows)
     _log_geometry(data.fit)
-    if results.kind.begins_with == "fit":
-        _log_matches(data, config)
-        return
-    if fitted.solved is not None:
+    if results.kind.rehearses_fit:
         rehearse_solution(results)
-        gauge = fitted.solved.gauge
-        for text in gauge.settled:
-            log.info("fit: %s", text)
-        warnings = gauge.unsettled
-    else:
-        warnings = fitted.facts["deviations"]["warnings"]
-    for text in warnings:
-        log.warning("fit: WARNING: %s", text)
-    if fitted.scatter is not None:
-        scatter = fitted.facts["scatter"]
-        sizes = ", ".join(f"{name} {term['value']:.2g}" for name, term in scatter.items())
-        log.info("fit: scatter of the exposures %s", sizes)
+    for level, text in results.kind.fit_notes(data, config):
+        log.log(level, "fit: %s%s", "WARNING: " if level >= logging.WARNING else "", text)
 
 
 def _log_geometry(fit: LinearFit) -> None:
@@ -84,30 +64,6 @@ def _log_geometry(fit: LinearFit) -> None:
         log.info("fit: chip %d: %s", chip.chip, chip.sentence)
         for text in chip.warnings:
             log.warning("fit: WARNING: %s", text)
-
-
-def _log_matches(data: FitData, config: Config) -> None:
-    """Log notes and warnings about stars that were matched before the run."""
-    matches, fit = data.placed, data.fit
-    for note in matches.notes:
-        log.info("fit: %s", note)
-    for reason, count in matches.rejected.items():
-        log.info("fit: %d rows were left out in reading: %s", count, reason)
-    for text in doubts_on_stars(data.sample, data.model, config):
-        log.warning("fit: WARNING: %s", text)
-    shift = epoch_shift(data.sample, fit)
-    if shift is not None and shift.significant:
-        log.warning("fit: WARNING: %s", shift.sentence)
-    majority = majority_sentence(fit)
-    if data.error_scale_sentence:
-        log.warning("fit: WARNING: %s", data.error_scale_sentence)
-    suspicious = bool(majority or data.error_scale_sentence)
-    if text := frames_doubt(fit, data.sample, suspicious=suspicious):
-        log.warning("fit: WARNING: %s", text)
-    if data.fitted.grouped is not None:
-        log.info("fit: %s", grouping_sentence(data.fitted.grouped, fit.unit))
-    if majority:
-        log.warning("fit: WARNING: %s", majority)
 
 
 def save_sampled(results: Results) -> None:
@@ -131,10 +87,7 @@ def save_sampled(results: Results) -> None:
 def save_diagnosed(results: Results) -> None:
     """Write the diagnostics, including those of held-out stars, periods and exposures."""
     run, diagnostics = results.run, results.diagnostics
-    if results.fitted.alone is not None:
-        from bayesdist.app.assessment.series import write_series_tables
-
-        write_series_tables(run, results.fitted, results.config)
+    results.kind.save_diagnosed(run, results.data, results.posterior, diagnostics, results.config)
     write_diagnostics(run, results.fit, results.posterior, diagnostics)
     if diagnostics.holdout is not None:
         write_table(holdout_table(diagnostics.holdout), run / "holdout.ecsv")
@@ -147,15 +100,6 @@ def save_diagnosed(results: Results) -> None:
         run.summarise(periods=periods_summary(periods))
         for text in (periods.verdict, periods.pattern_sentence, *periods.cautions):
             log.info("diagnose: %s", text)
-    solved = results.fitted.solved
-    if solved is not None:
-        from bayesdist.app.kinds.selfcal.stars import write_stars
-
-        notes = provenance_notes(results.posterior, solved.gauge_words)
-        stars = write_stars(
-            run.path, solved, diagnostics.correlated, notes, results.config.resources()
-        )
-        run.summarise(selfcal=run.summary.get("selfcal", {}) | {"stars": stars})
 
 
 def save_evaluation(results: Results) -> None:
@@ -167,10 +111,7 @@ def save_evaluation(results: Results) -> None:
         log.warning("evaluate: WARNING: %s", idle)
     gauge, solution = results.fitted.gauge_words, results.solution
     write_evaluation(run, results.fit, results.posterior, solution, gauge, evaluation)
-    if results.fitted.scatter is not None:
-        from bayesdist.app.kinds.campaign.linear_terms import line_sections
-
-        run.summarise(**line_sections(solution, config.chips()[0].number))
+    run.summarise(**results.kind.evaluation_sections(solution, config))
     for period in evaluation.validity:
         log.info("evaluate: %s", period.sentence)
     largest = max(float(np.nanmax(period.per_axis)) for period in evaluation.maps)

@@ -9,7 +9,6 @@ from typing import Any
 
 from bayesdist.app.config import load_config
 from bayesdist.app.kinds.fitted import Fitted
-from bayesdist.app.kinds.kind import kind_of
 from bayesdist.app.pipeline import (
     diagnose,
     error_model,
@@ -100,7 +99,7 @@ def run(
     )
     with initialized(directory) as results:
         names = list(STAGES)
-        names = names[names.index(results.kind.begins_with) : None if report else -1]
+        names = names[names.index(results.config.begins_with) : None if report else -1]
         results = make_stages(results, names)
         _require_converged(results, strict)
     return directory.path
@@ -224,7 +223,7 @@ def continue_stage(
         If the stage cannot be run.
     """
     directory = RunDirectory.open(path)
-    begins_with = kind_of(directory.config).begins_with
+    begins_with = directory.config.begins_with
     if stage == "match" != begins_with:
         raise InputError(
             "has no star lists to match", where=str(path), do="begin with the stage 'fit'"

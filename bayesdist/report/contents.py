@@ -165,7 +165,7 @@ REPORT = Registry(
         Section("status", "Status"),
         Section("holdout", "Held-out stars"),
         # in a campaign, the section on matching describes the data
-        Section("data", "Data", printed=lambda r: r.campaign is None),
+        Section("data", "Data", printed=lambda r: r.words.prints_data),
         Section("campaign", "Campaign"),
         Section("campaign-matching", "Catalogue and matching", parent="campaign"),
         Section("campaign-tables", "Look-up tables", parent="campaign"),
@@ -177,10 +177,7 @@ REPORT = Registry(
             printed=False,  # these products are in files
         ),
         Section("selfcal", "Gauge and stars"),
-        Section(
-            "fit",
-            lambda r: "Least-squares fit" if r.selfcal is None else r.words.fit.capitalize(),
-        ),
+        Section("fit", lambda r: r.words.fit_title),
         Section("residuals", "Residuals"),
         Section(
             "outliers",

@@ -82,30 +82,51 @@ class SelfcalResults:
     matching: Table  # one row per exposure
     stars: Table  # content of stars.ecsv
     outlines: tuple[Float, ...]  # (M, 2), closed, of each chip in each exposure, on the sky
-    held: tuple[str, ...]  # parameters that the gauge constrains
     summary: Mapping[str, Any]  # as in summary.json
+
+
+NEW_EXPOSURE = "a new exposure whose shift and rotation are fitted by its user"
 
 
 @dataclass(frozen=True)
 class Terminology:
-    """Terms of a report that differ between the kinds of runs."""
+    """Words of a report that differ between the kinds of runs."""
 
-    rows: str  # name of the rows that are fitted
-    all_rows: str  # name of the rows before rejection
-    false_rows: str
-    rejection: str  # sampling itself rejects nothing
-    fit: str  # the fit before sampling
-    constraint: str  # on parameters that the data do not constrain
+    rows: str = "stars"  # name of the rows that are fitted
+    all_rows: str = "matched stars"  # name of the rows before rejection
+    false_rows: str = "false matches"
+    rejection: str = "least-squares fit"  # sampling itself rejects nothing
+    fit: str = "linear fit"  # the fit before sampling
+    fit_title: str = "Least-squares fit"  # of its section
+    constraint: str = "a prior"  # on parameters that the data do not constrain
     leverage: str = ""  # clause on why residuals are smaller than errors; may be empty
+    # True to print the general sections on the data; False if those of the kind say more
+    prints_data: bool = True
+    held: str = (  # parameters that the data do not constrain
+        "Held, and therefore not shown: a prior alone says what these parameters are, and the data"
+        " add nothing to it"
+    )
+    # clauses and sentences on the exposures that errors of positions hold for; may be empty
+    whom: str = ""
+    new_exposure: str = ""
+    # clause on a common shift and rotation in errors of positions of several exposures
+    with_shift: str = ", shift and rotation included"
+    gauge_of_maps: str = (  # `first`: the first exposure
+        "Shift and rotation of the detector as a whole count as errors here, relative to exposure"
+        " {first}."
+    )
+    relative_map: str = ""  # sentence on the map of relative positions, if it is shown
+    residuals: str = ""  # sentence on the binned residuals; may be empty
 
 
-MATCHED = Terminology(
-    rows="stars",
-    all_rows="matched stars",
-    false_rows="false matches",
-    rejection="least-squares fit",
-    fit="linear fit",
-    constraint="a prior",
+MATCHED = Terminology()
+PAIRED = Terminology(
+    prints_data=False,
+    whom=f" for {NEW_EXPOSURE}",
+    new_exposure=f"For {NEW_EXPOSURE}: what a shift and a rotation of all chips together take up is"
+    " no error here.",
+    residuals=" These are the residuals of the joint fit, with all tables, in the cells of the test"
+    " for structure (see the status).",
 )
 DETECTED = Terminology(
     rows="detections",
@@ -113,8 +134,18 @@ DETECTED = Terminology(
     false_rows="false detections",
     rejection="limits of residuals",
     fit="solution",
+    fit_title="Solution",
     constraint="the gauge",
     leverage=", less what the fitted stars take of them",
+    held="Held by the gauge, and therefore not shown: the detections say nothing of what these"
+    " parameters stand for",
+    with_shift=", in the gauge of the solution",
+    gauge_of_maps="What the gauge holds by convention, shift and rotation of the detector as a"
+    " whole among them unless something fixes them, has no error here.",
+    relative_map=" That of relative positions is the same in any gauge of shift, rotation and scale"
+    " (and skew, where all exposures have one roll angle); the other is that of the run's gauge.",
+    residuals=" Stars were fitted to these detections, so that fewer may do so than by chance; the"
+    " status has the test that allows for it.",
 )
 
 
@@ -151,6 +182,9 @@ class ReportInput:
     periods: TimeVariation | None = None  # comparison of the models of several periods
     held_out: HoldoutValidation | None = None  # stars set aside before the fit
     selfcal: SelfcalResults | None = None  # for a run without a catalogue
+    tables: tuple[LookupTable, ...] = ()  # look-up tables that the fit has used
+    held: frozenset[str] = frozenset()  # parameters that a prior or the gauge alone constrains
+    words: Terminology = MATCHED  # for the kind of run
 
     @property
     def unit(self) -> str:
@@ -167,11 +201,6 @@ class ReportInput:
     def warnings(self) -> tuple[str, ...]:
         """Sentences to show at the top of the report."""
         return warnings_of(self.checks)
-
-    @property
-    def words(self) -> Terminology:
-        """Terminology for the kind of run."""
-        return MATCHED if self.selfcal is None else DETECTED
 
     @property
     def sample(self) -> str:
@@ -228,13 +257,6 @@ class ReportInput:
         """'(508, 509)', with the name of the chip if there are several."""
         chip_with_position = next(c.chip for c in self.chips if c.chip.number == chip)
         return "({:.0f}, {:.0f})".format(*pixel) + self.on_chip(chip_with_position)
-
-    @property
-    def held(self) -> frozenset[str]:
-        """Parameters that a prior or the gauge constrains, which are not measurements."""
-        if self.selfcal is not None:
-            return frozenset(self.selfcal.held)
-        return frozenset(() if self.campaign is None else self.campaign.held)
 
     @property
     def scale_mas(self) -> float | None:
@@ -362,7 +384,6 @@ class CampaignResults:
     tables: tuple[LookupTable, ...] = field(default=())
     series: LinearSeries | None = None
     overlap: OverlapTest | None = None
-    held: tuple[str, ...] = ()  # parameters constrained only by their prior
 
     def section(self, name: str) -> Mapping[str, Any]:
         """Section of summary.json; empty if there is none."""

@@ -99,7 +99,7 @@ def actual_error(
         piece = next(one for one in truth.chips if one.number == chip.number)
         true.append(truth.true_map(*piece.mosaic(x, y), epoch))
     seen, at = np.concatenate(predicted), np.concatenate(true)
-    if results.fitted.solved is not None:
+    if "solved" in results.fitted.parts:
         error = selfcal_error(results, truth, seen, code)
     elif framed:
         error = truth.frames[model.exposures[code]].undone(seen) - at

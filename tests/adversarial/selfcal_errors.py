@@ -26,7 +26,7 @@ def aligned(results: Results, truth: Truth) -> np.ndarray:
 
     As z -> (p + i q) z + (r + i s), of the positions z = u + i v.
     """
-    solution, gauge = results.solution, results.fitted.solved.gauge
+    solution, gauge = results.solution, results.fitted.parts["solved"].gauge
     model, mean = solution.model, np.asarray(solution.mean)
     assert gauge.open.shape[1] == 4, "the exposures leave more free than a similarity"
     nodes, weights = legendre.leggauss(NODES)

@@ -76,7 +76,7 @@ def begin(folder: Path, run: Path, names: list[str], *, holdout: str = "", drift
 def run(folder):
     run = begin(folder, folder.parent / "release", parts(folder)[0], holdout=HOLDOUT)
     # how linear terms went with time takes longer than all the rest, and is not asked here
-    with patch("bayesdist.app.assessment.series.write_series_tables"):
+    with patch("bayesdist.app.kinds.campaign.series.write_series_tables"):
         return carried_out(run, "match", "fit", "sample", "diagnose")
 
 

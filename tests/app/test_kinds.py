@@ -11,12 +11,8 @@ from bayesdist.app.config import load_config
 from bayesdist.app.kinds.errors import ErrorLaw
 from bayesdist.app.kinds.fit_data import FitData, StarReader
 from bayesdist.app.kinds.kind import kind_of
-from bayesdist.app.kinds.matches.stars import (
-    fit_stars,
-    match_stars,
-    read_stars,
-    sample_stars,
-)
+from bayesdist.app.kinds.matches.stars import fit_stars, match_stars, read_stars
+from bayesdist.app.kinds.sampling import sample_stars
 from bayesdist.app.results import open_results
 from bayesdist.app.saving import fit_sections
 from bayesdist.app.store import as_json

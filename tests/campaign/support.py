@@ -150,7 +150,7 @@ def calibrated(setting: Setting, seed: int) -> Iterator[Calibrated]:
                 tables=made["fit_tables"][1],
                 bare=bare,
                 joint=_with_catalogue(bare, results.data),
-                terms=results.fitted.alone,
+                terms=results.fitted.parts["alone"].series,
             )
 
 

@@ -13,6 +13,7 @@ from bayesdist.diagnose.overlap import OverlapTest, _binned, align
 from bayesdist.diagnose.residuals.binned import binned_residuals
 from bayesdist.model import LookupTable
 from bayesdist.report.context import (
+    PAIRED,
     CampaignResults,
     CatalogStars,
     ChipResiduals,
@@ -232,4 +233,5 @@ def results(chips, **changes) -> CampaignResults:
 def campaign_input() -> ReportInput:
     """A run of two chips with what a campaign adds."""
     run = report_input(size=SIZE, names=NAMES)
-    return replace(run, campaign=results([c.chip for c in run.chips]))
+    campaign = results([c.chip for c in run.chips])
+    return replace(run, campaign=campaign, tables=campaign.tables, words=PAIRED)

@@ -9,7 +9,7 @@ import pytest
 
 from bayesdist.app.kinds.campaign.report import _residuals
 from bayesdist.app.kinds.errors import ErrorLaw
-from bayesdist.app.kinds.fitted import StoredLookupTables
+from bayesdist.app.kinds.parts import StoredLookupTables
 from bayesdist.data import Matches
 from bayesdist.diagnose.overlap import _at_first_epoch, align, chosen_exposures
 from bayesdist.infer.nodes.pixels import inside_chips

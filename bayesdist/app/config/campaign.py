@@ -56,6 +56,8 @@ class CampaignBlock(StarListsBlock):
 class CampaignConfig(RunConfig):
     """Configuration of a run that begins with star lists and a catalogue."""
 
+    kind: ClassVar[str] = "bayesdist.app.kinds.campaign.kind:CAMPAIGN"
+    is_dated: ClassVar[bool] = True
     data: ClassVar[None] = None
     selfcal: ClassVar[None] = None
     periods: ClassVar[None] = None
@@ -88,6 +90,11 @@ class CampaignConfig(RunConfig):
         if tdd is not None and tdd.rates != FREE:
             files.append(rates_file(base / tdd.rates))
         return files
+
+    @property
+    def filter_name(self) -> str:
+        """Filter of the exposures, if the settings name it; may be empty."""
+        return self.detector.filter or self.campaign.filter or ""
 
     @property
     def named_detector(self) -> str:

@@ -142,6 +142,8 @@ class Periods(Section):
 class MatchesConfig(RunConfig):
     """Configuration of a run that begins with matched stars."""
 
+    kind: ClassVar[str] = "bayesdist.app.kinds.matches.kind:MATCHES"
+    begins_with: ClassVar[str] = "fit"
     campaign: ClassVar[None] = None
     selfcal: ClassVar[None] = None
     tables: ClassVar[TablesBlock] = TablesBlock()

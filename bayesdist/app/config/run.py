@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Self
+from typing import TYPE_CHECKING, ClassVar, Self
 
 from pydantic import Field
 
@@ -63,6 +63,10 @@ class RunConfig(Section):
         @property
         def compute(self) -> ComputeBlock: ...
 
+    kind: ClassVar[str]  # the kind of run as "module:object"
+    begins_with: ClassVar[str] = "match"  # first stage; 'fit' if stars are matched before the run
+    is_dated: ClassVar[bool] = False  # True if all exposures have dates
+
     detector: RunDetector = RunDetector()
     chip: list[ChipBlock] = Field(default_factory=list)
     assess: Assess = Assess()
@@ -107,6 +111,11 @@ class RunConfig(Section):
     def named_detector(self) -> str:
         """Name of the detector, for formats that are specific to one detector."""
         return self.detector.name
+
+    @property
+    def filter_name(self) -> str:
+        """Filter of the exposures, if the settings name it; may be empty."""
+        return self.detector.filter or ""
 
     @property
     def compares_jitters(self) -> bool:

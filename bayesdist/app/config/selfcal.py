@@ -95,6 +95,7 @@ class GaugeBlock(Section):
 class SelfcalConfig(RunConfig):
     """Configuration of a run that begins with star lists alone."""
 
+    kind: ClassVar[str] = "bayesdist.app.kinds.selfcal.kind:SELFCAL"
     data: ClassVar[None] = None
     campaign: ClassVar[None] = None
     tables: ClassVar[TablesBlock] = TablesBlock()

@@ -7,6 +7,7 @@ from functools import cached_property
 
 import numpy as np
 
+from bayesdist.app.config import Config
 from bayesdist.app.kinds.errors import QUOTED, ErrorLaw
 from bayesdist.app.kinds.fitted import Fitted
 from bayesdist.app.kinds.matched import Matched
@@ -101,15 +102,10 @@ class FitData:
         """Stars with pixels corrected by the look-up tables, and with their quoted errors."""
         return self.fitted.placed(self.matched.stars)
 
-    @property
-    def _law(self) -> ErrorLaw:
-        """Errors that remain to be applied; none for a self-calibration, which has applied them."""
-        return QUOTED if self.fitted.solved is not None else self.fitted.errors
-
     @cached_property
     def stars(self) -> Matches:
         """Fitted stars with their errors."""
-        return self.reader.matches(self.placed, self._law)
+        return self.reader.matches(self.placed, self.fitted.remaining_errors)
 
     @cached_property
     def held(self) -> Matches | None:
@@ -120,12 +116,12 @@ class FitData:
     @property
     def shards(self) -> Shards:
         """All fitted stars, split into shards for passes over the data."""
-        return self.reader.shards(self.model, self.placed, self._law)
+        return self.reader.shards(self.model, self.placed, self.fitted.remaining_errors)
 
     @property
     def sample(self) -> Matches:
         """Evenly spread subset of the fitted stars, or all of them if they are few."""
-        return self.reader.sample(self.placed, self._law)
+        return self.reader.sample(self.placed, self.fitted.remaining_errors)
 
     @cached_property
     def dates(self) -> Float:
@@ -150,3 +146,15 @@ class FitData:
             self.model.unit,
             by_magnitude=self.placed.has_mag,
         )
+
+
+def assessment_epoch(data: FitData, config: Config) -> float | None:
+    """Epoch of the assessment in decimal years.
+
+    By default it is the date from which a product is to be used, or the latest date of the stars if
+    that is later, because errors of a drift grow with time.  None if the model does not depend on
+    time.
+    """
+    if config.assess.epoch is not None or data.model.time is None:
+        return config.assess.epoch
+    return max((data.last_epoch, *config.products.useafter_years()))

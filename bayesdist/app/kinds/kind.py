@@ -1,128 +1,205 @@
-"""The three kinds of runs, which differ in every step before the posterior."""
+"""One kind of run: what differs between matched stars, campaigns and self-calibrations."""
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
-from functools import cache
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar, Generic, Literal, TypeVar
 
 from bayesdist.app.config import Config
-from bayesdist.app.kinds.fit_data import StarReader
+from bayesdist.app.kinds.fit_data import FitData, StarReader
 from bayesdist.app.kinds.fitted import Fitted, load_fitted
 from bayesdist.app.kinds.matched import Matched, Outline
-from bayesdist.app.kinds.matches.stars import (
-    fit_stars,
-    match_stars,
-    read_stars,
-    sample_stars,
-)
+from bayesdist.app.kinds.sampling import sample_stars
+from bayesdist.app.store.rundir import RunDirectory
+from bayesdist.assess.evaluation import EvaluationSettings
+from bayesdist.assess.model import ErrorModel, with_diagnosed_errors
+from bayesdist.assess.terms.forms import ErrorTerm
+from bayesdist.data import MagnitudeErrors
+from bayesdist.diagnose.diagnostics import Diagnostics
+from bayesdist.diagnose.holdout.predictive import Predictive, predictive_of
 from bayesdist.infer import Posterior
+from bayesdist.infer.exposures.chip_offsets import Settling
+from bayesdist.infer.selfcal import SelfCalibrationMode
+from bayesdist.infer.solution.solution import Solution
+from bayesdist.plugin import load_object
+from bayesdist.utils.arrays import Float
+from bayesdist.utils.checks import Check
+
+C = TypeVar("C", contravariant=False)  # configuration
+I = TypeVar("I")  # inputs
+M = TypeVar("M", bound=Matched)  # fitted and held-out stars
+
+
+@dataclass(frozen=True, eq=False)
+class Questions:
+    """What the general diagnostics have to know of the fit of a run."""
+
+    # centroid errors, if the fit has estimated them; else they are the scatter of the residuals
+    centroid: MagnitudeErrors | Literal["residuals"] | None = "residuals"
+    structure: bool = True  # False if look-up tables were fitted to the structure
+    exposures: bool = True  # False if a hierarchy of exposures was fitted
+    settling: Settling | None = None  # applied to the shifts of single chips after sampling
+    eliminated: SelfCalibrationMode | None = None  # solution with the positions of stars
 
 
 @dataclass(frozen=True)
-class Kind:
-    """Functions that implement one kind of run: matched stars, a campaign, or a self-calibration.
+class EvaluationDomain:
+    """The exposure that errors are evaluated for."""
 
-    Configurations, inputs and matches have different types for each kind.
+    aligned: bool = False  # shift and rotation of a new exposure are fitted by its user
+    single: bool = False  # the deviation of a single exposure is an error
+    frames: bool = False  # errors of the frames are correlated with the measured errors
+    structure_left: bool = True  # False if errors of look-up tables include the structure
 
-    Parameters
-    ----------
-    read : callable
-        ``read(config, base)`` reads the inputs of a run; paths are relative to the folder `base`.
-    match : callable
-        ``match(inputs, config)`` returns the fitted and the held-out stars.
-    fit : callable
-        ``fit(matched, config, base, reader)`` returns the least-squares solution.
-    sample : callable
-        ``sample(data, config, folder=, progress=)`` returns the posterior of a fit; checkpoints are
-        written to `folder`.
-    load_matched : callable, optional
-        ``load_matched(folder, inputs, summary)`` loads the matches of an earlier stage from the
-        folder of a run and its summary.json.  None if the stars are matched again instead.
-    load_fitted : callable
-        ``load_fitted(folder, matched)`` loads the fit of an earlier stage; `matched` is a function
-        that returns the matches, called only if they are needed.
-    refuse : callable
-        ``refuse(inputs)`` raises InputError if the inputs are inconsistent.  Problems of matched
-        stars are found by their fit.
-    lines : callable
-        ``lines(inputs)`` returns the lines that the command `check` prints about the inputs, or
-        None if those about the fit are more informative.
-    outline : callable, optional
-        ``outline(inputs)`` returns the shape of the solution, from which products are written on
-        trial before stars are matched.  None if the fit is used for that.
-    begins_with : str
-        First stage: 'match', or 'fit' if the stars are matched already.
-    rows : str
-        Word for the rows of the data.
-    chooser : str
-        Words for the step that rejects outlying rows.
+
+class RunKind(ABC, Generic[C, I, M]):
+    """One kind of run.
+
+    Methods up to `sample` make a posterior; the others contribute what only this kind has to steps
+    that are the same for all kinds.  A kind names itself in `kind` of its configuration.
     """
 
-    read: Callable[[Any, Path], Any]
-    match: Callable[[Any, Any], Matched]
-    fit: Callable[[Any, Any, Path, StarReader], Fitted]
-    sample: Callable[..., Posterior] = sample_stars
-    load_matched: Callable[[Path, Any, Mapping[str, Any]], Matched] | None = None
-    load_fitted: Callable[[Path, Callable[[], Any]], Fitted] = lambda folder, _: load_fitted(folder)
-    refuse: Callable[[Any], None] = lambda inputs: None
-    lines: Callable[[Any], Iterator[str] | None] = lambda inputs: None
-    outline: Callable[[Any], Outline] | None = None
-    begins_with: str = "match"
-    rows: str = "stars"
-    chooser: str = "least-squares fit"
+    rows: ClassVar[str] = "stars"  # word for the rows of the data
+    chooser: ClassVar[str] = "least-squares fit"  # words for the step that rejects outlying rows
+    # True if the fit estimates the errors of centroids, which then include no other errors
+    measures_centroids: ClassVar[bool] = True
+    # True if errors, requirements and products are tried out with the fit before it is sampled
+    rehearses_fit: ClassVar[bool] = False
+
+    # -- up to the posterior ----------------------------------------------------------------------
+
+    @abstractmethod
+    def read(self, config: C, base: Path) -> I:
+        """Inputs of a run; paths are relative to the folder `base`."""
+
+    @abstractmethod
+    def match(self, inputs: I, config: C) -> M:
+        """Fitted and held-out stars."""
+
+    @abstractmethod
+    def fit(self, matched: M, config: C, base: Path, reader: StarReader) -> Fitted:
+        """Least-squares solution; `reader` may hold the stars."""
+
+    def sample(
+        self,
+        data: FitData,
+        config: Config,
+        *,
+        folder: Path | None = None,
+        progress: Callable[[int, int], None] | None = None,
+    ) -> Posterior:
+        """Posterior of a fit; checkpoints are written to `folder`."""
+        return sample_stars(data, config, folder=folder, progress=progress)
+
+    def load_matched(
+        self,
+        folder: Path,
+        inputs: I,
+        config: C,
+        summary: Mapping[str, Any],
+    ) -> M:
+        """Matches of an earlier stage, from the folder of a run and its summary.json."""
+        return self.match(inputs, config)
+
+    def load_fitted(self, folder: Path, matched: Callable[[], M]) -> Fitted:
+        """Fit of an earlier stage; `matched` returns the matches, and is called if they matter."""
+        return load_fitted(folder)
+
+    def refuse(self, inputs: I) -> None:
+        """Raise InputError if inputs are inconsistent."""
+
+    def lines(self, inputs: I) -> Iterator[str] | None:
+        """Lines that the command `check` prints; None if those about the fit say more."""
+        return None
+
+    def outline(self, inputs: I) -> Outline | None:
+        """Shape of the solution, to make products on trial before stars are matched.
+
+        None if the fit is used for that.
+        """
+        return None
+
+    def fit_notes(self, data: FitData, config: C) -> Iterator[tuple[int, str]]:
+        """Level of logging and sentence of each remark on a fit, before it is sampled."""
+        yield from ()
+
+    # -- from the posterior on --------------------------------------------------------------------
+
+    def questions(self, data: FitData, config: C) -> Questions:
+        """What the general diagnostics have to know of a fit."""
+        return Questions()
+
+    def save_diagnosed(
+        self,
+        run: RunDirectory,
+        data: FitData,
+        posterior: Posterior,
+        diagnostics: Diagnostics,
+        config: C,
+    ) -> None:
+        """Write diagnostics that only this kind has, with their sections of summary.json."""
+
+    def predictive(
+        self,
+        posterior: Posterior,
+        diagnostics: Diagnostics,
+        errors: ErrorModel,
+        data: FitData,
+        settings: EvaluationSettings,
+    ) -> Predictive:
+        """Predictive distribution of the assessed solution for the held-out stars.
+
+        Quoted errors and jitter include the distortion that the model leaves out at a position.
+        That error is common to neighbouring stars.
+        """
+        prediction = predictive_of(with_diagnosed_errors(posterior, diagnostics))
+        correlated = diagnostics.correlated
+        rows = None if correlated is None else correlated.facts.get("structure")
+        if not rows:
+            return prediction
+        side = max(row["length_pix"] for row in rows)
+        local = errors.local_tables(settings.grid, settings.epoch)
+        return replace(prediction, local=local, cell=(side, side), local_in_noise=True)
+
+    def error_terms(self, solution: Solution, data: FitData, config: Config) -> list[ErrorTerm]:
+        """Errors of positions beside those of the solution: those that the user states."""
+        return [*config.linear_terms(solution), *config.user_terms(solution.model.unit)]
+
+    def domain(self, data: FitData, config: Config) -> EvaluationDomain:
+        """The exposure that errors are evaluated for."""
+        return EvaluationDomain(single=config.assess.exposure == "single")
+
+    def null_space(self, data: FitData) -> Float | None:
+        """Directions of the parameters (D, k) that only the gauge fixes; None if there are none."""
+        return None
+
+    def checks(self, data: FitData, series: Mapping[str, Any]) -> tuple[Check, ...]:
+        """Checks of matching, exposures and gauge.
+
+        `series` is the section 'time_dependence' of summary.json.
+        """
+        return ()
+
+    def evaluation_sections(self, solution: Solution, config: C) -> dict[str, Any]:
+        """Sections of summary.json about the evaluated solution."""
+        return {}
+
+    def report_parts(
+        self,
+        run: RunDirectory,
+        data: FitData,
+        posterior: Posterior,
+        diagnostics: Diagnostics,
+        epoch: float | None,
+    ) -> dict[str, Any]:
+        """Fields of the content of the report that only this kind has, by their names."""
+        return {}
 
 
-MATCHES = Kind(read=read_stars, match=match_stars, fit=fit_stars, begins_with="fit")
-
-
-@cache
-def _campaign() -> Kind:
-    """Functions of a campaign; imported only when needed, as those of self-calibrations."""
-    from bayesdist.app.kinds.campaign.fit import fit_campaign
-    from bayesdist.app.kinds.campaign.input_validation import refuse_campaign
-    from bayesdist.app.kinds.campaign.inputs import outline_of_campaign, read_campaign
-    from bayesdist.app.kinds.campaign.matched import load_matched_campaign
-    from bayesdist.app.kinds.campaign.matching import campaign_lines, match_lists
-
-    return Kind(
-        read=read_campaign,
-        match=lambda inputs, _: match_lists(inputs),
-        fit=lambda matched, *_: fit_campaign(matched),
-        load_matched=load_matched_campaign,
-        refuse=refuse_campaign,
-        lines=campaign_lines,
-        outline=outline_of_campaign,
-    )
-
-
-@cache
-def _selfcal() -> Kind:
-    """Functions of a self-calibration."""
-    from bayesdist.app.kinds.selfcal.fit import fit_selfcal, load_selfcal, sample_detections
-    from bayesdist.app.kinds.selfcal.inputs import outline_of_selfcal, read_selfcal, refuse_selfcal
-    from bayesdist.app.kinds.selfcal.matched import load_matched_selfcal
-    from bayesdist.app.kinds.selfcal.matching import match_dithers, selfcal_lines
-
-    return Kind(
-        read=read_selfcal,
-        match=lambda inputs, _: match_dithers(inputs),
-        fit=lambda matched, *_: fit_selfcal(matched),
-        sample=sample_detections,
-        load_matched=load_matched_selfcal,
-        load_fitted=load_selfcal,
-        refuse=refuse_selfcal,
-        lines=selfcal_lines,
-        outline=outline_of_selfcal,
-        rows="detections",
-        chooser="limits of residuals",
-    )
-
-
-def kind_of(config: Config) -> Kind:
-    """Kind of run that a configuration describes."""
-    if config.campaign is not None:
-        return _campaign()
-    return _selfcal() if config.selfcal is not None else MATCHES
+def kind_of(config: Config) -> RunKind[Any, Any, Any]:
+    """Kind of run that a configuration describes; it is imported when it is first used."""
+    kind: RunKind[Any, Any, Any] = load_object(config.kind)
+    return kind

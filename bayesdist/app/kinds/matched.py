@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, ClassVar, Self
@@ -12,7 +12,6 @@ from astropy.table import Table
 
 from bayesdist.app.config import Config
 from bayesdist.app.config.fit import HoldoutBlock
-from bayesdist.app.kinds.errors import ExposureScatter
 from bayesdist.app.store.output import write_table
 from bayesdist.assess.terms.parameters import ScaleError
 from bayesdist.data import ReferenceCatalog
@@ -109,7 +108,7 @@ class Matched:
             return table
         return table.with_columns(**dict(zip(names, motions[table.star].T, strict=True)))
 
-    def aberration(self, scatter: ExposureScatter, solution: Solution) -> ScaleError | None:
+    def aberration(self, kinds: Sequence[str], tau: Float, solution: Solution) -> ScaleError | None:
         """Scale error by velocity aberration, a part of the exposure scatter; None if unknown."""
         return None
 

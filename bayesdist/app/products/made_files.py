@@ -10,11 +10,11 @@ from typing import Any
 
 import numpy as np
 
-from bayesdist.app.assessment.error_terms import assessment_epoch
 from bayesdist.app.config import Config
 from bayesdist.app.config.products import ReleaseBlock
-from bayesdist.app.kinds.fit_data import FitData
+from bayesdist.app.kinds.fit_data import FitData, assessment_epoch
 from bayesdist.app.kinds.fitted import Fitted
+from bayesdist.app.kinds.kind import kind_of
 from bayesdist.app.kinds.matched import Outline
 from bayesdist.assess.budget.budget import TOTAL
 from bayesdist.assess.model import with_diagnosed_errors
@@ -115,8 +115,9 @@ def product_input(solution: Solution, data: FitData, config: Config, source: str
     epoch, tables = assessment_epoch(data, config), fitted.tables.tables
     ingredients = _input_of(solution, config, source, plane, data.matched.filter, epoch, tables)
     notes = (fitted.gauge_words,) if fitted.gauge_words else ()
+    aligned = kind_of(config).domain(data, config).aligned
     calibration = replace(ingredients.calibration, notes=notes)
-    return replace(ingredients, calibration=calibration, aligned=fitted.scatter is not None)
+    return replace(ingredients, calibration=calibration, aligned=aligned)
 
 
 def _input_of(
@@ -173,9 +174,7 @@ def solution_of(posterior: Posterior, found: Diagnostics | None, fitted: Fitted)
 
     Neither the catalogue nor the matches are needed.
     """
-    return with_diagnosed_errors(
-        posterior, found, None if fitted.scatter is None else fitted.linear
-    )
+    return with_diagnosed_errors(posterior, found, fitted.hierarchy)
 
 
 def product_of(

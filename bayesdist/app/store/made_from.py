@@ -57,7 +57,7 @@ def base_of(facts: Mapping[str, Any], run: Path) -> Path:
 # stages in order; `revision` is raised when the results or files of a stage change
 STAGES = {
     "match": Stage(revision=2),
-    "fit": Stage(revision=4),
+    "fit": Stage(revision=5),
     "sample": Stage(revision=3, checkpoints=("chain-*.h5",)),
     "diagnose": Stage(revision=7),
     "evaluate": Stage(revision=4),
@@ -120,8 +120,8 @@ def made_from_of(
         Entries of the record: inputs with their hashes, and requirements that replace the
         configured ones.
     """
-    begins_with = () if config.data is not None or stage == "match" else ("match",)
-    if not before.keys() >= {*begins_with, *NEEDS[stage]}:
+    first = {config.begins_with} - {stage, "fit"}
+    if not before.keys() >= {*first, *NEEDS[stage]}:
         return None
     solution, limits, later = settings_of(config)
     configured = [as_json(vars(item)) for item in config.requirements()]
@@ -156,7 +156,7 @@ def _of_diagnoses(later: Mapping[str, Any], own: list[Any], config: Config) -> d
 def _is_on_the_grid(config: Config) -> bool:
     """True if the fit writes errors of tables on the grid of the assessment."""
     tables = config.tables
-    return config.campaign is not None and (tables.method != "none" or tables.detector is not None)
+    return tables.method != "none" or tables.detector is not None
 
 
 def changes(known: Config, now: Config) -> Iterator[tuple[str, Any, Any]]:

@@ -34,23 +34,4 @@ def gauge_of_maps(r: ReportInput) -> str:
     """Sentence on shift and rotation in the maps of the uncertainty; empty without frames."""
     if not r.fit.model.n_frame:
         return ""
-    if r.selfcal is not None:
-        return (
-            "What the gauge holds by convention, shift and rotation of the detector as a whole"
-            " among them unless something fixes them, has no error here."
-        )
-    first = r.fit.model.exposures[0]
-    return (
-        "Shift and rotation of the detector as a whole count as errors here, relative to exposure"
-        f" {first}."
-    )
-
-
-def gauge_of_new_exposure(r: ReportInput) -> str:
-    """Sentence on the exposures for which a campaign's results hold; empty for other runs."""
-    if r.campaign is None:
-        return ""
-    return (
-        "For a new exposure whose shift and rotation are fitted by its user: what a shift"
-        " and a rotation of all chips together take up is no error here."
-    )
+    return r.words.gauge_of_maps.format(first=r.fit.model.exposures[0])

@@ -18,7 +18,7 @@ import bayesdist.products.release
 from bayesdist.app.commands.on_runs.filters import compare_filters
 from bayesdist.app.commands.on_runs.release import _require_alike
 from bayesdist.app.kinds.campaign.reference import held_tables
-from bayesdist.app.kinds.fitted import StoredLookupTables, read_tables, write_tables
+from bayesdist.app.kinds.parts import StoredLookupTables, read_tables, write_tables
 from bayesdist.app.results import results_of
 from bayesdist.app.store.rundir import RunDirectory
 from bayesdist.assess import LocalErrors

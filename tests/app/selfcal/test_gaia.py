@@ -84,12 +84,12 @@ def test_other_gaia_stars_move_as_was_found(solved, capsys):
     pixels of what the observatory's solution has left: places differ by more than their errors.
     """
     results, others = solved
-    stars = star_catalogue(results.fitted.solved.mode)
+    stars = star_catalogue(results.fitted.parts["solved"].mode)
     there: ReferenceCatalog = others.at(stars.epoch)
     tree = cKDTree(stars.values[:, :2])
     distance, which = tree.query(np.column_stack([there.u, there.v]), distance_upper_bound=0.08)
     pairs = np.flatnonzero(np.isfinite(distance))
-    pairs = pairs[~results.fitted.solved.mode.problem.priors.informed[which[pairs]]]
+    pairs = pairs[~results.fitted.parts["solved"].mode.problem.priors.informed[which[pairs]]]
     which = which[pairs]
     found = {}
     for name, first in (("place", 0), ("motion", 2)):

@@ -67,7 +67,7 @@ def test_the_distortion_is_that_of_the_observatory(run, data_dir, capsys):
     nodes = (np.arange(CELLS) + 0.5) * SIDE / CELLS
     rows = np.unique([np.argmin((x - a) ** 2 + (y - b) ** 2) for a in nodes for b in nodes])
     x, y, theirs = x[rows], y[rows], np.column_stack([u, v])[rows]
-    relative = gauge_free(results.solution, results.fitted.solved.gauge.null)
+    relative = gauge_free(results.solution, results.fitted.parts["solved"].gauge.null)
     model, K = relative.model, relative.model.n_polynomial
     first = np.zeros(len(x), np.int64)
     ours = model.predict(relative.mean, x, y, exposure=first)

@@ -43,7 +43,7 @@ def test_the_distortion_is_within_its_errors(name, kind, n_free, request):
     """Chi-square of the coefficients, but for the sky's free maps, which theta's null space has."""
     finished = request.getfixturevalue(name)
     results = results_of(RunDirectory.open(finished.path))
-    posterior, gauge = results.posterior, results.fitted.solved.gauge
+    posterior, gauge = results.posterior, results.fitted.parts["solved"].gauge
     assert gauge.null.shape[1] == gauge.open.shape[1] == n_free
     relative = gauge_free(results.solution, gauge.null)
     model, truth = posterior.model, finished.truth
@@ -92,9 +92,13 @@ def test_functions_find_what_the_run_has_found(one_roll):
     np.testing.assert_array_equal(fitted.linear.mean, known.mean)
     np.testing.assert_array_equal(fitted.linear.cov, known.cov)
     results = results_of(RunDirectory.open(one_roll.path))
-    np.testing.assert_array_equal(fitted.solved.mode.stars, results.fitted.solved.mode.stars)
-    np.testing.assert_array_equal(fitted.solved.gauge.held, results.fitted.solved.gauge.held)
-    assert fitted.solved.fixed == results.fitted.solved.fixed
+    np.testing.assert_array_equal(
+        fitted.parts["solved"].mode.stars, results.fitted.parts["solved"].mode.stars
+    )
+    np.testing.assert_array_equal(
+        fitted.parts["solved"].gauge.held, results.fitted.parts["solved"].gauge.held
+    )
+    assert fitted.parts["solved"].fixed == results.fitted.parts["solved"].fixed
     made, read = FitData(matched, fitted).stars, results.data.stars
     for name in ("x", "u", "sigma_u", "exposure", "row"):
         np.testing.assert_array_equal(getattr(made, name), getattr(read, name))
@@ -106,7 +110,7 @@ def test_stars_are_where_they_were(three_rolls):
     """But for a similarity of the sky, and by the errors of their own detections."""
     stars, truth = Table.read(three_rolls.path / "stars.ecsv"), three_rolls.truth
     found = np.column_stack([stars["u"], stars["v"]])
-    problem = results_of(RunDirectory.open(three_rolls.path)).fitted.solved.mode.problem
+    problem = results_of(RunDirectory.open(three_rolls.path)).fitted.parts["solved"].mode.problem
     every = np.split(truth.detections.star[problem.rows], problem.starts[1:-1])
     whose = np.array([np.median(one) for one in every]).astype(int)
     assert len(np.unique(whose)) == len(whose) == len(stars)
@@ -306,7 +310,7 @@ def test_new_matches_on_another_sky_test_the_release(bend, three_rolls, tmp_path
 def test_more_exposures_are_planned_as_these_are_dithered(three_rolls):
     """Once more as many exposures halve the variance: as a limit by the root of 2 nearer asks."""
     results = results_of(RunDirectory.open(three_rolls.path))
-    mode = results.fitted.solved.mode
+    mode = results.fitted.parts["solved"].mode
     n = mode.problem.model.n_distortion
     more = with_information(mode.solution, mode.distortion_information)
     before, after = (np.diag(one.cov)[:n] for one in (mode.solution, more))
@@ -336,7 +340,7 @@ def test_residuals_are_about_the_stars_that_were_fitted(three_rolls):
     """The residuals of a star have no mean: about the mean of the draws they would have one."""
     results = results_of(RunDirectory.open(three_rolls.path))
     sample = results.diagnostics.sample
-    problem = results.fitted.solved.mode.problem
+    problem = results.fitted.parts["solved"].mode.problem
     n, star = len(problem.starts) - 1, np.empty(problem.rows.max() + 1, int)
     star[problem.rows] = np.repeat(np.arange(n), np.diff(problem.starts))
     assert set(sample.table.row) == set(problem.rows)

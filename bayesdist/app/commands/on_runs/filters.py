@@ -12,7 +12,8 @@ from pathlib import Path
 import numpy as np
 from astropy.table import Table
 
-from bayesdist.app.kinds.fitted import Fitted, required
+from bayesdist.app.kinds.campaign.parts import ExposuresAlone
+from bayesdist.app.kinds.fitted import Fitted
 from bayesdist.errors import InputError
 from bayesdist.infer.series import FilterDependence, Series, TrendModel, filter_dependence
 from bayesdist.infer.solution.solution import Solution
@@ -246,7 +247,7 @@ def draw_filters(
         for chip in sorted(model.chips, key=lambda c: c.name):
             for name, fitted in fits.items():
                 label = f"{chip.name}.{term}"
-                series = required(fitted.alone, "fits of single exposures")
+                series = fitted.part(ExposuresAlone).series
                 if label not in series.coefficients:
                     continue
                 segments = [lines(views[name], s, chip=chip.number) for s in range(time.n_segments)]

@@ -11,7 +11,8 @@ from astropy.table import Table
 
 from bayesdist.app.commands.on_runs.compare import joined
 from bayesdist.app.config import Config, load_config
-from bayesdist.app.kinds.fitted import load_errors, required
+from bayesdist.app.kinds.campaign.parts import ExposureScatter
+from bayesdist.app.kinds.fitted import load_errors
 from bayesdist.app.kinds.matches.sources import read_configured
 from bayesdist.app.results import Results, results_of
 from bayesdist.app.store.keys import attributes
@@ -375,7 +376,7 @@ def fit_new_exposures(release: Results, new: Path) -> tuple[Matches, NewFit, tup
         errors = load_errors(run.path).by_magnitude or errors
     if placed.mag is not None and errors is not None:
         placed = placed.with_errors(errors, in_quadrature=True)
-    scatter = required(fitted.scatter, "joint fit of exposures")
+    scatter = fitted.part(ExposureScatter)
     new_fit = fit_new(
         released,
         placed,

@@ -25,6 +25,7 @@ from bayesdist.infer.compare.planning import (
     exposure_information,
     with_information,
 )
+from bayesdist.infer.selfcal import SelfCalibrationMode
 from bayesdist.infer.solution.solution import Solution
 from bayesdist.utils.arrays import Float
 
@@ -50,27 +51,12 @@ def plan(run: str | Path, *, name: str | None = None, epochs: Sequence[float] = 
         )
     with open_results(RunDirectory.open(run)) as results:
         results.run.require("plan", ("fit", "sample", "diagnose", "evaluate"))
-        solved = results.fitted.solved
-        if solved is not None and epochs:
-            raise InputError(
-                "is a run of a self-calibration, whose exposures count as those at hand with their "
-                "dates",
-                where=str(run),
-                do="leave --epochs out",
-            )
-        if epochs and results.solution.model.time is None:
-            raise InputError(
-                "does not depend on time, so that the dates of further exposures do not matter",
-                where=str(run),
-                do="leave --epochs out",
-            )
+        exposures = _exposures_of(results)
+        if epochs and exposures.dateless:
+            raise InputError(exposures.dateless, where=str(run), do="leave --epochs out")
         content = content_of(results)
         needs = needs_of(results, content, name=name, epochs=epochs)
-    if solved is None:
-        lines = [f"An exposure is taken to hold {content.n_stars:.0f} matched stars as these do."]
-    else:
-        n = len(solved.mode.problem.model.exposures)
-        lines = [f"Exposures are taken to be dithered as these {n} are, over the same stars."]
+        lines = [exposures.sentence(content)]
     for requirement, several in needs:
         lines.append("")
         lines.append(f"{requirement.name} (probability {requirement.probability:g} asked for)")
@@ -145,7 +131,7 @@ def content_of(results: Results) -> ExposureContent:
         stars.table,
         true[:, None] / (sigma**2 + jitter**2),
         n_total=stars.n_total,
-        n_exposures=_n_exposures(results),
+        n_exposures=_exposures_of(results).count,
     )
 
 
@@ -156,29 +142,7 @@ def schedules_of(
     epochs: Sequence[float] = (),
 ) -> list[Schedule]:
     """Schedules of exposures: at relevant dates, or one schedule if dates do not matter."""
-    solution, epoch, solved = results.solution, results.epoch, results.fitted.solved
-    if solved is not None:
-        # a single exposure is informative only about stars in other exposures
-        information = solved.mode.gain * solved.mode.distortion_information / _n_exposures(results)
-        further = further_dithers(solved.mode, results.config.sampler.seed)
-        return [Schedule("dithered like these", information, together=further)]
-
-    def worth(date: float | None) -> Float:
-        return exposure_information(solution, content, date)
-
-    if solution.model.time is None or epoch is None:
-        return [Schedule("at any date", worth(None))]
-    wanted = requirement.epoch or (requirement.epochs or [epoch])[-1]
-    last = float(np.max(results.diagnostics.sample.table.column("epoch")))
-    schedules = [
-        Schedule(f"at {date:.2f}", worth(date), single_date=True)
-        for date in dict.fromkeys([*epochs, wanted])
-    ]
-    if wanted > last:
-        spread = [worth(float(date)) for date in np.linspace(last, wanted, LATER + 1)[1:]]
-        name = f"evenly from {last:.2f} to {wanted:.2f}"
-        schedules.append(Schedule(name, np.sum(spread, axis=0) / len(spread)))
-    return schedules
+    return _exposures_of(results).schedules(requirement, content, epochs)
 
 
 def futures_of(results: Results, content: ExposureContent) -> Callable[[Requirement], Futures]:
@@ -186,7 +150,7 @@ def futures_of(results: Results, content: ExposureContent) -> Callable[[Requirem
     settings, errors = results.settings, results.errors
     errors = with_measured_centroids(errors, results.diagnostics, settings)
     diagnostics = results.diagnostics
-    hierarchy = results.fitted.linear if results.fitted.scatter is not None else None
+    hierarchy = results.fitted.hierarchy
     # further exposures of the same stars do not reduce the effect of catalogue errors
     independent = with_diagnosed_errors(
         results.posterior, replace(diagnostics, catalogue=None), hierarchy, noise_alone=True
@@ -198,8 +162,7 @@ def futures_of(results: Results, content: ExposureContent) -> Callable[[Requirem
             return extended
         return with_shared_stars(extended, hierarchy, diagnostics.catalogue)
 
-    solved = results.fitted.solved
-    gain = 1.0 if solved is None else solved.mode.gain
+    exposures = _exposures_of(results)
     weight = np.mean([np.sum([m[axis, 0, 0] for m in content.moments.values()]) for axis in (0, 1)])
     seed = int(assessment_rng(results.config).integers(2**63))
 
@@ -207,7 +170,7 @@ def futures_of(results: Results, content: ExposureContent) -> Callable[[Requirem
         return Futures(
             errors,
             requirement,
-            Data(_n_exposures(results), float(weight), content.n_stars, gain),
+            Data(exposures.count, float(weight), content.n_stars, exposures.gain),
             solution,
             settings.grid,
             settings.epoch,
@@ -218,9 +181,85 @@ def futures_of(results: Results, content: ExposureContent) -> Callable[[Requirem
     return of
 
 
-def _n_exposures(results: Results) -> int:
-    """Number of exposures of the run."""
-    solved = results.fitted.solved
-    if solved is not None:
-        return len(solved.mode.problem.model.exposures)
-    return max(len(results.data.placed.exposure_names), 1)
+class _Exposures:
+    """Exposures of a run with a catalogue; further ones have stars like theirs."""
+
+    gain = 1.0
+
+    def __init__(self, results: Results) -> None:
+        self.results = results
+
+    @property
+    def count(self) -> int:
+        """Number of exposures of the run."""
+        return max(len(self.results.data.placed.exposure_names), 1)
+
+    @property
+    def dateless(self) -> str:
+        """Clause on why dates of further exposures do not matter; empty if they do."""
+        if self.results.solution.model.time is not None:
+            return ""
+        return "does not depend on time, so that the dates of further exposures do not matter"
+
+    def sentence(self, content: ExposureContent) -> str:
+        """Sentence on the exposures that are assumed."""
+        return f"An exposure is taken to hold {content.n_stars:.0f} matched stars as these do."
+
+    def schedules(
+        self, requirement: Requirement, content: ExposureContent, epochs: Sequence[float]
+    ) -> list[Schedule]:
+        """Schedules at relevant dates, or one schedule if dates do not matter."""
+        solution, epoch = self.results.solution, self.results.epoch
+
+        def worth(date: float | None) -> Float:
+            return exposure_information(solution, content, date)
+
+        if solution.model.time is None or epoch is None:
+            return [Schedule("at any date", worth(None))]
+        wanted = requirement.epoch or (requirement.epochs or [epoch])[-1]
+        last = float(np.max(self.results.diagnostics.sample.table.column("epoch")))
+        schedules = [
+            Schedule(f"at {date:.2f}", worth(date), single_date=True)
+            for date in dict.fromkeys([*epochs, wanted])
+        ]
+        if wanted > last:
+            spread = [worth(float(date)) for date in np.linspace(last, wanted, LATER + 1)[1:]]
+            name = f"evenly from {last:.2f} to {wanted:.2f}"
+            schedules.append(Schedule(name, np.sum(spread, axis=0) / len(spread)))
+        return schedules
+
+
+class _DitheredExposures(_Exposures):
+    """Exposures of a self-calibration; each is informative about stars in other exposures only."""
+
+    dateless = (
+        "is a run of a self-calibration, whose exposures count as those at hand with their dates"
+    )
+
+    def __init__(self, results: Results, mode: SelfCalibrationMode) -> None:
+        super().__init__(results)
+        self.mode, self.gain = mode, mode.gain
+
+    @property
+    def count(self) -> int:
+        """Number of exposures of the run."""
+        return len(self.mode.problem.model.exposures)
+
+    def sentence(self, content: ExposureContent) -> str:
+        """Sentence on the exposures that are assumed."""
+        return f"Exposures are taken to be dithered as these {self.count} are, over the same stars."
+
+    def schedules(
+        self, requirement: Requirement, content: ExposureContent, epochs: Sequence[float]
+    ) -> list[Schedule]:
+        """One schedule, of the same dithers."""
+        information = self.gain * self.mode.distortion_information / self.count
+        further = further_dithers(self.mode, self.results.config.sampler.seed)
+        return [Schedule("dithered like these", information, together=further)]
+
+
+def _exposures_of(results: Results) -> _Exposures:
+    """Exposures of a run, with what further ones like them are worth."""
+    mode = results.kind.questions(results.data, results.config).eliminated
+    # exposures without a catalogue are informative only together, which is another computation
+    return _Exposures(results) if mode is None else _DitheredExposures(results, mode)

@@ -17,7 +17,8 @@ from bayesdist.app.commands.on_runs.filters import (
     draw_filters,
 )
 from bayesdist.app.config.products import ReleaseBlock
-from bayesdist.app.kinds.fitted import Fitted, required
+from bayesdist.app.kinds.campaign.parts import ExposuresAlone
+from bayesdist.app.kinds.fitted import Fitted
 from bayesdist.app.products.made_files import write_files
 from bayesdist.app.results import Results, results_of
 from bayesdist.app.screen import table_text
@@ -231,7 +232,7 @@ def _compared(by_filter: Mapping[str, Results]) -> tuple[FilterComparison | None
     try:
         comparison = compare_filters(
             {
-                name: required(results.fitted.alone, "fits of single exposures")
+                name: results.fitted.part(ExposuresAlone).series
                 for name, results in by_filter.items()
             },
             first.posterior.model.time,

@@ -11,9 +11,10 @@ from bayesdist.app.kinds.campaign.input_validation import frames_not_set
 from bayesdist.app.kinds.campaign.inputs import Inputs
 from bayesdist.app.kinds.campaign.linear_terms import FIXED, gap_priors, line_sections, with_gap
 from bayesdist.app.kinds.campaign.matched import CampaignMatched
+from bayesdist.app.kinds.campaign.parts import ExposuresAlone, ExposureScatter
 from bayesdist.app.kinds.campaign.reference import rate_priors
 from bayesdist.app.kinds.campaign.tables import fit_tables, scatter_by_magnitude, tables_section
-from bayesdist.app.kinds.errors import ErrorLaw, ExposureScatter
+from bayesdist.app.kinds.errors import ErrorLaw
 from bayesdist.app.kinds.fitted import Fitted
 from bayesdist.data import centroid_errors
 from bayesdist.data.matches import Matches
@@ -69,9 +70,11 @@ def _fitted(matched: CampaignMatched) -> Fitted:
         joint.fit,
         errors,
         joint.priors,
-        tables=tables,
-        scatter=ExposureScatter(joint.scatter.kinds, joint.tau_draws, joint.settling),
-        alone=_series(alone, joint.model.chips[0]),
+        parts={
+            "tables": tables,
+            "scatter": ExposureScatter(joint.scatter.kinds, joint.tau_draws, joint.settling),
+            "alone": ExposuresAlone(_series(alone, joint.model.chips[0])),
+        },
         facts=facts,
     )
 

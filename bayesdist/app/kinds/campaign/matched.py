@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
@@ -13,7 +13,6 @@ import numpy as np
 
 from bayesdist.app.config import CampaignConfig
 from bayesdist.app.kinds.campaign.inputs import Inputs, errors_by_star
-from bayesdist.app.kinds.errors import ExposureScatter
 from bayesdist.app.kinds.matched import Matched, set_aside
 from bayesdist.app.kinds.star_lists import known_calibration
 from bayesdist.app.store.rundir import PAIRS, part_files
@@ -25,6 +24,7 @@ from bayesdist.infer import Posterior
 from bayesdist.infer.catalogue.star_errors import StarErrors
 from bayesdist.infer.solution.solution import Solution
 from bayesdist.model import DistortionModel, LookupTable
+from bayesdist.utils.arrays import Float
 
 GAUGE_EXPOSURES = 1  # leading exposures that define the gauge and cannot be held out
 
@@ -59,9 +59,9 @@ class CampaignMatched(Matched):
         """Errors of the catalogue by star code; None if there are none."""
         return errors_by_star(self.inputs.catalog, self.inputs.largest_vafactor)
 
-    def aberration(self, scatter: ExposureScatter, solution: Solution) -> ScaleError:
+    def aberration(self, kinds: Sequence[str], tau: Float, solution: Solution) -> ScaleError:
         """Scale error by velocity aberration, which is a part of the exposure scatter."""
-        return aberration_term(scatter, self.inputs, solution)
+        return aberration_term(kinds, tau, self.inputs, solution)
 
     def overlap(self, posterior: Posterior, tables: tuple[LookupTable, ...]) -> OverlapTest | None:
         """Comparison of two exposures far apart in time; None if there is no such pair."""
@@ -135,7 +135,9 @@ def scale_error(exptime: float | None) -> float:
     return min(spread, spread * 2 * math.pi / PERIOD * exptime / math.sqrt(12))
 
 
-def aberration_term(scatter: ExposureScatter, inputs: Inputs, solution: Solution) -> ScaleError:
+def aberration_term(
+    kinds: Sequence[str], tau: Float, inputs: Inputs, solution: Solution
+) -> ScaleError:
     """Scale error by residual velocity aberration, limited to the measured scatter in scale.
 
     VAFACTOR holds for one instant, but the velocity of a telescope in a low orbit changes direction
@@ -155,8 +157,8 @@ def aberration_term(scatter: ExposureScatter, inputs: Inputs, solution: Solution
         source += f", over {seconds:.0f} s"
         if not times:
             source += " (assumed: the log has no times)"
-    if "scale" in scatter.kinds:
-        scale_draws = scatter.tau[:, scatter.kinds.index("scale")]
+    if "scale" in kinds:
+        scale_draws = tau[:, kinds.index("scale")]
         measured = float(np.sqrt(np.mean(scale_draws**2)))
         if measured < sigma:
             sigma, source = measured, f"{source}, and no more than exposures scatter"

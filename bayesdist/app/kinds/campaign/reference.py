@@ -8,7 +8,8 @@ from bayesdist.app.config import Config
 from bayesdist.app.config.model import TablesBlock
 from bayesdist.app.config.run import TABLES, rates_file, tables_file
 from bayesdist.app.kinds.campaign.linear_terms import with_gap
-from bayesdist.app.kinds.fitted import converged_posterior, read_tables
+from bayesdist.app.kinds.fitted import converged_posterior
+from bayesdist.app.kinds.parts import read_tables
 from bayesdist.errors import InputError
 from bayesdist.formats.lookup.d2im import read_d2im
 from bayesdist.infer import GaussianPriors

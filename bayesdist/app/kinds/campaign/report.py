@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from typing import Any, cast
+
 import numpy as np
 from astropy.table import Table
 
 from bayesdist.app.config import CampaignConfig
 from bayesdist.app.kinds.campaign.inputs import Inputs
-from bayesdist.app.kinds.campaign.matched import affine_model_of
+from bayesdist.app.kinds.campaign.matched import CampaignMatched, affine_model_of
 from bayesdist.app.kinds.fit_data import FitData
 from bayesdist.app.store import as_json
 from bayesdist.app.store.rundir import RunDirectory
@@ -22,6 +24,7 @@ from bayesdist.infer.solution.linear import Rejection
 from bayesdist.model import DistortionModel
 from bayesdist.model.grid import outline_pixels
 from bayesdist.report.context import (
+    PAIRED,
     CampaignResults,
     CatalogStars,
     ChipResiduals,
@@ -37,17 +40,15 @@ HELD_BY_PRIOR = 0.99  # ratio to the prior sigma above which the data determine 
 WIDEST_CELL = 8  # largest factor on the size of cells
 
 
-def campaign_results(
-    run: RunDirectory,
-    inputs: Inputs,
-    data: FitData,
-    posterior: Posterior,
-    overlap: OverlapTest | None,
-) -> CampaignResults:
-    """Content that a campaign adds to the report of its run."""
-    model, fitted, matched = posterior.model, data.fitted, data.matched
+def report_fields(
+    run: RunDirectory, data: FitData, posterior: Posterior, overlap: OverlapTest | None
+) -> dict[str, Any]:
+    """Fields of the content of the report: catalogue, tables and series, and the words."""
+    model, fitted = posterior.model, data.fitted
+    matched = cast(CampaignMatched, data.matched)
+    inputs = matched.inputs
     matching = read_ecsv(run / "matching.ecsv")
-    return CampaignResults(
+    results = CampaignResults(
         summary=dict(run.summary),
         config=as_json(run.config.model_dump(exclude_none=True)),
         filter=matched.filter,
@@ -62,8 +63,9 @@ def campaign_results(
         tables=fitted.tables.tables,
         series=_series(run, fitted.linear.model, matching),
         overlap=overlap,
-        held=held_parameters(fitted.linear, fitted.priors),
     )
+    held = frozenset(held_parameters(fitted.linear, fitted.priors))
+    return {"campaign": results, "held": held, "words": PAIRED}
 
 
 def held_parameters(fit: LinearFit, priors: GaussianPriors) -> tuple[str, ...]:

@@ -12,7 +12,7 @@ from bayesdist.app.config import Config
 from bayesdist.app.kinds.campaign.inputs import Inputs
 from bayesdist.app.kinds.campaign.matched import CampaignMatched
 from bayesdist.app.kinds.campaign.reference import held_tables
-from bayesdist.app.kinds.fitted import StoredLookupTables
+from bayesdist.app.kinds.parts import StoredLookupTables
 from bayesdist.data.magnitude_errors import MagnitudeErrors
 from bayesdist.data.matches import Matches
 from bayesdist.diagnose.tables.between_nodes import BetweenNodes

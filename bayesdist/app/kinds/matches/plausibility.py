@@ -8,6 +8,7 @@ import numpy as np
 from numpy.polynomial import legendre
 
 from bayesdist.app.config import Config
+from bayesdist.app.kinds.sampling import doubts_on_numbers, n_terms
 from bayesdist.data import Matches
 from bayesdist.errors import InputError
 from bayesdist.model import DistortionModel, TimeDependence
@@ -22,7 +23,6 @@ HALF_TURN = 180.0  # degrees: largest plausible extent of u and v
 IN_DEGREES = {"deg": 1.0, "arcsec": 1 / 3600, "mas": 1 / 3.6e6}
 MADE_FROM_PIXELS = 1e-3  # pixels: smaller scatter means that positions were computed from pixels
 FAR_BELOW = 0.1  # such a scatter is also below this fraction of the quoted errors
-STARS_PER_TERM = 3  # fewest stars per term and axis for which residuals show the errors
 ORDER = 4
 # rounds of rejection in estimates of the scatter, and in comparisons of orders
 ROUNDS, ORDER_ROUNDS = 20, 6
@@ -60,21 +60,6 @@ def _doubts(stars: Matches, model: DistortionModel, scale_mas: float | None) -> 
     yield from _doubts_on_scale(stars, scale, unit, scale_mas)
     yield from _doubts_on_errors(stars, scale)
     yield from _doubts_on_scatter(stars, scale)
-
-
-def doubts_on_numbers(stars: Matches, model: DistortionModel) -> Iterator[str]:
-    """Sentences about chips with fewer than three stars per polynomial term and axis."""
-    terms = n_terms(model.order)
-    needed = STARS_PER_TERM * terms
-    counts = dict(zip(stars.chip_numbers, np.bincount(stars.chip), strict=False))
-    for chip in model.chips:
-        n_stars = int(counts.get(chip.number, 0))
-        if n_stars < needed:
-            yield (
-                f"chip {chip.name} has {n_stars} stars for {terms} terms on each axis (order "
-                f"{model.order}), and {needed} or more are advisable: the posterior may be far "
-                "from normal and sampling slow; lower model.order, or add stars"
-            )
 
 
 def _scale(stars: Matches) -> float | None:
@@ -240,11 +225,6 @@ def scatter_about_polynomials(table: Matches) -> float | None:
     if not residuals:
         return None
     return float(f"{_robust(np.concatenate(residuals)):.2g}")
-
-
-def n_terms(order: int) -> int:
-    """Number of terms of a polynomial on one axis."""
-    return len(polynomial_terms(order))
 
 
 def _scatter_about(table: Matches, rows: Int, order: int) -> float:

@@ -3,22 +3,18 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable
 from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
-
 from bayesdist.app.config import Config, MatchesConfig
 from bayesdist.app.config.run import POSTERIOR, calibration_file
 from bayesdist.app.kinds.errors import QUOTED, ErrorLaw
-from bayesdist.app.kinds.fit_data import FitData, StarReader
-from bayesdist.app.kinds.fitted import FIT, Fitted, converged_posterior
+from bayesdist.app.kinds.fit_data import StarReader
+from bayesdist.app.kinds.fitted import FIT, Fitted, converged_posterior, load_fitted
 from bayesdist.app.kinds.matched import Matched, set_aside
 from bayesdist.app.kinds.matches.added_errors import compared_errors, in_circle
 from bayesdist.app.kinds.matches.plausibility import (
-    doubts_on_numbers,
     refuse_empty_segments,
     refuse_stars,
 )
@@ -35,13 +31,11 @@ from bayesdist.errors import ConfigError, DegenerateError, NotSettledError
 from bayesdist.infer import (
     GaussianPriors,
     LinearFit,
-    Posterior,
     Shards,
     build_model,
     fit_by_magnitude,
     fit_linear,
     load_fit,
-    sample,
 )
 from bayesdist.infer.exposures.frame_choice import frames_that_help
 from bayesdist.infer.solution.geometry import geometries, refuse_geometry
@@ -50,8 +44,6 @@ from bayesdist.model import DistortionModel
 from bayesdist.products.registry import read_calibration
 
 log = logging.getLogger("bayesdist")
-
-SAMPLING = 1  # number of the random stream of the stage 'sample', derived from the seed
 
 
 def match_stars(stars: Matches, config: MatchesConfig) -> Matched:
@@ -198,35 +190,6 @@ def priors_of(model: DistortionModel, config: Config) -> GaussianPriors:
     return GaussianPriors.of(model, {p.parameter: (p.mean, p.sigma) for p in config.prior})
 
 
-def sample_stars(
-    data: FitData,
-    config: Config,
-    *,
-    folder: Path | None = None,
-    progress: Callable[[int, int], None] | None = None,
-) -> Posterior:
-    """Sample the posterior of a fit.
-
-    If exposures were fitted jointly, each chip has its mean position over the exposures.
-    """
-    for text in doubts_on_numbers(data.sample, data.model):
-        log.warning("sample: %s", text)
-    posterior = sample(
-        data.fit,
-        data.shards,
-        outliers=config.mixture(data.matched.stars.match_radius),
-        priors=data.fitted.priors,
-        folder=folder,
-        progress=progress,
-        **config.sampler.model_dump(),
-    )
-    if data.fitted.scatter is None:
-        return posterior
-    return data.fitted.scatter.averaged(
-        posterior, np.random.default_rng([config.sampler.seed, SAMPLING])
-    )
-
-
 def earlier_calibration(
     model: DistortionModel, config: Config, base: Path
 ) -> CalibrationPrior | None:
@@ -258,6 +221,5 @@ def _calibration(path: Path, filter: str | None) -> Calibration:
         run.require("prior_calibration", ("fit", "sample", "diagnose"))
         fit = load_fit(folder / FIT)
         diagnostics = load_diagnostics(run, fit, posterior)
-        hierarchy = fit if run.config.campaign is not None else None
-        posterior = with_diagnosed_errors(posterior, diagnostics, hierarchy)
+        posterior = with_diagnosed_errors(posterior, diagnostics, load_fitted(folder).hierarchy)
     return calibration_of(posterior, str(folder))

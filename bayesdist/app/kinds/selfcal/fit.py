@@ -13,16 +13,10 @@ from numpy.typing import NDArray
 from bayesdist.app.config import Config
 from bayesdist.app.kinds.errors import ErrorLaw
 from bayesdist.app.kinds.fit_data import FitData
-from bayesdist.app.kinds.fitted import (
-    FIT_AGAIN,
-    SOLUTION,
-    Fitted,
-    SelfCalibrated,
-    load_fitted,
-    required,
-)
+from bayesdist.app.kinds.fitted import FIT_AGAIN, Fitted, load_fitted
 from bayesdist.app.kinds.selfcal.gauge import fixed_by, gauge_summary, gauge_table, gauge_words
 from bayesdist.app.kinds.selfcal.matched import SelfcalMatched, magnitude_errors_of, matches_of
+from bayesdist.app.kinds.selfcal.solved import SOLUTION, SelfCalibrated
 from bayesdist.files.hdf5 import read_arrays
 from bayesdist.infer import Compute, GaussianPriors, Posterior
 from bayesdist.infer.selfcal import SelfCalibrationMode, sample_selfcal
@@ -58,7 +52,8 @@ def load_selfcal(folder: Path, matched: Callable[[], SelfcalMatched]) -> Fitted:
     matches = matched()
     compute = matches.inputs.config.resources()
     arrays = read_arrays(folder / SOLUTION, "", "a solution of detections", ARRAYS, do=FIT_AGAIN)
-    return replace(fitted, solved=solved_of(matches, fitted.linear.model, arrays, compute))
+    solved = solved_of(matches, fitted.linear.model, arrays, compute)
+    return replace(fitted, parts={"solved": solved})
 
 
 def solved_of(
@@ -125,7 +120,7 @@ def fit_selfcal(matched: SelfcalMatched) -> Fitted:
         mode.solution,
         ErrorLaw(by_magnitude=magnitude_errors_of(solved.mode, solved.matches)),
         GaussianPriors.none(model),
-        solved=solved,
+        parts={"solved": solved},
         facts={"selfcal": {**matched.facts, "gauge": summary}},
     )
 
@@ -139,7 +134,7 @@ def sample_detections(
 ) -> Posterior:
     """Sample the posterior of a self-calibration, with errors in the unit of u, v."""
     return sample_selfcal(
-        required(data.fitted.solved, "solution of detections").mode,
+        data.fitted.part(SelfCalibrated).mode,
         outliers=config.mixture(),
         **config.sampler.model_dump(),
         folder=folder,

@@ -11,7 +11,7 @@ import numpy as np
 from astropy.table import Column, Table
 from astropy.units import Unit
 
-from bayesdist.app.kinds.fitted import SelfCalibrated
+from bayesdist.app.kinds.selfcal.solved import SelfCalibrated
 from bayesdist.app.store.output import write_table
 from bayesdist.data import ReferenceCatalog
 from bayesdist.data.storage.write import write_columns

@@ -23,7 +23,6 @@ from bayesdist.report.plots.errors import (
     plot_budget,
     row_per_axis,
 )
-from bayesdist.report.sections.gauge import gauge_of_new_exposure
 from bayesdist.report.texttable import TextTable
 from bayesdist.utils.arrays import Float
 from bayesdist.utils.numbers import (
@@ -119,7 +118,7 @@ def _table(
         note="Per axis: rms of u and v; CE68, CE95: circles that hold 68 and 95 % of errors of that"
         " size, if Gaussian. The parts of the model are correlated and enter the total jointly, by"
         " draws; independent terms add in quadrature. The total therefore need not be the root"
-        f" of the sum of squares.{_of_products(rows)} {gauge_of_new_exposure(r)}".rstrip()
+        f" of the sum of squares.{_of_products(rows)} {r.words.new_exposure}".rstrip()
         + _focal_plane(r),
     )
 

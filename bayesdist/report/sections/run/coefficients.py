@@ -91,15 +91,7 @@ def _held_note(r: ReportInput, names: list[str]) -> str:
         f"{term} ({', '.join(kinds)})" if term else ", ".join(kinds)
         for term, kinds in terms.items()
     ]
-    if r.selfcal is not None:
-        return (
-            "Held by the gauge, and therefore not shown: the detections say nothing of what these"
-            f" parameters stand for: {'; '.join(texts)}."
-        )
-    return (
-        "Held, and therefore not shown: a prior alone says what these parameters are, and the data"
-        f" add nothing to it: {'; '.join(texts)}."
-    )
+    return f"{r.words.held}: {'; '.join(texts)}."
 
 
 def _readable(row: Any) -> tuple[float, str]:

@@ -139,7 +139,7 @@ def residuals_by_magnitude(r: ReportInput) -> Plot:
     )
 
 
-@REPORT.figure("data", printed=lambda r: r.campaign is None)
+@REPORT.figure("data", printed=lambda r: r.words.prints_data)
 def coverage(r: ReportInput) -> Plot:
     """Map of the number of stars in each cell of the detector."""
     grids = [Grid(c.binned.x, c.binned.y, np.asarray(c.binned.count, float)) for c in r.chips]

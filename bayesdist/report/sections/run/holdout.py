@@ -82,7 +82,7 @@ def _question(test: HeldTest, unit: str) -> str:
     }[test.name]
 
 
-@REPORT.figure("holdout", needs=("held_out",), printed=lambda r: r.campaign is None)
+@REPORT.figure("holdout", needs=("held_out",), printed=lambda r: r.words.prints_data)
 def holdout(r: ReportInput) -> Plot:
     """Predictive probabilities, and residuals by region in units of their prediction."""
     stars, mosaic = needed(r.held_out), r.mosaic

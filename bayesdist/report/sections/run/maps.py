@@ -94,11 +94,8 @@ def uncertainty_radius(r: ReportInput) -> Plot:
         " holds 68 % has 1.51 times this as its radius where both axes are alike, that of 95 %"
         " 2.45 times."
     )
-    if r.selfcal is not None:
-        text += (
-            " That of relative positions is the same in any gauge of shift, rotation and scale (and"
-            " skew, where all exposures have one roll angle); the other is that of the run's gauge."
-        )
+    if r.words.relative_map:
+        text += r.words.relative_map
         return Plot(figure, "Uncertainty over the detector", text, f"Contour maps. {text}")
     pairs = [(c.formal_map, c.posterior_map) for c in r.chips]
     ratios = [p.radius / f.radius for f, p in pairs if p is not None]

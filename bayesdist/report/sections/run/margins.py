@@ -8,7 +8,6 @@ from bayesdist.report.contents import REPORT, Plot
 from bayesdist.report.context import ReportInput
 from bayesdist.report.figures.style import WIDTH, new_figure
 from bayesdist.report.plots.errors import plot_margins, plot_validity
-from bayesdist.report.sections.gauge import gauge_of_new_exposure
 from bayesdist.report.texttable import TextTable, tabulated
 from bayesdist.utils.numbers import (
     count,
@@ -58,7 +57,7 @@ def margin_table(r: ReportInput) -> TextTable:
         words=(0, 1, 6, 7),
         stacked=(7,),
         note="Margin: the limit minus the value that the statistic stays under with the probability"
-        f" asked for. {gauge_of_new_exposure(r)}".rstrip(),
+        f" asked for. {r.words.new_exposure}".rstrip(),
     )
 
 

@@ -161,7 +161,7 @@ def _patterns(found: TimeVariation, r: ReportInput) -> TextTable:
     )
 
 
-@REPORT.figure("periods", needs=("periods",), printed=lambda r: r.campaign is None)
+@REPORT.figure("periods", needs=("periods",), printed=lambda r: r.words.prints_data)
 def period_differences(r: ReportInput) -> Plot:
     """Map of the latest model minus the earliest one.
 

@@ -93,7 +93,7 @@ def _histograms(
     return fig
 
 
-@REPORT.figure("fit", printed=lambda r: r.campaign is None)
+@REPORT.figure("fit", printed=lambda r: r.words.prints_data)
 def residual_vectors(r: ReportInput) -> Plot:
     """Mean residual vector of each cell of the detector; pale ones are what noise would give."""
     binned = [c.binned for c in r.chips]
@@ -106,23 +106,13 @@ def residual_vectors(r: ReportInput) -> Plot:
     filled = sum(int((np.asarray(c.binned.count) > 0).sum()) for c in r.chips)
     significant = sum(int(significant_cells(c.binned).sum()) for c in r.chips)
     chance = CHANCE * filled
-    axes, note, cannot = "", "", "the polynomial cannot follow"
+    axes, note, cannot = "", r.words.residuals, "the polynomial cannot follow"
     if r.fit.model.frames not in ("none", "shift"):  # they turn u and v
         axes = ", along the axes of the polynomials, before the exposures' frames turn them"
-    if r.campaign is not None:
-        note = (
-            " These are the residuals of the joint fit, with all tables, in the cells of the test"
-            " for structure (see the status)."
-        )
-        if r.campaign.tables:
-            cannot = "neither tables nor polynomial follow"
-            if significant < chance / 2:
-                note += " They are fewer than by chance, as the tables follow these very stars."
-    if r.words.leverage:
-        note = (
-            " Stars were fitted to these detections, so that fewer may do so than by chance; the"
-            " status has the test that allows for it."
-        )
+    if r.tables:
+        cannot = "neither tables nor polynomial follow"
+        if significant < chance / 2:
+            note += " They are fewer than by chance, as the tables follow these very stars."
     return Plot(
         panels.figure,
         "Binned residuals",

@@ -302,19 +302,12 @@ def _accuracy_sentence(r: ReportInput) -> str:
         return f"{text}."
     total = r.budget.rows()[-1]
     with_budget = length(float(per_axis(total["u"], total["v"])))
-    whom = (
-        ""
-        if r.campaign is None
-        else " for a new exposure whose shift and rotation are fitted by its user"
-    )
     return (
         f"{text}; with all terms of the budget the rms over the detector is {with_budget} per"
-        f" axis{whom}."
+        f" axis{r.words.whom}."
     )
 
 
 def _with_shift(r: ReportInput) -> str:
     """Clause on whether errors of positions include a common shift and rotation."""
-    if r.selfcal is not None:
-        return ", in the gauge of the solution"
-    return ", shift and rotation included" if r.fit.model.n_frame else ""
+    return r.words.with_shift if r.fit.model.n_frame else ""

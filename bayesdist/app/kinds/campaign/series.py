@@ -9,7 +9,8 @@ import numpy as np
 from astropy.table import Table
 
 from bayesdist.app.config import Config
-from bayesdist.app.kinds.fitted import Fitted, required
+from bayesdist.app.kinds.campaign.parts import ExposuresAlone
+from bayesdist.app.kinds.fitted import Fitted
 from bayesdist.app.store.output import write_table
 from bayesdist.app.store.rundir import RunDirectory
 from bayesdist.errors import DegenerateError
@@ -23,7 +24,7 @@ MIN_EXPOSURES = 8  # fewest exposures for a statement about time
 
 def write_series_tables(run: RunDirectory, fitted: Fitted, config: Config) -> None:
     """Write series.ecsv and drift.ecsv, and the section 'time_dependence' of summary.json."""
-    series = required(fitted.alone, "fits of single exposures")
+    series = fitted.part(ExposuresAlone).series
     time, seed = fitted.linear.model.time, config.sampler.seed
     if time is None or len(series.names) < MIN_EXPOSURES:
         return

@@ -1,0 +1,60 @@
+"""Sampling of a fit with stars at given positions, as of matched stars and campaigns."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+
+from bayesdist.app.config import Config
+from bayesdist.app.kinds.fit_data import FitData
+from bayesdist.data import Matches
+from bayesdist.infer import Posterior, sample
+from bayesdist.model import DistortionModel, polynomial_terms
+
+log = logging.getLogger("bayesdist")
+
+STARS_PER_TERM = 3  # fewest stars per term and axis for which residuals show the errors
+
+
+def sample_stars(
+    data: FitData,
+    config: Config,
+    *,
+    folder: Path | None = None,
+    progress: Callable[[int, int], None] | None = None,
+) -> Posterior:
+    """Sample the posterior of a fit; checkpoints are written to `folder`."""
+    for text in doubts_on_numbers(data.sample, data.model):
+        log.warning("sample: %s", text)
+    return sample(
+        data.fit,
+        data.shards,
+        outliers=config.mixture(data.matched.stars.match_radius),
+        priors=data.fitted.priors,
+        folder=folder,
+        progress=progress,
+        **config.sampler.model_dump(),
+    )
+
+
+def doubts_on_numbers(stars: Matches, model: DistortionModel) -> Iterator[str]:
+    """Sentences about chips with fewer than three stars per polynomial term and axis."""
+    terms = n_terms(model.order)
+    needed = STARS_PER_TERM * terms
+    counts = dict(zip(stars.chip_numbers, np.bincount(stars.chip), strict=False))
+    for chip in model.chips:
+        n_stars = int(counts.get(chip.number, 0))
+        if n_stars < needed:
+            yield (
+                f"chip {chip.name} has {n_stars} stars for {terms} terms on each axis (order "
+                f"{model.order}), and {needed} or more are advisable: the posterior may be far "
+                "from normal and sampling slow; lower model.order, or add stars"
+            )
+
+
+def n_terms(order: int) -> int:
+    """Number of terms of a polynomial on one axis."""
+    return len(polynomial_terms(order))

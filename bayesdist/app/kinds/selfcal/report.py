@@ -1,0 +1,43 @@
+"""Content that a self-calibration adds to the report of a run."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from bayesdist.app.kinds.fitted import Fitted
+from bayesdist.app.kinds.selfcal.solved import SelfCalibrated
+from bayesdist.app.store.rundir import RunDirectory
+from bayesdist.files.tables import read_ecsv
+from bayesdist.infer import Posterior
+from bayesdist.model.grid import outline_pixels
+from bayesdist.report.context import DETECTED, SelfcalResults
+
+
+def report_fields(
+    run: RunDirectory, fitted: Fitted, posterior: Posterior, epoch: float | None
+) -> dict[str, Any]:
+    """Fields of the content of the report: gauge and stars, and the words of the report."""
+    model, theta = fitted.linear.model, posterior.mean
+    solved = fitted.part(SelfCalibrated)
+    outlines = []
+    for e in range(len(model.exposures)):
+        for chip in model.chips:
+            x, y = outline_pixels(chip.size)
+            when = None if model.time is None else np.full(len(x), epoch)
+            codes = np.full(len(x), e)
+            outlines.append(
+                model.predict(theta, x, y, exposure=codes, chip=chip.number, epoch=when)
+            )
+    names = model.names
+    results = SelfcalResults(
+        words=solved.gauge_words,
+        gauge=read_ecsv(run / "gauge.ecsv"),
+        matching=read_ecsv(run / "matching.ecsv"),
+        stars=read_ecsv(run / "stars.ecsv"),
+        outlines=tuple(outlines),
+        summary=run.summary["selfcal"],
+    )
+    held = frozenset(names[k] for k in solved.gauge.held)
+    return {"selfcal": results, "held": held, "words": DETECTED}
