@@ -57,7 +57,8 @@ class Plugin:
     Parameters
     ----------
     kinds : mapping of str to str
-        Kinds of runs by name; each object is a run kind.
+        Kinds of runs by the section of the configuration that they begin with; each object is the
+        class of that configuration, a subclass of `bayesdist.app.config.RunConfig`.
     formats : mapping of str to str
         Formats of calibration files by key; each object is a
         `bayesdist.products.common.document.Format`.

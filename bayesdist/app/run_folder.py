@@ -39,7 +39,7 @@ def save_run(results: Results, folder: Path) -> None:
         changed.
     """
     unsaved, config = results.run, results.config
-    has_matches = config.data is not None and config.data.matches == MATCHES_FILE
+    has_matches = not unsaved.facts["inputs"]  # else the stars are in files
     with atomic_directory(folder) as temporary:
         if has_matches:
             write_matches(temporary / MATCHES_FILE, results.inputs.load())

@@ -194,8 +194,8 @@ class ReportInput:
     @property
     def simulated(self) -> bool:
         """True if the configuration marks the input as simulated."""
-        kinds = ("data", "campaign", "selfcal")
-        return any(bool(self.setting(kind, "simulated", False)) for kind in kinds)
+        sections = (section for section in self.config.values() if isinstance(section, Mapping))
+        return any(bool(section.get("simulated")) for section in sections)
 
     @property
     def warnings(self) -> tuple[str, ...]:

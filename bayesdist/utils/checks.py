@@ -34,7 +34,7 @@ GROUPS = (
 class Check:
     """Comparison of one diagnostic with its limit: a row of the status table."""
 
-    group: str  # subject, one of `GROUPS`
+    group: str  # subject, one of `GROUPS` or a subject of another package
     name: str  # quantity that was checked, with its unit
     value: float | str = ""  # its value; empty if the sentence contains it
     limit: str = ""  # the limit in words; empty if there is none
@@ -54,7 +54,8 @@ class Check:
 
 def in_order(checks: Iterable[Check]) -> tuple[Check, ...]:
     """Checks sorted by group; the order within each group is preserved."""
-    return tuple(sorted(checks, key=lambda check: GROUPS.index(check.group)))
+    places = {group: place for place, group in enumerate(GROUPS)}
+    return tuple(sorted(checks, key=lambda check: places.get(check.group, len(GROUPS))))
 
 
 def level_of(good: bool, bad: str = "fail") -> str:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from bayesdist.app.config.campaign import CampaignConfig
-from bayesdist.app.config.data import Data, MatchesConfig
+from bayesdist.app.config.data import Data, MatchesConfig, StarsConfig
 from bayesdist.app.config.reading import (
     KINDS,
     Config,
@@ -24,6 +24,7 @@ __all__ = [
     "Data",
     "MatchesConfig",
     "SelfcalConfig",
+    "StarsConfig",
     "config_of_record",
     "load_config",
     "load_requirements",

@@ -57,9 +57,8 @@ class CampaignConfig(RunConfig):
     """Configuration of a run that begins with star lists and a catalogue."""
 
     kind: ClassVar[str] = "bayesdist.app.kinds.campaign.kind:CAMPAIGN"
+    title: ClassVar[str] = "star lists and a catalogue"
     is_dated: ClassVar[bool] = True
-    data: ClassVar[None] = None
-    selfcal: ClassVar[None] = None
     periods: ClassVar[None] = None
     prior: ClassVar[tuple[PriorBlock, ...]] = ()
     prior_calibration: ClassVar[None] = None

@@ -19,7 +19,7 @@ from pydantic import (
     field_validator,
 )
 
-from bayesdist.app.config.fit import ComputeBlock, Fit, HoldoutBlock, Outliers, Sampler
+from bayesdist.app.config.fit import ComputeBlock, Fit, HoldoutBlock, Outliers, Periods, Sampler
 from bayesdist.app.config.model import (
     MatchedModel,
     PriorBlock,
@@ -132,20 +132,33 @@ def _of_its_format(raw: Any, handler: Any, info: ValidationInfo) -> Data:
 DataOfFormat = Annotated[SerializeAsAny[Data], WrapValidator(_of_its_format)]
 
 
-class Periods(Section):
-    """Periods to be compared."""
+class StarsConfig(RunConfig):
+    """Configuration whose stars are fitted like matched stars; a base for kinds of other packages.
 
-    centres: list[float]
-    days: PositiveFloat
+    Subclasses add the section that the run begins with, and define `kind`, `title` and
+    `named_files`.
+    """
+
+    tables: ClassVar[TablesBlock] = TablesBlock()
+    periods: ClassVar[None] = None
+    prior: ClassVar[tuple[PriorBlock, ...]] = ()
+    prior_calibration: ClassVar[None] = None
+
+    model: MatchedModel
+    fit: Fit = Fit()
+    outliers: Outliers = Outliers()
+    sampler: Sampler = Sampler()
+    compute: ComputeBlock = ComputeBlock()
+    holdout: HoldoutBlock | None = None
+    products: MatchedProducts = MatchedProducts()
 
 
 class MatchesConfig(RunConfig):
     """Configuration of a run that begins with matched stars."""
 
     kind: ClassVar[str] = "bayesdist.app.kinds.matches.kind:MATCHES"
+    title: ClassVar[str] = "matched stars"
     begins_with: ClassVar[str] = "fit"
-    campaign: ClassVar[None] = None
-    selfcal: ClassVar[None] = None
     tables: ClassVar[TablesBlock] = TablesBlock()
 
     data: DataOfFormat

@@ -28,6 +28,13 @@ class HoldoutBlock(Section):
             yield "[holdout] sets nothing aside; give a fraction of the stars, or exposures"
 
 
+class Periods(Section):
+    """Periods to be compared."""
+
+    centres: list[float]
+    days: PositiveFloat
+
+
 class _Fit(Section):
     clip_chi2: Annotated[float, Field(gt=0, le=1e9)] = 25.0
     clip_abs: Annotated[float, Field(gt=0, le=1e9)] = 2.0

@@ -7,7 +7,7 @@ import math
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Annotated, Any, TypeAlias
+from typing import Annotated, Any, TypeAlias, Union
 
 from pydantic import Discriminator, Field, Tag, TypeAdapter, ValidationError
 
@@ -22,14 +22,17 @@ from bayesdist.assess import Requirement
 from bayesdist.errors import ConfigError, InputError
 from bayesdist.files.documents import toml_of
 from bayesdist.files.regular import MOST_TEXT, read_text
+from bayesdist.plugin import objects
 from bayesdist.utils.text import refuse_control_characters
 
-# by the section that determines the kind of a configuration
-KINDS: dict[str, type[RunConfig]] = {
-    "data": MatchesConfig,
-    "campaign": CampaignConfig,
-    "selfcal": SelfcalConfig,
-}
+
+def _installed_kinds() -> dict[str, type[RunConfig]]:
+    """Configurations of this and of other packages, by the section that determines the kind."""
+    ours = {"data": MatchesConfig, "campaign": CampaignConfig, "selfcal": SelfcalConfig}
+    return {**objects(lambda plugin: plugin.kinds), **ours}
+
+
+KINDS = _installed_kinds()
 
 
 def _kind_of(raw: Any) -> str | None:
@@ -38,21 +41,19 @@ def _kind_of(raw: Any) -> str | None:
     return kinds[0] if len(kinds) == 1 else None
 
 
-Config: TypeAlias = MatchesConfig | CampaignConfig | SelfcalConfig
+def _begins_with() -> str:
+    """Clause that lists the sections a run may begin with."""
+    *first, last = (f"with [{section}], {kind.title}" for section, kind in KINDS.items())
+    return f"a run begins {', '.join(first)}, or {last}; give one"
 
+
+Config: TypeAlias = RunConfig
+
+_UNION: Any = Union[*(Annotated[kind, Tag(section)] for section, kind in KINDS.items())]
 CONFIG: TypeAdapter[Config] = TypeAdapter(
     Annotated[
-        Annotated[MatchesConfig, Tag("data")]
-        | Annotated[CampaignConfig, Tag("campaign")]
-        | Annotated[SelfcalConfig, Tag("selfcal")],
-        Discriminator(
-            _kind_of,
-            custom_error_type="no_kind",
-            custom_error_message=(
-                "a run begins with [data], matched stars, with [campaign], star lists and a "
-                "catalogue, or with [selfcal], star lists alone; give one"
-            ),
-        ),
+        _UNION,
+        Discriminator(_kind_of, custom_error_type="no_kind", custom_error_message=_begins_with()),
     ]
 )
 
@@ -84,7 +85,8 @@ def load_config(path: str | Path) -> tuple[Config, str]:
 
     Returns
     -------
-    config : MatchesConfig, CampaignConfig or SelfcalConfig
+    config : RunConfig
+        Of the class of its kind of run.
     text : str
         Unchanged text of the file.
 
@@ -109,7 +111,8 @@ def parse_config(text: str, where: str) -> Config:
 
     Returns
     -------
-    MatchesConfig, CampaignConfig or SelfcalConfig
+    RunConfig
+        Of the class of its kind of run.
 
     Raises
     ------
@@ -121,7 +124,7 @@ def parse_config(text: str, where: str) -> Config:
     with _as_config_errors(where):
         config.time()
         # matches may state their radius, which is unknown until they are read
-        config.mixture(None if config.data is None else 1.0)
+        config.mixture(1.0 if config.begins_with == "fit" else None)
         config.user_terms()
         config.requirements()
         config.spans()
@@ -140,7 +143,8 @@ def config_of_record(settings: Mapping[str, Any], where: str) -> Config:
 
     Returns
     -------
-    MatchesConfig, CampaignConfig or SelfcalConfig
+    RunConfig
+        Of the class of its kind of run.
 
     Raises
     ------

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar, Self
@@ -16,15 +16,26 @@ from bayesdist.app.config.assess import (
     RequirementBlock,
 )
 from bayesdist.app.config.fit import (
+    CampaignFit,
     CampaignOutliers,
     ComputeBlock,
     DiscrepancyBlock,
+    Fit,
+    HoldoutBlock,
     Outliers,
+    Periods,
     Sampler,
     SelfcalOutliers,
     SelfcalSampler,
 )
-from bayesdist.app.config.model import CampaignModel, MatchedModel, SelfcalModel
+from bayesdist.app.config.model import (
+    CampaignModel,
+    MatchedModel,
+    PriorBlock,
+    PriorCalibrationBlock,
+    SelfcalModel,
+    TablesBlock,
+)
 from bayesdist.app.config.products import Products
 from bayesdist.app.config.section import (
     ChipBlock,
@@ -61,9 +72,28 @@ class RunConfig(Section):
         products: Products
 
         @property
+        def tables(self) -> TablesBlock: ...
+
+        @property
+        def fit(self) -> Fit | CampaignFit: ...
+
+        @property
+        def periods(self) -> Periods | None: ...
+
+        @property
+        def holdout(self) -> HoldoutBlock | None: ...
+
+        @property
+        def prior(self) -> Sequence[PriorBlock]: ...
+
+        @property
+        def prior_calibration(self) -> PriorCalibrationBlock | None: ...
+
+        @property
         def compute(self) -> ComputeBlock: ...
 
     kind: ClassVar[str]  # the kind of run as "module:object"
+    title: ClassVar[str]  # what the run begins with
     begins_with: ClassVar[str] = "match"  # first stage; 'fit' if stars are matched before the run
     is_dated: ClassVar[bool] = False  # True if all exposures have dates
 

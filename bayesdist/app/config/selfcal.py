@@ -96,8 +96,7 @@ class SelfcalConfig(RunConfig):
     """Configuration of a run that begins with star lists alone."""
 
     kind: ClassVar[str] = "bayesdist.app.kinds.selfcal.kind:SELFCAL"
-    data: ClassVar[None] = None
-    campaign: ClassVar[None] = None
+    title: ClassVar[str] = "star lists alone"
     tables: ClassVar[TablesBlock] = TablesBlock()
     fit: ClassVar[Fit] = Fit()
     periods: ClassVar[None] = None

@@ -66,6 +66,10 @@ class RunKind(ABC, Generic[C, I, M]):
     chooser: ClassVar[str] = "least-squares fit"  # words for the step that rejects outlying rows
     # True if the fit estimates the errors of centroids, which then include no other errors
     measures_centroids: ClassVar[bool] = True
+    # frames of new exposures that are compared with a solution; None for those of the solution
+    new_frames: ClassVar[str | None] = None
+    # clause on why orders cannot be compared by held-out stars; empty if they can
+    no_order: ClassVar[str] = ""
     # True if errors, requirements and products are tried out with the fit before it is sampled
     rehearses_fit: ClassVar[bool] = False
 

@@ -8,6 +8,8 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, field_validator
 
+from bayesdist.app.config import KINDS
+
 Number = float | None  # null where it is not finite, or not known
 
 
@@ -388,7 +390,7 @@ class Summary(Sections):
 
     schema_: Literal[2] = Field(alias="schema")
     bayesdist: str = Field(description="version of the package")
-    kind: Literal["data", "campaign", "selfcal"] = Field(description="what the run begins with")
+    kind: str = Field(description="what the run begins with")
     detector: str = Field(description="name of detector or chips, and filter of a campaign")
     began: str = Field(description="when the run began, UTC")
     simulated: bool = Field(description="the input is simulated, as the configuration has it")
@@ -397,7 +399,7 @@ class Summary(Sections):
 def head_of(facts: Mapping[str, Any]) -> dict[str, Any]:
     """Entries of summary.json about the run as a whole."""
     config = facts["config"]
-    kind = next(name for name in ("data", "campaign", "selfcal") if name in config)
+    kind = next(name for name in KINDS if name in config)
     chips = " and ".join(chip["name"] for chip in config["chip"])
     parts = [config["detector"]["name"] or chips, config[kind].get("filter")]
     return {
@@ -405,7 +407,7 @@ def head_of(facts: Mapping[str, Any]) -> dict[str, Any]:
         "kind": kind,
         "detector": ", ".join(part for part in parts if part),
         "began": facts["created"],
-        "simulated": config[kind]["simulated"],
+        "simulated": config[kind].get("simulated", False),
     }
 
 

@@ -10,7 +10,7 @@ import numpy as np
 from astropy.table import Table
 
 from bayesdist.app.commands.on_runs.compare import joined
-from bayesdist.app.config import Config, load_config
+from bayesdist.app.config import CampaignConfig, Config, MatchesConfig, load_config
 from bayesdist.app.kinds.campaign.parts import ExposureScatter
 from bayesdist.app.kinds.fitted import load_errors
 from bayesdist.app.kinds.matches.sources import read_configured
@@ -108,18 +108,17 @@ def _fitted(
     run: RunDirectory, config: Config, new: Path
 ) -> tuple[Posterior, Matches, NewFit, tuple[str, ...]]:
     """Release, new matches and their fit, and exposures or files that the release has used."""
-    if config.campaign is not None:
-        release = results_of(run)
+    release = results_of(run)
+    if isinstance(config, CampaignConfig):  # new exposures scatter as those of the release do
         return release.solution, *fit_new_exposures(release, new)
-    posterior = results_of(run).solution
+    posterior = release.solution
     matches, used_files = _new_matches(run, config, new)
     new_fit = fit_new(
         posterior,
         matches,
         rejection=Rejection(config.fit.clip_chi2, config.fit.clip_abs),
         compute=config.resources(),
-        # the orientation on the sky is unknown to a self-calibration
-        frames=None if config.selfcal is None else "affine",
+        frames=release.kind.new_frames,
     )
     return posterior, matches, new_fit, used_files
 
@@ -136,7 +135,7 @@ def _new_matches(run: RunDirectory, config: Config, new: Path) -> tuple[Matches,
     if configured is not None:
         stated, base = configured
         size, chips = stated.detector.size, stated.chip
-        if stated.data is None:
+        if not isinstance(stated, MatchesConfig):  # its exposures would have to be matched first
             raise InputError(
                 "names no table of matches", where=str(new), do="give one in data.matches"
             )
@@ -144,7 +143,7 @@ def _new_matches(run: RunDirectory, config: Config, new: Path) -> tuple[Matches,
         path = data.paths(base)
     else:
         path, size, chips = new, config.detector.size, config.chip
-        if config.data is None:
+        if not isinstance(config, MatchesConfig):  # other kinds read no tables of matches
             raise InputError(
                 "is a table, and a self-calibration has not said how to read one",
                 where=str(new),
@@ -405,7 +404,8 @@ def _pairs(run: RunDirectory | None, new: Path, unit: str) -> Matches:
             raise InputError("there is no such file", where=str(new), do="check the name")
         pairs = read_matches(new, unit=unit)
     else:
-        if run.config.campaign is None or not part_files(run / PAIRS):
+        # pairs of matched stars have no catalogue in common with those of a campaign
+        if not isinstance(run.config, CampaignConfig) or not part_files(run / PAIRS):
             raise InputError(
                 "is a run without matched pairs of a campaign",
                 where=str(run.path),
@@ -416,7 +416,7 @@ def _pairs(run: RunDirectory | None, new: Path, unit: str) -> Matches:
 
 
 def _refuse_other_filters(config: Config, pairs: Matches, where: str) -> None:
-    mine = None if config.campaign is None else config.campaign.filter
+    mine = config.filter_name or None
     other_filters = sorted({name for name in pairs.filter_names if name} - {mine})
     if mine is not None and other_filters:
         raise InputError(
@@ -438,8 +438,9 @@ def _catalogue_errors(pairs: Matches) -> StarErrors | None:
 
 def _catalogue_of(run: RunDirectory) -> str | None:
     """Hash of the catalogue of a run."""
-    block, base = run.config.campaign, Path(run.facts["base"])
-    if block is None:
+    config, base = run.config, Path(run.facts["base"])
+    if not isinstance(config, CampaignConfig):  # has no catalogue
         return None
-    digest: str | None = run.facts["inputs"].get(input_name(base / block.catalog, base))
+    name = input_name(base / config.campaign.catalog, base)
+    digest: str | None = run.facts["inputs"].get(name)
     return digest

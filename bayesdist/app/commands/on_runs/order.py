@@ -10,9 +10,10 @@ from typing import Any
 import numpy as np
 from astropy.table import Table
 
-from bayesdist.app.config import load_config
+from bayesdist.app.config import MatchesConfig, load_config
 from bayesdist.app.kinds.errors import QUOTED
 from bayesdist.app.kinds.fit_data import FitData
+from bayesdist.app.kinds.kind import kind_of
 from bayesdist.app.kinds.matched import Matched
 from bayesdist.app.kinds.matches.stars import fit_stars, model_of, shards_of
 from bayesdist.app.results import Results, open_results
@@ -77,10 +78,10 @@ def order(
             do=f"give the lowest and the highest, between 1 and {MAX_ORDER}",
         )
     config, text = load_config(path)
-    if config.selfcal is not None:
+    unsuitable = kind_of(config).no_order
+    if unsuitable:
         raise InputError(
-            "is a self-calibration, whose stars take up what an order too low leaves, so that no "
-            "star that is held out shows it",
+            unsuitable,
             where=str(path),
             do="run it, and see whether the report asks for terms of a higher order",
         )
@@ -128,7 +129,8 @@ def _compared(
     rejection = Rejection(config.fit.clip_chi2, config.fit.clip_abs)
     stars: Matches | Shards
     one_frame = config.model.frames == "none" and config.time() is None
-    if config.data is not None and len(config.chips()) < 2 and one_frame:  # one map at all dates
+    # stars that were matched before the run, of one map at all dates, need no fit
+    if isinstance(config, MatchesConfig) and len(config.chips()) < 2 and one_frame:
         errors = QUOTED
         if config.data.sigma == "by_magnitude":
             errors = fit_stars(matched, config, reader=reader).errors

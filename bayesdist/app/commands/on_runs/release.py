@@ -16,6 +16,7 @@ from bayesdist.app.commands.on_runs.filters import (
     comparison_table,
     draw_filters,
 )
+from bayesdist.app.config import CampaignConfig
 from bayesdist.app.config.products import ReleaseBlock
 from bayesdist.app.kinds.campaign.parts import ExposuresAlone
 from bayesdist.app.kinds.fitted import Fitted
@@ -108,7 +109,7 @@ def release_runs(
 def _opened(path: str | Path) -> Results:
     """Results of a finished run of a campaign."""
     run = RunDirectory.open(path)
-    if run.config.campaign is None:
+    if not isinstance(run.config, CampaignConfig):  # only campaigns have filters to release
         raise InputError(
             "is no run of a campaign", where=str(path), do="give runs that began with star lists"
         )

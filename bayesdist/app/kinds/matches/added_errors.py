@@ -46,7 +46,7 @@ def in_circle(stars: Matches, config: Config) -> bool:
 
     The likelihood then accounts for this selection.
     """
-    if config.data is None or not stars.has_nominal:
+    if config.begins_with != "fit" or not stars.has_nominal:
         return False
     return config.match_radius(stars.match_radius) is not None
 

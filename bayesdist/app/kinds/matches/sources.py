@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
 
-from bayesdist.app.config import ChipBlock, Data
+from bayesdist.app.config import ChipBlock, Data, MatchesConfig
 from bayesdist.app.store.rundir import RunDirectory
 from bayesdist.data import Matches, input_files, open_matches, read_matches
 from bayesdist.data.tables.parquet import describe_part
@@ -134,8 +134,8 @@ def _source(name: str) -> MatchSource | None:
 
 def input_of_run(run: RunDirectory) -> RunInput | None:
     """Input of a run in the format of a mission; None for any other run."""
-    data = run.config.data
-    source = None if data is None else _source(data.format)
+    config = run.config
+    source = _source(config.data.format) if isinstance(config, MatchesConfig) else None
     return None if source is None else source.input_of(run)
 
 

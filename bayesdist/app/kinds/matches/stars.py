@@ -90,7 +90,7 @@ def model_of(stars: Matches, config: Config) -> DistortionModel:
 
 def fit_stars(
     matched: Matched,
-    config: Config,
+    config: MatchesConfig,
     base: Path = Path(),
     reader: StarReader | None = None,
 ) -> Fitted:
@@ -128,14 +128,14 @@ def fit_stars(
 def _fitted(
     stars: Matches,
     model: DistortionModel,
-    config: Config,
+    config: MatchesConfig,
     reader: StarReader,
     earlier: CalibrationPrior | None,
 ) -> Fitted:
     """Fit with errors by magnitude, or with the quoted errors adjusted to the residuals."""
     priors = priors_of(model, config)
     rejection = Rejection(config.fit.clip_chi2, config.fit.clip_abs, config.fit.radial_weight)
-    by_magnitude = config.data is not None and config.data.sigma == "by_magnitude"
+    by_magnitude = config.data.sigma == "by_magnitude"
 
     def begun(priors: GaussianPriors) -> tuple[LinearFit, ErrorLaw]:
         """First fit, with errors by magnitude or with the quoted errors."""

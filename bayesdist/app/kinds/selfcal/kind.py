@@ -37,6 +37,11 @@ class SelfcalKind(RunKind[SelfcalConfig, Inputs, SelfcalMatched]):
     rows = "detections"
     chooser = "limits of residuals"
     rehearses_fit = True
+    new_frames = "affine"  # the orientation on the sky is unknown to a self-calibration
+    no_order = (
+        "is a self-calibration, whose stars take up what an order too low leaves, so that no star "
+        "that is held out shows it"
+    )
 
     def read(self, config: SelfcalConfig, base: Path) -> Inputs:
         """Detections, and additional constraints."""

@@ -119,8 +119,9 @@ def status_checks(r: ReportInput) -> dict[str, tuple[Check, ...]]:
     The order is requirements, validity and assumptions, errors, held-out data, fit, and the other
     groups.
     """
+    names = dict.fromkeys((*GROUPS, *(check.group for check in r.checks)))
     groups = {
-        **{name: tuple(c for c in r.checks if c.group == name) for name in GROUPS},
+        **{name: tuple(c for c in r.checks if c.group == name) for name in names},
         "Requirements": _margin_checks(r),
         "Validity": validity_checks(r),
         "Products": tuple(
@@ -130,7 +131,7 @@ def status_checks(r: ReportInput) -> dict[str, tuple[Check, ...]]:
             if c.level != "note"
         ),
     }
-    return {name: groups[name] for name in _ORDER if groups[name]}
+    return {name: groups[name] for name in dict.fromkeys((*_ORDER, *groups)) if groups[name]}
 
 
 @REPORT.table("status")
