@@ -15,7 +15,7 @@ from bayesdist.assess import Requirement
 from bayesdist.assess.budget.budget import budget_of
 from bayesdist.assess.requirements.margins import judge
 from bayesdist.assess.terms.given import centroid_errors
-from bayesdist.diagnose.residuals.sample import centroid_scatter, star_sample
+from bayesdist.diagnose.residuals.stars import centroid_scatter, star_sample
 from bayesdist.errors import InputError
 
 REHEARSAL_DRAWS = 100

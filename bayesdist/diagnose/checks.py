@@ -10,9 +10,9 @@ from bayesdist.data.repeated_stars import repeated_detections, tight_groups
 from bayesdist.diagnose.correlated import Discrepancy
 from bayesdist.diagnose.correlated.deviations import CURVATURE
 from bayesdist.diagnose.holdout.validation import HoldoutValidation
-from bayesdist.diagnose.residuals.coverage import Coverage
+from bayesdist.diagnose.residuals.binned import Coverage
 from bayesdist.diagnose.residuals.misfit import Misfit, worst_misfit
-from bayesdist.diagnose.residuals.sample import ExposureScatter
+from bayesdist.diagnose.residuals.stars import ExposureScatter
 from bayesdist.diagnose.score.result import ScoreTest
 from bayesdist.infer import LinearFit
 from bayesdist.infer.exposures.frame_choice import frames_that_help

@@ -23,30 +23,28 @@ from bayesdist.diagnose.correlated import Discrepancy, DiscrepancyPriors, estima
 from bayesdist.diagnose.holdout.validation import HoldoutValidation
 from bayesdist.diagnose.overlap import OverlapTest
 from bayesdist.diagnose.periods import PeriodSettings, TimeVariation, time_variation
-from bayesdist.diagnose.residuals.binned import BinnedSums
-from bayesdist.diagnose.residuals.coverage import Coverage, coverage_of
+from bayesdist.diagnose.residuals.binned import BinnedSums, Coverage, coverage_of
 from bayesdist.diagnose.residuals.epoch_shift import EpochShift, epoch_shift
 from bayesdist.diagnose.residuals.misfit import (
     MAX_BINS,
     STARS_PER_BIN,
     Misfit,
+    explained_by_false_matches,
+    majority_sentence,
     misfit_of,
     partitions_for,
     worst_misfit,
 )
-from bayesdist.diagnose.residuals.quoted import explained_by_false_matches, majority_sentence
-from bayesdist.diagnose.residuals.sample import (
+from bayesdist.diagnose.residuals.stars import (
     SAMPLE,
     StarSample,
+    StarSums,
     centroid_scatter,
     dates_of,
-    likelihood_shown,
-    star_sample,
-)
-from bayesdist.diagnose.residuals.star_sums import (
-    StarSums,
     flagged_by_exposure,
+    likelihood_shown,
     star_bins,
+    star_sample,
     star_sums,
 )
 from bayesdist.diagnose.score.result import ScoreTest
@@ -424,7 +422,7 @@ def diagnose_fit(
     if eliminated is None:
         misfits = _misfits(fit, stars, partitions, sums, shown)
     else:
-        from bayesdist.diagnose.selfcal.misfit import dithered_misfit
+        from bayesdist.diagnose.selfcal.tests import dithered_misfit
 
         misfits = (dithered_misfit(eliminated),)
         sample = replace(sample, taken=_taken(eliminated, sample.table.row))
@@ -534,7 +532,7 @@ def misfits_of(
 
 def _taken(eliminated: SelfCalibrationMode, rows: Int) -> Float:
     """Fraction (N,) of the variance of detections that fitted positions of stars absorb."""
-    from bayesdist.diagnose.selfcal.scores import taken_by_stars
+    from bayesdist.diagnose.selfcal.eliminated import taken_by_stars
 
     problem_rows = eliminated.problem.rows
     fraction = np.zeros(max(int(problem_rows.max(initial=-1)), int(rows.max(initial=-1))) + 1)
@@ -607,7 +605,7 @@ def diagnose_posterior(
     shared = None
     if eliminated is not None:
         from bayesdist.diagnose.selfcal.correlated import selfcal_discrepancy
-        from bayesdist.diagnose.selfcal.score import selfcal_score_tests
+        from bayesdist.diagnose.selfcal.tests import selfcal_score_tests
 
         estimated = selfcal_discrepancy(eliminated, rng=restarted(rng), priors=discrepancy)
         tests = selfcal_score_tests(

@@ -29,8 +29,7 @@ if TYPE_CHECKING:
     from bayesdist.diagnose.overlap import OverlapTest
     from bayesdist.diagnose.periods import TimeVariation
     from bayesdist.diagnose.residuals.binned import BinnedResiduals
-    from bayesdist.diagnose.residuals.sample import StarSample
-    from bayesdist.diagnose.residuals.star_sums import ExposureSums
+    from bayesdist.diagnose.residuals.stars import ExposureSums, StarSample
     from bayesdist.infer import LinearFit, Posterior
     from bayesdist.infer.catalogue.added_errors import GroupedErrors
 

@@ -3,7 +3,7 @@ import pytest
 
 from bayesdist.assess.terms.given import centroid_errors
 from bayesdist.data import Matches
-from bayesdist.diagnose.residuals.sample import StarSample, centroid_scatter
+from bayesdist.diagnose.residuals.stars import StarSample, centroid_scatter
 from bayesdist.errors import InputError
 
 

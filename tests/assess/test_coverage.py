@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from bayesdist.assess import Requirement
-from bayesdist.diagnose.residuals.binned import binned_sums
-from bayesdist.diagnose.residuals.coverage import coverage_of
+from bayesdist.diagnose.residuals.binned import binned_sums, coverage_of
 from bayesdist.diagnose.residuals.misfit import partitions_for
 from bayesdist.infer.stars.survey import _hull
 from bayesdist.model import Chip

@@ -29,7 +29,7 @@ from bayesdist.assess.terms.solution import SolutionErrors
 from bayesdist.data import MagnitudeErrors
 from bayesdist.diagnose.correlated import Discrepancy
 from bayesdist.diagnose.correlated.deviations import LinearDeviations
-from bayesdist.diagnose.tables.between_nodes import MeanSquare
+from bayesdist.diagnose.tables import MeanSquare
 from bayesdist.model import Chip, DistortionModel, TimeDependence
 from tests.budgets import detector_budget
 

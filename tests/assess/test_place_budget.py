@@ -7,7 +7,7 @@ from bayesdist.assess.model import error_model
 from bayesdist.assess.terms.given import Centroids
 from bayesdist.assess.terms.local import LocalErrors
 from bayesdist.data import MagnitudeErrors
-from bayesdist.diagnose.tables.between_nodes import MeanSquare
+from bayesdist.diagnose.tables import MeanSquare
 from bayesdist.errors import InputError
 from bayesdist.model import Chip, DistortionModel
 

@@ -15,8 +15,12 @@ from bayesdist.assess.planning.futures import (
     Scattering,
     with_more_data,
 )
-from bayesdist.diagnose.selfcal.eliminated import Columns, EvenStars, eliminated
-from bayesdist.diagnose.selfcal.scores import scores_of_detections
+from bayesdist.diagnose.selfcal.eliminated import (
+    Columns,
+    EvenStars,
+    eliminated,
+    scores_of_detections,
+)
 from bayesdist.infer import fit_linear
 from bayesdist.infer.compare.frame_fields import mean_squares
 from bayesdist.infer.compare.planning import (

@@ -11,7 +11,7 @@ from bayesdist.assess.requirements.validity import validity_period
 from bayesdist.assess.statistics import extent
 from bayesdist.assess.terms.given import Centroids
 from bayesdist.data import MagnitudeErrors
-from bayesdist.diagnose.significance import clopper_pearson
+from bayesdist.diagnose.statistics import clopper_pearson
 from bayesdist.errors import InputError
 from bayesdist.model import Chip, DistortionModel, TimeDependence
 from tests.reduced import case_in_full

@@ -8,7 +8,7 @@ from scipy import stats
 from bayesdist.assess import STATISTICS, Requirement, UserTerm, drawn
 from bayesdist.assess.requirements.tally import Tally
 from bayesdist.assess.terms.forms import Pool
-from bayesdist.diagnose.significance import clopper_pearson
+from bayesdist.diagnose.statistics import clopper_pearson
 from bayesdist.errors import InputError
 from bayesdist.infer.posterior.checks import scatter_too_small
 from bayesdist.model import Chip, DistortionModel

@@ -9,10 +9,9 @@ import numpy as np
 
 from bayesdist.data.matches import Matches
 from bayesdist.diagnose import ScoreTest, score_tests
-from bayesdist.diagnose.score.gap import gap_test
-from bayesdist.diagnose.score.motions import motion_test
+from bayesdist.diagnose.score.motions import gap_test, motion_test
 from bayesdist.diagnose.score.projection import projection_of
-from bayesdist.diagnose.score.regressors import functions_for
+from bayesdist.diagnose.score.questions import functions_for
 from bayesdist.diagnose.score.result import Outcome
 from bayesdist.diagnose.score.sample import scored_sample
 from bayesdist.infer import GaussianPriors, LinearFit, Rejection, fit_linear

@@ -9,10 +9,8 @@ import pytest
 from scipy import stats
 
 from bayesdist.diagnose.score.exposures import exposure_tests
-from bayesdist.diagnose.score.projection import Projection, projection_of
-from bayesdist.diagnose.score.questions import CONSTANT, Products, Question
-from bayesdist.diagnose.score.regressor_tests import regressor_tests
-from bayesdist.diagnose.score.regressors import functions_for
+from bayesdist.diagnose.score.projection import Projection, projection_of, regressor_tests
+from bayesdist.diagnose.score.questions import CONSTANT, Products, Question, functions_for
 from bayesdist.diagnose.score.result import Family
 from bayesdist.diagnose.score.sample import scored_sample
 from bayesdist.infer import GaussianPriors, Rejection, fit_linear

@@ -10,14 +10,14 @@ from scipy.stats import chi2, kstest
 
 from bayesdist.diagnose.periods import pattern_changes
 from bayesdist.diagnose.residuals.binned import BinValues, band_bins
-from bayesdist.diagnose.residuals.rows import (
+from bayesdist.diagnose.residuals.tables import (
     STATISTICS,
     bin_row,
     pair_row,
     pair_statistics,
+    period_table,
     residual_statistics,
 )
-from bayesdist.diagnose.residuals.tables import period_table
 from bayesdist.errors import DegenerateError, InputError
 from bayesdist.infer import build_model, fit_linear, residuals
 from bayesdist.infer.stars.likelihood import Clip

@@ -6,8 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from bayesdist.diagnose.selfcal.misfit import _shifts, dithered_misfit
-from bayesdist.diagnose.selfcal.scores import taken_by_stars
+from bayesdist.diagnose.selfcal.eliminated import taken_by_stars
+from bayesdist.diagnose.selfcal.tests import _shifts, dithered_misfit
 from bayesdist.infer.selfcal import self_calibrate
 from bayesdist.infer.selfcal.elimination import memberships
 from tests.dithered_fields import simulate_dithers, smooth_distortion

@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 from scipy.stats import binom
 
-from bayesdist.diagnose.selfcal.misfit import dithered_misfit
-from bayesdist.diagnose.selfcal.score import selfcal_score_tests
+from bayesdist.diagnose.selfcal.tests import dithered_misfit, selfcal_score_tests
 from bayesdist.infer.selfcal import self_calibrate
 from tests.infer.selfcal.fields import field
 from tests.reduced import only_in_full

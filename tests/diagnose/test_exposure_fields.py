@@ -16,12 +16,12 @@ from bayesdist.assess.terms.solution import SolutionErrors
 from bayesdist.data.matches import Matches
 from bayesdist.diagnose import score_tests
 from bayesdist.diagnose.correlated import Discrepancy, estimate_discrepancy
-from bayesdist.diagnose.correlated.exposure_products import (
-    EDGES,
+from bayesdist.diagnose.correlated.exposure_time import correlation_p
+from bayesdist.diagnose.correlated.neighbours import (
+    SEPARATION_EDGES,
     DetectionScores,
     exposure_products,
 )
-from bayesdist.diagnose.correlated.exposure_time import correlation_p
 from bayesdist.infer import Rejection, fit_linear
 from bayesdist.model import TimeDependence
 
@@ -150,7 +150,7 @@ def test_products_are_those_of_all_pairs():
     same = exposure[i] == exposure[j]
     ratio = (g**2).sum(axis=0) / (n - 18)
     products = ((g[i] * g[j]) + H[i, j][:, None] * ratio).sum(axis=1) / 2
-    low, high = EDGES[one.bins], EDGES[one.bins + 1]
+    low, high = SEPARATION_EDGES[one.bins], SEPARATION_EDGES[one.bins + 1]
     direct = np.array([
         products[same & (d[i, j] >= a) & (d[i, j] < b)].mean()
         - products[~same & (d[i, j] >= a) & (d[i, j] < b)].mean()

@@ -14,7 +14,6 @@ import pytest
 from scipy.stats import binom, chi2, kstest, norm
 
 from bayesdist.data.holdout import HoldoutSpec, split_matches
-from bayesdist.diagnose.holdout.grouped import SpreadMoments, sum_tails
 from bayesdist.diagnose.holdout.predictive import (
     SCALES,
     Predictive,
@@ -22,9 +21,9 @@ from bayesdist.diagnose.holdout.predictive import (
     scores_of,
     uniforms_of,
 )
-from bayesdist.diagnose.holdout.sums import _beyond
+from bayesdist.diagnose.holdout.sums import SpreadMoments, _beyond, sum_tails
 from bayesdist.diagnose.holdout.validation import holdout_validation
-from bayesdist.diagnose.significance import holm
+from bayesdist.diagnose.statistics import holm
 from bayesdist.infer import GaussianPriors, OutlierMixture, fit_linear, load
 from bayesdist.infer.density.grid import build_proposal
 from bayesdist.infer.density.target import Target

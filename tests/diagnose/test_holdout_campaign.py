@@ -15,7 +15,7 @@ import pytest
 from scipy.stats import binom, kstest
 
 from bayesdist.data.holdout import HoldoutSpec, split_matches
-from bayesdist.diagnose.holdout.frames import frames_for
+from bayesdist.diagnose.holdout.predictive import frames_for
 from bayesdist.diagnose.holdout.validation import holdout_validation
 from bayesdist.errors import InputError
 from bayesdist.infer.catalogue.star_errors import star_covariance, star_influence

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from bayesdist.diagnose.tables.between_nodes import MeanSquare
+from bayesdist.diagnose.tables import MeanSquare
 
 MEASURED, ERROR = np.array([-2e-6, 3e-5]), np.array([1e-6, 2e-6])
 

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from bayesdist.diagnose.score import regressors
+from bayesdist.diagnose.score import questions as regressors
 from bayesdist.diagnose.score.questions import LINEAR, Products, Question
 from bayesdist.diagnose.score.result import Family
-from bayesdist.diagnose.selfcal.score import selfcal_score_tests
+from bayesdist.diagnose.selfcal.tests import selfcal_score_tests
 from bayesdist.infer.equations.priors import Prior
 from bayesdist.infer.selfcal.mode import SelfCalibrationMode, gauge_of, solve
 from bayesdist.infer.selfcal.problem import prepare

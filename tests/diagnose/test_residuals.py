@@ -3,7 +3,7 @@ import pytest
 from scipy.stats import binned_statistic_2d
 
 from bayesdist.diagnose.residuals.binned import binned_residuals
-from bayesdist.diagnose.residuals.rows import pair_statistics, residual_statistics
+from bayesdist.diagnose.residuals.tables import pair_statistics, residual_statistics
 from bayesdist.errors import InputError
 
 SIZE = (1016.0, 508.0)

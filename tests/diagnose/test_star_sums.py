@@ -10,8 +10,12 @@ import pytest
 from bayesdist.data import Matches
 from bayesdist.diagnose.checks import exposure_checks
 from bayesdist.diagnose.residuals.binned import binned_residuals, binned_sums
-from bayesdist.diagnose.residuals.sample import StarSample, star_sample
-from bayesdist.diagnose.residuals.star_sums import flagged_by_exposure, star_sums
+from bayesdist.diagnose.residuals.stars import (
+    StarSample,
+    flagged_by_exposure,
+    star_sample,
+    star_sums,
+)
 from bayesdist.infer import (
     OutlierMixture,
     fit_linear,

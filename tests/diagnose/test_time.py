@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from bayesdist.diagnose.score.gap import visit_codes
+from bayesdist.diagnose.score.motions import visit_codes
 from bayesdist.model import TimeDependence
 from bayesdist.utils.limits import SCORE_TESTS
 from tests.reduced import case_in_full

@@ -23,8 +23,7 @@ from bayesdist.assess import (
 from bayesdist.assess.solution import chip_places
 from bayesdist.data.magnitude_errors import estimate
 from bayesdist.data.matches import Matches
-from bayesdist.diagnose.residuals.sample import star_sample
-from bayesdist.diagnose.residuals.star_sums import flagged_by_exposure, star_sums
+from bayesdist.diagnose.residuals.stars import flagged_by_exposure, star_sample, star_sums
 from bayesdist.infer.convergence import Convergence, Limits
 from bayesdist.infer.posterior import Posterior, SamplerInfo
 from bayesdist.infer.posterior.checks import ChiSquare, fit_checks, sampling_checks

@@ -14,7 +14,7 @@ from bayesdist.app.store.keys import attributes
 from bayesdist.assess import convert, pixel_scale_of
 from bayesdist.data import Matches
 from bayesdist.diagnose.periods import PeriodSettings, TimeVariation, bins_for
-from bayesdist.diagnose.residuals.sample import SAMPLE
+from bayesdist.diagnose.residuals.stars import SAMPLE
 from bayesdist.errors import InputError
 
 # attributes of the largest difference of two models

@@ -12,8 +12,8 @@ from bayesdist.app.kinds.errors import QUOTED, ErrorLaw
 from bayesdist.app.kinds.fitted import Fitted
 from bayesdist.app.kinds.matched import Matched
 from bayesdist.data.matches import Matches
-from bayesdist.diagnose.residuals.quoted import error_scale_sentence
-from bayesdist.diagnose.residuals.sample import SAMPLE, dates_of
+from bayesdist.diagnose.residuals.misfit import error_scale_sentence
+from bayesdist.diagnose.residuals.stars import SAMPLE, dates_of
 from bayesdist.infer import LinearFit, Shards, load
 from bayesdist.infer.stars.shards import Compute
 from bayesdist.model import DistortionModel

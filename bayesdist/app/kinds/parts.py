@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import ClassVar
 
 from bayesdist.data.matches import Matches
-from bayesdist.diagnose.tables.between_nodes import BetweenNodes
+from bayesdist.diagnose.tables import BetweenNodes
 from bayesdist.files.records import read_record, write_record
 from bayesdist.infer.nodes import corrected_matches, on_the_chips
 from bayesdist.model import DistortionModel, LookupTable

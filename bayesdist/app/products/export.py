@@ -26,7 +26,7 @@ from bayesdist.assess.terms.forms import PRODUCT
 from bayesdist.calibration.plane import ARCSEC
 from bayesdist.data.sky.tangent import sky_of_plane
 from bayesdist.diagnose.diagnostics import Diagnostics
-from bayesdist.diagnose.residuals.sample import StarSample, star_sample
+from bayesdist.diagnose.residuals.stars import StarSample, star_sample
 from bayesdist.files.atomic import atomic_path, path_within
 from bayesdist.formats.sip.positions import sky_of_header
 from bayesdist.infer import Posterior

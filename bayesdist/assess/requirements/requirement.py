@@ -17,7 +17,7 @@ from bayesdist.assess.domain import (
 )
 from bayesdist.assess.statistics import STATISTICS
 from bayesdist.assess.units import UNITS, stated_unit
-from bayesdist.diagnose.residuals.coverage import Coverage
+from bayesdist.diagnose.residuals.binned import Coverage
 from bayesdist.errors import InputError, require_known
 from bayesdist.model.grid import grid_pixels, mesh
 from bayesdist.utils.limits import BEYOND_STARS

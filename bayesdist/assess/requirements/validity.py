@@ -11,7 +11,7 @@ from bayesdist.assess.drawn import DrawnErrors
 from bayesdist.assess.requirements.margins import domains_of
 from bayesdist.assess.requirements.requirement import Requirement
 from bayesdist.assess.units import convert
-from bayesdist.diagnose.significance import clopper_pearson
+from bayesdist.diagnose.statistics import clopper_pearson
 from bayesdist.model.grid import DEFAULT_GRID
 from bayesdist.utils.arrays import Float
 

@@ -9,7 +9,7 @@ import numpy as np
 from bayesdist.assess.checks import visits_of
 from bayesdist.diagnose.correlated import Discrepancy
 from bayesdist.diagnose.diagnostics import Diagnostics
-from bayesdist.diagnose.significance import clopper_pearson
+from bayesdist.diagnose.statistics import clopper_pearson
 from bayesdist.model import DistortionModel
 from bayesdist.utils.arrays import Float
 from bayesdist.utils.checks import LARGER, Check, doubts_of

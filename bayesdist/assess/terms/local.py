@@ -10,7 +10,7 @@ import numpy as np
 from bayesdist.assess.domain import EvaluationDomain
 from bayesdist.assess.solution import place_of
 from bayesdist.assess.terms.forms import LOCAL, MEASURED, Independent, Row
-from bayesdist.diagnose.tables.between_nodes import BetweenNodes, MeanSquare
+from bayesdist.diagnose.tables import BetweenNodes, MeanSquare
 from bayesdist.errors import InputError
 from bayesdist.infer.solution.solution import Solution
 from bayesdist.model import DistortionModel, LookupTable

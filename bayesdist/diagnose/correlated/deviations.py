@@ -25,7 +25,7 @@ from bayesdist.diagnose.correlated.exposure_time import (
 )
 from bayesdist.diagnose.correlated.information import Information
 from bayesdist.diagnose.correlated.priors import DiscrepancyPriors, log_half_t, log_widths
-from bayesdist.diagnose.efficient import EfficientScore
+from bayesdist.diagnose.statistics import EfficientScore
 from bayesdist.infer.exposures.hierarchy import MOST_OUTLYING
 from bayesdist.infer.exposures.scatter import OUTLYING, OUTLYING_FRACTION
 from bayesdist.model import DistortionModel, Groups

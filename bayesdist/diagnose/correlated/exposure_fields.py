@@ -19,19 +19,19 @@ from typing import Any
 import numpy as np
 import scipy.linalg
 
-from bayesdist.diagnose.correlated.exposure_products import (
+from bayesdist.diagnose.correlated.functions import FINE, StructureFunctions, legendre_products
+from bayesdist.diagnose.correlated.information import (
+    GroupCells,
+    Information,
+    scores_on_chips,
+)
+from bayesdist.diagnose.correlated.neighbours import (
     LENGTHS,
     SECOND_ORDER,
     DetectionScores,
     ExposureProducts,
     exposure_products,
     modes,
-)
-from bayesdist.diagnose.correlated.functions import FINE, StructureFunctions, legendre_products
-from bayesdist.diagnose.correlated.information import (
-    GroupCells,
-    Information,
-    scores_on_chips,
 )
 from bayesdist.diagnose.correlated.priors import (
     DiscrepancyPriors,

@@ -3,6 +3,16 @@
 Scores, curvatures and squared scores are summed in one pass.  The cells are so small that all
 functions are nearly constant within a cell.  Later steps therefore do not need the stars again,
 however many there are.
+
+Covariance of parameters from the scatter of the stars, as far as the data require it.
+
+The sandwich A^-1 (sum of g g^T) A^-1 is valid for any variances of single stars, but its elements
+scatter like sums of squares.  Squared scores divided by (1 - l)^2, with l the leverage of a star
+(HC3 of MacKinnon and White 1985, Journal of Econometrics 29, 305), remain valid if stars of high
+leverage have larger errors than others, and are 1 / (1 - l) times too large if all stars are alike.
+In that case the likelihood's covariance, multiplied by one factor for all stars, is exact.
+
+Variance of the stars' scores over the detector, relative to the likelihood's prediction.
 """
 
 from __future__ import annotations
@@ -13,7 +23,7 @@ from functools import cached_property
 
 import numpy as np
 
-from bayesdist.diagnose.correlated.squares import MIN_FREE, SquaredScores
+from bayesdist.diagnose.statistics import sums_over
 from bayesdist.infer.equations.normal import NormalEquations
 from bayesdist.infer.equations.priors import GaussianPriors
 from bayesdist.infer.equations.scaled import scaled_inverse
@@ -27,6 +37,11 @@ from bayesdist.utils.arrays import Float, Int
 # cells along each side of a chip, by the largest number of groups: limits memory and time
 SIDES = ((8, 64), (32, 48), (10**9, 32))
 COLUMNS = 9  # n, g_u, g_v, h_uu, h_uv, h_vv, g_u^2, g_u g_v, g_v^2
+# A star that alone determines a parameter has no residual: its squared score is uninformative.
+MIN_FREE = 0.1
+STARS_PER_BLOCK = 60
+MAX_BLOCKS = 8  # along each side of a chip
+MIN_RATIO, MAX_RATIO = 0.25, 100.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -256,3 +271,123 @@ def cell_sums(
         for k, z in ((1, stars.X), (2, stars.Y)):
             position[chip, :, k] += np.bincount(code[rows], z[rows], minlength=C)
     return CellSums(stars.groups, side, sums, position)
+
+
+@dataclass(frozen=True, eq=False)
+class SquaredScores:
+    """Information from the scores of the stars, and that expected from the likelihood.
+
+    X : Y below is the sum over stars of trace(A^-1 X_i A^-1 Y_i), where X_i and Y_i are a star's
+    contributions to two sums and A is the information of the parameters.
+    """
+
+    covariance: Float  # (D, D) A^-1 of the parameters, from likelihood and priors
+    expected: Float  # (D, D) information of the likelihood: expectation of the sum of squares
+    prior: Float  # (D, D) information of the priors
+    # (D, D) from scores divided by sqrt(1 - l) (HC2): unbiased if all stars are alike
+    unbiased: Float
+    jackknife: Float  # (D, D) from scores divided by 1 - l (HC3)
+    # unbiased : unbiased, unbiased : expected, and expected : expected
+    products: tuple[float, float, float]
+
+    @cached_property
+    def scale(self) -> float:
+        """Mean ratio of the squares to their expectation."""
+        return float(np.sum(self.covariance * self.unbiased)) / float(
+            np.sum(self.covariance * self.expected)
+        )
+
+    @cached_property
+    def weight(self) -> float:
+        """Weight of the sandwich: 0 if the variances of the stars show no differences.
+
+        Let d be the squared distance of the unbiased sum from `scale` times the expected one, and b
+        the part of d due to the scatter of single squares.  Then 1 - b / d is the weight of linear
+        shrinkage with the smallest expected squared error (Ledoit and Wolf 2004, Journal of
+        Multivariate Analysis 88, 365; James and Stein's estimator as an empirical Bayes estimate:
+        Efron and Morris 1973, Journal of the American Statistical Association 68, 117).  It is
+        doubled, because errors that are too small are worse than errors that are too large: only
+        the sandwich is used if chance explains less than half of the difference.  Distances are
+        measured in units of the likelihood's covariance, which replaces Ledoit and Wolf's identity
+        matrix, so that the result does not depend on the parametrisation.
+        """
+        whitened = self.covariance @ (self.unbiased - self.scale * self.expected)
+        distance = float(np.sum(whitened * whitened.T))
+        squares, crossed, expected = self.products
+        by_chance = squares - 2 * self.scale * crossed + self.scale**2 * expected
+        return float(np.clip(2 * (1 - by_chance / distance), 0.0, 1.0)) if distance > 0 else 0.0
+
+    def sandwich(self, weight: float = 1.0) -> Float:
+        """Covariance (D, D) with this weight of the jackknife and the rest from the likelihood."""
+        meat = weight * self.jackknife + (1 - weight) * self.scale * self.expected + self.prior
+        return np.asarray(self.covariance @ meat @ self.covariance)
+
+    @property
+    def by_evidence(self) -> Float:
+        """Covariance (D, D) with the weight `weight`."""
+        return self.sandwich(self.weight)
+
+
+def score_excess(information: Information) -> Float:
+    """Ratio (chips, C, 2) of the variance of the scores to their curvature, by chip, cell and axis.
+
+    It is 1 for a correct likelihood.  Ratios of blocks of the detector are shrunk to their mean
+    according to their errors and their scatter (a normal model of their logarithms, by moments:
+    DerSimonian and Laird 1986, Controlled Clinical Trials 7, 177).
+    """
+    side, n_chips = information.sums.side, len(information.model.chips)
+    stars = information.sums.position[:, :, 0].sum(axis=1)
+    blocks = np.clip(np.sqrt(stars / STARS_PER_BLOCK).astype(int), 1, MAX_BLOCKS)
+    # squared scores and curvatures along both axes, and the number of stars
+    sums = np.zeros((n_chips, side * side, 5))
+    for cells in information.groups():
+        free = 1 - information.leverage(cells)
+        squares, curvature = (
+            np.einsum("caa->ca", matrix) for matrix in (cells.squares, cells.curvature)
+        )
+        values = np.column_stack([squares / free, curvature, cells.count])
+        sums[cells.chip] += sums_over(
+            cell_index(cells.X, cells.Y, (side, side)), values, side * side
+        )
+    out = np.ones((n_chips, side * side, 2))
+    index = np.arange(side)
+    for chip in range(n_chips):
+        b = int(blocks[chip])
+        block = ((index[:, None] * b // side) * b + index * b // side).ravel()
+        for a in (0, 1):
+            out[chip, :, a] = block_ratios(block, sums[chip][:, [a, 2 + a, 4]], b * b)
+    return out
+
+
+def block_ratios(block: Int, values: Float, n: int) -> Float:
+    """Ratios (N,) of the sums over n blocks of squares and curvatures, shrunk to their mean.
+
+    `block` (N,) is the block of each row of `values` (N, 3): square, curvature, number.
+    """
+    top, bottom, number = sums_over(block, values, n).T
+    mean = top.sum() / bottom.sum()
+    good = (number >= STARS_PER_BLOCK / 6) & (bottom > 0) & (top > 0)
+    out = np.full(n, mean)
+    if good.sum() > 1:
+        ratio = np.log(top[good] / bottom[good] / mean)
+        # the square of a normal variable has variance 2; mixtures have a larger one
+        variance = 2.5 / number[good]
+        w = 1 / variance
+        q = (w * (ratio - np.average(ratio, weights=w)) ** 2).sum()
+        scatter = max(0.0, (q - (len(w) - 1)) / (w.sum() - (w**2).sum() / w.sum()))
+        out[good] = mean * np.exp(ratio * scatter / (scatter + variance))
+    return np.asarray(np.clip(out, MIN_RATIO, MAX_RATIO)[block])
+
+
+def not_narrower(noise: Float, formal: Float) -> tuple[Float, float]:
+    """Covariance from the stars' scatter, at least as large as the formal one, and their ratio.
+
+    Both are (D, D), with zeros for fixed parameters.  The formal covariance is the lower limit
+    because residuals cannot distinguish quoted errors that are too large from truncated matches.
+    """
+    # a small part of the formal covariance, so that no direction has zero variance
+    noise = 0.99 * noise + 0.01 * formal
+    free = np.flatnonzero(np.diag(formal) > 0)
+    inner = np.ix_(free, free)
+    ratio = float(np.sum(scaled_inverse(formal[inner]) * noise[inner])) / len(free)
+    return noise * max(1.0, 1 / ratio), ratio

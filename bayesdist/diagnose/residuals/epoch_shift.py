@@ -20,8 +20,8 @@ import numpy as np
 
 from bayesdist.data.magnitude_errors import MAD_TO_SIGMA
 from bayesdist.data.matches import Matches
-from bayesdist.diagnose.clusters import squares_over
 from bayesdist.diagnose.score.sample import ScoredSample, scored_sample
+from bayesdist.diagnose.statistics import squares_over
 from bayesdist.infer.solution.solution import Solution
 from bayesdist.utils.arrays import Float, Int
 from bayesdist.utils.limits import EPOCH_SHIFT

@@ -7,26 +7,48 @@ of the scores of the exposure's stars.  Each exposure deviates independently, so
 T_e is tested; this does not need the covariance of hundreds of scores.  The polynomials, which are
 fitted to all exposures, make the T_e slightly dependent.  The mean and variance of the sum are
 therefore those of a scaled chi-square (Satterthwaite 1946).
+
+Test whether deviations of exposures are correlated in time, beyond the drift and a parabola.
+
+Test for smooth fields that differ from exposure to exposure, from products of nearby stars.
+
+The sum of products within exposures, minus that across exposures, is weighted according to the
+signal of a field with a given correlation length.  It is a quadratic form of independent scores, so
+that its distribution is approximated by a chi-square with the same skewness.  A few correlation
+lengths are tried.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
-from bayesdist.diagnose.clusters import add_over, sums_over
-from bayesdist.diagnose.efficient import EfficientScore, independent_directions, squares_of
-from bayesdist.diagnose.score.exposure_time import exposure_time_test
+from bayesdist.diagnose.correlated.exposure_time import correlation_p, fitted_deviations
+from bayesdist.diagnose.correlated.neighbours import (
+    DetectionScores,
+    ExposureProducts,
+    exposure_products,
+    modes,
+)
 from bayesdist.diagnose.score.projection import Projection, contracted, weighted
-from bayesdist.diagnose.score.result import Family, Outcome, outcome
-from bayesdist.diagnose.score.sample import Block
-from bayesdist.diagnose.significance import chi_square_of, hotelling_p
+from bayesdist.diagnose.score.result import POWER, Family, Outcome, outcome
+from bayesdist.diagnose.score.sample import Block, ScoredSample
+from bayesdist.diagnose.statistics import (
+    EfficientScore,
+    add_over,
+    chi_square_of,
+    hotelling_p,
+    independent_directions,
+    squares_of,
+    sums_over,
+)
 from bayesdist.infer.equations.priors import GaussianPriors
 from bayesdist.model.frames import LINEAR_MATRICES, frame_names
 from bayesdist.utils.arrays import Float, Int
-from bayesdist.utils.distributions import chi2_sf
+from bayesdist.utils.distributions import chi2_isf, chi2_sf, norm_isf
 
 EXPOSURES = Family(
     "exposures",
@@ -50,6 +72,21 @@ STARS_PER_DIRECTION = 4  # minimum per tested direction of an exposure
 MAX_PRODUCTS = 1e10
 # smallest remaining fraction of the information: deviations below it are absorbed by the frames
 INDEPENDENT = 0.02
+EXPOSURES_IN_TIME = Family(
+    "exposures in time",
+    "judge dates among those of the exposures, or add exposures at dates between and beyond them",
+    "deviations of exposures are correlated in time",
+    "deviations of exposures are not correlated in time",
+    held_by="time",
+)
+EXPOSURE_FIELDS = Family(
+    "fields of exposures",
+    "calibrate exposures one by one, or take more of them, in whose mean such fields average out",
+    "exposures differ by a smooth field that is new in each",
+    "exposures do not differ by smooth fields",
+    held_by="exposure fields",
+)
+LENGTHS = (0.08, 0.2, 0.5)  # correlation lengths that are tried, in longer half sides
 
 
 @dataclass(frozen=True, eq=False)
@@ -353,3 +390,111 @@ def _covariances(
     P = projection.precision[np.ix_(rows, rows)]
     before, after = shared[rows], left.gain[rows]
     return of_own, of_others + after.T @ P @ after - before.T @ P @ before
+
+
+def exposure_time_test(
+    projection: Projection, estimates: Mapping[int, Float], theta: Float, priors: GaussianPriors
+) -> Outcome | None:
+    """Test of the deviations of exposures; None without a drift, and for too few dates.
+
+    `estimates` are the linear deviations of exposures that are not parameters, by exposure code.
+    Deviations that are parameters, with `priors` on their size, are taken from the solution
+    `theta`.
+    """
+    sample = projection.sample
+    model, time = sample.model, sample.model.time
+    if time is None or sample.epoch is None:
+        return None
+    values = fitted_deviations(model, theta, priors)
+    if values is not None:
+        names, first = np.unique(
+            [block.frame_exposure for block in sample.blocks], return_index=True
+        )
+        dates = np.array([sample.epoch[sample.blocks[k].rows.start] for k in first])
+        values = values[names]
+    elif estimates:
+        codes, first = np.unique([block.exposure for block in sample.blocks], return_index=True)
+        by_code = {
+            int(code): sample.epoch[sample.blocks[k].rows.start]
+            for code, k in zip(codes, first, strict=True)
+        }
+        dates = np.array([by_code[code] for code in estimates])
+        values = np.stack(list(estimates.values()))
+    else:
+        return None
+    p, correlation = correlation_p(values, dates, time.breaks)
+    if correlation == 0.0:
+        return None
+    rms = float(np.sqrt(np.mean((values - values.mean(axis=0)) ** 2)))
+    rms *= model.pixel_size(theta) * max(max(chip.size) for chip in model.chips) / 2
+    family = EXPOSURES_IN_TIME
+    return outcome(
+        replace(family, present=f"{family.present} ({correlation:.2f} between successive ones)"),
+        correlation,
+        1.0,
+        None,
+        p,
+        square=max(correlation, 0.0) * rms**2,
+        noise=0.0,
+        unit=model.unit,
+        smallest=partial(_smallest, rms, values.size),
+    )
+
+
+def _smallest(rms: float, n: int, level: float) -> float:
+    """Rms of the correlated part of n deviations that is detected with the power `POWER`."""
+    needed = (norm_isf(level) - norm_isf(POWER)) / np.sqrt(n)
+    return float(rms * np.sqrt(min(needed, 1.0)))
+
+
+def exposure_field_test(sample: ScoredSample) -> Outcome | None:
+    """Test for fields of single exposures; None if fewer than two exposures have enough stars."""
+    if len({block.exposure for block in sample.blocks}) < 2:
+        return None
+    scores = DetectionScores(
+        sample.X, sample.Y, *sample.on_detector, sample.chip, sample.exposure, sample.star
+    )
+    chips = exposure_products(scores, [chip.size for chip in sample.model.chips])
+    if not chips:
+        return None
+    tried = [_tried(list(chips.values()), length) for length in LENGTHS]
+    p, statistic, dof, variance, error, length = min(tried)
+    # both axes together, without terms up to second order; the contribution of noise is subtracted
+    remaining = 2 * modes(next(iter(chips.values())).size, length).left
+    size = np.sqrt(remaining * max(variance, 0.0))
+
+    def smallest(level: float) -> float:
+        limit = _deviate(level / len(LENGTHS), dof)
+        return float(np.sqrt(remaining * error * max(limit - _deviate(POWER, dof), 0.0)))
+
+    half = max(max(chip.size) for chip in sample.model.chips) / 2
+    family = EXPOSURE_FIELDS
+    present = f"{family.present}, over some {length * half:.2g} pix"
+    return outcome(
+        replace(family, present=present),
+        statistic,
+        dof,
+        None,
+        min(1.0, len(LENGTHS) * p),
+        square=size**2,
+        noise=0.0,
+        unit=sample.model.unit,
+        smallest=smallest,
+    )
+
+
+def _tried(
+    chips: list[ExposureProducts], length: float
+) -> tuple[float, float, float, float, float, float]:
+    """Probability, chi-square, its degrees of freedom, variance of the field, its error, length."""
+    fits = np.array([chip.amplitude(length) for chip in chips])
+    weight = fits[:, 1] ** -2
+    variance, error = float(fits[:, 0] @ weight / weight.sum()), float(weight.sum() ** -0.5)
+    dof = sum(chip.n_fields * modes(chip.size, length).dof for chip in chips)
+    T = max(dof + variance / error * np.sqrt(2 * dof), 0.0)
+    return float(chi2_sf(T, dof)), T, dof, variance, error, length
+
+
+def _deviate(level: float, dof: float) -> float:
+    """Standardised chi-square that is exceeded with the probability `level`."""
+    return float((chi2_isf(level, dof) - dof) / np.sqrt(2 * dof))

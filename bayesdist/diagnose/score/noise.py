@@ -14,10 +14,9 @@ from functools import partial
 
 import numpy as np
 
-from bayesdist.diagnose.clusters import squares_over
 from bayesdist.diagnose.score.result import Family, Outcome, outcome, smallest_pattern
 from bayesdist.diagnose.score.sample import ScoredSample
-from bayesdist.diagnose.significance import hotelling_p
+from bayesdist.diagnose.statistics import hotelling_p, squares_over
 from bayesdist.model.grid import cell_index
 from bayesdist.utils.arrays import Float, Int
 from bayesdist.utils.distributions import chi2_sf

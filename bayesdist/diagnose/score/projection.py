@@ -1,4 +1,16 @@
-"""Regressors of matched stars with the parameters projected out, and their values at detections.
+"""Score tests of regressors: would additional terms improve the fit?
+
+    T = U^T V^-1 U        U = sum of Z_i^T g_i        V = sum of (Z_i^T g'_i) (Z_i^T g'_i)^T
+
+Z are the regressors with the parameters projected out, g is the score of a detection, and g' its
+score after the fit has moved one step along Z, corrected for the leverage of fit and step.  The
+only assumption about the noise is that stars are independent; the scores of the detections of a
+star are summed first.  V is distributed like a Wishart matrix with fewer degrees of freedom than
+there are stars, because stars near the edge, and stars whose errors are quoted too small, have the
+largest weight.  T is distributed like Hotelling's statistic (Bell and McCaffrey 2002; Pustejovsky
+and Tipton 2018).
+
+Regressors of matched stars with the parameters projected out, and their values at detections.
 
 The regressors of a test are functions of the detections.  No array has both the length of the
 detections and the width of parameters or regressors, because each block's polynomials have only a
@@ -7,20 +19,244 @@ few coefficients.
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import pairwise
 
 import numpy as np
-from scipy.linalg import cho_solve
+from scipy.linalg import block_diag, cho_solve
 
-from bayesdist.diagnose.efficient import EfficientScore
-from bayesdist.diagnose.score.regressors import Functions
+from bayesdist.diagnose.score.questions import Functions, Regressors, one_of_each
+from bayesdist.diagnose.score.result import Family, Outcome, outcome
 from bayesdist.diagnose.score.sample import Block, ScoredSample
+from bayesdist.diagnose.statistics import Directions, EfficientScore, add_over, chi_square_of
 from bayesdist.infer.equations.priors import GaussianPriors
 from bayesdist.utils.arrays import Float, Int
+from bayesdist.utils.distributions import chi2_sf, f_sf
 
+MAX_TAKEN = 0.5  # largest leverage by fit and step: with more, the residuals do not show the noise
+# Exponent of the leverage correction. 1/2 is exact if the quoted errors are correct (HC2), and 1,
+# the jackknife, is too conservative then (HC3); if they are not, 1/2 underestimates the scatter of
+# stars with a large weight.
+GIVEN_BACK = 0.75
+MIN_DOF = 3  # smallest degrees of freedom of the noise: with fewer, its covariance is meaningless
+MAX_CHIPS = 4  # largest number of chips tested together, using the covariance of all their scores
 RIDGE = 1e-12  # added to a scaled information matrix, so that undetermined directions stay finite
 LARGEST_LEVERAGE = 0.95  # of one detection; with a larger leverage hardly any residual remains
+
+
+def regressor_tests(projection: Projection) -> list[Outcome]:
+    """Outcomes of all regressor tests for which there are enough stars."""
+    by_regressors: dict[Regressors, list[_Part]] = {}
+    for chips in _chips_together(projection):
+        for regressors, part in _parts_of(projection, chips):
+            by_regressors.setdefault(regressors, []).append(part)
+    return one_of_each(
+        (regressors, _outcome(projection, regressors.family, parts))
+        for regressors, parts in by_regressors.items()
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class _Part:
+    """Result of one test on one chip or on a few chips together."""
+
+    statistic: float
+    p_value: float
+    dof: float
+    dof_residual: float
+    # square, noise: mean square of the pattern over these chips, noise included, and of the noise
+    square: float
+    noise: float
+
+
+def _chips_together(projection: Projection) -> list[list[int]]:
+    """Codes of the chips that are tested together: all, or each chip alone if there are many."""
+    chips = sorted({block.chip for block in projection.sample.blocks})
+    return [chips] if len(chips) <= MAX_CHIPS else [[chip] for chip in chips]
+
+
+def _outcome(projection: Projection, family: Family, parts: Sequence[_Part]) -> Outcome:
+    """Outcome of one family, combined from its parts."""
+    T, dof = parts[0].statistic, float(sum(part.dof for part in parts))
+    residual: float | None = parts[0].dof_residual
+    p = parts[0].p_value
+    if len(parts) > 1:
+        T = sum(chi_square_of(part.p_value, part.dof) for part in parts)
+        residual, p = None, float(chi2_sf(T, dof))
+    return outcome(
+        family,
+        T,
+        dof,
+        residual,
+        p,
+        square=float(np.mean([part.square for part in parts])),
+        noise=float(np.mean([part.noise for part in parts])),
+        unit=projection.sample.model.unit,
+    )
+
+
+def _parts_of(projection: Projection, chips: list[int]) -> Iterator[tuple[Regressors, _Part]]:
+    """Iterate over the tests of all regressors on the given chips."""
+    asked, tried = [], []
+    for regressors in projection.functions.regressors:
+        columns = np.concatenate([projection.columns(regressors.every, chip) for chip in chips])
+        is_tested = regressors.own(len(chips))
+        directions = Directions.of(
+            projection.regressors,
+            columns,
+            is_tested,
+            regressors.directions(len(chips)),
+            projection.beside_exposures(columns[is_tested]),
+            regressors.least,
+        )
+        if directions.q:
+            asked.append(regressors)
+            tried.append(directions)
+    sums = _star_sums(projection, chips, tried)
+    for regressors, directions, (V, spreads, taken) in zip(asked, tried, sums, strict=True):
+        # Wishart matrices with the same scatter
+        quoted, measured = directions.q * (directions.q + 1) / spreads - directions.q + 1
+        if taken > MAX_TAKEN or quoted < MIN_DOF:
+            continue
+        dof_residual = float(np.clip(measured, MIN_DOF, quoted))
+        dof = dof_residual + directions.q - 1
+        T = dof_residual / dof * float(directions.score @ np.linalg.solve(V, directions.score))
+        p = float(f_sf(T / directions.q, directions.q, dof_residual))
+        square = np.repeat(projection.functions.mean_square[regressors.every], 2)
+        squares = directions.squares(V, np.diag(np.tile(square, len(chips)) / len(chips)))
+        yield regressors, _Part(T, p, directions.q, dof_residual, *squares)
+
+
+def _star_sums(
+    projection: Projection, chips: list[int], tried: Sequence[Directions]
+) -> list[tuple[Float, Float, float]]:
+    """Covariance of the scores of each family, from the sums of scores per star.
+
+    For each family the list also has the scatter (2,) of that covariance, according to the quoted
+    errors and to the scores, and the mean leverage by fit and step of the contributing stars.
+    """
+    if not tried:
+        return []
+    sample = projection.sample
+    n_stars = int(sample.star.max()) + 1
+    single = n_stars == len(sample)
+    together = _Together.of(tried)
+    parts = [slice(a, b) for a, b in pairwise([*together.starts, len(together.step)])]
+    V = [np.zeros((directions.q, directions.q)) for directions in tried]
+    information = [np.zeros((directions.q, directions.q)) for directions in tried]
+    by_star = np.zeros((0 if single else n_stars, len(together.step)))
+    trace, norm = np.zeros((2, n_stars, len(tried)))
+    leverage = np.zeros(len(tried))
+    size2 = np.zeros((n_stars, len(tried)))
+    blocks = [block for block in sample.blocks if block.chip in chips]
+    all_chips = len(blocks) == len(sample.blocks)
+    for block in blocks:
+        coefficients = projection.regressor_map(block, together.columns) @ together.basis
+        F = projection.functions.at(block.rows)
+        x = np.stack([F.T @ coefficients[axis] for axis in (0, 1)])
+        psi, trace_and_norm, lost = together.left_scores(projection, block, x)
+        leverage += lost
+        star = sample.star[block.rows]
+        if single:
+            trace[star], norm[star] = trace_and_norm
+            size2[star] = np.add.reduceat(psi**2, together.starts, axis=1)
+            for k, part in enumerate(parts):
+                V[k] += psi[:, part].T @ psi[:, part]
+        else:
+            for total, values in (
+                (by_star, psi),
+                (trace, trace_and_norm[0]),
+                (norm, trace_and_norm[1]),
+            ):
+                add_over(total, star, values)
+        if not all_chips:
+            uu, uv, vv = sample.curvature[:, block.rows]
+            for k, part in enumerate(parts):
+                u, v = x[..., part]
+                cross = (u.T * uv) @ v
+                information[k] += (u.T * uu) @ u + (v.T * vv) @ v + cross + cross.T
+    for k, (directions, part) in enumerate(zip(tried, parts, strict=True)):
+        if not single:
+            V[k] += by_star[:, part].T @ by_star[:, part]
+        if all_chips:
+            V[k] += (
+                directions.basis.T @ projection.prior_meat(directions.columns) @ directions.basis
+            )
+        else:  # contribution of other chips and priors through the frames, which is small
+            V[k] += projection.score_ratio * (np.eye(directions.q) - information[k])
+    if not single:
+        size2 = np.add.reduceat(by_star**2, together.starts, axis=1)
+    spreads = _spreads(
+        trace, norm, size2, np.array([np.trace(matrix) / len(matrix) for matrix in V])
+    )
+    leverage /= trace.sum(axis=0)
+    return [(matrix, a, float(b)) for matrix, a, b in zip(V, spreads, leverage, strict=True)]
+
+
+def _spreads(trace: Float, norm: Float, size2: Float, scale: Float) -> Float:
+    """Scatter (families, 2) of the covariances of scores, from quoted errors and from the scores.
+
+    `trace` and `norm` (stars, families) are those of each star's information, `size2` (stars,
+    families) the squares of its scores, and `scale` (families,) the mean variance of the scores per
+    direction.
+    """
+    quoted = trace**2 + norm**2
+    # part of the fourth moment that normal scores with these covariances have
+    part = quoted / np.maximum(trace**2 + 2 * norm**2, 1e-300)
+    measured = (part * size2**2).sum(axis=0) / scale**2
+    return np.stack([quoted.sum(axis=0), measured], axis=1)
+
+
+@dataclass(frozen=True, eq=False)
+class _Together:
+    """Directions of several families, concatenated."""
+
+    columns: Int  # (n,)
+    basis: Float  # (n, q)
+    step: Float  # (q,)
+    starts: Int  # (families,) index of the first direction of each family
+
+    @classmethod
+    def of(cls, tried: Sequence[Directions]) -> _Together:
+        """Concatenate the directions of these families."""
+        return cls(
+            np.concatenate([directions.columns for directions in tried]),
+            np.asarray(block_diag(*(directions.basis for directions in tried))),
+            np.concatenate([directions.score for directions in tried]),
+            np.cumsum([0, *(directions.q for directions in tried[:-1])]),
+        )
+
+    def left_scores(
+        self, projection: Projection, block: Block, x: Float
+    ) -> tuple[Float, Float, Float]:
+        """Scores (n, q) of detections after a step of the fit along the directions of each family.
+
+        Also returns trace and norm (2, n, families) of each detection's information on the
+        directions x (2, n, q), and the sum (families,) of leverage times trace.
+        """
+
+        def of_families(values: Float) -> Float:
+            return np.add.reduceat(values, self.starts, axis=1)
+
+        sample = projection.sample
+        uu, uv, vv = sample.curvature[:, block.rows, None]
+        moved = [of_families(component * self.step) for component in x]
+        g = sample.score[:, block.rows, None] - np.stack(
+            [uu * moved[0] + uv * moved[1], uv * moved[0] + vv * moved[1]]
+        )
+        G_uu, G_vv = np.abs(uu) * of_families(x[0] ** 2), np.abs(vv) * of_families(x[1] ** 2)
+        G_uv = np.sqrt(np.abs(uu * vv)) * of_families(x[0] * x[1])
+        leverage = projection.leverage[:, block.rows, None] + np.stack(
+            [np.where(uu > 0, G_uu, 0.0), np.where(vv > 0, G_vv, 0.0)]
+        )
+        leverage = np.minimum(leverage, LARGEST_LEVERAGE)
+        g = g / (1.0 - leverage) ** GIVEN_BACK
+        family = np.repeat(np.arange(len(self.starts)), np.diff([*self.starts, len(self.step)]))
+        psi = g[0][:, family] * x[0] + g[1][:, family] * x[1]
+        lost = (leverage[0] * G_uu + leverage[1] * G_vv).sum(axis=0)
+        return psi, np.stack([G_uu + G_vv, np.sqrt(G_uu**2 + 2 * G_uv**2 + G_vv**2)]), lost
 
 
 @dataclass(frozen=True, eq=False)

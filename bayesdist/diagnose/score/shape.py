@@ -24,11 +24,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from bayesdist.diagnose.clusters import sums_over
 from bayesdist.diagnose.score.missing_orders import MIN_STARS, ChipResiduals, legendre_products
 from bayesdist.diagnose.score.result import Family, Outcome, outcome
 from bayesdist.diagnose.score.sample import ScoredSample
-from bayesdist.diagnose.significance import chi_square_of, hotelling_p
+from bayesdist.diagnose.statistics import chi_square_of, hotelling_p, sums_over
 from bayesdist.model.grid import cell_index
 from bayesdist.utils.arrays import Float, Int
 from bayesdist.utils.distributions import beta_sf, chi2_sf, norm_isf, norm_sf

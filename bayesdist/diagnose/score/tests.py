@@ -5,19 +5,14 @@ from __future__ import annotations
 import numpy as np
 
 from bayesdist.data.matches import Matches
-from bayesdist.diagnose.score.exposure_fields import exposure_field_test
-from bayesdist.diagnose.score.exposures import exposure_tests
-from bayesdist.diagnose.score.gap import gap_test
-from bayesdist.diagnose.score.jumps import jump_test
+from bayesdist.diagnose.score.exposures import exposure_field_test, exposure_tests
 from bayesdist.diagnose.score.missing_orders import chip_residuals, missing_orders_test
-from bayesdist.diagnose.score.motions import motion_test
+from bayesdist.diagnose.score.motions import gap_test, motion_test
 from bayesdist.diagnose.score.noise import noise_tests
-from bayesdist.diagnose.score.pattern import pattern_test
-from bayesdist.diagnose.score.projection import projection_of
-from bayesdist.diagnose.score.regressor_tests import regressor_tests
-from bayesdist.diagnose.score.regressors import functions_for
+from bayesdist.diagnose.score.patterns import jump_test, pattern_test, ring_test
+from bayesdist.diagnose.score.projection import projection_of, regressor_tests
+from bayesdist.diagnose.score.questions import functions_for
 from bayesdist.diagnose.score.result import ScoreTest, corrected
-from bayesdist.diagnose.score.rings import ring_test
 from bayesdist.diagnose.score.sample import scored_sample
 from bayesdist.diagnose.score.shape import shape_tests
 from bayesdist.diagnose.score.truncation import radius_test, truncation_test

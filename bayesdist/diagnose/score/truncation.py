@@ -22,7 +22,7 @@ from scipy import optimize, special
 
 from bayesdist.diagnose.score.result import Family, Outcome
 from bayesdist.diagnose.score.sample import ScoredSample
-from bayesdist.diagnose.significance import chi_square_of
+from bayesdist.diagnose.statistics import chi_square_of
 from bayesdist.infer.kernel import GAUSSIAN
 from bayesdist.utils.arrays import Float, Int
 from bayesdist.utils.checks import EITHER

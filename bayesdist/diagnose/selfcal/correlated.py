@@ -12,7 +12,7 @@ import numpy as np
 
 from bayesdist.diagnose.correlated.deviations import deviation_draws
 from bayesdist.diagnose.correlated.functions import MIN_SIDE, StructureFunctions
-from bayesdist.diagnose.correlated.noise import not_narrower
+from bayesdist.diagnose.correlated.information import not_narrower
 from bayesdist.diagnose.correlated.priors import DiscrepancyPriors
 from bayesdist.diagnose.correlated.result import (
     ChipStructure,
@@ -24,10 +24,11 @@ from bayesdist.diagnose.selfcal.eliminated import (
     Columns,
     EvenStars,
     eliminated,
+    score_excess,
+    scores_of_detections,
+    squared_scores,
     without_parameters,
 )
-from bayesdist.diagnose.selfcal.sandwich import squared_scores
-from bayesdist.diagnose.selfcal.scores import score_excess, scores_of_detections
 from bayesdist.infer.equations.scaled import one_thread
 from bayesdist.infer.selfcal.mode import SelfCalibrationMode
 from bayesdist.infer.selfcal.problem import Problem

@@ -10,6 +10,10 @@ detection.  Then
 
 where the sums over s include all stars, and those within T, A and b the detections of a star.
 Polynomials and functions over a chip are dense columns, parameters of single exposures sparse ones.
+
+Scores of single detections of a self-calibration, and the fraction of them that stars absorb.
+
+Covariance of a self-calibration from the scatter of the scores of its stars.
 """
 
 from __future__ import annotations
@@ -21,25 +25,30 @@ from functools import cached_property
 import numpy as np
 from scipy.sparse import csr_array
 
-from bayesdist.diagnose.clusters import sums_over
 from bayesdist.diagnose.correlated.deviations import DeviationColumns, deviation_columns
 from bayesdist.diagnose.correlated.functions import StructureFunctions
-from bayesdist.diagnose.efficient import EfficientScore
-from bayesdist.diagnose.selfcal.scores import (
-    UNKNOWN,
-    DetectionScores,
-    inverse_roots,
-    places_by_star,
+from bayesdist.diagnose.correlated.information import (
+    MAX_BLOCKS,
+    MIN_FREE,
+    STARS_PER_BLOCK,
+    SquaredScores,
+    block_ratios,
 )
+from bayesdist.diagnose.statistics import EfficientScore, sums_over
 from bayesdist.infer.equations.scaled import determined
-from bayesdist.infer.selfcal.elimination import PlaceDerivatives
+from bayesdist.infer.selfcal.calibrate import MOST_TAKEN
+from bayesdist.infer.selfcal.elimination import STARS, PlaceDerivatives, memberships
 from bayesdist.infer.selfcal.mode import SelfCalibrationMode
 from bayesdist.infer.selfcal.problem import Problem
+from bayesdist.model.grid import cell_index
 from bayesdist.utils.arrays import Bool, Float, Int
 
 DETECTIONS = 8192  # per chunk in memory
 MAX_DETECTIONS = 60_000  # largest number that is examined
 MAX_EXPOSURES = 150  # largest number of exposures with separate deviations
+# relative curvature below which a combination of parameters, or of a star's parameters, counts as
+# undetermined
+UNKNOWN = 1e-10
 
 
 @dataclass(frozen=True, eq=False)
@@ -361,3 +370,209 @@ def _pulled(columns: Columns, piece: Piece, gradient: Float) -> Float:
             out[columns.dense(code, axis)] = values.T @ gradient[members, axis]
     out[columns.sparse] = piece.sparse.T @ gradient.ravel()
     return out
+
+
+@dataclass(frozen=True, eq=False)
+class DetectionScores:
+    """Gradient and curvature of each detection's log density with respect to sky position."""
+
+    gradient: Float  # (N, 2)
+    # (N, 2, 2) minus the second derivatives; zero for detections with uncertain membership, so that
+    # every sum is positive definite
+    curvature: Float
+
+    def at(self, rows: slice | Bool) -> DetectionScores:
+        """Scores of the given detections."""
+        return DetectionScores(self.gradient[rows], self.curvature[rows])
+
+    def flattened(self, excess: Float) -> DetectionScores:
+        """Scores of a likelihood with variances multiplied by factors (N,)."""
+        return DetectionScores(
+            self.gradient / excess[:, None], self.curvature / excess[:, None, None]
+        )
+
+
+def scores_of_detections(solution: SelfCalibrationMode) -> DetectionScores:
+    """Scores of all detections of a solution, with the stars at their modes."""
+    p, mixture = solution.problem, solution.mixture
+    member = memberships(p, solution.theta, mixture, solution.stars)
+    r = p.places(solution.theta) - p.star_places(solution.stars)
+    W = _square(p)
+    inverse = 1.0 / (p.var + mixture.jitter**2)
+    pulled = inverse[:, None] * np.einsum("nab,nb->na", W, r)
+    H = (member * inverse)[:, None, None] * W
+    # derivative of the membership with respect to position
+    H -= (member * (1 - member))[:, None, None] * (pulled[:, :, None] * pulled[:, None, :])
+    good = (H[:, 0, 0] > 0) & (np.linalg.det(H) > 0)
+    return DetectionScores(-member[:, None] * pulled, np.where(good[:, None, None], H, 0.0))
+
+
+def score_excess(solution: SelfCalibrationMode, scores: DetectionScores) -> Float:
+    """Ratio (N,) of the variance of the scores to their curvature, in blocks of the detector.
+
+    The ratios are corrected for the part of the residuals that stars absorb.  Those of the blocks
+    are shrunk to their mean, as for matched stars.
+    """
+    p = solution.problem
+    free = 1.0 - taken_by_stars(solution)
+    free *= max(1.0 - len(solution.free) / max(2 * float(free.sum()), 1.0), 0.1)
+    to_pixels = np.linalg.inv(_square(p))  # converts squared gradients to pixels
+    top = np.einsum("na,nab,nb->n", scores.gradient, to_pixels, scores.gradient) / free
+    bottom = np.einsum("nab,nba->n", to_pixels, scores.curvature)
+    chip = p.groups.chip[p.groups.index]
+    out = np.ones(len(p))
+    for code in range(len(p.model.chips)):
+        on_chip = np.flatnonzero(chip == code)
+        if not len(on_chip) or bottom[on_chip].sum() <= 0:
+            continue
+        side = int(np.clip(np.sqrt(len(on_chip) / STARS_PER_BLOCK), 1, MAX_BLOCKS))
+        block = cell_index(p.X[on_chip], p.Y[on_chip], (side, side))
+        out[on_chip] = block_ratios(
+            block, np.stack([top, bottom, 2 * free], axis=1)[on_chip], side**2
+        )
+    return out
+
+
+def _square(problem: Problem) -> Float:
+    return np.asarray(problem.W[:, [0, 1, 1, 2]].reshape(-1, 2, 2))
+
+
+@dataclass(frozen=True, eq=False)
+class StarBlock:
+    """A block of stars with their n detections, in detector pixels."""
+
+    rows: slice  # range of detections in the problem
+    star: Int  # (n,) index of each detection's star in the block
+    member: Float  # (n,) probability of belonging to the star
+    weight: Float  # (n,) inverse variance per axis, times that probability
+    residual: Float  # (n, 2) detection minus star
+    # (n, q, 2) R B: B is the curvature of the log density with respect to the star's parameters and
+    # the detection's pixels, R^T R the inverse of that with respect to the star's parameters
+    ties: Float
+
+
+def star_blocks(solution: SelfCalibrationMode) -> Iterator[StarBlock]:
+    """Iterate over the stars of a solution in blocks, with their detections."""
+    p, theta, mixture = solution.problem, solution.theta, solution.mixture
+    members = memberships(p, theta, mixture, solution.stars)
+    weights = members / (p.var + mixture.jitter**2)
+    residuals = p.places(theta) - p.star_places(solution.stars)
+    for first in range(0, p.n_stars, STARS):
+        last = min(first + STARS, p.n_stars)
+        rows = slice(int(p.starts[first]), int(p.starts[last]))
+        to_pixels = np.linalg.inv(p.jacobians(theta, rows))
+        w, star = weights[rows], p.star[rows] - first
+        by_star = np.swapaxes(to_pixels @ places_by_star(p, rows), 1, 2)
+        curvature = w[:, None, None] * by_star @ np.swapaxes(by_star, 1, 2)
+        information = p.priors.precision[first:last] + sums_over(star, curvature, last - first)
+        roots = inverse_roots(information)
+        residual = np.einsum("nij,nj->ni", to_pixels, residuals[rows])
+        ties = w[:, None, None] * (roots[star] @ by_star)
+        yield StarBlock(rows, star, members[rows], w, residual, ties)
+
+
+def taken_by_stars(solution: SelfCalibrationMode) -> Float:
+    """Fraction (N,) of each detection's variance that its star absorbs, at most `MOST_TAKEN`."""
+    out = np.empty(len(solution.problem))
+    for block in star_blocks(solution):
+        square = np.sum(block.ties**2, axis=(1, 2))
+        out[block.rows] = square / (2 * np.maximum(block.weight, np.finfo(float).tiny))
+    return np.minimum(out, MOST_TAKEN)
+
+
+def inverse_roots(matrices: Float) -> Float:
+    """Matrices R with R^T R the inverse of each matrix (S, q, q).
+
+    Undetermined directions are left out.
+    """
+    scale = np.sqrt(np.maximum(np.einsum("sqq->sq", matrices), 1e-300))
+    values, vectors = np.linalg.eigh(matrices / (scale[:, :, None] * scale[:, None, :]))
+    good = values > UNKNOWN
+    roots = np.where(good, np.where(good, values, 1.0) ** -0.5, 0.0)
+    return np.asarray(roots[:, :, None] * np.swapaxes(vectors, 1, 2) / scale[:, None, :])
+
+
+def places_by_star(problem: Problem, rows: slice) -> Float:
+    """Derivatives (n, 2, q) of positions with respect to the parameters of their stars."""
+    n, q, unit = rows.stop - rows.start, problem.n_star, np.eye(2)
+    out = np.broadcast_to(unit, (n, 2, 2))
+    if q >= 4:
+        out = np.concatenate([out, problem.time[rows, None, None] * unit], axis=2)
+    return out if q < 5 else np.concatenate([out, problem.factor[rows, :, None]], axis=2)
+
+
+def squared_scores(solution: SelfCalibrationMode, scores: DetectionScores) -> SquaredScores:
+    """Sums over the stars of products of their scores, and their expectation.
+
+    0 for fixed parameters.
+
+    The detections of a star share its position, so that their scores are summed.  The leverage is
+    that of the star's detections per degree of freedom, beyond the star's parameters.
+    """
+    p, free = solution.problem, solution.free
+    columns = Columns(p, solution.theta)
+    root = np.zeros((columns.n_params, len(free)))
+    root[free] = np.linalg.inv(np.linalg.cholesky(solution.precision)).T
+    inside = np.empty_like(root)
+    inside[columns.order] = root
+    unbiased, jackknife = np.zeros((2, columns.n_params, columns.n_params))
+    products = np.zeros(3)
+    for piece in pieces(columns):
+        piece_scores = piece.scores(scores)
+        sums = absorbed_by_stars(columns, piece, piece_scores, solution.stars)
+        S, q = piece.stars.stop - piece.stars.start, p.n_star
+        moved = _displacements(columns, piece, inside)
+        total_leverage = np.einsum(
+            "nab,naf,nbf->n", piece_scores.curvature, moved, moved, optimize=True
+        )
+        leverage = np.bincount(piece.star, total_leverage, S)
+        leverage -= np.sum((sums.rows @ inside) ** 2, axis=1).reshape(S, q).sum(axis=1)
+        number = np.maximum(
+            2 * np.bincount(piece.star, piece_scores.curvature[:, 0, 0] > 0, S) - q, 1
+        )
+        mean = np.clip(leverage / number, 0.0, 1 - MIN_FREE)
+        psi = star_scores(columns, piece, piece_scores.gradient) / np.sqrt(1 - mean)[:, None]
+        unbiased += psi.T @ psi
+        square = np.sum((psi @ root) ** 2, axis=1)
+        # expected squares of a star are assumed equal for all its degrees of freedom
+        products += [square @ square, square @ mean, leverage @ mean]
+        psi /= np.sqrt(1 - mean)[:, None]
+        jackknife += psi.T @ psi
+    prior = np.array(solution.prior.precision)
+    expected = np.zeros_like(prior)
+    expected[np.ix_(free, free)] = solution.precision - prior[np.ix_(free, free)]
+    return SquaredScores(
+        root @ root.T,
+        expected,
+        prior,
+        unbiased,
+        jackknife,
+        (float(products[0]), float(products[1]), float(products[2])),
+    )
+
+
+def star_scores(columns: Columns, piece: Piece, gradient: Float) -> Float:
+    """Scores (S, n) of each star of a chunk with respect to all columns.
+
+    Stars are at their modes: the gradient with respect to their parameters is zero, so that nothing
+    needs to be eliminated.
+    """
+    S = piece.stars.stop - piece.stars.start
+    out = np.zeros((S, columns.sparse.stop))
+    # one value per star
+    for code, (members, values) in enumerate(piece.dense):
+        for axis in (0, 1):
+            summed = piece.of_stars(gradient[:, None, axis, None])[:, members] @ values
+            out[:, columns.dense(code, axis)] = summed
+    out[:, columns.sparse] = (piece.of_stars(gradient[:, None, :]) @ piece.sparse).toarray()
+    return out[:, columns.order]
+
+
+def _displacements(columns: Columns, piece: Piece, root: Float) -> Float:
+    """Displacements (n, 2, f) of detections due to changes `root` (internal columns, f)."""
+    out = np.zeros((len(piece), 2, root.shape[1]))
+    for code, (members, values) in enumerate(piece.dense):
+        for axis in (0, 1):
+            out[members, axis] = values @ root[columns.dense(code, axis)]
+    out += (piece.sparse @ root[columns.sparse]).reshape(out.shape)
+    return np.asarray(out)

@@ -30,7 +30,7 @@ from bayesdist.utils.numbers import Scale, count
 if TYPE_CHECKING:
     from bayesdist.data import MagnitudeErrors
     from bayesdist.diagnose.residuals.binned import BinnedResiduals
-    from bayesdist.diagnose.residuals.sample import StarSample
+    from bayesdist.diagnose.residuals.stars import StarSample
     from bayesdist.infer import LinearFit, Posterior
 
 AXES = ("u", "v")

@@ -18,7 +18,7 @@ from bayesdist.utils.arrays import Bool, Float, Int
 from bayesdist.utils.numbers import Scale
 
 if TYPE_CHECKING:
-    from bayesdist.diagnose.residuals.sample import ExposureScatter, StarSample
+    from bayesdist.diagnose.residuals.stars import ExposureScatter, StarSample
     from bayesdist.infer.solution.solution import Solution
 
 QUANTITIES = ("x", "y", "magnitude", "colour", "epoch")

@@ -9,9 +9,14 @@ import pytest
 
 from bayesdist.diagnose.correlated.deviations import deviation_columns
 from bayesdist.diagnose.correlated.functions import StructureFunctions
-from bayesdist.diagnose.selfcal.eliminated import Columns, eliminated, without_parameters
-from bayesdist.diagnose.selfcal.sandwich import squared_scores
-from bayesdist.diagnose.selfcal.scores import DetectionScores, scores_of_detections
+from bayesdist.diagnose.selfcal.eliminated import (
+    Columns,
+    DetectionScores,
+    eliminated,
+    scores_of_detections,
+    squared_scores,
+    without_parameters,
+)
 from bayesdist.infer.equations.priors import Prior
 from bayesdist.infer.selfcal.elimination import Mixture
 from bayesdist.infer.selfcal.mode import SelfCalibrationMode, gauge_of, mode_at, solve

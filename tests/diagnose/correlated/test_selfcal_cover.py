@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from bayesdist.diagnose.selfcal.correlated import selfcal_discrepancy
-from bayesdist.diagnose.selfcal.score import selfcal_score_tests
+from bayesdist.diagnose.selfcal.tests import selfcal_score_tests
 from bayesdist.infer.equations.priors import Prior
 from bayesdist.infer.selfcal.mode import gauge_of, solve
 from bayesdist.infer.selfcal.problem import prepare

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from bayesdist.data import Matches
-from bayesdist.diagnose.correlated.information import Information, cell_sums
-from bayesdist.diagnose.correlated.squares import SquaredScores
+from bayesdist.diagnose.correlated.information import Information, SquaredScores, cell_sums
 from bayesdist.infer import GaussianPriors, LinearFit
 from bayesdist.infer.solution.solution import likelihood_of
 from bayesdist.infer.stars.stars import prepare

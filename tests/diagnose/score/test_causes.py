@@ -9,11 +9,10 @@ import numpy as np
 import pytest
 
 import bayesdist as bd
-from bayesdist.diagnose.score.causes import CAUSES, cause_of, explains_more
 from bayesdist.diagnose.score.exposures import SECOND_ORDER
 from bayesdist.diagnose.score.noise import BY_POSITION
 from bayesdist.diagnose.score.questions import POINTING, order_family
-from bayesdist.diagnose.score.result import Outcome, corrected
+from bayesdist.diagnose.score.result import CAUSES, Outcome, cause_of, corrected, explains_more
 from bayesdist.diagnose.score.shape import SKEWNESS
 from bayesdist.diagnose.score.truncation import RADIUS
 

@@ -9,7 +9,7 @@ import pytest
 from scipy import stats
 from scipy.optimize import minimize_scalar
 
-from bayesdist.diagnose.selfcal.score import selfcal_score_tests
+from bayesdist.diagnose.selfcal.tests import selfcal_score_tests
 from bayesdist.infer.selfcal import self_calibrate
 from bayesdist.infer.selfcal.sky_moves import gauge_free_matrix
 from bayesdist.infer.selfcal.tangent import TangentPlane

@@ -9,7 +9,7 @@ import pytest
 from scipy.special import ndtri
 
 from bayesdist.assess import distortion_vectors
-from bayesdist.diagnose.residuals.rows import StatisticsRow
+from bayesdist.diagnose.residuals.tables import StatisticsRow
 from bayesdist.missions.wise.assess.account import RowAccount
 from bayesdist.missions.wise.assess.distortion_field import field_of_solution
 from bayesdist.missions.wise.assess.histograms import histogram

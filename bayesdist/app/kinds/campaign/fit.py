@@ -112,7 +112,7 @@ def _trends(joint: HierarchicalFit, stars: Matches) -> list[str]:
     """Clauses about deviations that drift with time although they are modelled as scatter.
 
     Only scale and shears are tested: motion of the chips relative to each other has its own test
-    (`bayesdist.diagnose.score.gap`).
+    (`bayesdist.diagnose.score.motions`).
     """
     if stars.epoch is None:
         return []

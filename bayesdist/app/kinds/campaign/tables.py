@@ -15,8 +15,7 @@ from bayesdist.app.kinds.campaign.reference import held_tables
 from bayesdist.app.kinds.parts import StoredLookupTables
 from bayesdist.data.magnitude_errors import MagnitudeErrors
 from bayesdist.data.matches import Matches
-from bayesdist.diagnose.tables.between_nodes import BetweenNodes
-from bayesdist.diagnose.tables.measured import measured_between
+from bayesdist.diagnose.tables import BetweenNodes, measured_between
 from bayesdist.errors import InputError
 from bayesdist.infer import LinearFit, fit_by_magnitude, residuals
 from bayesdist.infer.nodes import (

@@ -17,7 +17,7 @@ from bayesdist.app.kinds.matches.stars import fit_stars, match_stars, read_stars
 from bayesdist.data import Matches
 from bayesdist.diagnose.checks import frames_doubt
 from bayesdist.diagnose.residuals.epoch_shift import epoch_shift
-from bayesdist.diagnose.residuals.quoted import majority_sentence
+from bayesdist.diagnose.residuals.misfit import majority_sentence
 
 
 class MatchesKind(RunKind[MatchesConfig, Matches, Matched]):

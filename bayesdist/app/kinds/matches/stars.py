@@ -25,8 +25,8 @@ from bayesdist.assess.model import with_diagnosed_errors
 from bayesdist.calibration.calibration import Calibration, calibration_of
 from bayesdist.calibration.prior import CalibrationPrior, prior_of_calibration
 from bayesdist.data import Matches
-from bayesdist.diagnose.residuals.quoted import error_scale
-from bayesdist.diagnose.residuals.sample import SAMPLE
+from bayesdist.diagnose.residuals.misfit import error_scale
+from bayesdist.diagnose.residuals.stars import SAMPLE
 from bayesdist.errors import ConfigError, DegenerateError, NotSettledError
 from bayesdist.infer import (
     GaussianPriors,

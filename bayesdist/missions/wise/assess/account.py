@@ -13,8 +13,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from bayesdist.diagnose.residuals.rows import StatisticsRow
-from bayesdist.diagnose.residuals.tables import StatisticsTable
+from bayesdist.diagnose.residuals.tables import StatisticsRow, StatisticsTable
 from bayesdist.missions.wise.assess.contradictions import (
     contradictions_across,
     contradictions_within,

@@ -8,7 +8,7 @@ from decimal import Decimal
 
 import numpy as np
 
-from bayesdist.diagnose.residuals.rows import STATISTICS
+from bayesdist.diagnose.residuals.tables import STATISTICS
 from bayesdist.errors import InputError
 from bayesdist.model.basis import polynomial_terms
 

@@ -8,8 +8,7 @@ from itertools import combinations, product
 import numpy as np
 
 from bayesdist.diagnose.residuals.binned import BAND_AXES, BinnedSums
-from bayesdist.diagnose.residuals.rows import bin_row, pair_row
-from bayesdist.diagnose.residuals.tables import StatisticsTable
+from bayesdist.diagnose.residuals.tables import StatisticsTable, bin_row, pair_row
 
 _AXES = BAND_AXES[:2]
 

@@ -6,7 +6,7 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
-from bayesdist.diagnose.residuals.rows import STATISTICS
+from bayesdist.diagnose.residuals.tables import STATISTICS
 from bayesdist.missions.wise.assess.account import RowAccount
 from bayesdist.missions.wise.assess.published import HEADS, PrintedRow
 from bayesdist.missions.wise.bands.context import BANDS, BandsInput

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from bayesdist.diagnose.residuals.rows import residual_statistics
+from bayesdist.diagnose.residuals.tables import residual_statistics
 from bayesdist.diagnose.score.result import POWER
 from bayesdist.infer.solution.geometry import geometries
 from bayesdist.infer.solution.skew import skew_of

@@ -20,7 +20,7 @@ from bayesdist.utils.distributions import binom_ppf
 from bayesdist.utils.numbers import count, number
 
 if TYPE_CHECKING:
-    from bayesdist.diagnose.holdout.tests import HeldTest
+    from bayesdist.diagnose.holdout.validation import HeldTest
 
 _WHAT = ("u", "v, given u", "distance")
 _LEAST_RANGE = 0.3  # least range of the error factor about 1, so that chance is not exaggerated

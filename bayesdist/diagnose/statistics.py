@@ -1,4 +1,11 @@
-"""Efficient scores: columns of a likelihood, with the parameters of the model projected out.
+"""Statistics of tests: sums over clusters, efficient scores, and p-values.
+
+Sums over detections with correlated errors: those of one star, one exposure, or one cell.
+
+The variance of a statistic that is a sum over detections follows from the squares of its sums over
+such clusters, not from those of single detections.
+
+Efficient scores: columns of a likelihood, with the parameters of the model projected out.
 
 Tests add columns Z to the derivatives J of positions with respect to the parameters, which are
 nuisance parameters.  With H the curvature and g the gradient of each detection, and P and r the
@@ -9,15 +16,73 @@ precision of the priors and their gradient,
     score = Z^T g - gain^T (J^T g + r)
 
 If positions of stars are fitted, they are eliminated from all these sums first.
+
+P-values, their correction for the number of tests, and confidence intervals of fractions.
 """
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import ArrayLike
+from scipy.sparse import csr_matrix
 
 from bayesdist.utils.arrays import Bool, Float, Int
+from bayesdist.utils.distributions import beta_ppf, beta_sf, chi2_isf
+
+MIN_P = 1e-300  # avoids underflow: no p-value is zero
+
+
+def sums_over(cluster: Int, values: Float, n: int = 0) -> Float:
+    """Sums of values over clusters.
+
+    `cluster` (N,) are codes from 0, `values` are (N, ...), and the result has at least `n` rows.
+    """
+    columns = values.reshape(len(values), math.prod(values.shape[1:])).T
+    sums = [np.bincount(cluster, column, n) for column in columns]
+    return np.stack(sums, axis=1).reshape(-1, *values.shape[1:]).astype(np.float64)
+
+
+def add_over(total: Float, cluster: Int, values: Float) -> None:
+    """Add values (N, ...) to the totals (c, ...) of their clusters, a few of many.
+
+    `total` is changed in place.
+    """
+    present, of = np.unique(cluster, return_inverse=True)
+    total[present] += sums_over(of, values)
+
+
+def joint_clusters(group: Int, cluster: Int) -> tuple[Int, Int]:
+    """Split clusters by group: the group (c,) of each part, and the part (N,) of each value.
+
+    `group` and `cluster` (N,) must not be negative.
+    """
+    n = int(cluster.max(initial=0)) + 1
+    keys, of = np.unique(group * n + cluster, return_inverse=True)
+    return keys // n, of
+
+
+def squares_over(cluster: Int, values: Float, group: Int | None = None, n: int = 1) -> Float:
+    """Squares (n, ...) of the sums over clusters, summed in each group.
+
+    `cluster` (N,) must not be negative, `values` are (N, ...); there is a single group by default.
+    """
+    owner, of = joint_clusters(np.zeros_like(cluster) if group is None else group, cluster)
+    return sums_over(owner, sums_over(of, values) ** 2, n)
+
+
+def products_over(group: Int, cluster: Int, values: Float, n: int) -> Float:
+    """Products between groups of the sums of k values over clusters, summed over the clusters.
+
+    Returns a matrix (k n, k n) for values (N, k) in n groups.
+    """
+    k = values.shape[1]
+    rows = (group[:, None] * k + np.arange(k)).ravel()
+    shape = (n * k, int(cluster.max(initial=0)) + 1)
+    table = csr_matrix((values.ravel(), (rows, np.repeat(cluster, k))), shape=shape)
+    return np.asarray((table @ table.T).toarray())
 
 
 @dataclass(frozen=True, eq=False)
@@ -138,3 +203,43 @@ def squares_of(
     step = inverse @ score
     noise = np.trace(square @ inverse @ covariance @ inverse)
     return float(step @ square @ step), float(noise)
+
+
+def holm(p_values: ArrayLike) -> Float:
+    """P-values (m,) corrected for their number (Holm 1979).
+
+    A test is significant at a level, among all tests, if its corrected value does not exceed the
+    level.
+    """
+    p = np.asarray(p_values, float)
+    order = np.argsort(p, kind="stable")
+    out = np.empty(len(p))
+    steps = np.arange(len(p), 0, -1) * p[order]
+    out[order] = np.minimum(np.maximum.accumulate(steps), 1.0)
+    return out
+
+
+def hotelling_p(statistic: float, dof: float, n: float) -> float:
+    """P-value of a chi-square statistic with a covariance estimated from the squares of n vectors.
+
+    The squares are taken about zero (Hotelling 1931).  `dof` is the number of directions, `n` that
+    of stars or other independent vectors.
+    """
+    return float(beta_sf(min(statistic / n, 1.0), dof / 2, max(n - dof, 1) / 2))
+
+
+def chi_square_of(p: float, dof: float) -> float:
+    """Chi-square with the p-value `p`, for combining tests that have other distributions."""
+    return float(chi2_isf(max(p, MIN_P), dof))
+
+
+def clopper_pearson(fraction: float, n: float, confidence: float) -> tuple[float, float]:
+    """Exact central confidence interval of a fraction, given the observed fraction in n trials.
+
+    Clopper & Pearson 1934, Biometrika 26, 404, in its form with quantiles of the beta distribution:
+    neither the number of trials nor that of successes needs to be an integer.
+    """
+    tail, k = (1.0 - confidence) / 2.0, fraction * n
+    low = float(beta_ppf(tail, k, n - k + 1.0)) if k > 0 else 0.0
+    high = float(beta_ppf(1.0 - tail, k + 1.0, n - k)) if k < n else 1.0
+    return low, high

@@ -1,1 +1,0 @@
-"""Errors of look-up tables between their nodes."""
