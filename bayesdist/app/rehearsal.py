@@ -12,7 +12,7 @@ from bayesdist.app.kinds.fit_data import FitData
 from bayesdist.app.products.made_files import product_input, rehearse_files, rehearse_outline
 from bayesdist.app.results import Results
 from bayesdist.assess import Requirement
-from bayesdist.assess.budget.budget import budget_of
+from bayesdist.assess.budget import budget_of
 from bayesdist.assess.requirements.margins import judge
 from bayesdist.assess.terms.given import centroid_errors
 from bayesdist.diagnose.residuals.stars import centroid_scatter, star_sample

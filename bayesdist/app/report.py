@@ -12,10 +12,9 @@ from bayesdist.app.calibrations import difference_from_previous
 from bayesdist.app.config import Config
 from bayesdist.app.results import Results
 from bayesdist.app.store import as_json
-from bayesdist.assess.coefficients import coefficient_table
 from bayesdist.assess.comparison.compare import Comparison
 from bayesdist.assess.evaluation import Evaluation
-from bayesdist.assess.solution import chip_places
+from bayesdist.assess.solution import chip_places, coefficient_table
 from bayesdist.assess.vectors import diagram_vectors
 from bayesdist.diagnose.diagnostics import Diagnostics
 from bayesdist.files.atomic import atomic_path

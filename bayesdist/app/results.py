@@ -36,7 +36,7 @@ from bayesdist.assess.evaluation import (
     validity_of,
 )
 from bayesdist.assess.model import ErrorModel
-from bayesdist.assess.requirements.validity import ValidityPeriod
+from bayesdist.assess.requirements.margins import ValidityPeriod
 from bayesdist.diagnose.diagnostics import Diagnostics
 from bayesdist.infer import LinearFit, Posterior, load_posterior
 from bayesdist.utils.checks import Check, in_order

@@ -23,7 +23,7 @@ from bayesdist.app.stages import evaluated
 from bayesdist.app.stages import run as run_configuration
 from bayesdist.app.store.rundir import RunDirectory
 from bayesdist.assess import ErrorBudget, Margin, Requirement, UncertaintyMap
-from bayesdist.assess.budget.budget import budget_of, place_budget
+from bayesdist.assess.budget import budget_of, place_budget
 from bayesdist.assess.drawn import DrawnErrors
 from bayesdist.assess.evaluation import Evaluation, position_map
 from bayesdist.assess.requirements.requirement import as_requirements

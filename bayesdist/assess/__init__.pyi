@@ -1,14 +1,20 @@
 """Public names and the modules that define them; each is imported on first use."""
 
-from .maps.area import (
+from .maps import (
     AreaMap as AreaMap,
+    UncertaintyMap as UncertaintyMap,
     area_map as area_map,
+    uncertainty_map as uncertainty_map,
 )
-from .budget.budget import (
+from .budget import (
     BudgetTerm as BudgetTerm,
     ErrorBudget as ErrorBudget,
 )
-from .domain import EvaluationDomain as EvaluationDomain
+from .domain import (
+    STATISTICS as STATISTICS,
+    EvaluationDomain as EvaluationDomain,
+    field_statistic as field_statistic,
+)
 from .model import (
     ErrorModel as ErrorModel,
     error_model as error_model,
@@ -22,25 +28,17 @@ from .evaluation import (
     EvaluationSettings as EvaluationSettings,
     evaluate as evaluate,
 )
-from .maps.uncertainty import (
-    UncertaintyMap as UncertaintyMap,
-    uncertainty_map as uncertainty_map,
-)
 from .requirements.margins import (
     Margin as Margin,
     Requirement as Requirement,
 )
 from .solution import chip_places as chip_places
-from .statistics import (
-    STATISTICS as STATISTICS,
-    field_statistic as field_statistic,
-)
 from .terms.given import (
     TERM_KINDS as TERM_KINDS,
     Catalogue as Catalogue,
     UserTerm as UserTerm,
 )
-from .terms.local import LocalErrors as LocalErrors
+from .terms.correlated import LocalErrors as LocalErrors
 from .units import (
     UNITS as UNITS,
     convert as convert,

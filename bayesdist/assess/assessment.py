@@ -11,8 +11,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from bayesdist.assess.budget.budget import ErrorBudget, budget_of
-from bayesdist.assess.checks import UNEXAMINED, assumption_checks, catalogue_checks
+from bayesdist.assess.budget import ErrorBudget, budget_of
 from bayesdist.assess.domain import EvaluationDomain
 from bayesdist.assess.evaluation import (
     EvaluationSettings,
@@ -23,6 +22,7 @@ from bayesdist.assess.evaluation import (
 from bayesdist.assess.model import ErrorModel, diagnosed_error_model, error_model
 from bayesdist.assess.requirements.margins import Margin, judge
 from bayesdist.assess.requirements.requirement import Requirement, as_requirements
+from bayesdist.assess.requirements.verdict import UNEXAMINED, assumption_checks, catalogue_checks
 from bayesdist.assess.solution import place_of
 from bayesdist.assess.terms.forms import ErrorTerm
 from bayesdist.assess.terms.given import (

@@ -16,8 +16,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from bayesdist.assess.domain import EvaluationDomain, WorstPosition
-from bayesdist.assess.statistics import extent, of_sizes, sizes
+from bayesdist.assess.domain import EvaluationDomain, WorstPosition, extent, of_sizes, sizes
 from bayesdist.assess.terms.forms import (
     PRODUCT,
     DrawnField,

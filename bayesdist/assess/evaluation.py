@@ -8,16 +8,21 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from bayesdist.assess.budget.budget import ErrorBudget, budget_of
-from bayesdist.assess.budget.surface import BudgetSurface, budget_surface
+from bayesdist.assess.budget import ErrorBudget, budget_of
+from bayesdist.assess.budget_surface import BudgetSurface, budget_surface
 from bayesdist.assess.domain import WHOLE, EvaluationDomain, Region, in_region
 from bayesdist.assess.drawn import DrawnErrors
-from bayesdist.assess.maps.area import AreaMap, area_map
-from bayesdist.assess.maps.uncertainty import RELATIVE, UncertaintyMap, uncertainty_map, with_local
+from bayesdist.assess.maps import (
+    RELATIVE,
+    AreaMap,
+    UncertaintyMap,
+    area_map,
+    uncertainty_map,
+    with_local,
+)
 from bayesdist.assess.model import ErrorModel
-from bayesdist.assess.requirements.margins import Margin, judge
+from bayesdist.assess.requirements.margins import Margin, ValidityPeriod, judge, validity_period
 from bayesdist.assess.requirements.requirement import Requirement
-from bayesdist.assess.requirements.validity import ValidityPeriod, validity_period
 from bayesdist.assess.requirements.verdict import VERDICT_LEVELS, rests_on
 from bayesdist.assess.terms.correlated import StructureErrors
 from bayesdist.assess.terms.forms import Known

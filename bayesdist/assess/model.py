@@ -12,15 +12,19 @@ from functools import partial
 import numpy as np
 from scipy.linalg import solve_triangular
 
-from bayesdist.assess.budget.budget import ErrorBudget, budget_of
+from bayesdist.assess.budget import ErrorBudget, budget_of
 from bayesdist.assess.domain import EvaluationDomain
 from bayesdist.assess.drawn import DrawnErrors, generators
-from bayesdist.assess.terms.correlated import Deviations, FieldsOfExposures, StructureErrors
+from bayesdist.assess.terms.correlated import (
+    Deviations,
+    FieldsOfExposures,
+    LocalErrors,
+    StructureErrors,
+    table_of,
+)
 from bayesdist.assess.terms.forms import ErrorTerm, Image
 from bayesdist.assess.terms.given import Centroids, UserTerm
-from bayesdist.assess.terms.local import LocalErrors, table_of
-from bayesdist.assess.terms.parameters import ExposureVariation, catalogue_terms
-from bayesdist.assess.terms.solution import SolutionErrors
+from bayesdist.assess.terms.parameters import ExposureVariation, SolutionErrors, catalogue_terms
 from bayesdist.assess.units import pixel_scale_of
 from bayesdist.diagnose.diagnostics import Diagnostics
 from bayesdist.errors import InputError, required

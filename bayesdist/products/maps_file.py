@@ -15,7 +15,7 @@ import numpy as np
 from astropy.io import fits
 
 from bayesdist.assess import AreaMap, UncertaintyMap
-from bayesdist.assess.maps.uncertainty import RELATIVE
+from bayesdist.assess.maps import RELATIVE
 from bayesdist.calibration.area import PixelAreaMap
 from bayesdist.errors import InputError
 from bayesdist.files.atomic import atomic_path

@@ -19,10 +19,10 @@ if TYPE_CHECKING:
     from astropy.table import Table
 
     from bayesdist.assess import AreaMap, Margin, UncertaintyMap, VectorMap
-    from bayesdist.assess.budget.budget import ErrorBudget
-    from bayesdist.assess.budget.surface import BudgetSurface
+    from bayesdist.assess.budget import ErrorBudget
+    from bayesdist.assess.budget_surface import BudgetSurface
     from bayesdist.assess.comparison.compare import Comparison
-    from bayesdist.assess.requirements.validity import ValidityPeriod
+    from bayesdist.assess.requirements.margins import ValidityPeriod
     from bayesdist.data import MagnitudeErrors
     from bayesdist.diagnose import ScoreTest
     from bayesdist.diagnose.holdout.validation import HoldoutValidation

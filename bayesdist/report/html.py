@@ -8,7 +8,7 @@ from html import escape
 from textwrap import fill
 from typing import TYPE_CHECKING
 
-from bayesdist.assess.maps.uncertainty import per_axis
+from bayesdist.assess.maps import per_axis
 from bayesdist.assess.requirements.verdict import VERDICT_LEVELS
 from bayesdist.utils.numbers import (
     MISSING,

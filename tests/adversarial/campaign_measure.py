@@ -16,7 +16,7 @@ from bayesdist.app.stages import make_stages
 from bayesdist.app.store.rundir import RunDirectory
 from bayesdist.assess import LocalErrors
 from bayesdist.assess.domain import EvaluationDomain
-from bayesdist.assess.terms.local import INTERPOLATION as BETWEEN
+from bayesdist.assess.terms.correlated import INTERPOLATION as BETWEEN
 from bayesdist.infer.solution.transforms import reference_gauge, without_frames
 from bayesdist.model import DistortionModel
 from bayesdist.model.grid import grid_pixels, mesh

@@ -19,8 +19,8 @@ from bayesdist.app.config import load_config
 from bayesdist.app.results import Results, margins_of
 from bayesdist.app.store.rundir import RunDirectory
 from bayesdist.assess import Margin, Requirement
+from bayesdist.assess.domain import field_statistic
 from bayesdist.assess.requirements.verdict import verdict_of
-from bayesdist.assess.statistics import field_statistic
 from bayesdist.model.grid import grid_pixels, mesh
 from bayesdist.utils.streams import restarted
 from tests.app.support import after_stages

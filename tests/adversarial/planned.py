@@ -13,7 +13,7 @@ import numpy as np
 from bayesdist.app.commands.on_runs.plan import content_of, futures_of, schedules_of
 from bayesdist.app.results import Results, margins_of
 from bayesdist.assess import Requirement
-from bayesdist.assess.planning.exposures import exposures_needed
+from bayesdist.assess.planning.futures import exposures_needed
 
 from . import exposure_kinds, fields, selfcal_kinds
 from .exposure_kinds import Scatter

@@ -13,7 +13,7 @@ from astropy.table import Table
 
 import bayesdist as bd
 from bayesdist.assess import Catalogue
-from bayesdist.assess.statistics import field_statistic
+from bayesdist.assess.domain import field_statistic
 from bayesdist.assess.terms.given import said_by_user
 from bayesdist.diagnose.diagnostics import Diagnostics, diagnose
 from bayesdist.model.grid import grid_pixels, mesh

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from bayesdist.app.config import parse_config
-from bayesdist.assess.checks import time_checks, visits_of
+from bayesdist.assess.requirements.verdict import time_checks, visits_of
 from bayesdist.model.timedep import TimeDependence
 
 from .support import config_text

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from bayesdist.assess.budget.budget import place_budget
-from bayesdist.assess.budget.surface import JOINT, budget_surface
+from bayesdist.assess.budget import place_budget
+from bayesdist.assess.budget_surface import JOINT, budget_surface
 from bayesdist.assess.model import error_model
 from bayesdist.assess.terms.parameters import ScaleError
 from bayesdist.errors import InputError

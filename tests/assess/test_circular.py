@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.stats import chi2, norm
 
-from bayesdist.assess.maps.uncertainty import circular_error, per_axis
+from bayesdist.assess.maps import circular_error, per_axis
 
 
 @pytest.mark.parametrize("p", [0.5, 0.68, 0.95, 0.99])

@@ -8,8 +8,13 @@ import numpy as np
 import pytest
 from scipy.stats import chi2, kstest
 
-from bayesdist.assess.comparison.compare import compare, comparison_table, difference_table
-from bayesdist.assess.comparison.sentences import comparison_lines, verdict
+from bayesdist.assess.comparison.compare import (
+    compare,
+    comparison_lines,
+    comparison_table,
+    difference_table,
+    verdict,
+)
 from bayesdist.calibration.chip_map import ChipMap, fitted_map
 from bayesdist.errors import InputError
 from bayesdist.model import PolynomialBasis

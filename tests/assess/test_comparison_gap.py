@@ -12,8 +12,8 @@ from astropy.io import fits
 from astropy.table import Table
 from scipy.stats import chi2, kstest
 
-from bayesdist.assess.comparison.gap import gap_difference, pair_of_chips
-from bayesdist.assess.comparison.sentences import gap_lines, gap_verdict
+from bayesdist.assess.comparison.compare import gap_lines, gap_verdict
+from bayesdist.assess.comparison.frame import gap_difference, pair_of_chips
 from bayesdist.calibration.calibration import calibration_of
 from bayesdist.formats.idctab.build import idctab_from_solution
 from bayesdist.formats.idctab.table import write_idctab

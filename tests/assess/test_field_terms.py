@@ -9,14 +9,14 @@ import pytest
 
 from bayesdist.assess import LocalErrors, Requirement, UserTerm, check_requirements
 from bayesdist.assess.model import error_model
-from bayesdist.assess.terms.forms.polynomials import without_rigid
+from bayesdist.assess.terms.forms import without_rigid
 from bayesdist.assess.terms.parameters import (
     MOTIONS,
     CatalogueErrors,
     ExposureVariation,
     ScaleError,
+    SolutionErrors,
 )
-from bayesdist.assess.terms.solution import SolutionErrors
 from bayesdist.infer.solution.transforms import reference_gauge, without_frames
 from tests.budgets import detector_budget
 from tests.infer.small_campaign import campaign_model, campaign_truth

@@ -8,7 +8,7 @@ from scipy import stats
 
 from bayesdist.assess.domain import EvaluationDomain
 from bayesdist.assess.model import error_model
-from bayesdist.assess.terms.local import LocalErrors
+from bayesdist.assess.terms.correlated import LocalErrors
 from bayesdist.diagnose.tables import MeanSquare
 from bayesdist.infer import fit_linear
 from tests.infer.support import UNCLIPPED, simulated

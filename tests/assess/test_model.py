@@ -10,22 +10,26 @@ import pytest
 from scipy import stats
 
 from bayesdist.assess import Requirement, UserTerm
-from bayesdist.assess.budget.budget import budget_of, place_budget
-from bayesdist.assess.budget.surface import budget_surface
+from bayesdist.assess.budget import budget_of, place_budget
+from bayesdist.assess.budget_surface import budget_surface
 from bayesdist.assess.domain import EvaluationDomain
 from bayesdist.assess.model import error_model
-from bayesdist.assess.requirements.validity import validity_period
+from bayesdist.assess.requirements.margins import validity_period
 from bayesdist.assess.terms.correlated import (
     STRUCTURE,
     STRUCTURE_IN_FIT,
     Deviations,
+    LocalErrors,
     StructureErrors,
 )
 from bayesdist.assess.terms.forms import DrawnField, Functions, Known, Row
 from bayesdist.assess.terms.given import Centroids
-from bayesdist.assess.terms.local import LocalErrors
-from bayesdist.assess.terms.parameters import CatalogueErrors, ExposureVariation, ScaleError
-from bayesdist.assess.terms.solution import SolutionErrors
+from bayesdist.assess.terms.parameters import (
+    CatalogueErrors,
+    ExposureVariation,
+    ScaleError,
+    SolutionErrors,
+)
 from bayesdist.data import MagnitudeErrors
 from bayesdist.diagnose.correlated import Discrepancy
 from bayesdist.diagnose.correlated.deviations import LinearDeviations

@@ -2,10 +2,10 @@ import numpy as np
 import pytest
 
 from bayesdist.assess import UserTerm, error_budget
-from bayesdist.assess.budget.budget import place_budget
+from bayesdist.assess.budget import place_budget
 from bayesdist.assess.model import error_model
+from bayesdist.assess.terms.correlated import LocalErrors
 from bayesdist.assess.terms.given import Centroids
-from bayesdist.assess.terms.local import LocalErrors
 from bayesdist.data import MagnitudeErrors
 from bayesdist.diagnose.tables import MeanSquare
 from bayesdist.errors import InputError

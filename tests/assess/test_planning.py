@@ -7,12 +7,14 @@ from scipy import stats
 from bayesdist.assess import Requirement, UserTerm, check_requirements
 from bayesdist.assess.model import error_model
 from bayesdist.assess.planning.dithers import further_dithers
-from bayesdist.assess.planning.exposures import MOST, Schedule, exposures_needed
 from bayesdist.assess.planning.futures import (
+    MOST,
     TRUTHS,
     Data,
     Futures,
     Scattering,
+    Schedule,
+    exposures_needed,
     with_more_data,
 )
 from bayesdist.diagnose.selfcal.eliminated import (

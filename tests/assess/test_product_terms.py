@@ -7,8 +7,8 @@ import json
 import numpy as np
 import pytest
 
-from bayesdist.assess.budget.budget import place_budget, with_product
-from bayesdist.assess.budget.surface import budget_surface
+from bayesdist.assess.budget import place_budget, with_product
+from bayesdist.assess.budget_surface import budget_surface
 from bayesdist.assess.model import error_model
 from bayesdist.assess.terms.forms import PRODUCT, Known, Row
 from bayesdist.model import Chip, DistortionModel

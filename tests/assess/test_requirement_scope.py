@@ -6,9 +6,9 @@ from scipy import stats
 from scipy.spatial.distance import pdist
 
 from bayesdist.assess import Requirement, UserTerm
+from bayesdist.assess.domain import extent
 from bayesdist.assess.model import error_model
-from bayesdist.assess.requirements.validity import validity_period
-from bayesdist.assess.statistics import extent
+from bayesdist.assess.requirements.margins import validity_period
 from bayesdist.assess.terms.given import Centroids
 from bayesdist.data import MagnitudeErrors
 from bayesdist.diagnose.statistics import clopper_pearson

@@ -6,7 +6,7 @@ import pytest
 from scipy import stats
 
 from bayesdist.assess import STATISTICS, Requirement, UserTerm, drawn
-from bayesdist.assess.requirements.tally import Tally
+from bayesdist.assess.requirements.verdict import Tally
 from bayesdist.assess.terms.forms import Pool
 from bayesdist.diagnose.statistics import clopper_pearson
 from bayesdist.errors import InputError

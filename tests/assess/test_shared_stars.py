@@ -7,8 +7,7 @@ import pytest
 from threadpoolctl import threadpool_limits
 
 from bayesdist.assess.model import error_model
-from bayesdist.assess.terms.parameters import CatalogueErrors, ExposureVariation
-from bayesdist.assess.terms.solution import SolutionErrors
+from bayesdist.assess.terms.parameters import CatalogueErrors, ExposureVariation, SolutionErrors
 from bayesdist.infer import fit_linear
 from bayesdist.infer.exposures.hierarchy import fit_hierarchical
 from tests.budgets import detector_budget

@@ -9,7 +9,7 @@ import numpy as np
 
 from bayesdist.assess import Requirement, UserTerm
 from bayesdist.assess.model import error_model
-from bayesdist.assess.requirements.validity import validity_period
+from bayesdist.assess.requirements.margins import validity_period
 from bayesdist.infer import Solution
 from bayesdist.model import Chip, DistortionModel, TimeDependence
 from tests.benchmarks.timing import best, say

@@ -10,8 +10,8 @@ import numpy as np
 
 from bayesdist.app.results import margins_of
 from bayesdist.assess import Margin, Requirement
-from bayesdist.assess.budget.surface import JOINT as MODEL
-from bayesdist.assess.statistics import field_statistic
+from bayesdist.assess.budget_surface import JOINT as MODEL
+from bayesdist.assess.domain import field_statistic
 from bayesdist.model.grid import grid_pixels, mesh
 
 from .campaigns import BEYOND, EXPOSURES, KINDS, OFFSET, assessed, campaign

@@ -11,14 +11,14 @@ import numpy as np
 from scipy.stats import norm
 
 from bayesdist.app.results import errors_of
-from bayesdist.assess.budget.budget import TOTAL, place_budget
-from bayesdist.assess.budget.surface import JOINT as MODEL
+from bayesdist.assess.budget import TOTAL, place_budget
+from bayesdist.assess.budget_surface import JOINT as MODEL
 from bayesdist.assess.domain import EvaluationDomain
 from bayesdist.assess.drawn import DrawnErrors
 from bayesdist.assess.terms.correlated import STRUCTURE_IN_FIT
 from bayesdist.assess.terms.forms import PolynomialField
 from bayesdist.assess.terms.given import CENTROID
-from bayesdist.assess.terms.solution import COEFFICIENTS, TIME_DEPENDENCE
+from bayesdist.assess.terms.parameters import COEFFICIENTS, TIME_DEPENDENCE
 from bayesdist.diagnose.correlated import Discrepancy
 from bayesdist.infer import kernel
 from bayesdist.model import DistortionModel

@@ -22,8 +22,7 @@ from scipy.stats import t as student_t
 
 from bayesdist.app.results import Results, errors_of, margins_of
 from bayesdist.assess import Requirement
-from bayesdist.assess.domain import EvaluationDomain
-from bayesdist.assess.statistics import field_statistic
+from bayesdist.assess.domain import EvaluationDomain, field_statistic
 from bayesdist.diagnose.correlated import Discrepancy, DiscrepancyPriors
 from bayesdist.diagnose.correlated.exposure_fields import ExposureFields
 from bayesdist.diagnose.correlated.functions import StructureFunctions

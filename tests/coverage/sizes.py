@@ -22,7 +22,7 @@ import numpy as np
 from numpy.polynomial.legendre import legvander2d
 
 import bayesdist as bd
-from bayesdist.assess.statistics import field_statistic
+from bayesdist.assess.domain import field_statistic
 from bayesdist.model.grid import grid_pixels, mesh
 from tests.adversarial.fields import MIDDLE, SIDE, distortion, scaled
 

@@ -19,9 +19,9 @@ import numpy as np
 import pytest
 from scipy.stats import binom
 
-from bayesdist.assess.budget.budget import TOTAL
+from bayesdist.assess.budget import TOTAL
 from bayesdist.assess.terms.given import CENTROID
-from bayesdist.assess.terms.solution import COEFFICIENTS, TIME_DEPENDENCE
+from bayesdist.assess.terms.parameters import COEFFICIENTS, TIME_DEPENDENCE
 
 from .campaigns import KINDS
 from .places import PLACE_TOTAL

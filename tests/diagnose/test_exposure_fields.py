@@ -12,7 +12,7 @@ from scipy import stats
 from bayesdist.assess.domain import EvaluationDomain
 from bayesdist.assess.model import ErrorModel
 from bayesdist.assess.terms.correlated import FieldsOfExposures
-from bayesdist.assess.terms.solution import SolutionErrors
+from bayesdist.assess.terms.parameters import SolutionErrors
 from bayesdist.data.matches import Matches
 from bayesdist.diagnose import score_tests
 from bayesdist.diagnose.correlated import Discrepancy, estimate_discrepancy

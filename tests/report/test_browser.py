@@ -13,13 +13,13 @@ import numpy as np
 import pytest
 
 from bayesdist.assess import UserTerm
-from bayesdist.assess.budget.budget import budget_of, place_budget
-from bayesdist.assess.budget.surface import budget_surface
+from bayesdist.assess.budget import budget_of, place_budget
+from bayesdist.assess.budget_surface import budget_surface
 from bayesdist.assess.domain import EvaluationDomain
 from bayesdist.assess.model import error_model
+from bayesdist.assess.terms.correlated import LocalErrors
 from bayesdist.assess.terms.forms import PRODUCT, Known, Row
 from bayesdist.assess.terms.given import Centroids
-from bayesdist.assess.terms.local import LocalErrors
 from bayesdist.assess.terms.parameters import ScaleError
 from bayesdist.data.magnitude_errors import estimate
 from bayesdist.report.run_report import write_report

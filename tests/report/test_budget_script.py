@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 
 import bayesdist.report
-from bayesdist.assess.budget.budget import budget_of, place_budget
-from bayesdist.assess.budget.surface import budget_surface
+from bayesdist.assess.budget import budget_of, place_budget
+from bayesdist.assess.budget_surface import budget_surface
 from bayesdist.assess.domain import EvaluationDomain
 from bayesdist.assess.model import error_model
 from bayesdist.report.sections.explorer import budget_data

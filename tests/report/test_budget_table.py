@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from lxml import html as lxml_html
 
-from bayesdist.assess.budget.budget import BudgetTerm
+from bayesdist.assess.budget import BudgetTerm
 from bayesdist.report.contents import REPORT
 from bayesdist.report.run_report import render_report
 from bayesdist.report.sections.run.budget import budget_table

@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from bayesdist.assess.checks import catalogue_checks
-from bayesdist.assess.requirements.validity import ValidityPeriod
+from bayesdist.assess.requirements.margins import ValidityPeriod
+from bayesdist.assess.requirements.verdict import catalogue_checks
 from bayesdist.report.contents import EXPLAINED, section_of
 from bayesdist.report.context import Product
 from bayesdist.report.sections.run.provenance import product_table

@@ -21,7 +21,7 @@ from scipy.stats import chi2
 import bayesdist as bd
 from bayesdist.assess import Requirement, distortion_vectors
 from bayesdist.assess.evaluation import EvaluationSettings
-from bayesdist.assess.requirements.validity import ValidityPeriod
+from bayesdist.assess.requirements.margins import ValidityPeriod
 from bayesdist.errors import InputError
 from bayesdist.report import html, plots
 from bayesdist.report.figures.arrows import Arrows

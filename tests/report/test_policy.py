@@ -17,7 +17,7 @@ import pytest
 from lxml import html as lxml_html
 
 from bayesdist.assess import Requirement, UserTerm
-from bayesdist.assess.budget.surface import budget_surface
+from bayesdist.assess.budget_surface import budget_surface
 from bayesdist.assess.model import error_model
 from bayesdist.report.context import Product
 from bayesdist.report.overview import OverviewRow, write_overview

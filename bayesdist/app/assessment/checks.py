@@ -8,7 +8,7 @@ from typing import Any
 from bayesdist.app.config import Config
 from bayesdist.app.kinds.fit_data import FitData
 from bayesdist.app.kinds.kind import kind_of
-from bayesdist.assess.checks import assumption_checks
+from bayesdist.assess.requirements.verdict import assumption_checks
 from bayesdist.diagnose.diagnostics import Diagnostics
 from bayesdist.infer import Posterior
 from bayesdist.utils.checks import Check

@@ -23,8 +23,12 @@ from bayesdist.assess.terms.given import (
     names_catalogue,
     names_motions,
 )
-from bayesdist.assess.terms.parameters import one_size_kinds
-from bayesdist.assess.terms.solution import COEFFICIENTS, EXPOSURE_FRAME, TIME_DEPENDENCE
+from bayesdist.assess.terms.parameters import (
+    COEFFICIENTS,
+    EXPOSURE_FRAME,
+    TIME_DEPENDENCE,
+    one_size_kinds,
+)
 
 Probability = Annotated[float, Field(gt=0, lt=1)]
 GridPoints = Annotated[int, Field(ge=2, le=10_000)]  # no more than a detector has pixels

@@ -20,7 +20,7 @@ from bayesdist.app.products.made_files import (
     product_of,
     write_files,
 )
-from bayesdist.assess.budget.budget import with_product
+from bayesdist.assess.budget import with_product
 from bayesdist.assess.evaluation import Evaluation
 from bayesdist.assess.terms.forms import PRODUCT
 from bayesdist.calibration.plane import ARCSEC

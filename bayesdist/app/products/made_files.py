@@ -16,12 +16,18 @@ from bayesdist.app.kinds.fit_data import FitData, assessment_epoch
 from bayesdist.app.kinds.fitted import Fitted
 from bayesdist.app.kinds.kind import kind_of
 from bayesdist.app.kinds.matched import Outline
-from bayesdist.assess.budget.budget import TOTAL
+from bayesdist.assess.budget import TOTAL
 from bayesdist.assess.model import with_diagnosed_errors
 from bayesdist.assess.terms.correlated import DEVIATIONS, STRUCTURE, STRUCTURE_IN_FIT
 from bayesdist.assess.terms.forms import PRODUCT
-from bayesdist.assess.terms.parameters import ABERRATION, CATALOGUE, MOTIONS
-from bayesdist.assess.terms.solution import COEFFICIENTS, EXPOSURE_FRAME, TIME_DEPENDENCE
+from bayesdist.assess.terms.parameters import (
+    ABERRATION,
+    CATALOGUE,
+    COEFFICIENTS,
+    EXPOSURE_FRAME,
+    MOTIONS,
+    TIME_DEPENDENCE,
+)
 from bayesdist.calibration.calibration import Calibration, GaussianSolution, calibration_of
 from bayesdist.calibration.further import FurtherError
 from bayesdist.calibration.orientation import lay_on

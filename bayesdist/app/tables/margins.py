@@ -12,7 +12,7 @@ from bayesdist.app.screen import number, table_text
 from bayesdist.app.store.rundir import RunDirectory
 from bayesdist.app.store.summary import MarginRow, WorstPosition
 from bayesdist.assess import Margin, Requirement
-from bayesdist.assess.maps.uncertainty import per_axis
+from bayesdist.assess.maps import per_axis
 from bayesdist.utils.numbers import probability_words
 
 # attributes that define the scope of a requirement, in addition to chip and epoch

@@ -18,10 +18,10 @@ from bayesdist.app.store.rundir import RunDirectory
 from bayesdist.app.store.summary import ValidityRow
 from bayesdist.app.tables.margins import margin_rows, margin_table
 from bayesdist.assess import Margin
-from bayesdist.assess.budget.budget import ErrorBudget
-from bayesdist.assess.coefficients import coefficient_table
+from bayesdist.assess.budget import ErrorBudget
 from bayesdist.assess.evaluation import Evaluation
-from bayesdist.assess.requirements.validity import ValidityPeriod
+from bayesdist.assess.requirements.margins import ValidityPeriod
+from bayesdist.assess.solution import coefficient_table
 from bayesdist.diagnose.diagnostics import Diagnostics
 from bayesdist.diagnose.residuals.misfit import Misfit
 from bayesdist.diagnose.score.result import ScoreTest

@@ -14,7 +14,7 @@ import numpy as np
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from bayesdist.assess.maps.uncertainty import UncertaintyMap, uncertainty_map
+from bayesdist.assess.maps import UncertaintyMap, uncertainty_map
 from bayesdist.data.detections import Detections
 from bayesdist.errors import InputError
 from bayesdist.infer.compare.frame_fields import mean_squares

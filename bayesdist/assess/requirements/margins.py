@@ -1,4 +1,11 @@
-"""Requirements on the position error, and the margins by which a solution meets them."""
+"""Margins by which a solution meets requirements, and how long they hold.
+
+Requirements on the position error, and the margins by which a solution meets them.
+
+Reduction of an error term that would meet a requirement.
+
+Validity period of a calibration: until when a requirement is met by the extrapolated drift.
+"""
 
 from __future__ import annotations
 
@@ -9,20 +16,21 @@ from html import escape
 from itertools import count
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from bayesdist.assess.domain import EvaluationDomain, WorstPosition
 from bayesdist.assess.drawn import DrawnErrors
-from bayesdist.assess.requirements.reduction import RequiredReduction, required_reduction
 from bayesdist.assess.requirements.requirement import Requirement
-from bayesdist.assess.requirements.tally import Tally
 from bayesdist.assess.requirements.verdict import (
     MISSED_BELOW,
+    Tally,
     counting_error,
     undecided_by_draws,
     verdict_of,
 )
 from bayesdist.assess.solution import place_of
 from bayesdist.assess.units import convert
+from bayesdist.diagnose.statistics import clopper_pearson
 from bayesdist.errors import InputError
 from bayesdist.model import Chip, DistortionModel
 from bayesdist.model.grid import DEFAULT_GRID
@@ -33,6 +41,9 @@ from bayesdist.utils.numbers import counted, probability_words, rounded
 EPOCHS = 9  # number of evenly spaced epochs, with both ends, at which a range is judged
 MOST_DRAWS = 512_000  # 99.9 % of verdicts are right 0.001 from the required probability 0.95
 DRAWS_AT_ONCE = 32_000  # number of draws added at a time, to limit memory
+DRAWS = 1000  # number of draws, sufficient for a factor accurate to one or two percent
+STEPS = 9  # number of bisections of the interval that contains the factor
+BAND = 0.95  # level of the interval of a probability
 
 
 @dataclass(frozen=True, eq=False)
@@ -431,3 +442,154 @@ def _margin(
         draws=tally.values[0],
         worst=replace(position, rms=factor * position.rms),
     )
+
+
+@dataclass(frozen=True)
+class RequiredReduction:
+    """The error term that must be reduced to meet a requirement."""
+
+    # the term that needs the smallest reduction if one term is sufficient; else the largest term
+    term: str
+    factor: float  # factor by which its error must be multiplied; 0 if it is not sufficient
+    now: float  # its radial rms over the positions judged, in the unit of the requirement
+    needed: float  # radial rms that it may have
+    enough: bool  # True if the requirement is then met with the other terms unchanged
+    unit: str
+
+    @property
+    def sentence(self) -> str:
+        """The reduction in one sentence."""
+        if not self.enough:
+            return (
+                f"no term can do it alone: the largest, {self.term} ({self.now:.3g} {self.unit} "
+                "radial rms), could vanish and the requirement would still not be met"
+            )
+        return (
+            f"it would be met if {self.term} fell from {self.now:.3g} to {self.needed:.3g} "
+            f"{self.unit} radial rms, all else being as it is"
+        )
+
+
+def required_reduction(
+    errors: DrawnErrors, requirement: Requirement, domain: EvaluationDomain, factor: float
+) -> RequiredReduction | None:
+    """Find the term that needs the smallest reduction for a requirement to be met.
+
+    Each term in turn is multiplied by a number between 0 and 1, with the same draws throughout.
+
+    `domain`: positions at the worst epoch. `factor`: size of the solution's unit in the unit of the
+    requirement. Returns None if the requirement is met with the draws used here.
+    """
+    n = min(DRAWS, errors.n_draws)
+    statistic = requirement.statistic
+
+    def met(term: str, size: float) -> bool:
+        statistics = errors.statistics(domain, [statistic], scale={term: size}, n_draws=n)
+        return bool(
+            np.mean(factor * statistics[statistic] <= requirement.limit) >= requirement.probability
+        )
+
+    if met("", 1.0):  # met with these draws, so that no reduction can be stated
+        return None
+    sizes = {name: factor * size for name, size in errors.sizes(domain).items()}
+    largest = max(sizes, key=lambda name: sizes[name])
+    best, best_factor = "", 0.0
+    for name in sizes:
+        # terms that need a larger reduction than the best one so far are skipped
+        if sizes[name] > 0 and met(name, best_factor):
+            low, high = 0.0, 1.0
+            for _ in range(STEPS):
+                middle = (low + high) / 2
+                low, high = (middle, high) if met(name, middle) else (low, middle)
+            if not best or low > best_factor:
+                best, best_factor = name, low
+    if not best:
+        return RequiredReduction(largest, 0.0, sizes[largest], 0.0, False, requirement.unit)
+    now = sizes[best]
+    return RequiredReduction(best, best_factor, now, best_factor * now, True, requirement.unit)
+
+
+@dataclass(frozen=True, eq=False)
+class ValidityPeriod:
+    """Probability of meeting a requirement as a function of epoch."""
+
+    requirement: Requirement
+    epoch: Float  # (n,), decimal years, ascending
+    probability: Float  # (n,), fraction of draws that meet the limit
+    low: Float  # (n,), central 95 % interval for the number of draws (Clopper-Pearson)
+    high: Float  # (n,)
+    value: Float  # (n,), median of the statistic, in the unit of the requirement
+
+    @property
+    def date(self) -> float | None:
+        """Date at which the probability falls below the required one; None if it does not."""
+        return self._fall(self.probability)
+
+    @property
+    def interval(self) -> tuple[float | None, float | None]:
+        """Such dates for both ends of the interval of the probability, the earlier one first."""
+        return self._fall(self.low), self._fall(self.high)
+
+    @property
+    def sentence(self) -> str:
+        """The date in one sentence."""
+        name, asked = self.requirement.name, self.requirement.probability
+        first, last = float(self.epoch[0]), float(self.epoch[-1])
+        if self.date is None:
+            return f"{name}: the probability stays at {asked:g} or more until {last:.1f}"
+        if self.date == first:
+            p_first = float(self.probability[0])
+            return (
+                f"{name}: the probability is below {asked:g} already at {first:.1f} ({p_first:.2g})"
+            )
+        early, late = self.interval
+        until = f"{late:.1f}" if late is not None else f"after {last:.1f}"
+        since = first if early is None else early
+        return f"{name}: recalibrate before {self.date:.1f} ({since:.1f} to {until})"
+
+    def _fall(self, probability: Float) -> float | None:
+        below = probability < self.requirement.probability
+        if not below.any():
+            return None
+        k = int(np.argmax(below))
+        if k == 0:
+            return float(self.epoch[0])
+        ends = slice(k - 1, k + 1)
+        return float(
+            np.interp(
+                -self.requirement.probability,  # `interp` needs ascending values
+                -probability[ends],
+                self.epoch[ends],
+            )
+        )
+
+
+def validity_period(
+    errors: DrawnErrors,
+    requirement: Requirement,
+    epochs: ArrayLike,
+    *,
+    grid: tuple[int, int] = DEFAULT_GRID,
+    pixel_scale: float | None = None,
+) -> ValidityPeriod:
+    """Follow a requirement through time.
+
+    The error at each epoch is that of the drift in the model, extrapolated with its covariance. It
+    includes the curvature of the drift that data and prior allow, if the errors contain it.
+
+    `errors`: draws for a model that depends on time; the same draws are used at all epochs, so the
+    curve has no Monte-Carlo noise between epochs. `requirement`: its epoch is ignored. `epochs`:
+    decimal years, ascending, shape (n,), at least two. `grid`: number of points along x and y of a
+    chip. `pixel_scale`: see `check_requirements`.
+    """
+    at = np.asarray(epochs, float)
+    requirement = requirement.in_unit_of(errors.unit)
+    factor = convert(1.0, errors.unit, requirement.unit, pixel_scale, where=requirement.where)
+    n = errors.n_effective
+    single_epoch = replace(requirement, epoch=float(at[0]), epochs=None)
+    (domain,) = domains_of(single_epoch, errors.solution.model, grid)
+    statistics = errors.over_epochs(domain, [float(epoch) for epoch in at], [requirement.statistic])
+    draws = factor * np.array([by_name[requirement.statistic] for by_name in statistics])
+    met, value = np.mean(draws <= requirement.limit, axis=1), np.median(draws, axis=1)
+    low, high = np.array([clopper_pearson(p, n, BAND) for p in met]).T
+    return ValidityPeriod(requirement, at, met, low, high, value)

@@ -9,13 +9,13 @@ from numbers import Real
 from typing import Any
 
 from bayesdist.assess.domain import (
+    STATISTICS,
     WHOLE,
     Region,
     check_region,
     in_region,
     region_words,
 )
-from bayesdist.assess.statistics import STATISTICS
 from bayesdist.assess.units import UNITS, stated_unit
 from bayesdist.diagnose.residuals.binned import Coverage
 from bayesdist.errors import InputError, require_known

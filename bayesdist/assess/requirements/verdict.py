@@ -1,18 +1,29 @@
-"""Verdict on a requirement from a probability counted in draws, and its assumptions."""
+"""Verdicts on requirements, the probabilities that they rest on, and their assumptions.
+
+Verdict on a requirement from a probability counted in draws, and its assumptions.
+
+A probability estimated by counting draws, and its effective number of independent draws.
+
+Checks of the assumptions of an evaluation: residuals, catalogue and dates.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
 
 import numpy as np
 
-from bayesdist.assess.checks import visits_of
+from bayesdist.assess.terms.forms import Pool
 from bayesdist.diagnose.correlated import Discrepancy
 from bayesdist.diagnose.diagnostics import Diagnostics
 from bayesdist.diagnose.statistics import clopper_pearson
+from bayesdist.infer import Posterior
+from bayesdist.infer.posterior.checks import sampling_checks
 from bayesdist.model import DistortionModel
-from bayesdist.utils.arrays import Float
-from bayesdist.utils.checks import LARGER, Check, doubts_of
+from bayesdist.model.timedep import TimeDependence
+from bayesdist.utils.arrays import Bool, Float, Int
+from bayesdist.utils.checks import EITHER, LARGER, Check, doubts_of
 from bayesdist.utils.distributions import beta_std
 from bayesdist.utils.limits import CONFIDENCE, COUNTING_ERROR, EXCEEDS
 from bayesdist.utils.numbers import count, probability_words
@@ -20,6 +31,17 @@ from bayesdist.utils.numbers import count, probability_words
 # level of a check for each verdict, from best to worst
 VERDICT_LEVELS = {"met": "pass", "not shown": "warn", "undecided": "warn", "missed": "fail"}
 MISSED_BELOW = round(1.0 - EXCEEDS.value, 12)  # largest probability of meeting a missed limit
+GROUP = "Assumptions"
+UNEXAMINED = Check(
+    "Fit",
+    "Residuals",
+    "not examined",
+    "bd.diagnose",
+    "warn",
+    "the residuals were not examined; give diagnostics=bd.diagnose(posterior, matches)",
+    # structure would make errors larger; overestimated quoted errors would make them smaller
+    EITHER,
+)
 
 
 def counting_error(fraction: float, n: float) -> float:
@@ -177,3 +199,207 @@ def _exposures(
     if single:
         return f"a position in a single exposure, as {linear.n_exposures} exposures, {variation}"
     return f"a position in the mean of {linear.n_exposures} exposures, {variation}"
+
+
+@dataclass(eq=False)
+class Tally:
+    """Draws of a statistic compared with its limit, in one or several sets of draws.
+
+    Parameters
+    ----------
+    limit : float
+        Limit in the unit of the values.
+    values : list of ndarray
+        The statistic of each draw, for each set of draws.
+    pools : list of tuple of Pool
+        Finite sets from which the draws of the errors were taken, for each set of draws; with the
+        same terms in the same order.
+    """
+
+    limit: float
+    values: list[Float] = field(default_factory=list)
+    pools: list[tuple[Pool, ...]] = field(default_factory=list)
+
+    def add(self, values: Float, pools: tuple[Pool, ...]) -> None:
+        """Add further draws."""
+        self.values.append(values)
+        self.pools.append(pools)
+
+    @property
+    def all_values(self) -> Float:
+        """The statistic of every draw, shape (n,)."""
+        return np.concatenate(self.values)
+
+    @property
+    def n(self) -> int:
+        """Number of draws."""
+        return sum(len(values) for values in self.values)
+
+    @property
+    def fraction(self) -> float:
+        """Fraction of draws that do not exceed the limit."""
+        return float(np.mean(self.all_values <= self.limit))
+
+    def effective(self) -> tuple[float, float]:
+        """Effective number of independent draws, and its limit for an infinite number of draws.
+
+        Let n draws contain terms that are taken from finite sets of m independent draws each. The
+        variance of the fraction p of the draws that meet the limit is at most
+
+            p (1 - p) / n + sum(s / m)
+
+        where s is the covariance of two draws that use the same draw of the set (Hoeffding's
+        decomposition; the sum of s is at most p (1 - p)). It is estimated from such pairs, and two
+        standard errors are added; without pairs it is p (1 - p).
+
+        Returns
+        -------
+        now, limit : float
+            At least 1; the second is infinite without finite sets.
+        """
+        met = self.all_values <= self.limit
+        n, p = len(met), float(np.mean(met))
+        variance = p * (1.0 - p)
+        sizes, shares = [], []
+        for k in range(len(self.pools[0])):
+            term_pools = [pools[k] for pools in self.pools]
+            sizes.append(
+                sum(pool.size for pool in term_pools)
+                if term_pools[0].renewed
+                else term_pools[0].size
+            )
+            shares.append(_share(met, p, term_pools) if variance > 0 else 1.0)
+        if not sizes:
+            return float(n), np.inf
+        worst = 1.0 / min(sizes)
+        fixed = min(float(np.dot(shares, 1.0 / np.array(sizes))), worst)
+        return max(1.0 / (1.0 / n + fixed), 1.0), max(1.0 / fixed, 1.0) if fixed > 0 else np.inf
+
+
+def _share(met: Bool, p: float, pools: list[Pool]) -> float:
+    """Covariance of two draws with the same draw of a set, relative to their variance.
+
+    `met`: True for each draw that meets the limit, shape (n,). `p`: mean of `met`. `pools`: the set
+    for each set of draws.
+    """
+    rows: list[Int] = []
+    first = 0
+    for pool in pools:
+        if pool.rows is None:
+            return 1.0
+        rows.append(pool.rows + first)
+        if pool.renewed:
+            first += int(pool.rows.max()) + 1
+    number = np.concatenate(rows)
+    n_draws = np.bincount(number).astype(float)
+    n_met = np.bincount(number, met)
+    n_pairs = float(np.sum(n_draws * (n_draws - 1.0)))
+    if n_pairs == 0:
+        return 1.0
+    products = (n_met - p * n_draws) ** 2 - (n_met * (1.0 - 2.0 * p) + p**2 * n_draws)
+    share = float(products.sum()) / n_pairs / (p * (1.0 - p))
+    # each of the n_pairs / 2 distinct pairs has a product with variance (p (1 - p))^2
+    return float(np.clip(share + 2.0 * np.sqrt(2.0 / n_pairs), 0.0, 1.0))
+
+
+def assumption_checks(
+    posterior: Posterior | None,
+    diagnostics: Diagnostics,
+    time: TimeDependence | None,
+    *,
+    catalogue_stated: bool | None,
+    motions_stated: bool | None,
+) -> tuple[Check, ...]:
+    """Checks of the sampling, the fit, the matching, the catalogue and the dates.
+
+    A verdict relies on all of these, in addition to `Diagnostics.checks`.
+
+    Parameters
+    ----------
+    posterior : Posterior or None
+        None for a fit that was not sampled.
+    diagnostics : Diagnostics
+        Diagnostics of the posterior or of the fit.
+    time : TimeDependence or None
+        Time dependence of the model.
+    catalogue_stated, motions_stated : bool or None
+        True if errors of the reference catalogue's positions, and of its proper motions, are
+        stated; None without a catalogue.
+
+    Returns
+    -------
+    tuple of Check
+    """
+    return (
+        *sampling_checks(posterior),
+        *diagnostics.checks_of_input,
+        *catalogue_checks(catalogue_stated),
+        *time_checks(time, diagnostics.dates, motions_stated),
+    )
+
+
+def catalogue_checks(catalogue_stated: bool | None) -> Iterator[Check]:
+    """Check that errors of the reference catalogue are stated; no check without a catalogue."""
+    if catalogue_stated is None:
+        return
+    name, limit = "Error of the reference catalogue", "a row of [[budget]] or of the table"
+    if catalogue_stated:
+        yield Check(GROUP, name, "stated", limit, "pass")
+        return
+    sentence = (
+        "no error of the reference catalogue is stated: give a [[budget]] row that is named after "
+        "the catalogue, such as 'Gaia DR3', or in Python catalogue=bd.Catalogue('Gaia DR3', "
+        "sigma_mas=...); an error of 0 needs a source"
+    )
+    yield Check(GROUP, name, "not stated", limit, "warn", sentence, LARGER)
+
+
+def time_checks(
+    time: TimeDependence | None, dates: Float, motions_stated: bool | None
+) -> Iterator[Check]:
+    """Checks that the data constrain a drift and that errors of the proper motions are stated.
+
+    `time`: time dependence of the model; nothing is checked if it is None. `dates`: dates of the
+    matches, decimal years. `motions_stated`: None without a catalogue.
+    """
+    if time is None:
+        return
+    segment = np.searchsorted(time.breaks, dates, side="right")
+    counts = [visits_of(dates[segment == k], whole=dates).size for k in np.unique(segment)]
+    if counts and min(counts) <= 2:
+        yield Check(
+            GROUP,
+            "Dates that the drift is fitted to",
+            level="warn",
+            sentence=f"a drift is fitted to {('one date', 'two dates')[min(counts) - 1]}, so that "
+            "neither the variation between exposures nor the curvature of the drift is measured",
+            doubt=EITHER,
+        )
+    if motions_stated is False:
+        yield Check(
+            GROUP,
+            "Error of the proper motions",
+            "not stated",
+            "a row of [[budget]] or of the table",
+            "warn",
+            "no error of the catalogue's proper motions is stated, and the drift is "
+            "measured against them: give a [[budget]] row that names the motions, of size 0 with "
+            "its source where they have none",
+            LARGER,
+        )
+
+
+def visits_of(dates: Float, *, whole: Float | None = None) -> Float:
+    """Start dates of the visits, ascending; consecutive exposures form one visit.
+
+    A visit spans at most one day or 2 % of the baseline. `whole`: dates that define the baseline;
+    `dates` by default.
+    """
+    if not dates.size:
+        return dates
+    span = max(1 / 365.25, float(np.ptp(dates if whole is None else whole)) / 50)
+    ordered = np.unique(dates)
+    first = [ordered[0]]
+    while (i := np.searchsorted(ordered, first[-1] + span, side="right")) < ordered.size:
+        first.append(ordered[i])
+    return np.array(first)

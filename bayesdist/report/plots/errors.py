@@ -13,7 +13,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
 
-from bayesdist.assess.maps.uncertainty import per_axis
+from bayesdist.assess.maps import per_axis
 from bayesdist.assess.requirements.verdict import VERDICT_LEVELS
 from bayesdist.assess.terms.forms import PRODUCT
 from bayesdist.errors import InputError
@@ -32,7 +32,7 @@ from bayesdist.utils.numbers import Scale, counted, display_scale, number
 
 if TYPE_CHECKING:
     from bayesdist.assess import ErrorBudget, Margin
-    from bayesdist.assess.requirements.validity import ValidityPeriod
+    from bayesdist.assess.requirements.margins import ValidityPeriod
 
 SHOWN_QUANTILES = (0.001, 0.999)  # quantiles of the draws that limit a histogram
 # shapes in addition to colours

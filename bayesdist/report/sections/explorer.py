@@ -9,7 +9,7 @@ import numpy as np
 from matplotlib.colors import to_hex
 from scipy.interpolate import PchipInterpolator
 
-from bayesdist.assess.budget.surface import JOINT, BudgetSurface, GridRow
+from bayesdist.assess.budget_surface import JOINT, BudgetSurface, GridRow
 from bayesdist.assess.terms.forms import MEASURED, Row
 from bayesdist.assess.terms.given import CENTROID
 from bayesdist.report.contents import REPORT

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import bayesdist as bd
-from bayesdist.assess.statistics import field_statistic
+from bayesdist.assess.domain import field_statistic
 from bayesdist.diagnose import score_tests
 from bayesdist.model import DistortionModel
 from bayesdist.model.grid import grid_pixels, mesh

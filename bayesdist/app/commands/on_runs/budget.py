@@ -13,9 +13,9 @@ from bayesdist.app.commands.on_files.position_table import origin_line, read_pos
 from bayesdist.app.results import errors_of, open_results
 from bayesdist.app.screen import number, table_text
 from bayesdist.app.store.rundir import RunDirectory
-from bayesdist.assess.budget.budget import TOTAL, ErrorBudget, place_budget
+from bayesdist.assess.budget import TOTAL, ErrorBudget, place_budget
 from bayesdist.assess.drawn import DrawnErrors
-from bayesdist.assess.maps.uncertainty import circular_error, per_axis
+from bayesdist.assess.maps import circular_error, per_axis
 from bayesdist.assess.terms.forms import PRODUCT
 from bayesdist.calibration.chip_map import chosen_chip
 from bayesdist.calibration.sky_table import chip_numbers, pixel_columns

@@ -22,24 +22,22 @@ from bayesdist.app.calibrations import (
 from bayesdist.app.store.keys import attributes
 from bayesdist.app.store.output import record_folder, write_table
 from bayesdist.assess.comparison.compare import (
+    IDENTICAL,
     NOISE_SEED,
     Comparison,
     compare,
+    comparison_lines,
     comparison_table,
     difference_table,
+    gap_lines,
     gap_table,
+    gap_verdict,
+    verdict,
 )
-from bayesdist.assess.comparison.gap import (
+from bayesdist.assess.comparison.frame import (
     GapDifference,
     gap_difference,
     pair_of_chips,
-)
-from bayesdist.assess.comparison.sentences import (
-    IDENTICAL,
-    comparison_lines,
-    gap_lines,
-    gap_verdict,
-    verdict,
 )
 from bayesdist.calibration.calibration import Calibration
 from bayesdist.calibration.inverse import detector_grid

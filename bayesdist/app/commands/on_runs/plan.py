@@ -15,8 +15,7 @@ from bayesdist.app.tables.margins import judged_requirements
 from bayesdist.assess.evaluation import with_measured_centroids
 from bayesdist.assess.model import with_diagnosed_errors, with_shared_stars
 from bayesdist.assess.planning.dithers import further_dithers
-from bayesdist.assess.planning.exposures import Need, Schedule, exposures_needed
-from bayesdist.assess.planning.futures import Data, Futures
+from bayesdist.assess.planning.futures import Data, Futures, Need, Schedule, exposures_needed
 from bayesdist.assess.requirements.requirement import Requirement
 from bayesdist.errors import InputError
 from bayesdist.infer.compare.planning import (

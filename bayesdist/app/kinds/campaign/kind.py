@@ -28,8 +28,8 @@ from bayesdist.app.kinds.sampling import sample_stars
 from bayesdist.app.store.rundir import RunDirectory
 from bayesdist.assess.evaluation import EvaluationSettings
 from bayesdist.assess.model import ErrorModel, with_diagnosed_errors
+from bayesdist.assess.terms.correlated import LocalErrors, interpolation_term
 from bayesdist.assess.terms.forms import GIVEN, MEASURED, ErrorTerm
-from bayesdist.assess.terms.local import LocalErrors, interpolation_term
 from bayesdist.assess.terms.parameters import ExposureVariation
 from bayesdist.diagnose.diagnostics import Diagnostics
 from bayesdist.diagnose.holdout.predictive import ExposureDeviations, Predictive, predictive_of

@@ -9,7 +9,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 
-from bayesdist.assess.maps.uncertainty import per_axis
+from bayesdist.assess.maps import per_axis
 from bayesdist.report.contents import REPORT, Plot
 from bayesdist.report.context import ReportInput, SelfcalResults, needed
 from bayesdist.report.figures.style import CYCLE, INK, PALE, WIDTH, new_figure

@@ -10,7 +10,7 @@ import numpy as np
 from matplotlib.colors import BoundaryNorm, ListedColormap
 from matplotlib.patches import Patch
 
-from bayesdist.assess.maps.uncertainty import circular_error
+from bayesdist.assess.maps import circular_error
 from bayesdist.assess.terms.forms import PRODUCT
 from bayesdist.report.contents import REPORT, Plot
 from bayesdist.report.context import ReportInput, needed
@@ -35,7 +35,7 @@ from bayesdist.utils.numbers import (
 )
 
 if TYPE_CHECKING:
-    from bayesdist.assess.budget.budget import BudgetTerm, ErrorBudget
+    from bayesdist.assess.budget import BudgetTerm, ErrorBudget
 
 AS_ABOVE = "as above"  # in rows of single chips
 _LETTERS = 31  # of a label next to another one, above a narrow figure

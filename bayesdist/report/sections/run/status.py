@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from bayesdist.assess.maps.uncertainty import per_axis
-from bayesdist.assess.requirements.validity import ValidityPeriod
+from bayesdist.assess.maps import per_axis
+from bayesdist.assess.requirements.margins import ValidityPeriod
 from bayesdist.assess.requirements.verdict import VERDICT_LEVELS
 from bayesdist.report.contents import REPORT
 from bayesdist.report.context import ReportInput, needed

@@ -17,14 +17,7 @@ import numpy as np
 
 from bayesdist.assess.domain import EvaluationDomain
 from bayesdist.assess.drawn import DrawnErrors
-from bayesdist.assess.terms.forms import (
-    LOCAL,
-    ErrorField,
-    Image,
-    Known,
-    PolynomialField,
-    Row,
-)
+from bayesdist.assess.terms.forms import LOCAL, ErrorField, Image, Known, PolynomialField, Row
 from bayesdist.assess.terms.given import Centroids
 from bayesdist.data.magnitude_errors import MagnitudeErrors
 from bayesdist.errors import InputError

@@ -1,1 +1,0 @@
-"""Maps over the detector: uncertainty of positions, area of pixels."""
