@@ -25,7 +25,7 @@ from bayesdist.app.store.rundir import part_files
 from bayesdist.app.store.summary import GeometryRow, Sampler
 from bayesdist.app.tables.result_files import write_diagnostics, write_evaluation
 from bayesdist.data import Matches
-from bayesdist.data.storage.write import write_columns
+from bayesdist.data.storage import write_columns
 from bayesdist.files.atomic import made_folder, remove_leftovers
 from bayesdist.infer import LinearFit, Posterior, save_posterior
 from bayesdist.infer.posterior.memberships import memberships_of

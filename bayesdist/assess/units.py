@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-from bayesdist.data.tables.units import UNITS
+from bayesdist.data.tables.column import UNITS
 from bayesdist.errors import InputError, require_known
 from bayesdist.infer.solution.solution import Solution
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from bayesdist.data.sky.tangent import (
+from bayesdist.data.sky import (
     is_on_plane,
     sky_of_plane,
     tangent_jacobian,

@@ -17,7 +17,7 @@ import numpy as np
 
 from bayesdist.calibration.chip_map import ChipMap, Monomials
 from bayesdist.calibration.inverse import detector_grid
-from bayesdist.data.sky.tangent import ARCSEC, plane_axes, sky_of_plane, tangent_plane
+from bayesdist.data.sky import ARCSEC, plane_axes, sky_of_plane, tangent_plane
 from bayesdist.errors import InputError
 from bayesdist.model import PolynomialBasis
 from bayesdist.model.basis import MAX_ORDER

@@ -17,7 +17,7 @@ from bayesdist.calibration.sky_positions import (
     placement_of,
     shared_covariance,
 )
-from bayesdist.data.sky.tangent import plane_axes
+from bayesdist.data.sky import plane_axes
 from bayesdist.errors import InputError
 from bayesdist.utils.arrays import Float
 from bayesdist.utils.matern import drawn_fields

@@ -14,8 +14,8 @@ from bayesdist.calibration.apply import on_chip
 from bayesdist.calibration.calibration import Calibration
 from bayesdist.calibration.sky_positions import sky_positions
 from bayesdist.data.reading.table import as_table
+from bayesdist.data.tables.column import unit_of
 from bayesdist.data.tables.names import ALIASES, find_columns, origin_of
-from bayesdist.data.tables.units import unit_of
 from bayesdist.errors import InputError
 from bayesdist.utils.arrays import Float, Int
 from bayesdist.utils.quantities import Direction, Epoch, direction_in, year_of

@@ -28,10 +28,10 @@ from .matching.campaign import (
     CampaignMatches as CampaignMatches,
     match_campaign as match_campaign,
 )
-from .matching.linear_map import LinearMap as LinearMap
+from .matching.pairs import LinearMap as LinearMap
 from .matching.reports import ExposureReport as ExposureReport
 from .matching.rough_wcs import match as match
-from .matching.search_radius import (
+from .matching.exposure import (
     SearchRadius as SearchRadius,
     search_radius as search_radius,
 )
@@ -52,15 +52,17 @@ from .preparing import (
 )
 from .read import read_matches as read_matches
 from .reading.options import ReadOptions as ReadOptions
-from .sky.earth import velocity_aberration as velocity_aberration
-from .sky.tangent import (
+from .sky import (
     mean_direction as mean_direction,
     tangent_plane as tangent_plane,
+    velocity_aberration as velocity_aberration,
 )
 from .starlists import (
     StarCuts as StarCuts,
     read_star_lists as read_star_lists,
 )
-from .storage.on_disk import open_matches as open_matches
-from .storage.write import write_partitioned as write_partitioned
-from .tables.units import UNITS as UNITS
+from .storage import (
+    open_matches as open_matches,
+    write_partitioned as write_partitioned,
+)
+from .tables.column import UNITS as UNITS

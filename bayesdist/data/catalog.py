@@ -12,9 +12,7 @@ from numpy.typing import NDArray
 
 from bayesdist.data.reading.columns import is_on_sky, plane_unit, position_unit
 from bayesdist.data.reading.table import as_table, with_sky_columns
-from bayesdist.data.sky.earth import parallax_factors
-from bayesdist.data.sky.positions import sky_columns
-from bayesdist.data.sky.tangent import onto_plane
+from bayesdist.data.sky import onto_plane, parallax_factors, sky_columns
 from bayesdist.data.tables.checks import (
     COMPLETED,
     check_columns,
@@ -23,9 +21,8 @@ from bayesdist.data.tables.checks import (
     row_number,
     without_missing,
 )
-from bayesdist.data.tables.column import Quantities, SourceColumn
+from bayesdist.data.tables.column import Quantities, SourceColumn, check_unit
 from bayesdist.data.tables.names import ALIASES, find_columns
-from bayesdist.data.tables.units import check_unit
 from bayesdist.errors import InputError
 from bayesdist.files.tables import read_table
 from bayesdist.utils.arrays import Float, Int

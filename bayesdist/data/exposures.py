@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from astropy.table import Column, MaskedColumn, Table
 
-from bayesdist.data.sky.earth import velocity_aberration
+from bayesdist.data.sky import velocity_aberration
 from bayesdist.data.tables.column import SourceColumn
 from bayesdist.data.tables.names import find_columns
 from bayesdist.errors import InputError

@@ -13,15 +13,22 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from bayesdist.data.batches import batch_edges, every_kth
-from bayesdist.data.columns.checked import COLUMNS, POSITIONS, SIGMAS, MatchColumns, refuse_repeated
-from bayesdist.data.columns.joining import joined_arguments, joined_columns
-from bayesdist.data.columns.labels import Labels, merged_counts
-from bayesdist.data.columns.output import arrow_stream, html_of, table_of
+from bayesdist.data.columns import (
+    COLUMNS,
+    POSITIONS,
+    SIGMAS,
+    Labels,
+    MatchColumns,
+    joined_arguments,
+    joined_columns,
+    merged_counts,
+    refuse_repeated,
+)
 from bayesdist.data.magnitude_errors import AddedErrors, MagnitudeErrors, no_magnitudes
+from bayesdist.data.output import arrow_stream, html_of, table_of
 from bayesdist.data.reading.options import ReadOptions, option_names, refuse_missing_errors
-from bayesdist.data.reading.sky_table import sky_table
-from bayesdist.data.reading.table import match_arguments
-from bayesdist.data.repeated_stars import check_same_position, error_codes, star_codes
+from bayesdist.data.reading.table import match_arguments, sky_table
+from bayesdist.data.repeated import check_same_position, error_codes, star_codes
 from bayesdist.errors import InputError
 from bayesdist.utils.arrays import Float, Int
 from bayesdist.utils.quantities import Direction, Epoch, Number, values_in

@@ -18,9 +18,9 @@ from bayesdist.data.formats.files import (
     input_files,
     kind_of,
     mission_formats,
+    read_written_matches,
 )
 from bayesdist.data.formats.hst1pass import is_matchup, read_hst1pass, read_matchup
-from bayesdist.data.formats.record import read_written_matches
 from bayesdist.data.matches import Matches
 from bayesdist.data.matching.table import match_table
 from bayesdist.data.reading.columns import numbered, text_labels
@@ -31,8 +31,8 @@ from bayesdist.data.reading.table import (
     match_arguments,
     sky_positions,
 )
-from bayesdist.data.repeated_stars import star_codes
-from bayesdist.data.sky.tangent import mean_direction
+from bayesdist.data.repeated import star_codes
+from bayesdist.data.sky import mean_direction
 from bayesdist.data.tables.checks import absent
 from bayesdist.data.tables.column import SourceColumn
 from bayesdist.data.tables.names import ALIASES, find_columns

@@ -13,10 +13,10 @@ from astropy.table import Table
 from bayesdist.data.detections import Detections
 from bayesdist.data.formats.files import exposure_names, input_files, kind_of
 from bayesdist.data.formats.hst1pass import read_hst1pass
+from bayesdist.data.repeated import first_duplicate
 from bayesdist.data.tables.checks import COMPLETED, counted, row_number
 from bayesdist.data.tables.column import SourceColumn
 from bayesdist.data.tables.names import ALIASES, BASIC, find_columns, origin_of
-from bayesdist.data.tables.repeated import first_duplicate
 from bayesdist.errors import FormatError, InputError
 from bayesdist.files.tables import TABLE_SUFFIXES, read_table
 from bayesdist.files.unpacked import without_codec

@@ -6,7 +6,7 @@ from collections.abc import Iterator, Sequence
 from math import isclose
 
 from bayesdist.data.matches import Matches
-from bayesdist.data.repeated_stars import repeated_detections, tight_groups
+from bayesdist.data.repeated import repeated_detections, tight_groups
 from bayesdist.diagnose.correlated import Discrepancy
 from bayesdist.diagnose.correlated.deviations import CURVATURE
 from bayesdist.diagnose.holdout.validation import HoldoutValidation

@@ -14,7 +14,7 @@ from bayesdist.calibration.calibration import Calibration, calibration_of_maps
 from bayesdist.calibration.chip_map import ChipMap, fitted_map
 from bayesdist.calibration.inverse import detector_grid
 from bayesdist.calibration.plane import Plane
-from bayesdist.data.sky.tangent import is_on_plane, separation, sky_of_plane, tangent_plane
+from bayesdist.data.sky import is_on_plane, separation, sky_of_plane, tangent_plane
 from bayesdist.errors import InputError
 from bayesdist.formats.sip.read import image_size
 from bayesdist.products.common.cards import holds_wcs

@@ -13,7 +13,7 @@ from bayesdist.app.kinds.matches.stars import fit_stars
 from bayesdist.app.results import open_results
 from bayesdist.app.store.rundir import RunDirectory
 from bayesdist.data import Matches, read_matches, write_partitioned
-from bayesdist.data.storage.on_disk import StoredRows
+from bayesdist.data.storage import StoredRows
 from bayesdist.infer import load_fit, load_posterior
 from bayesdist.model import TimeDependence
 from bayesdist.simulate import simulate_matches

@@ -39,7 +39,7 @@ QUICK = Sizes((0, 2), 4, 400, 2, 2**9, 300)
 
 def measure(workers: int, exposures: int, stars: int, order: int, piece: int) -> dict[str, Any]:
     """Group, solve and sample, with so many workers."""
-    from bayesdist.data.matching import friends
+    from bayesdist.data.matching import field as friends
     from bayesdist.infer import Compute
     from bayesdist.infer.selfcal import pieces
 
@@ -59,7 +59,7 @@ def measure(workers: int, exposures: int, stars: int, order: int, piece: int) ->
 
 
 def _stages(compute: Any, client: Any, exposures: int, stars: int, order: int) -> dict[str, Any]:
-    from bayesdist.data.matching.friends import friends_of_friends
+    from bayesdist.data.matching.field import friends_of_friends
     from bayesdist.infer.equations.priors import Prior
     from bayesdist.infer.selfcal import sample_selfcal
     from bayesdist.infer.selfcal.mode import solve_in_gauge

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from bayesdist.data.matching.linear_map import LinearMap, best_similarity, iterated_map
+from bayesdist.data.matching.pairs import LinearMap, best_similarity, iterated_map
 from bayesdist.infer.selfcal import SelfCalibrationMode, self_calibrate
 from bayesdist.infer.selfcal.problem import Problem, StarPriors
 from bayesdist.model import DistortionModel

@@ -10,7 +10,7 @@ from astropy.coordinates import GCRS, CartesianRepresentation, SkyCoord, get_sun
 from astropy.io import fits
 from astropy.time import Time
 
-from bayesdist.data.sky.earth import velocity_aberration
+from bayesdist.data.sky import velocity_aberration
 from bayesdist.errors import InputError
 
 TARGETS = [(5.655, -72.07), (271.0, 66.5), (120.0, 20.0), (300.0, -20.0)]

@@ -10,7 +10,7 @@ from bayesdist.data import MagnitudeErrors, Matches, ReferenceCatalog, read_hst1
 from bayesdist.data.detections import Detections
 from bayesdist.data.exposures import Exposure, ExposureLog
 from bayesdist.data.matching.campaign import match_campaign
-from bayesdist.data.matching.search_radius import search_radius
+from bayesdist.data.matching.exposure import search_radius
 from bayesdist.data.matching.similarity import mismatch_reason, pattern_index
 from bayesdist.data.preparing import neutralise_aberration
 from bayesdist.data.starlists import StarCuts, read_star_lists

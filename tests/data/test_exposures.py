@@ -10,7 +10,7 @@ from bayesdist.data.exposures import (
     read_exposures,
     write_exposures,
 )
-from bayesdist.data.sky.earth import velocity_aberration
+from bayesdist.data.sky import velocity_aberration
 from bayesdist.errors import InputError
 
 LOG = ExposureLog(

@@ -8,8 +8,8 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial.distance import cdist
 
 from bayesdist.data.detections import NO_STAR
-from bayesdist.data.matching import friends
-from bayesdist.data.matching.friends import (
+from bayesdist.data.matching import field as friends
+from bayesdist.data.matching.field import (
     FINE,
     MIN_SIDE,
     Friends,

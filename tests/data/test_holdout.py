@@ -9,7 +9,7 @@ import pytest
 from scipy.stats import binomtest, kstest
 
 from bayesdist.data import Matches, batches, open_matches, write_partitioned
-from bayesdist.data.holdout import HELD_OUT, HoldoutSpec, exposures_drawn, split_matches
+from bayesdist.data.preparing import HELD_OUT, HoldoutSpec, exposures_drawn, split_matches
 from bayesdist.errors import InputError
 
 NAMES = ("a", "b", "c", "d")

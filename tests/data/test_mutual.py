@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from bayesdist.data.matching.frames import mutual_frames, refuse_duplicates
+from bayesdist.data.matching.field import mutual_frames, refuse_duplicates
 from bayesdist.errors import InputError
 
 SIGMA = 0.02  # px

@@ -7,8 +7,8 @@ import pytest
 from astropy.table import Table
 
 from bayesdist.data import Matches, open_matches, read_matches
-from bayesdist.data.holdout import HoldoutSpec, split_matches
-from bayesdist.data.storage.write import write_partitioned
+from bayesdist.data.preparing import HoldoutSpec, split_matches
+from bayesdist.data.storage import write_partitioned
 from bayesdist.errors import InputError
 
 NOMINAL = ("u_nominal", "v_nominal")

@@ -8,7 +8,7 @@ from astropy import units as u
 from astropy.coordinates import GCRS, Distance, SkyCoord
 from astropy.time import Time
 
-from bayesdist.data.sky.earth import parallax_factors
+from bayesdist.data.sky import parallax_factors
 
 EPOCHS = np.linspace(2010.0, 2011.9, 8)
 

@@ -17,9 +17,9 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from bayesdist.data import MagnitudeErrors, Matches, batches, open_matches, read_matches
+from bayesdist.data import repeated as duplicates_module
 from bayesdist.data.magnitude_errors import AddedErrors
-from bayesdist.data.storage.write import write_partitioned
-from bayesdist.data.tables import repeated as duplicates_module
+from bayesdist.data.storage import write_partitioned
 from bayesdist.errors import FormatError, InputError
 from tests.reduced import FULL, only_in_full
 
@@ -329,7 +329,7 @@ def test_any_sizes_of_row_groups_pieces_and_batches(tmp_path_factory, groups, pi
         writer.close()
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("bayesdist.data.tables.parquet._BATCH", batch)
-        patch.setattr("bayesdist.data.storage.stored.BLOCK", piece + 3)
+        patch.setattr("bayesdist.data.storage.BLOCK", piece + 3)
         assert_same(folder, monkeypatch=patch, piece=piece, unit="pix")
 
 
@@ -635,7 +635,7 @@ def test_nothing_half_written_stays(rng, tmp_path):
 def test_one_batch_at_a_time_is_in_memory(rng, tmp_path, monkeypatch, take):
     """Beside its columns there is a block of rows, and no batch that came before."""
     monkeypatch.setattr(batches, "BATCH", 200_000)
-    monkeypatch.setattr("bayesdist.data.storage.on_disk.BLOCK", 20_000)
+    monkeypatch.setattr("bayesdist.data.storage.BLOCK", 20_000)
     for name in "abcd":
         write(tmp_path / f"{name}.parquet", stars(rng, 100_000), group=100_000)
     opened = open_matches(tmp_path)
@@ -656,7 +656,7 @@ import json, sys
 import numpy as np, pyarrow as pa
 from bayesdist.data import batches, open_matches
 from bayesdist.data.storage import on_disk, stored
-from bayesdist.data.tables import repeated
+from bayesdist.data import repeated
 
 def peak():
     return int(next(s for s in open("/proc/self/status") if s.startswith("VmHWM")).split()[1])

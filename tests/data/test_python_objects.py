@@ -12,7 +12,7 @@ from astropy.table import QTable, Table
 from astropy.time import Time
 
 from bayesdist.data import Matches, read_matches
-from bayesdist.data.columns.checked import COLUMNS
+from bayesdist.data.columns import COLUMNS
 from bayesdist.data.reading.options import ReadOptions
 from bayesdist.data.reading.table import match_arguments
 from bayesdist.errors import InputError

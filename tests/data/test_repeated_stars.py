@@ -7,7 +7,7 @@ import pytest
 from astropy.table import Table
 
 from bayesdist.data import Matches, read_matches
-from bayesdist.data.repeated_stars import (
+from bayesdist.data.repeated import (
     position_codes,
     repeated_detections,
     star_codes,

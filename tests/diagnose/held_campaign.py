@@ -10,8 +10,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from bayesdist.data.holdout import HoldoutSpec, Split, split_matches
 from bayesdist.data.matches import Matches
+from bayesdist.data.preparing import HoldoutSpec, Split, split_matches
 from bayesdist.diagnose.holdout.predictive import ExposureDeviations, Predictive
 from bayesdist.diagnose.holdout.validation import HoldoutValidation, holdout_validation
 from bayesdist.infer import OutlierMixture, Rejection, load

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from scipy.stats import binom, chi2, kstest, norm
 
-from bayesdist.data.holdout import HoldoutSpec, split_matches
+from bayesdist.data.preparing import HoldoutSpec, split_matches
 from bayesdist.diagnose.holdout.predictive import (
     SCALES,
     Predictive,

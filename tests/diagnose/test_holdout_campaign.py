@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from scipy.stats import binom, kstest
 
-from bayesdist.data.holdout import HoldoutSpec, split_matches
+from bayesdist.data.preparing import HoldoutSpec, split_matches
 from bayesdist.diagnose.holdout.predictive import frames_for
 from bayesdist.diagnose.holdout.validation import holdout_validation
 from bayesdist.errors import InputError

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 from bayesdist.calibration.calibration import Calibration, calibration_of
-from bayesdist.data.sky.tangent import mean_direction, tangent_plane
+from bayesdist.data.sky import mean_direction, tangent_plane
 from bayesdist.diagnose.overlap import Alignment, align
 from bayesdist.missions.hst.simulate.tables import detector_tables, filter_tables
 from bayesdist.model.lookup import LookupTable, corrected

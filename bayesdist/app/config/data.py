@@ -31,7 +31,7 @@ from bayesdist.app.config.run import RunConfig, calibration_file
 from bayesdist.app.config.section import Epoch, RightAscensionDeclination, Section, Unit
 from bayesdist.data import FORMATS
 from bayesdist.data.formats.files import mission_formats
-from bayesdist.data.tables.units import length_advice
+from bayesdist.data.tables.column import length_advice
 from bayesdist.errors import InputError
 from bayesdist.infer.compare.period_dates import check_periods, mjd_periods
 from bayesdist.plugin import mission_objects

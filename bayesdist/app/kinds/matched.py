@@ -15,8 +15,8 @@ from bayesdist.app.config.fit import HoldoutBlock
 from bayesdist.app.store.output import write_table
 from bayesdist.assess.terms.parameters import ScaleError
 from bayesdist.data import ReferenceCatalog
-from bayesdist.data.holdout import HoldoutSpec, exposures_drawn, split_matches
 from bayesdist.data.matches import Matches
+from bayesdist.data.preparing import HoldoutSpec, exposures_drawn, split_matches
 from bayesdist.diagnose.overlap import OverlapTest
 from bayesdist.errors import InputError
 from bayesdist.infer import Posterior

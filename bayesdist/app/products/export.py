@@ -24,7 +24,7 @@ from bayesdist.assess.budget import with_product
 from bayesdist.assess.evaluation import Evaluation
 from bayesdist.assess.terms.forms import PRODUCT
 from bayesdist.calibration.plane import ARCSEC
-from bayesdist.data.sky.tangent import sky_of_plane
+from bayesdist.data.sky import sky_of_plane
 from bayesdist.diagnose.diagnostics import Diagnostics
 from bayesdist.diagnose.residuals.stars import StarSample, star_sample
 from bayesdist.files.atomic import atomic_path, path_within

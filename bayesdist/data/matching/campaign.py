@@ -21,7 +21,7 @@ from astropy.table import Table
 from numpy.typing import ArrayLike, NDArray
 
 from bayesdist.data.catalog import ReferenceCatalog
-from bayesdist.data.columns.labels import merged_counts
+from bayesdist.data.columns import merged_counts
 from bayesdist.data.detections import Detections
 from bayesdist.data.exposures import ExposureLog
 from bayesdist.data.matches import Matches

@@ -1,9 +1,17 @@
-"""Match one exposure of a campaign with the catalogue at its epoch."""
+"""Match one exposure of a campaign with the catalogue at its epoch.
+
+Search radius for pairs, derived from the distances of the pairs.
+
+In regions with a less well known distortion, usually the corners, pairs need a larger search radius
+than in the middle. A radius that is large everywhere includes false matches (the WISE distortion
+report, Section 3, item 1: criteria that depend on the radial distance from the centre).
+"""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -11,24 +19,21 @@ from scipy.spatial import cKDTree
 from bayesdist.data.catalog import ReferenceCatalog
 from bayesdist.data.detections import Detections
 from bayesdist.data.exposures import Exposure
-from bayesdist.data.matching.linear_map import (
+from bayesdist.data.matching.pairs import (
     MIN_PAIRS,
     LinearMap,
-    best_similarity,
-    iterated_map,
-    smooth_map,
-)
-from bayesdist.data.matching.pairs import (
     beats_chance,
+    best_similarity,
     chance_radius,
     chance_rate,
     hull_of,
     inside_hull,
+    iterated_map,
     mutual_pairs,
     overlap,
+    smooth_map,
 )
 from bayesdist.data.matching.reports import ExposureReport
-from bayesdist.data.matching.search_radius import SearchRadius, search_radius
 from bayesdist.data.matching.similarity import (
     PatternIndex,
     Similarity,
@@ -51,6 +56,11 @@ _MAX_FALSE_FRACTION = 0.1  # largest fraction of chance pairs; with more, the ma
 # increase of the number of pairs per round above which the cubics are still improving
 _GROWTH_FACTOR = 1.01
 _MAG_PERCENTILES = (1.0, 99.0)  # percentiles that define the range of magnitudes of a list
+_MIN_PAIRS_IN_RING = 100
+_MAX_RINGS = 8
+_TRUE_PAIRS_WITHIN = 0.98  # fraction of the true pairs within half the radius
+_RADIUS_MARGIN = 2.0
+_MIN_RADIUS = 1e-3  # of the largest radius; pairs without scatter still have rounding errors
 
 
 @dataclass(frozen=True, eq=False)
@@ -339,3 +349,77 @@ def _footprint(moved: Float, chip: Int, reference: Float) -> Bool:
     for number in np.unique(chip):
         covered |= inside_hull(reference, hull_of(moved[chip == number])[0])
     return covered
+
+
+@dataclass(frozen=True, eq=False)
+class SearchRadius:
+    """Largest distance of a pair, as a function of the distance from the centre of the detections.
+
+    The radius is interpolated linearly between rings and is constant beyond them.
+
+    Parameters
+    ----------
+    rho : ndarray, shape (R,)
+        Median distance of the pairs in each ring from the centre, ascending.
+    radius : ndarray, shape (R,)
+        Largest distance of a pair in each ring.
+    """
+
+    rho: Float
+    radius: Float
+
+    def __call__(self, rho: Float) -> Float:
+        """Radius at given distances from the centre."""
+        return np.interp(rho, self.rho, self.radius)
+
+
+def search_radius(
+    rho: Float, distance: Float, unpaired: Float, *, largest: float, chance: float
+) -> SearchRadius:
+    """Radius that keeps nearly all true pairs and few false ones.
+
+    In each ring, the distances of the pairs are a mixture of those of true pairs, which are
+    concentrated near zero, and of chance pairs, with a number within r that grows as r^2. The
+    radius is twice that within which 98 % of the true pairs are found. For circular normal errors
+    it is 5.6 standard errors, and larger for the wider mixture of bright and faint stars.
+
+    Parameters
+    ----------
+    rho : ndarray, shape (n,)
+        Distances of the pairs from the centre.
+    distance : ndarray, shape (n,)
+        Distances between the two members of a pair, up to `largest`.
+    unpaired : ndarray, shape (m,)
+        Distances of the unpaired detections from the centre.
+    largest : float
+        Radius within which the pairs were searched for.
+    chance : float
+        Probability that a detection without true counterpart finds a neighbour within that radius.
+
+    Returns
+    -------
+    SearchRadius
+        Search radius, at most `largest`.
+    """
+    rings = int(np.clip(len(rho) // _MIN_PAIRS_IN_RING, 1, _MAX_RINGS))
+    order = np.argsort(rho, kind="stable")
+    edges = np.concatenate(
+        [[-np.inf], [rho[part[0]] for part in np.array_split(order, rings)[1:]], [np.inf]]
+    )
+    middles, radii = [], []
+    for low, high in pairwise(edges):
+        inside = (rho >= low) & (rho < high)
+        distances = np.sort(distance[inside])
+        if not len(distances):  # an empty ring, if distances from the centre are equal
+            continue
+        all_detections = len(distances) + int(((unpaired >= low) & (unpaired < high)).sum())
+        # n = true + chance (all - true)
+        true = max(
+            (len(distances) - chance * all_detections) / (1.0 - chance), 0.5 * len(distances)
+        )
+        false = len(distances) - true
+        excess = np.arange(1, len(distances) + 1) - false * (distances / largest) ** 2
+        within = distances[int(np.argmax(excess >= _TRUE_PAIRS_WITHIN * true))]
+        middles.append(float(np.median(rho[inside])))
+        radii.append(float(np.clip(_RADIUS_MARGIN * within, _MIN_RADIUS * largest, largest)))
+    return SearchRadius(np.array(middles), np.array(radii))

@@ -21,12 +21,15 @@ from scipy.spatial import cKDTree
 from bayesdist.data.catalog import ReferenceCatalog
 from bayesdist.data.matches import Matches
 from bayesdist.data.matching.exposure import Pairs, iterated_pairs
-from bayesdist.data.matching.linear_map import MIN_PAIRS, LinearMap, best_similarity, iterated_map
 from bayesdist.data.matching.pairs import (
+    MIN_PAIRS,
     NARROW,
+    LinearMap,
     are_enough,
     beats_chance,
+    best_similarity,
     chance_rate,
+    iterated_map,
     mutual_pairs,
     overlap,
 )
@@ -37,14 +40,27 @@ from bayesdist.data.matching.similarity import (
     pattern_index,
 )
 from bayesdist.data.reading.options import ReadOptions
-from bayesdist.data.reading.sky_table import SKY_COLUMN, icrs_of
-from bayesdist.data.reading.table import as_table, match_arguments, own_epoch, with_sky_columns
-from bayesdist.data.sky.positions import MOTIONS, SKY_QUANTITIES, reference_sky, sky_columns
-from bayesdist.data.sky.tangent import mean_direction, separation, sky_of_plane, tangent_plane
+from bayesdist.data.reading.table import (
+    SKY_COLUMN,
+    as_table,
+    icrs_of,
+    match_arguments,
+    own_epoch,
+    with_sky_columns,
+)
+from bayesdist.data.sky import (
+    MOTIONS,
+    SKY_QUANTITIES,
+    mean_direction,
+    reference_sky,
+    separation,
+    sky_columns,
+    sky_of_plane,
+    tangent_plane,
+)
 from bayesdist.data.tables.checks import without_missing
-from bayesdist.data.tables.column import Quantities
+from bayesdist.data.tables.column import Quantities, unit_of
 from bayesdist.data.tables.names import ALIASES, PAIRS, find_columns, origin_of
-from bayesdist.data.tables.units import unit_of
 from bayesdist.errors import InputError
 from bayesdist.files.tables import read_table
 from bayesdist.utils.arrays import Float, Int

@@ -9,12 +9,13 @@ from numpy.typing import ArrayLike
 
 from bayesdist.data.catalog import ReferenceCatalog
 from bayesdist.data.matches import Matches
-from bayesdist.data.matching.linear_map import LinearMap, iterated_map
 from bayesdist.data.matching.pairs import (
     NARROW,
+    LinearMap,
     are_enough,
     beats_chance,
     chance_radius,
+    iterated_map,
     mutual_pairs,
     overlap,
 )

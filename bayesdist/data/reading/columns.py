@@ -10,12 +10,10 @@ from typing import Any
 import numpy as np
 
 from bayesdist.data.reading.options import ReadOptions
-from bayesdist.data.sky.positions import SKY_QUANTITIES, reference_sky
-from bayesdist.data.sky.tangent import onto_plane
+from bayesdist.data.sky import SKY_QUANTITIES, onto_plane, reference_sky
 from bayesdist.data.tables.checks import refuse_half
-from bayesdist.data.tables.column import EncodedColumn, Quantities, SourceColumn
+from bayesdist.data.tables.column import EncodedColumn, Quantities, SourceColumn, check_unit
 from bayesdist.data.tables.names import ALIASES, PAIRS, find_columns, origin_of
-from bayesdist.data.tables.units import check_unit
 from bayesdist.errors import InputError
 from bayesdist.utils.arrays import Float, Int
 

@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 
 from bayesdist.data.magnitude_errors import no_magnitudes
-from bayesdist.data.repeated_stars import check_same_position
+from bayesdist.data.repeated import check_same_position
 from bayesdist.data.tables.checks import check_not_finite
-from bayesdist.data.tables.units import length_in_mm
+from bayesdist.data.tables.column import length_in_mm
 from bayesdist.errors import BayesdistError, InputError
 from bayesdist.utils.quantities import Number, direction_in, year_of
 

@@ -1,28 +1,33 @@
-"""Columns of Matches from any table-like object: astropy, pandas, Arrow, mappings, records."""
+"""Columns of Matches from any table-like object: astropy, pandas, Arrow, mappings, records.
+
+Table of detector positions with sky coordinates, under names that the readers recognise.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
 from functools import partial
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from astropy.table import Column, MaskedColumn, Table
+from astropy.table import Column, MaskedColumn, QTable, Table
 from astropy.time import Time
 
-from bayesdist.data.columns.output import header_arguments
+from bayesdist.data.output import header_arguments
 from bayesdist.data.reading.columns import columns_read, is_on_sky, match_columns
 from bayesdist.data.reading.options import ReadOptions
-from bayesdist.data.repeated_stars import star_codes
-from bayesdist.data.sky.positions import MOTIONS, SPARED, sky_columns
+from bayesdist.data.repeated import star_codes
+from bayesdist.data.sky import MOTIONS, SPARED, sky_columns
 from bayesdist.data.tables.checks import absent, row_number, without_missing
-from bayesdist.data.tables.column import Quantities
+from bayesdist.data.tables.column import Quantities, length_in_mm, unit_of, without_unit
 from bayesdist.data.tables.names import ALIASES, PAIRS, find_columns
-from bayesdist.data.tables.units import length_in_mm, unit_of, without_unit
 from bayesdist.errors import InputError
 from bayesdist.files.parquet import arrow_table
 from bayesdist.utils.arrays import Float
+
+if TYPE_CHECKING:
+    from astropy.coordinates import SkyCoord
 
 # beginnings of error messages about values that `not_finite` can leave out
 NOT_FINITE_CAUSES = ("value is nan", "value is inf", "value is -inf")
@@ -33,6 +38,7 @@ _KINDS = (
     "an astropy Table or QTable, a pandas or polars DataFrame, an Arrow table, a mapping of arrays "
     "or a structured array"
 )
+SKY_COLUMN = "skycoord"
 
 
 def is_table(data: Any) -> bool:
@@ -307,3 +313,70 @@ def own_epoch(header: Mapping[str, Any]) -> float | str | None:
         return float(Time(day, format="mjd", scale="tt").decimalyear)
     date = upper.get("DATE-OBS")
     return date if isinstance(date, str) and date.strip() else None
+
+
+def sky_table(x: Any, y: Any, sky: SkyCoord, *, sigma: Any, epoch: Any, **columns: Any) -> QTable:
+    """Table of pixels (N,) and sky coordinates (N,), with the other columns given by keyword.
+
+    `sigma` is one error, one per star, or a pair of these; plain numbers are in arcsec. `epoch`
+    becomes a column if it has one value per star.
+    """
+    table = QTable({"x": _column(x, "x", None)})
+    n = len(table)
+    table["y"] = _column(y, "y", n)
+    table[SKY_COLUMN] = icrs_of(sky, n)
+    if sigma is not None:
+        pair = sigma if isinstance(sigma, tuple) else (sigma, sigma)
+        for name, values in zip(("sigma_u", "sigma_v"), pair, strict=True):
+            table[name] = _column(values, name, n, broadcast=True)
+    for name, values in columns.items():
+        if values is not None:
+            table[name] = _column(values, name, n)
+    if epoch is not None and np.shape(epoch) == (n,):
+        table["epoch"] = _column(epoch, "epoch", n)
+    return table
+
+
+def icrs_of(sky: Any, n: int | None, *, where: str = "sky") -> SkyCoord:
+    """Sky coordinates (N,) in ICRS, with proper motions and obstime if they have them."""
+    from astropy.coordinates import ConvertError, SkyCoord
+
+    if not isinstance(sky, SkyCoord):
+        raise InputError(
+            f"is a {type(sky).__name__}, not sky coordinates",
+            where=where,
+            do="give a SkyCoord, or a table with ra and dec by Matches.from_table",
+        )
+    if sky.ndim != 1 or (n is not None and sky.size != n):
+        raise InputError(
+            f"has the shape {sky.shape}" + ("" if n is None else f", and x has {n} values"),
+            where=where,
+            do="give one direction for each detection",
+        )
+    obstime = sky.obstime
+    try:
+        icrs = sky.icrs
+    except (ConvertError, ValueError, TypeError) as error:
+        raise InputError(
+            f"cannot be transformed from {sky.name} to ICRS ({error})",
+            where=where,
+            do="give the frame what it needs, or coordinates in ICRS",
+        ) from None
+    if obstime is not None and icrs.obstime is None:
+        icrs = SkyCoord(icrs, obstime=obstime)
+    return icrs
+
+
+def _column(values: Any, name: str, n: int | None, *, broadcast: bool = False) -> Any:
+    """Column of n values, or of any number of values if n is None."""
+    if not hasattr(values, "shape"):
+        values = np.asarray(values)
+    if broadcast and n is not None and values.shape == ():
+        values = np.broadcast_to(values, (n,), subok=True)
+    if len(values.shape) != 1 or (n is not None and len(values) != n):
+        raise InputError(
+            f"has the shape {values.shape}" + ("" if n is None else f", and x has {n} values"),
+            where=name,
+            do="give one value for each detection",
+        )
+    return values

@@ -11,7 +11,7 @@ from bayesdist.calibration.calibration import Calibration, calibration_of_maps
 from bayesdist.calibration.chip_map import fitted_map, refuse_order
 from bayesdist.calibration.inverse import detector_grid
 from bayesdist.calibration.plane import ARCSEC, Plane
-from bayesdist.data.sky.tangent import sky_of_plane, tangent_plane
+from bayesdist.data.sky import sky_of_plane, tangent_plane
 from bayesdist.formats.sip.header import SIDE_FILE, SIP_ORDERS, SipHeader
 from bayesdist.formats.sip.write import sip_header
 from bayesdist.model import polynomial_terms

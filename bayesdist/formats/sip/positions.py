@@ -10,7 +10,7 @@ from astropy.io import fits
 
 from bayesdist.calibration.calibration import Calibration
 from bayesdist.calibration.plane import ARCSEC, arcsec_per
-from bayesdist.data.sky.tangent import tangent_plane
+from bayesdist.data.sky import tangent_plane
 from bayesdist.formats.sip.header import SipHeader
 from bayesdist.formats.sip.read import sip_of
 from bayesdist.formats.sip.write import sip_header

@@ -12,7 +12,7 @@ from astropy.coordinates import SkyCoord
 from astropy.io import fits
 from astropy.wcs import WCS, NoConvergence
 
-from bayesdist.data.sky.tangent import tangent_plane
+from bayesdist.data.sky import tangent_plane
 from bayesdist.errors import InputError
 from bayesdist.products.common.document import Finding
 

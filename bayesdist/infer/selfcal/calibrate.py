@@ -9,7 +9,7 @@ from functools import partial
 import numpy as np
 
 from bayesdist.data.detections import Detections
-from bayesdist.data.matching.friends import Friends, friends_of_friends
+from bayesdist.data.matching.field import Friends, friends_of_friends
 from bayesdist.errors import NotSettledError
 from bayesdist.infer.equations.priors import Prior
 from bayesdist.infer.selfcal.elimination import Mixture, memberships

@@ -15,7 +15,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from bayesdist.data.catalog import ReferenceCatalog
-from bayesdist.data.matching.linear_map import MIN_PAIRS, LinearMap, iterated_map
+from bayesdist.data.matching.pairs import MIN_PAIRS, LinearMap, iterated_map
 from bayesdist.errors import InputError
 from bayesdist.infer.equations.priors import Prior
 from bayesdist.infer.selfcal.problem import Problem, StarPriors

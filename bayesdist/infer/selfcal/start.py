@@ -10,8 +10,8 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from bayesdist.data.matching.frames import MutualFrames
-from bayesdist.data.matching.linear_map import LinearMap
+from bayesdist.data.matching.field import MutualFrames
+from bayesdist.data.matching.pairs import LinearMap
 from bayesdist.model import Chip, DistortionModel, PolynomialBasis
 from bayesdist.utils.arrays import Float, Int
 

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from bayesdist.data.detections import Detections
-from bayesdist.data.sky.tangent import ARCSEC
+from bayesdist.data.sky import ARCSEC
 from bayesdist.model import DistortionModel
 from bayesdist.utils.arrays import Float
 

@@ -14,7 +14,7 @@ from numbers import Real
 import numpy as np
 
 from bayesdist.data.matches import Matches
-from bayesdist.data.tables.units import conversion
+from bayesdist.data.tables.column import conversion
 from bayesdist.errors import DegenerateError, InputError
 from bayesdist.infer.equations.gauss_newton import (
     gauss_newton,

@@ -13,7 +13,7 @@ from scipy import stats
 
 from bayesdist.app.kinds.selfcal.stars import star_table
 from bayesdist.app.store.output import write_table
-from bayesdist.data.sky.earth import parallax_factors
+from bayesdist.data.sky import parallax_factors
 from bayesdist.infer import load_fit
 from bayesdist.infer.selfcal import star_catalogue
 from bayesdist.infer.selfcal.sky_moves import functionals

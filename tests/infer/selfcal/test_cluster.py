@@ -16,8 +16,8 @@ from functools import partial
 import numpy as np
 import pytest
 
-from bayesdist.data.matching import friends
-from bayesdist.data.matching.friends import friends_of_friends, grouped
+from bayesdist.data.matching import field as friends
+from bayesdist.data.matching.field import friends_of_friends, grouped
 from bayesdist.errors import InputError
 from bayesdist.files.records import write_record
 from bayesdist.infer import Compute

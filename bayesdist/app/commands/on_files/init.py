@@ -21,8 +21,7 @@ from bayesdist.app.kinds.matches.plausibility import scatter_about_polynomials
 from bayesdist.app.kinds.matches.sources import load_matches, mission_template
 from bayesdist.app.store.output import refuse_existing
 from bayesdist.data import FORMATS, Matches
-from bayesdist.data.formats.files import mission_formats
-from bayesdist.data.formats.layout import TableLayout, table_layout
+from bayesdist.data.formats.files import TableLayout, mission_formats, table_layout
 from bayesdist.data.reading.table import NOT_FINITE_CAUSES
 from bayesdist.errors import InputError
 from bayesdist.files.atomic import atomic_path

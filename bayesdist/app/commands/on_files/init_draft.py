@@ -8,9 +8,8 @@ from pathlib import Path
 from bayesdist.app.commands.on_files.init_guesses import detector_lines, quoted
 from bayesdist.app.config import parse_config
 from bayesdist.data import read_star_lists
-from bayesdist.data.formats.files import input_files, kind_of
+from bayesdist.data.formats.files import TableLayout, input_files, kind_of, table_layout
 from bayesdist.data.formats.hst1pass import read_hst1pass
-from bayesdist.data.formats.layout import TableLayout, table_layout
 
 MAX_CANDIDATES = 40  # largest number of columns listed
 

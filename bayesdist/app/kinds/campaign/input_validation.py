@@ -12,8 +12,8 @@ from bayesdist.app.config.products import ReleaseBlock
 from bayesdist.app.kinds.campaign.inputs import Inputs
 from bayesdist.app.kinds.campaign.reference import rehearse_references
 from bayesdist.app.kinds.star_lists import refuse_other_chips
-from bayesdist.data.holdout import refuse_strangers
 from bayesdist.data.matching.reports import check_campaign
+from bayesdist.data.preparing import refuse_strangers
 from bayesdist.errors import ConfigError, DegenerateError, InputError
 from bayesdist.formats.idctab.table import read_idctab
 from bayesdist.model import TimeDependence

@@ -20,7 +20,7 @@ from bayesdist.data import (
     read_exposures,
     select_motions,
 )
-from bayesdist.data.sky.tangent import mean_direction, tangent_plane
+from bayesdist.data.sky import mean_direction, tangent_plane
 from bayesdist.errors import InputError
 from bayesdist.files.tables import read_table
 from bayesdist.formats.idctab.hst import parity_of

@@ -18,8 +18,8 @@ from bayesdist.app.kinds.star_lists import lists_of, refuse_other_chips
 from bayesdist.calibration.plane import ARCSEC
 from bayesdist.data import ReferenceCatalog, read_catalog, read_exposures
 from bayesdist.data.detections import Detections, detections_of
-from bayesdist.data.matching.frames import refuse_duplicates
-from bayesdist.data.sky.earth import parallax_factors
+from bayesdist.data.matching.field import refuse_duplicates
+from bayesdist.data.sky import parallax_factors
 from bayesdist.errors import InputError
 from bayesdist.infer.selfcal import ReferenceStars
 from bayesdist.infer.selfcal.problem import Problem, prepare

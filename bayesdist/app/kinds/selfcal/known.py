@@ -9,9 +9,8 @@ from pathlib import Path
 import numpy as np
 
 from bayesdist.app.config import SelfcalConfig
-from bayesdist.data.tables.column import SourceColumn
+from bayesdist.data.tables.column import SourceColumn, conversion
 from bayesdist.data.tables.names import find_columns
-from bayesdist.data.tables.units import conversion
 from bayesdist.errors import InputError
 from bayesdist.files.tables import read_table
 from bayesdist.infer.equations.priors import GaussianPriors, Prior

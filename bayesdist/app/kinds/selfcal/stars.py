@@ -14,7 +14,7 @@ from astropy.units import Unit
 from bayesdist.app.kinds.selfcal.solved import SelfCalibrated
 from bayesdist.app.store.output import write_table
 from bayesdist.data import ReferenceCatalog
-from bayesdist.data.storage.write import write_columns
+from bayesdist.data.storage import write_columns
 from bayesdist.diagnose.correlated import Discrepancy
 from bayesdist.infer import Compute
 from bayesdist.infer.selfcal import SelfCalibrationMode, StarCatalogue, star_catalogue

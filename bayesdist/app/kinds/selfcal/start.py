@@ -12,8 +12,8 @@ from bayesdist.app.kinds.selfcal.known import Commanded
 from bayesdist.app.kinds.star_lists import positions_by_chip, start_of
 from bayesdist.data import ReferenceCatalog
 from bayesdist.data.detections import Detections
-from bayesdist.data.matching.frames import mutual_frames
-from bayesdist.data.matching.linear_map import LinearMap, best_similarity
+from bayesdist.data.matching.field import mutual_frames
+from bayesdist.data.matching.pairs import LinearMap, best_similarity
 from bayesdist.data.matching.similarity import Similarity, find_similarity, pattern_index
 from bayesdist.errors import InputError
 from bayesdist.infer import load_fit, load_posterior

@@ -10,7 +10,7 @@ import numpy as np
 from bayesdist.data import ReferenceCatalog, read_catalog
 from bayesdist.data.exposures import read_exposures, write_exposures
 from bayesdist.data.starlists import read_star_lists
-from bayesdist.data.storage.write import write_columns
+from bayesdist.data.storage import write_columns
 from bayesdist.data.tables.checks import columns_of
 from bayesdist.errors import InputError
 from bayesdist.files.atomic import atomic_path, made_folder

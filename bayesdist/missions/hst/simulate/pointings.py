@@ -16,7 +16,7 @@ from astropy.coordinates import get_body_barycentric
 from astropy.time import Time
 
 from bayesdist.data.exposures import Exposure, ExposureLog
-from bayesdist.data.sky.earth import velocity_aberration
+from bayesdist.data.sky import velocity_aberration
 from bayesdist.missions.hst.simulate.distortion import SM4
 from bayesdist.missions.hst.simulate.stars import CENTRE
 from bayesdist.utils.arrays import Bool, Float

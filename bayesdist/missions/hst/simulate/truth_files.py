@@ -9,7 +9,7 @@ import numpy as np
 from astropy.table import Table
 
 from bayesdist.data.exposures import ExposureLog
-from bayesdist.data.storage.write import write_columns
+from bayesdist.data.storage import write_columns
 from bayesdist.data.tables.checks import columns_of
 from bayesdist.files.atomic import atomic_path
 from bayesdist.files.faults import naming_faults

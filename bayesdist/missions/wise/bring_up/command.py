@@ -11,10 +11,10 @@ from astropy.table import Table
 from bayesdist.app.screen import table_text
 from bayesdist.app.store.output import record_folder, write_table
 from bayesdist.data.detections import Detections
+from bayesdist.data.repeated import first_duplicate
 from bayesdist.data.tables.checks import row_number
 from bayesdist.data.tables.column import SourceColumn
 from bayesdist.data.tables.names import find_columns
-from bayesdist.data.tables.repeated import first_duplicate
 from bayesdist.errors import InputError
 from bayesdist.files.tables import read_table
 from bayesdist.missions.wise.bands.optical import optical_models

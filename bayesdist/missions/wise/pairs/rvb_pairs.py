@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from bayesdist.data.matches import Matches
-from bayesdist.data.storage.write import Part, write_parts
+from bayesdist.data.storage import Part, write_parts
 from bayesdist.data.tables.checks import columns_of
 from bayesdist.errors import InputError
 from bayesdist.files.atomic import made_folder

@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from bayesdist.data.columns.labels import merged_counts
+from bayesdist.data.columns import merged_counts
 from bayesdist.data.matches import Matches
 from bayesdist.data.tables.checks import counted
 from bayesdist.errors import InputError

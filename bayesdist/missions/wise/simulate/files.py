@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from astropy.table import Table
 
-from bayesdist.data.storage.write import write_columns
+from bayesdist.data.storage import write_columns
 from bayesdist.errors import InputError
 from bayesdist.files.atomic import atomic_path, made_folder
 from bayesdist.missions.wise.simulate.pattern import PartitionPattern

@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesdist.data.columns.checked import COLUMNS, MatchColumns, column_unit
-from bayesdist.data.tables.units import check_unit, conversion
+from bayesdist.data.columns import COLUMNS, MatchColumns, column_unit
+from bayesdist.data.tables.column import check_unit, conversion
 from bayesdist.files.parquet import HEADER, arrow_array
 
 if TYPE_CHECKING:

@@ -1,15 +1,23 @@
-"""Columns of matches as plain arrays of equal length in one unit, and checks of their values."""
+"""Columns and labels of matches: default values, checks, and concatenation.
+
+Labels of matches: names of codes, unit, counts and notes.
+
+Columns of matches as plain arrays of equal length in one unit, and checks of their values.
+
+Concatenation of tables of matches: codes are renumbered, counts added, and columns checked.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesdist.data.columns.labels import LABELS_OF_CODES, Labels, merged_counts
+from bayesdist.data.repeated import first_duplicate
 from bayesdist.data.tables.checks import (
     COMPLETED,
     absent,
@@ -19,12 +27,17 @@ from bayesdist.data.tables.checks import (
     one_length,
     refuse_half,
 )
-from bayesdist.data.tables.repeated import first_duplicate
-from bayesdist.data.tables.units import check_unit, conversion, unit_of, without_unit
+from bayesdist.data.tables.column import check_unit, conversion, unit_of, without_unit
 from bayesdist.errors import InputError
 from bayesdist.utils.arrays import Float, Int
 from bayesdist.utils.text import refuse_control_characters
 
+LABELS_OF_CODES = {
+    "exposure": "exposure_names",
+    "chip": "chip_numbers",
+    "filter": "filter_names",
+}
+DEFAULT_LABELS: dict[str, Any] = {"exposure": "1", "chip": 1, "filter": ""}
 POSITIONS = ("x", "y", "u", "v")
 SIGMAS = ("sigma_u", "sigma_v")
 _NOMINAL = ("u_nominal", "v_nominal")
@@ -33,8 +46,73 @@ OPTIONAL = ("epoch", "mag", "colour", *_NOMINAL, *_MOTIONS)
 _INTEGERS = ("row", "source", "star", *LABELS_OF_CODES)
 _NUMBERS = (*POSITIONS, *SIGMAS, *OPTIONAL)
 COLUMNS = (*_NUMBERS, *_INTEGERS)
-
 Columns = Mapping[str, NDArray[Any]]
+
+
+@dataclass(frozen=True, eq=False)
+class Labels:
+    """Attributes shared by all batches of matches; the fields are those of `Matches`."""
+
+    unit: str
+    exposure_names: tuple[str, ...]
+    chip_numbers: tuple[int, ...]
+    filter_names: tuple[str, ...]
+    sources: tuple[str, ...]
+    n_rows: int
+    tangent_point: tuple[float, float] | None = None
+    chip_names: tuple[str, ...] = ()
+    rejected: Mapping[str, int] = field(default_factory=dict)
+    notes: tuple[str, ...] = ()
+    match_radius: float | None = None
+
+    def arguments(self) -> dict[str, Any]:
+        """Arguments of `Matches` by name."""
+        return {label_field.name: getattr(self, label_field.name) for label_field in fields(self)}
+
+    def of_batch(self, n: int) -> Labels:
+        """Labels of a batch of n rows, without the counts of rejected rows."""
+        return replace(self, n_rows=n, rejected={})
+
+    def codes(self, key: str, block: Mapping[str, Any], *, source: str) -> Int:
+        """Codes of a block's exposures, chips or filters, converted to the labels of all files.
+
+        InputError for a label that did not exist when the files were scanned.
+        """
+        code_by_label = self._numbers[key]
+        labels = block[LABELS_OF_CODES[key]]
+        try:
+            code_of_label = np.array([code_by_label[label] for label in labels], np.int64)
+        except KeyError:
+            raise InputError(
+                "has changed since it was opened", where=source, do="start again"
+            ) from None
+        return recoded(key, block, code_of_label)
+
+    @cached_property
+    def _numbers(self) -> dict[str, dict[Any, int]]:
+        """Code of each label, by the kind of label."""
+        return {
+            key: {label: k for k, label in enumerate(getattr(self, names))}
+            for key, names in LABELS_OF_CODES.items()
+        }
+
+
+def recoded(key: str, block: Mapping[str, Any], code_of_label: Int) -> Int:
+    """Codes (N,) of a block, converted with the new code of each of its labels."""
+    codes = block.get(key)
+    if codes is None:
+        codes = np.zeros(len(block["x"]), np.int64)
+    return code_of_label[codes]
+
+
+def merged_counts(counts: Sequence[Mapping[str, int]]) -> dict[str, int]:
+    """Sums of counts by key."""
+    total: dict[str, int] = {}
+    for count_by_key in counts:
+        for key, number in count_by_key.items():
+            total[key] = total.get(key, 0) + number
+    return total
+
 
 _LABELS = tuple(label_field.name for label_field in fields(Labels))
 
@@ -264,3 +342,114 @@ def refuse_repeated(columns: Columns, *, place: Callable[[int], str]) -> None:
             where=place(second),
             do="keep each row once",
         )
+
+
+def joined_arguments(tables: Sequence[MatchColumns]) -> dict[str, Any]:
+    """Arguments of `Matches` for the rows of several tables in their order.
+
+    InputError if units or tangent points differ, or if only some tables have an optional column.
+    """
+    first = tables[0]
+    for table in tables[1:]:
+        for name, label in (("unit", "unit"), ("tangent_point", "tangent point")):
+            if getattr(table, name) != getattr(first, name):
+                raise InputError(
+                    f"{label} is {getattr(table, name)}, but {getattr(first, name)} in "
+                    f"{', '.join(first.sources)}",
+                    where=", ".join(table.sources),
+                    do="bring all files to one",
+                )
+    joined: dict[str, Any] = {
+        name: np.concatenate([getattr(t, name) for t in tables]) for name in (*POSITIONS, "row")
+    }
+    for name in (*SIGMAS, *OPTIONAL):
+        joined[name] = merged_optional(
+            name, [getattr(t, name) for t in tables], [", ".join(t.sources) for t in tables]
+        )
+    stars = [t.star for t in tables if t.star is not None]
+    joined["star"] = np.concatenate(stars) if len(stars) == len(tables) else None
+    for name, labels in {**LABELS_OF_CODES, "source": "sources"}.items():
+        joined[name], joined[labels] = merged_codes(
+            [getattr(t, name) for t in tables],
+            [getattr(t, labels) for t in tables],
+            ordered=name == "chip",
+        )
+    name_of = {
+        number: name
+        for t in tables
+        for number, name in zip(t.chip_numbers, t.chip_names, strict=False)
+    }
+    chips = joined["chip_numbers"]
+    if len(name_of) == len(chips):
+        joined["chip_names"] = tuple(name_of[number] for number in chips)
+    joined |= {
+        "notes": tuple(dict.fromkeys(note for t in tables for note in t.notes)),
+        "unit": first.unit,
+        "tangent_point": first.tangent_point,
+        "match_radius": common_radius(
+            [t.match_radius for t in tables], [", ".join(t.sources) for t in tables]
+        ),
+        "n_rows": sum(t.n_rows for t in tables),
+        "rejected": merged_counts([t.rejected for t in tables]),
+    }
+    return joined
+
+
+def joined_columns(parts: Sequence[Mapping[str, NDArray[Any]]]) -> dict[str, NDArray[Any]]:
+    """Columns that all parts have, concatenated in their order."""
+    names = [name for name in parts[0] if all(name in part for part in parts)]
+    if len(parts) == 1:
+        return dict(parts[0])
+    return {name: np.concatenate([part[name] for part in parts]) for name in names}
+
+
+def merged_codes(
+    codes: Sequence[Int], labels: Sequence[tuple[Any, ...]], *, ordered: bool = False
+) -> tuple[Int, tuple[Any, ...]]:
+    """Concatenate codes with different labels: returns the new codes and the labels.
+
+    Labels are in the order of their first appearance, or sorted if `ordered`.
+    """
+    all_labels: list[Any] = list(
+        dict.fromkeys(label for part_labels in labels for label in part_labels)
+    )
+    if ordered:
+        all_labels.sort()
+    number = {label: k for k, label in enumerate(all_labels)}
+    renumbered = [
+        np.array([number[label] for label in part_labels], np.int64)[code]
+        for code, part_labels in zip(codes, labels, strict=True)
+    ]
+    return np.concatenate(renumbered), tuple(all_labels)
+
+
+def common_radius(radii: Sequence[float | None], sources: Sequence[str]) -> float | None:
+    """Match radius of all tables; None if any has none. InputError if they differ."""
+    stated = {radius for radius in radii if radius is not None}
+    if len(stated) == 0 or None in radii:
+        return None
+    if len(stated) > 1:
+        raise InputError(
+            f"match radii differ: {', '.join(f'{radius:g}' for radius in sorted(stated))}",
+            where=", ".join(sources),
+            do="match all tables with one radius",
+        )
+    return stated.pop()
+
+
+def merged_optional(
+    name: str, arrays: Sequence[Float | None], sources: Sequence[str]
+) -> Float | None:
+    """Concatenated column; None if no table has it. InputError if only some have it."""
+    present = [a for a in arrays if a is not None]
+    if not present:
+        return None
+    if len(present) < len(arrays):
+        lacking = next(s for a, s in zip(arrays, sources, strict=True) if a is None)
+        having = next(s for a, s in zip(arrays, sources, strict=True) if a is not None)
+        raise InputError(
+            f"has no {name!r}, but {having} has",
+            where=lacking,
+            do="give the column in all files or in none",
+        )
+    return np.concatenate(present)

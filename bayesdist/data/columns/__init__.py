@@ -1,1 +1,0 @@
-"""Columns and labels of matches: default values, checks, and concatenation."""

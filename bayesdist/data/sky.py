@@ -1,0 +1,505 @@
+"""Sky positions: epochs, effects of the Earth's motion, and tangent planes.
+
+Reference positions on the sky, with the errors and motions of a catalogue.
+
+Positions are moved to the epoch of the exposures: space motion by astropy, and the parallax as seen
+from the Earth. Their errors include those of motion and parallax.
+
+Effects of the Earth's motion on positions: parallax, and the scale of aberration.
+
+    VAFACTOR = sqrt(1 - b^2) / (1 - n . b),    b = velocity / c
+
+Stars are displaced towards the apex of the motion: a true offset on the sky is VAFACTOR times the
+offset computed with an aberration-free pixel scale (Cox & Gilliland 2002, HST Calibration
+Workshop). Aberration is conformal, so the factor is the same in all directions.
+
+Tangent plane: gnomonic projection of the sky, in seconds of arc.
+
+    D   = sin d sin d0 + cos d cos d0 cos(a - a0)
+    xi  = cos d sin(a - a0) / D                                  east
+    eta = (cos d0 sin d - sin d0 cos d cos(a - a0)) / D          north
+
+Calabretta & Greisen 2002, A&A 395, 1077, Section 5.1.3, written as standard coordinates.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from bayesdist.data.tables.checks import Place, row_number, zero_motions
+from bayesdist.data.tables.column import Quantities, SourceColumn
+from bayesdist.errors import InputError
+from bayesdist.utils.arrays import Bool, Float
+
+if TYPE_CHECKING:
+    from astropy.time import Time
+
+MOTIONS = ("pm_ra", "pm_dec", "sigma_pm_ra", "sigma_pm_dec")
+# quantities that may be missing for a star, which then count as zero
+SPARED = ("parallax", "sigma_parallax", "corr_ra", "corr_dec")
+SKY_QUANTITIES = ("sigma_ra", "sigma_dec", *MOTIONS, *SPARED, "catalogue_epoch")
+# parsecs; without a radial velocity, the path on the sky does not depend on the distance
+_NO_MATTER = 100
+_STANDS = 1e-3  # years; over a shorter time motions are negligible
+_LIGHT = 299_792.458  # km/s
+ARCSEC = np.degrees(1.0) * 3600.0  # seconds of arc in a radian
+
+
+@dataclass(frozen=True, eq=False)
+class ReferenceSky:
+    """Reference positions at the epoch at which they are compared with the detections."""
+
+    ra: Float  # (N,), degrees
+    dec: Float  # (N,), degrees
+    sigma: Float | None  # (2, N), along east and north, arcsec
+    motion: Float | None  # (2, N), to east (with cos(dec)) and north, arcsec/yr
+    sigma_motion: Float | None  # (2, N), errors of the motions
+    notes: tuple[str, ...]  # clauses on how the positions were treated
+
+
+def sky_columns(quantities: Quantities) -> tuple[Float, Float]:
+    """Right ascension and declination (N,) of the rows of a table, converted to degrees."""
+    ra, dec = (_degrees(quantities[key], key) for key in ("ra", "dec"))
+    beyond = np.abs(dec) > 90.0
+    if beyond.any():
+        bad = int(np.argmax(beyond))
+        raise quantities["dec"].fail(bad, f"declination is {dec[bad]:g} degrees")
+    return ra, dec
+
+
+def _degrees(column: SourceColumn, key: str) -> Float:
+    values = np.asarray(column.values) if hasattr(column.values, "dtype") else np.zeros(0)
+    if values.dtype.kind in "SU" and any(mark in str(values.flat[0]) for mark in ": hd"):
+        return _sexagesimal(column, values.astype(str), key)
+    return column.numbers() * column.factor("deg")
+
+
+def _sexagesimal(column: SourceColumn, texts: NDArray[np.str_], key: str) -> Float:
+    """Degrees from strings such as 10:00:24.1 (hours, for ra) and +02:12:00 (degrees)."""
+    import astropy.units as apu
+    from astropy.coordinates import Angle
+
+    unit = apu.hourangle if key == "ra" else apu.deg
+    try:
+        return np.asarray(Angle(texts, unit=unit).deg, float)
+    except (ValueError, TypeError, apu.UnitsError):
+        for index, text in enumerate(texts):
+            try:
+                Angle(text, unit=unit)
+            except (ValueError, TypeError, apu.UnitsError):
+                raise column.fail(index, f"{text[:40]!r} stands where an angle must be") from None
+        raise
+
+
+def reference_sky(
+    quantities: Quantities,
+    *,
+    epoch: Float | None = None,
+    catalogue_epoch: float | None = None,
+) -> ReferenceSky:
+    """Reference positions at `epoch`, with errors and motions if the table has them.
+
+    `epoch` (N,) is that of the exposures, `catalogue_epoch` that of the positions if there is no
+    such column. Besides ra and dec, these columns are used if they exist: sigma_ra, sigma_dec,
+    pm_ra, pm_dec and their errors, corr_ra and corr_dec (correlation of position and motion on one
+    axis), parallax and its error. InputError for half a pair, and for missing or invalid units.
+    """
+    ra, dec = sky_columns(quantities)
+    sigma = _pair(quantities, ("sigma_ra", "sigma_dec"), "arcsec")
+    if "catalogue_epoch" in quantities:
+        start: Float | None = quantities["catalogue_epoch"].years()
+    else:
+        start = None if catalogue_epoch is None else np.full(len(ra), float(catalogue_epoch))
+    moves = epoch is not None and start is not None
+    motion = _pair(quantities, ("pm_ra", "pm_dec"), "arcsec / yr", missing=not moves)
+    if motion is None:
+        return ReferenceSky(ra, dec, sigma, None, None, ())
+    sigma_motion = _pair(
+        quantities, ("sigma_pm_ra", "sigma_pm_dec"), "arcsec / yr", missing=not moves
+    )
+    if epoch is None or start is None:
+        lacks = "the epoch of the exposures" if epoch is None else "the epoch of the catalogue"
+        key = "data.epoch" if epoch is None else "data.catalogue_epoch"
+        note = f"proper motions are not used: {lacks} is not given ({key})"
+        return ReferenceSky(ra, dec, sigma, motion, sigma_motion, (note,))
+    zero = zero_motions(quantities["pm_ra"].values, quantities["pm_dec"].values)
+    if zero.any():  # tables on disk: rows are not left out in reading
+        raise quantities["pm_ra"].fail(
+            int(np.argmax(zero)),
+            f"proper motion is exactly 0 on both axes in {np.count_nonzero(zero)} rows, as where "
+            "missing values were filled",
+            do="write the table without these rows, or read it with read_matches",
+        )
+    dt = epoch - start
+    new_ra, new_dec = _moved(ra, dec, motion, start, epoch)
+    factors, parallax = np.zeros((2, len(ra))), _optional(quantities, "parallax", "arcsec")
+    if parallax is not None:
+        factors = _factors(epoch, mean_direction(ra, dec))
+        new_ra = new_ra + parallax * factors[0] / 3600 / np.cos(np.radians(new_dec))
+        new_dec = new_dec + parallax * factors[1] / 3600
+    if sigma is not None:
+        sigma = _sigma_at(quantities, sigma, sigma_motion, dt, factors)
+    step = np.hypot(*motion) * np.abs(dt)
+    first, last = float(epoch.min()), float(epoch.max())
+    to = f"{first:.2f}" + (f" to {last:.2f}" if last - first > 0.005 else "")
+    if not np.any(step) and parallax is None:
+        note = "positions are of the exposures' epoch"
+        return ReferenceSky(ra, dec, sigma, motion, sigma_motion, (note,))
+    note = (
+        f"positions of {np.median(start):.2f} were moved to {to} by proper motions"
+        f"{'' if parallax is None else ' and parallaxes'} (median {np.median(step):.2g}, "
+        f"at most {step.max():.2g} arcsec)"
+    )
+    return ReferenceSky(new_ra, new_dec, sigma, motion, sigma_motion, (note,))
+
+
+def _pair(
+    quantities: Quantities, keys: tuple[str, str], unit: str, *, missing: bool = False
+) -> Float | None:
+    """Columns of a pair (2, N) in a unit; None if neither exists."""
+    have = [key for key in keys if key in quantities]
+    if len(have) == 1:
+        partner = keys[1 - keys.index(have[0])]
+        raise InputError(
+            f"column {partner!r} is missing beside {quantities[have[0]].name!r}",
+            where=quantities.source,
+            do="name it in the option 'columns', or leave the other out by an empty name",
+        )
+    if not have:
+        return None
+    return np.stack([_in_unit(quantities[key], key, unit, missing=missing) for key in keys])
+
+
+def _optional(quantities: Quantities, key: str, unit: str) -> Float | None:
+    """Column in a unit, with 0 for missing values; None if it does not exist."""
+    if key not in quantities:
+        return None
+    return _in_unit(quantities[key], key, unit, missing=True)
+
+
+def _in_unit(column: SourceColumn, key: str, unit: str, *, missing: bool) -> Float:
+    if column.unit is None and unit:
+        # catalogues use degrees for positions and mas for other columns, so no default is safe
+        raise InputError(
+            "has no unit, and its name is that of no known catalogue",
+            where=column.where,
+            do="write it into the file (mas, or mas / yr), or leave the column out: "
+            f'columns = {{{key} = ""}}',
+        )
+    factor = column.factor(unit) if unit else 1.0
+    return factor * (column.numbers_or(0.0) if missing else column.numbers())
+
+
+def _moved(ra: Float, dec: Float, motion: Float, start: Float, end: Float) -> tuple[Float, Float]:
+    """Positions at the end of a space motion without radial velocity."""
+    if np.max(np.abs(end - start), initial=0.0) < _STANDS:
+        return ra, dec
+    import astropy.units as apu
+    from astropy.coordinates import SkyCoord
+    from astropy.time import Time
+
+    before, after = (Time(years, format="jyear", scale="tdb") for years in (start, end))
+    sky = SkyCoord(
+        ra=ra * apu.deg,
+        dec=dec * apu.deg,
+        distance=np.full(ra.shape, _NO_MATTER) * apu.pc,
+        pm_ra_cosdec=motion[0] * apu.arcsec / apu.yr,
+        pm_dec=motion[1] * apu.arcsec / apu.yr,
+        radial_velocity=np.zeros(len(ra)) * apu.km / apu.s,
+        obstime=before,
+    ).apply_space_motion(new_obstime=after)
+    return np.asarray(sky.ra.deg), np.asarray(sky.dec.deg)
+
+
+def _factors(epoch: Float, direction: tuple[float, float]) -> Float:
+    """Parallax factors (2, N), computed for the middle of the field."""
+    dates, of = np.unique(epoch, return_inverse=True)
+    return np.asarray(parallax_factors(dates, *direction)[of].T, float)
+
+
+def _sigma_at(
+    quantities: Quantities, sigma: Float, sigma_pm: Float | None, dt: Float, factors: Float
+) -> Float:
+    """Errors (2, N) at the new epoch, including those of motion and parallax."""
+    variance = sigma**2
+    if sigma_pm is not None:
+        for axis, key in enumerate(("corr_ra", "corr_dec")):
+            rho = _optional(quantities, key, "")
+            if rho is not None:
+                variance[axis] += 2 * np.clip(rho, -1, 1) * sigma[axis] * sigma_pm[axis] * dt
+        variance = variance + (sigma_pm * dt) ** 2
+    sigma_parallax = _optional(quantities, "sigma_parallax", "arcsec")
+    if sigma_parallax is not None:
+        variance = variance + (factors * sigma_parallax) ** 2
+    return np.sqrt(np.maximum(variance, np.finfo(float).tiny))
+
+
+def velocity_aberration(
+    epoch: float | Time,
+    ra: float,
+    dec: float,
+    *,
+    velocity_km_s: ArrayLike = (0.0, 0.0, 0.0),
+) -> float:
+    """Scale factor of velocity aberration for a target at an epoch.
+
+    The barycentric velocity of the Earth is taken from astropy's built-in ephemeris, without
+    network access. Over a year the factor varies by up to 1e-4; the orbit of HST (7.5 km/s) adds
+    2.5e-5.
+
+    Parameters
+    ----------
+    epoch : float or astropy Time
+        Decimal year, or a time.
+    ra, dec : float
+        Position of the target in degrees. Strictly, the formula requires the apparent direction;
+        the true direction changes the factor by b^2, 1e-8.
+    velocity_km_s : array_like, shape (3,), optional
+        Velocity of the telescope relative to the Earth, along the axes of the ICRS.
+
+    Returns
+    -------
+    float
+        VAFACTOR; larger than 1 if the telescope moves towards the target.
+
+    Raises
+    ------
+    InputError
+        If the epoch, direction or velocity is invalid.
+    """
+    import astropy.units as apu
+    from astropy.coordinates import get_body_barycentric_posvel
+    from astropy.time import Time
+
+    relative = np.asarray(velocity_km_s, float)
+    numbers = (0.0 if isinstance(epoch, Time) else float(epoch), float(ra), float(dec))
+    if (
+        relative.shape != (3,)
+        or not np.isfinite([*relative, *numbers]).all()
+        or abs(numbers[2]) > 90.0
+    ):
+        raise InputError(
+            f"no aberration for epoch {epoch}, direction ({ra}, {dec}) and velocity {relative}",
+            do="give a decimal year, ra and dec in degrees, and three components in km/s",
+        )
+    # TT needs no table of leap seconds, and an error of a minute changes the factor by only 1e-9
+    time = epoch if isinstance(epoch, Time) else Time(epoch, format="decimalyear", scale="tt")
+    _, earth = get_body_barycentric_posvel("earth", time, ephemeris="builtin")
+    b = (earth.xyz.to_value(apu.km / apu.s) + relative) / _LIGHT
+    speed2 = float(b @ b)
+    if not speed2 < 1.0:
+        raise InputError("the telescope is faster than light", do="give the velocity in km/s")
+    a, d = np.radians([ra, dec])
+    n = np.array([np.cos(d) * np.cos(a), np.cos(d) * np.sin(a), np.sin(d)])
+    return float(np.sqrt(1.0 - speed2) / (1.0 - n @ b))
+
+
+def parallax_factors(epoch: ArrayLike, ra: float, dec: float) -> Float:
+    """Displacements (E, 2) to east and north per unit of parallax, at Julian years (E,).
+
+    `ra` and `dec` are ICRS degrees. The observer is at the centre of the Earth; a satellite in low
+    orbit is within 5e-5 au of it. See Green, Spherical Astronomy (1985), section 8. The position of
+    the Earth is from astropy's built-in ephemeris (ERFA's epv00), which needs no file.
+    """
+    from astropy.coordinates import get_body_barycentric
+    from astropy.time import Time
+
+    time = Time(np.atleast_1d(np.asarray(epoch, float)), format="jyear", scale="tdb")
+    earth = get_body_barycentric("earth", time, ephemeris="builtin").xyz.to_value("au")
+    a, d = np.radians([ra, dec])
+    east = np.array([-np.sin(a), np.cos(a), 0.0])
+    north = np.array([-np.sin(d) * np.cos(a), -np.sin(d) * np.sin(a), np.cos(d)])
+    return -np.stack([east @ earth, north @ earth], axis=1)
+
+
+def mean_direction(ra: ArrayLike, dec: ArrayLike) -> tuple[float, float]:
+    """Mean direction: that of the sum of the unit vectors.
+
+    Parameters
+    ----------
+    ra, dec : array_like, shape (N,)
+        Right ascension and declination in degrees.
+
+    Returns
+    -------
+    ra0, dec0 : float
+        Mean direction in degrees, with ra0 in [0, 360).
+    """
+    return direction_of(direction_sum(ra, dec))
+
+
+def direction_sum(ra: ArrayLike, dec: ArrayLike) -> tuple[int, int, int]:
+    """Sum of unit vectors in units of 2^-62, from ra and dec (N,) in degrees.
+
+    The sum is exact to the last digit, so that sums of parts add up to the total.
+    """
+    a, d = np.radians(np.asarray(ra, float)), np.radians(np.asarray(dec, float))
+    x, y, z = (_exact_sum(c) for c in (np.cos(d) * np.cos(a), np.cos(d) * np.sin(a), np.sin(d)))
+    return x, y, z
+
+
+def _exact_sum(values: Float) -> int:
+    """Sum of numbers in [-1, 1] in units of 2^-62; two parts of 31 bits cannot overflow."""
+    upper = np.rint(values * 2.0**31)
+    lower = np.rint((values * 2.0**31 - upper) * 2.0**31)
+    return (int(upper.astype(np.int64).sum()) << 31) + int(lower.astype(np.int64).sum())
+
+
+def direction_of(vector: tuple[int, int, int]) -> tuple[float, float]:
+    """Direction of a vector of any length, in the form returned by `mean_direction`."""
+    x, y, z = (float(component) for component in vector)
+    ra0 = float(np.degrees(np.arctan2(y, x)) % 360.0)
+    return ra0, float(np.degrees(np.arctan2(z, np.hypot(x, y))))
+
+
+def _angles(
+    ra: ArrayLike, dec: ArrayLike, point: tuple[float, float], where: str, place: Place
+) -> tuple[Float, Float, float, Float]:
+    """Hour angle from the tangent point, declination, its declination, and D; in radians."""
+    delta, d, d0, D = _distances(ra, dec, point)
+    if np.any(D <= 0):
+        row = place(int(np.argmax(D <= 0)))
+        raise InputError(
+            f"the position lies 90 degrees or more from the tangent point {point}",
+            where=f"{where}, {row}" if where else row,
+            do="give a tangent point inside the field",
+        )
+    return delta, d, d0, D
+
+
+def _distances(
+    ra: ArrayLike, dec: ArrayLike, point: tuple[float, float]
+) -> tuple[Float, Float, float, Float]:
+    delta = np.radians(np.asarray(ra, float) - point[0])
+    d = np.radians(np.asarray(dec, float))
+    d0 = float(np.radians(point[1]))
+    return delta, d, d0, np.sin(d) * np.sin(d0) + np.cos(d) * np.cos(d0) * np.cos(delta)
+
+
+def is_on_plane(ra: ArrayLike, dec: ArrayLike, point: tuple[float, float]) -> Bool:
+    """Boolean mask (N,) of positions that `tangent_plane` can project; False for NaN."""
+    return np.asarray(_distances(ra, dec, point)[3] > 0)
+
+
+def tangent_plane(
+    ra: ArrayLike,
+    dec: ArrayLike,
+    point: tuple[float, float],
+    *,
+    where: str = "",
+    place: Place = row_number,
+) -> tuple[Float, Float]:
+    """Project sky positions onto a tangent plane.
+
+    Parameters
+    ----------
+    ra, dec : array_like, shape (N,)
+        Right ascension and declination in degrees.
+    point : tuple of float
+        Tangent point (ra0, dec0), degrees.
+    where : str, optional
+        Name of the file, for the error message.
+    place : callable, optional
+        ``place(index)`` is the name of a row of that file, given its index in the arrays.
+
+    Returns
+    -------
+    xi, eta : ndarray, shape (N,)
+        Coordinates in seconds of arc; xi increases to the east, eta to the north.
+
+    Raises
+    ------
+    InputError
+        If a position is 90 degrees or more from the tangent point.
+    """
+    delta, d, d0, D = _angles(ra, dec, point, where, place)
+    xi = np.cos(d) * np.sin(delta) / D
+    eta = (np.cos(d0) * np.sin(d) - np.sin(d0) * np.cos(d) * np.cos(delta)) / D
+    return ARCSEC * xi, ARCSEC * eta
+
+
+def tangent_jacobian(
+    ra: ArrayLike, dec: ArrayLike, point: tuple[float, float], *, where: str = ""
+) -> Float:
+    """Derivatives (N, 2, 2) of (xi, eta) with respect to displacements to the east and north.
+
+    ``J[:, 0, 1]`` is d xi / d dec; a displacement to the east is d ra cos(dec).
+    """
+    delta, d, d0, D = _angles(ra, dec, point, where, row_number)
+    out = np.empty((*np.shape(D), 2, 2))
+    out[..., 0, 0] = (np.sin(d) * np.sin(d0) * np.cos(delta) + np.cos(d) * np.cos(d0)) / D**2
+    out[..., 0, 1] = -np.sin(d0) * np.sin(delta) / D**2
+    out[..., 1, 0] = np.sin(d) * np.sin(delta) / D**2
+    out[..., 1, 1] = np.cos(delta) / D**2
+    return out
+
+
+def onto_plane(
+    ra: Float,
+    dec: Float,
+    point: tuple[float, float] | None,
+    *,
+    sigma: Float | None = None,
+    motion: Float | None = None,
+    sigma_motion: Float | None = None,
+    where: str = "",
+    place: Place = row_number,
+) -> dict[str, Any]:
+    """Columns u, v, tangent_point of stars in arcsec, and sigma_u, pm_u, sigma_pm_u if given.
+
+    `ra`, `dec` (N,) and `point` are in degrees; the default point is the mean direction. Errors,
+    motions and their errors (2, N) are to the east (with the factor cos(dec)) and to the north, in
+    arcsec (per year).
+    """
+    point = mean_direction(ra, dec) if point is None else point
+    u, v = tangent_plane(ra, dec, point, where=where, place=place)
+    out: dict[str, Any] = {"u": u, "v": v, "tangent_point": (float(point[0]), float(point[1]))}
+    if sigma is None and motion is None:
+        return out
+    J = tangent_jacobian(ra, dec, point, where=where)
+    if motion is not None:
+        out["pm_u"], out["pm_v"] = np.einsum("nij,jn->in", J, motion)
+    for name, errors in (("sigma", sigma), ("sigma_pm", sigma_motion)):
+        if errors is not None:
+            variance = np.einsum("nij,jn->in", J**2, errors**2)
+            out[f"{name}_u"], out[f"{name}_v"] = np.sqrt(variance)
+    return out
+
+
+def plane_axes(point: tuple[float, float]) -> Float:
+    """Unit vectors to east, north and tangent point (degrees), as rows (3, 3) of a matrix.
+
+    A point on the plane is in the direction (xi, eta, 1) @ rows, with xi and eta in radians.
+    """
+    a, d = np.radians(point)
+    return np.array(
+        [
+            [-np.sin(a), np.cos(a), 0.0],
+            [-np.sin(d) * np.cos(a), -np.sin(d) * np.sin(a), np.cos(d)],
+            [np.cos(d) * np.cos(a), np.cos(d) * np.sin(a), np.sin(d)],
+        ]
+    )
+
+
+def separation(point: tuple[ArrayLike, ArrayLike], ra: ArrayLike, dec: ArrayLike) -> Float:
+    """Angular separations (N,) between positions, all in degrees (Vincenty's formula).
+
+    `point` is one position, or the longitudes and latitudes (N,) of as many positions as `ra` and
+    `dec`.
+    """
+    a0, d0, a, d = (np.radians(angle) for angle in (*point, ra, dec))
+    cos_a, sin_a = np.cos(a - a0), np.sin(a - a0)
+    across = np.hypot(np.cos(d) * sin_a, np.cos(d0) * np.sin(d) - np.sin(d0) * np.cos(d) * cos_a)
+    along = np.sin(d0) * np.sin(d) + np.cos(d0) * np.cos(d) * cos_a
+    return np.asarray(np.degrees(np.arctan2(across, along)))
+
+
+def sky_of_plane(xi: ArrayLike, eta: ArrayLike, point: tuple[float, float]) -> tuple[Float, Float]:
+    """Right ascension in [0, 360) and declination, degrees, of points (arcsec) on a plane."""
+    xi, eta = np.asarray(xi, float) / ARCSEC, np.asarray(eta, float) / ARCSEC
+    x, y, z = np.moveaxis(np.stack([xi, eta, np.ones_like(xi)], axis=-1) @ plane_axes(point), -1, 0)
+    return np.degrees(np.arctan2(y, x)) % 360.0, np.degrees(np.arctan2(z, np.hypot(x, y)))

@@ -1,1 +1,0 @@
-"""Sky positions: epoch propagation, effects of the Earth's motion, and tangent planes."""

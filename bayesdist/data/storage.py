@@ -1,0 +1,608 @@
+"""Matches in Parquet files: writing, scanning, and reading from disk in batches.
+
+Matches that stay on disk: Parquet files, read batch by batch.
+
+A scan with one block in memory at a time collects what must be known about all rows: the names of
+exposures, chips and filters, and the tangent point. It also checks that no row is invalid or
+repeated.
+
+Parquet files of matches: how each file is read, and the labels found by scanning all of them.
+
+Write columns, or matches table by table, to Parquet.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from itertools import pairwise
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from astropy.table import Column
+from numpy.typing import NDArray
+
+from bayesdist.data import batches
+from bayesdist.data.batches import BATCH
+from bayesdist.data.columns import (
+    COLUMNS,
+    DEFAULT_LABELS,
+    LABELS_OF_CODES,
+    POSITIONS,
+    SIGMAS,
+    Labels,
+    common_radius,
+    recoded,
+)
+from bayesdist.data.formats.files import exposure_names, input_files
+from bayesdist.data.matches import Matches
+from bayesdist.data.output import geometry_header, header_arguments
+from bayesdist.data.reading.columns import (
+    columns_read,
+    match_columns,
+    nominal_columns,
+    plane_unit,
+    position_unit,
+)
+from bayesdist.data.reading.options import ReadOptions, refuse_missing_errors
+from bayesdist.data.repeated import buckets_for, first_repetition
+from bayesdist.data.sky import direction_of, direction_sum, sky_columns
+from bayesdist.data.tables.checks import columns_of, refuse_half
+from bayesdist.data.tables.column import Quantities, SourceColumn
+from bayesdist.data.tables.parquet import ParquetPart, RowBlock, describe_part
+from bayesdist.errors import FormatError, InputError
+from bayesdist.files.atomic import atomic_path, made_folder
+from bayesdist.files.parquet import HEADER, arrow_array
+from bayesdist.utils.arrays import Int
+
+if TYPE_CHECKING:
+    import pyarrow
+
+PathLike = str | os.PathLike[str]
+Segment = tuple[int, int, int]  # file, first row, and row after the last
+BLOCK = 2**16  # rows read together
+Labelled = tuple[Int, tuple[str, ...]]
+# columns, their units, and header values that no column holds
+Part = tuple[Mapping[str, NDArray[Any] | Labelled], Mapping[str, str], Mapping[str, Any]]
+_NUMBERS = (
+    *("x", "y", "u", "v", "sigma_u", "sigma_v", "epoch", "mag", "colour"),
+    *("u_nominal", "v_nominal"),
+)
+_LENGTHS = ("u", "v", "sigma_u", "sigma_v", "u_nominal", "v_nominal")
+
+
+@dataclass(frozen=True, eq=False)
+class StoredRows:
+    """Consecutive rows of Parquet files."""
+
+    labels: Labels
+    files: tuple[StoredFile, ...]  # files of the rows
+    # for each file: its code, the first row, and the row after the last
+    segments: tuple[Segment, ...]
+
+    def __len__(self) -> int:
+        return sum(stop - start for _, start, stop in self.segments)
+
+    def load(self) -> Matches:
+        """Read the rows, with codes and sources that refer to the labels.
+
+        InputError if a file is damaged, missing, or has changed since it was opened.
+        """
+        columns: dict[str, NDArray[Any]] = {}
+        names, end = set(COLUMNS), 0
+        for block in self._blocks():
+            first, end = end, end + len(block["x"])
+            names &= block.keys()
+            for name in names:
+                if first == 0:
+                    columns[name] = np.empty(len(self), block[name].dtype)
+                columns[name][first:end] = block[name]
+        labels = self.labels.of_batch(len(self)).arguments()
+        return Matches.of_distinct_rows(**{name: columns[name] for name in names}, **labels)
+
+    def _blocks(self) -> Iterator[dict[str, NDArray[Any]]]:
+        """Columns of the rows, block by block."""
+        for file, (code, start, stop) in zip(self.files, self.segments, strict=True):
+            row = start
+            for block in file.blocks(start=start, stop=stop, size=BLOCK):
+                out = {name: block[name] for name in COLUMNS if name in block}
+                for key in LABELS_OF_CODES:
+                    out[key] = self.labels.codes(key, block, source=file.source)
+                out["row"] = np.arange(row, row + len(out["x"]))
+                out["source"] = np.full(len(out["x"]), code)
+                row += len(out["x"])
+                yield out
+
+
+def open_matches(path: PathLike | Sequence[PathLike], **options: Any) -> Matches:
+    """Open matched star positions without reading them into memory.
+
+    Parameters
+    ----------
+    path : path-like or sequence of path-like
+        Parquet: a file, a list of files, a pattern, or a folder of parts of one table.
+    **options
+        As for `ReadOptions`; rows with missing values or values that are not finite are an error.
+
+    Returns
+    -------
+    Matches
+        Matches on disk; the batches are equal to `read_matches` of their rows.
+
+    Raises
+    ------
+    InputError
+        If a file or an option is invalid; the message says what to change. All files must have the
+        same quantities, and some of them may be empty.
+
+    Examples
+    --------
+    >>> from bayesdist.data import write_partitioned
+    >>> from bayesdist.missions.wise import simulate_wise
+    >>> matches, _ = simulate_wise(500, rng=np.random.default_rng(1))
+    >>> paths = write_partitioned([matches], "stars")
+    >>> stars = bd.open_matches("stars")  # stays on disk
+    >>> sum(len(batch) for batch in stars.batches())
+    500
+    """
+    reading = ReadOptions(**options)
+    if reading.not_finite == "reject":
+        raise InputError(
+            "rows of tables on disk cannot be left out in reading",
+            where="data.not_finite",
+            do="write the table without them",
+        )
+    if reading.plate_scale is not None:
+        raise InputError(
+            "tables on disk are not brought to another unit",
+            where="data.plate_scale",
+            do="write u, v and their errors in arcsec",
+        )
+    files = input_files(path)
+    for file in files:
+        if file.suffix.lower() != ".parquet":
+            raise FormatError(
+                "is no Parquet file, and others are read into memory",
+                where=str(file),
+                do="use read_matches",
+            )
+    in_parts = isinstance(path, str | os.PathLike) and Path(path).is_dir()
+    names: Sequence[str | None] = [None] * len(files)
+    if not in_parts and len(files) > 1:
+        names = exposure_names(files)
+    stored = [
+        stored_file(describe_part(file), reading, exposure_name=name)
+        for file, name in zip(files, names, strict=True)
+    ]
+    _refuse_differences(stored)
+    first = stored[0]
+    sigma = reading.sigma
+    refuse_missing_errors(sigma, _has_errors(first), "mag" in first.found, where=first.source)
+    if first.on_sky and reading.tangent_point is None:
+        point = tangent_point_of(stored)
+        stored = [
+            replace(part, options=replace(part.options, tangent_point=point)) for part in stored
+        ]
+    labels = scan(stored)
+    matches = Matches.from_readers(_readers(labels, stored), labels, _columns_of(first))
+    return matches if isinstance(sigma, str) else matches.with_errors(sigma)
+
+
+def _readers(labels: Labels, files: Sequence[StoredFile]) -> list[StoredRows]:
+    """Consecutive rows of all files.
+
+    Row groups and files are combined up to `BATCH` rows; larger ones are split evenly.
+    """
+    out: list[list[Segment]] = [[]]
+    size = 0
+    for code, file in enumerate(files):
+        for start, stop in _spans(file.part.group_rows):
+            if size + stop - start > batches.BATCH:
+                out.append([])
+                size = 0
+            size += stop - start
+            last = out[-1][-1] if out[-1] else None
+            if last is not None and last[0] == code:
+                out[-1][-1] = (code, last[1], stop)
+            else:
+                out[-1].append((code, start, stop))
+    return [
+        StoredRows(labels, tuple(files[code] for code, *_ in segments), tuple(segments))
+        for segments in out
+    ]
+
+
+def _spans(group_rows: Sequence[int]) -> list[tuple[int, int]]:
+    """First row and row after the last of each row group; large groups are split evenly."""
+    out = []
+    first = 0
+    for rows in group_rows:
+        edges = [first + edge for edge in batches.batch_edges(rows)]
+        out += list(pairwise(edges))
+        first += rows
+    return out
+
+
+def _columns_of(file: StoredFile) -> set[str]:
+    """Columns of matches that a file provides."""
+    available = set(file.found) & set(COLUMNS) | {*POSITIONS, *LABELS_OF_CODES, "row", "source"}
+    if file.options.epoch is not None:
+        available.add("epoch")
+    if _has_errors(file):
+        available |= set(SIGMAS)
+    for on_sky, on_plane in (("pm_ra", "pm"), ("sigma_pm_ra", "sigma_pm")):
+        if on_sky in file.found:
+            available |= {f"{on_plane}_u", f"{on_plane}_v"}
+    return available
+
+
+def _refuse_differences(parts: Sequence[StoredFile]) -> None:
+    """Raise InputError for parts that do not form one table."""
+    first = parts[0]
+    for part in parts[1:]:
+        for lacking, having in ((part, first), (first, part)):
+            missing = [key for key in having.found if key not in lacking.found]
+            if missing:
+                raise InputError(
+                    f"has no column for {missing[0]!r}, but {having.source} has "
+                    f"{having.found[missing[0]]!r}",
+                    where=lacking.source,
+                    do="give all parts the same columns",
+                )
+        if part.unit != first.unit:
+            raise InputError(
+                f"unit is {part.unit}, but {first.unit} in {first.source}",
+                where=part.source,
+                do="bring all files to one",
+            )
+
+
+def _has_errors(file: StoredFile) -> bool:
+    """True if a file has errors of the matches, or of the reference positions."""
+    return bool({"sigma_u", "sigma_ra"} & set(file.found))
+
+
+@dataclass(frozen=True, eq=False)
+class StoredFile:
+    """Parquet file of matches, and how to read it."""
+
+    part: ParquetPart
+    found: Mapping[str, str]  # column of each quantity
+    unit: str  # unit of u and v
+    exposure_name: str | None  # name of the single exposure, if there is no column of exposures
+    options: ReadOptions  # with pixel origin, and with the tangent point once it is known
+    notes: tuple[str, ...] = ()  # clauses on the file
+
+    @property
+    def source(self) -> str:
+        """Name of the file."""
+        return self.part.name
+
+    @property
+    def on_sky(self) -> bool:
+        """True if the reference positions are ra and dec."""
+        return "ra" in self.found
+
+    def blocks(
+        self,
+        *,
+        start: int = 0,
+        stop: int | None = None,
+        size: int,
+    ) -> Iterator[dict[str, Any]]:
+        """Arguments of Matches for rows `start` to `stop`, at most `size` rows at a time.
+
+        As from `match_columns`, with codes that refer to labels of the block. InputError for an
+        invalid row names its row group.
+        """
+        column_names = self.found
+        encoded = {column_names[key] for key in LABELS_OF_CODES if key in column_names}
+        encoded |= {column_names["epoch"]} & self.part.texts if "epoch" in column_names else set()
+        columns = list(dict.fromkeys(column_names.values()))
+        # chip names get their numbers once all names are known
+        options = replace(self.options, unit=self.unit, chips=self.options.chips or {})
+        for block in self.part.blocks(columns, encoded=encoded, start=start, stop=stop, size=size):
+            out = match_columns(self._quantities(block, column_names), options)
+            for key, labels in LABELS_OF_CODES.items():
+                if key not in column_names:
+                    exposure_label = self.exposure_name if key == "exposure" else None
+                    out[labels] = (
+                        DEFAULT_LABELS[key] if exposure_label is None else exposure_label,
+                    )
+            yield out
+
+    def direction(self) -> tuple[int, int, int]:
+        """Sum of the direction vectors of all reference positions."""
+        total = np.zeros(3, object)
+        columns = [self.found["ra"], self.found["dec"]]
+        for block in self.part.blocks(columns, size=BLOCK):
+            total += direction_sum(*sky_columns(self._quantities(block, self.found)))
+        x, y, z = total.tolist()
+        return x, y, z
+
+    def _quantities(self, block: RowBlock, found: Mapping[str, str]) -> Quantities:
+        place = self.part.place(block.first)
+        return Quantities(block, found, self.source, place, self.part.colnames)
+
+
+def stored_file(
+    part: ParquetPart,
+    options: ReadOptions,
+    *,
+    exposure_name: str | None,
+) -> StoredFile:
+    """Layout of a file from the names and units of its columns; InputError if one is missing."""
+    source = part.name
+    column_names, options, notes = columns_read(part.colnames, {}, options, source=source)
+    column_names.pop("flux", None)  # magnitudes would require the fluxes of all rows to be positive
+    refuse_half(("sigma_u", "sigma_v"), column_names, where=source, what="errors")
+    nominal_columns(column_names, source=source, tangent_point=options.tangent_point)
+    if "ra" in column_names:
+        plane_unit_ = plane_unit(options.unit, source=source)
+    else:
+        u, v = (
+            SourceColumn(
+                Column([], unit=part.units.get(column_names[key])), source, column_names[key]
+            )
+            for key in ("u", "v")
+        )
+        plane_unit_ = position_unit((u, v), options.unit)
+    return StoredFile(part, column_names, plane_unit_, exposure_name, options, notes)
+
+
+def tangent_point_of(parts: Sequence[StoredFile]) -> tuple[float, float]:
+    """Mean direction of all reference positions."""
+    total = np.zeros(3, object)
+    for part in parts:
+        total += part.direction()
+    x, y, z = total.tolist()
+    return direction_of((x, y, z))
+
+
+@dataclass(eq=False)
+class _Scan:
+    """Iterates over all parts batch by batch, as `first_repetition` requires.
+
+    All columns are read, so that any invalid row is found, and labels are numbered as they appear.
+    """
+
+    parts: Sequence[StoredFile]
+    numbers: dict[str, dict[Any, int]] = field(
+        default_factory=lambda: {k: {} for k in LABELS_OF_CODES}
+    )
+
+    def __call__(self) -> Iterator[list[NDArray[Any]]]:
+        for part in self.parts:
+            for block in part.blocks(size=BLOCK):
+                keys = [block[name] for name in ("x", "y", "u", "v")]
+                for key, code_by_label in self.numbers.items():
+                    code_of_label = np.array(
+                        [
+                            code_by_label.setdefault(label, len(code_by_label))
+                            for label in block[LABELS_OF_CODES[key]]
+                        ]
+                    )
+                    if key in block or part.exposure_name is not None:
+                        keys.append(recoded(key, block, code_of_label))
+                if "epoch" in block:
+                    keys.append(block["epoch"])
+                yield keys
+
+
+def scan(parts: Sequence[StoredFile]) -> Labels:
+    """Labels common to all parts, from a scan of all rows; InputError for invalid or repeated rows.
+
+    The parts must have the same quantities and unit, and a tangent point if they need one.
+    """
+    n_rows = sum(part.part.n_rows for part in parts)
+    if n_rows == 0:
+        remainder = f" and {len(parts) - 1} more" if len(parts) > 1 else ""
+        raise InputError(
+            "holds no rows", where=parts[0].source + remainder, do="give a table with matched stars"
+        )
+    rows = _Scan(parts)
+    pair = first_repetition(rows, buckets_for(n_rows))
+    if pair is not None:
+        first, second = (_named(parts, row) for row in pair)
+        raise InputError(
+            f"repeats {first}: the same x, y, u, v, exposure and chip",
+            where=second,
+            do="keep each row once",
+        )
+    return Labels(
+        unit=parts[0].unit,
+        exposure_names=tuple(rows.numbers["exposure"]),
+        chip_numbers=tuple(sorted(rows.numbers["chip"])),
+        filter_names=tuple(rows.numbers["filter"]),
+        sources=tuple(part.source for part in parts),
+        n_rows=n_rows,
+        **_geometry(parts),
+        notes=tuple(dict.fromkeys(note for part in parts for note in part.notes)),
+    )
+
+
+def _geometry(parts: Sequence[StoredFile]) -> dict[str, Any]:
+    """Tangent point and match radius of all parts, as arguments of `Labels`.
+
+    InputError if parts state different values.
+    """
+    first = parts[0]
+    if first.on_sky:
+        return {"tangent_point": first.options.tangent_point}
+    stated = [header_arguments(part.part.header, part.unit, source=part.source) for part in parts]
+    points = [header.get("tangent_point") for header in stated]
+    for point, part in zip(points, parts, strict=True):
+        if point != points[0]:
+            raise InputError(
+                f"tangent point is {point}, but {points[0]} in {first.source}",
+                where=part.source,
+                do="bring all parts to one",
+            )
+    radii = [header.get("match_radius") for header in stated]
+    return {
+        "tangent_point": points[0],
+        "match_radius": common_radius(radii, [part.source for part in parts]),
+    }
+
+
+def _named(parts: Sequence[StoredFile], row: int) -> str:
+    """File, row group and row of a row number counted over all parts."""
+    for part in parts:
+        if row < part.part.n_rows:
+            break
+        row -= part.part.n_rows
+    return f"{part.source}, {part.part.place(0)(row)}"
+
+
+def write_partitioned(
+    tables: Iterable[Matches],
+    folder: str | os.PathLike[str],
+    *,
+    rows_per_group: int = BATCH,
+) -> list[Path]:
+    """Write tables of matches as a folder of Parquet files, which are parts of one table.
+
+    Only one of the tables needs to be in memory at a time. Reading the folder gives bit-identical
+    numbers, with the tangent point and the match radius. Not written are the rows and files of
+    origin, counts of rejected rows, labels without stars, and exposures, chips and filters if the
+    first table has only the default label.
+
+    Parameters
+    ----------
+    tables : iterable of Matches
+        Tables in one unit, with the same columns.
+    folder : path-like
+        Output folder, which is created if necessary and must not contain Parquet files.
+    rows_per_group : int, optional
+        Largest number of rows in a row group.
+
+    Returns
+    -------
+    list of pathlib.Path
+        ``part-00000.parquet`` and so on, one per table. If a file cannot be written, or if the
+        iterable raises an error, the files written so far are removed.
+
+    Raises
+    ------
+    InputError
+        If there are no tables, if tables differ in columns or unit, or if the folder cannot be
+        written to or is in use.
+
+    Examples
+    --------
+    >>> from bayesdist.data import write_partitioned
+    >>> from bayesdist.missions.wise import simulate_wise
+    >>> matches, _ = simulate_wise(500, rng=np.random.default_rng(1))
+    >>> [path.name for path in write_partitioned([matches, matches], "stars")]
+    ['part-00000.parquet', 'part-00001.parquet']
+    """
+    folder = Path(folder)
+    if rows_per_group < 1:
+        raise InputError(f"rows_per_group is {rows_per_group}", do="give 1 or more")
+    _make_empty(folder)
+    written = write_parts(folder, _parts(tables, folder), rows_per_group=rows_per_group)
+    if not written:
+        raise InputError("there are no tables to write", where=str(folder), do="give at least one")
+    return written
+
+
+def _parts(tables: Iterable[Matches], folder: Path) -> Iterator[Part]:
+    """Columns and units of tables, which must be those of the first table."""
+    names: list[str] = []
+    unit = ""
+    for number, table in enumerate(tables, 1):
+        columns = _columns(table, names)
+        if number == 1:
+            names, unit = list(columns), table.unit
+        elif list(columns) != names or table.unit != unit:
+            raise InputError(
+                f"table {number} has another unit or other columns than the first",
+                where=str(folder),
+                do="give tables of one kind",
+            )
+        units = dict.fromkeys(_LENGTHS, unit) | {"x": "pix", "y": "pix", "epoch": "yr"}
+        yield columns, units, geometry_header(table)
+
+
+def write_parts(
+    folder: Path, parts: Iterable[Part], *, rows_per_group: int | None = None
+) -> list[Path]:
+    """Write columns and units to part-00000.parquet and so on; remove all files if one fails."""
+    written: list[Path] = []
+    try:
+        for columns, units, header in parts:
+            path = folder / f"part-{len(written):05d}.parquet"
+            write_columns(path, columns, units, header=header, rows_per_group=rows_per_group)
+            written.append(path)
+    except BaseException:
+        for path in written:
+            path.unlink(missing_ok=True)
+        raise
+    return written
+
+
+def _make_empty(folder: Path) -> None:
+    made_folder(folder)
+    if next(folder.rglob("*.parquet"), None) is not None:
+        raise InputError(
+            "holds Parquet files already", where=str(folder), do="choose an empty folder"
+        )
+
+
+def _columns(table: Matches, names: Collection[str]) -> dict[str, NDArray[Any] | Labelled]:
+    """Columns of a table; labels only if they are not the default or if `names` contains them."""
+    columns: dict[str, Any] = columns_of(table, (*_NUMBERS, "star"))
+    for name, key in LABELS_OF_CODES.items():
+        labels = getattr(table, key)
+        if labels != (DEFAULT_LABELS[name],) or name in names:
+            columns[name] = (getattr(table, name), labels)
+    return columns
+
+
+def write_columns(
+    path: str | os.PathLike[str],
+    columns: Mapping[str, NDArray[Any] | Labelled],
+    units: Mapping[str, str],
+    *,
+    header: Mapping[str, Any] | None = None,
+    rows_per_group: int | None = None,
+) -> None:
+    """Write a Parquet file atomically, with units in the metadata of its fields.
+
+    `columns` are arrays (N,), or codes with their labels, which are stored as a dictionary.
+    `header` is stored as JSON in the metadata of the file.
+    """
+    import pyarrow.parquet
+
+    fields, arrays = [], []
+    for name, values in columns.items():
+        array = _labelled(*values) if isinstance(values, tuple) else arrow_array(values)
+        metadata = {"unit": units[name]} if name in units else None
+        fields.append(pyarrow.field(name, array.type, nullable=False, metadata=metadata))
+        arrays.append(array)
+    metadata_of_file = {HEADER: json.dumps(dict(header))} if header else None
+    table = pyarrow.table(arrays, schema=pyarrow.schema(fields, metadata=metadata_of_file))
+    with atomic_path(path) as temporary:
+        pyarrow.parquet.write_table(
+            table,
+            temporary,
+            row_group_size=rows_per_group,
+            # measurements do not compress well; labels are run-length encoded in any case
+            compression="none",
+            use_dictionary=[name for name, v in columns.items() if isinstance(v, tuple)],
+            write_statistics=False,
+            write_page_checksum=True,  # to detect damage
+        )
+    pyarrow.default_memory_pool().release_unused()
+
+
+def _labelled(codes: Int, labels: Sequence[str | int]) -> pyarrow.DictionaryArray:
+    """Column of labels from codes that refer to them."""
+    import pyarrow
+
+    return pyarrow.DictionaryArray.from_arrays(
+        arrow_array(codes.astype(np.int32)), arrow_array(np.asarray(labels))
+    )

@@ -1,1 +1,0 @@
-"""Matches in Parquet files: writing, scanning, and reading from disk in batches."""
