@@ -10,8 +10,12 @@ from numpy.typing import NDArray
 
 from bayesdist.data.detections import NO_STAR, Detections
 from bayesdist.model import Chip, DistortionModel
-from bayesdist.simulate.dithers import dithered_model, sky_seen, stars_on_detector
-from bayesdist.simulate.patterns import flat_coefficients
+from bayesdist.simulate.dithers import (
+    dithered_model,
+    flat_coefficients,
+    sky_seen,
+    stars_on_detector,
+)
 
 Float = NDArray[np.float64]
 Bool = NDArray[np.bool_]

@@ -30,7 +30,7 @@ from bayesdist.assess.requirements.requirement import as_requirements
 from bayesdist.assess.requirements.verdict import VERDICT_LEVELS
 from bayesdist.calibration.calibration import Calibration, calibration_of_exposure
 from bayesdist.calibration.chip_map import chosen_chip
-from bayesdist.calibration.sky_distribution import sky_distribution
+from bayesdist.calibration.sky_positions import sky_distribution
 from bayesdist.calibration.sky_table import pixel_columns, position_column
 from bayesdist.data import Matches
 from bayesdist.diagnose.diagnostics import Diagnostics

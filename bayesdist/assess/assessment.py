@@ -40,9 +40,8 @@ from bayesdist.infer import Posterior, Solution
 from bayesdist.infer.equations.scaled import one_thread
 from bayesdist.infer.posterior.checks import convergence_check
 from bayesdist.model.grid import DEFAULT_GRID
-from bayesdist.utils.arguments import takes
 from bayesdist.utils.checks import Check, in_order
-from bayesdist.utils.quantities import Epoch, Number, Random, value_in, year_of
+from bayesdist.utils.quantities import Epoch, Number, Random, takes, value_in, year_of
 from bayesdist.utils.streams import assessment_rng
 
 EXPOSURES = ("mean", "single")

@@ -23,9 +23,8 @@ from bayesdist.errors import InputError, required
 from bayesdist.infer.solution.solution import Solution
 from bayesdist.model.basis import point_blocks
 from bayesdist.model.grid import DEFAULT_GRID, grid_pixels, mesh, position_of_largest
-from bayesdist.utils.arguments import takes
 from bayesdist.utils.arrays import Float
-from bayesdist.utils.quantities import Epoch, year_of
+from bayesdist.utils.quantities import Epoch, takes, year_of
 
 RELATIVE = "relative positions"
 NODES = 33  # number of axis ratios between which radii are interpolated, accurate to 1e-4

@@ -15,8 +15,8 @@ import numpy as np
 from numpy.polynomial import legendre
 from numpy.typing import ArrayLike
 
+from bayesdist.calibration.apply import FULL, Subarray
 from bayesdist.calibration.chip_map import ChipMap
-from bayesdist.calibration.subarray import FULL, Subarray
 from bayesdist.errors import InputError
 from bayesdist.model import PolynomialBasis
 from bayesdist.utils.arrays import Float

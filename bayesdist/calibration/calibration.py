@@ -17,8 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from bayesdist.calibration import hooks
-from bayesdist.calibration.chip_map import ChipMap, chip_of, sampling_of
-from bayesdist.calibration.further import FurtherError
+from bayesdist.calibration.chip_map import ChipMap, FurtherError, chip_of, sampling_of
 from bayesdist.calibration.inverse import ExplicitInverse
 from bayesdist.calibration.plane import ARCSEC, Plane
 from bayesdist.errors import InputError

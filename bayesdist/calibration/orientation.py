@@ -16,7 +16,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from bayesdist.calibration.calibration import Calibration
-from bayesdist.calibration.further import scaled
+from bayesdist.calibration.chip_map import scaled
 from bayesdist.calibration.inverse import detector_grid
 from bayesdist.calibration.plane import ARCSEC, Agreement, Orientation, Plane, arcsec_per
 from bayesdist.errors import DegenerateError, InputError

@@ -57,10 +57,9 @@ from bayesdist.infer.exposures.chip_offsets import Settling
 from bayesdist.infer.posterior.checks import ChiSquare
 from bayesdist.infer.stars.likelihood import Likelihood
 from bayesdist.infer.stars.loading import opened
-from bayesdist.utils.arguments import takes
 from bayesdist.utils.arrays import Float, Int
 from bayesdist.utils.checks import EITHER, Check, warnings_of
-from bayesdist.utils.quantities import Number, Random, value_in
+from bayesdist.utils.quantities import Number, Random, takes, value_in
 from bayesdist.utils.streams import assessment_rng, restarted
 
 if TYPE_CHECKING:

@@ -16,7 +16,7 @@ from astropy.wcs import WCS
 
 import bayesdist as bd
 from bayesdist.calibration.calibration import Calibration, GaussianSolution
-from bayesdist.calibration.further import FurtherError, scaled
+from bayesdist.calibration.chip_map import FurtherError, scaled
 from bayesdist.calibration.plane import Plane
 from bayesdist.calibration.sky_positions import sky_positions
 from bayesdist.errors import InputError

@@ -20,12 +20,15 @@ from bayesdist.assess.planning.dithers import (
 from bayesdist.errors import InputError
 from bayesdist.infer.selfcal import self_calibrate
 from bayesdist.model import Chip
-from bayesdist.simulate.dithers import dither_pattern, dithered_model, sky_seen, stars_on_detector
-from bayesdist.simulate.patterns import (
+from bayesdist.simulate.dithers import (
     DitherPattern,
+    dither_pattern,
+    dithered_model,
     flat_coefficients,
     grid_offsets,
     rolls_in_turn,
+    sky_seen,
+    stars_on_detector,
 )
 from tests.dithered_fields import simulate_dithers, smooth_distortion
 from tests.infer.selfcal.fields import aligned

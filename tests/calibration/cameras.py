@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from bayesdist.calibration.calibration import Calibration, GaussianSolution
-from bayesdist.calibration.further import FurtherError
+from bayesdist.calibration.chip_map import FurtherError
 from bayesdist.calibration.plane import Plane
 from bayesdist.model import Chip, DistortionModel, LookupTable, TimeDependence
 

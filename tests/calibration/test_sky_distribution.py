@@ -10,10 +10,9 @@ from astropy.time import Time
 from astropy.uncertainty import Distribution
 
 from bayesdist.calibration.calibration import Calibration, GaussianSolution
-from bayesdist.calibration.further import FurtherError
+from bayesdist.calibration.chip_map import FurtherError
 from bayesdist.calibration.plane import Plane
-from bayesdist.calibration.sky_distribution import sky_distribution
-from bayesdist.calibration.sky_positions import sky_positions
+from bayesdist.calibration.sky_positions import sky_distribution, sky_positions
 from bayesdist.errors import InputError
 from bayesdist.model import Chip, DistortionModel
 

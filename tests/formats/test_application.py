@@ -9,15 +9,17 @@ import pytest
 from astropy.io import fits
 from numpy.testing import assert_allclose
 
-from bayesdist.calibration.apply import Application, OutputFrame, frame_that_holds
-from bayesdist.calibration.calibration import calibration_of
-from bayesdist.calibration.inverse import fitted_inverse
-from bayesdist.calibration.subarray import (
+from bayesdist.calibration.apply import (
+    Application,
+    OutputFrame,
     Subarray,
+    frame_that_holds,
     subarray_at_corner,
     subarray_of_header,
     subarrays_of_image,
 )
+from bayesdist.calibration.calibration import calibration_of
+from bayesdist.calibration.inverse import fitted_inverse
 from bayesdist.errors import FormatError, InputError
 from bayesdist.formats.idctab.build import idctab_from_solution
 from bayesdist.formats.idctab.calibration import idctab_calibration

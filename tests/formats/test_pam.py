@@ -8,9 +8,9 @@ from astropy.io import fits
 from numpy.testing import assert_allclose
 
 from bayesdist.assess import area_map
+from bayesdist.calibration.apply import Subarray, subarray_at_corner
 from bayesdist.calibration.area import pixel_area_map, pixel_areas
 from bayesdist.calibration.calibration import calibration_of
-from bayesdist.calibration.subarray import Subarray, subarray_at_corner
 from bayesdist.errors import InputError
 from bayesdist.formats.idctab.calibration import idctab_calibration
 from bayesdist.formats.idctab.table import read_idctab

@@ -11,7 +11,7 @@ from astropy.wcs import WCS, FITSFixedWarning
 
 import bayesdist as bd
 from bayesdist.calibration.calibration import Calibration, GaussianSolution, calibration_of
-from bayesdist.calibration.further import FurtherError
+from bayesdist.calibration.chip_map import FurtherError
 from bayesdist.calibration.plane import Plane
 from bayesdist.errors import InputError
 from bayesdist.formats import sip_from_solution

@@ -15,7 +15,7 @@ from bayesdist.assess.planning.dithers import (
 from bayesdist.model import Chip
 from bayesdist.report.drawing import png_of
 from bayesdist.report.figures.commands import pattern_maps
-from bayesdist.simulate.patterns import DitherPattern, flat_coefficients
+from bayesdist.simulate.dithers import DitherPattern, flat_coefficients
 
 SIZE = (400.0, 200.0)
 

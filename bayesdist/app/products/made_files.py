@@ -29,7 +29,7 @@ from bayesdist.assess.terms.parameters import (
     TIME_DEPENDENCE,
 )
 from bayesdist.calibration.calibration import Calibration, GaussianSolution, calibration_of
-from bayesdist.calibration.further import FurtherError
+from bayesdist.calibration.chip_map import FurtherError
 from bayesdist.calibration.orientation import lay_on
 from bayesdist.calibration.plane import ARCSEC, Plane
 from bayesdist.diagnose.diagnostics import Diagnostics

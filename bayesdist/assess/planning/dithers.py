@@ -35,8 +35,7 @@ from bayesdist.infer.selfcal.sky_moves import POINTS, functionals, moves
 from bayesdist.model import Chip, DistortionModel
 from bayesdist.model.frames import FRAME_KINDS
 from bayesdist.model.grid import outline_pixels
-from bayesdist.simulate.dithers import dithered_model, sky_seen, stars_on_detector
-from bayesdist.simulate.patterns import DitherPattern
+from bayesdist.simulate.dithers import DitherPattern, dithered_model, sky_seen, stars_on_detector
 from bayesdist.utils.arrays import Float, Int
 
 KINDS = ("gauge-free", "shape", "absolute")

@@ -26,9 +26,8 @@ from bayesdist.data.matching.similarity import (
     pattern_index,
 )
 from bayesdist.errors import InputError
-from bayesdist.utils.arguments import takes
 from bayesdist.utils.arrays import Int
-from bayesdist.utils.quantities import Number, value_in
+from bayesdist.utils.quantities import Number, takes, value_in
 
 _FALSE_RATE = 0.02  # probability of a chance match of a detection that the default radius allows
 

@@ -28,8 +28,8 @@ from bayesdist.infer.stars.likelihood import good_probability
 from bayesdist.infer.stars.shards import Compute
 from bayesdist.infer.stars.stars import groups_of, in_table_order, prepare
 from bayesdist.model import DistortionModel
-from bayesdist.utils.arguments import takes
 from bayesdist.utils.arrays import Float
+from bayesdist.utils.quantities import takes
 
 STARS = 200_000  # sample size; it determines the error law to a part in a thousand
 PER_EXPOSURE = 100  # the sample has on average at least this many stars per exposure and chip

@@ -38,7 +38,7 @@ from bayesdist.infer.solution.linear import LinearFit
 from bayesdist.infer.stars.likelihood import Clip
 from bayesdist.infer.stars.mixture import OutlierMixture
 from bayesdist.model import DistortionModel
-from bayesdist.utils.arguments import takes
+from bayesdist.utils.quantities import takes
 
 if TYPE_CHECKING:
     import xarray

@@ -13,8 +13,8 @@ from bayesdist.infer.stars.likelihood import star_averages, star_log_likelihoods
 from bayesdist.infer.stars.mixture import Hyper
 from bayesdist.infer.stars.shards import Shards
 from bayesdist.infer.stars.stars import Stars, in_table_order, prepare
-from bayesdist.utils.arguments import takes
 from bayesdist.utils.arrays import Float, Int
+from bayesdist.utils.quantities import takes
 
 MOST_DRAWS, LEAST_DRAWS = 64, 8
 AT_A_TIME = 1_000_000  # log-likelihoods (stars times draws) that are computed at a time

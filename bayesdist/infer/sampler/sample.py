@@ -35,10 +35,9 @@ from bayesdist.infer.stars.loading import opened
 from bayesdist.infer.stars.mixture import OutlierMixture
 from bayesdist.infer.stars.shards import Compute, Shards
 from bayesdist.infer.stars.stars import Stars
-from bayesdist.utils.arguments import takes
 from bayesdist.utils.limits import PARETO_K
 from bayesdist.utils.memory import require_memory
-from bayesdist.utils.quantities import whole_number
+from bayesdist.utils.quantities import takes, whole_number
 
 STEPS_KEPT = 100  # steps per walker assumed for the check of the available memory
 FORMAT = 3  # version of the checkpoint files

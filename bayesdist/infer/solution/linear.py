@@ -31,9 +31,8 @@ from bayesdist.infer.stars.loading import opened
 from bayesdist.infer.stars.shards import Compute, Shards
 from bayesdist.infer.stars.stars import Stars, in_table_order, prepare
 from bayesdist.model import Chip, DistortionModel, TimeDependence
-from bayesdist.utils.arguments import takes
 from bayesdist.utils.arrays import Bool, Float
-from bayesdist.utils.quantities import Random, generator_of, value_in, values_in
+from bayesdist.utils.quantities import Random, generator_of, takes, value_in, values_in
 
 MEDIAN_STARS = 1_000_000  # medians are taken over at most about this many stars
 MEDIAN_CHI2_2 = 2 * np.log(2)  # median of chi-square with two degrees of freedom

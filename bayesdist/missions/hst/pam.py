@@ -9,8 +9,8 @@ import numpy as np
 from bayesdist.app.commands.on_files.calibrations import calibration_of_scale, images_of, notes_of
 from bayesdist.app.screen import number
 from bayesdist.app.store.output import refuse_existing
+from bayesdist.calibration.apply import FULL
 from bayesdist.calibration.area import PixelAreaMap, pixel_area_map
-from bayesdist.calibration.subarray import FULL
 from bayesdist.errors import InputError
 from bayesdist.products.maps_file import write_pam
 

@@ -23,7 +23,7 @@ import numpy as np
 from astropy.io import fits
 
 from bayesdist.calibration.calibration import Calibration, GaussianSolution
-from bayesdist.calibration.further import further_from
+from bayesdist.calibration.chip_map import further_from
 from bayesdist.calibration.inverse import detector_grid
 from bayesdist.calibration.plane import Plane
 from bayesdist.errors import FormatError

@@ -14,7 +14,7 @@ import numpy as np
 from pydantic import BaseModel, Field, TypeAdapter
 
 from bayesdist.calibration.calibration import Calibration, GaussianSolution
-from bayesdist.calibration.further import further_from
+from bayesdist.calibration.chip_map import further_from
 from bayesdist.calibration.inverse import detector_grid
 from bayesdist.calibration.orientation import in_arcsec
 from bayesdist.calibration.plane import Plane, arcsec_per

@@ -7,7 +7,7 @@ import pytest
 from scipy.integrate import quad
 from scipy.special import j0
 
-from bayesdist.calibration.further import FurtherError
+from bayesdist.calibration.chip_map import FurtherError
 from bayesdist.diagnose.correlated import Discrepancy, estimate_discrepancy
 from bayesdist.diagnose.correlated.functions import StructureFunctions, legendre_products
 from bayesdist.diagnose.correlated.neighbours import _below

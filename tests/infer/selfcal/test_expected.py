@@ -11,8 +11,12 @@ from bayesdist.data.detections import Detections
 from bayesdist.infer.equations.priors import Prior
 from bayesdist.infer.selfcal.expected import expected_solution
 from bayesdist.infer.selfcal.prior import frame_prior
-from bayesdist.simulate.dithers import dithered_model, sky_seen, stars_on_detector
-from bayesdist.simulate.patterns import flat_coefficients
+from bayesdist.simulate.dithers import (
+    dithered_model,
+    flat_coefficients,
+    sky_seen,
+    stars_on_detector,
+)
 from tests.infer.selfcal.fields import SIZE, chips
 
 RNG = np.random.default_rng(8)

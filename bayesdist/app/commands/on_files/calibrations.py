@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 
 from bayesdist.app.calibrations import calibration_at, refuse_unused_date
+from bayesdist.calibration.apply import Subarray, subarray_at_corner, subarrays_of_image
 from bayesdist.calibration.calibration import Calibration
-from bayesdist.calibration.subarray import Subarray, subarray_at_corner, subarrays_of_image
 from bayesdist.errors import InputError
 from bayesdist.products.common.content import read_hdus
 

@@ -24,9 +24,9 @@ from bayesdist.app.config.section import (
 from bayesdist.app.config.selfcal import Frames, MinDetections, scale_faults
 from bayesdist.assess.planning.dithers import Camera, PlannedStars, PriorInformation
 from bayesdist.model import Chip
-from bayesdist.simulate.dithers import dither_pattern
-from bayesdist.simulate.patterns import (
+from bayesdist.simulate.dithers import (
     DitherPattern,
+    dither_pattern,
     flat_coefficients,
     grid_offsets,
     rolls_in_turn,
