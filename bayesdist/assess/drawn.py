@@ -26,6 +26,7 @@ from bayesdist.assess.terms.forms import (
     Image,
     NoiseField,
     Pool,
+    VaryingTerm,
 )
 from bayesdist.infer.equations.scaled import one_thread
 from bayesdist.infer.solution.solution import Solution
@@ -103,7 +104,7 @@ class DrawnErrors:
         """
         model = self.solution.model
         variants = [
-            getattr(term, "treatments", lambda *_: ())(model, grid) or (term, term)
+            (term.treatments(model, grid) if isinstance(term, VaryingTerm) else ()) or (term, term)
             for term in self.terms
         ]
         if all(pair == (term, term) for pair, term in zip(variants, self.terms, strict=True)):

@@ -29,6 +29,7 @@ from bayesdist.assess.requirements.verdict import (
     verdict_of,
 )
 from bayesdist.assess.solution import place_of
+from bayesdist.assess.terms.forms import VaryingTerm
 from bayesdist.assess.units import convert
 from bayesdist.diagnose.statistics import clopper_pearson
 from bayesdist.errors import InputError
@@ -206,7 +207,7 @@ def judge(
     cases = [domains_of(r, model, grid, epoch=epoch, chip=chip) for r in requirements]
     doubts = doubts_of(checks)
     tallies = _tallied(errors, requirements, cases, factors, grid, doubts, adaptive=adaptive)
-    varying = [t.rows[0].name for t in errors.terms if getattr(t, "varies", False)]
+    varying = [t.rows[0].name for t in errors.terms if isinstance(t, VaryingTerm) and t.varies]
     ways, margins = (errors, *errors.treatments(grid)), []
     for r, case, factor, (by_epoch, by_way) in zip(
         requirements, cases, factors, tallies, strict=True

@@ -21,7 +21,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property, reduce
-from typing import ClassVar, Protocol
+from typing import ClassVar, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -90,6 +90,36 @@ class ErrorTerm(Protocol):
 
     def draw(self, n: int, rng: np.random.Generator) -> ErrorDraws:
         """Draw the error n times; each draw applies to all chips and epochs."""
+        ...
+
+
+@runtime_checkable
+class VaryingTerm(ErrorTerm, Protocol):
+    """A term of unknown extent: an error of the whole field, or one that varies over it."""
+
+    @property
+    def varies(self) -> bool | None:
+        """True if the error may vary over the field."""
+        ...
+
+    def treatments(
+        self, model: DistortionModel, grid: tuple[int, int] | None
+    ) -> tuple[ErrorTerm, ...]:
+        """The error as a smooth field and as independent errors; empty if it cannot vary.
+
+        `grid`: number of points along x and y of each chip over which the smooth field has its
+        stated rms; None for the default grid.
+        """
+        ...
+
+
+@runtime_checkable
+class SizedTerm(ErrorTerm, Protocol):
+    """A term whose size the user states as one number."""
+
+    @property
+    def sigma(self) -> float:
+        """Standard deviation; 0 if there is no error."""
         ...
 
 

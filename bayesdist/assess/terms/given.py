@@ -20,6 +20,7 @@ from bayesdist.assess.terms.forms import (
     Independent,
     Pool,
     Row,
+    SizedTerm,
 )
 from bayesdist.assess.units import UNITS, convert
 from bayesdist.data.magnitude_errors import MagnitudeErrors
@@ -77,9 +78,11 @@ def stated_names(terms: Sequence[ErrorTerm]) -> tuple[str, ...]:
     """Names of the terms that state an error, in order."""
     names = []
     for term in terms:
-        sizes = [getattr(term, "sigma", 1.0)]  # other terms have one size, or compute their size
+        sizes = [1.0]  # of terms that compute their size
         if isinstance(term, UserTerm):
             sizes = [term.sigma_u, term.sigma_v]
+        elif isinstance(term, SizedTerm):
+            sizes = [term.sigma]
         row = term.rows[0]
         if is_stated(sizes, row.source):
             names.append(row.name)
