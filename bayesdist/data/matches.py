@@ -7,7 +7,7 @@ from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import MISSING, dataclass, field, fields, replace
 from functools import cached_property, partial
 from itertools import pairwise
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol, Unpack
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -26,7 +26,12 @@ from bayesdist.data.columns import (
 )
 from bayesdist.data.magnitude_errors import AddedErrors, MagnitudeErrors, no_magnitudes
 from bayesdist.data.output import arrow_stream, html_of, table_of
-from bayesdist.data.reading.options import ReadOptions, option_names, refuse_missing_errors
+from bayesdist.data.reading.options import (
+    ReadArguments,
+    ReadOptions,
+    option_names,
+    refuse_missing_errors,
+)
 from bayesdist.data.reading.table import match_arguments, sky_table
 from bayesdist.data.repeated import check_same_position, error_codes, star_codes
 from bayesdist.errors import InputError
@@ -173,18 +178,7 @@ class Matches(MatchColumns):
     def from_table(
         cls,
         table: Any,
-        *,
-        columns: Mapping[str, str] | None = None,
-        unit: str | None = None,
-        sigma: str | Number = "columns",
-        pixel_origin: int | None = None,
-        tangent_point: Direction | None = None,
-        epoch: Epoch | None = None,
-        catalogue_epoch: Epoch | None = None,
-        chips: Mapping[str, int] | None = None,
-        not_finite: str = "refuse",
-        same_position: str = "one_star",
-        plate_scale: float | None = None,
+        **options: Unpack[ReadArguments],
     ) -> Matches:
         """Matches from any object with columns.
 
@@ -197,13 +191,9 @@ class Matches(MatchColumns):
             An astropy Table or QTable, also with Time and SkyCoord columns; a pandas DataFrame, in
             which NaN is a missing value; an object with an Arrow stream (a polars DataFrame, a
             pyarrow Table, a DuckDB result); a mapping of arrays or lists; or a structured array.
-        columns, unit, sigma, pixel_origin, tangent_point, epoch, catalogue_epoch, chips, not_finite
-            As for `ReadOptions`.
-        same_position : {'one_star', 'separate_stars'}, optional
-            As for `ReadOptions`: without a column `star`, rows with the same reference position
-            belong to one star by default.
-        plate_scale : float, optional
-            As for `ReadOptions`: arcsec per millimetre of u and v.
+        **options
+            Fields of `ReadOptions` by name: columns, unit, sigma, pixel_origin, tangent_point,
+            epoch, catalogue_epoch, chips, not_finite, same_position, plate_scale.
 
         Returns
         -------
@@ -223,20 +213,8 @@ class Matches(MatchColumns):
         <2 matches in memory: 1 exposure, 1 chip, u and v in arcsec, median error 0.01 arcsec>
         """
         with option_names():
-            options = ReadOptions(
-                columns,
-                unit,
-                sigma,
-                pixel_origin,
-                tangent_point,
-                epoch,
-                catalogue_epoch,
-                chips,
-                not_finite,
-                same_position,
-                plate_scale,
-            )
-            return cls(**match_arguments(table, options)).as_read(options.plane_sigma)
+            reading = ReadOptions(**options)
+            return cls(**match_arguments(table, reading)).as_read(reading.plane_sigma)
 
     @classmethod
     def from_sky(

@@ -6,7 +6,7 @@ import os
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Unpack
 
 import numpy as np
 from astropy.table import Table
@@ -24,7 +24,7 @@ from bayesdist.data.formats.hst1pass import is_matchup, read_hst1pass, read_matc
 from bayesdist.data.matches import Matches
 from bayesdist.data.matching.table import match_table
 from bayesdist.data.reading.columns import numbered, text_labels
-from bayesdist.data.reading.options import ReadOptions
+from bayesdist.data.reading.options import ReadArguments, ReadOptions
 from bayesdist.data.reading.table import (
     catalogue_positions,
     is_table,
@@ -39,7 +39,6 @@ from bayesdist.data.tables.names import ALIASES, find_columns
 from bayesdist.errors import InputError
 from bayesdist.files.tables import read_table
 from bayesdist.files.unpacked import read_lines
-from bayesdist.utils.quantities import Direction, Epoch, Number
 
 PathLike = str | os.PathLike[str]
 # other quantities are omitted: 'mag', if present, is the magnitude of the index star
@@ -50,17 +49,7 @@ def read_matches(
     path: PathLike | Sequence[PathLike] | Any,
     *,
     format: str = "auto",
-    columns: Mapping[str, str] | None = None,
-    unit: str | None = None,
-    sigma: str | Number = "columns",
-    pixel_origin: int | None = None,
-    tangent_point: Direction | None = None,
-    epoch: Epoch | None = None,
-    catalogue_epoch: Epoch | None = None,
-    chips: Mapping[str, int] | None = None,
-    not_finite: str = "refuse",
-    same_position: str = "one_star",
-    plate_scale: float | None = None,
+    **options: Unpack[ReadArguments],
 ) -> Matches:
     r"""Read matched star positions.
 
@@ -75,13 +64,9 @@ def read_matches(
         (lists with raw and corrected positions), 'matchup' (such lists and the MATCHUP master with
         which they are matched), 'astrometry.net' (corr.fits), 'bayesdist' (matches.h5 of a saved
         run), a format added by a mission, or 'auto': recognized by name and content.
-    columns, unit, sigma, pixel_origin, tangent_point, epoch, catalogue_epoch, chips, not_finite
-        As for `ReadOptions`.
-    plate_scale : float, optional
-        As for `ReadOptions`: arcsec per millimetre of u and v.
-    same_position : {'one_star', 'separate_stars'}, optional
-        As for `ReadOptions`: without a column `star`, rows with the same reference position, in one
-        or several files, belong to one star by default.
+    **options
+        Fields of `ReadOptions` by name: columns, unit, sigma, pixel_origin, tangent_point, epoch,
+        catalogue_epoch, chips, not_finite, same_position, plate_scale.
 
     Returns
     -------
@@ -106,19 +91,7 @@ def read_matches(
         raise InputError(
             f"format is {format!r}", where="data.format", do=f"choose one of {', '.join(formats)}"
         )
-    options = ReadOptions(
-        columns,
-        unit,
-        sigma,
-        pixel_origin,
-        tangent_point,
-        epoch,
-        catalogue_epoch,
-        chips,
-        not_finite,
-        same_position,
-        plate_scale,
-    )
+    reading = ReadOptions(**options)
     if is_table(path):
         if format not in ("auto", "table"):
             raise InputError(
@@ -126,16 +99,16 @@ def read_matches(
                 where="format",
                 do="leave it out",
             )
-        return Matches(**match_arguments(path, options)).as_read(options.plane_sigma)
+        return Matches(**match_arguments(path, reading)).as_read(reading.plane_sigma)
     files = input_files(path)
-    kinds = [kind_of(file, columns) if format == "auto" else format for file in files]
+    kinds = [kind_of(file, reading.columns) if format == "auto" else format for file in files]
     masters = [file for file, kind in zip(files, kinds, strict=True) if kind == "matchup"]
     if masters:
-        table = _read_with_master(files, kinds, options)
+        table = _read_with_master(files, kinds, reading)
     else:
         in_parts = isinstance(path, str | os.PathLike) and Path(path).is_dir()
-        table = _read_plain(files, kinds, options, in_parts=in_parts)
-    return table.as_read(options.plane_sigma)
+        table = _read_plain(files, kinds, reading, in_parts=in_parts)
+    return table.as_read(reading.plane_sigma)
 
 
 def _read_plain(

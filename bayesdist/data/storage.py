@@ -19,7 +19,7 @@ from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Unpack
 
 import numpy as np
 from astropy.table import Column
@@ -47,7 +47,7 @@ from bayesdist.data.reading.columns import (
     plane_unit,
     position_unit,
 )
-from bayesdist.data.reading.options import ReadOptions, refuse_missing_errors
+from bayesdist.data.reading.options import ReadArguments, ReadOptions, refuse_missing_errors
 from bayesdist.data.repeated import buckets_for, first_repetition
 from bayesdist.data.sky import direction_of, direction_sum, sky_columns
 from bayesdist.data.tables.checks import columns_of, refuse_half
@@ -117,7 +117,7 @@ class StoredRows:
                 yield out
 
 
-def open_matches(path: PathLike | Sequence[PathLike], **options: Any) -> Matches:
+def open_matches(path: PathLike | Sequence[PathLike], **options: Unpack[ReadArguments]) -> Matches:
     """Open matched star positions without reading them into memory.
 
     Parameters

@@ -32,6 +32,7 @@ from bayesdist.files.fits import FITS_START, open_fits, refuse_long_arrays
 from bayesdist.files.parquet import parquet_table
 from bayesdist.files.regular import head_of
 from bayesdist.files.text_tables import (
+    MAYBE_FOREIGN,
     MAYBE_FOREIGN_BYTES,
     columns_of_numbers,
     is_text_table,
@@ -104,7 +105,8 @@ def read_ecsv(path: Path, limits: Limits = LIMITS) -> Table:
         mark = _mark_of_ecsv(lines)
         lines = _whole_lines(lines, mark, path)
         table = Table.read(lines, format="ascii.ecsv")
-        refuse_foreign_numbers(_columns_of_ecsv(lines), lines, mark, where=str(path))
+        if any(map(MAYBE_FOREIGN.search, lines)):  # else the header need not be parsed again
+            refuse_foreign_numbers(_columns_of_ecsv(lines), lines, mark, where=str(path))
         return table
 
 

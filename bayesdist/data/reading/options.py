@@ -6,7 +6,7 @@ import re
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, fields
-from typing import Any
+from typing import Any, TypedDict
 
 import numpy as np
 
@@ -15,7 +15,23 @@ from bayesdist.data.repeated import check_same_position
 from bayesdist.data.tables.checks import check_not_finite
 from bayesdist.data.tables.column import length_in_mm
 from bayesdist.errors import BayesdistError, InputError
-from bayesdist.utils.quantities import Number, direction_in, year_of
+from bayesdist.utils.quantities import Direction, Epoch, Number, direction_in, year_of
+
+
+class ReadArguments(TypedDict, total=False):
+    """Arguments of functions that read matches: the fields of `ReadOptions`, all optional."""
+
+    columns: Mapping[str, str] | None
+    unit: str | None
+    sigma: str | Number
+    pixel_origin: int | None
+    tangent_point: Direction | None
+    epoch: Epoch | None
+    catalogue_epoch: Epoch | None
+    chips: Mapping[str, int] | None
+    not_finite: str
+    same_position: str
+    plate_scale: float | None
 
 
 @dataclass(frozen=True)

@@ -146,9 +146,13 @@ def _entries(budgets: Sequence[ErrorBudget], rows: Sequence[int] | Any) -> Itera
     ]
     for k in np.argsort(rows):
         total = entries[k]["terms"][-1]
-        for name, probability in CIRCLES:
-            total[name] = float(circular_error(total["u"], total["v"], 0.0, probability))
+        total |= _circles(total["u"], total["v"])
         yield entries[k]
+
+
+def _circles(u: float, v: float) -> dict[str, float]:
+    """Radii of the circles of `CIRCLES` for errors along u and v."""
+    return {name: float(circular_error(u, v, 0.0, probability)) for name, probability in CIRCLES}
 
 
 def _json(
@@ -213,8 +217,7 @@ def _text(found: ErrorBudget, at: tuple[float, float], scale_mas: float | None) 
             }
             if scale_mas is not None:
                 row["mas"] = number(size * scale_mas)
-            for name, probability in CIRCLES:
-                row[name] = number(float(circular_error(u, v, 0.0, probability)), 3)
+            row |= {name: number(radius, 3) for name, radius in _circles(u, v).items()}
             rows.append(row | {"source": t.source})
         lines += [place, table_text(rows), ""]
     lines += [
