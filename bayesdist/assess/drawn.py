@@ -64,6 +64,7 @@ class DrawnErrors:
     seed: int  # for the terms, and for errors that are independent between positions
     # further(n, number): n more draws of the same errors, another set for each number from 1 on
     further: Callable[[int, int], DrawnErrors] | None = None
+    block: int = BLOCK  # positions times draws that each thread evaluates at a time
     _cache: dict[EvaluationDomain, tuple[ErrorField, ...]] = field(default_factory=dict, repr=False)
 
     @property
@@ -145,16 +146,17 @@ class DrawnErrors:
         *,
         scale: Mapping[str, float] | None = None,
         n_draws: int | None = None,
+        at_once: int = EPOCHS,
     ) -> tuple[dict[str, Float], ...]:
         """Statistics at several epochs, faster than with one call per epoch.
 
-        `epochs`: decimal years. `names`, `scale`, `n_draws`: see `statistics`. Returns for each
-        epoch an array (n_draws,) for each name.
+        `epochs`: decimal years. `names`, `scale`, `n_draws`: see `statistics`. `at_once`: number of
+        epochs in memory at the same time. Returns for each epoch an array (n_draws,) for each name.
         """
         statistics: list[dict[str, Float]] = []
-        for k in range(0, len(epochs), EPOCHS):
+        for k in range(0, len(epochs), at_once):
             uncached = replace(self, _cache={})  # errors at many epochs would need much memory
-            statistics += uncached._together(domain, epochs[k : k + EPOCHS], names, scale, n_draws)
+            statistics += uncached._together(domain, epochs[k : k + at_once], names, scale, n_draws)
         return tuple(statistics)
 
     @one_thread  # of linear algebra in each thread that it starts
@@ -178,7 +180,7 @@ class DrawnErrors:
         over_all = domain.relative == "pairs" and domain.separation is None
         n = n_draws or self.n_draws
         width = max(domain.size, 0 if pairs is None else pairs.shape[1])
-        step = ROWS * max(1, BLOCK // (ROWS * width))
+        step = ROWS * max(1, self.block // (ROWS * width))
 
         def found(start: int) -> list[list[Float]]:
             rows, out = slice(start, min(start + step, n)), []

@@ -46,8 +46,9 @@ MIN_STARS = 20  # with fewer stars, groups cannot be distinguished from chance
 UInt = NDArray[np.uint64]
 Keys = Sequence[NDArray[Any]]
 Batches = Callable[[], Iterable[Keys]]
+Hashing = Callable[[Keys], UInt]
 HELD = 8_000_000  # number of hashes in memory at a time
-_COMPARED = 100_000  # number of hashes for which rows are compared in full at a time
+COMPARED = 100_000  # number of hashes for which rows are compared in full at a time
 _BLOCK = 16_384  # number of rows hashed together, so that their keys stay in the cache
 _MULTIPLIER = np.uint64(0x9E3779B97F4A7C15)
 _SHIFT = np.uint64(29)
@@ -239,37 +240,6 @@ def _linked(pairs: Sequence[Int] | Int, n: int) -> tuple[int, Int]:
     return connected_components(coo_array((np.ones(len(i)), (i, j)), shape=(n, n)), directed=False)
 
 
-def first_duplicate(keys: Keys) -> tuple[int, int] | None:
-    """Indices of a row and of its first repetition in all keys (N,); None if no row repeats."""
-    return first_repetition(lambda: (keys,), 1)
-
-
-def buckets_for(n_rows: int) -> int:
-    """Number of buckets for the hashes of `n_rows` rows."""
-    return max(1, -(-n_rows // HELD))
-
-
-def first_repetition(batches: Batches, buckets: int) -> tuple[int, int] | None:
-    """Row numbers of a row and of its first repetition in all keys; None if no row repeats.
-
-    `batches` returns, at each call, an iterable over the batches of the table from its beginning.
-    Each batch is a sequence of keys as for `first_duplicate`. A fraction 1 / `buckets` of the
-    hashes is in memory at a time. The pair is the earliest one; if more than 100 000 different rows
-    repeat, it is the earliest among the first of them. InputError if the scratch folder is full.
-    """
-    waiting: list[UInt] = []
-    for k, hashes in enumerate(_bucketed(batches, buckets)):
-        waiting.append(_repeated(hashes))
-        if k < buckets - 1 and sum(len(w) for w in waiting) <= _COMPARED:
-            continue
-        repeated, waiting = np.concatenate(waiting), []
-        for a in range(0, len(repeated), _COMPARED):
-            pair = _first_of(batches, np.sort(repeated[a : a + _COMPARED]))
-            if pair is not None:
-                return pair
-    return None
-
-
 def _bits(keys: Keys) -> list[UInt]:
     """Keys as integers that are equal if the keys are equal."""
     out = []
@@ -279,7 +249,7 @@ def _bits(keys: Keys) -> list[UInt]:
     return out
 
 
-def _hashed(keys: Keys) -> UInt:
+def row_hashes(keys: Keys) -> UInt:
     """One integer hash per row."""
     n = len(keys[0])
     out = np.zeros(n, np.uint64)
@@ -292,16 +262,54 @@ def _hashed(keys: Keys) -> UInt:
     return out
 
 
-def _bucketed(batches: Batches, buckets: int) -> Iterator[UInt]:
+def first_duplicate(keys: Keys, *, hashing: Hashing = row_hashes) -> tuple[int, int] | None:
+    """Indices of a row and of its first repetition in all keys (N,); None if no row repeats."""
+    return first_repetition(lambda: (keys,), 1, hashing=hashing)
+
+
+def buckets_for(n_rows: int) -> int:
+    """Number of buckets for the hashes of `n_rows` rows."""
+    return max(1, -(-n_rows // HELD))
+
+
+def first_repetition(
+    batches: Batches,
+    buckets: int,
+    *,
+    hashing: Hashing = row_hashes,
+    at_once: int = COMPARED,
+) -> tuple[int, int] | None:
+    """Row numbers of a row and of its first repetition in all keys; None if no row repeats.
+
+    `batches` returns, at each call, an iterable over the batches of the table from its beginning.
+    Each batch is a sequence of keys as for `first_duplicate`. A fraction 1 / `buckets` of the
+    hashes is in memory at a time. `hashing` returns an integer per row. `at_once` is the number of
+    repeated hashes for which rows are compared in full at a time: the pair is the earliest one
+    among the first of them. InputError if the scratch folder is full.
+    """
+    waiting: list[UInt] = []
+    for k, hashes in enumerate(_bucketed(batches, buckets, hashing)):
+        waiting.append(_repeated(hashes))
+        if k < buckets - 1 and sum(len(w) for w in waiting) <= at_once:
+            continue
+        repeated, waiting = np.concatenate(waiting), []
+        for a in range(0, len(repeated), at_once):
+            pair = _first_of(batches, np.sort(repeated[a : a + at_once]), hashing)
+            if pair is not None:
+                return pair
+    return None
+
+
+def _bucketed(batches: Batches, buckets: int, hashing: Hashing) -> Iterator[UInt]:
     """Hashes of each bucket; the table is read once."""
     if buckets == 1:
-        hashes_of_batches = [_hashed(keys) for keys in batches()]
+        hashes_of_batches = [hashing(keys) for keys in batches()]
         yield np.concatenate(hashes_of_batches) if hashes_of_batches else np.zeros(0, np.uint64)
         return
     edges: list[Int] = []  # positions in the file of the buckets of each batch
     with tempfile.TemporaryFile(prefix="bayesdist-") as file:
         try:
-            for hashed in _joined(_hashed(keys) for keys in batches()):
+            for hashed in _joined(hashing(keys) for keys in batches()):
                 # use the upper half: the lower bits of a product depend only on the lower bits of
                 # its factors
                 bucket = (hashed >> np.uint64(32)) % np.uint64(buckets)
@@ -343,12 +351,12 @@ def _repeated(hashed: UInt) -> UInt:
     return np.unique(duplicates)
 
 
-def _first_of(batches: Batches, repeated: UInt) -> tuple[int, int] | None:
+def _first_of(batches: Batches, repeated: UInt, hashing: Hashing) -> tuple[int, int] | None:
     """Earliest pair of equal rows among those with the hashes `repeated`, which are ascending."""
     row_of_bytes: dict[bytes, int] = {}
     start = 0
     for keys in batches():
-        hashed = _hashed(keys)
+        hashed = hashing(keys)
         slot = np.minimum(np.searchsorted(repeated, hashed), len(repeated) - 1)
         for index in np.flatnonzero(repeated[slot] == hashed).tolist():
             row = b"".join(b.tobytes() for b in _bits([k[index : index + 1] for k in keys]))

@@ -170,7 +170,11 @@ def simulate_matches(
 
 
 def simulate_partitioned(
-    folder: str | os.PathLike[str], n: int, simulate: Callable[[int], tuple[Matches, Truth]]
+    folder: str | os.PathLike[str],
+    n: int,
+    simulate: Callable[[int], tuple[Matches, Truth]],
+    *,
+    chunk: int = CHUNK,
 ) -> Truth:
     """Simulate matches in chunks and write them to a folder of Parquet files.
 
@@ -181,8 +185,10 @@ def simulate_partitioned(
     n : int
         Total number of matches.
     simulate : callable
-        Function of a number of matches, at most `CHUNK`, that returns simulated matches and their
+        Function of a number of matches, at most `chunk`, that returns simulated matches and their
         truth, such as `simulate_matches` with all other arguments fixed.
+    chunk : int, optional
+        Maximum number of matches in memory.
 
     Returns
     -------
@@ -207,7 +213,7 @@ def simulate_partitioned(
     400
     """
     truths: list[Truth] = []
-    edges = even_edges(n, CHUNK)
+    edges = even_edges(n, chunk)
 
     def chunks() -> Iterator[Matches]:
         for size in np.diff(edges).tolist():

@@ -1,10 +1,11 @@
 """Several epochs at once, blocks and threads: all give the statistics of one draw after another."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from bayesdist.assess import UserTerm
-from bayesdist.assess import drawn as module
 from bayesdist.assess.domain import EvaluationDomain
 from bayesdist.assess.model import error_model
 from bayesdist.model import Chip, DistortionModel, TimeDependence
@@ -32,9 +33,8 @@ def cases(**more):
 
 
 @pytest.mark.parametrize("more", [{}, {"relative": True}, {"relative": True, "separation": 30.0}])
-def test_epochs_together_are_epochs_one_by_one(errors, more, monkeypatch):
-    monkeypatch.setattr(module, "EPOCHS", 2)
-    together = errors.over_epochs(cases(**more)[0], EPOCHS, NAMES)
+def test_epochs_together_are_epochs_one_by_one(errors, more):
+    together = errors.over_epochs(cases(**more)[0], EPOCHS, NAMES, at_once=2)
     for case, found in zip(cases(**more), together, strict=True):
         alone = errors.statistics(case, NAMES)
         for name in NAMES:
@@ -42,9 +42,9 @@ def test_epochs_together_are_epochs_one_by_one(errors, more, monkeypatch):
     assert np.mean(together[0]["max"] != together[2]["max"]) > 0.5
 
 
-def test_fewer_draws_are_the_first_ones(errors, monkeypatch):
+def test_fewer_draws_are_the_first_ones(errors):
     every = errors.statistics(cases()[0], NAMES)
-    monkeypatch.setattr(module, "BLOCK", 1)
+    errors = replace(errors, block=1)
     for n in (150, 37, 16, 1):
         some = errors.statistics(cases()[0], NAMES, n_draws=n)
         for name in NAMES:

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import numpy as np
 import pytest
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial.distance import cdist
 
 from bayesdist.data.detections import NO_STAR
-from bayesdist.data.matching import field as friends
 from bayesdist.data.matching.field import (
     FINE,
     MIN_SIDE,
@@ -100,16 +101,14 @@ def assert_same(a: Friends, b: Friends) -> None:
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_groups_do_not_depend_on_the_cells(seed, monkeypatch):
+def test_groups_do_not_depend_on_the_cells(seed):
     """Nor on the sequence in which these are grouped; codes rise with the first detection."""
     places, exposure = field_of_cells(seed)
-    monkeypatch.setattr(friends, "CELL", 10**9)
-    whole = friends_of_friends(places, exposure, 1.0)
+    whole = friends_of_friends(places, exposure, 1.0, per_cell=10**9)
     assert whole.n_stars > 1000 and whole.n_doubled > 100 and whole.n_chains == 4
     heads = np.unique(whole.star, return_index=True)[1][1:]
     assert np.all(np.diff(heads) > 0)
     for detections in (1, 1500, 4000):
-        monkeypatch.setattr(friends, "CELL", detections)
         parts = list(cells(places, exposure, 1.0, detections))
         assert len(parts) > 3
         inside = np.concatenate([part.rows[part.inside] for part in parts])
@@ -117,10 +116,9 @@ def test_groups_do_not_depend_on_the_cells(seed, monkeypatch):
         # stars that lie in several cells
         cut = sum(len(set(whole.star[part.rows[part.inside]]) - {NO_STAR}) for part in parts)
         assert detections > 1 or cut > whole.n_stars + 500
-        assert_same(friends_of_friends(places, exposure, 1.0), whole)
-        backwards = friends_of_friends(
-            places, exposure, 1.0, each=lambda one, many: map(one, reversed(list(many)))
-        )
+        in_cells = partial(friends_of_friends, places, exposure, 1.0, per_cell=detections)
+        assert_same(in_cells(), whole)
+        backwards = in_cells(each=lambda one, many: map(one, reversed(list(many))))
         assert_same(backwards, whole)
 
 

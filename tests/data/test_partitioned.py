@@ -545,21 +545,20 @@ def test_the_earliest_repetition_is_found_in_any_number_of_buckets(rng, buckets)
 
 
 @pytest.mark.parametrize("different", [1, 150])
-def test_rows_whose_hashes_meet_by_chance_are_no_repetition(rng, monkeypatch, different):
+def test_rows_whose_hashes_meet_by_chance_are_no_repetition(rng, different):
     def bad_hash(keys):
         return (keys[0] * 1e6).astype(np.uint64) % np.uint64(different)
 
-    monkeypatch.setattr(duplicates_module, "_hashed", bad_hash)
     keys = [rng.uniform(size=500) for _ in range(2)]
-    assert duplicates_module.first_duplicate(keys) is None
-    assert duplicates_module.first_duplicate([np.r_[k, k[7]] for k in keys]) == (7, 500)
+    assert duplicates_module.first_duplicate(keys, hashing=bad_hash) is None
+    repeated_keys = [np.r_[k, k[7]] for k in keys]
+    assert duplicates_module.first_duplicate(repeated_keys, hashing=bad_hash) == (7, 500)
 
 
-def test_more_repetitions_than_are_compared_at_a_time(rng, monkeypatch):
-    monkeypatch.setattr(duplicates_module, "_COMPARED", 10)
+def test_more_repetitions_than_are_compared_at_a_time(rng):
     keys = [np.tile(rng.uniform(size=300), 2)]
     for buckets in (1, 4):
-        first, second = duplicates_module.first_repetition(lambda: (keys,), buckets)
+        first, second = duplicates_module.first_repetition(lambda: (keys,), buckets, at_once=10)
         assert second == first + 300
 
 

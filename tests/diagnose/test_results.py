@@ -11,7 +11,6 @@ from scipy import stats
 
 from bayesdist.diagnose import score_tests
 from bayesdist.diagnose.checks import score_checks
-from bayesdist.diagnose.score import sample as sample_module
 from bayesdist.diagnose.score.questions import order_family
 from bayesdist.diagnose.score.result import Family, Outcome, corrected, noncentrality
 from bayesdist.diagnose.score.sample import SAMPLE, scored_sample
@@ -201,14 +200,13 @@ def test_drift_of_exposures_that_deviate_is_doubtful():
     assert "if deviating exposures do not explain it" in found["drift"].finding
 
 
-def test_large_tables_are_sampled_and_say_what_the_sample_sees(monkeypatch):
+def test_large_tables_are_sampled_and_say_what_the_sample_sees():
     scene = Scene(4000, 2)
     table, fit = scene.fitted(1)
     assert SAMPLE == 200_000
     whole = by_name(score_tests(table, fit))
-    monkeypatch.setattr(sample_module, "SAMPLE", 1000)
-    part = by_name(score_tests(table, fit))
-    assert len(scored_sample(table, fit)) == 1000
+    part = by_name(score_tests(table, fit, sample_size=1000))
+    assert len(scored_sample(table, fit, size=1000)) == 1000
     ratio = part["order 3"].smallest / whole["order 3"].smallest
     assert ratio == pytest.approx(2.0, rel=0.1)
     assert min(one.p_value for one in part.values()) > 1e-3

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import numpy as np
 import pytest
 from scipy import stats
@@ -9,7 +11,7 @@ from scipy import stats
 from bayesdist.data import Matches, open_matches, read_matches
 from bayesdist.errors import InputError
 from bayesdist.missions.wise.simulate import simulate_wise, simulate_wise_partitioned, wise_solution
-from bayesdist.simulate import matches as simulated_matches
+from bayesdist.simulate.matches import simulate_partitioned
 
 NAMES = ("x", "y", "u", "v", "sigma_u", "sigma_v", "mag")
 
@@ -24,9 +26,9 @@ def test_reading_back_gives_the_same_numbers(tmp_path):
     assert back.unit == matches.unit and back.exposure_names == matches.exposure_names
 
 
-def test_chunks_follow_one_generator(tmp_path, monkeypatch):
-    monkeypatch.setattr(simulated_matches, "CHUNK", 1000)
-    truth = simulate_wise_partitioned(tmp_path, 2500, rng=np.random.default_rng(3))
+def test_chunks_follow_one_generator(tmp_path):
+    simulate = partial(simulate_wise, rng=np.random.default_rng(3))
+    truth = simulate_partitioned(tmp_path, 2500, simulate, chunk=1000)
     assert len(list(tmp_path.iterdir())) == 3
     rng = np.random.default_rng(3)
     chunks, truths = zip(*(simulate_wise(n, rng=rng) for n in (833, 833, 834)), strict=True)
@@ -39,9 +41,9 @@ def test_chunks_follow_one_generator(tmp_path, monkeypatch):
     assert (truth.false == np.concatenate([t.false for t in truths])).all()
 
 
-def test_pairs_scatter_about_the_published_solution_across_chunks(tmp_path, monkeypatch):
-    monkeypatch.setattr(simulated_matches, "CHUNK", 7000)
-    truth = simulate_wise_partitioned(tmp_path, 40_000, rng=np.random.default_rng(8), fraction=0.1)
+def test_pairs_scatter_about_the_published_solution_across_chunks(tmp_path):
+    simulate = partial(simulate_wise, rng=np.random.default_rng(8), fraction=0.1)
+    truth = simulate_partitioned(tmp_path, 40_000, simulate, chunk=7000)
     model, theta = wise_solution()
     m = read_matches(tmp_path)
     r = np.column_stack([m.u, m.v]) - model.predict(theta, m.x, m.y)

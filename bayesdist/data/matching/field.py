@@ -203,17 +203,20 @@ class Grouped:
     chain: Int  # (k,) number of the chain, counted within the cell
 
 
-def friends_of_friends(places: Float, exposure: Int, length: float, *, each: Each = map) -> Friends:
+def friends_of_friends(
+    places: Float, exposure: Int, length: float, *, each: Each = map, per_cell: int = CELL
+) -> Friends:
     """Groups of detections (N, 2) that are connected by steps of at most one linking length.
 
     Distances are exact to a sixteenth of the linking length: positions are rounded to a grid, which
     reduces the many detections of a star to a few points. Star codes are in the order of the first
     detections. `each` applies a function to the cells, by default one after another in this
-    process.
+    process. `per_cell` is the average number of detections per cell; the result does not depend on
+    it.
     """
     first = np.full(len(places), NO_STAR)
     n_doubled, n_dropped, chains = 0, 0, list[tuple[Int, Int]]()
-    for cell_groups in each(grouped, cells(places, exposure, length, CELL)):
+    for cell_groups in each(grouped, cells(places, exposure, length, per_cell)):
         first[cell_groups.rows] = cell_groups.first
         n_doubled, n_dropped = n_doubled + cell_groups.n_doubled, n_dropped + cell_groups.n_dropped
         chains.append((cell_groups.chained, cell_groups.chain))

@@ -139,15 +139,19 @@ class ScoredSample:
 
 
 def scored_sample(
-    table: Matches, solution: Solution, match_radius: float | None = None
+    table: Matches,
+    solution: Solution,
+    match_radius: float | None = None,
+    *,
+    size: int = SAMPLE,
 ) -> ScoredSample:
     """Sample of the detections of a table, with their scores at a solution.
 
-    The table must contain errors.  Every k-th row is used if it has more than `SAMPLE` rows.
+    The table must contain errors.  Every k-th row is used if it has more than `size` rows.
     `match_radius` is in the unit of u and v.  Raises InputError if the table does not match the
     solution.
     """
-    table = table.sample(SAMPLE)
+    table = table.sample(size)
     by_exposure = np.argsort(table.exposure, kind="stable")
     likelihood = likelihood_of(solution)
     stars, order = prepare(solution.model, table.select(by_exposure))

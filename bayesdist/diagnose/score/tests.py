@@ -13,7 +13,7 @@ from bayesdist.diagnose.score.patterns import jump_test, pattern_test, ring_test
 from bayesdist.diagnose.score.projection import projection_of, regressor_tests
 from bayesdist.diagnose.score.questions import functions_for
 from bayesdist.diagnose.score.result import ScoreTest, corrected
-from bayesdist.diagnose.score.sample import scored_sample
+from bayesdist.diagnose.score.sample import SAMPLE, scored_sample
 from bayesdist.diagnose.score.shape import shape_tests
 from bayesdist.diagnose.score.truncation import radius_test, truncation_test
 from bayesdist.infer.equations.priors import GaussianPriors
@@ -26,6 +26,7 @@ def score_tests(
     *,
     priors: GaussianPriors | None = None,
     match_radius: float | None = None,
+    sample_size: int = SAMPLE,
 ) -> tuple[ScoreTest, ...]:
     """Test for effects that a model lacks, and for noise that differs from the stated errors.
 
@@ -36,13 +37,15 @@ def score_tests(
     ----------
     table : Matches
         The N matches that the solution was made from, or a part of them.  If there are more than
-        `SAMPLE` rows, every k-th is used, and the power of the tests is that of this sample.
+        `sample_size` rows, every k-th is used, and the power of the tests is that of this sample.
     solution : Posterior or LinearFit
         The solution to test.
     priors : GaussianPriors, optional
         Priors of the solution; flat by default.
     match_radius : float, optional
         Radius within which the stars were matched, in the unit of u and v.
+    sample_size : int, optional
+        Largest number of detections that are tested.
 
     Returns
     -------
@@ -57,7 +60,7 @@ def score_tests(
     """
     priors, mean = priors or GaussianPriors.none(solution.model), np.asarray(solution.mean, float)
     projection = projection_of(
-        functions_for(scored_sample(table, solution, match_radius)), mean, priors
+        functions_for(scored_sample(table, solution, match_radius, size=sample_size)), mean, priors
     )
     sample = projection.scored
     chips = chip_residuals(sample)
