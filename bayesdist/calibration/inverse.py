@@ -109,7 +109,7 @@ def fitted_inverse(
     U, V = np.linalg.solve(L, chip.at(x, y) - zero[:, None])
     slope = chip.slope(x, y)
     check_one_to_one(U, V, nodes, np.linalg.det(slope) / np.linalg.det(L))
-    fit = _Fit.of(U, V, order, constant=constant)
+    fit = _InverseFit.of(U, V, order, constant=constant)
     offsets = np.stack([x - x0 - U, y - y0 - V], axis=1)
     terms = fit.terms(offsets)
     # at a fixed position a change dX of the forward map shifts the pixel by -(dX/dx)^-1 dX
@@ -150,7 +150,7 @@ def fit_inverse(
     U, V = forward(x, y)
     check_one_to_one(U, V, FIT_NODES)
     offsets = np.stack([x - reference_pixel[0] - U, y - reference_pixel[1] - V], axis=1)
-    return _Fit.of(U, V, order, constant=True).terms(offsets)
+    return _InverseFit.of(U, V, order, constant=True).terms(offsets)
 
 
 def detector_grid(
@@ -180,7 +180,7 @@ def check_one_to_one(U: Float, V: Float, nodes: int, areas: Float | None = None)
 
 
 @dataclass(frozen=True, eq=False)
-class _Fit:
+class _InverseFit:
     """Least-squares fit of orthogonal polynomials over the bounding box of N points."""
 
     basis: PolynomialBasis
@@ -188,7 +188,7 @@ class _Fit:
     at_zero: Float | None  # (K - 1,), values at (0, 0) that were subtracted so that they vanish
 
     @classmethod
-    def of(cls, U: Float, V: Float, order: int, *, constant: bool) -> _Fit:
+    def of(cls, U: Float, V: Float, order: int, *, constant: bool) -> _InverseFit:
         extent = np.ptp(U), np.ptp(V)
         # a basis covers pixels 0.5 to n + 0.5, so the box and its zero point are shifted there
         zero = [(n + 1) / 2 - (w.max() + w.min()) / 2 for n, w in zip(extent, (U, V), strict=True)]

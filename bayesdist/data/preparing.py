@@ -221,7 +221,7 @@ class HoldoutSpec:
 
 
 @dataclass(frozen=True, eq=False)
-class Split:
+class HoldoutSplit:
     """Matches split into those to fit and those that are held out."""
 
     kept: Matches  # matches to fit; exposures without such matches are not listed
@@ -241,7 +241,7 @@ def exposures_drawn(names: Sequence[str], n: int, seed: int) -> tuple[str, ...]:
     return tuple(name for name in names if name in chosen)
 
 
-def split_matches(matches: Matches, aside: HoldoutSpec) -> Split:
+def split_matches(matches: Matches, aside: HoldoutSpec) -> HoldoutSplit:
     """Split matches into two parts; matches on disk are read once.
 
     InputError for an unknown exposure, or if either part would be empty.
@@ -260,7 +260,7 @@ def split_matches(matches: Matches, aside: HoldoutSpec) -> Split:
         n for n, is_fitted in zip(matches.exposure_names, has_fitted, strict=True) if is_fitted
     )
     fitted = matches.select(~held, reason=HELD_OUT).with_exposure_names(names)
-    return Split(fitted, matches.select(held))
+    return HoldoutSplit(fitted, matches.select(held))
 
 
 def refuse_strangers(asked: Sequence[str], names: Sequence[str], where: str) -> None:

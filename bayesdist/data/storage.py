@@ -363,7 +363,7 @@ def tangent_point_of(parts: Sequence[StoredFile]) -> tuple[float, float]:
 
 
 @dataclass(eq=False)
-class _Scan:
+class _LabelScan:
     """Iterates over all parts batch by batch, as `first_repetition` requires.
 
     All columns are read, so that any invalid row is found, and labels are numbered as they appear.
@@ -403,7 +403,7 @@ def scan(parts: Sequence[StoredFile]) -> Labels:
         raise InputError(
             "holds no rows", where=parts[0].source + remainder, do="give a table with matched stars"
         )
-    rows = _Scan(parts)
+    rows = _LabelScan(parts)
     pair = first_repetition(rows, buckets_for(n_rows))
     if pair is not None:
         first, second = (_named(parts, row) for row in pair)

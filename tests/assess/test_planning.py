@@ -10,7 +10,7 @@ from bayesdist.assess.planning.dithers import further_dithers
 from bayesdist.assess.planning.futures import (
     MOST,
     TRUTHS,
-    Data,
+    ExistingData,
     Futures,
     Scattering,
     Schedule,
@@ -18,7 +18,7 @@ from bayesdist.assess.planning.futures import (
     with_more_data,
 )
 from bayesdist.diagnose.selfcal.eliminated import (
-    Columns,
+    AddedColumns,
     EvenStars,
     eliminated,
     scores_of_detections,
@@ -135,7 +135,7 @@ def futures_of(fit, requirement, *, terms=(), n_stars=1500.0):
     return Futures(
         error_model(fit, terms),
         requirement,
-        Data(2, n_stars / SIGMA**2, n_stars),
+        ExistingData(2, n_stars / SIGMA**2, n_stars),
         lambda information: with_information(fit, information),
         (9, 5),
         None,
@@ -185,7 +185,7 @@ def test_scatters_follow_from_deviations_as_bayes_theorem_has_it():
     rng = np.random.default_rng(4)
     variance = np.geomspace(1e-2, 1e2, 6001)
     scattering = Scattering(None, None, variance[:, None])
-    data = Data(2, 1e12, 100.0)  # deviations are measured without error
+    data = ExistingData(2, 1e12, 100.0)  # deviations are measured without error
     means = []
     truth = len(variance) // 2  # of variance 1
     for _ in range(150):
@@ -201,7 +201,7 @@ def test_scatters_follow_from_deviations_as_bayes_theorem_has_it():
 def effect_of_deviations(mode):
     """Rms over the detector of the polynomials' response to deviations of unit scatter."""
     even = EvenStars.of(mode)
-    columns = Columns(even.problem, mode.theta, {}, even.deviations)
+    columns = AddedColumns(even.problem, mode.theta, {}, even.deviations)
     scores = scores_of_detections(mode).at(even.rows)
     information, _, _ = eliminated(columns, scores, even.stars)
     n, model = len(mode.theta), mode.problem.model

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from bayesdist.data.matches import Matches
-from bayesdist.data.preparing import HoldoutSpec, Split, split_matches
+from bayesdist.data.preparing import HoldoutSpec, HoldoutSplit, split_matches
 from bayesdist.diagnose.holdout.predictive import ExposureDeviations, Predictive
 from bayesdist.diagnose.holdout.validation import HoldoutValidation, holdout_validation
 from bayesdist.infer import OutlierMixture, Rejection, load
@@ -118,7 +118,7 @@ def field(
 
 
 def solved(
-    one: Field, split: Split, whole: tuple[str, ...], *, mixture: bool = False
+    one: Field, split: HoldoutSplit, whole: tuple[str, ...], *, mixture: bool = False
 ) -> tuple[HierarchicalFit, Predictive]:
     """The joint fit of what is kept, and what it predicts."""
     kept, held = split.kept, split.held

@@ -19,7 +19,7 @@ from bayesdist.diagnose.correlated import Discrepancy, estimate_discrepancy
 from bayesdist.diagnose.correlated.exposure_time import correlation_p
 from bayesdist.diagnose.correlated.neighbours import (
     SEPARATION_EDGES,
-    DetectionScores,
+    ExposureScores,
     exposure_products,
 )
 from bayesdist.infer import Rejection, fit_linear
@@ -131,7 +131,7 @@ def test_products_are_those_of_all_pairs():
     # in the middles of cells, so that pairs are in the bins of their cells
     X = (2 * rng.integers(32, size=n) + 1) / 32 - 1
     Y = (2 * rng.integers(26, size=n) + 1) / 26 - 1
-    scores = DetectionScores(
+    scores = ExposureScores(
         X, Y, rng.standard_normal((n, 2)), np.ones((n, 2)), np.zeros(n, int), exposure,
         np.arange(n),
     )  # fmt: skip

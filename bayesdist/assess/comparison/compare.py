@@ -17,8 +17,8 @@ from astropy.table import Table
 
 from bayesdist.assess.comparison.frame import (
     CommonFrame,
+    FrameSimilarity,
     GapDifference,
-    Similarity,
     common_frame,
     draws_of_sum,
     with_errors,
@@ -95,7 +95,7 @@ class Comparison:
     p_largest_chi2: float | None
 
     @property
-    def similarity(self) -> Similarity:
+    def similarity(self) -> FrameSimilarity:
         """Shift, rotation and scale between the calibrations."""
         return self.frame.similarity
 

@@ -41,7 +41,7 @@ NEAR = 0.1  # radians, or relative scale: largest difference of axes that count 
 
 
 @dataclass(frozen=True)
-class Similarity:
+class FrameSimilarity:
     """Shift, rotation and scale between A and B: w_A = shift + turn w_B."""
 
     # mean over the detector of A minus B, along x and y, pixels; None unless the axes of A and B
@@ -75,7 +75,7 @@ class CommonFrame:
     # kept
     taken: Float
     shares: tuple[float, float]  # fractions that A and B contribute to the variances
-    similarity: Similarity
+    similarity: FrameSimilarity
     pixel_mas: float | None  # size of a pixel of A, if either side states it
 
     @property
@@ -204,7 +204,7 @@ def _similarity(
     za: Complex,
     zb: Complex,
     errors: Float | None,
-) -> Similarity:
+) -> FrameSimilarity:
     inverse = np.linalg.inv(linear)
     shift = inverse @ as_real((za - zb)[:1])
     sigma = None
@@ -214,7 +214,7 @@ def _similarity(
         shift_cov = inverse @ errors[:2, :2] @ inverse.T
         along_u, along_v = np.sqrt(np.maximum(np.diag(shift_cov), 0.0)).tolist()
         sigma_shift = along_u, along_v
-    return Similarity(
+    return FrameSimilarity(
         shift=(float(shift[0]), float(shift[1])) if lies_alike else None,
         rotation=float(np.angle(turn)),
         scale=abs(turn),

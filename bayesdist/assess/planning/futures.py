@@ -65,7 +65,7 @@ SMALL = 0.05  # probability of meeting a limit, below which errors are called to
 
 
 @dataclass(frozen=True)
-class Data:
+class ExistingData:
     """Size of the existing data, to which further exposures add.
 
     Parameters
@@ -111,7 +111,7 @@ class Scattering:
     variances: Float
     bends: bool = False  # True if the term includes the curvature of the drift
 
-    def chosen(self, n: int, data: Data, truth: int, rng: np.random.Generator) -> Int:
+    def chosen(self, n: int, data: ExistingData, truth: int, rng: np.random.Generator) -> Int:
         """Draws (DRAWS,) that are probable after n more exposures if draw `truth` is true.
 
         Deviations are measured with the precision that the stars of an exposure allow. The
@@ -159,7 +159,7 @@ class Futures:
 
     errors: ErrorModel
     requirement: Requirement
-    data: Data
+    data: ExistingData
     solution: Callable[[Float], Solution]
     grid: tuple[int, int]
     epoch: float | None
@@ -262,7 +262,7 @@ class Futures:
         return [_scattering(term, np.random.default_rng([self.seed, 3])) for term in terms]
 
     @cached_property
-    def _places(self) -> list[_Place]:
+    def _places(self) -> list[_Position]:
         drawn = self._drawn
         r = self.requirement.in_unit_of(drawn.unit)
         limit = convert(r.limit, r.unit, drawn.unit, self.pixel_scale)
@@ -270,7 +270,7 @@ class Futures:
         out = []
         for domain in domains_of(r, drawn.solution.model, self.grid, epoch=self.epoch):
             positions, pairs = _some(domain, self.seed)
-            place = _Place(
+            place = _Position(
                 positions,
                 r.statistic,
                 pairs,
@@ -306,7 +306,7 @@ class Futures:
 
 
 @dataclass(frozen=True, eq=False)
-class _Place:
+class _Position:
     """Errors of the terms at the positions of a requirement, at one epoch."""
 
     positions: EvaluationDomain

@@ -21,7 +21,7 @@ from bayesdist.data.formats.hst1pass import is_hst1pass, is_matchup
 from bayesdist.data.matches import Matches
 from bayesdist.data.reading.columns import lacking_columns, present_columns
 from bayesdist.data.reading.table import own_epoch, with_sky_columns
-from bayesdist.data.tables.column import Columns
+from bayesdist.data.tables.column import TableColumns
 from bayesdist.data.tables.names import origin_of
 from bayesdist.data.tables.parquet import describe_part
 from bayesdist.errors import FormatError, InputError
@@ -191,7 +191,7 @@ def table_layout(
         part = describe_part(file)
         if not part.n_rows:
             raise InputError("holds no rows", where=str(file), do="give a table with stars")
-        table: Columns = next(part.blocks(part.colnames, size=MAX_ROWS_READ))
+        table: TableColumns = next(part.blocks(part.colnames, size=MAX_ROWS_READ))
         header: Mapping[str, Any] = {}
     else:
         full_table = with_sky_columns(read_table(file))

@@ -96,7 +96,8 @@ class PatternIndex:
     """Reference list (M, 2) prepared for repeated searches; made by `pattern_index`."""
 
     positions: Float
-    levels: tuple[Level, ...]  # increasing numbers of the brightest stars, with their triangles
+    # increasing numbers of the brightest stars, with their triangles
+    levels: tuple[StarTriangles, ...]
     area: float  # area of the hull of all positions
 
     @cached_property
@@ -147,7 +148,7 @@ def pattern_index(positions: ArrayLike, mag: ArrayLike | None = None) -> Pattern
             sizes.append(size)
             size *= _LEVEL_FACTOR
         sizes.append(len(points))
-    return PatternIndex(points, tuple(Level(stars[:n]) for n in sizes), hull_of(points)[1])
+    return PatternIndex(points, tuple(StarTriangles(stars[:n]) for n in sizes), hull_of(points)[1])
 
 
 def find_similarity(
@@ -257,7 +258,7 @@ def grown_map(
 
 def _tries(
     n: int, ranked: bool, reference: PatternIndex, area: float
-) -> Iterator[tuple[float, Level, int]]:
+) -> Iterator[tuple[float, StarTriangles, int]]:
     """Tolerance, reference level and number of stars for each trial, the most promising first."""
     for tolerance in _TOLERANCES:
         for level in reference.levels:
@@ -383,7 +384,7 @@ def _described(stars: Complex, corners: Int) -> Triangles:
 
 
 @dataclass(frozen=True, eq=False)
-class Level:
+class StarTriangles:
     """The brightest reference stars x + i y (M,) and their triangles."""
 
     stars: Complex
@@ -405,7 +406,7 @@ class Candidate:
 
 
 def candidates(
-    stars: Complex, level: Level, tolerance: float, scale: tuple[float, float]
+    stars: Complex, level: StarTriangles, tolerance: float, scale: tuple[float, float]
 ) -> Iterator[Candidate]:
     """Peaks of the votes from all pairs of triangles of equal shape, the best supported first.
 

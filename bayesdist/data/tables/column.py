@@ -336,7 +336,7 @@ def _all_numbers(texts: Iterable[Any]) -> bool:
     return True
 
 
-class Columns(Protocol):
+class TableColumns(Protocol):
     """Named columns of equal length, as in an astropy Table."""
 
     @property
@@ -354,7 +354,7 @@ class Columns(Protocol):
 class Quantities:
     """Columns of a table, accessible by quantity."""
 
-    table: Columns
+    table: TableColumns
     found: Mapping[str, str]  # column of each quantity
     source: str  # file, for error messages
     place: Place = row_number  # name of a row, given its index

@@ -392,7 +392,7 @@ def deviation_draws(
 
 def _of_all_exposures(
     columns: DeviationColumns,
-    root: _Root,
+    root: _CovarianceRoot,
     spread: Float,
     loose: Float,
     drawn: Float,
@@ -432,7 +432,7 @@ def _bend(columns: DeviationColumns, curvature: Float) -> float:
 
 
 @dataclass(frozen=True, eq=False)
-class _Root:
+class _CovarianceRoot:
     """Linear combinations of independent coefficients that have one correlation time."""
 
     time: float  # in years; 0 for independent exposures
@@ -446,14 +446,14 @@ class _Root:
 
 def _roots(
     columns: DeviationColumns, S: Float, score: Float, index: Int, loose: Float, scale: Float
-) -> list[_Root]:
+) -> list[_CovarianceRoot]:
     """Correlation times of the deviations, or independence alone.
 
     Correlation times are considered only if there is a drift and the data suggest a correlation.
     """
     n, E = columns.n_of_exposures, columns.n_exposures
     scales = np.where(loose > 0, loose, 1.0)
-    independent = _Root(0.0, 1.0, np.diag(scales))
+    independent = _CovarianceRoot(0.0, 1.0, np.diag(scales))
     if not n or columns.model.time is None:
         return [independent]
     mean, _ = _given(S, score, np.where(loose > 0, loose, WIDE * scale[index]))
@@ -468,7 +468,7 @@ def _roots(
         matrix = np.diag(scales)
         root = correlation_root(columns.epoch, time, np.logical_not(wrong))
         matrix[:n, :n] = scales[:n, None] * np.kron(root, np.eye(n // E))
-        out.append(_Root(time, (1 - UNCORRELATED) / len(CORRELATION_TIMES), matrix))
+        out.append(_CovarianceRoot(time, (1 - UNCORRELATED) / len(CORRELATION_TIMES), matrix))
     return out
 
 

@@ -28,8 +28,8 @@ from bayesdist.diagnose.correlated.information import (
 from bayesdist.diagnose.correlated.neighbours import (
     LENGTHS,
     SECOND_ORDER,
-    DetectionScores,
     ExposureProducts,
+    ExposureScores,
     exposure_products,
     modes,
 )
@@ -111,7 +111,7 @@ class ExposureFields:
 def exposure_fields(
     information: Information,
     working: Information,
-    stars: DetectionScores | None,
+    stars: ExposureScores | None,
     priors: DiscrepancyPriors,
     n: int,
     rng: np.random.Generator,
@@ -144,14 +144,14 @@ def exposure_fields(
 
 def detection_scores(
     model: DistortionModel, stars: Stars, likelihood: Likelihood, exposure: Int, star: Int
-) -> DetectionScores:
+) -> ExposureScores:
     """Scores of detections in the order of `stars`, along the axes of the polynomials.
 
     `exposure` and `star` (N,) are their codes.
     """
     g, H, chip = scores_on_chips(model, stars, likelihood)
     h = np.einsum("naa->na", H)
-    return DetectionScores(stars.X, stars.Y, g, h, chip, exposure, star)
+    return ExposureScores(stars.X, stars.Y, g, h, chip, exposure, star)
 
 
 @dataclass(frozen=True, eq=False)

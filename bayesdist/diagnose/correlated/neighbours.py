@@ -271,7 +271,7 @@ def _shared(
 
 
 @dataclass(frozen=True, eq=False)
-class DetectionScores:
+class ExposureScores:
     """Detections with their scores along the axes of the polynomials."""
 
     # X, Y (N,): scaled positions on the chip
@@ -310,7 +310,7 @@ class ExposureProducts:
 
 
 def exposure_products(
-    scores: DetectionScores, sizes: Iterable[tuple[float, float]]
+    scores: ExposureScores, sizes: Iterable[tuple[float, float]]
 ) -> dict[int, ExposureProducts]:
     """Products of neighbours on each chip, by its code; chips with too few pairs are left out.
 
@@ -327,7 +327,7 @@ def exposure_products(
 
 
 def _of_chip(
-    scores: DetectionScores, rows: Int, size: tuple[float, float]
+    scores: ExposureScores, rows: Int, size: tuple[float, float]
 ) -> ExposureProducts | None:
     """Products on one chip; None if fewer than two exposures have enough stars."""
     if not rows.size:
@@ -450,7 +450,7 @@ def _binned(lags: Float, cells: tuple[int, int]) -> Float:
     return np.stack([np.bincount(bins, lag.ravel(), n + 1)[:n] for lag in lags])
 
 
-def _same_stars(scores: DetectionScores, rows: Int, g: Float, size: tuple[float, float]) -> Float:
+def _same_stars(scores: ExposureScores, rows: Int, g: Float, size: tuple[float, float]) -> Float:
     """Sums (4, bins) over pairs of detections of one star, which share a catalogue error."""
     out = np.zeros((4, len(SEPARATION_EDGES) - 1))
     order = np.argsort(scores.star[rows], kind="stable")

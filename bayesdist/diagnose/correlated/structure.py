@@ -48,7 +48,7 @@ UNLIKE = 0.2  # prior probability that the amplitude differs between both axes, 
 
 
 @dataclass(frozen=True, eq=False)
-class Field:
+class FieldLikelihood:
     """Likelihood of a field with one correlation length, on one or more axes, for any amplitude.
 
     The coefficients of the sines are scaled to the variance that they have in a field of unit
@@ -65,7 +65,9 @@ class Field:
     terms_score: Float
 
     @classmethod
-    def of(cls, blocks: Sequence[StructureFunctions], length: float, S: Float, s: Float) -> Field:
+    def of(
+        cls, blocks: Sequence[StructureFunctions], length: float, S: Float, s: Float
+    ) -> FieldLikelihood:
         """Build from information and score of all terms of all blocks, followed by their sines."""
         scale = np.concatenate([block.decline() for block in blocks])
         root = np.sqrt(np.concatenate([block.spectrum(length) for block in blocks]))
@@ -101,7 +103,7 @@ class Field:
 class SizedField:
     """Likelihood of the terms, given the correlation length and amplitude of the field."""
 
-    field: Field
+    field: FieldLikelihood
     amplitude: float
     variance: Float  # (n_sines,) of the sines along their eigenvectors, given the terms
     values: Float  # (T,) eigenvalues of the terms' information with the sines marginalised
@@ -253,7 +255,10 @@ def structure_posterior(
     )
     by_amplitude = {
         float(length): _SizedFields(
-            [Field.of(part_functions, float(length), S, s) for part_functions, S, s in parts],
+            [
+                FieldLikelihood.of(part_functions, float(length), S, s)
+                for part_functions, S, s in parts
+            ],
             amplitudes.terms,
         )
         for length in (LENGTHS if lengths is None else lengths)
@@ -320,7 +325,7 @@ def _terms_first(
 class _SizedFields:
     """Fields of one correlation length in all parts, computed once per amplitude."""
 
-    fields: Sequence[Field]
+    fields: Sequence[FieldLikelihood]
     of_terms: Float  # (TERM_STEPS,) amplitudes of the terms
     _cache: dict[float, tuple[tuple[SizedField, ...], Float]] = field(default_factory=dict)
 

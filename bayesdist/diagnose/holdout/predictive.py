@@ -257,7 +257,7 @@ def _radial(first: Float, second: Float) -> Float:
 
 
 @dataclass(frozen=True, eq=False)
-class Prediction:
+class StarPrediction:
     """Data minus prediction for stars of one group, or a part of them."""
 
     index: Int  # rows (n,) in their table
@@ -269,7 +269,7 @@ class Prediction:
 
 def predictions(
     model: DistortionModel, theta: Float, table: Matches, rows: Int, exposure: Int | int | None
-) -> Iterator[Prediction]:
+) -> Iterator[StarPrediction]:
     """Iterate over rows (n,) of a table, grouped by chip, date and code of the exposure."""
     groups = groups_of(model, table, rows, exposure)
     effective = model.effective(theta, groups)
@@ -283,7 +283,9 @@ def predictions(
             index = rows[members[start : start + AT_ONCE]]
             phi = basis.evaluate(table.x[index], table.y[index])
             jacobian = np.einsum("nk,akm->nam", phi, d)
-            yield Prediction(index, data[index] - phi @ effective[g].T, columns, jacobian, frame)
+            yield StarPrediction(
+                index, data[index] - phi @ effective[g].T, columns, jacobian, frame
+            )
 
 
 def groups_of(
@@ -437,7 +439,7 @@ def _alone(model: DistortionModel) -> DistortionModel:
 
 def framed(
     predictive: Predictive, table: Matches, index: Int, values: Float
-) -> Iterator[tuple[Prediction, Float, Float]]:
+) -> Iterator[tuple[StarPrediction, Float, Float]]:
     """Iterate over rows (n,) of one exposure, predicted with a frame of given parameters (q,).
 
     Each item contains the prediction and the derivatives (n, 2, n_distortion) with respect to

@@ -28,14 +28,14 @@ import numpy as np
 
 from bayesdist.diagnose.correlated.exposure_time import correlation_p, fitted_deviations
 from bayesdist.diagnose.correlated.neighbours import (
-    DetectionScores,
     ExposureProducts,
+    ExposureScores,
     exposure_products,
     modes,
 )
 from bayesdist.diagnose.score.projection import Projection, contracted, weighted
 from bayesdist.diagnose.score.result import POWER, Family, Outcome, outcome
-from bayesdist.diagnose.score.sample import Block, ScoredSample
+from bayesdist.diagnose.score.sample import DetectionBlock, ScoredSample
 from bayesdist.diagnose.statistics import (
     EfficientScore,
     add_over,
@@ -289,7 +289,7 @@ def _independent(every: _Deviations, whole: Float, combinations: Float) -> _Devi
     return every.along(combinations @ N) if N.shape[1] else None
 
 
-def _linear(block: Block, names: list[str], origin: tuple[float, float]) -> Float:
+def _linear(block: DetectionBlock, names: list[str], origin: tuple[float, float]) -> Float:
     """Changes (2, K, n) of the polynomial of a block due to unit linear deviations."""
     out = np.zeros((*block.effective.shape, len(names)))
     about = block.effective.copy()
@@ -302,7 +302,7 @@ def _linear(block: Block, names: list[str], origin: tuple[float, float]) -> Floa
     return out
 
 
-def _second_order(block: Block, columns: list[tuple[int, int, int]]) -> Float:
+def _second_order(block: DetectionBlock, columns: list[tuple[int, int, int]]) -> Float:
     """Changes (2, K, n) of the polynomial of a block due to unit second-order terms.
 
     Each column is a term: index of the chip, axis, and index of the polynomial function.
@@ -315,7 +315,7 @@ def _second_order(block: Block, columns: list[tuple[int, int, int]]) -> Float:
 
 
 def _of_exposure(
-    projection: Projection, blocks: list[Block], fields: list[Float], meat: _Meat | None
+    projection: Projection, blocks: list[DetectionBlock], fields: list[Float], meat: _Meat | None
 ) -> tuple[Float, _Deviations]:
     """Information before anything is projected out, and the deviations of one exposure.
 
@@ -357,7 +357,7 @@ def _of_exposure(
 
 def _covariances(
     projection: Projection,
-    blocks: list[Block],
+    blocks: list[DetectionBlock],
     fields: list[Float],
     left: EfficientScore,
     meat: _Meat | None,
@@ -451,7 +451,7 @@ def exposure_field_test(sample: ScoredSample) -> Outcome | None:
     """Test for fields of single exposures; None if fewer than two exposures have enough stars."""
     if len({block.exposure for block in sample.blocks}) < 2:
         return None
-    scores = DetectionScores(
+    scores = ExposureScores(
         sample.X, sample.Y, *sample.on_detector, sample.chip, sample.exposure, sample.star
     )
     chips = exposure_products(scores, [chip.size for chip in sample.model.chips])

@@ -115,9 +115,11 @@ class ChipResiduals:
         step = -(-self.n_stars // MAX_STARS)
         part = self.at(np.flatnonzero(self.star % step == 0)) if step > 1 else self
         orders = [self.order]
-        for order in range(self.order + 1, MAX_ORDER + 1):
-            if STARS_PER_FITTED_TERM * len(polynomial_terms(order)) <= part.n_stars:
-                orders.append(order)
+        orders += [
+            order
+            for order in range(self.order + 1, MAX_ORDER + 1)
+            if STARS_PER_FITTED_TERM * len(polynomial_terms(order)) <= part.n_stars
+        ]
         fits = [part.without_terms(order) for order in orders]
         variance = np.array([(fit.scatter() ** 2 / fit.free) for fit in fits])
         if variance.min() > LARGEST_RATIO**2 * variance[0]:

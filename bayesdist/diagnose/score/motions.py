@@ -44,7 +44,7 @@ from bayesdist.diagnose.score.result import (
     outcome,
     smallest_pattern,
 )
-from bayesdist.diagnose.score.sample import Block, ScoredSample
+from bayesdist.diagnose.score.sample import DetectionBlock, ScoredSample
 from bayesdist.diagnose.statistics import squares_over, sums_over
 from bayesdist.model.frames import DEVIATIONS, LINEAR_MATRICES, RIGID, frame_names
 from bayesdist.utils.arrays import Float, Int
@@ -382,7 +382,9 @@ def _exposures(projection: Projection, epoch: Float) -> Iterator[_Exposure]:
             yield exposure
 
 
-def _exposure(projection: Projection, epoch: Float, blocks: list[Block]) -> _Exposure | None:
+def _exposure(
+    projection: Projection, epoch: Float, blocks: list[DetectionBlock]
+) -> _Exposure | None:
     sample = projection.sample
     number: dict[int, int] = {}
     for block in blocks:
@@ -429,7 +431,7 @@ def _half(projection: Projection, chip: int) -> float:
     return model.pixel_size(projection.theta) * max(model.chips[chip].size) / 2
 
 
-def _columns(projection: Projection, block: Block, chips: list[int]) -> Float:
+def _columns(projection: Projection, block: DetectionBlock, chips: list[int]) -> Float:
     """Derivatives (2, n, unknowns) of the positions of a block.
 
     They are with respect to the unknowns of the block's exposure.

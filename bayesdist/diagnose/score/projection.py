@@ -27,9 +27,9 @@ from itertools import pairwise
 import numpy as np
 from scipy.linalg import block_diag, cho_solve
 
-from bayesdist.diagnose.score.questions import Functions, Regressors, one_of_each
+from bayesdist.diagnose.score.questions import Regressors, TestedFunctions, one_of_each
 from bayesdist.diagnose.score.result import Family, Outcome, outcome
-from bayesdist.diagnose.score.sample import Block, ScoredSample
+from bayesdist.diagnose.score.sample import DetectionBlock, ScoredSample
 from bayesdist.diagnose.statistics import Directions, EfficientScore, add_over, chi_square_of
 from bayesdist.infer.equations.priors import GaussianPriors
 from bayesdist.utils.arrays import Float, Int
@@ -48,7 +48,7 @@ LARGEST_LEVERAGE = 0.95  # of one detection; with a larger leverage hardly any r
 
 def regressor_tests(projection: Projection) -> list[Outcome]:
     """Outcomes of all regressor tests for which there are enough stars."""
-    by_regressors: dict[Regressors, list[_Part]] = {}
+    by_regressors: dict[Regressors, list[_ProjectedPart]] = {}
     for chips in _chips_together(projection):
         for regressors, part in _parts_of(projection, chips):
             by_regressors.setdefault(regressors, []).append(part)
@@ -59,7 +59,7 @@ def regressor_tests(projection: Projection) -> list[Outcome]:
 
 
 @dataclass(frozen=True, eq=False)
-class _Part:
+class _ProjectedPart:
     """Result of one test on one chip or on a few chips together."""
 
     statistic: float
@@ -77,7 +77,7 @@ def _chips_together(projection: Projection) -> list[list[int]]:
     return [chips] if len(chips) <= MAX_CHIPS else [[chip] for chip in chips]
 
 
-def _outcome(projection: Projection, family: Family, parts: Sequence[_Part]) -> Outcome:
+def _outcome(projection: Projection, family: Family, parts: Sequence[_ProjectedPart]) -> Outcome:
     """Outcome of one family, combined from its parts."""
     T, dof = parts[0].statistic, float(sum(part.dof for part in parts))
     residual: float | None = parts[0].dof_residual
@@ -97,7 +97,9 @@ def _outcome(projection: Projection, family: Family, parts: Sequence[_Part]) -> 
     )
 
 
-def _parts_of(projection: Projection, chips: list[int]) -> Iterator[tuple[Regressors, _Part]]:
+def _parts_of(
+    projection: Projection, chips: list[int]
+) -> Iterator[tuple[Regressors, _ProjectedPart]]:
     """Iterate over the tests of all regressors on the given chips."""
     asked, tried = [], []
     for regressors in projection.functions.regressors:
@@ -126,7 +128,7 @@ def _parts_of(projection: Projection, chips: list[int]) -> Iterator[tuple[Regres
         p = float(f_sf(T / directions.q, directions.q, dof_residual))
         square = np.repeat(projection.functions.mean_square[regressors.every], 2)
         squares = directions.squares(V, np.diag(np.tile(square, len(chips)) / len(chips)))
-        yield regressors, _Part(T, p, directions.q, dof_residual, *squares)
+        yield regressors, _ProjectedPart(T, p, directions.q, dof_residual, *squares)
 
 
 def _star_sums(
@@ -229,7 +231,7 @@ class _Together:
         )
 
     def left_scores(
-        self, projection: Projection, block: Block, x: Float
+        self, projection: Projection, block: DetectionBlock, x: Float
     ) -> tuple[Float, Float, Float]:
         """Scores (n, q) of detections after a step of the fit along the directions of each family.
 
@@ -267,7 +269,7 @@ class Projection:
     tests add, on both axes of every chip.
     """
 
-    functions: Functions
+    functions: TestedFunctions
     theta: Float  # (D,) parameters at which the scores were evaluated
     precision: Float  # (D, D) of the priors
     parameters: Float  # (D, D) information of the parameters, including the priors
@@ -315,7 +317,7 @@ class Projection:
         projected = self.regressors.information[np.ix_(which, which)]
         return self.with_global(projected, self.cross[:, which].T @ self.following)
 
-    def star_scores(self, F: Float, block: Block, coefficients: Float) -> Float:
+    def star_scores(self, F: Float, block: DetectionBlock, coefficients: Float) -> Float:
         """Scores (n, q) of detections, from coefficients (2, L, q) of functions F (L, n)."""
         g = self.scored.whole_score[:, block.rows]
         return np.asarray(sum((F * g[axis]).T @ coefficients[axis] for axis in (0, 1)))
@@ -339,7 +341,7 @@ class Projection:
         """Sample including the leverage of its detections."""
         return replace(self.sample, leverage=self.leverage)
 
-    def regressor_map(self, block: Block, which: Int) -> Float:
+    def regressor_map(self, block: DetectionBlock, which: Int) -> Float:
         """Coefficients (2, L, n) of projected regressors in a block.
 
         `which` (n,) are regressor indices from 0 to q - 1.
@@ -361,7 +363,7 @@ class Projection:
         return float((self.scored.whole_score**2).sum() / h.sum())
 
 
-def projection_of(functions: Functions, theta: Float, priors: GaussianPriors) -> Projection:
+def projection_of(functions: TestedFunctions, theta: Float, priors: GaussianPriors) -> Projection:
     """Sums over the detections of a sample, at the parameters `theta` (D,) of its scores.
 
     If the information matrix is not positive definite, only concave parts of the likelihood are
@@ -374,7 +376,7 @@ def projection_of(functions: Functions, theta: Float, priors: GaussianPriors) ->
         return _summed(replace(functions, sample=concave), theta, priors)
 
 
-def _summed(functions: Functions, theta: Float, priors: GaussianPriors) -> Projection:
+def _summed(functions: TestedFunctions, theta: Float, priors: GaussianPriors) -> Projection:
     sample, model = functions.sample, functions.sample.model
     D, K, n = model.n_params, model.n_terms, 2 * functions.n_added
     N, score = np.zeros((D + n * len(model.chips),) * 2), np.zeros(D + n * len(model.chips))
@@ -403,7 +405,7 @@ def _summed(functions: Functions, theta: Float, priors: GaussianPriors) -> Proje
     )
 
 
-def _added(block: Block, n_added: int, n_terms: int, which: Int) -> Float:
+def _added(block: DetectionBlock, n_added: int, n_terms: int, which: Int) -> Float:
     """Coefficients (2, L, n) of regressors in a block, along the axes of the polynomials."""
     out = np.zeros((2, n_terms + n_added, len(which)))
     chip, index_in_chip = np.divmod(which, 2 * n_added)

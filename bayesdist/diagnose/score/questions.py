@@ -253,7 +253,7 @@ class Regressors:
     """Directions that one test adds to the model on every chip: functions along its axes."""
 
     family: Family
-    functions: Int  # (f,) indices into the functions of `Functions`
+    functions: Int  # (f,) indices into the functions of `TestedFunctions`
     # (2 f, q) components of each direction: both axes of the first function, of the second, ...
     combination: Float
     least: float  # see `Question`
@@ -277,7 +277,7 @@ class Regressors:
 
 
 @dataclass(frozen=True, eq=False)
-class Functions:
+class TestedFunctions:
     """Functions of the detections: those of the model and those that the tests add."""
 
     sample: ScoredSample
@@ -351,7 +351,7 @@ class Functions:
         )
 
 
-def functions_for(sample: ScoredSample, asked: Iterable[Question] | None = None) -> Functions:
+def functions_for(sample: ScoredSample, asked: Iterable[Question] | None = None) -> TestedFunctions:
     """Functions for the questions `asked`; by default for all that the sample can answer."""
     products = [Products(polynomial_terms(sample.model.order))]
     start = len(products[0].terms)
@@ -374,7 +374,7 @@ def functions_for(sample: ScoredSample, asked: Iterable[Question] | None = None)
             regressors.append(
                 Regressors(question.family, functions, combination, question.least, adjustment)
             )
-    return Functions(sample, tuple(products), tuple(regressors))
+    return TestedFunctions(sample, tuple(products), tuple(regressors))
 
 
 def _along_axes(several: Iterable[Products], n_detections: int) -> tuple[list[Products], Float]:

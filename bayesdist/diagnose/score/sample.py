@@ -20,7 +20,7 @@ LARGEST_BLOCK = 4096  # detections per block, so that their functions fit into t
 
 
 @dataclass(frozen=True, eq=False)
-class Block:
+class DetectionBlock:
     """Detections of one chip, exposure and epoch, or a part of them, that share one polynomial."""
 
     rows: slice
@@ -70,7 +70,7 @@ class ScoredSample:
     # fitted
     position: Float | None = None
     offset: Float | None = None
-    blocks: tuple[Block, ...] = ()  # empty if the model's derivatives are not needed
+    blocks: tuple[DetectionBlock, ...] = ()  # empty if the model's derivatives are not needed
     motion: Float | None = None  # (2, N) proper motions along u and v, in the unit of u, v per year
     motion_sigma: Float | None = None  # (2, N) their standard errors, if the table has them
     # (2, N) leverage: fraction of the noise of each detection that the fit follows, along u and v;
@@ -118,9 +118,9 @@ class ScoredSample:
         score = np.einsum("nba,bn->na", self.turn, self.whole_score)
         return score, np.einsum("nba,nbc,nca->na", self.turn, matrix, self.turn)
 
-    def blocks_by(self, name: str) -> list[list[Block]]:
+    def blocks_by(self, name: str) -> list[list[DetectionBlock]]:
         """Blocks grouped by the attribute `name`: 'exposure' or 'frame_exposure'."""
-        by_code: dict[int, list[Block]] = {}
+        by_code: dict[int, list[DetectionBlock]] = {}
         for block in self.blocks:
             by_code.setdefault(getattr(block, name), []).append(block)
         return list(by_code.values())
@@ -202,7 +202,7 @@ def _both(u: Float | None, v: Float | None, rows: Int) -> Float | None:
     return None if u is None or v is None else np.stack([u[rows], v[rows]])
 
 
-def _blocks(stars: Stars, exposure: Int, theta: Float) -> tuple[Block, ...]:
+def _blocks(stars: Stars, exposure: Int, theta: Float) -> tuple[DetectionBlock, ...]:
     """Divide groups into blocks of one exposure each, of at most `LARGEST_BLOCK` detections."""
     model, groups = stars.model, stars.groups
     effective = model.effective(theta, groups)
@@ -217,7 +217,7 @@ def _blocks(stars: Stars, exposure: Int, theta: Float) -> tuple[Block, ...]:
         frame = model.frame(theta, int(groups.exposure[g]))[0]
         for first, last in zip([a, *edges], [*edges, b], strict=True):
             out.append(
-                Block(
+                DetectionBlock(
                     slice(int(first), int(last)),
                     int(groups.chip[g]),
                     int(exposure[first]),

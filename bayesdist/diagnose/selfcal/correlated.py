@@ -21,7 +21,7 @@ from bayesdist.diagnose.correlated.result import (
 )
 from bayesdist.diagnose.correlated.structure import structure_posterior
 from bayesdist.diagnose.selfcal.eliminated import (
-    Columns,
+    AddedColumns,
     EvenStars,
     eliminated,
     score_excess,
@@ -73,7 +73,7 @@ def selfcal_discrepancy(
     star_subset = EvenStars.of(solution)
     flat, working = flat.at(star_subset.rows), working.at(star_subset.rows)
     functions, deviations = _functions(star_subset.problem), star_subset.deviations
-    columns = Columns(star_subset.problem, solution.theta, functions, deviations)
+    columns = AddedColumns(star_subset.problem, solution.theta, functions, deviations)
     N, score, response = eliminated(columns, flat, star_subset.stars, working=working)
     efficient = without_parameters(solution, N, score)
     S, score = efficient.information, efficient.score

@@ -52,7 +52,7 @@ UNKNOWN = 1e-10
 
 
 @dataclass(frozen=True, eq=False)
-class Columns:
+class AddedColumns:
     """Displacements of detections by parameters, functions over chips and deviations of exposures.
 
     This is the order of the columns in all matrices.  Functions are sorted by chip, those along u
@@ -161,7 +161,7 @@ class EvenStars:
 
 
 @dataclass(frozen=True, eq=False)
-class Piece:
+class StarPiece:
     """A chunk of stars with their n detections, displaced along the axes of the polynomials."""
 
     stars: slice  # range of stars in the problem
@@ -174,11 +174,11 @@ class Piece:
     dense: tuple[tuple[Int, Float], ...]
     sparse: csr_array  # (2 n, n_sparse) displacements along both axes in turn
 
-    def scores(self, every: DetectionScores) -> DetectionScores:
+    def scores(self, every: SelfcalScores) -> SelfcalScores:
         """Scores of these detections along the axes of the polynomials."""
         in_piece = every.at(self.rows)
         gradient = np.einsum("nab,na->nb", self.frame, in_piece.gradient)
-        return DetectionScores(gradient, self.frame.mT @ in_piece.curvature @ self.frame)
+        return SelfcalScores(gradient, self.frame.mT @ in_piece.curvature @ self.frame)
 
     def __len__(self) -> int:
         return len(self.star)
@@ -192,7 +192,7 @@ class Piece:
         return csr_array((values.ravel(), (row, column.ravel())), shape=shape)
 
 
-def pieces(columns: Columns) -> Iterator[Piece]:
+def pieces(columns: AddedColumns) -> Iterator[StarPiece]:
     """Iterate over the detections in chunks of stars."""
     p, structure = columns.problem, columns.structure
     n_sparse_params = columns.n_params - p.model.n_polynomial
@@ -233,7 +233,7 @@ def pieces(columns: Columns) -> Iterator[Piece]:
         sparse = csr_array((data, (row, at)), shape=(2 * n, columns.n_sparse))
         star, by_star = p.star[rows] - first, back[group] @ places_by_star(p, rows)
         frame = structure.linear[group]
-        yield Piece(slice(first, last), rows, star, by_star, frame, tuple(dense), sparse)
+        yield StarPiece(slice(first, last), rows, star, by_star, frame, tuple(dense), sparse)
         first = last
 
 
@@ -260,7 +260,7 @@ def without_parameters(solution: SelfCalibrationMode, N: Float, score: Float) ->
 
 
 def absorbed_by_stars(
-    columns: Columns, piece: Piece, scores: DetectionScores, stars: Float
+    columns: AddedColumns, piece: StarPiece, scores: SelfcalScores, stars: Float
 ) -> Absorbed:
     """Sums over the detections of each star of a chunk.
 
@@ -286,11 +286,11 @@ def absorbed_by_stars(
 
 
 def eliminated(
-    columns: Columns,
-    scores: DetectionScores,
+    columns: AddedColumns,
+    scores: SelfcalScores,
     stars: Float,
     *,
-    working: DetectionScores | None = None,
+    working: SelfcalScores | None = None,
 ) -> tuple[Float, Float, Float]:
     """Information (n, n) and score (n,) of all columns, with the stars (S, q) eliminated.
 
@@ -299,7 +299,7 @@ def eliminated(
     """
     p, n = columns.problem, columns.sparse.stop
     total, score = np.zeros((n, n)), np.zeros(n)
-    narrow = Columns(p, columns.theta)
+    narrow = AddedColumns(p, columns.theta)
     inside = np.concatenate(
         [
             *(
@@ -328,7 +328,9 @@ def eliminated(
     return (total + total.T) / 2, score[columns.order], by_working[narrow.order][:, columns.order]
 
 
-def add_products(N: Float, left: Columns, right: Columns, piece: Piece, H: Float) -> None:
+def add_products(
+    N: Float, left: AddedColumns, right: AddedColumns, piece: StarPiece, H: Float
+) -> None:
     """Add Z^T H Z of a chunk to N, with internal columns; `left` may lack the dense functions."""
     n, n_left_sparse = len(piece), left.n_sparse
     across = np.arange(2 * n).reshape(n, 2)
@@ -362,7 +364,7 @@ def add_products(N: Float, left: Columns, right: Columns, piece: Piece, H: Float
     ]
 
 
-def _pulled(columns: Columns, piece: Piece, gradient: Float) -> Float:
+def _pulled(columns: AddedColumns, piece: StarPiece, gradient: Float) -> Float:
     """Sums (n,) of Z^T g over a chunk, with internal columns."""
     out = np.zeros(columns.sparse.stop)
     for code, (members, values) in enumerate(piece.dense):
@@ -373,7 +375,7 @@ def _pulled(columns: Columns, piece: Piece, gradient: Float) -> Float:
 
 
 @dataclass(frozen=True, eq=False)
-class DetectionScores:
+class SelfcalScores:
     """Gradient and curvature of each detection's log density with respect to sky position."""
 
     gradient: Float  # (N, 2)
@@ -381,18 +383,18 @@ class DetectionScores:
     # every sum is positive definite
     curvature: Float
 
-    def at(self, rows: slice | Bool) -> DetectionScores:
+    def at(self, rows: slice | Bool) -> SelfcalScores:
         """Scores of the given detections."""
-        return DetectionScores(self.gradient[rows], self.curvature[rows])
+        return SelfcalScores(self.gradient[rows], self.curvature[rows])
 
-    def flattened(self, excess: Float) -> DetectionScores:
+    def flattened(self, excess: Float) -> SelfcalScores:
         """Scores of a likelihood with variances multiplied by factors (N,)."""
-        return DetectionScores(
+        return SelfcalScores(
             self.gradient / excess[:, None], self.curvature / excess[:, None, None]
         )
 
 
-def scores_of_detections(solution: SelfCalibrationMode) -> DetectionScores:
+def scores_of_detections(solution: SelfCalibrationMode) -> SelfcalScores:
     """Scores of all detections of a solution, with the stars at their modes."""
     p, mixture = solution.problem, solution.mixture
     member = memberships(p, solution.theta, mixture, solution.stars)
@@ -404,10 +406,10 @@ def scores_of_detections(solution: SelfCalibrationMode) -> DetectionScores:
     # derivative of the membership with respect to position
     H -= (member * (1 - member))[:, None, None] * (pulled[:, :, None] * pulled[:, None, :])
     good = (H[:, 0, 0] > 0) & (np.linalg.det(H) > 0)
-    return DetectionScores(-member[:, None] * pulled, np.where(good[:, None, None], H, 0.0))
+    return SelfcalScores(-member[:, None] * pulled, np.where(good[:, None, None], H, 0.0))
 
 
-def score_excess(solution: SelfCalibrationMode, scores: DetectionScores) -> Float:
+def score_excess(solution: SelfCalibrationMode, scores: SelfcalScores) -> Float:
     """Ratio (N,) of the variance of the scores to their curvature, in blocks of the detector.
 
     The ratios are corrected for the part of the residuals that stars absorb.  Those of the blocks
@@ -501,7 +503,7 @@ def places_by_star(problem: Problem, rows: slice) -> Float:
     return out if q < 5 else np.concatenate([out, problem.factor[rows, :, None]], axis=2)
 
 
-def squared_scores(solution: SelfCalibrationMode, scores: DetectionScores) -> SquaredScores:
+def squared_scores(solution: SelfCalibrationMode, scores: SelfcalScores) -> SquaredScores:
     """Sums over the stars of products of their scores, and their expectation.
 
     0 for fixed parameters.
@@ -510,7 +512,7 @@ def squared_scores(solution: SelfCalibrationMode, scores: DetectionScores) -> Sq
     that of the star's detections per degree of freedom, beyond the star's parameters.
     """
     p, free = solution.problem, solution.free
-    columns = Columns(p, solution.theta)
+    columns = AddedColumns(p, solution.theta)
     root = np.zeros((columns.n_params, len(free)))
     root[free] = np.linalg.inv(np.linalg.cholesky(solution.precision)).T
     inside = np.empty_like(root)
@@ -551,7 +553,7 @@ def squared_scores(solution: SelfCalibrationMode, scores: DetectionScores) -> Sq
     )
 
 
-def star_scores(columns: Columns, piece: Piece, gradient: Float) -> Float:
+def star_scores(columns: AddedColumns, piece: StarPiece, gradient: Float) -> Float:
     """Scores (S, n) of each star of a chunk with respect to all columns.
 
     Stars are at their modes: the gradient with respect to their parameters is zero, so that nothing
@@ -568,7 +570,7 @@ def star_scores(columns: Columns, piece: Piece, gradient: Float) -> Float:
     return out[:, columns.order]
 
 
-def _displacements(columns: Columns, piece: Piece, root: Float) -> Float:
+def _displacements(columns: AddedColumns, piece: StarPiece, root: Float) -> Float:
     """Displacements (n, 2, f) of detections due to changes `root` (internal columns, f)."""
     out = np.zeros((len(piece), 2, root.shape[1]))
     for code, (members, values) in enumerate(piece.dense):

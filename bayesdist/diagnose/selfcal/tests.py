@@ -32,13 +32,18 @@ from bayesdist.diagnose.residuals.misfit import Misfit, bin_means, partitions_fo
 from bayesdist.diagnose.score.exposures import EXPOSURES
 from bayesdist.diagnose.score.motions import MIN_MOTION_SPAN, MOTIONS, StarResiduals, motion_outcome
 from bayesdist.diagnose.score.noise import noise_tests
-from bayesdist.diagnose.score.questions import Functions, Regressors, functions_for, one_of_each
+from bayesdist.diagnose.score.questions import (
+    Regressors,
+    TestedFunctions,
+    functions_for,
+    one_of_each,
+)
 from bayesdist.diagnose.score.result import Family, Outcome, ScoreTest, corrected, outcome
 from bayesdist.diagnose.score.sample import ScoredSample
 from bayesdist.diagnose.selfcal.eliminated import (
-    Columns,
-    DetectionScores,
+    AddedColumns,
     EvenStars,
+    SelfcalScores,
     StarBlock,
     absorbed_by_stars,
     add_products,
@@ -75,10 +80,10 @@ MIN_STAR_INFORMATION = 0.05  # of a direction, relative to that for known stars
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class _AddedColumns(Columns):
+class _AddedColumns(AddedColumns):
     """Functions of the questions on both axes of every chip, and deviations of exposures."""
 
-    added: Functions
+    added: TestedFunctions
 
     def n_functions(self, chip: int) -> int:
         """Number of functions along one axis."""
@@ -166,7 +171,7 @@ def selfcal_score_tests(
 
 
 def _summed(
-    solution: SelfCalibrationMode, columns: _AddedColumns, scores: DetectionScores, stars: Float
+    solution: SelfCalibrationMode, columns: _AddedColumns, scores: SelfcalScores, stars: Float
 ) -> _Sums:
     """Sums over the detections of a solution's stars, or of a part of them."""
     p, n, D = columns.problem, columns.sparse.stop, columns.n_params
@@ -203,7 +208,7 @@ def _summed(
 
 
 def _regressor_tests(
-    sums: _Sums, columns: _AddedColumns, functions: Functions
+    sums: _Sums, columns: _AddedColumns, functions: TestedFunctions
 ) -> Iterator[tuple[Regressors, Outcome]]:
     """Iterate over the tests of all regressors for which there are enough stars."""
     n_chips = len(columns.problem.model.chips)
@@ -261,7 +266,7 @@ def _tested(
 def _sample(
     solution: SelfCalibrationMode,
     some: EvenStars,
-    scores: DetectionScores,
+    scores: SelfcalScores,
     **known: Float | None,
 ) -> ScoredSample:
     """Sample of detections along the detector axes, in the unit of u and v.

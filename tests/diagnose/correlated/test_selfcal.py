@@ -10,8 +10,8 @@ import pytest
 from bayesdist.diagnose.correlated.deviations import deviation_columns
 from bayesdist.diagnose.correlated.functions import StructureFunctions
 from bayesdist.diagnose.selfcal.eliminated import (
-    Columns,
-    DetectionScores,
+    AddedColumns,
+    SelfcalScores,
     eliminated,
     scores_of_detections,
     squared_scores,
@@ -53,7 +53,7 @@ def star_design(p: Problem) -> np.ndarray:
     return S
 
 
-def displacement(columns: Columns, theta: np.ndarray) -> np.ndarray:
+def displacement(columns: AddedColumns, theta: np.ndarray) -> np.ndarray:
     """Derivatives (N, 2, n) of places by all columns, detection by detection."""
     p, model = columns.problem, columns.problem.model
     found = p.effective_jacobian(theta)
@@ -119,7 +119,7 @@ def test_sums_are_those_with_all_stars_explicit(kind, motion, rng):
         c: StructureFunctions(model.order, chip.size, 6) for c, chip in enumerate(model.chips)
     }
     counts = np.bincount(p.groups.index, minlength=len(p.groups)).astype(float)
-    columns = Columns(p, theta, functions, deviation_columns(model, theta, p.groups, counts))
+    columns = AddedColumns(p, theta, functions, deviation_columns(model, theta, p.groups, counts))
     working = scores_of_detections(solution)
     scores = working.flattened(rng.uniform(0.7, 2.0, len(p)))
     N, score, taken = eliminated(columns, scores, solution.stars, working=working)
@@ -131,7 +131,7 @@ def test_sums_are_those_with_all_stars_explicit(kind, motion, rng):
     for i, s in enumerate(p.star):
         whole[i, :, n + q * s : n + q * (s + 1)] = -S[i]
 
-    def sums(one: DetectionScores) -> tuple[np.ndarray, np.ndarray]:
+    def sums(one: SelfcalScores) -> tuple[np.ndarray, np.ndarray]:
         matrix = np.einsum("nai,nab,nbj->ij", whole, one.curvature, whole, optimize=True)
         pull = np.einsum("nai,na->i", whole, one.gradient)
         for s in range(p.n_stars):
@@ -172,7 +172,7 @@ def test_sums_are_those_with_all_stars_explicit(kind, motion, rng):
 
 def test_information_of_the_parameters_is_that_of_the_expansion():
     solution = solution_of(field(2, 8, 150))
-    columns = Columns(solution.problem, solution.theta)
+    columns = AddedColumns(solution.problem, solution.theta)
     N, score, _ = eliminated(columns, scores_of_detections(solution), solution.stars)
     known = solution.expansion
     assert np.abs(N - known.curvature).max() < 1e-9 * np.abs(known.curvature).max()
@@ -189,14 +189,14 @@ def test_sandwich_is_a_jackknife_over_stars():
     p, free = solution.problem, solution.free
     scores = scores_of_detections(solution)
     found = squared_scores(solution, scores).sandwich()
-    columns = Columns(p, solution.theta)
+    columns = AddedColumns(p, solution.theta)
     A = eliminated(columns, scores, solution.stars)[0][np.ix_(free, free)]
     moved = np.zeros((p.n_stars, len(free)))
     for s in range(p.n_stars):
         others = np.setdiff1d(np.arange(p.n_stars), [s])
         rest = np.isin(p.star, others)
         N, score, _ = eliminated(
-            Columns(p.of_stars(others), solution.theta),
+            AddedColumns(p.of_stars(others), solution.theta),
             scores.at(rest),
             solution.stars[others],
         )

@@ -15,7 +15,13 @@ from bayesdist.app.tables.margins import judged_requirements
 from bayesdist.assess.evaluation import with_measured_centroids
 from bayesdist.assess.model import with_diagnosed_errors, with_shared_stars
 from bayesdist.assess.planning.dithers import further_dithers
-from bayesdist.assess.planning.futures import Data, Futures, Need, Schedule, exposures_needed
+from bayesdist.assess.planning.futures import (
+    ExistingData,
+    Futures,
+    Need,
+    Schedule,
+    exposures_needed,
+)
 from bayesdist.assess.requirements.requirement import Requirement
 from bayesdist.errors import InputError
 from bayesdist.infer.compare.planning import (
@@ -169,7 +175,7 @@ def futures_of(results: Results, content: ExposureContent) -> Callable[[Requirem
         return Futures(
             errors,
             requirement,
-            Data(exposures.count, float(weight), content.n_stars, exposures.gain),
+            ExistingData(exposures.count, float(weight), content.n_stars, exposures.gain),
             solution,
             settings.grid,
             settings.epoch,

@@ -12,7 +12,7 @@ from astropy.table import Table
 from bayesdist.data.batches import BATCH
 from bayesdist.data.formats.files import input_files
 from bayesdist.data.tables.checks import Place, row_number
-from bayesdist.data.tables.column import Columns, SourceColumn
+from bayesdist.data.tables.column import SourceColumn, TableColumns
 from bayesdist.data.tables.names import BASIC, find_columns
 from bayesdist.data.tables.parquet import ParquetPart, describe_part
 from bayesdist.errors import InputError
@@ -61,7 +61,7 @@ class RvbFile:
     contents: Table | ParquetPart
     found: Mapping[str, str]  # column name by quantity
 
-    def blocks(self, keys: Sequence[str]) -> Iterator[tuple[Columns, int, Place]]:
+    def blocks(self, keys: Sequence[str]) -> Iterator[tuple[TableColumns, int, Place]]:
         """Read some quantities block by block.
 
         Yields
@@ -84,12 +84,12 @@ class RvbFile:
         for block in part.blocks(columns, encoded=labels & set(columns), size=BATCH):
             yield block, block.first, part.place(block.first)
 
-    def column(self, table: Columns, key: str, place: Place) -> SourceColumn:
+    def column(self, table: TableColumns, key: str, place: Place) -> SourceColumn:
         """Column of a quantity in a block."""
         name = self.found[key]
         return SourceColumn(table[name], self.source, name, place)
 
-    def bands(self, table: Columns, place: Place) -> tuple[Int, tuple[str, ...]]:
+    def bands(self, table: TableColumns, place: Place) -> tuple[Int, tuple[str, ...]]:
         """Code (N,) of the band of each row, and the names of the bands."""
         column = self.column(table, "band", place)
         codes, labels = column.labels()

@@ -18,7 +18,7 @@ from bayesdist.data.matches import Matches
 from bayesdist.data.reading.columns import match_columns
 from bayesdist.data.reading.options import ReadOptions, check_sigma, refuse_missing_errors
 from bayesdist.data.tables.checks import Place
-from bayesdist.data.tables.column import Columns, Quantities, SourceColumn
+from bayesdist.data.tables.column import Quantities, SourceColumn, TableColumns
 from bayesdist.errors import InputError
 from bayesdist.missions.wise.pairs.files import (
     MAGNITUDES,
@@ -198,7 +198,7 @@ def chosen_band(files: Sequence[RvbFile], band: str | None) -> str:
 
 def _pairs(
     file: RvbFile,
-    table: Columns,
+    table: TableColumns,
     first: int,
     place: Place,
     which: Bool,
