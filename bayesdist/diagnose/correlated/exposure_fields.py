@@ -14,7 +14,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 import scipy.linalg
@@ -68,7 +67,7 @@ class ExposureFields:
     length: Float  # (n,) its correlation length in longer half sides of a chip
     n_exposures: int
 
-    def facts(self, size: tuple[float, float]) -> dict[str, Any]:
+    def facts(self, size: tuple[float, float]) -> dict[str, float]:
         """Median rms of both kinds over a chip, both axes together, for summaries.
 
         `size` contains the numbers of columns and rows of the chip.  Terms up to second order are
