@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 from bayesdist.assess.model import error_model
 from bayesdist.assess.requirements.margins import judge
 from bayesdist.assess.units import pixel_scale_of
@@ -19,15 +21,18 @@ def margins_by_draws(
     chip=None,
     pixel_scale=None,
     checks=(),
+    block=None,
     **places,
 ):
     """Margins of requirements: what draws decide, if nothing is known to be wrong with them.
 
-    `places`: grid and epoch as of `judge`.
+    `block`: positions times draws that are evaluated at a time. `places`: grid and epoch as of
+    `judge`.
     """
     scale = pixel_scale_of(solution, chip, pixel_scale)
     errors = error_model(solution, terms=terms, aligned=aligned, pixel_scale=scale)
     if solution.convergence is not None:
         checks = (convergence_check(solution.convergence), *checks)
     drawn = errors.drawn(n_draws, rng)
+    drawn = replace(drawn, block=block or drawn.block)
     return judge(drawn, requirements, chip=chip, pixel_scale=scale, checks=checks, **places)

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from bayesdist.assess import STATISTICS, Requirement, UserTerm, drawn
+from bayesdist.assess import STATISTICS, Requirement, UserTerm
 from bayesdist.assess.requirements.verdict import Tally
 from bayesdist.assess.terms.forms import Pool
 from bayesdist.diagnose.statistics import clopper_pearson
@@ -330,12 +330,11 @@ def test_each_requirement_is_judged_at_its_own_epoch(rich):
         margins_of(rich, reqs)
 
 
-def test_blocks_of_draws_do_not_change_the_margins(shifting, monkeypatch):
+def test_blocks_of_draws_do_not_change_the_margins(shifting):
     req = [Requirement("r", "p90", 0.1)]
     options = dict(terms=[*SYSTEMATIC, *RANDOM], grid=(5, 5), n_draws=200)
     [whole] = margins_of(shifting(), req, **options)
-    monkeypatch.setattr(drawn, "BLOCK", 75)
-    [cut] = margins_of(shifting(), req, **options)
+    [cut] = margins_of(shifting(), req, block=75, **options)
     np.testing.assert_allclose(cut.draws, whole.draws, rtol=1e-12)
     [other] = margins_of(shifting(), req, seed=2, **options)
     assert (other.draws != whole.draws).all()

@@ -204,19 +204,19 @@ class Grouped:
 
 
 def friends_of_friends(
-    places: Float, exposure: Int, length: float, *, each: Each = map, per_cell: int = CELL
+    places: Float, exposure: Int, length: float, *, each: Each = map, per_cell: int | None = None
 ) -> Friends:
     """Groups of detections (N, 2) that are connected by steps of at most one linking length.
 
     Distances are exact to a sixteenth of the linking length: positions are rounded to a grid, which
     reduces the many detections of a star to a few points. Star codes are in the order of the first
     detections. `each` applies a function to the cells, by default one after another in this
-    process. `per_cell` is the average number of detections per cell; the result does not depend on
-    it.
+    process. `per_cell` is the average number of detections per cell (default: `CELL`); the result
+    does not depend on it.
     """
     first = np.full(len(places), NO_STAR)
     n_doubled, n_dropped, chains = 0, 0, list[tuple[Int, Int]]()
-    for cell_groups in each(grouped, cells(places, exposure, length, per_cell)):
+    for cell_groups in each(grouped, cells(places, exposure, length, per_cell or CELL)):
         first[cell_groups.rows] = cell_groups.first
         n_doubled, n_dropped = n_doubled + cell_groups.n_doubled, n_dropped + cell_groups.n_dropped
         chains.append((cell_groups.chained, cell_groups.chain))
