@@ -270,7 +270,7 @@ class _Written(io.FileIO):
 
     def write(self, content: Any) -> int:
         remaining = memoryview(content)
-        while len(remaining) and self._refused is None:
+        while remaining and self._refused is None:
             try:
                 remaining = remaining[super().write(remaining) :]
             except OSError as error:

@@ -45,11 +45,7 @@ def open_parquet(
         page_checksum_verification=True,
     )
     try:
-        for name, n in Counter(stored.schema_arrow.names).items():
-            if n > 1:
-                raise FormatError(
-                    f"has {n} columns named {name!r}", where=str(path), do="rename one of them"
-                )
+        _refuse_repeated_names(stored, path)
         _refuse_announced(stored, budget)
         with opened(path) as stream:
             _refuse_pages(stream, stored.metadata, budget)
@@ -57,6 +53,15 @@ def open_parquet(
         stored.close()
         raise
     return stored
+
+
+def _refuse_repeated_names(stored: pyarrow.parquet.ParquetFile, path: Path) -> None:
+    """Refuse a file in which several columns have the same name."""
+    for name, n in Counter(stored.schema_arrow.names).items():
+        if n > 1:
+            raise FormatError(
+                f"has {n} columns named {name!r}", where=str(path), do="rename one of them"
+            )
 
 
 def _refuse_announced(stored: pyarrow.parquet.ParquetFile, budget: Budget) -> None:

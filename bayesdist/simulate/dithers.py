@@ -108,8 +108,10 @@ def sky_seen(model: DistortionModel, theta: Float) -> tuple[Float, Float]:
     for chip in model.chips:
         right, top = (n + 0.5 for n in chip.size)
         x, y = np.array([0.5, right] * 2), np.array([0.5] * 2 + [top] * 2)
-        for e in range(len(model.exposures)):
-            corners.append(model.predict(theta, x, y, exposure=e, chip=chip.number))
+        corners += [
+            model.predict(theta, x, y, exposure=e, chip=chip.number)
+            for e in range(len(model.exposures))
+        ]
     points = np.concatenate(corners)
     return points.min(axis=0), points.max(axis=0)
 

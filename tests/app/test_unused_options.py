@@ -150,7 +150,7 @@ def read_names(function: object) -> set[str]:
     tree = ast.parse(textwrap.dedent(inspect.getsource(function)))
     nodes = [node for part in tree.body[0].body for node in ast.walk(part)]
     read = {n.id for n in nodes if isinstance(n, ast.Name) and isinstance(n.ctx, ast.Load)}
-    # options["name"], options.pop("name")
+    # constants are keys: of subscripts, and of calls of pop
     return read | {n.value for n in nodes if isinstance(n, ast.Constant) and type(n.value) is str}
 
 

@@ -495,9 +495,9 @@ def required_reduction(
     sizes = {name: factor * size for name, size in errors.sizes(domain).items()}
     largest = max(sizes, key=lambda name: sizes[name])
     best, best_factor = "", 0.0
-    for name in sizes:
+    for name, size in sizes.items():
         # terms that need a larger reduction than the best one so far are skipped
-        if sizes[name] > 0 and met(name, best_factor):
+        if size > 0 and met(name, best_factor):
             low, high = 0.0, 1.0
             for _ in range(STEPS):
                 middle = (low + high) / 2

@@ -269,16 +269,22 @@ def _numbers(path: Path, lines: list[str], n_columns: int, kept: Sequence[int]) 
         raise FormatError("the last line is cut off", where=str(path), do=_DAMAGED)
     out = np.empty((len(rows), len(kept)))
     for k, line in enumerate(rows):
-        fields = line.split()
         try:
-            if len(fields) < n_columns:
-                raise ValueError(f"has {len(fields)} of {n_columns} columns")
-            if "_" in line or not line.isascii():  # Python would accept these as parts of numbers
-                raise ValueError(f"{line.strip()[:40]!r} holds other characters than numbers do")
+            fields = _fields(line, n_columns)
             out[k] = [fields[m].removeprefix("K") for m in kept]
         except ValueError as error:
             raise FormatError(str(error), where=f"{path}, row {k + 1}", do=_DAMAGED) from None
     return out
+
+
+def _fields(line: str, n_columns: int) -> list[str]:
+    """Fields of a row; raises ValueError if there are fewer than `n_columns`, or for odd ones."""
+    fields = line.split()
+    if len(fields) < n_columns:
+        raise ValueError(f"has {len(fields)} of {n_columns} columns")
+    if "_" in line or not line.isascii():  # Python would accept these as parts of numbers
+        raise ValueError(f"{line.strip()[:40]!r} holds other characters than numbers do")
+    return fields
 
 
 def read_matchup(

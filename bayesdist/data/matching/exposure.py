@@ -149,7 +149,7 @@ def match_exposure(
         raise failure
     moved, allowed, index, partner = pairs.moved, pairs.allowed, pairs.index, pairs.partner
     false_rate = _false_rate(pairs, rho, reference, _DISPLACEMENT * largest)
-    # matched = true + false_rate (all - true)
+    # solved for the true pairs: a fraction `false_rate` of all other detections is matched too
     true = max((len(index) - false_rate * len(points)) / (1.0 - min(false_rate, 0.99)), 0.0)
     false_fraction = float(np.clip(1.0 - true / len(index), 0.0, 1.0))
     if radius is None and false_fraction > _MAX_FALSE_FRACTION:
@@ -413,7 +413,7 @@ def search_radius(
         if not len(distances):  # an empty ring, if distances from the centre are equal
             continue
         all_detections = len(distances) + int(((unpaired >= low) & (unpaired < high)).sum())
-        # n = true + chance (all - true)
+        # solved for the true pairs: a fraction `chance` of all other detections is paired too
         true = max(
             (len(distances) - chance * all_detections) / (1.0 - chance), 0.5 * len(distances)
         )

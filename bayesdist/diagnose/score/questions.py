@@ -388,8 +388,7 @@ def _along_axes(several: Iterable[Products], n_detections: int) -> tuple[list[Pr
             blocks.append(np.eye(2 * n))
             continue
         values = np.ones(n_detections) if product.values is None else product.values
-        for along in product.direction:
-            parts.append(Products(product.terms, values * along))
+        parts += [Products(product.terms, values * along) for along in product.direction]
         blocks.append(np.concatenate([np.kron(np.eye(n), axis[:, None]) for axis in np.eye(2)]))
     return parts, np.asarray(block_diag(*blocks))
 

@@ -71,9 +71,11 @@ def _first_rows(tab: IdcTab) -> list[int]:
 def _row_text(tab: IdcTab, row: int) -> list[str]:
     record = tab.rows[row]
     parts = [f"row {row + 1}"]
-    for label in ("DETCHIP", "DIRECTION", *FILTER_COLUMNS):
-        if label in tab.columns:
-            parts.append(f"{label} {str(record[label]).strip()}")
+    parts += [
+        f"{label} {str(record[label]).strip()}"
+        for label in ("DETCHIP", "DIRECTION", *FILTER_COLUMNS)
+        if label in tab.columns
+    ]
     lines = ["  " + ", ".join(parts)]
     geometry = [n for n in ("XSIZE", "YSIZE", "XREF", "YREF", "V2REF", "V3REF", "SCALE", "THETA")
                 if n in tab.columns]  # fmt: skip

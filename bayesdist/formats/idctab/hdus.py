@@ -169,9 +169,8 @@ def tdd_cards(fitted: Sequence[ChipNumbers], epoch: float | None, acs_wfc: bool)
     rates = {name: f.column(name) for f in fitted for name in f.names if name.startswith("TDD")}
     for chip in (1, 2):  # stwcs recognizes the scheme by TDD_CTB1, whatever the chip
         rates.setdefault(f"TDD_CTB{chip}", 0.0)
-    for name in sorted(rates):
-        cards.append(number_card(name, rates[name], comment or "[arcsec/pix/yr]"))
-    return cards
+    comment = comment or "[arcsec/pix/yr]"
+    return cards + [number_card(name, rates[name], comment) for name in sorted(rates)]
 
 
 def provenance_cards(

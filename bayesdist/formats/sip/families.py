@@ -75,7 +75,7 @@ def half_unit(sip: SipHeader) -> float:
 
 def with_coefficient(sip: SipHeader, keyword: str, value: float) -> SipHeader:
     """Header with one coefficient replaced."""
-    family = keyword.split("_")[0].lower()
+    family = keyword.split("_", maxsplit=1)[0].lower()
     change: dict[str, Any] = {family: {**getattr(sip, family), powers_of(keyword): value}}
     return replace(sip, **change)
 

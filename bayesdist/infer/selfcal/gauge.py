@@ -404,8 +404,7 @@ def _unnamed(model: DistortionModel, null: Float, known: Float) -> tuple[str, ..
     U, s, _ = np.linalg.svd(remainder, full_matrices=False)
     out = []
     for k in np.flatnonzero(s > EXPLAINED):
-        for at in np.argsort(-np.abs(U[:, k]))[:2]:
-            out.append(model.names[at])
+        out += [model.names[at] for at in np.argsort(-np.abs(U[:, k]))[:2]]
     return tuple(dict.fromkeys(out))
 
 

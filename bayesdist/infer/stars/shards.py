@@ -168,7 +168,6 @@ def shard_of(model: DistortionModel, reader: BatchReader, n_total: int) -> tuple
 
 def total(parts: Iterable[Any]) -> Any:
     """Sum of parts, added in their order by a tree with `BRANCHES` branches; None for no parts."""
-    remaining, sums = iter(parts), []
-    for first in remaining:
-        sums.append(reduce(add, islice(remaining, BRANCHES - 1), first))
+    remaining = iter(parts)
+    sums = [reduce(add, islice(remaining, BRANCHES - 1), first) for first in remaining]
     return total(sums) if len(sums) > 1 else next(iter(sums), None)

@@ -129,7 +129,7 @@ def _pooled(series: Mapping[str, Series], terms: Sequence[str]) -> Series:
 
 def _place(term: str) -> tuple[str, int, int]:
     """Axis and powers of a linear term; for example, 'WFC2.B_2' is ('v', 1, 0)."""
-    letter, _, digit = term.split(".")[-1].partition("_")
+    letter, _, digit = term.rsplit(".", maxsplit=1)[-1].partition("_")
     return ("u" if letter == "A" else "v", *POWERS.get(digit, (0, 0)))
 
 

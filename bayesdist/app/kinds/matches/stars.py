@@ -100,8 +100,8 @@ def fit_stars(
     settle, the error names the frames of the exposures that would help, if any.
     """
     if reader is None:
-        with closing(StarReader(config.resources())) as reader:
-            return fit_stars(matched, config, base, reader=reader)
+        with closing(StarReader(config.resources())) as opened:
+            return fit_stars(matched, config, base, reader=opened)
     model = model_of(matched.stars, config)
     refuse_stars(reader.sample(matched.stars), model, config)
     if matched.stars.in_memory and matched.stars.epoch is not None:

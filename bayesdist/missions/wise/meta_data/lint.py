@@ -101,7 +101,7 @@ def _without_a_digit(sip: SipHeader, keyword: str, number: re.Match[str]) -> dic
         if abs(value - implied.value) <= _ALLOWED_SIGMAS * implied.sigma
     }
     maxima = StatedMaxima.of(sip, sip.size)
-    prefix = keyword.split("_")[0]
+    prefix = keyword.split("_", maxsplit=1)[0]
     if maxima is None or prefix not in ("A", "B"):
         return near
     return {t: v for t, v in near.items() if maxima.with_value(keyword, v).met(prefix)}

@@ -114,11 +114,11 @@ def _line_table(
         if (label, row["segment"]) in alone:
             numbers = _numbers(alone[label, row["segment"]], factor, digits)
             rows.append((*head, "exposures, then line", *numbers))
-        for published_line in lines:
-            if published_line.chip == chip and abs(published_line.rdate - row["epoch0"]) < 1e-6:
-                rows.append(
-                    (*head, source, *_numbers(vars(published_line), factor, vars(published_line)))
-                )
+        rows += [
+            (*head, source, *_numbers(vars(published_line), factor, vars(published_line)))
+            for published_line in lines
+            if published_line.chip == chip and abs(published_line.rdate - row["epoch0"]) < 1e-6
+        ]
     system = ""
     if c.section("gauge"):
         system = f", in the system of {c.chip_name(c.section('gauge')['chip'])}"
