@@ -29,8 +29,7 @@ from bayesdist.data.storage import write_columns
 from bayesdist.files.atomic import made_folder, remove_leftovers
 from bayesdist.infer import LinearFit, Posterior, save_posterior
 from bayesdist.infer.posterior.memberships import memberships_of
-from bayesdist.infer.solution.geometry import geometries
-from bayesdist.infer.solution.skew import skew_of
+from bayesdist.infer.solution.geometry import geometries, skew_of
 from bayesdist.infer.stars.stars import in_table_order, prepare
 from bayesdist.utils.checks import warnings_of
 

@@ -22,8 +22,8 @@ from bayesdist.calibration.plane import ARCSEC, Agreement, Orientation, Plane, a
 from bayesdist.errors import DegenerateError, InputError
 from bayesdist.infer.solution.solution import DerivedSolution, Solution
 from bayesdist.model import DistortionModel, PolynomialBasis
+from bayesdist.model.alignment import turned, turned_model
 from bayesdist.model.grid import DEFAULT_GRID, grid_pixels, mesh
-from bayesdist.model.similarity import turned, turned_model
 from bayesdist.utils.arrays import Complex, Float
 from bayesdist.utils.quantities import Random, generator_of
 

@@ -53,7 +53,7 @@ from bayesdist.errors import InputError
 from bayesdist.infer import Compute, GaussianPriors, LinearFit, Posterior, Shards, fit_linear
 from bayesdist.infer.catalogue.star_errors import StarCovariance, StarErrors, star_covariance
 from bayesdist.infer.equations.scaled import one_thread
-from bayesdist.infer.exposures.chip_offsets import Settling
+from bayesdist.infer.exposures.hierarchy import Settling
 from bayesdist.infer.posterior.checks import ChiSquare
 from bayesdist.infer.stars.likelihood import Likelihood
 from bayesdist.infer.stars.loading import opened

@@ -22,10 +22,10 @@ from bayesdist.infer.compare.period_dates import sum_by_period
 from bayesdist.infer.compare.periods import (
     PeriodComparison,
     PeriodSums,
+    PositionChange,
     compare_periods,
     sums_of_stars,
 )
-from bayesdist.infer.compare.positions import PositionChange
 from bayesdist.infer.stars.stars import prepare
 from bayesdist.utils.arrays import Float, Int
 from bayesdist.utils.distributions import chi2_isf, chi2_sf, f_sf

@@ -20,7 +20,7 @@ from bayesdist.calibration.calibration import Calibration, calibration_of_maps
 from bayesdist.calibration.chip_map import ChipMap, fitted_map
 from bayesdist.errors import FormatError, InputError
 from bayesdist.model import polynomial_terms
-from bayesdist.model.basis import MAX_ORDER, PolynomialBasis
+from bayesdist.model.basis import MAX_ORDER, PolynomialBasis, n_terms
 from bayesdist.products.common.content import Content
 from bayesdist.products.common.document import (
     Choice,
@@ -56,7 +56,7 @@ class GbdesParameters:
         """Polynomial order of a map; FormatError if the number of coefficients fits no order."""
         half = len(rows) // 2
         for order in range(MAX_ORDER + 1):
-            if len(polynomial_terms(order)) == half and len(rows) == 2 * half:
+            if n_terms(order) == half and len(rows) == 2 * half:
                 return order
         raise FormatError(f"a map has {len(rows)} coefficients", where=self.name, do="check it")
 
@@ -217,8 +217,8 @@ def _map(
 def _change(own: int, basis: PolynomialBasis) -> Float:
     """Matrix from the coefficients of a map, x before y, to Legendre coefficients."""
     columns = []
-    for k in range(len(polynomial_terms(own))):
-        values = np.zeros((2, len(polynomial_terms(own))))
+    for k in range(n_terms(own)):
+        values = np.zeros((2, n_terms(own)))
         values[0, k] = 1.0
         chip_map = _map(values.ravel(), own, basis.order, basis.size, "", 1)
         columns.append(chip_map.coefficients[0])

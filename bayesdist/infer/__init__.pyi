@@ -1,6 +1,6 @@
 """Public names and the modules that define them; each is imported on first use."""
 
-from .catalogue.by_magnitude import fit_by_magnitude as fit_by_magnitude
+from .catalogue.magnitude_errors import fit_by_magnitude as fit_by_magnitude
 from .catalogue.star_errors import (
     StarCovariance as StarCovariance,
     StarErrors as StarErrors,
@@ -56,7 +56,7 @@ from .solution.solution import (
     TransformedSolution as TransformedSolution,
 )
 from .stars.loading import load as load
-from .stars.mixture import OutlierMixture as OutlierMixture
+from .stars.likelihood import OutlierMixture as OutlierMixture
 from .stars.shards import (
     Compute as Compute,
     Shards as Shards,

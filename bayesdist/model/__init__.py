@@ -2,8 +2,8 @@
 
 from bayesdist.model.basis import PolynomialBasis, polynomial_terms
 from bayesdist.model.distortion import DistortionModel
+from bayesdist.model.effective import Groups, merge_groups
 from bayesdist.model.frames import DEVIATIONS, FRAME_KINDS
-from bayesdist.model.grouping import Groups, merge_groups
 from bayesdist.model.layout import GAUGES, Chip
 from bayesdist.model.lookup import LookupTable, corrected
 from bayesdist.model.timedep import AXES, TimeDependence

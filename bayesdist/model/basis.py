@@ -46,6 +46,11 @@ def polynomial_terms(order: int) -> tuple[tuple[int, int], ...]:
     return tuple((n - j, j) for n in range(order + 1) for j in range(n + 1))
 
 
+def n_terms(order: int) -> int:
+    """Number of terms of a polynomial of total order `order` in two variables."""
+    return (order + 1) * (order + 2) // 2
+
+
 def polynomial_values(coefficients: Float, x: ArrayLike, y: ArrayLike) -> Float:
     """Evaluate the sum of coefficients[i, j] x^i y^j at points of any shape.
 
@@ -172,7 +177,7 @@ class PolynomialBasis:
     @property
     def n_terms(self) -> int:
         """Number of basis functions, that is, of coefficients per axis."""
-        return (self.order + 1) * (self.order + 2) // 2
+        return n_terms(self.order)
 
     @property
     def mean_squares(self) -> Float:

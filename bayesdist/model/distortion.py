@@ -25,8 +25,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from bayesdist.errors import InputError
-from bayesdist.model.effective import EffectiveCoefficients
-from bayesdist.model.grouping import Groups, group_by
+from bayesdist.model.effective import EffectiveCoefficients, Groups, group_by
 from bayesdist.utils.arrays import Float, Int
 
 NO_EXPOSURE = -1  # exposure code that stands for the polynomial without any exposure frame

@@ -10,7 +10,7 @@ from lxml import html as lxml_html
 from scipy import stats
 
 from bayesdist.infer import Rejection, fit_linear, load_fit, load_posterior
-from bayesdist.infer.solution.skew import skew_of
+from bayesdist.infer.solution.geometry import skew_of
 from bayesdist.report.sections.run.fit import fit_tables
 from tests.app.support import (
     CENTRE,

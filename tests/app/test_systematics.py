@@ -16,7 +16,7 @@ from bayesdist.assess.terms.parameters import MOTIONS, catalogue_terms
 from bayesdist.data import Matches, ReferenceCatalog
 from bayesdist.diagnose.diagnostics import catalogue_covariance
 from bayesdist.infer import Posterior, Rejection, fit_linear
-from bayesdist.infer.stars.mixture import OutlierMixture
+from bayesdist.infer.stars.likelihood import OutlierMixture
 from bayesdist.model import Chip, DistortionModel
 
 STARS, EXPOSURES = 60, 9

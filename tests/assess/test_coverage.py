@@ -8,7 +8,7 @@ import pytest
 from bayesdist.assess import Requirement
 from bayesdist.diagnose.residuals.binned import binned_sums, coverage_of
 from bayesdist.diagnose.residuals.misfit import partitions_for
-from bayesdist.infer.stars.survey import _hull
+from bayesdist.infer.stars.shards import _hull
 from bayesdist.model import Chip
 from bayesdist.utils.limits import UNCOVERED_BY_CHANCE
 

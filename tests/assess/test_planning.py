@@ -24,13 +24,13 @@ from bayesdist.diagnose.selfcal.eliminated import (
     scores_of_detections,
 )
 from bayesdist.infer import fit_linear
-from bayesdist.infer.compare.frame_fields import mean_squares
 from bayesdist.infer.compare.planning import (
     exposure_content,
     exposure_information,
     with_information,
 )
 from bayesdist.infer.selfcal.mode import of_first
+from bayesdist.model.alignment import mean_squares
 from tests.diagnose.correlated.test_selfcal import solution_of
 from tests.infer.compare.test_planning import SIGMA, model_of, stars
 from tests.infer.selfcal.fields import field

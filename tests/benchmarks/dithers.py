@@ -66,7 +66,7 @@ def simulated(exposures: int, stars: int, order: int) -> DitheredField:
 
 def _calibrated(exposures: int, stars: int, order: int) -> dict[str, Any]:
     from bayesdist.infer.selfcal import sample_selfcal, self_calibrate
-    from bayesdist.infer.selfcal.catalogue import star_catalogue
+    from bayesdist.infer.selfcal.calibrate import star_catalogue
 
     field = simulated(exposures, stars, order)
     detections = field.unlabelled

@@ -41,12 +41,12 @@ def measure(workers: int, exposures: int, stars: int, order: int, piece: int) ->
     """Group, solve and sample, with so many workers."""
     from bayesdist.data.matching import field as friends
     from bayesdist.infer import Compute
-    from bayesdist.infer.selfcal import pieces
+    from bayesdist.infer.selfcal import elimination
 
-    pieces.PIECE = friends.CELL = piece
+    elimination.PIECE = friends.CELL = piece
     compute = Compute(engine="dask", workers=workers) if workers else None
     with ExitStack() as stack:
-        shared = stack.enter_context(pieces.one_cluster(compute))
+        shared = stack.enter_context(elimination.one_cluster(compute))
         client = None
         if shared is not None:
             from distributed import Client
@@ -62,10 +62,9 @@ def _stages(compute: Any, client: Any, exposures: int, stars: int, order: int) -
     from bayesdist.data.matching.field import friends_of_friends
     from bayesdist.infer.equations.priors import Prior
     from bayesdist.infer.selfcal import sample_selfcal
+    from bayesdist.infer.selfcal.elimination import each_of
     from bayesdist.infer.selfcal.mode import solve_in_gauge
-    from bayesdist.infer.selfcal.pieces import each_of
-    from bayesdist.infer.selfcal.problem import prepare
-    from bayesdist.infer.selfcal.tangent import places_of
+    from bayesdist.infer.selfcal.problem import places_of, prepare
 
     field = simulated(exposures, stars, order)
     model, detections, theta = field.model, field.unlabelled, field.theta

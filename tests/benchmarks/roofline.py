@@ -8,7 +8,7 @@ import numba as nb
 import numpy as np
 
 from bayesdist.infer.kernel.blocks import BLOCK, scratch
-from bayesdist.infer.kernel.vectors import whole_vectors
+from bayesdist.infer.kernel.numeric import whole_vectors
 from tests.benchmarks.timing import best
 
 __all__ = ["Roofline", "measure"]

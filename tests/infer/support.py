@@ -22,7 +22,7 @@ from bayesdist.infer import (
     load,
 )
 from bayesdist.infer.density.target import Target
-from bayesdist.infer.stars.mixture import OUTLIER_SHAPE, T_DOF, Hyper
+from bayesdist.infer.stars.likelihood import OUTLIER_SHAPE, T_DOF, Hyper
 from bayesdist.infer.stars.stars import Stars, prepare
 from bayesdist.model import Chip, DistortionModel, TimeDependence
 from bayesdist.simulate import simulate_matches

@@ -7,7 +7,7 @@ import pytest
 from arviz_stats.base import array_stats
 from scipy.signal import lfilter
 
-from bayesdist.infer.effective_draws import mean_draws, rhat_and_bulk_draws, tail_draws
+from bayesdist.infer.convergence import mean_draws, rhat_and_bulk_draws, tail_draws
 
 AXES = {"chain_axis": 0, "draw_axis": 1}
 TAILS = (0.05, 0.95)

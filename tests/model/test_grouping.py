@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from bayesdist.model.grouping import Groups, group_by, merge_groups
+from bayesdist.model.effective import Groups, group_by, merge_groups
 
 Key = tuple[int, int, float]
 EPOCHS = [2001.5, 2003.0, 0.0, -1.0, 2001.5000000001]

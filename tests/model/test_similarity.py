@@ -9,7 +9,7 @@ import pytest
 from numpy.testing import assert_allclose
 
 from bayesdist.model import Chip, DistortionModel, TimeDependence
-from bayesdist.model.similarity import turned, turned_model
+from bayesdist.model.alignment import turned, turned_model
 
 CHIPS = tuple(Chip(n, f"WFC{n}", (4096.0, 2048.0), (2048.0, 1024.0)) for n in (2, 1))
 ONE_AXIS = TimeDependence((("u", 1, 0), ("v", 1, 1)), (2004.5, 2012.5), (2009.4,))

@@ -28,8 +28,8 @@ from bayesdist.infer.convergence import Convergence, Limits
 from bayesdist.infer.posterior import Posterior, SamplerInfo
 from bayesdist.infer.posterior.checks import ChiSquare, fit_checks, sampling_checks
 from bayesdist.infer.solution.linear import LinearFit, fit_linear, residuals
+from bayesdist.infer.stars.likelihood import OutlierMixture
 from bayesdist.infer.stars.loading import load
-from bayesdist.infer.stars.mixture import OutlierMixture
 from bayesdist.model import Chip, DistortionModel, TimeDependence
 from bayesdist.report.context import ChipResults, Product, ReportInput
 from bayesdist.utils.checks import Check

@@ -12,7 +12,7 @@ from bayesdist.app.kinds.errors import ErrorLaw
 from bayesdist.app.kinds.parts import StoredLookupTables
 from bayesdist.data import Matches
 from bayesdist.diagnose.overlap import _at_first_epoch, align, chosen_exposures
-from bayesdist.infer.nodes.pixels import inside_chips
+from bayesdist.infer.nodes.residuals import inside_chips
 from bayesdist.model import Chip, DistortionModel, LookupTable, corrected
 
 SIZE = (1024.0, 512.0)

@@ -21,7 +21,7 @@ from bayesdist.data import MagnitudeErrors
 from bayesdist.diagnose.diagnostics import Diagnostics
 from bayesdist.diagnose.holdout.predictive import Predictive, predictive_of
 from bayesdist.infer import Posterior
-from bayesdist.infer.exposures.chip_offsets import Settling
+from bayesdist.infer.exposures.hierarchy import Settling
 from bayesdist.infer.selfcal import SelfCalibrationMode
 from bayesdist.infer.solution.solution import Solution
 from bayesdist.plugin import load_object

@@ -12,7 +12,8 @@ from bayesdist.app.config import Config
 from bayesdist.app.kinds.fit_data import FitData
 from bayesdist.data import Matches
 from bayesdist.infer import Posterior, sample
-from bayesdist.model import DistortionModel, polynomial_terms
+from bayesdist.model import DistortionModel
+from bayesdist.model.basis import n_terms
 
 log = logging.getLogger("bayesdist")
 
@@ -53,8 +54,3 @@ def doubts_on_numbers(stars: Matches, model: DistortionModel) -> Iterator[str]:
                 f"{model.order}), and {needed} or more are advisable: the posterior may be far "
                 "from normal and sampling slow; lower model.order, or add stars"
             )
-
-
-def n_terms(order: int) -> int:
-    """Number of terms of a polynomial on one axis."""
-    return len(polynomial_terms(order))

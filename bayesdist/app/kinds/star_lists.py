@@ -15,7 +15,7 @@ from bayesdist.data import Detections, StarCuts, read_star_lists
 from bayesdist.errors import InputError
 from bayesdist.formats.idctab.calibration import idctab_calibration
 from bayesdist.formats.idctab.table import IdcTab, read_idctab
-from bayesdist.infer.selfcal.start import Start
+from bayesdist.infer.selfcal.prior import Start
 from bayesdist.model import Chip
 from bayesdist.utils.arrays import Bool, Float, Int
 

@@ -34,7 +34,7 @@ from bayesdist.calibration.orientation import lay_on
 from bayesdist.calibration.plane import ARCSEC, Plane
 from bayesdist.diagnose.diagnostics import Diagnostics
 from bayesdist.infer import Posterior
-from bayesdist.infer.selfcal.start import fitted_polynomials, undistorted
+from bayesdist.infer.selfcal.prior import fitted_polynomials, undistorted
 from bayesdist.infer.solution.solution import Solution
 from bayesdist.infer.solution.transforms import reference_gauge, without_frames
 from bayesdist.model import LookupTable

@@ -32,9 +32,9 @@ from bayesdist.calibration.calibration import Calibration
 from bayesdist.calibration.chip_map import ChipMap
 from bayesdist.calibration.orientation import as_real, similarity_fields, turn_between
 from bayesdist.errors import InputError
-from bayesdist.infer.compare.frame_fields import term_squares
 from bayesdist.infer.equations.scaled import FieldTest, chi_square
 from bayesdist.model import PolynomialBasis
+from bayesdist.model.alignment import term_squares
 from bayesdist.utils.arrays import Complex, Float
 
 NEAR = 0.1  # radians, or relative scale: largest difference of axes that count as parallel

@@ -17,15 +17,15 @@ from scipy.sparse.csgraph import connected_components
 from bayesdist.assess.maps import UncertaintyMap, uncertainty_map
 from bayesdist.data.detections import Detections
 from bayesdist.errors import InputError
-from bayesdist.infer.compare.frame_fields import mean_squares
 from bayesdist.infer.equations.priors import Prior
-from bayesdist.infer.selfcal.expected import (
+from bayesdist.infer.selfcal.gauge import SAME_ROLL
+from bayesdist.infer.selfcal.mode import (
     ExpectedSolution,
+    SelfCalibrationMode,
     expected_curvature,
     expected_solution,
+    of_first,
 )
-from bayesdist.infer.selfcal.gauge import SAME_ROLL
-from bayesdist.infer.selfcal.mode import SelfCalibrationMode, of_first
 from bayesdist.infer.selfcal.prior import (
     frame_prior,
     pointing_prior,
@@ -33,6 +33,7 @@ from bayesdist.infer.selfcal.prior import (
 )
 from bayesdist.infer.selfcal.sky_moves import POINTS, functionals, moves
 from bayesdist.model import Chip, DistortionModel
+from bayesdist.model.alignment import mean_squares
 from bayesdist.model.frames import FRAME_KINDS
 from bayesdist.model.grid import outline_pixels
 from bayesdist.simulate.dithers import DitherPattern, dithered_model, sky_seen, stars_on_detector

@@ -29,8 +29,8 @@ from numpy.typing import NDArray
 from bayesdist.assess.domain import EvaluationDomain
 from bayesdist.assess.solution import place_of
 from bayesdist.calibration.chip_map import position_moments
-from bayesdist.infer.compare.frame_fields import mean_squares
 from bayesdist.model import DistortionModel
+from bayesdist.model.alignment import mean_squares
 from bayesdist.model.grid import DEFAULT_GRID, grid_pixels, mesh
 from bayesdist.utils.arrays import Float, Int
 

@@ -34,10 +34,10 @@ from bayesdist.diagnose.correlated.priors import DiscrepancyPriors, log_half_t
 from bayesdist.diagnose.correlated.result import ChipStructure, Discrepancy, structure_correlation
 from bayesdist.diagnose.correlated.structure import Structure, structure_posterior
 from bayesdist.diagnose.statistics import EfficientScore
-from bayesdist.infer.catalogue.star_sums import StarSums, influence_by_group
+from bayesdist.infer.catalogue.star_errors import StarSums, influence_by_group
 from bayesdist.infer.equations.priors import GaussianPriors
 from bayesdist.infer.equations.scaled import one_thread
-from bayesdist.infer.exposures.chip_offsets import Settling
+from bayesdist.infer.exposures.hierarchy import Settling
 from bayesdist.infer.solution.solution import Solution, likelihood_of
 from bayesdist.infer.stars.likelihood import Likelihood
 from bayesdist.infer.stars.loading import opened

@@ -42,7 +42,7 @@ from bayesdist.infer.exposures.scatter import OUTLYING, OUTLYING_FRACTION
 from bayesdist.infer.stars.likelihood import Likelihood
 from bayesdist.infer.stars.stars import Stars
 from bayesdist.model import Chip, DistortionModel
-from bayesdist.model.basis import polynomial_terms
+from bayesdist.model.basis import n_terms, polynomial_terms
 from bayesdist.utils.arrays import Float, Int
 
 STEPS = 40  # number of grid points in amplitude
@@ -52,7 +52,7 @@ WIDE = 30.0  # multiple of the resolution of the data that is practically a flat
 RANGE = 10.0
 SHAPE = 0.3  # relative tolerance of the correlation at a separation, compared with a Matern field
 SINES = 10  # along each side of a chip; finer sines do not change the polynomials
-QUADRATIC = polynomial_terms(SECOND_ORDER)[len(polynomial_terms(SECOND_ORDER - 1)) :]
+QUADRATIC = polynomial_terms(SECOND_ORDER)[n_terms(SECOND_ORDER - 1) :]
 STARS_PER_TERM = 2  # per exposure and chip; with fewer, its second-order terms are not estimated
 
 

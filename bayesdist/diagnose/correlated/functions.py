@@ -14,7 +14,7 @@ from functools import cached_property
 import numpy as np
 from numpy.polynomial import legendre
 
-from bayesdist.model.basis import polynomial_terms
+from bayesdist.model.basis import n_terms, polynomial_terms
 from bayesdist.utils.arrays import Float, Int
 
 ORDERS = 3  # number of Legendre orders above the model's
@@ -51,7 +51,7 @@ class StructureFunctions:
     @cached_property
     def terms(self) -> tuple[tuple[int, int], ...]:
         """Powers of the Legendre products above the model's order."""
-        had = len(polynomial_terms(self.order))
+        had = n_terms(self.order)
         return polynomial_terms(self.order + ORDERS)[had:]
 
     @property

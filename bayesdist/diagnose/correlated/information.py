@@ -28,8 +28,7 @@ from bayesdist.infer.equations.normal import NormalEquations
 from bayesdist.infer.equations.priors import GaussianPriors
 from bayesdist.infer.equations.scaled import scaled_inverse
 from bayesdist.infer.stars.likelihood import Likelihood
-from bayesdist.infer.stars.stars import Stars
-from bayesdist.infer.stars.sums import Sums
+from bayesdist.infer.stars.stars import Stars, Sums
 from bayesdist.model import DistortionModel, Groups
 from bayesdist.model.grid import cell_index
 from bayesdist.utils.arrays import Float, Int

@@ -25,8 +25,7 @@ from bayesdist.infer.posterior.memberships import averaged_draws, memberships_of
 from bayesdist.infer.solution.linear import LinearFit
 from bayesdist.infer.stars.likelihood import Likelihood, star_averages
 from bayesdist.infer.stars.shards import Shards
-from bayesdist.infer.stars.stars import Stars, in_table_order, prepare
-from bayesdist.infer.stars.sums import Sums
+from bayesdist.infer.stars.stars import Stars, Sums, in_table_order, prepare
 from bayesdist.model import DistortionModel
 from bayesdist.model.grid import cell_index
 from bayesdist.utils.arrays import Bool, Float, Int

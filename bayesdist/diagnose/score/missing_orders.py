@@ -19,7 +19,7 @@ from numpy.polynomial import legendre
 
 from bayesdist.diagnose.score.result import Family, Outcome, outcome
 from bayesdist.diagnose.score.sample import ScoredSample
-from bayesdist.model.basis import MAX_ORDER, polynomial_terms
+from bayesdist.model.basis import MAX_ORDER, n_terms, polynomial_terms
 from bayesdist.utils.arrays import Float, Int
 from bayesdist.utils.distributions import f_sf
 
@@ -81,7 +81,7 @@ class ChipResiduals:
     def order_above(self, number: int) -> int:
         """Highest order, at most `number` above the model's, that the stars constrain."""
         for total in range(self.order + number, self.order, -1):
-            if STARS_PER_TERM * len(polynomial_terms(total)) <= self.n_stars:
+            if STARS_PER_TERM * n_terms(total) <= self.n_stars:
                 return total
         return self.order
 
@@ -97,11 +97,11 @@ class ChipResiduals:
             z = z.copy()
             for k in range(len(codes)):
                 at = np.flatnonzero(of == k)
-                low = [n for n in (2, 1, 0) if STARS_PER_TERM * len(polynomial_terms(n)) <= len(at)]
+                low = [n for n in (2, 1, 0) if STARS_PER_TERM * n_terms(n) <= len(at)]
                 if low:
                     F = legendre_products(self.X[at], self.Y[at], polynomial_terms(low[0]))
                     z[:, at] = _minus_fit(F, z[:, at])
-        return replace(self, z=z, free=1.0 - len(polynomial_terms(order)) / self.n_stars)
+        return replace(self, z=z, free=1.0 - n_terms(order) / self.n_stars)
 
     def in_units_of_scatter(self) -> ChipResiduals:
         """Residuals divided by their scatter, with errors that are larger by the same factor."""
@@ -118,14 +118,14 @@ class ChipResiduals:
         orders += [
             order
             for order in range(self.order + 1, MAX_ORDER + 1)
-            if STARS_PER_FITTED_TERM * len(polynomial_terms(order)) <= part.n_stars
+            if STARS_PER_FITTED_TERM * n_terms(order) <= part.n_stars
         ]
         fits = [part.without_terms(order) for order in orders]
         variance = np.array([(fit.scatter() ** 2 / fit.free) for fit in fits])
         if variance.min() > LARGEST_RATIO**2 * variance[0]:
             return None
         k = int(np.argmax(variance <= LEAST_GAIN * variance.min()))
-        dof = 2 * (len(polynomial_terms(orders[k])) - len(polynomial_terms(self.order)))
+        dof = 2 * (n_terms(orders[k]) - n_terms(self.order))
         dof_residual = 2 * part.n_stars * fits[k].free
         return MissingOrders(
             orders[k],

@@ -20,7 +20,7 @@ from scipy.linalg import block_diag
 
 from bayesdist.diagnose.score.result import LOOK_UP_TABLE, Family, Outcome
 from bayesdist.diagnose.score.sample import ScoredSample
-from bayesdist.model.basis import MAX_ORDER, polynomial_terms
+from bayesdist.model.basis import MAX_ORDER, n_terms, polynomial_terms
 from bayesdist.model.timedep import TimeDependence
 from bayesdist.utils.arrays import Bool, Float, Int
 
@@ -149,7 +149,7 @@ def questions(sample: ScoredSample) -> Iterator[Question]:
     """Iterate over the questions that a sample can answer; constant values are removed later."""
     order = sample.model.order
     for total in range(order + 1, order + HIGHER + 1):
-        terms = polynomial_terms(total)[len(polynomial_terms(total - 1)) :]
+        terms = polynomial_terms(total)[n_terms(total - 1) :]
         yield Question(order_family(total, order), (Products(terms),))
     if sample.mag is not None:
         yield Question(MAGNITUDE, (Products(LINEAR, _standing_out(sample.mag)),))

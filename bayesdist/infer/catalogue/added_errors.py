@@ -32,7 +32,7 @@ import numpy as np
 from bayesdist.data.magnitude_errors import AddedErrors
 from bayesdist.data.matches import Matches
 from bayesdist.errors import InputError
-from bayesdist.infer.catalogue.by_magnitude import (
+from bayesdist.infer.catalogue.magnitude_errors import (
     FALSE,
     false_matches,
     refitted,

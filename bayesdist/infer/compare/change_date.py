@@ -17,13 +17,13 @@ import numpy as np
 from scipy.linalg import null_space
 
 from bayesdist.data.matches import Matches
-from bayesdist.infer.compare.frame_fields import mean_squares, without
 from bayesdist.infer.compare.monitoring import Change, NewFit
 from bayesdist.infer.equations.normal import NormalEquations, mixture
 from bayesdist.infer.equations.scaled import FieldTest, determined
 from bayesdist.infer.kernel import Constants
 from bayesdist.infer.stars.stars import prepare
 from bayesdist.model import DistortionModel
+from bayesdist.model.alignment import mean_squares, without
 from bayesdist.model.frames import nearest_frame
 from bayesdist.utils.arrays import Float, Int
 from bayesdist.utils.distributions import chi2_sf

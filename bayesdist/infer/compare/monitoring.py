@@ -19,7 +19,6 @@ import numpy as np
 from bayesdist.data.matches import Matches
 from bayesdist.errors import InputError
 from bayesdist.infer.catalogue.star_errors import StarErrors, star_covariance, star_influence
-from bayesdist.infer.compare.frame_fields import frame_between, frame_fields, mean_squares, without
 from bayesdist.infer.density.grid import build_proposal
 from bayesdist.infer.density.target import Target
 from bayesdist.infer.equations.priors import GaussianPriors
@@ -28,11 +27,11 @@ from bayesdist.infer.exposures.hierarchy import held_in_reference
 from bayesdist.infer.solution.linear import DEFAULT_REJECTION, LinearFit, Rejection, fit_linear
 from bayesdist.infer.solution.solution import Solution, TransformedSolution
 from bayesdist.infer.solution.transforms import without_frames
-from bayesdist.infer.stars.likelihood import MixtureAt
+from bayesdist.infer.stars.likelihood import MixtureAt, OutlierMixture
 from bayesdist.infer.stars.loading import load
-from bayesdist.infer.stars.mixture import OutlierMixture
 from bayesdist.infer.stars.shards import Compute
 from bayesdist.model import DistortionModel
+from bayesdist.model.alignment import frame_between, frame_fields, mean_squares, without
 from bayesdist.utils.arrays import Float
 
 __all__ = ["Change", "NewFit", "change_of", "fit_new", "new_model", "with_star_errors_of"]

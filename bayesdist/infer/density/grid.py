@@ -20,7 +20,7 @@ from bayesdist.infer.density.laplace import (
 from bayesdist.infer.density.proposal import GridProposal, quality_of
 from bayesdist.infer.density.target import Target
 from bayesdist.infer.solution.linear import LinearFit
-from bayesdist.infer.stars.mixture import TAILS
+from bayesdist.infer.stars.likelihood import TAILS
 from bayesdist.utils.arrays import Float
 
 Line = dict[float, Conditional]  # nodes along an axis of the grid, by their coordinate

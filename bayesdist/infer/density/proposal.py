@@ -31,7 +31,7 @@ from scipy.interpolate import CubicHermiteSpline, CubicSpline, PchipInterpolator
 from bayesdist.infer.convergence import importance_efficiency, pareto_k
 from bayesdist.infer.density.laplace import Node, Split
 from bayesdist.infer.equations.arrow import Arrow
-from bayesdist.infer.stars.mixture import TAILS
+from bayesdist.infer.stars.likelihood import TAILS
 from bayesdist.utils.arrays import Bool, Float, Int
 
 Random = np.random.Generator | np.random.RandomState

@@ -13,7 +13,7 @@ from bayesdist.infer.equations.arrow import Arrow
 from bayesdist.infer.equations.normal import mixture
 from bayesdist.infer.equations.priors import GaussianPriors
 from bayesdist.infer.kernel import Constants
-from bayesdist.infer.stars.mixture import HYPER_NAMES, Hyper, OutlierMixture
+from bayesdist.infer.stars.likelihood import HYPER_NAMES, Hyper, OutlierMixture
 from bayesdist.infer.stars.shards import Shards
 from bayesdist.infer.stars.stars import Stars
 from bayesdist.model import DistortionModel

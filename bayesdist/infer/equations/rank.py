@@ -13,7 +13,7 @@ from scipy.spatial import ConvexHull, QhullError
 
 from bayesdist.errors import DegenerateError
 from bayesdist.infer.equations.arrow import Arrow
-from bayesdist.infer.stars.survey import Survey
+from bayesdist.infer.stars.shards import Survey
 from bayesdist.model import DistortionModel, Groups
 from bayesdist.model.frames import DEVIATIONS, FRAME_KINDS, frame_names
 

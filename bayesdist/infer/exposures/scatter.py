@@ -198,13 +198,16 @@ class Scatter:
         )
         return np.asarray(optimum.x)
 
-    def draws(self, n: int, rng: np.random.Generator) -> Float:
+    def draws(
+        self, n: int, rng: np.random.Generator, least_efficiency: float = LEAST_EFFICIENCY
+    ) -> Float:
         """Draws (n, k) from the posterior of tau, with equal weights.
 
         They come from importance sampling of log tau with resampling.  The kinds are proposed
         independently, each from its conditional density at the mode of the others, slightly
         widened, since the scatter of different kinds is usually almost independent.  If the
-        importance efficiency is low, a Markov chain is started from the best proposal instead.
+        importance efficiency is below `least_efficiency`, a Markov chain is started from the best
+        proposal instead.
         """
         proposals = self._proposals(self.mode())
         u = rng.uniform(size=(PROPOSALS * n, len(proposals)))
@@ -214,7 +217,7 @@ class Scatter:
         log_q = sum(proposal.log_density(t) for proposal, t in zip(proposals, x.T, strict=True))
         log_w = self.log_densities(np.exp(x)) - log_q
         w = np.exp(log_w - logsumexp(log_w))
-        if 1 / (w**2).sum() < LEAST_EFFICIENCY * len(w):
+        if 1 / (w**2).sum() < least_efficiency * len(w):
             return np.exp(self._chain(x[int(np.argmax(w))], proposals, n, rng))
         # systematic resampling
         at = (np.arange(n) + rng.uniform()) / n

@@ -16,7 +16,7 @@ from bayesdist.infer.equations.scaled import scaled_inverse, unit_diagonal
 from bayesdist.infer.solution.solution import DerivedSolution, Solution
 from bayesdist.infer.solution.transforms import reference_gauge, without_frames
 from bayesdist.model import DistortionModel
-from bayesdist.model.similarity import turned, turned_model
+from bayesdist.model.alignment import turned, turned_model
 from bayesdist.utils.arrays import Float
 from bayesdist.utils.quantities import Random, generator_of
 

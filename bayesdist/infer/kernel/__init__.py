@@ -9,15 +9,19 @@ from bayesdist.infer.kernel.cache import kept_by_content
 
 with kept_by_content():
     from bayesdist.infer.kernel.blocks import BLOCK, get_threads, pieces_of, set_threads
-    from bayesdist.infer.kernel.likelihood import log_likelihood
-    from bayesdist.infer.kernel.mixture import GAUSSIAN, NO_OUTLIERS, UNIFORM, Constants
+    from bayesdist.infer.kernel.mixture import (
+        GAUSSIAN,
+        NO_OUTLIERS,
+        UNIFORM,
+        Constants,
+        log_likelihood,
+    )
     from bayesdist.infer.kernel.moments import (
         PIECE,
         Moments,
         least_squares_moments,
         mixture_moments,
     )
-    from bayesdist.infer.kernel.sky_places import linearised, positions, slopes
     from bayesdist.infer.kernel.small import (
         densities,
         draw_deviations,
@@ -32,7 +36,7 @@ with kept_by_content():
         MOST_DOUBTFUL,
         log_marginals,
     )
-    from bayesdist.infer.kernel.stars import memberships, residuals
+    from bayesdist.infer.kernel.stars import linearised, memberships, positions, residuals, slopes
     from bayesdist.infer.kernel.stars_unknown import (
         EliminationSums,
         eliminate_stars,

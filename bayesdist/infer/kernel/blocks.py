@@ -21,7 +21,7 @@ import numba as nb
 import numpy as np
 
 from bayesdist.infer.kernel.lanes import FAST, INNER, copy
-from bayesdist.infer.kernel.vectors import whole_vectors
+from bayesdist.infer.kernel.numeric import whole_vectors
 from bayesdist.utils.arrays import Float, Int
 
 # options of compiled passes; a check for division by zero would prevent vectorisation

@@ -26,8 +26,7 @@ import numba as nb
 import numpy as np
 
 from bayesdist.infer.kernel.lanes import FAST
-from bayesdist.infer.kernel.numeric import exp_negative
-from bayesdist.infer.kernel.vectors import whole_vectors
+from bayesdist.infer.kernel.numeric import exp_negative, whole_vectors
 from bayesdist.utils.arrays import Float, Int
 
 SURE = 8.6**2  # squared distance from the edge in sigma at which the probability is 1 in float64

@@ -41,9 +41,13 @@ from bayesdist.infer.kernel.lanes import (
     total,
 )
 from bayesdist.infer.kernel.mixture import Constants, log_of_product, packed
-from bayesdist.infer.kernel.numeric import exp_negative, inverse_root
-from bayesdist.infer.kernel.polynomial import evaluate, legendre
-from bayesdist.infer.kernel.vectors import whole_vectors
+from bayesdist.infer.kernel.numeric import (
+    evaluate,
+    exp_negative,
+    inverse_root,
+    legendre,
+    whole_vectors,
+)
 from bayesdist.utils.arrays import Float, Int
 
 PIECE = 4096  # maximum number of stars per piece

@@ -13,9 +13,8 @@ import numpy as np
 
 from bayesdist.infer.kernel.blocks import PASS
 from bayesdist.infer.kernel.lanes import FAST
-from bayesdist.infer.kernel.numeric import exp_negative
+from bayesdist.infer.kernel.numeric import exp_negative, whole_vectors
 from bayesdist.infer.kernel.star_modes import cholesky
-from bayesdist.infer.kernel.vectors import whole_vectors
 from bayesdist.utils.arrays import Float
 
 SUMS = PASS | {"fastmath": FAST | {"reassoc"}}

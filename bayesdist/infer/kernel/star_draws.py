@@ -21,8 +21,7 @@ from numpy.typing import NDArray
 
 from bayesdist.infer.kernel.blocks import PASS, share_out
 from bayesdist.infer.kernel.lanes import WIDTH, choose, larger, load, put, spread
-from bayesdist.infer.kernel.numeric import bits_of, exp_negative, from_bits
-from bayesdist.infer.kernel.sky_places import legendre
+from bayesdist.infer.kernel.numeric import bits_of, exp_negative, from_bits, whole_vectors
 from bayesdist.infer.kernel.star_modes import (
     CLOSE,
     MOST_STAR,
@@ -34,7 +33,7 @@ from bayesdist.infer.kernel.star_modes import (
     own_rows,
     to_mode,
 )
-from bayesdist.infer.kernel.vectors import whole_vectors
+from bayesdist.infer.kernel.stars import legendre
 from bayesdist.utils.arrays import Float
 
 Flags = NDArray[np.int8]

@@ -23,8 +23,7 @@ import numba as nb
 import numpy as np
 
 from bayesdist.infer.kernel.lanes import FAST, WIDTH
-from bayesdist.infer.kernel.numeric import exp_negative
-from bayesdist.infer.kernel.vectors import whole_vectors
+from bayesdist.infer.kernel.numeric import exp_negative, whole_vectors
 
 MOST_STAR = 5  # maximum number of parameters of a star
 MOST_STEPS = 60  # maximum number of Newton steps

@@ -16,7 +16,7 @@ import numpy as np
 
 from bayesdist.infer.kernel.blocks import PASS, share_out
 from bayesdist.infer.kernel.lanes import WIDTH, load, put, total
-from bayesdist.infer.kernel.sky_places import legendre
+from bayesdist.infer.kernel.numeric import whole_vectors
 from bayesdist.infer.kernel.star_modes import (
     MOST_STAR,
     PLACE_U,
@@ -32,7 +32,7 @@ from bayesdist.infer.kernel.star_modes import (
     residual,
     to_mode,
 )
-from bayesdist.infer.kernel.vectors import whole_vectors
+from bayesdist.infer.kernel.stars import legendre
 from bayesdist.utils.arrays import Float, Int
 
 

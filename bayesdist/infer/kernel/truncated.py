@@ -40,9 +40,7 @@ from bayesdist.infer.kernel.moments import (
     room_for,
     write_columns,
 )
-from bayesdist.infer.kernel.numeric import exp_negative
-from bayesdist.infer.kernel.polynomial import evaluate, legendre
-from bayesdist.infer.kernel.vectors import whole_vectors
+from bayesdist.infer.kernel.numeric import evaluate, exp_negative, legendre, whole_vectors
 from bayesdist.utils.arrays import Float, Int
 
 SCRATCH = 16_000_000  # bytes of partial sums in memory at a time

@@ -17,8 +17,7 @@ import scipy.linalg
 import scipy.optimize
 
 from bayesdist.infer.kernel.lapack import cholesky, inverse_of
-from bayesdist.infer.nodes.grid import NodeGrid
-from bayesdist.infer.nodes.sums import NodeSums
+from bayesdist.infer.nodes.grid import NodeGrid, NodeSums
 from bayesdist.utils.arrays import Float, Int
 
 SMOOTHNESS = (0.5, 1.5, 2.5)

@@ -11,9 +11,8 @@ from scipy.sparse.linalg import LinearOperator, cg
 
 from bayesdist.infer.kernel.blocks import at_once
 from bayesdist.infer.kernel.lapack import cholesky, divided
-from bayesdist.infer.nodes.grid import NodeGrid
+from bayesdist.infer.nodes.grid import NodeGrid, NodeSums
 from bayesdist.infer.nodes.hyperparameters import Evidence, FittedField, Matern
-from bayesdist.infer.nodes.sums import NodeSums
 from bayesdist.model.lookup import LookupTable
 from bayesdist.utils.arrays import Float
 

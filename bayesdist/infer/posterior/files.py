@@ -31,12 +31,10 @@ from bayesdist.files.faults import restoring
 from bayesdist.files.hdf5 import netcdf_groups
 from bayesdist.infer.convergence import DIAGNOSTICS, Convergence, Limits
 from bayesdist.infer.posterior import Posterior, SamplerInfo
-from bayesdist.infer.posterior.groups import Group, datatree_of
 from bayesdist.infer.posterior.memberships import memberships, star_log_likelihood
-from bayesdist.infer.posterior.posterior import SCHEMA
+from bayesdist.infer.posterior.posterior import SCHEMA, Group, datatree_of
 from bayesdist.infer.solution.linear import LinearFit
-from bayesdist.infer.stars.likelihood import Clip
-from bayesdist.infer.stars.mixture import OutlierMixture
+from bayesdist.infer.stars.likelihood import Clip, OutlierMixture
 from bayesdist.model import DistortionModel
 from bayesdist.utils.quantities import takes
 
@@ -56,6 +54,8 @@ def save_posterior(
     path: str | Path,
     *,
     provenance: Mapping[str, object] | None = None,
+    max_stars: int = MOST_STARS,
+    max_bytes: int = LARGEST,
 ) -> None:
     """Write a posterior to a netCDF file.
 
@@ -63,12 +63,15 @@ def save_posterior(
     ----------
     posterior : Posterior
     matches : Matches or None
-        The data from which the posterior was sampled. They are stored in the file, except for
-        more than a million stars; None omits them.
+        The data from which the posterior was sampled; None omits them.
     path : path
         Output file, replaced atomically.
     provenance : mapping, optional
         Facts about the run that JSON can represent, stored as an attribute.
+    max_stars : int
+        The matches are not stored if there are more stars than this.
+    max_bytes : int
+        The log-likelihood of each star at each draw is not stored if it is larger than this.
 
     Raises
     ------
@@ -87,7 +90,7 @@ def save_posterior(
     >>> np.array_equal(bd.load_posterior("posterior.nc").theta, posterior.theta)
     True
     """
-    _write(_groups(posterior, matches, provenance), path)
+    _write(_groups(posterior, matches, provenance, max_stars, max_bytes), path)
 
 
 def posterior_datatree(
@@ -118,15 +121,19 @@ def posterior_datatree(
 
 
 def _groups(
-    posterior: Posterior, matches: Matches | None, provenance: Mapping[str, object] | None
+    posterior: Posterior,
+    matches: Matches | None,
+    provenance: Mapping[str, object] | None,
+    max_stars: int = MOST_STARS,
+    max_bytes: int = LARGEST,
 ) -> dict[str, Group]:
     """Groups of posterior.nc by name, the top group under ''."""
     groups = posterior.groups(provenance)
-    if matches is not None and len(matches) <= MOST_STARS:
+    if matches is not None and len(matches) <= max_stars:
         groups["observed_data"] = Group({"u": (("star",), matches.u), "v": (("star",), matches.v)})
         groups["constant_data"] = _constants(posterior, matches)
         # omitted if the stars' positions are unknowns too: they are given at a single draw only
-        is_small = posterior.log_prob.size * len(matches) * 8 <= LARGEST
+        is_small = posterior.log_prob.size * len(matches) * 8 <= max_bytes
         if is_small and not posterior.own_places:
             values = star_log_likelihood(posterior, matches)
             groups["log_likelihood"] = Group({"uv": (("chain", "draw", "star"), values)})

@@ -9,8 +9,7 @@ import numpy as np
 from bayesdist.data.matches import Matches
 from bayesdist.infer.kernel import Constants
 from bayesdist.infer.posterior.posterior import Posterior
-from bayesdist.infer.stars.likelihood import star_averages, star_log_likelihoods
-from bayesdist.infer.stars.mixture import Hyper
+from bayesdist.infer.stars.likelihood import Hyper, star_averages, star_log_likelihoods
 from bayesdist.infer.stars.shards import Shards
 from bayesdist.infer.stars.stars import Stars, in_table_order, prepare
 from bayesdist.utils.arrays import Float, Int
@@ -115,13 +114,18 @@ def averaged_draws(posterior: Posterior) -> tuple[Float, Constants]:
     return theta, posterior.bound_mixture.constants(h)
 
 
-def star_log_likelihood(posterior: Posterior, matches: Matches) -> Float:
-    """Log-likelihood (chains, draws, N) of each star at every draw."""
+def star_log_likelihood(
+    posterior: Posterior, matches: Matches, at_a_time: int = AT_A_TIME
+) -> Float:
+    """Log-likelihood (chains, draws, N) of each star at every draw.
+
+    About `at_a_time` values (stars times draws) are computed at a time.
+    """
     stars, order = prepare(posterior.model, matches)
     theta, h = posterior.sampled_points
     constants = posterior.bound_mixture.constants(h)
     out = np.empty((len(theta), len(matches)))
-    step = max(1, AT_A_TIME // max(1, len(matches)))
+    step = max(1, at_a_time // max(1, len(matches)))
     for k in range(0, len(theta), step):
         rows = slice(k, k + step)
         values = star_log_likelihoods(stars, theta[rows], constants.of(rows))

@@ -163,7 +163,9 @@ class Walkers:
     coords: Float  # (walkers, D): psi for independence moves only, otherwise whitened coordinates
     log_prob: Float  # log posterior density (walkers,)
     log_q: Float  # log proposal density (walkers,); NaN if no move needs it
-    random: tuple  # state of emcee's random generator, from `numpy.random.RandomState.get_state`
+    random: tuple[
+        object, ...
+    ]  # state of emcee's random generator, from `numpy.random.RandomState.get_state`
 
 
 @dataclass(frozen=True, eq=False)

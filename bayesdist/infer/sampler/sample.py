@@ -31,8 +31,8 @@ from bayesdist.infer.sampler.chains import (
 from bayesdist.infer.sampler.proposals import CHECKPOINT
 from bayesdist.infer.sampler.schedule import Plan, expected_passes
 from bayesdist.infer.solution.linear import LinearFit
+from bayesdist.infer.stars.likelihood import OutlierMixture
 from bayesdist.infer.stars.loading import opened
-from bayesdist.infer.stars.mixture import OutlierMixture
 from bayesdist.infer.stars.shards import Compute, Shards
 from bayesdist.infer.stars.stars import Stars
 from bayesdist.utils.limits import PARETO_K

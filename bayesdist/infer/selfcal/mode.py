@@ -4,6 +4,10 @@ Free directions are determined at a solution, but finding a solution requires th
 fixed.  With the large errors of a starting point, more directions seem free than at the mode; for
 example if roll angles hardly differ.  The free directions are therefore determined again at the
 mode, and the decision is stored with the solution for later use.
+
+The covariance expected for planned exposures is that of the mode for simulated detections.  It
+depends only on the positions of the stars: residuals would enter the information only through the
+membership probabilities, and all simulated detections are at the positions of their stars.
 """
 
 from __future__ import annotations
@@ -15,19 +19,23 @@ from functools import cached_property
 
 import numpy as np
 
+from bayesdist.data.detections import Detections
 from bayesdist.errors import DegenerateError, NotSettledError
 from bayesdist.infer.equations.priors import Prior
-from bayesdist.infer.selfcal import pieces as of
-from bayesdist.infer.selfcal.elimination import Expansion, Mixture
+from bayesdist.infer.selfcal import elimination as of
+from bayesdist.infer.selfcal.elimination import Expansion, Mixture, expand
 from bayesdist.infer.selfcal.gauge import Decision, Gauge, find_gauge
-from bayesdist.infer.selfcal.problem import Problem
+from bayesdist.infer.selfcal.problem import Problem, prepare
+from bayesdist.infer.selfcal.sky_moves import gauge_free_matrix
 from bayesdist.infer.solution.linear import LinearFit
+from bayesdist.infer.solution.solution import Solution
 from bayesdist.infer.stars.likelihood import Clip
 from bayesdist.infer.stars.shards import Compute, MappedPieces
+from bayesdist.model import DistortionModel
 from bayesdist.utils.arrays import Float, Int
+from bayesdist.utils.quantities import Random, generator_of
 
 PriorAt = Callable[[Float], Prior]  # prior linearised at given parameters (D,)
-
 MAX_PASSES = 80
 MAX_DECREMENT = 1e-5  # decrement (expected gain in log density) at convergence
 NEAR = 1.0  # decrement below which the curvature of the mixture is used instead of EM weights
@@ -36,6 +44,9 @@ MIN_FRACTION = 1e-5  # smallest fraction of false detections
 # initial errors as a multiple of the robust scatter, large enough that no star is lost
 START_SCALE = 3.0
 REJECTED = 25.0  # chi-square (sum over both axes) above which a detection counts as rejected
+
+BOUNDED = 1e-3  # largest unexplained fraction of a free direction for bounded errors
+NONE_FALSE = Mixture(jitter=0.0, fraction=1e-300)
 
 
 @dataclass(frozen=True, eq=False)
@@ -229,7 +240,7 @@ def solve(
 class _Begun:
     """Starting point of a search."""
 
-    pieces: MappedPieces
+    pieces: MappedPieces[of.StarPiece]
     theta: Float
     mixture: Mixture | None = None  # None to start with large errors
     medians: bool = False  # True to start with the stars at the medians of their detections
@@ -239,7 +250,7 @@ class _Begun:
 class _Found:
     """Result of a search."""
 
-    pieces: MappedPieces
+    pieces: MappedPieces[of.StarPiece]
     theta: Float
     mixture: Mixture
     free: Int
@@ -269,7 +280,7 @@ class _Found:
 
 def _loaded(
     problem: Problem, stars: Float | None, compute: Compute | None
-) -> AbstractContextManager[MappedPieces]:
+) -> AbstractContextManager[MappedPieces[of.StarPiece]]:
     """Context with the pieces of a problem, with stars (S, q) or, if None, stars at zero."""
     places = np.zeros((problem.n_stars, problem.n_star)) if stars is None else stars
     return of.in_pieces(problem, places, compute)
@@ -303,12 +314,12 @@ def _solved(
             (problem.var + after.jitter**2).mean() / (problem.var + mixture.jitter**2).mean() - 1.0
         )
         if near and decrement < MAX_DECREMENT and change < MAX_CHANGE:
-            pieces = pieces.map(of.at_modes, theta, mixture, True)
+            settled = pieces.map(of.at_modes, theta, mixture, True)
             expansion, at_solution = (
-                pieces.sum(of.expansion_of),
-                curvatures(problem, pieces, theta, mixture),
+                settled.sum(of.expansion_of),
+                curvatures(problem, settled, theta, mixture),
             )
-            return _Found(pieces, theta, mixture, free, expansion, at_solution, prior)
+            return _Found(settled, theta, mixture, free, expansion, at_solution, prior)
         near = decrement < NEAR and change < 0.1
         mixture = after
     raise NotSettledError(
@@ -334,7 +345,7 @@ def newton_step(curvature: Float, gradient: Float, free: Int) -> Float | None:
     return out
 
 
-def wide_mixture(pieces: MappedPieces, theta: Float) -> Mixture:
+def wide_mixture(pieces: MappedPieces[of.StarPiece], theta: Float) -> Mixture:
     """Mixture with large errors, estimated from the scatter at a starting point."""
     square = np.concatenate(list(pieces.each(of.squares, theta)))
     # the median of r^2 is 1.386 sigma^2
@@ -457,17 +468,104 @@ def gauge_of(
     return find_gauge(problem, theta, alone, prior, known=informed, decision=solution.decision)
 
 
-def _gauge_at_start(problem: Problem, loaded: MappedPieces, theta: Float, prior: Prior) -> Gauge:
+def _gauge_at_start(
+    problem: Problem, loaded: MappedPieces[of.StarPiece], theta: Float, prior: Prior
+) -> Gauge:
     pieces = loaded.map(of.at_means, theta)
     alone, informed = curvatures(problem, pieces, theta, wide_mixture(pieces, theta))
     return find_gauge(problem, theta, alone, prior, known=informed)
 
 
 def curvatures(
-    problem: Problem, pieces: MappedPieces, theta: Float, mixture: Mixture
+    problem: Problem, pieces: MappedPieces[of.StarPiece], theta: Float, mixture: Mixture
 ) -> tuple[Float, Float]:
     """Curvatures (D, D) for the detections alone, and including the priors of the stars."""
     informed = pieces.sum(of.expansion, theta, mixture, False, True).curvature
     if not problem.priors.informed.any():
         return informed, informed
     return pieces.sum(of.expansion, theta, mixture, False, False).curvature, informed
+
+
+# -- expected covariance for planned exposures: the Fisher information at assumed true parameters --
+
+
+@dataclass(frozen=True, eq=False)
+class ExpectedSolution(Solution):
+    """Expected solution: its mean is the assumed truth, its covariance the expected one."""
+
+    model: DistortionModel
+    mean: Float  # true parameters (D,)
+    cov: Float  # covariance (D, D); zero for parameters that the gauge fixes
+    gauge: Gauge
+    problem: Problem  # detections that would be used, sorted by star
+
+    def draws(self, n: int, rng: Random) -> Float:
+        """Draws (n, D) from the Gaussian with this mean and covariance; see `Solution.draws`."""
+        generator = generator_of(rng)
+        return np.asarray(generator.multivariate_normal(self.mean, self.cov, n, method="eigh"))
+
+    def up_to(self, directions: Float) -> Float:
+        """Covariance (D, D) without errors along the directions (D, d); see `gauge_free_matrix`.
+
+        It is meaningful only if `bounded_by` is True for these directions.
+        """
+        S = gauge_free_matrix(self.model, self.mean, directions)
+        return np.asarray(S @ self.cov @ S.T)
+
+    def bounded_by(self, directions: Float) -> bool:
+        """True if errors are bounded apart from those along the given directions (D, d)."""
+        free, model = self.gauge.open, self.model
+        if not free.shape[1]:
+            return True
+        remainder = gauge_free_matrix(model, self.mean, directions) @ free
+        return _largest(remainder, model) <= BOUNDED * _largest(free, model)
+
+
+def _largest(change: Float, model: DistortionModel) -> float:
+    """Largest absolute change of a polynomial coefficient in changes (D, k) of the parameters."""
+    return float(np.abs(change[: model.n_polynomial]).max())
+
+
+def expected_solution(
+    model: DistortionModel,
+    truth: Float,
+    detections: Detections,
+    prior: Prior,
+    *,
+    min_detections: int = 2,
+) -> ExpectedSolution:
+    """Compute the expected covariance of a self-calibration, marginalised over the stars.
+
+    `truth` (D,) are the true parameters.  `detections` are the noise-free positions of stars, with
+    star codes and errors; `prior` is information from other sources; `min_detections` is the
+    minimum number of detections of a star.  Raises InputError if no star has enough detections.
+    """
+    problem, curvature = _expanded(model, truth, detections, min_detections)
+    gauge = find_gauge(problem, truth, curvature, prior)
+    free = np.setdiff1d(np.arange(model.n_params), gauge.held)
+    precision = (curvature + prior.precision)[np.ix_(free, free)]
+    scale = 1.0 / np.sqrt(np.diag(precision))
+    cov = np.zeros_like(curvature)
+    cov[np.ix_(free, free)] = np.linalg.inv(precision * np.outer(scale, scale)) * np.outer(
+        scale, scale
+    )
+    return ExpectedSolution(model, np.array(truth, float), cov, gauge, problem)
+
+
+def expected_curvature(model: DistortionModel, truth: Float, detections: Detections) -> Float:
+    """Curvature (D, D) of the log-likelihood by all parameters, its stars marginalised.
+
+    Arguments are as of `expected_solution`.
+    """
+    return _expanded(model, truth, detections, 2)[1]
+
+
+def _expanded(
+    model: DistortionModel, truth: Float, detections: Detections, min_detections: int
+) -> tuple[Problem, Float]:
+    """Problem of detections without noise, and the curvature (D, D) of its log-likelihood."""
+    # there are no false detections, so the match radius does not matter
+    problem = prepare(model, detections, truth, match_radius=1.0, min_detections=min_detections)
+    stars = problem.mean_places(truth)
+    problem = problem.at(truth, stars)
+    return problem, expand(problem, truth, NONE_FALSE, stars)[0].curvature

@@ -25,11 +25,18 @@ from bayesdist.infer.equations.priors import Prior
 from bayesdist.infer.equations.scaled import one_thread
 from bayesdist.infer.posterior import Posterior
 from bayesdist.infer.sampler.chains import ChainSettings, ensemble_seeds, run_chains
-from bayesdist.infer.selfcal.elimination import Mixture, memberships
+from bayesdist.infer.selfcal.elimination import (
+    Mixture,
+    ModePiece,
+    in_pieces,
+    log_density,
+    memberships,
+    slope,
+    to_sample,
+)
 from bayesdist.infer.selfcal.mode import SelfCalibrationMode
-from bayesdist.infer.selfcal.pieces import in_pieces, log_density, slope, to_sample
 from bayesdist.infer.selfcal.problem import Problem
-from bayesdist.infer.stars.mixture import Hyper, OutlierMixture
+from bayesdist.infer.stars.likelihood import Hyper, OutlierMixture
 from bayesdist.infer.stars.shards import Compute, Pieces
 from bayesdist.utils.arrays import Float
 
@@ -52,7 +59,7 @@ class SelfTarget:
     """Posterior density of psi = (free parameters, log j, logit f), with the jitter j in pixels."""
 
     solution: SelfCalibrationMode  # the mode; fixed parameters keep their values there
-    pieces: Pieces  # its detections
+    pieces: Pieces[ModePiece]  # its detections
     outliers: OutlierMixture | None = None  # in pixels; default: see `mixture`
 
     @property

@@ -3,17 +3,24 @@
 from bayesdist.infer.series.compare import (
     Comparison,
     FilterDependence,
+    Verdict,
     compare,
+    default_candidates,
+    describe,
     filter_dependence,
     serial_correlation,
 )
-from bayesdist.infer.series.design import Design
-from bayesdist.infer.series.fit import fit_series
-from bayesdist.infer.series.heldout import HeldOut, block_folds, exposure_folds, held_out
-from bayesdist.infer.series.posterior import Change, Prediction, SeriesPosterior
-from bayesdist.infer.series.series import Series
-from bayesdist.infer.series.trend import KINDS, TrendModel
-from bayesdist.infer.series.verdict import Verdict, default_candidates, describe
+from bayesdist.infer.series.posterior import (
+    Change,
+    HeldOut,
+    Prediction,
+    SeriesPosterior,
+    block_folds,
+    exposure_folds,
+    fit_series,
+    held_out,
+)
+from bayesdist.infer.series.series import KINDS, Design, Series, TrendModel
 
 __all__ = [
     "KINDS",

@@ -16,12 +16,12 @@ import numpy as np
 from bayesdist.data.matches import Matches
 from bayesdist.data.tables.column import conversion
 from bayesdist.errors import DegenerateError, InputError
-from bayesdist.infer.equations.gauss_newton import (
+from bayesdist.infer.equations.normal import (
     gauss_newton,
+    least_squares,
     refuse_absorbed_drift,
     starting_point,
 )
-from bayesdist.infer.equations.normal import least_squares
 from bayesdist.infer.equations.priors import GaussianPriors
 from bayesdist.infer.equations.rank import check_coverage, require_full_rank
 from bayesdist.infer.equations.scaled import scaled_cholesky

@@ -17,8 +17,7 @@ from bayesdist.utils.quantities import Random
 if TYPE_CHECKING:  # not imported at run time, so that inspecting a file stays fast
     from bayesdist.data.matches import Matches
     from bayesdist.infer.convergence import Convergence
-    from bayesdist.infer.stars.likelihood import Likelihood
-    from bayesdist.infer.stars.mixture import OutlierMixture
+    from bayesdist.infer.stars.likelihood import Likelihood, OutlierMixture
 
 
 def root_of_diagonal(cov: Float) -> Float:

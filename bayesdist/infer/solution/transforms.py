@@ -20,8 +20,8 @@ from bayesdist.infer.solution.solution import (
     root_of_diagonal,
 )
 from bayesdist.model import DistortionModel, TimeDependence
-from bayesdist.model.grouping import Groups
-from bayesdist.model.similarity import turned, turned_model
+from bayesdist.model.alignment import turned, turned_model
+from bayesdist.model.effective import Groups
 from bayesdist.utils.arrays import Complex, Float
 
 # constant, x and y terms of both axes, numbered as in ACS ISR 2015-06 (Equations 1-2)

@@ -19,14 +19,14 @@ import pickle
 import tempfile
 import threading
 import weakref
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import CancelledError
 from contextlib import AbstractContextManager, ExitStack, contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from time import monotonic
-from typing import Any, Self
+from typing import Any, Concatenate, Generic, cast
 
 from bayesdist.data.matches import Matches
 from bayesdist.errors import FormatError, InputError
@@ -36,13 +36,15 @@ from bayesdist.infer.stars.shards import (
     BRANCHES,
     Compute,
     MappedPieces,
+    P,
+    Piece_co,
     Shards,
-    Task,
+    Survey,
+    T,
     shard_of,
     total,
 )
 from bayesdist.infer.stars.stars import Stars
-from bayesdist.infer.stars.survey import Survey
 from bayesdist.model import DistortionModel
 from bayesdist.version import __version__
 
@@ -76,7 +78,7 @@ class _Lease:
     """Token shared by all pieces on a cluster, which is closed when no piece holds it any more."""
 
 
-class ClusterPieces(MappedPieces):
+class ClusterPieces(MappedPieces[Piece_co]):
     """Pieces on the workers of a Dask cluster, made there from sources by a function.
 
     If `compute` has a `scheduler`, that cluster is used; its workers must have the same version of
@@ -91,7 +93,9 @@ class ClusterPieces(MappedPieces):
     the workers.
     """
 
-    def __init__(self, make: Task, sources: Iterable[Any], compute: Compute) -> None:
+    def __init__(
+        self, make: Callable[[Any], Piece_co], sources: Iterable[Any], compute: Compute
+    ) -> None:
         self._pieces: list[Future] = []
         self._loading: set[str] = set()  # workers that sources are tied to
         self._client, cluster = _connected(compute)
@@ -130,8 +134,10 @@ class ClusterPieces(MappedPieces):
             self.close()
             raise
 
-    def sum(self, task: Task, *args: Any) -> Any:
-        """Sum of ``task(piece, *args)`` over the pieces, added in their order.
+    def sum(
+        self, task: Callable[Concatenate[Piece_co, P], T], *args: P.args, **options: P.kwargs
+    ) -> T:
+        """Sum of ``task(piece, *args, **options)`` over the pieces, added in their order.
 
         Raises InputError if there are no workers any more, or if workers die while they run the
         task.  Otherwise an exception of the task is raised: that of the first piece that fails or,
@@ -139,7 +145,7 @@ class ClusterPieces(MappedPieces):
         """
         with _large_graphs():
             with self._connection():
-                parts = self._tasks(task, args)
+                parts = self._tasks(task, args, options)
                 while len(parts) > BRANCHES:
                     parts = [
                         self._client.submit(total, parts[k : k + BRANCHES], pure=False)
@@ -147,22 +153,26 @@ class ClusterPieces(MappedPieces):
                     ]
             return total(self._results(parts))
 
-    def each(self, task: Task, *args: Any) -> Iterator[Any]:
-        """Yield ``task(piece, *args)`` in the order of the pieces; see `sum` for exceptions."""
+    def each(
+        self, task: Callable[Concatenate[Piece_co, P], T], *args: P.args, **options: P.kwargs
+    ) -> Iterator[T]:
+        """Yield ``task(piece, *args, **options)`` in their order; see `sum` for exceptions."""
         with _large_graphs():
             with self._connection():
-                futures = self._tasks(task, args)
+                futures = self._tasks(task, args, options)
             yield from self._results(futures)
 
-    def map(self, task: Task, *args: Any) -> Self:
-        """New pieces ``task(piece, *args)``, each on the worker that has the piece.
+    def map(
+        self, task: Callable[Concatenate[Piece_co, P], T], *args: P.args, **options: P.kwargs
+    ) -> ClusterPieces[T]:
+        """New pieces ``task(piece, *args, **options)``, each on the worker that has the piece.
 
         If a worker is lost, they are computed again from the original pieces.  See `sum` for
         exceptions.
         """
-        out = copy.copy(self)
+        out = cast("ClusterPieces[T]", copy.copy(self))
         with _large_graphs(), self._connection():
-            out._pieces = self._tasks(task, args)
+            out._pieces = self._tasks(task, args, options)
             futures = out._on_each(_made)
         for _ in out._results(futures):
             pass
@@ -174,15 +184,17 @@ class ClusterPieces(MappedPieces):
         self._pieces = []
         self._end()
 
-    def _tasks(self, task: Task, args: tuple[Any, ...]) -> list[Future]:
+    def _tasks(
+        self, task: Callable[..., object], args: tuple[Any, ...], options: dict[str, Any]
+    ) -> list[Future]:
         """Submit a task for each piece."""
-        work: _Work | Future = _Work(task, args)
-        if len(pickle.dumps(args, protocol=5)) > LARGE:
+        work: _Work | Future = _Work(task, args, options)
+        if len(pickle.dumps((args, options), protocol=5)) > LARGE:
             # sent once, as the result of a task, which unlike scattered data survives its worker
             work = self._client.submit(_same, work, pure=False)
         return self._on_each(_pass, work=work)
 
-    def _on_each(self, function: Task, **options: Any) -> list[Future]:
+    def _on_each(self, function: Callable[..., object], **options: Any) -> list[Future]:
         # Restrict the tasks loosely to the workers. Without a restriction, Dask would treat a small
         # number of tasks as roots of a graph and distribute them regardless of where the pieces
         # are, so that the pieces would have to be transferred.
@@ -274,7 +286,7 @@ class ClusterPieces(MappedPieces):
         self._loading = set()
 
 
-class ClusterShards(ClusterPieces, Shards):
+class ClusterShards(Shards):
     """Shards on the workers of a Dask cluster.
 
     Batches of stars in memory are sent to the workers.  Batches on disk are read by the workers,
@@ -284,20 +296,26 @@ class ClusterShards(ClusterPieces, Shards):
     """
 
     def __init__(self, model: DistortionModel, matches: Matches, compute: Compute) -> None:
-        Shards.__init__(self, model)
+        super().__init__(model)
         make = partial(shard_of, model, n_total=len(matches))
         if not matches.in_memory:
             compute = replace(compute, scratch=None)
-        ClusterPieces.__init__(self, make, matches.readers(), compute)
+        self._pieces = ClusterPieces(make, matches.readers(), compute)
         try:
-            self.survey = super().sum(_survey)
+            self.survey = self._pieces.sum(_survey)
         except BaseException:
             self.close()
             raise
 
-    def sum(self, task: Task, *args: Any) -> Any:
-        """Sum of ``task(stars, *args)`` over the shards; see `ClusterPieces.sum`."""
-        return super().sum(_of_stars, task, *args)
+    def sum(
+        self, task: Callable[Concatenate[Stars, P], T], *args: P.args, **options: P.kwargs
+    ) -> T:
+        """Sum of ``task(stars, *args, **options)`` over the shards; see `ClusterPieces.sum`."""
+        return self._pieces.sum(_OfStars(task), *args, **options)
+
+    def close(self) -> None:
+        """Release the data, and shut down the cluster if it was started here."""
+        self._pieces.close()
 
 
 def _survey(shard: tuple[Stars, Survey]) -> Survey:
@@ -305,17 +323,23 @@ def _survey(shard: tuple[Stars, Survey]) -> Survey:
     return shard[1]
 
 
-def _of_stars(shard: tuple[Stars, Survey], task: Task, *args: Any) -> Any:
-    """Result of a task for the stars of a shard (runs on a worker)."""
-    return task(shard[0], *args)
+@dataclass(frozen=True)
+class _OfStars(Generic[P, T]):
+    """Task for the stars of a shard (runs on a worker)."""
+
+    task: Callable[Concatenate[Stars, P], T]
+
+    def __call__(self, shard: tuple[Stars, Survey], /, *args: P.args, **options: P.kwargs) -> T:
+        return self.task(shard[0], *args, **options)
 
 
 @dataclass(frozen=True, eq=False)
 class _Work:
     """A task and its arguments, wrapped so that Dask does not inspect them."""
 
-    task: Task
+    task: Callable[..., object]
     args: tuple[Any, ...]
+    options: dict[str, Any]
 
 
 @dataclass(frozen=True)
@@ -343,7 +367,7 @@ class _Written:
             raise InputError(error.cause, where=error.where, do=do) from error
 
 
-def _made_from(make: Task, source: Any) -> Any:
+def _made_from(make: Callable[[Any], T], source: Any) -> T:
     """Make a piece from a source, which may be in a file (runs on a worker)."""
     return make(source.read() if isinstance(source, _Written) else source)
 
@@ -357,12 +381,12 @@ def _same(work: _Work) -> _Work:
     return work
 
 
-def _pass(piece: Any, work: _Work) -> Any:
+def _pass(piece: object, work: _Work) -> object:
     """Result of a task for a piece (runs on a worker)."""
     with _one_pass:
         # the setting belongs to the thread, which may differ from call to call
         kernel.set_threads(get_worker().state.nthreads)
-        return work.task(piece, *work.args)
+        return work.task(piece, *work.args, **work.options)
 
 
 async def _in_order(client: Any, futures: Sequence[Future]) -> list[Any]:

@@ -7,26 +7,38 @@ threads nor on the engine.
 
 from __future__ import annotations
 
+import io
+import tempfile
+import weakref
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass, replace
 from functools import reduce
-from itertools import islice
+from itertools import chain, islice
 from operator import add
-from typing import Any, Self
+from typing import Any, Concatenate, Generic, ParamSpec, TypeVar
+
+import numpy as np
+from scipy.spatial import ConvexHull, QhullError
 
 from bayesdist.data.matches import BatchReader, Matches
 from bayesdist.errors import InputError
-from bayesdist.infer.stars.scratch import Store
 from bayesdist.infer.stars.stars import Stars, prepare
-from bayesdist.infer.stars.survey import Survey, survey
-from bayesdist.model import DistortionModel, Groups
+from bayesdist.model import DistortionModel, Groups, merge_groups
+from bayesdist.utils.arrays import Float, Int
 from bayesdist.utils.memory import release_memory
 
-Task = Callable[..., Any]
-
+P = ParamSpec("P")
+T = TypeVar("T")
+Piece_co = TypeVar("Piece_co", covariant=True)
 BRANCHES = 16  # number of branches of the summation tree
 SAMPLE = 1_000_000  # number of stars used to compute the median error
+
+EMPTY = np.zeros(0)
+COLUMNS, OFFSETS = ("X", "Y", "u", "v", "var_u", "var_v"), ("off_u", "off_v")
+
+# relative tolerance for stars at the edge of their match circle
+ROUNDING = 1e-6
 
 
 @dataclass(frozen=True)
@@ -83,31 +95,40 @@ class Compute:
             )
 
 
-class Pieces(ABC):
+class Pieces(ABC, Generic[Piece_co]):
     """Data divided into pieces, in memory, on disk or on a cluster."""
 
     @abstractmethod
-    def sum(self, task: Task, *args: Any) -> Any:
-        """Sum of ``task(piece, *args)`` over the pieces, added in their order."""
+    def sum(
+        self, task: Callable[Concatenate[Piece_co, P], T], *args: P.args, **options: P.kwargs
+    ) -> T:
+        """Sum of ``task(piece, *args, **options)`` over the pieces, added in their order."""
 
     @abstractmethod
     def close(self) -> None:
         """Release the data."""
 
 
-class MappedPieces(Pieces):
+class MappedPieces(Pieces[Piece_co]):
     """Pieces that can be mapped to other pieces at the same location."""
 
     @abstractmethod
-    def each(self, task: Task, *args: Any) -> Iterable[Any]:
-        """Results ``task(piece, *args)`` in the order of the pieces."""
+    def each(
+        self, task: Callable[Concatenate[Piece_co, P], T], *args: P.args, **options: P.kwargs
+    ) -> Iterable[T]:
+        """Results ``task(piece, *args, **options)`` in the order of the pieces."""
 
     @abstractmethod
-    def map(self, task: Task, *args: Any) -> Self:
-        """New pieces ``task(piece, *args)``; they are valid until the original ones are closed."""
+    def map(
+        self, task: Callable[Concatenate[Piece_co, P], T], *args: P.args, **options: P.kwargs
+    ) -> MappedPieces[T]:
+        """New pieces ``task(piece, *args, **options)``.
+
+        They are valid until the original ones are closed.
+        """
 
 
-class Shards(Pieces):
+class Shards(Pieces[Stars]):
     """Stars prepared for a model, divided into shards; each shard is a `Stars` object.
 
     Parameters
@@ -150,9 +171,11 @@ class LocalShards(Shards):
         if not matches.in_memory:
             release_memory()
 
-    def sum(self, task: Task, *args: Any) -> Any:
-        """Sum of ``task(stars, *args)`` over the shards, added in their order."""
-        return total(task(stars, *args) for stars in self._store)
+    def sum(
+        self, task: Callable[Concatenate[Stars, P], T], *args: P.args, **options: P.kwargs
+    ) -> T:
+        """Sum of ``task(stars, *args, **options)`` over the shards, added in their order."""
+        return total(task(stars, *args, **options) for stars in self._store)
 
     def close(self) -> None:
         """Release the data."""
@@ -166,8 +189,233 @@ def shard_of(model: DistortionModel, reader: BatchReader, n_total: int) -> tuple
     return stars, survey(stars, table, max(1, n_total // SAMPLE))
 
 
-def total(parts: Iterable[Any]) -> Any:
-    """Sum of parts, added in their order by a tree with `BRANCHES` branches; None for no parts."""
+def total(parts: Iterable[T]) -> T:
+    """Sum of parts, added in their order by a tree with `BRANCHES` branches.
+
+    Raises ValueError if there are no parts.
+    """
     remaining = iter(parts)
     sums = [reduce(add, islice(remaining, BRANCHES - 1), first) for first in remaining]
-    return total(sums) if len(sums) > 1 else next(iter(sums), None)
+    if not sums:
+        raise ValueError("there are no parts to add")
+    return total(sums) if len(sums) > 1 else sums[0]
+
+
+# -- storage of shards in memory up to a limit, and beyond it in a scratch file --------------------
+
+
+class Store:
+    """Sequence of shards, with at most `budget` bytes of columns in memory."""
+
+    def __init__(self, budget: float) -> None:
+        self._left = budget
+        self._kept: list[tuple[Stars, tuple[io.FileIO, int] | None]] = []
+        self._file: io.FileIO | None = None
+
+    def __len__(self) -> int:
+        return len(self._kept)
+
+    def add(self, stars: Stars) -> None:
+        """Append a shard; raises InputError if the disk is full."""
+        if stars.nbytes <= self._left:
+            self._left -= stars.nbytes
+            self._kept.append((stars, None))
+            return
+        stars.blocks, stars.pieces  # noqa: B018  computed once and kept in memory
+        try:
+            if self._file is None:
+                # an unnamed file, which is removed when the process ends for any reason
+                self._file = tempfile.TemporaryFile(buffering=0, prefix="bayesdist-")  # noqa: SIM115
+                self._closed = weakref.finalize(self, self._file.close)
+            place = (self._file, self._file.seek(0, 2))
+            for column in (*stars.columns, *stars.offsets):
+                _write(self._file, np.ascontiguousarray(column).view(np.uint8).data)
+        except OSError as error:
+            raise InputError(
+                f"the stars do not fit into the scratch folder ({error.strerror})",
+                where=_folder(),
+                do="set TMPDIR to a folder with more space, or increase compute.memory_mb",
+            ) from error
+        none: dict[str, Any] = dict.fromkeys(COLUMNS + OFFSETS[: len(stars.offsets)], EMPTY)
+        frame = replace(stars, **none)
+        frame.__dict__.update(blocks=stars.blocks, pieces=stars.pieces)
+        self._kept.append((frame, place))
+
+    def close(self) -> None:
+        """Release the shards and the scratch file."""
+        self._kept = []
+        if self._file is not None:
+            self._closed()
+            self._file = None
+
+    def __iter__(self) -> Iterator[Stars]:
+        for stars, place in self._kept:
+            yield stars if place is None else self._restored(stars, *place)
+
+    def _restored(self, frame: Stars, file: io.FileIO, place: int) -> Stars:
+        n = int(frame.starts[-1])
+        names = COLUMNS + OFFSETS[: len(frame.offsets)]
+        columns = np.empty((len(names), n))
+        file.seek(place)
+        view, done = columns.ravel().view(np.uint8).data, 0
+        while done < len(view):
+            got = file.readinto(view[done:])
+            if not got:
+                raise InputError("the scratch file has been truncated", do="start again")
+            done += got
+        read: dict[str, Any] = dict(zip(names, columns, strict=True))
+        stars = replace(frame, **read)
+        stars.__dict__.update(blocks=frame.blocks, pieces=frame.pieces)
+        return stars
+
+
+def _write(file: io.FileIO, view: memoryview) -> None:
+    """Write all bytes, repeatedly, since a write to an almost full disk may be partial."""
+    while len(view):
+        view = view[file.write(view) :]
+
+
+def _folder() -> str:
+    """Path of the scratch folder, or "TMPDIR" if none is usable."""
+    try:
+        return tempfile.gettempdir()
+    except OSError:
+        return "TMPDIR"
+
+
+# -- statistics of the stars that are needed before a fit, as sums over chunks of the data ---------
+
+
+@dataclass(frozen=True, eq=False)
+class ChipSurvey:
+    """Number and extent of the stars on one chip."""
+
+    n: int  # number of stars
+    # vertices (m, 2) of the convex hull, FITS 1-based pixels; all points if they span no area
+    corners: Float
+    sums: Float  # sums (5,) of x, y, x^2, xy, y^2 in units of the chip's size
+    outside: str  # message about the first star outside the chip; empty if there is none
+
+    def __add__(self, other: ChipSurvey) -> ChipSurvey:
+        return ChipSurvey(
+            self.n + other.n,
+            _hull(np.concatenate([self.corners, other.corners])),
+            self.sums + other.sums,
+            self.outside or other.outside,
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Survey:
+    """Statistics of stars; the surveys of different chunks of the data can be added."""
+
+    n: int  # number of stars
+    groups: Groups  # without members
+    exposures: Int  # number (E,) of stars in each exposure of the model
+    chips: tuple[ChipSurvey, ...]  # in the order of the model's chips
+    variance: tuple[Float, ...]  # evenly spaced samples of the squared errors of both axes
+    sources: tuple[str, ...]  # names of the files
+    # largest distance of a star from its nominal position, and the name of the star; the distance
+    # is negative if nominal positions are unknown
+    farthest: tuple[float, str] = (-1.0, "")
+
+    def __add__(self, other: Survey) -> Survey:
+        return Survey(
+            self.n + other.n,
+            merge_groups(self.groups, other.groups)[0],
+            self.exposures + other.exposures,
+            tuple(a + b for a, b in zip(self.chips, other.chips, strict=True)),
+            self.variance + other.variance,
+            self.sources,
+            max(self.farthest, other.farthest, key=lambda one: one[0]),
+        )
+
+    @property
+    def reference_sigma(self) -> float:
+        """Median quoted error per axis, which is the scale of the priors."""
+        return float(np.sqrt(np.median(np.concatenate(self.variance))))
+
+    def check_circle(self, radius: float | None) -> None:
+        """Raise InputError if a star is outside its match circle.
+
+        `radius` is in the unit of u, v; None if there is no match circle.  The message names the
+        star that is farthest from its nominal position.
+        """
+        distance, star_name = self.farthest
+        if radius is not None and distance > radius * (1 + ROUNDING):
+            raise InputError(
+                f"is {distance:.6g} from its nominal position, outside the match circle of "
+                f"radius {radius:g}",
+                where=star_name,
+                do="set outliers.match_radius to the radius with which the stars were matched, or "
+                "correct the row",
+            )
+
+    @property
+    def where(self) -> str:
+        """Names of the files, for error messages."""
+        return ", ".join(self.sources)
+
+
+def survey(stars: Stars, matches: Matches, every: int) -> Survey:
+    """Survey of a chunk of the data; the errors of every `every`-th star are sampled."""
+    model = stars.model
+    numbers = matches.chip_number
+    chips = []
+    for chip in model.chips:
+        rows = np.flatnonzero(numbers == chip.number) if len(model.chips) > 1 else slice(None)
+        x, y = matches.x[rows], matches.y[rows]
+        out = (x < 0.5) | (x > chip.size[0] + 0.5) | (y < 0.5) | (y > chip.size[1] + 0.5)
+        sentence = ""
+        if out.any():
+            k = int(np.arange(len(matches))[rows][np.argmax(out)])
+            file = f" of {matches.sources[matches.source[k]]}" if len(matches.sources) > 1 else ""
+            sentence = (
+                f"row {matches.row[k] + 1}{file} lies at pixel ({matches.x[k]:.2f}, "
+                f"{matches.y[k]:.2f}), outside the {chip.size[0]:g} x {chip.size[1]:g} detector"
+            )
+            if bool(((x <= chip.size[1] + 0.5) & (y <= chip.size[0] + 0.5)).all()):
+                sentence += " (all rows would lie inside if x and y, or the size, are swapped)"
+        a, b = x / chip.size[0], y / chip.size[1]
+        sums = np.array([a.sum(), b.sum(), a @ a, a @ b, b @ b])
+        chips.append(ChipSurvey(len(x), _hull(np.column_stack([x, y])), sums, sentence))
+    return Survey(
+        n=len(stars),
+        groups=stars.groups,
+        # truncated to the exposures of the model, which may be fewer if it has no frames
+        exposures=np.bincount(matches.exposure, minlength=len(model.exposures))[
+            : len(model.exposures)
+        ],
+        chips=tuple(chips),
+        variance=(stars.var_u[::every].copy(), stars.var_v[::every].copy()),
+        sources=matches.sources,
+        farthest=_farthest(matches),
+    )
+
+
+def _farthest(matches: Matches) -> tuple[float, str]:
+    """Largest distance of a star from its nominal position, and the file and row of the star."""
+    if matches.u_nominal is None or matches.v_nominal is None:
+        return -1.0, ""
+    distance = np.hypot(matches.u - matches.u_nominal, matches.v - matches.v_nominal)
+    k = int(np.argmax(distance))
+    return float(distance[k]), f"{matches.sources[matches.source[k]]}, row {matches.row[k] + 1}"
+
+
+def _hull(points: Float) -> Float:
+    """Vertices of the convex hull, or all points if it has no area."""
+    if len(points) < 4:
+        return points
+    try:
+        if len(points) > 1000:  # drop points inside the octagon of the extremes, for speed
+            x, y = points.T
+            projections = (x, y, x + y, x - y)
+            extreme = points[sorted(set(chain(*((p.argmin(), p.argmax()) for p in projections))))]
+            inner = ConvexHull(extreme).equations
+            beyond = np.zeros(len(points), bool)
+            for a, b, c in inner:
+                beyond |= a * x + b * y + c > -1e-9
+            points = points[beyond]
+        return points[ConvexHull(points).vertices]
+    except QhullError:  # nearly collinear: no area
+        return points

@@ -38,7 +38,7 @@ if TYPE_CHECKING:
 
     from bayesdist.assess.comparison.compare import Comparison
     from bayesdist.assess.planning.dithers import PlannedPattern
-    from bayesdist.infer.compare.order_result import OrderSelection
+    from bayesdist.infer.compare.order import OrderSelection
 
 
 LEVELS = (0.0, 1.0, 2.0, 3.0, 4.0, 5.0)

@@ -30,7 +30,7 @@ from bayesdist.formats.lookup.d2im import read_d2im
 from bayesdist.formats.lookup.file import read_lookup_file
 from bayesdist.infer import load_fit, load_posterior
 from bayesdist.infer.exposures.shared_drift import drift_priors, with_drift_of
-from bayesdist.infer.nodes.table_fit import held_sigma
+from bayesdist.infer.nodes.fit import held_sigma
 from bayesdist.infer.series import Series, fit_series
 from bayesdist.infer.solution.transforms import linear_terms, lines, reference_gauge, without_frames
 from bayesdist.missions.hst.simulate import acs_solution, making, read_acs, simulate_acs

@@ -8,7 +8,7 @@ import pytest
 from bayesdist.app.config import load_config
 from bayesdist.app.config.fit import ComputeBlock
 from bayesdist.app.pipeline import fit, match, read, sample
-from bayesdist.infer.selfcal import pieces
+from bayesdist.infer.selfcal import elimination
 from bayesdist.infer.stars import cluster
 from tests.app.selfcal.support import list_table, small, write_selfcal
 from tests.reduced import only_in_full
@@ -25,16 +25,16 @@ def test_draws_are_those_of_one_process(tmp_path, monkeypatch):
             passes.append(task)
             return super().sum(task, *args)
 
-    monkeypatch.setattr(pieces, "PIECE", 500)
+    monkeypatch.setattr(elimination, "PIECE", 500)
     monkeypatch.setattr(cluster, "ClusterPieces", Counted)
     sections = {"sampler": {"target_ess": 100}, "compute": {"engine": "dask", "workers": 2}}
     path = write_selfcal(tmp_path, list_table(small()), **sections)
     config, _ = load_config(path)
     data = fit(match(read(config, tmp_path), config), config, tmp_path)
-    assert {pieces.expansion_of, pieces.expansion} == set(passes)
+    assert {elimination.expansion_of, elimination.expansion} == set(passes)
     passes.clear()
     there = sample(data, config)
-    assert {pieces.log_density, pieces.slope} == set(passes)
+    assert {elimination.log_density, elimination.slope} == set(passes)
     here = sample(data, config.model_copy(update={"compute": ComputeBlock()}))
     sd = here.theta.std(axis=(0, 1))
     assert (np.abs(there.theta - here.theta) <= 1e-10 * np.maximum(sd, np.abs(here.theta))).all()

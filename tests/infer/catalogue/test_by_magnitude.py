@@ -9,7 +9,6 @@ from numpy.polynomial import legendre
 from bayesdist.data import Matches, read_matches
 from bayesdist.errors import InputError
 from bayesdist.infer import Rejection, build_model, fit_by_magnitude, fit_linear, residuals
-from bayesdist.infer.catalogue import by_magnitude
 from tests.reduced import case_in_full
 
 from ..support import simulated
@@ -85,19 +84,16 @@ def test_one_error_for_all_is_that_of_the_residuals_and_their_freedom():
 @pytest.mark.parametrize(
     "name", [case_in_full("AstroTomii", instead="another field is run"), "Harry695"]
 )
-def test_real_pairs_of_every_order_have_errors(name, data_dir, monkeypatch):
+def test_real_pairs_of_every_order_have_errors(name, data_dir):
     """Fields on which fit and errors in turn swung for ever; the climb ends long before its end."""
-    monkeypatch.setattr(by_magnitude, "TURNS", 60)
     path = data_dir / "anet_pairs" / f"{name}_corr.fits"
     table = read_matches(path, format="astrometry.net", sigma="by_magnitude")
     size = (table.x.max() + 1, table.y.max() + 1)
     found = []
     for order in range(1, 8):
         model = build_model(table, order=order, size=size)
-        short = fit_by_magnitude(table, model)[2]
-        monkeypatch.setattr(by_magnitude, "TURNS", 1000)
-        fit, _, errors = fit_by_magnitude(table, model)
-        monkeypatch.setattr(by_magnitude, "TURNS", 60)
+        short = fit_by_magnitude(table, model, max_iterations=60)[2]
+        fit, _, errors = fit_by_magnitude(table, model, max_iterations=1000)
         np.testing.assert_array_equal(errors.sigma_u, short.sigma_u)
         found.append(errors.sigma_u)
         assert 0.9 < fit.chi2 / fit.dof < 2.0

@@ -12,7 +12,6 @@ from threadpoolctl import threadpool_limits
 from bayesdist.data.matches import Matches
 from bayesdist.errors import InputError
 from bayesdist.infer import GaussianPriors, Rejection, fit_linear
-from bayesdist.infer.catalogue import star_sums as module
 from bayesdist.infer.catalogue.star_errors import StarErrors, star_covariance
 from bayesdist.infer.exposures.hierarchy import fit_hierarchical
 from bayesdist.infer.solution.solution import Solution
@@ -78,15 +77,14 @@ def dense(fit, matches, code, catalogue, weight):
 
 
 @pytest.mark.parametrize("scratch", [64_000_000, 16 * 100 * 7])
-def test_it_is_the_dense_formula(scratch, monkeypatch):
+def test_it_is_the_dense_formula(scratch):
     """Also in pieces of a few stars, and with one star several times in one exposure."""
-    monkeypatch.setattr(module, "SCRATCH", scratch)
     _, matches, fit, code, catalogue = some()
     used = fit.uses(matches)
     assert 0 < (~used).sum() < 100
     pairs = {tuple(p) for p in np.column_stack([code, matches.exposure, matches.chip])}
     assert len(pairs) < len(matches)  # some do stand twice
-    found = star_covariance(fit, matches, catalogue)
+    found = star_covariance(fit, matches, catalogue, scratch=scratch)
     total, counted = dense(fit, matches, code, catalogue, used.astype(float))
     scale = np.sqrt(np.diag(total))
     unit = np.outer(scale, scale)

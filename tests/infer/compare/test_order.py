@@ -12,8 +12,13 @@ from scipy import stats
 from bayesdist.data import open_matches, write_partitioned
 from bayesdist.errors import DegenerateError, InputError
 from bayesdist.infer import Rejection, fit_linear
-from bayesdist.infer.compare.order import select_order
-from bayesdist.infer.compare.order_sums import bin_sums, departures, fold_sums, held_out_gain
+from bayesdist.infer.compare.order import (
+    bin_sums,
+    departures,
+    fold_sums,
+    held_out_gain,
+    select_order,
+)
 from bayesdist.infer.stars.stars import prepare
 from bayesdist.missions.wise.simulate import wise_solution
 from bayesdist.model import Chip, DistortionModel

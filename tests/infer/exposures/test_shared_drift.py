@@ -11,7 +11,7 @@ from bayesdist.errors import DegenerateError, InputError
 from bayesdist.infer.exposures.shared_drift import drift_priors, with_drift_of
 from bayesdist.infer.solution.transforms import lines, reference_gauge, without_frames
 from bayesdist.model import TimeDependence
-from bayesdist.model.similarity import turned, turned_model
+from bayesdist.model.alignment import turned, turned_model
 from tests.infer.solution.test_transforms import Gaussian, acs
 
 

@@ -14,7 +14,7 @@ import pytest
 from scipy import stats
 
 from bayesdist.infer import kernel
-from bayesdist.infer.kernel import Constants, blocks, likelihood
+from bayesdist.infer.kernel import Constants, blocks, mixture
 from bayesdist.model.basis import polynomial_terms
 
 KINDS = {
@@ -151,7 +151,7 @@ def test_each_draw_is_by_itself(kind, monkeypatch):
     together = run(starts, columns, coef, order, constants)
     for step in (1, 2, 3):
         n_blocks = len(kernel.pieces_of(starts, kernel.BLOCK))
-        monkeypatch.setattr(likelihood, "SCRATCH", 8 * n_blocks * step)
+        monkeypatch.setattr(mixture, "SCRATCH", 8 * n_blocks * step)
         np.testing.assert_array_equal(run(starts, columns, coef, order, constants), together)
     for d in range(7):
         one = slice(d, d + 1)

@@ -25,7 +25,7 @@ from bayesdist.infer.kernel.lanes import (
     total,
 )
 from bayesdist.infer.kernel.moments import add_columns
-from bayesdist.infer.kernel.polynomial import legendre
+from bayesdist.infer.kernel.numeric import legendre
 
 
 @nb.njit

@@ -7,8 +7,8 @@ import pytest
 from scipy.optimize import minimize_scalar
 
 from bayesdist.infer.nodes import hyperparameters
+from bayesdist.infer.nodes.grid import node_sums
 from bayesdist.infer.nodes.hyperparameters import SMOOTHNESS, Evidence, Matern, fitted_field
-from bayesdist.infer.nodes.sums import node_sums
 from tests.infer.nodes.support import (
     CHIP,
     PATTERN,

@@ -23,7 +23,6 @@ from bayesdist.infer import (
     save_fit,
     save_posterior,
 )
-from bayesdist.infer.posterior import files
 from bayesdist.model import TimeDependence
 from tests.reduced import case_in_full
 
@@ -169,17 +168,14 @@ def test_what_is_said_of_each_star_is_the_mean_over_some_draws(written, az):
 
 
 @OF_ONE
-def test_large_runs_leave_out_star_times_draw_and_then_the_stars(
-    written, az, monkeypatch, tmp_path
-):
+def test_large_runs_leave_out_star_times_draw_and_then_the_stars(written, az, tmp_path):
     posterior, matches, _ = written
-    monkeypatch.setattr(files, "LARGEST", posterior.log_prob.size * len(matches) * 8 - 1)
-    save_posterior(posterior, matches, tmp_path / "big.nc")
+    max_bytes = posterior.log_prob.size * len(matches) * 8 - 1
+    save_posterior(posterior, matches, tmp_path / "big.nc", max_bytes=max_bytes)
     draws = {"posterior", "sample_stats", "diagnostics"}
     with xr.open_datatree(tmp_path / "big.nc", engine="h5netcdf") as tree:
         assert set(tree.children) == draws | {"observed_data", "constant_data"}
-    monkeypatch.setattr(files, "MOST_STARS", len(matches) - 1)
-    save_posterior(posterior, matches, tmp_path / "larger.nc")
+    save_posterior(posterior, matches, tmp_path / "larger.nc", max_stars=len(matches) - 1)
     save_posterior(posterior, None, tmp_path / "none.nc")
     for name in ("larger.nc", "none.nc"):
         with xr.open_datatree(tmp_path / name, engine="h5netcdf") as tree:

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from bayesdist.data import batches
 from bayesdist.infer import GaussianPriors, OutlierMixture, load, memberships
 from bayesdist.infer.density.target import Target
-from bayesdist.infer.posterior import memberships as membership
 from bayesdist.infer.posterior.memberships import count_outliers, some_draws, star_log_likelihood
 
 from ..oracle import star_terms
@@ -64,10 +65,9 @@ def test_memberships_are_means_over_the_draws(known):
 
 
 @pytest.mark.parametrize("at_a_time", [1, 1000, 1_000_000])
-def test_log_likelihoods_of_the_stars_add_up_to_the_density(known, at_a_time, monkeypatch):
-    monkeypatch.setattr(membership, "AT_A_TIME", at_a_time)
+def test_log_likelihoods_of_the_stars_add_up_to_the_density(known, at_a_time):
     target, posterior, matches, _, loglik, psi = known
-    by_star = star_log_likelihood(posterior, matches)
+    by_star = star_log_likelihood(posterior, matches, at_a_time)
     assert by_star.shape == (1, DRAWS, 400)
     np.testing.assert_allclose(by_star[0], loglik, rtol=1e-10, atol=1e-9)
     prior = target.hyper.log_prior(psi[:, target.n_theta :])
@@ -119,13 +119,13 @@ def test_fewer_draws_for_more_stars():
     assert len(some_draws(theta[:5], h[:5], 10)[0]) == 5
 
 
-def test_draws_are_chosen_by_the_stars_of_the_posterior(known, monkeypatch):
+def test_draws_are_chosen_by_the_stars_of_the_posterior(known):
     """Some of the stars are judged by the same draws as all of them."""
     _, posterior, matches, *_ = known
-    monkeypatch.setattr(membership, "EVALUATIONS", 400 * 3)
-    monkeypatch.setattr(membership, "LEAST_DRAWS", 1)
-    assert memberships(posterior, matches).draws == 3
-    assert memberships(posterior, matches.select(np.arange(10))).draws == 3
+    assert memberships(posterior, matches.select(np.arange(10))).draws == DRAWS
+    many = replace(posterior, n_stars=10**9)
+    assert memberships(many, matches).draws == 8
+    assert memberships(many, matches.select(np.arange(10))).draws == 8
 
 
 def test_planted_outliers_come_out_where_they_were_put():

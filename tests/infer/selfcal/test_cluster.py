@@ -22,20 +22,21 @@ from bayesdist.errors import InputError
 from bayesdist.files.records import write_record
 from bayesdist.infer import Compute
 from bayesdist.infer.equations.priors import Prior
-from bayesdist.infer.selfcal import pieces, sample_selfcal, self_calibrate, star_catalogue
-from bayesdist.infer.selfcal.elimination import Mixture, StarModes, expand
-from bayesdist.infer.selfcal.mode import mode_at, solve_in_gauge
-from bayesdist.infer.selfcal.pieces import (
+from bayesdist.infer.selfcal import elimination, sample_selfcal, self_calibrate, star_catalogue
+from bayesdist.infer.selfcal.elimination import (
+    Mixture,
+    StarModes,
     StarPiece,
     each_of,
+    expand,
     in_pieces,
     log_density,
     slope,
     to_sample,
 )
+from bayesdist.infer.selfcal.mode import mode_at, solve_in_gauge
 from bayesdist.infer.selfcal.posterior import SelfTarget
-from bayesdist.infer.selfcal.problem import StarPriors
-from bayesdist.infer.selfcal.tangent import places_of
+from bayesdist.infer.selfcal.problem import StarPriors, places_of
 from bayesdist.infer.stars import cluster as cluster_module
 from bayesdist.infer.stars import shards
 from bayesdist.infer.stars.cluster import ClusterPieces
@@ -75,7 +76,7 @@ def cluster(forked_workers):
 
 @pytest.fixture
 def compute(cluster, monkeypatch) -> Compute:
-    monkeypatch.setattr(pieces, "PIECE", PIECE)
+    monkeypatch.setattr(elimination, "PIECE", PIECE)
     monkeypatch.setattr(friends, "CELL", PIECE)
     return Compute(engine="dask", scheduler=cluster.scheduler_address)
 
@@ -187,7 +188,7 @@ def test_density_and_slope_are_those_of_the_whole(solution, compute):
 
 def test_sums_by_a_tree_of_workers_are_those_of_one_process(solution, compute, monkeypatch):
     """In the same order, bit for bit; and only the last branches come back."""
-    monkeypatch.setattr(pieces, "PIECE", SMALL)
+    monkeypatch.setattr(elimination, "PIECE", SMALL)
     monkeypatch.setattr(shards, "BRANCHES", 2)
     monkeypatch.setattr(cluster_module, "BRANCHES", 2)
     fetched, inner = [], ClusterPieces._results
@@ -266,7 +267,7 @@ def test_workers_read_pieces_from_files_again_where_one_is_lost(
     solution, compute, tmp_path, monkeypatch
 ):
     """The scheduler has their paths alone; they are removed at the end."""
-    monkeypatch.setattr(pieces, "PIECE", SMALL)
+    monkeypatch.setattr(elimination, "PIECE", SMALL)
     folder, mark = tmp_path / "scratch", tmp_path / "mark"
     folder.mkdir()
     compute = replace(compute, scratch=str(folder))

@@ -9,7 +9,7 @@ import pytest
 
 from bayesdist.data.detections import Detections
 from bayesdist.infer.equations.priors import Prior
-from bayesdist.infer.selfcal.expected import expected_solution
+from bayesdist.infer.selfcal.mode import expected_solution
 from bayesdist.infer.selfcal.prior import frame_prior
 from bayesdist.simulate.dithers import (
     dithered_model,

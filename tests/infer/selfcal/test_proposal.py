@@ -9,7 +9,7 @@ import pytest
 
 from bayesdist.errors import DegenerateError
 from bayesdist.infer.equations.priors import Prior
-from bayesdist.infer.selfcal import pieces, posterior
+from bayesdist.infer.selfcal import elimination, posterior
 from bayesdist.infer.selfcal.mode import solve
 from bayesdist.infer.selfcal.posterior import SelfTarget
 
@@ -19,7 +19,7 @@ from .fields import field, problem_of
 def indefinite(when):
     """`expand` with a negative curvature in those passes for which `when(observed, k)` is true."""
     passes = {True: 0, False: 0}
-    expand = pieces.expand
+    expand = elimination.expand
 
     def wrapped(*args, observed=True):
         passes[observed] += 1
@@ -38,13 +38,13 @@ def target():
     K = simulated.model.n_terms
     free = np.setdiff1d(np.arange(simulated.model.n_params), [0, 1, K, K + 1])
     mode = solve(problem, simulated.theta, free, Prior.none(simulated.theta))
-    with pieces.in_pieces(mode.problem, mode.stars) as whole:
-        yield SelfTarget(mode, whole.map(pieces.to_sample, mode.theta, mode.mixture))
+    with elimination.in_pieces(mode.problem, mode.stars) as whole:
+        yield SelfTarget(mode, whole.map(elimination.to_sample, mode.theta, mode.mixture))
 
 
 def test_nodes_are_found_past_an_indefinite_curvature(target, monkeypatch):
     plain = posterior.propose(target)
-    monkeypatch.setattr(pieces, "expand", indefinite(lambda observed, k: observed and k == 2))
+    monkeypatch.setattr(elimination, "expand", indefinite(lambda observed, k: observed and k == 2))
     found = posterior.propose(target)
     sigma = np.sqrt(np.diag(target.solution.cov)[target.solution.free])
     assert len(found.nodes) == len(plain.nodes)
@@ -54,7 +54,7 @@ def test_nodes_are_found_past_an_indefinite_curvature(target, monkeypatch):
 
 
 def test_what_is_indefinite_with_any_weights_is_refused(target, monkeypatch):
-    monkeypatch.setattr(pieces, "expand", indefinite(lambda *_: True))
+    monkeypatch.setattr(elimination, "expand", indefinite(lambda *_: True))
     with pytest.raises(DegenerateError, match="do not determine"):
         posterior.propose(target)
 
@@ -68,9 +68,9 @@ def test_nodes_between_are_those_found_one_by_one(monkeypatch):
     mode = solve(problem, simulated.theta, free, Prior.none(simulated.theta))
     sigma, passes = np.sqrt(np.diag(mode.cov)[free]), []
     counted = indefinite(lambda *_: bool(passes.append(1)))
-    monkeypatch.setattr(pieces, "expand", counted)
-    with pieces.in_pieces(mode.problem, mode.stars) as whole:
-        target = SelfTarget(mode, whole.map(pieces.to_sample, mode.theta, mode.mixture))
+    monkeypatch.setattr(elimination, "expand", counted)
+    with elimination.in_pieces(mode.problem, mode.stars) as whole:
+        target = SelfTarget(mode, whole.map(elimination.to_sample, mode.theta, mode.mixture))
         few, n_few = posterior.propose(target), len(passes)
         monkeypatch.setattr(posterior, "LINEAR", 0.0)
         all_nodes = posterior.propose(target)

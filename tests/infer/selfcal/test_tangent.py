@@ -11,8 +11,8 @@ from scipy.optimize import minimize_scalar
 
 from bayesdist.diagnose.selfcal.tests import selfcal_score_tests
 from bayesdist.infer.selfcal import self_calibrate
+from bayesdist.infer.selfcal.problem import TangentPlane
 from bayesdist.infer.selfcal.sky_moves import gauge_free_matrix
-from bayesdist.infer.selfcal.tangent import TangentPlane
 from bayesdist.model import Chip, DistortionModel
 from tests.infer.selfcal.wide import (
     ARCSEC,

@@ -10,9 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesdist.infer.series.design import Design
-from bayesdist.infer.series.series import Series
-from bayesdist.infer.series.trend import TrendModel
+from bayesdist.infer.series.series import Design, Series, TrendModel
 
 __all__ = ["StraightLines", "straight_lines"]
 

@@ -15,7 +15,7 @@ from bayesdist.infer.series import (
     fit_series,
     held_out,
 )
-from bayesdist.infer.series.problem import WIDE, Problem, trend_equations
+from bayesdist.infer.series.sampler import WIDE, SeriesProblem, trend_equations
 from tests.reduced import case_in_full
 
 from .straight import straight_lines
@@ -56,7 +56,7 @@ def least_squares(series: Series, columns: np.ndarray) -> tuple[np.ndarray, np.n
 def test_known_scatter_is_generalised_least_squares(trend, rng):
     series = some_series(rng)
     design = Design(trend, series)
-    problem = Problem.of(series, design, SCATTER, outliers=False)
+    problem = SeriesProblem.of(series, design, SCATTER, outliers=False)
     columns = problem.columns(np.zeros((1, 0)))
     precision = precisions(problem.formal, problem.sigma[None])
     matrix, right = trend_equations(problem, precision, columns, np.ones((1, 2)))

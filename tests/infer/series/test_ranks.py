@@ -11,9 +11,15 @@ from scipy.stats import chisquare
 
 from bayesdist.infer.convergence import Limits
 from bayesdist.infer.series import Design, Series, TrendModel
-from bayesdist.infer.series.chains import run
-from bayesdist.infer.series.problem import WIDE, Problem
-from bayesdist.infer.series.scatter import FRACTION_PRIOR, KAPPA_RATE, MAX_FRACTION, MIN_KAPPA
+from bayesdist.infer.series.sampler import (
+    FRACTION_PRIOR,
+    KAPPA_RATE,
+    MAX_FRACTION,
+    MIN_KAPPA,
+    WIDE,
+    SeriesProblem,
+    run,
+)
 from tests.infer.calibration import over_seeds
 from tests.reduced import only_in_full
 
@@ -64,7 +70,7 @@ def ranks_of(name: str, seed: int) -> dict[str, float]:
     noise = [np.linalg.cholesky(sigma + formal[..., e]) @ rng.standard_normal(k) for e in range(n)]
     off = rng.random(n) < fraction
     y = b @ columns.T + (np.array(noise) * np.where(off, kappa, 1.0)[:, None]).T
-    problem = Problem(dummy, design, y, formal, np.sqrt(formal))
+    problem = SeriesProblem(dummy, design, y, formal, np.sqrt(formal))
     _, _, draws, convergence = run(
         problem, rng, chains=16, warmup=100, sweeps=150, most=1200, limits=Limits(400, 1.02)
     )

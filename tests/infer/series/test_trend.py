@@ -7,7 +7,7 @@ import pytest
 
 from bayesdist.errors import DegenerateError, InputError
 from bayesdist.infer.series import KINDS, Design, Series, TrendModel
-from bayesdist.infer.series.design import Drift
+from bayesdist.infer.series.series import Drift
 
 BREAKS = (2005.3, 2011.0)
 

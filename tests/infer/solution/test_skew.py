@@ -8,7 +8,7 @@ from scipy import stats
 from scipy.optimize import least_squares
 
 from bayesdist.infer import fit_linear
-from bayesdist.infer.solution.skew import skew_of
+from bayesdist.infer.solution.geometry import skew_of
 from bayesdist.model import DistortionModel
 from tests.reduced import only_in_full
 

@@ -230,7 +230,7 @@ def test_shards_are_spread_evenly_and_stay(problem, compute, n_shards, monkeypat
     assert len(counts) == 3 and max(counts) - min(counts) <= 1
     for _ in range(8):
         assert shards.sum(pid_of) == pids
-    copies = shards._client.who_has(shards._pieces).values()
+    copies = shards._pieces._client.who_has(shards._pieces._pieces).values()
     assert [len(workers) for workers in copies] == [1] * n_shards
     shards.close()
 
@@ -244,7 +244,7 @@ def test_large_arguments_are_the_same_everywhere(there, problem):
 def test_scheduler_knows_how_large_a_shard_is(there, cluster):
     """Otherwise it would move shards as if they were nothing."""
     n_columns = 5  # var_u and var_v are one
-    held = cluster.scheduler.tasks[there._pieces[0].key].nbytes
+    held = cluster.scheduler.tasks[there._pieces._pieces[0].key].nbytes
     assert held >= 8 * n_columns * N / 5
 
 

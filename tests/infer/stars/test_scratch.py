@@ -14,8 +14,8 @@ from bayesdist.data import batches
 from bayesdist.errors import InputError
 from bayesdist.infer import Compute, GaussianPriors, OutlierMixture, fit_linear, load
 from bayesdist.infer.density.target import Target
-from bayesdist.infer.stars import scratch as store
-from bayesdist.infer.stars.scratch import Store
+from bayesdist.infer.stars import shards as store
+from bayesdist.infer.stars.shards import Store
 
 from ..support import TWO_CHIPS, pieces, simulated, stars_of
 

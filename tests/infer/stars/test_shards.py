@@ -183,8 +183,10 @@ def test_results_add_up_in_the_order_of_the_data(campaign, monkeypatch):
     assert first == tuple(
         float(piece.load().u[_first_row(model, piece)]) for piece in matches.readers()
     )
-    assert total([]) is None and total([3.0]) == 3.0
+    assert total([3.0]) == 3.0
     assert total(iter([1e16, 1.0, 1.0])) == (1e16 + 1.0) + 1.0 != 1e16 + 2.0
+    with pytest.raises(ValueError, match="no parts"):
+        total([])
 
 
 def _first_u(stars):

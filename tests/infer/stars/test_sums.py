@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
-from bayesdist.infer.stars.sums import Sums
+from bayesdist.infer.stars.stars import Sums
 from bayesdist.model import Groups
 
 NOBODY = np.zeros(0, np.int64)

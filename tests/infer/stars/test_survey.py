@@ -8,9 +8,8 @@ from scipy.spatial import ConvexHull
 
 from bayesdist.data import batches
 from bayesdist.infer import load
-from bayesdist.infer.stars.shards import total
+from bayesdist.infer.stars.shards import survey, total
 from bayesdist.infer.stars.stars import prepare
-from bayesdist.infer.stars.survey import survey
 
 from ..support import CHIP, TWO_CHIPS, pieces, simulated, table
 

@@ -25,8 +25,7 @@ from bayesdist.data import Matches
 from bayesdist.errors import DegenerateError, InputError
 from bayesdist.files.atomic import atomic_path
 from bayesdist.infer import Shards
-from bayesdist.infer.compare.order import in_one_frame, select_order
-from bayesdist.infer.compare.order_result import OrderSelection
+from bayesdist.infer.compare.order import OrderSelection, in_one_frame, select_order
 from bayesdist.infer.solution.linear import Rejection
 from bayesdist.model import DistortionModel
 from bayesdist.model.basis import MAX_ORDER

@@ -8,7 +8,7 @@ import numpy as np
 
 from bayesdist.app.kinds.parts import Part
 from bayesdist.infer import Posterior
-from bayesdist.infer.exposures.chip_offsets import Settling
+from bayesdist.infer.exposures.hierarchy import Settling
 from bayesdist.infer.series import Series
 from bayesdist.utils.arrays import Float
 

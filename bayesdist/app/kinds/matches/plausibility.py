@@ -8,11 +8,11 @@ import numpy as np
 from numpy.polynomial import legendre
 
 from bayesdist.app.config import Config
-from bayesdist.app.kinds.sampling import doubts_on_numbers, n_terms
+from bayesdist.app.kinds.sampling import doubts_on_numbers
 from bayesdist.data import Matches
 from bayesdist.errors import InputError
 from bayesdist.model import DistortionModel, TimeDependence
-from bayesdist.model.basis import MAX_ORDER, polynomial_terms
+from bayesdist.model.basis import MAX_ORDER, n_terms, polynomial_terms
 from bayesdist.utils.arrays import Float, Int
 
 OFF = 1e3  # factor on the expected scale beyond which u and v are refused

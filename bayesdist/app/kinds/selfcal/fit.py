@@ -20,10 +20,9 @@ from bayesdist.app.kinds.selfcal.solved import SOLUTION, SelfCalibrated
 from bayesdist.files.hdf5 import read_arrays
 from bayesdist.infer import Compute, GaussianPriors, Posterior
 from bayesdist.infer.selfcal import SelfCalibrationMode, sample_selfcal
-from bayesdist.infer.selfcal.elimination import Mixture
+from bayesdist.infer.selfcal.elimination import Mixture, one_cluster
 from bayesdist.infer.selfcal.gauge import Decision
 from bayesdist.infer.selfcal.mode import gauge_of, mode_at, solve_in_gauge
-from bayesdist.infer.selfcal.pieces import one_cluster
 from bayesdist.model import DistortionModel
 from bayesdist.utils.arrays import Float
 

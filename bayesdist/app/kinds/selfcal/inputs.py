@@ -22,8 +22,7 @@ from bayesdist.data.matching.field import refuse_duplicates
 from bayesdist.data.sky import parallax_factors
 from bayesdist.errors import InputError
 from bayesdist.infer.selfcal import ReferenceStars
-from bayesdist.infer.selfcal.problem import Problem, prepare
-from bayesdist.infer.selfcal.tangent import TangentPlane, contacts_of
+from bayesdist.infer.selfcal.problem import Problem, TangentPlane, contacts_of, prepare
 from bayesdist.model import DistortionModel
 from bayesdist.utils.arrays import Float
 

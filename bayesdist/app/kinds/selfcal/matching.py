@@ -18,10 +18,9 @@ from bayesdist.data.matching.pairs import hull_of, inside_hull
 from bayesdist.errors import DegenerateError, InputError, NotSettledError
 from bayesdist.infer.selfcal import SelfCalibration
 from bayesdist.infer.selfcal.calibrate import self_calibrate
-from bayesdist.infer.selfcal.elimination import memberships
+from bayesdist.infer.selfcal.elimination import memberships, one_cluster
 from bayesdist.infer.selfcal.gauge import NamedDirection
-from bayesdist.infer.selfcal.pieces import one_cluster
-from bayesdist.infer.selfcal.tangent import places_of
+from bayesdist.infer.selfcal.problem import places_of
 from bayesdist.infer.solution.geometry import geometries
 from bayesdist.model import DistortionModel
 from bayesdist.utils.arrays import Bool, Float, Int

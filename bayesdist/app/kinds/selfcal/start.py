@@ -17,7 +17,7 @@ from bayesdist.data.matching.pairs import LinearMap, best_similarity
 from bayesdist.data.matching.similarity import Similarity, find_similarity, pattern_index
 from bayesdist.errors import InputError
 from bayesdist.infer import load_fit, load_posterior
-from bayesdist.infer.selfcal.start import (
+from bayesdist.infer.selfcal.prior import (
     Start,
     chips_side_by_side,
     fitted_polynomials,

@@ -13,8 +13,7 @@ import numpy as np
 
 from bayesdist.diagnose.residuals.binned import BinnedSums, band_bins
 from bayesdist.infer.stars.likelihood import Clip
-from bayesdist.infer.stars.stars import Stars
-from bayesdist.infer.stars.sums import Sums
+from bayesdist.infer.stars.stars import Stars, Sums
 from bayesdist.missions.wise.assess.distortion_field import DistortionField
 from bayesdist.utils.arrays import Float, Int
 

@@ -20,7 +20,7 @@ from bayesdist.missions.wise.assess.residual_field import (
     polynomials,
     residual_field,
 )
-from bayesdist.model.basis import polynomial_terms
+from bayesdist.model.basis import n_terms
 from bayesdist.utils.arrays import Float
 from bayesdist.utils.distributions import f_sf
 from bayesdist.utils.limits import STRUCTURE
@@ -172,8 +172,8 @@ def _shares(n: int, k: int) -> tuple[Float, Float]:
 
 def _order_with(freedom: int, order: int) -> int:
     """Lowest polynomial order that has at least `freedom` more terms than `order`."""
-    had = len(polynomial_terms(order))
-    while len(polynomial_terms(order)) - had < freedom:
+    had = n_terms(order)
+    while n_terms(order) - had < freedom:
         order += 1
     return order
 

@@ -23,7 +23,7 @@ from bayesdist.missions.wise.published import (
     SAMPLE_SIZES,
     WISE_BANDS,
 )
-from bayesdist.model.basis import polynomial_terms
+from bayesdist.model.basis import n_terms
 
 GRID = (33, 33)
 SEED = 20110201
@@ -51,7 +51,7 @@ def measure_bands(
         {b.name: b.sums.bins for b in bands},
         rng=np.random.default_rng(SEED),
         arcsec=arcsec,
-        absorbed={b.name: len(polynomial_terms(b.order)) for b in bands},
+        absorbed={b.name: n_terms(b.order) for b in bands},
     )
     first, *further = bands
     return BandsInput(

@@ -11,7 +11,7 @@ import numpy as np
 
 from bayesdist.data.matches import Matches
 from bayesdist.errors import DegenerateError, InputError
-from bayesdist.infer.stars.sums import Sums
+from bayesdist.infer.stars.stars import Sums
 from bayesdist.missions.wise.rvb.transform import PARAMETERS, RvbTransform
 from bayesdist.utils.arrays import Float
 

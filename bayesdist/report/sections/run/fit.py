@@ -6,8 +6,7 @@ import numpy as np
 
 from bayesdist.diagnose.residuals.tables import residual_statistics
 from bayesdist.diagnose.score.result import POWER
-from bayesdist.infer.solution.geometry import geometries
-from bayesdist.infer.solution.skew import skew_of
+from bayesdist.infer.solution.geometry import geometries, skew_of
 from bayesdist.report.contents import REPORT
 from bayesdist.report.context import ReportInput
 from bayesdist.report.texttable import TextTable, listing, tabulated

@@ -6,16 +6,22 @@ memberships and error law are updated in turn, each step increasing the same bou
 likelihood (variational EM).  The error law describes the residuals plus the part that the fit
 absorbs, star by star.  Stars are not rejected by a limit, because stars that alternate between
 rejected and accepted would make the errors oscillate.
+
+ln sigma is linear between nodes in magnitude.  Its changes of slope have a normal prior (integrated
+Wiener process).  The scale of the prior is estimated from the scatter in bins by restricted
+likelihood and then fixed, so that all later steps maximise the same function.
 """
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
+from scipy.optimize import minimize_scalar
 
 from bayesdist.data.magnitude_errors import MagnitudeErrors, estimate
 from bayesdist.data.matches import Matches
 from bayesdist.errors import InputError
-from bayesdist.infer.catalogue.magnitude_law import MagnitudeLaw
 from bayesdist.infer.equations.priors import GaussianPriors
 from bayesdist.infer.solution.linear import (
     DEFAULT_REJECTION,
@@ -28,16 +34,21 @@ from bayesdist.infer.stars.likelihood import good_probability
 from bayesdist.infer.stars.shards import Compute
 from bayesdist.infer.stars.stars import groups_of, in_table_order, prepare
 from bayesdist.model import DistortionModel
-from bayesdist.utils.arrays import Float
+from bayesdist.utils.arrays import Float, Int
 from bayesdist.utils.quantities import takes
 
 STARS = 200_000  # sample size; it determines the error law to a part in a thousand
 PER_EXPOSURE = 100  # the sample has on average at least this many stars per exposure and chip
 SETTLED = 1e-3  # change of ln sigma below which the iteration has converged
-TURNS = 200  # maximum number of iterations; far fewer are needed
+MAX_ITERATIONS = 200  # far fewer are needed
 FALSE = 0.02, 50.0  # prior of the fraction of false matches: mean, and weight in stars
 WIDER = 10.0  # smallest ratio of the scatter of false matches to the largest error of true ones
 LEAST_WEIGHT = 1e-9  # smallest weight of a star, to keep its error finite
+
+CELLS = 1000  # number of magnitude cells, small enough that the error is constant in each
+LOG_VARIANCE = 1.36  # variance of ln(scatter) times n, for the median absolute deviation
+BENDS = (1e-3, 1e2)  # limits of the prior scale of changes of slope over the range of magnitudes
+ROOM = 2.0  # prior sigma of ln sigma about the scatter of the bins (a factor of 7)
 
 
 @takes(matches=Matches, model=DistortionModel, rejection=Rejection, compute=Compute)
@@ -48,6 +59,7 @@ def fit_by_magnitude(
     rejection: Rejection = DEFAULT_REJECTION,
     priors: GaussianPriors | None = None,
     compute: Compute | None = None,
+    max_iterations: int = MAX_ITERATIONS,
 ) -> tuple[LinearFit, Matches, MagnitudeErrors]:
     """Fit a distortion model and the errors as a function of magnitude simultaneously.
 
@@ -62,6 +74,8 @@ def fit_by_magnitude(
         See `fit_linear`.
     compute : Compute, optional
         See `fit_linear`.
+    max_iterations : int
+        Maximum number of updates of distortion, memberships and error law.
 
     Returns
     -------
@@ -96,7 +110,7 @@ def fit_by_magnitude(
             do="map column 'mag' or give data.sigma another value",
         )
     count = max(STARS, PER_EXPOSURE * len(model.exposures) * len(model.chips))
-    errors = _law(matches.sample(count), model, rejection, priors)
+    errors = _law(matches.sample(count), model, rejection, priors, max_iterations)
     table = matches.without("u_nominal", "v_nominal").with_errors(errors)
     fit = fit_linear(table, model, rejection=rejection, priors=priors, compute=compute)
     return fit, table, errors
@@ -107,6 +121,7 @@ def _law(
     model: DistortionModel,
     rejection: Rejection,
     priors: GaussianPriors | None,
+    max_iterations: int,
 ) -> MagnitudeErrors:
     """Estimate the errors as a function of magnitude from a sample of stars."""
     mag = stars.column("mag")
@@ -117,7 +132,7 @@ def _law(
     nodes, square = law.start, residual**2
     narrowest = (WIDER * np.exp(nodes.max())) ** 2
     f, wide = FALSE[0], max(narrowest, float((square.sum(axis=0)).max()) / 8.0)
-    for _ in range(TURNS):
+    for _ in range(max_iterations):
         var = law.at_stars(nodes)
         good = good_probability(square, var, f, wide)
         fit, residual = refitted(stars, model, var, good, priors)
@@ -186,3 +201,102 @@ def variances_of(fit: LinearFit, stars: Matches) -> Float:
         for axis in (0, 1):
             out[axis, rows] = np.einsum("nk,nk->n", phi @ (d[axis] @ cov @ d[axis].T), phi)
     return out
+
+
+# -- errors as a smooth function of magnitude, by penalised likelihood -----------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class MagnitudeLaw:
+    """Interpolation and prior of ln sigma at B nodes, for C cells of stars of similar magnitude."""
+
+    cell: Int  # cell (N,) of each star
+    design: Float  # linear interpolation (C, B) from the nodes to the cells
+    # ln sigma (2, B) of u and v at the nodes from the scatter in bins; centre of a weak prior that
+    # keeps sigma away from zero
+    start: Float
+    penalty: Float  # inverse covariance (B, B) of the smoothness prior
+
+    @classmethod
+    def of(cls, mag: Float, bins: MagnitudeErrors) -> MagnitudeLaw:
+        """Law for stars with magnitudes (N,); the bins provide nodes and starting values."""
+        count = min(len(mag), CELLS)
+        rank = np.argsort(np.argsort(mag, kind="stable"), kind="stable")
+        cell = rank * count // len(mag)
+        size = np.bincount(cell, minlength=count)
+        centre = np.bincount(cell, weights=mag, minlength=count) / size
+        nodes = np.eye(len(bins.mag))
+        design = np.stack([np.interp(centre, bins.mag, node) for node in nodes], axis=1)
+        start = np.log(np.stack([bins.scatter_u, bins.scatter_v]))
+        penalty = np.zeros_like(nodes)
+        if len(bins.mag) > 2:
+            bends = _bends(bins.mag)
+            tau = _size_of_bends(start @ bends.T, bends, bins.n)
+            penalty = bends.T @ bends / tau**2
+        return cls(cell, design, start, penalty)
+
+    def at_stars(self, nodes: Float) -> Float:
+        """Squared errors (2, N) of the stars, from ln sigma (2, B) at the nodes."""
+        return np.asarray(np.exp(2.0 * nodes @ self.design.T)[:, self.cell])
+
+    def climbed(self, nodes: Float, weight: Float, square: Float) -> Float:
+        """Maximise the penalised likelihood; return ln sigma (2, B) at the nodes.
+
+        `nodes` (2, B) is the starting point, `weight` (N,) the probability that a star is a true
+        match, and `square` (2, N) its expected squared error.  The likelihood is concave, so that
+        Newton's method with step halving finds its only maximum.
+        """
+        n = self._of_cells(weight)
+        prior = self.penalty + np.eye(len(self.penalty)) / ROOM**2
+        out = nodes.copy()
+        for axis in (0, 1):
+            s = self._of_cells(weight * square[axis])
+            eta, value = out[axis], self._value(out[axis], axis, n, s)
+            for _ in range(100):
+                of_cells = s * np.exp(-2.0 * self.design @ eta)
+                pull = self.penalty @ eta + (eta - self.start[axis]) / ROOM**2
+                gradient = self.design.T @ (of_cells - n) - pull
+                hessian = 2.0 * (self.design.T * of_cells) @ self.design + prior
+                # limit the steps: far below the maximum the curvature grows exponentially
+                step = np.linalg.solve(hessian, gradient)
+                step *= min(1.0, 1.0 / max(np.abs(step).max(), 1e-300))
+                new_value = self._value(eta + step, axis, n, s)
+                while new_value < value and np.abs(step).max() > 1e-8:
+                    step /= 2.0
+                    new_value = self._value(eta + step, axis, n, s)
+                if new_value >= value:
+                    eta, value = eta + step, new_value
+                if np.abs(step).max() < 1e-6:
+                    break
+            out[axis] = eta
+        return out
+
+    def _of_cells(self, values: Float) -> Float:
+        sums = np.bincount(self.cell, weights=values, minlength=len(self.design))
+        return np.asarray(sums, float)
+
+    def _value(self, eta: Float, axis: int, n: Float, s: Float) -> float:
+        of_cells, off = self.design @ eta, eta - self.start[axis]
+        likelihood = -(n @ of_cells) - 0.5 * (s @ np.exp(-2.0 * of_cells))
+        return float(likelihood - 0.5 * (eta @ self.penalty @ eta + off @ off / ROOM**2))
+
+
+def _bends(mag: Float) -> Float:
+    """Matrix (B - 2, B) of changes of slope at the inner nodes, with unit prior variance."""
+    at = (mag - mag[0]) / (mag[-1] - mag[0])
+    gap = np.diff(at)
+    slopes = np.diff(np.eye(len(mag)), axis=0) / gap[:, None]
+    return np.asarray(np.diff(slopes, axis=0) / np.sqrt((gap[1:] + gap[:-1])[:, None] / 2.0))
+
+
+def _size_of_bends(found: Float, bends: Float, n: Int) -> float:
+    """Most likely prior scale of the changes of slope `found`, given the noise of the bins."""
+    noise = (bends * (LOG_VARIANCE / n)) @ bends.T
+
+    def misfit(log_tau: float) -> float:
+        cov = noise + np.exp(2.0 * log_tau) * np.eye(len(noise))
+        whitened = np.linalg.solve(np.linalg.cholesky(cov), found.T)
+        return float((whitened**2).sum() + len(found) * np.linalg.slogdet(cov)[1])
+
+    limits = np.log(BENDS)
+    return float(np.exp(minimize_scalar(misfit, bounds=limits, method="bounded").x))
