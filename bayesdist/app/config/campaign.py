@@ -91,6 +91,11 @@ class CampaignConfig(RunConfig):
         return files
 
     @property
+    def fits_on_grid(self) -> bool:
+        """True if the fit writes errors of tables on the grid of the assessment."""
+        return self.tables.method != "none" or self.tables.detector is not None
+
+    @property
     def filter_name(self) -> str:
         """Filter of the exposures, if the settings name it; may be empty."""
         return self.detector.filter or self.campaign.filter or ""

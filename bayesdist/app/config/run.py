@@ -148,6 +148,11 @@ class RunConfig(Section):
         return self.detector.filter or ""
 
     @property
+    def fits_on_grid(self) -> bool:
+        """True if the fit writes errors of tables on the grid of the assessment."""
+        return False
+
+    @property
     def compares_jitters(self) -> bool:
         """True if groups of stars may have separate jitters, if the data support it."""
         return False

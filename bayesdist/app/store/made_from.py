@@ -100,7 +100,7 @@ def settings_of(config: Config) -> tuple[dict[str, Any], dict[str, Any], dict[st
     limits = {"sampler": {key: settings["sampler"].pop(key) for key in LIMITS}}
     for key in NOWHERE:
         settings.pop(key, None)
-    if _is_on_the_grid(config):
+    if config.fits_on_grid:
         settings["assess"] = {"grid": later["assess"]["grid"]}
     return settings, limits, later
 
@@ -153,12 +153,6 @@ def _of_diagnoses(later: Mapping[str, Any], own: list[Any], config: Config) -> d
     return settings
 
 
-def _is_on_the_grid(config: Config) -> bool:
-    """True if the fit writes errors of tables on the grid of the assessment."""
-    tables = config.tables
-    return tables.method != "none" or tables.detector is not None
-
-
 def changes(known: Config, now: Config) -> Iterator[tuple[str, Any, Any]]:
     """Dotted key, old value and new value of each difference between two configurations."""
     yield from differences(as_json(known.model_dump()), as_json(now.model_dump()))
@@ -167,7 +161,7 @@ def changes(known: Config, now: Config) -> Iterator[tuple[str, Any, Any]]:
 def is_adjustable(key: str, config: Config) -> bool:
     """True if a run may be resumed with another value of the key."""
     section, _, name = key.partition(".")
-    if key.startswith("assess.grid") and _is_on_the_grid(config):
+    if key.startswith("assess.grid") and config.fits_on_grid:
         return False
     if section == "sampler":
         return name in LIMITS

@@ -69,7 +69,7 @@ def open_bands(paths: Sequence[str | Path]) -> dict[str, BandRun]:
 def _opened(path: str | Path) -> BandRun:
     run = RunDirectory.open(path)
     for kind, word, do in _OTHER_KINDS:
-        if getattr(run.config, kind) is not None:
+        if hasattr(run.config, kind):
             raise InputError(f"is a run of a {word}", where=str(path), do=do)
     results = results_of(run)
     run.require("bands", ("fit", "sample", "diagnose"))
