@@ -209,6 +209,28 @@ def effect_of_deviations(mode):
     return np.sqrt(mean_squares(model) @ (response**2).sum(axis=1))
 
 
+def test_every_possible_scatter_is_given_all_patterns():
+    """Deviations proportional to their scatter: chosen draws differ from others in size alone."""
+    rng = np.random.default_rng(6)
+    scatter = np.exp(rng.standard_normal(250))
+    scattering = Scattering(None, None, scatter[:, None] ** 2)
+    pattern = rng.standard_normal((250, 5, 2))
+    rows = np.repeat([3, 7], 125)
+    expected = scatter[rows][:, None, None] * pattern
+    np.testing.assert_allclose(
+        scattering.resized(scatter[:, None, None] * pattern, rows), expected, rtol=1e-12
+    )
+
+
+def test_truths_are_drawn_with_their_odds():
+    rng = np.random.default_rng(7)
+    odds = np.array([1.0, 2.0, 5.0])
+    scattering = Scattering(None, None, np.ones((3, 1)), odds=odds)
+    drawn = [scattering.truth(uniform) for uniform in rng.uniform(size=8000)]
+    share = np.bincount(drawn, minlength=3) / 8000
+    np.testing.assert_allclose(share, odds / 8, atol=4 * 0.5 / np.sqrt(8000))
+
+
 @pytest.mark.parametrize("seed", [1, case_in_full(3, instead="another seed is run")])
 def test_further_dithers_say_what_exposures_that_are_simulated_do(seed):
     """Of the same field, 38 exposures in place of 6: more than 38 / 6 times the information.

@@ -13,12 +13,13 @@ existing and the further exposures is predicted, and the requirement is judged w
   structure is detected, the prior of its size is nearly flat in its logarithm, and all sizes shrink
   alike. Several exposures of the same date do not constrain the curvature of a drift, which is then
   left unchanged.
-- Scatter of exposures: its draws are weighted by the likelihood of deviations drawn with the
-  scatter of the truth. The effect of deviations on the mean of the exposures decreases with the
-  square root of the number of exposures (in a self-calibration, it is computed for the geometry of
-  the dithers). The deviation of a single exposure does not decrease, but its size becomes
-  better known. A limit that is smaller than it is therefore never met, and with few exposures this
-  cannot be told.
+- Scatter of exposures: truths are drawn with a prior that is flat in the logarithm above the median
+  of the half-Cauchy prior of the run. The draws of the run are weighted by the likelihood of
+  deviations drawn with the scatter of the truth. The effect of deviations on the mean of the
+  exposures decreases with the square root of the number of exposures (in a self-calibration, it is
+  computed for the geometry of the dithers). The deviation of a single exposure does not decrease,
+  but its size becomes better known. A limit that is smaller than it is therefore never met, and
+  with few exposures this cannot be told.
 - Everything else, such as the stated error of a catalogue, is unchanged.
 
 Number and dates of further exposures that would meet a requirement.
@@ -46,6 +47,7 @@ from bayesdist.assess.terms.parameters import ExposureVariation, SolutionErrors
 from bayesdist.assess.units import convert
 from bayesdist.diagnose.correlated.deviations import LINEAR, SCATTERS, LinearDeviations
 from bayesdist.diagnose.correlated.exposure_fields import QUADRATIC
+from bayesdist.diagnose.correlated.priors import DiscrepancyPriors
 from bayesdist.errors import required
 from bayesdist.infer.equations.scaled import one_thread
 from bayesdist.infer.solution.solution import Solution
@@ -110,6 +112,23 @@ class Scattering:
     # (DRAWS, d), variances of the deviations of an exposure, as mean squares of displacements
     variances: Float
     bends: bool = False  # True if the term includes the curvature of the drift
+    # (DRAWS,) probabilities of the draws as truths, up to a factor; None if they are equal
+    odds: Float | None = None
+
+    def truth(self, uniform: float) -> int:
+        """Number of the draw that is taken as the truth, from a uniform random number."""
+        if self.odds is None:
+            return int(uniform * len(self.variances))
+        cumulative = np.cumsum(self.odds)
+        return int(min(np.searchsorted(cumulative, uniform * cumulative[-1]), len(cumulative) - 1))
+
+    def resized(self, error: Float, rows: Int) -> Float:
+        """Errors (DRAWS, N, 2) with the scatters of the draws `rows`, each with its own pattern.
+
+        A few draws that are chosen again and again would have the same few patterns.
+        """
+        size = np.sqrt(self.variances.sum(axis=1))
+        return np.asarray((size[rows] / np.maximum(size, 1e-300))[:, None, None] * error)
 
     def chosen(self, n: int, data: ExistingData, truth: int, rng: np.random.Generator) -> Int:
         """Draws (DRAWS,) that are probable after n more exposures if draw `truth` is true.
@@ -155,6 +174,8 @@ class Futures:
         Size of one pixel in mas.
     seed : int
         Seed of all random numbers.
+    priors : DiscrepancyPriors
+        Priors that the error model was estimated with.
     """
 
     errors: ErrorModel
@@ -165,6 +186,7 @@ class Futures:
     epoch: float | None
     pixel_scale: float | None
     seed: int
+    priors: DiscrepancyPriors = field(default_factory=DiscrepancyPriors)
 
     def probability(self, schedule: Schedule) -> Callable[[int], float]:
         """Probability that the requirement is met with n more exposures, as a function of n.
@@ -221,7 +243,9 @@ class Futures:
         # relative uncertainty of the scatter of the stars, from their number
         stars = self.data.n_stars * np.array([self.data.n_exposures, n])
         width = np.exp(rng.standard_normal() * np.sqrt(np.sum(0.5 / stars)))
-        chosen = [term.chosen(n, self.data, true, rng) for term in self._scattering]
+        chosen = [
+            term.chosen(n, self.data, term.truth(rng.uniform()), rng) for term in self._scattering
+        ]
         values = []
         for place, of_solution in zip(self._places, solution, strict=True):
             error = width * of_solution
@@ -230,8 +254,12 @@ class Futures:
             for term, (in_mean, deviation), rows in zip(
                 self._scattering, place.scattering, chosen, strict=True
             ):
-                size = 1 / np.sqrt(1 + of_bends) if term.bends else mean
-                error += size * in_mean[rows] + deviation[rows]
+                # the curvature of a drift does not scale with the scatter
+                if term.bends:
+                    error += in_mean[rows] / np.sqrt(1 + of_bends)
+                else:
+                    error += mean * term.resized(in_mean, rows)
+                error += term.resized(deviation, rows)
             values.append([place.values(error + r) / place.limit for r in place.unchanged])
         worst = np.max(values, axis=0)  # (ways, DRAWS), largest over the epochs
         return float(np.mean(worst <= 1.0, axis=1).min())
@@ -259,7 +287,9 @@ class Futures:
     @cached_property
     def _scattering(self) -> list[Scattering]:
         terms = [term for term in self._drawn.terms if _scatters(term)]
-        return [_scattering(term, np.random.default_rng([self.seed, 3])) for term in terms]
+        rng = np.random.default_rng([self.seed, 3])
+        pixel = self.errors.solution.solution.model.pixel_size(self.errors.solution.solution.mean)
+        return [_scattering(term, self.priors, pixel, rng) for term in terms]
 
     @cached_property
     def _places(self) -> list[_Position]:
@@ -360,8 +390,25 @@ def _scatters(term: ErrorTerm) -> bool:
     return isinstance(term, FieldsOfExposures | ExposureVariation)
 
 
-def _scattering(term: ErrorTerm, rng: np.random.Generator) -> Scattering:
-    """Draws of a term that varies between exposures, in the order of the draws of its scatter."""
+def _odds(*scatters: tuple[Float, float]) -> Float:
+    """Ratio (DRAWS,) of a prior that is flat in the logarithm above the median to a half-Cauchy.
+
+    For draws (DRAWS,) of scatters and their prior medians. The half-Cauchy prior resists errors
+    that no data show, but scatters are not known to be smaller in most calibrations: with it,
+    scatters that few exposures leave open would be expected to turn out small.
+    """
+    return np.asarray(
+        np.prod([np.hypot(1.0, draws / median) for draws, median in scatters], axis=0)
+    )
+
+
+def _scattering(
+    term: ErrorTerm, priors: DiscrepancyPriors, pixel: float, rng: np.random.Generator
+) -> Scattering:
+    """Draws of a term that varies between exposures, in the order of the draws of its scatter.
+
+    `pixel` is the size of a pixel in the unit of u and v.
+    """
     in_mean: ErrorDraws | None = None
     in_exposure: ErrorDraws | None = None
     if isinstance(term, Deviations):
@@ -369,17 +416,18 @@ def _scattering(term: ErrorTerm, rng: np.random.Generator) -> Scattering:
         rows = np.arange(DRAWS) % len(linear.theta)
         in_mean = term.of_rows(rows, None)
         in_exposure = term.of_rows(rows, int(rng.integers(2**63))) if term.single else None
-        variances = [
+        by_term = [
             # position in units of the half size of the chip: its mean square is 2 / 3
             (1.0 if kind == "shift" else 2 / 3)
             * (linear.size * linear.scatter[SCATTERS[kind]]) ** 2
             for kind, name in ((kind, SCATTERS[kind]) for kind in linear.kinds)
             for _ in LINEAR.get(kind, "uv")
         ]
+        names = {SCATTERS[kind] for kind in linear.kinds}
+        odds = _odds(*((linear.scatter[name][rows], priors.exposure) for name in sorted(names)))
         # the scatter of the exposures' mean cannot be distinguished from curvature of the drift
-        return Scattering(
-            in_mean, in_exposure, np.stack(variances, axis=1)[rows], bool(np.isfinite(linear.epoch))
-        )
+        bends = bool(np.isfinite(linear.epoch))
+        return Scattering(in_mean, in_exposure, np.stack(by_term, axis=1)[rows], bends, odds)
     if isinstance(term, FieldsOfExposures):
         fields = required(term.discrepancy.fields, "no fields of exposures were estimated")
         rows = np.arange(DRAWS) % len(fields.theta)
@@ -387,7 +435,12 @@ def _scattering(term: ErrorTerm, rng: np.random.Generator) -> Scattering:
         in_exposure = term.of_rows(rows, rng) if term.single else None
         n_terms = len(QUADRATIC)
         variance = fields.second_order**2 + fields.amplitude**2 / n_terms
-        return Scattering(in_mean, in_exposure, np.tile(variance[rows, None], (1, 2 * n_terms)))
+        odds = _odds(
+            (fields.second_order[rows], priors.higher_order * pixel),
+            (fields.amplitude[rows], priors.structure * pixel),
+        )
+        variances = np.tile(variance[rows, None], (1, 2 * n_terms))
+        return Scattering(in_mean, in_exposure, variances, odds=odds)
     if isinstance(term, ExposureVariation):
         rows = np.arange(DRAWS) % len(term.tau)
         half = term.model.pixel_size(term.mean) * max(max(c.size) for c in term.model.chips) / 2

@@ -181,6 +181,7 @@ def futures_of(results: Results, content: ExposureContent) -> Callable[[Requirem
             settings.epoch,
             settings.pixel_scale(errors),
             seed,
+            results.config.discrepancy.priors(),
         )
 
     return of
